@@ -1,0 +1,582 @@
+"""Cameras: intrinsics, lens and pose; projection and its inverse; resizing and cropping.
+
+Conventions (pinned by ``tests/conventions``):
+
+- Pixel centres are integers: (0, 0) is the centre of the top-left pixel, points are (x, y), sizes (h, w).
+- ``cam2ego`` maps camera points to the ego frame: ``p_ego = cam2ego @ p_cam``. Camera axes: x right, y down,
+  z forward. Ego axes: x forward, y left, z up, metres. The paper's rotation R_i is ``cam2ego[:3, :3].T``.
+- Angles at the public face are in degrees, geometry is float64.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal, NamedTuple, get_args
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from arbiview_aug.errors import CalibrationError
+
+Lens = Literal["pinhole", "radtan", "fisheye"]
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5, 8), "fisheye": (4,)}
+"""Numbers of distortion coefficients each lens takes, in OpenCV's order (k1 k2 p1 p2 [k3 [k4 k5 k6]]; k1..k4)."""
+
+ROTATION_TOLERANCE = 1e-4
+"""Largest entry of |R Rᵀ - I| that is still a rotation: published calibrations carry 5 to 7 digits."""
+
+UNPROJECT_TOLERANCE_PX = 1e-6
+"""A ray counts as found when projecting it again lands this close to its pixel."""
+
+MIN_DEPTH = 1e-6
+"""Smallest z / |p| of a point in front of a pinhole or radtan camera (89.99994 degrees off axis)."""
+
+MAX_SIZE_PX = 32766
+"""Largest image side: OpenCV's remap needs sizes below 32767."""
+
+_NEWTON_STEPS = 40
+
+
+class Projection(NamedTuple):
+    """Pixels of projected points.
+
+    Attributes:
+        uv: (..., 2) pixels (x, y); meaningless where ``valid`` is False, but always finite.
+        depth_m: (...,) z in the camera frame.
+        valid: (...,) in front of the camera and on the lens's unfolded branch; says nothing about image bounds.
+    """
+
+    uv: FloatArray
+    depth_m: FloatArray
+    valid: BoolArray
+
+
+class Rays(NamedTuple):
+    """Unit viewing directions (..., 3) and whether the lens could be inverted there (...,)."""
+
+    directions: FloatArray
+    valid: BoolArray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Camera:
+    """One calibrated camera.
+
+    Args:
+        name: Unique within its rig.
+        width_px: Image width.
+        height_px: Image height.
+        K: (3, 3) intrinsics in pixels, ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]``.
+        cam2ego: (4, 4) pose, camera to ego.
+        lens: ``pinhole``; ``radtan`` (OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]); ``fisheye`` (Kannala-Brandt,
+            OpenCV's k1..k4).
+        distortion: Coefficients of the lens.
+        mask: (H, W) bool, True where the scene is seen, False on the own car's body.
+
+    Raises:
+        CalibrationError: With the camera's name, what was expected, what came and how to mend it.
+    """
+
+    name: str
+    width_px: int
+    height_px: int
+    K: FloatArray
+    cam2ego: FloatArray
+    lens: Lens = "pinhole"
+    distortion: tuple[float, ...] = ()
+    mask: BoolArray | None = None
+
+    def __post_init__(self) -> None:
+        put = lambda field, value: object.__setattr__(self, field, value)  # noqa: E731 - frozen dataclass
+        if not isinstance(self.name, str) or not self.name:
+            raise CalibrationError(f"camera name: expected a non-empty string, got {self.name!r}")
+        for field in ("width_px", "height_px"):
+            put(field, self._checked_size(field, getattr(self, field)))
+        put("K", self._checked_intrinsics(self._checked_array("K", self.K, (3, 3))))
+        put("cam2ego", self._checked_pose(self._checked_array("cam2ego", self.cam2ego, (4, 4))))
+        if self.lens not in get_args(Lens):
+            raise self._error("lens", f"one of {', '.join(get_args(Lens))}", repr(self.lens))
+        put("distortion", self._checked_distortion(self.distortion))
+        if self.mask is not None:
+            put("mask", self._checked_mask(self.mask))
+
+    def _error(self, field: str, expected: str, got: str, fix: str = "") -> CalibrationError:
+        tail = f"; {fix}" if fix else ""
+        return CalibrationError(f"camera {self.name!r}: {field}: expected {expected}, got {got}{tail}")
+
+    def _checked_size(self, field: str, value: Any) -> int:
+        try:
+            size = int(value)
+            whole = size == value
+        except (TypeError, ValueError, OverflowError):
+            size, whole = 0, False
+        if not whole or not 1 <= size <= MAX_SIZE_PX:
+            raise self._error(field, f"a whole number of pixels from 1 to {MAX_SIZE_PX}", repr(value))
+        return size
+
+    def _checked_array(self, field: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
+        try:
+            array = np.array(value, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise self._error(field, f"numbers of shape {shape}", f"{type(value).__name__} ({error})") from None
+        if array.shape != shape:
+            raise self._error(field, f"shape {shape}", f"shape {array.shape}")
+        if not np.isfinite(array).all():
+            raise self._error(field, "finite numbers", f"NaN or infinity in {array.tolist()}")
+        array.setflags(write=False)
+        return array
+
+    def _checked_intrinsics(self, K: FloatArray) -> FloatArray:
+        if K[0, 0] <= 0 or K[1, 1] <= 0:
+            raise self._error("K", "positive focal lengths", f"fx {K[0, 0]:g}, fy {K[1, 1]:g}")
+        if K[1, 0] != 0 or K[2, 0] != 0 or K[2, 1] != 0 or abs(K[2, 2] - 1) > 1e-9:
+            fix = "pass K.T" if np.any(K[2, :2]) and not np.any(K[:2, 2]) else "divide K by K[2, 2]"
+            raise self._error("K", "[[fx, s, cx], [0, fy, cy], [0, 0, 1]]", f"{K.tolist()}", fix)
+        return K
+
+    def _checked_pose(self, cam2ego: FloatArray) -> FloatArray:
+        if np.abs(cam2ego[3] - (0, 0, 0, 1)).max() > 1e-9:
+            fix = "pass cam2ego.T" if np.any(cam2ego[3, :3]) and not np.any(cam2ego[:3, 3]) else ""
+            raise self._error("cam2ego", "last row (0, 0, 0, 1)", f"{cam2ego[3].tolist()}", fix)
+        R = cam2ego[:3, :3]
+        deviation = float(np.abs(R @ R.T - np.eye(3)).max())
+        determinant = float(np.linalg.det(R))
+        if deviation > ROTATION_TOLERANCE or determinant < 0:
+            raise self._error(
+                "cam2ego",
+                f"a rotation (|R Rᵀ - I| <= {ROTATION_TOLERANCE:g}, determinant +1)",
+                f"deviation {deviation:.3g}, determinant {determinant:.6g}",
+                f"the nearest rotation is {nearest_rotation(R).round(9).tolist()}",
+            )
+        # Residual scale and skew of published digits would bend straight lines by a fraction of a pixel.
+        if deviation > 1e-12:
+            cam2ego = cam2ego.copy()
+            cam2ego[:3, :3] = nearest_rotation(R)
+            cam2ego.setflags(write=False)
+        return cam2ego
+
+    def _checked_distortion(self, distortion: Any) -> tuple[float, ...]:
+        try:
+            coefficients = tuple(float(k) for k in distortion)
+        except (TypeError, ValueError):
+            raise self._error("distortion", "a sequence of numbers", repr(distortion)) from None
+        counts = COEFFICIENT_COUNTS[self.lens]
+        if len(coefficients) not in counts:
+            expected = " or ".join(map(str, counts)) + f" coefficients for a {self.lens} lens"
+            fix = "name the lens: lens='radtan' or lens='fisheye'" if self.lens == "pinhole" else ""
+            raise self._error("distortion", expected, str(len(coefficients)), fix)
+        if not all(map(math.isfinite, coefficients)):
+            raise self._error("distortion", "finite numbers", repr(coefficients))
+        return coefficients
+
+    def _checked_mask(self, mask: Any) -> BoolArray:
+        array = np.asarray(mask)
+        if array.dtype != np.bool_:
+            raise self._error("mask", "bool, True = scene", f"dtype {array.dtype}", "pass mask > 0")
+        if array.shape != self.size:
+            got = f"shape {array.shape}"
+            raise self._error("mask", f"shape {self.size}, the size (h, w) of the image", got)
+        array = array.copy()
+        array.setflags(write=False)
+        return array
+
+    # --- construction ---------------------------------------------------------------------------------------------
+    @classmethod
+    def looking(
+        cls,
+        *,
+        name: str,
+        azimuth_deg: float,
+        elevation_deg: float = 0.0,
+        roll_deg: float = 0.0,
+        position_m: tuple[float, float, float] = (0.0, 0.0, 1.5),
+        width_px: int,
+        height_px: int,
+        horizontal_fov_deg: float | None = None,
+        K: Any = None,
+        lens: Lens = "pinhole",
+        distortion: tuple[float, ...] = (),
+        mask: Any = None,
+    ) -> Camera:
+        """A camera by its viewing direction: the paper's R = R_z(θ) R_x(φ) (Sec. FAVS, Stage 1).
+
+        ``cam2ego[:3, :3] = R_z(azimuth) B R_x(elevation) R_z(roll)``, where B puts the resting camera's axes
+        (right, down, forward) on the ego axes (-y, -z, +x). R_z(azimuth) turns about the ego's z axis (up):
+        positive looks to the left. R_x(elevation) turns about the camera's own x axis (right): positive looks up.
+        Roll turns about the optical axis: positive turns the camera clockwise as seen from behind it.
+
+        Args:
+            name: The camera's name.
+            azimuth_deg: 0 looks forward, 90 to the left.
+            elevation_deg: 0 looks level, 90 straight up.
+            roll_deg: 0 for an upright image.
+            position_m: Optical centre in the ego frame.
+            width_px: Image width.
+            height_px: Image height.
+            horizontal_fov_deg: Angle between the outer edges of the image, measured along the row of the principal
+                point; gives a K with square pixels and a central principal point. Either this or ``K``.
+            K: (3, 3) intrinsics.
+            lens: The lens model.
+            distortion: Its coefficients.
+            mask: The car-body mask.
+
+        Raises:
+            CalibrationError: On impossible values, or when both or none of K and horizontal_fov_deg are given.
+        """
+        if (K is None) == (horizontal_fov_deg is None):
+            raise CalibrationError(f"camera {name!r}: expected either K or horizontal_fov_deg, got both or none")
+        if horizontal_fov_deg is not None:
+            K = _intrinsics_for_fov(name, horizontal_fov_deg, width_px, height_px, lens, distortion)
+        angles = (azimuth_deg, elevation_deg, roll_deg)
+        if not all(map(math.isfinite, angles)):
+            raise CalibrationError(f"camera {name!r}: expected finite angles, got {angles}")
+        cam2ego = np.eye(4)
+        cam2ego[:3, :3] = (
+            rotation_z(azimuth_deg) @ CAMERA_AXES_IN_EGO @ rotation_x(elevation_deg) @ rotation_z(roll_deg)
+        )
+        cam2ego[:3, 3] = position_m
+        return cls(
+            name=name,
+            width_px=width_px,
+            height_px=height_px,
+            K=K,
+            cam2ego=cam2ego,
+            lens=lens,
+            distortion=distortion,
+            mask=mask,
+        )
+
+    # --- derived ----------------------------------------------------------------------------------------------------
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        return self.height_px, self.width_px
+
+    @property
+    def center_m(self) -> FloatArray:
+        """(3,) optical centre in the ego frame."""
+        return self.cam2ego[:3, 3]
+
+    @property
+    def azimuth_deg(self) -> float:
+        """Direction of the optical axis in the ego's x-y plane: 0 forward, 90 to the left."""
+        return math.degrees(math.atan2(self.cam2ego[1, 2], self.cam2ego[0, 2]))
+
+    @property
+    def elevation_deg(self) -> float:
+        """Angle of the optical axis above the ego's x-y plane."""
+        return math.degrees(math.asin(max(-1.0, min(1.0, self.cam2ego[2, 2]))))
+
+    @property
+    def fov_deg(self) -> tuple[float, float]:
+        """(horizontal, vertical) angle between the image's outer edges, through the principal point."""
+        cx, cy = self.K[0, 2], self.K[1, 2]
+        edges = np.array([[-0.5, cy], [self.width_px - 0.5, cy], [cx, -0.5], [cx, self.height_px - 0.5]])
+        d = self.unproject_cam(edges).directions
+        theta = np.arctan2(np.stack([d[:2, 0], d[2:, 1]]), np.stack([d[:2, 2], d[2:, 2]]))  # [axis, edge]
+        return tuple(float(x) for x in np.degrees(theta[:, 1] - theta[:, 0]))  # type: ignore[return-value]
+
+    @cached_property
+    def content_key(self) -> bytes:
+        """Digest of everything that decides where pixels fall; the name is not part of it."""
+        digest = hashlib.sha256(repr((self.size, self.lens, self.distortion)).encode())
+        digest.update(self.K.tobytes() + self.cam2ego.tobytes())
+        if self.mask is not None:
+            digest.update(np.packbits(self.mask).tobytes())
+        return digest.digest()
+
+    @cached_property
+    def fold_limit(self) -> float:
+        """Where the lens's radial function stops rising: past it, points fold back into the image.
+
+        tan(angle off axis) for pinhole and radtan, the angle in radians for fisheye.
+        """
+        return _fold_limit(self.lens, self.distortion)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Camera):
+            return NotImplemented
+        return self.name == other.name and self.content_key == other.content_key
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.content_key))
+
+    def __repr__(self) -> str:
+        h_fov, v_fov = self.fov_deg
+        x, y, z = self.center_m
+        lens = "" if self.lens == "pinhole" else f" {self.lens}"
+        mask = "" if self.mask is None else f" mask {1 - self.mask.mean():.0%} own car"
+        return (
+            f"Camera({self.name} {self.width_px}x{self.height_px}{lens} fov {h_fov:.1f}x{v_fov:.1f} deg "
+            f"azimuth {self.azimuth_deg:+.1f} elevation {self.elevation_deg:+.1f} deg "
+            f"at ({x:.2f}, {y:.2f}, {z:.2f}) m{mask})"
+        )
+
+    # --- geometry ---------------------------------------------------------------------------------------------------
+    def project(self, points_ego: Any) -> Projection:
+        """Pixels of ego-frame points (..., 3)."""
+        points = np.asarray(points_ego, dtype=np.float64)
+        return self.project_cam((points - self.center_m) @ self.cam2ego[:3, :3])
+
+    def project_cam(self, points_cam: FloatArray) -> Projection:
+        """Pixels of camera-frame points (..., 3); directions without a distance do as well."""
+        x, y, z = points_cam[..., 0], points_cam[..., 1], points_cam[..., 2]
+        xd, yd, valid = distort(self.lens, self.distortion, self.fold_limit, x, y, z)
+        u = self.K[0, 0] * xd + self.K[0, 1] * yd + self.K[0, 2]
+        v = self.K[1, 1] * yd + self.K[1, 2]
+        return Projection(np.stack([u, v], -1), z, valid)
+
+    def unproject(self, uv: Any) -> Rays:
+        """Unit viewing directions in the ego frame of pixels (..., 2); the ray starts at ``center_m``.
+
+        Lenses are inverted by Newton's method. ``valid`` is False where no ray projects to within
+        ``UNPROJECT_TOLERANCE_PX`` of the pixel: outside the image circle, or past the lens's fold.
+        """
+        directions, valid = self.unproject_cam(np.asarray(uv, dtype=np.float64))
+        return Rays(directions @ self.cam2ego[:3, :3].T, valid)
+
+    def unproject_cam(self, uv: FloatArray) -> Rays:
+        """As ``unproject``, in the camera frame."""
+        yd = (uv[..., 1] - self.K[1, 2]) / self.K[1, 1]
+        xd = (uv[..., 0] - self.K[0, 2] - self.K[0, 1] * yd) / self.K[0, 0]
+        directions = undistort(self.lens, self.distortion, self.fold_limit, xd, yd)
+        if self.lens == "pinhole":
+            return Rays(directions, np.isfinite(directions).all(-1))
+        again = self.project_cam(directions)
+        with np.errstate(invalid="ignore"):
+            near = np.abs(again.uv - uv).max(-1) <= UNPROJECT_TOLERANCE_PX
+        return Rays(directions, again.valid & near)
+
+    def contains(self, uv: FloatArray) -> BoolArray:
+        """Whether pixels (..., 2) lie between the outermost pixel centres, where bilinear sampling reads no border."""
+        u, v = uv[..., 0], uv[..., 1]
+        return (u >= 0) & (u <= self.width_px - 1) & (v >= 0) & (v <= self.height_px - 1)
+
+    def pixel_grid(self) -> FloatArray:
+        """(h, w, 2) pixel centres (x, y)."""
+        u, v = np.meshgrid(np.arange(self.width_px, dtype=np.float64), np.arange(self.height_px, dtype=np.float64))
+        return np.stack([u, v], -1)
+
+    # --- changed copies -------------------------------------------------------------------------------------------
+    def resize(self, size: tuple[int, int]) -> Camera:
+        """The camera of the image resized to (h, w): outer edges stay, so centres move by half pixels."""
+        h, w = size
+        A = resize_matrix(self.size, size)
+        mask = self.mask
+        if mask is not None:
+            mask = cv2.resize(mask.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST_EXACT).astype(bool)
+        return replace(self, width_px=w, height_px=h, K=A @ self.K, mask=mask)
+
+    def crop(self, top: int, left: int, size: tuple[int, int]) -> Camera:
+        """The camera of the window of ``size`` (h, w) whose first pixel is (left, top); it may exceed the image.
+
+        Outside the image a mask is False: nothing was recorded there.
+        """
+        h, w = size
+        K = self.K.copy()
+        K[0, 2] -= left
+        K[1, 2] -= top
+        mask = None
+        if self.mask is not None:
+            mask = np.zeros((h, w), bool)
+            y0, y1 = max(0, top), min(self.height_px, top + h)
+            x0, x1 = max(0, left), min(self.width_px, left + w)
+            if y1 > y0 and x1 > x0:
+                mask[y0 - top : y1 - top, x0 - left : x1 - left] = self.mask[y0:y1, x0:x1]
+        return replace(self, width_px=w, height_px=h, K=K, mask=mask)
+
+    def moved(self, ego2ego: Any) -> Camera:
+        """The same camera in another ego frame: ``cam2ego`` becomes ``ego2ego @ cam2ego``."""
+        return replace(self, cam2ego=np.asarray(ego2ego, dtype=np.float64) @ self.cam2ego)
+
+    def turned(self, *, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Camera:
+        """Turned about its own centre: yaw about the ego's z (left), pitch about its own x (up), roll about its z."""
+        cam2ego = self.cam2ego.copy()
+        cam2ego[:3, :3] = rotation_z(yaw_deg) @ cam2ego[:3, :3] @ rotation_x(pitch_deg) @ rotation_z(roll_deg)
+        return replace(self, cam2ego=cam2ego)
+
+    def shifted(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Camera:
+        """Moved along the ego's axes."""
+        cam2ego = self.cam2ego.copy()
+        cam2ego[:3, 3] += (x_m, y_m, z_m)
+        return replace(self, cam2ego=cam2ego)
+
+    def undistorted(self) -> Camera:
+        """The pinhole camera with the same K, size and pose; the mask is re-sampled to it."""
+        if self.lens == "pinhole":
+            return self
+        pinhole = replace(self, lens="pinhole", distortion=(), mask=None)
+        if self.mask is None:
+            return pinhole
+        uv, _, valid = self.project_cam(pinhole.unproject_cam(pinhole.pixel_grid()).directions)
+        pixel = np.round(uv).clip(0, [self.width_px - 1, self.height_px - 1]).astype(int)
+        seen = valid & self.contains(uv)
+        return replace(pinhole, mask=self.mask[pixel[..., 1], pixel[..., 0]] & seen)
+
+
+CAMERA_AXES_IN_EGO = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Columns: the resting camera's x (right), y (down) and z (forward) axes in the ego frame."""
+CAMERA_AXES_IN_EGO.setflags(write=False)
+
+
+def rotation_x(angle_deg: float) -> FloatArray:
+    """(3, 3) right-handed rotation about x."""
+    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+def rotation_z(angle_deg: float) -> FloatArray:
+    """(3, 3) right-handed rotation about z."""
+    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def nearest_rotation(R: FloatArray) -> FloatArray:
+    """The proper rotation closest to R in the Frobenius norm (orthogonal Procrustes)."""
+    U, _, Vt = np.linalg.svd(R)
+    return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+
+
+def resize_matrix(size: tuple[int, int], new_size: tuple[int, int]) -> FloatArray:
+    """(3, 3) pixel map of a resize between (h, w) sizes: x' = s x + (s - 1) / 2, so that outer edges coincide."""
+    sy, sx = new_size[0] / size[0], new_size[1] / size[1]
+    return np.array([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5], [0.0, 0.0, 1.0]])
+
+
+# --- lenses: normalised coordinates ---------------------------------------------------------------------------------
+def distort(
+    lens: str, distortion: tuple[float, ...], fold_limit: float, x: FloatArray, y: FloatArray, z: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Distorted normalised coordinates of camera-frame directions, and where they are valid.
+
+    Invalid ones (behind the camera, past the fold) get finite placeholders.
+    """
+    if lens == "fisheye":
+        r = np.hypot(x, y)
+        theta = np.arctan2(r, z)
+        valid = (theta <= fold_limit) & ((r > 0) | (z > 0))
+        t2 = theta * theta
+        k1, k2, k3, k4 = distortion
+        theta_d = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        # theta_d / r tends to 1 / z on the axis.
+        scale = np.where(r > 1e-12 * np.abs(z), theta_d / np.where(r > 0, r, 1), 1 / np.where(z > 0, z, 1))
+        return x * scale, y * scale, valid
+    valid = z > MIN_DEPTH * np.sqrt(x * x + y * y + z * z)
+    inverse = 1 / np.where(valid, z, 1)
+    a, b = np.where(valid, x * inverse, 0.0), np.where(valid, y * inverse, 0.0)
+    if lens == "pinhole":
+        return a, b, valid
+    valid = valid & (a * a + b * b <= fold_limit**2)
+    a, b = np.where(valid, a, 0.0), np.where(valid, b, 0.0)
+    return *_radtan(distortion, a, b), valid
+
+
+def _radtan(distortion: tuple[float, ...], a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*distortion, *(0.0,) * (8 - len(distortion)))
+    r2 = a * a + b * b
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    return (
+        a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a),
+        b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b,
+    )
+
+
+def undistort(
+    lens: str, distortion: tuple[float, ...], fold_limit: float, xd: FloatArray, yd: FloatArray
+) -> FloatArray:
+    """Unit directions (..., 3) of distorted normalised coordinates; not checked for convergence."""
+    if lens == "fisheye":
+        theta_d = np.hypot(xd, yd)
+        k1, k2, k3, k4 = distortion
+        theta = np.minimum(theta_d, fold_limit)
+        for _ in range(_NEWTON_STEPS):
+            t2 = theta * theta
+            f = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) - theta_d
+            slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+            # The radial function rises up to the fold: a bounded step cannot leave that branch.
+            step = np.clip(f / np.maximum(slope, 1e-3), -0.25, 0.25)
+            theta = np.clip(theta - step, 0.0, fold_limit)
+            if np.abs(step).max(initial=0.0) < 1e-14:
+                break
+        scale = np.sin(theta) / np.where(theta_d > 0, theta_d, 1.0)
+        return np.stack([xd * scale, yd * scale, np.cos(theta)], -1)
+    a, b = xd, yd
+    if lens == "radtan":
+        a, b = _undistort_radtan(distortion, fold_limit, xd, yd)
+    norm = np.sqrt(a * a + b * b + 1)
+    return np.stack([a / norm, b / norm, 1 / norm], -1)
+
+
+def _undistort_radtan(
+    distortion: tuple[float, ...], fold_limit: float, xd: FloatArray, yd: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Newton's method in two unknowns, with a numerical Jacobian, kept inside the fold."""
+    limit = min(fold_limit, 1e6)
+    a, b = np.array(xd, dtype=np.float64), np.array(yd, dtype=np.float64)
+    h = 1e-7
+    for _ in range(_NEWTON_STEPS):
+        shrink = np.minimum(1.0, limit / np.maximum(np.hypot(a, b), 1e-300))
+        a, b = a * shrink, b * shrink
+        fa, fb = _radtan(distortion, a, b)
+        fa_da, fb_da = _radtan(distortion, a + h, b)
+        fa_db, fb_db = _radtan(distortion, a, b + h)
+        j11, j21, j12, j22 = (fa_da - fa) / h, (fb_da - fb) / h, (fa_db - fa) / h, (fb_db - fb) / h
+        determinant = j11 * j22 - j12 * j21
+        determinant = np.where(np.abs(determinant) < 1e-6, 1e-6, determinant)
+        ea, eb = fa - xd, fb - yd
+        da = (j22 * ea - j12 * eb) / determinant
+        db = (j11 * eb - j21 * ea) / determinant
+        length = np.hypot(da, db)
+        damping = np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))
+        a, b = a - da * damping, b - db * damping
+        if length.max(initial=0.0) < 1e-14:
+            break
+    return a, b
+
+
+def _fold_limit(lens: str, distortion: tuple[float, ...]) -> float:
+    if lens == "pinhole" or not any(distortion):
+        return math.pi if lens == "fisheye" else math.inf
+    if lens == "fisheye":
+        k1, k2, k3, k4 = distortion
+        slope = np.array([9 * k4, 0, 7 * k3, 0, 5 * k2, 0, 3 * k1, 0, 1.0])
+        return min(math.pi, _smallest_positive_root(slope))
+    k1, k2, _, _, k3, k4, k5, k6 = (*distortion, *(0.0,) * (8 - len(distortion)))
+    numerator = np.array([k3, 0, k2, 0, k1, 0, 1, 0.0])  # r (1 + k1 r^2 + k2 r^4 + k3 r^6)
+    denominator = np.array([k6, 0, k5, 0, k4, 0, 1.0])
+    slope = np.polysub(
+        np.polymul(np.polyder(numerator), denominator), np.polymul(numerator, np.polyder(denominator))
+    )
+    return min(_smallest_positive_root(slope), _smallest_positive_root(denominator))
+
+
+def _smallest_positive_root(polynomial: FloatArray) -> float:
+    roots = np.roots(np.trim_zeros(polynomial, "f"))
+    real = roots.real[(np.abs(roots.imag) < 1e-9 * np.maximum(np.abs(roots), 1)) & (roots.real > 0)]
+    return float(real.min()) if len(real) else math.inf
+
+
+def _intrinsics_for_fov(
+    name: str, fov_deg: float, width_px: int, height_px: int, lens: str, distortion: tuple[float, ...]
+) -> FloatArray:
+    """Square-pixel K with a central principal point whose outer image edges span ``fov_deg``."""
+    largest = 360.0 if lens == "fisheye" else 180.0
+    if not 0 < fov_deg < largest:
+        raise CalibrationError(
+            f"camera {name!r}: horizontal_fov_deg: expected between 0 and {largest:g} for a {lens} lens, got {fov_deg:g}"
+        )
+    half = np.array(math.radians(fov_deg) / 2)
+    x, _, valid = distort(lens, distortion, _fold_limit(lens, distortion), np.sin(half), np.array(0.0), np.cos(half))
+    if not valid or x <= 0:
+        raise CalibrationError(
+            f"camera {name!r}: horizontal_fov_deg: expected an angle inside the lens's unfolded branch, got {fov_deg:g}"
+        )
+    focal = width_px / 2 / float(x)
+    return np.array([[focal, 0, (width_px - 1) / 2], [0, focal, (height_px - 1) / 2], [0, 0, 1.0]])

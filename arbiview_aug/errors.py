@@ -1,0 +1,21 @@
+"""The errors this package raises on bad input: one base class, so that a pipeline can catch them all."""
+
+
+class ArbiviewError(Exception):
+    """Base of every error raised on purpose; the message names the camera or file, what was expected, what came."""
+
+
+class CalibrationError(ArbiviewError, ValueError):
+    """A camera, rig or rig file that does not describe real cameras."""
+
+
+class SampleError(ArbiviewError, ValueError):
+    """A sample whose images, calibration and labels do not fit together."""
+
+
+class SampleTypeError(ArbiviewError, TypeError):
+    """A sample value of a type that is not supported; the message gives the conversion to use."""
+
+
+class DataError(ArbiviewError, ValueError):
+    """A file of a data set that is missing, broken or inconsistent."""
