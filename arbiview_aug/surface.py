@@ -1,0 +1,150 @@
+"""Scene surfaces: where the ray of a target pixel meets the scene.
+
+A surface answers with the *inverse* distance along a unit ray, 1/m: infinity is 0, so the far surface, the horizon
+and rays that miss need no special cases, and a point X = o + d / q is handled as the homogeneous (o q + d, q).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+
+from arbiview_aug.camera import FloatArray
+
+SurfaceName = Literal["auto", "far", "ground", "street"]
+"""Surfaces a user can ask for. ``auto`` decides per pair of target and source camera (see ``plan``)."""
+
+MAX_INVERSE_DISTANCE = 100.0
+"""Nothing is nearer to a camera than 1 cm: keeps points finite when a camera touches a surface."""
+
+WALL_CENTER_M = (1.0, 0.0)
+"""Centre of the far wall in the ego frame: the middle of a car's cameras when the origin is its rear axle."""
+
+
+class Surface(Protocol):
+    """Anything that says how far away the scene is."""
+
+    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        """Inverse distances (...,) in 1/m, 0 <= q <= ``MAX_INVERSE_DISTANCE``.
+
+        Args:
+            origin: (3,) the rays' common start in the ego frame, metres.
+            directions: (..., 3) unit directions in the ego frame.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Far:
+    """Everything is infinitely far away: the paper's rotation-only model (Sec. FAVS, Stage 1)."""
+
+    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        """Zeros (...,)."""
+        return np.zeros(directions.shape[:-1])
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The road plane up to a cylinder: the plain reference surface.
+
+    Attributes:
+        ground_z_m: Height of the road in the ego frame.
+        radius_m: Radius of the upright cylinder about ``WALL_CENTER_M``; 20 to 60 m are within 0.5 dB of each other.
+    """
+
+    ground_z_m: float = 0.0
+    radius_m: float = 40.0
+
+    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        """The nearer of plane and cylinder, 1/m (...,)."""
+        wall = wall_inverse_distance(origin, directions, self.radius_m, self.radius_m)
+        return np.maximum(plane_inverse_distance(origin, directions, self.ground_z_m), wall)
+
+
+@dataclass(frozen=True)
+class Street:
+    """The road joined softly to an elliptical far wall: no crease, houses nearer at the sides than ahead.
+
+    The p-norm of two inverse distances, (q_road^k + q_wall^k)^(1/k), is a smooth minimum of the distances: it
+    follows the road where the road is near, and the wall where the road is beyond it or above the horizon.
+
+    Attributes:
+        ground_z_m: Height of the road in the ego frame.
+        half_length_m: Semi-axis of the wall along the road.
+        half_width_m: Semi-axis across it.
+        sharpness: k; infinity is the hard minimum with its crease.
+    """
+
+    ground_z_m: float = 0.0
+    half_length_m: float = 50.0
+    half_width_m: float = 20.0
+    sharpness: float = 3.0
+
+    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        """The smooth join of plane and wall, 1/m (...,)."""
+        road = plane_inverse_distance(origin, directions, self.ground_z_m)
+        wall = wall_inverse_distance(origin, directions, self.half_length_m, self.half_width_m)
+        near, beyond = np.maximum(road, wall), np.minimum(road, wall)
+        ratio = beyond / np.maximum(near, 1e-300)
+        joined = near * (1 + ratio**self.sharpness) ** (1 / self.sharpness)
+        return np.minimum(joined, MAX_INVERSE_DISTANCE)
+
+
+def make_surface(name: str, ground_z_m: float) -> Surface:
+    """The surface of a name (not ``auto``) over a road at ``ground_z_m``."""
+    if name == "far":
+        return Far()
+    return Ground(ground_z_m=ground_z_m) if name == "ground" else Street(ground_z_m=ground_z_m)
+
+
+def plane_inverse_distance(origin: FloatArray, directions: FloatArray, ground_z_m: float) -> FloatArray:
+    """Inverse distance to the horizontal plane z = ground_z_m; 0 for rays that do not descend to it.
+
+    A camera on or under the road sees no road: its rays get 0 too.
+    """
+    height = origin[2] - ground_z_m
+    if height <= 0:
+        return np.zeros(directions.shape[:-1])
+    return np.clip(-directions[..., 2] / height, 0.0, MAX_INVERSE_DISTANCE)
+
+
+def wall_inverse_distance(
+    origin: FloatArray, directions: FloatArray, half_length_m: float, half_width_m: float
+) -> FloatArray:
+    """Inverse distance to the inside of an upright elliptical wall about ``WALL_CENTER_M``.
+
+    From outside, the wall's far side is meant; rays that miss it, or start behind it, get 0.
+    """
+    ox, oy = (origin[0] - WALL_CENTER_M[0]) / half_length_m, (origin[1] - WALL_CENTER_M[1]) / half_width_m
+    dx, dy = directions[..., 0] / half_length_m, directions[..., 1] / half_width_m
+    # a t^2 + 2 b t + c = 0; both forms of the larger root, each without cancellation on its side of b = 0.
+    a, b, c = dx * dx + dy * dy, dx * ox + dy * oy, ox * ox + oy * oy - 1
+    root = np.sqrt(np.maximum(b * b - a * c, 0.0))
+    towards = a / np.maximum(root - b, 1e-300)
+    if c < 0:
+        q = np.where(b > 0, (root + b) / -c, towards)
+    else:
+        q = np.where((b < 0) & (b * b >= a * c), towards, 0.0)
+    return np.clip(q, 0.0, MAX_INVERSE_DISTANCE)
+
+
+def depth_uncertainty(inverse_distance: FloatArray) -> FloatArray:
+    """Spread (1/m) of the true inverse distance around a static surface's.
+
+    Objects stand in front of the surface, anywhere down to the camera: half the surface's own inverse distance, and
+    never less than 1/``_TYPICAL_OBJECT_M``, which is where the nearest objects of a street are.
+    """
+    return np.maximum(0.5 * inverse_distance, 1 / _TYPICAL_OBJECT_M)
+
+
+_TYPICAL_OBJECT_M = 20.0
+
+NEAREST_SCENE_M = 2.0
+"""Nearest scene point assumed for worst-case parallax: what stands closer fills a camera's view."""
+
+
+def worst_parallax_px(baseline_m: float, focal_px: float) -> float:
+    """Largest pixel shift between two centres if the scene is anywhere from ``NEAREST_SCENE_M`` to infinity."""
+    return focal_px * baseline_m / NEAREST_SCENE_M
