@@ -14,20 +14,13 @@ import hashlib
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from arbiview_aug.errors import CalibrationError
-
-Lens = Literal["pinhole", "radtan", "fisheye"]
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-
-COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5, 8), "fisheye": (4,)}
-"""Numbers of distortion coefficients each lens takes, in OpenCV's order (k1 k2 p1 p2 [k3 [k4 k5 k6]]; k1..k4)."""
+from arbiview_aug.lens import COEFFICIENT_COUNTS, BoolArray, FloatArray, Lens, distort, fold_limit, undistort
 
 ROTATION_TOLERANCE = 1e-4
 """Largest entry of |R Rᵀ - I| that is still a rotation: published calibrations carry 5 to 7 digits."""
@@ -35,13 +28,8 @@ ROTATION_TOLERANCE = 1e-4
 UNPROJECT_TOLERANCE_PX = 1e-6
 """A ray counts as found when projecting it again lands this close to its pixel."""
 
-MIN_DEPTH = 1e-6
-"""Smallest z / |p| of a point in front of a pinhole or radtan camera (89.99994 degrees off axis)."""
-
 MAX_SIZE_PX = 32766
 """Largest image side: OpenCV's remap needs sizes below 32767."""
-
-_NEWTON_STEPS = 40
 
 
 class Projection(NamedTuple):
@@ -130,6 +118,7 @@ class Camera:
             raise self._error(field, f"shape {shape}", f"shape {array.shape}")
         if not np.isfinite(array).all():
             raise self._error(field, "finite numbers", f"NaN or infinity in {array.tolist()}")
+        array += 0.0  # -0.0 becomes 0.0: equal calibrations have equal bytes (content_key)
         array.setflags(write=False)
         return array
 
@@ -164,7 +153,7 @@ class Camera:
 
     def _checked_distortion(self, distortion: Any) -> tuple[float, ...]:
         try:
-            coefficients = tuple(float(k) for k in distortion)
+            coefficients = tuple(float(k) + 0.0 for k in distortion)
         except (TypeError, ValueError):
             raise self._error("distortion", "a sequence of numbers", repr(distortion)) from None
         counts = COEFFICIENT_COUNTS[self.lens]
@@ -298,7 +287,7 @@ class Camera:
 
         tan(angle off axis) for pinhole and radtan, the angle in radians for fisheye.
         """
-        return _fold_limit(self.lens, self.distortion)
+        return fold_limit(self.lens, self.distortion)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Camera):
@@ -352,7 +341,7 @@ class Camera:
         again = self.project_cam(directions)
         with np.errstate(invalid="ignore"):
             near = np.abs(again.uv - uv).max(-1) <= UNPROJECT_TOLERANCE_PX
-        return Rays(directions, again.valid & near)
+        return Rays(directions, np.asarray(again.valid & near))
 
     def contains(self, uv: FloatArray) -> BoolArray:
         """Whether pixels (..., 2) lie between the outermost pixel centres, where bilinear sampling reads no border."""
@@ -450,119 +439,6 @@ def resize_matrix(size: tuple[int, int], new_size: tuple[int, int]) -> FloatArra
     return np.array([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5], [0.0, 0.0, 1.0]])
 
 
-# --- lenses: normalised coordinates ---------------------------------------------------------------------------------
-def distort(
-    lens: str, distortion: tuple[float, ...], fold_limit: float, x: FloatArray, y: FloatArray, z: FloatArray
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Distorted normalised coordinates of camera-frame directions, and where they are valid.
-
-    Invalid ones (behind the camera, past the fold) get finite placeholders.
-    """
-    if lens == "fisheye":
-        r = np.hypot(x, y)
-        theta = np.arctan2(r, z)
-        valid = (theta <= fold_limit) & ((r > 0) | (z > 0))
-        t2 = theta * theta
-        k1, k2, k3, k4 = distortion
-        theta_d = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-        # theta_d / r tends to 1 / z on the axis.
-        scale = np.where(r > 1e-12 * np.abs(z), theta_d / np.where(r > 0, r, 1), 1 / np.where(z > 0, z, 1))
-        return x * scale, y * scale, valid
-    valid = z > MIN_DEPTH * np.sqrt(x * x + y * y + z * z)
-    inverse = 1 / np.where(valid, z, 1)
-    a, b = np.where(valid, x * inverse, 0.0), np.where(valid, y * inverse, 0.0)
-    if lens == "pinhole":
-        return a, b, valid
-    valid = valid & (a * a + b * b <= fold_limit**2)
-    a, b = np.where(valid, a, 0.0), np.where(valid, b, 0.0)
-    return *_radtan(distortion, a, b), valid
-
-
-def _radtan(distortion: tuple[float, ...], a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    k1, k2, p1, p2, k3, k4, k5, k6 = (*distortion, *(0.0,) * (8 - len(distortion)))
-    r2 = a * a + b * b
-    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    return (
-        a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a),
-        b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b,
-    )
-
-
-def undistort(
-    lens: str, distortion: tuple[float, ...], fold_limit: float, xd: FloatArray, yd: FloatArray
-) -> FloatArray:
-    """Unit directions (..., 3) of distorted normalised coordinates; not checked for convergence."""
-    if lens == "fisheye":
-        theta_d = np.hypot(xd, yd)
-        k1, k2, k3, k4 = distortion
-        theta = np.minimum(theta_d, fold_limit)
-        for _ in range(_NEWTON_STEPS):
-            t2 = theta * theta
-            f = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) - theta_d
-            slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-            # The radial function rises up to the fold: a bounded step cannot leave that branch.
-            step = np.clip(f / np.maximum(slope, 1e-3), -0.25, 0.25)
-            theta = np.clip(theta - step, 0.0, fold_limit)
-            if np.abs(step).max(initial=0.0) < 1e-14:
-                break
-        scale = np.sin(theta) / np.where(theta_d > 0, theta_d, 1.0)
-        return np.stack([xd * scale, yd * scale, np.cos(theta)], -1)
-    a, b = xd, yd
-    if lens == "radtan":
-        a, b = _undistort_radtan(distortion, fold_limit, xd, yd)
-    norm = np.sqrt(a * a + b * b + 1)
-    return np.stack([a / norm, b / norm, 1 / norm], -1)
-
-
-def _undistort_radtan(
-    distortion: tuple[float, ...], fold_limit: float, xd: FloatArray, yd: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Newton's method in two unknowns, with a numerical Jacobian, kept inside the fold."""
-    limit = min(fold_limit, 1e6)
-    a, b = np.array(xd, dtype=np.float64), np.array(yd, dtype=np.float64)
-    h = 1e-7
-    for _ in range(_NEWTON_STEPS):
-        shrink = np.minimum(1.0, limit / np.maximum(np.hypot(a, b), 1e-300))
-        a, b = a * shrink, b * shrink
-        fa, fb = _radtan(distortion, a, b)
-        fa_da, fb_da = _radtan(distortion, a + h, b)
-        fa_db, fb_db = _radtan(distortion, a, b + h)
-        j11, j21, j12, j22 = (fa_da - fa) / h, (fb_da - fb) / h, (fa_db - fa) / h, (fb_db - fb) / h
-        determinant = j11 * j22 - j12 * j21
-        determinant = np.where(np.abs(determinant) < 1e-6, 1e-6, determinant)
-        ea, eb = fa - xd, fb - yd
-        da = (j22 * ea - j12 * eb) / determinant
-        db = (j11 * eb - j21 * ea) / determinant
-        length = np.hypot(da, db)
-        damping = np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))
-        a, b = a - da * damping, b - db * damping
-        if length.max(initial=0.0) < 1e-14:
-            break
-    return a, b
-
-
-def _fold_limit(lens: str, distortion: tuple[float, ...]) -> float:
-    if lens == "pinhole" or not any(distortion):
-        return math.pi if lens == "fisheye" else math.inf
-    if lens == "fisheye":
-        k1, k2, k3, k4 = distortion
-        slope = np.array([9 * k4, 0, 7 * k3, 0, 5 * k2, 0, 3 * k1, 0, 1.0])
-        return min(math.pi, _smallest_positive_root(slope))
-    k1, k2, _, _, k3, k4, k5, k6 = (*distortion, *(0.0,) * (8 - len(distortion)))
-    numerator = np.array([k3, 0, k2, 0, k1, 0, 1, 0.0])  # r (1 + k1 r^2 + k2 r^4 + k3 r^6)
-    denominator = np.array([k6, 0, k5, 0, k4, 0, 1.0])
-    slope = np.polysub(
-        np.polymul(np.polyder(numerator), denominator), np.polymul(numerator, np.polyder(denominator))
-    )
-    return min(_smallest_positive_root(slope), _smallest_positive_root(denominator))
-
-
-def _smallest_positive_root(polynomial: FloatArray) -> float:
-    roots = np.roots(np.trim_zeros(polynomial, "f"))
-    real = roots.real[(np.abs(roots.imag) < 1e-9 * np.maximum(np.abs(roots), 1)) & (roots.real > 0)]
-    return float(real.min()) if len(real) else math.inf
-
-
 def _intrinsics_for_fov(
     name: str, fov_deg: float, width_px: int, height_px: int, lens: str, distortion: tuple[float, ...]
 ) -> FloatArray:
@@ -570,10 +446,11 @@ def _intrinsics_for_fov(
     largest = 360.0 if lens == "fisheye" else 180.0
     if not 0 < fov_deg < largest:
         raise CalibrationError(
-            f"camera {name!r}: horizontal_fov_deg: expected between 0 and {largest:g} for a {lens} lens, got {fov_deg:g}"
+            f"camera {name!r}: horizontal_fov_deg: expected between 0 and {largest:g} for a {lens} lens, "
+            f"got {fov_deg:g}"
         )
     half = np.array(math.radians(fov_deg) / 2)
-    x, _, valid = distort(lens, distortion, _fold_limit(lens, distortion), np.sin(half), np.array(0.0), np.cos(half))
+    x, _, valid = distort(lens, distortion, fold_limit(lens, distortion), np.sin(half), np.array(0.0), np.cos(half))
     if not valid or x <= 0:
         raise CalibrationError(
             f"camera {name!r}: horizontal_fov_deg: expected an angle inside the lens's unfolded branch, got {fov_deg:g}"

@@ -269,9 +269,11 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
     label = f"{where}: camera {entry.get('name', index)!r}"
     missing = [key for key in ("name", "width", "height", "K", "cam2ego") if entry.get(key) is None]
     if missing:
-        raise CalibrationError(f"{label}: expected keys {', '.join(sorted(_CAMERA_KEYS))}, missing {', '.join(missing)}")
+        expected = ", ".join(sorted(_CAMERA_KEYS))
+        raise CalibrationError(f"{label}: expected keys {expected}, missing {', '.join(missing)}")
     distortion = entry.get("distortion")
-    lens, coefficients = "pinhole", []
+    lens: Any = "pinhole"
+    coefficients: Any = ()
     if distortion is not None:
         if not isinstance(distortion, Mapping) or "model" not in distortion or "coeffs" not in distortion:
             raise CalibrationError(f"{label}: distortion: expected null or {{model, coeffs}}, got {distortion!r}")
