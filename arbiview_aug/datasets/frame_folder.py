@@ -1,0 +1,254 @@
+"""Frame folders, the simplest way in: one folder a frame, with its calibration, images and what else there is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from arbiview_aug.camera import BoolArray, Camera
+from arbiview_aug.datasets.images import Reduce, check_reduce, decode_images, reduced_rig
+from arbiview_aug.errors import CalibrationError, DataError
+from arbiview_aug.rig import Rig, read_mask
+
+CALIBRATION_FILE = "calib.json"
+POINTS_FILE = "lidar.npy"
+
+# Masks a worker keeps: those of two eight-camera rigs, 2 MB each at full size.
+_CACHED_MASKS = 16
+
+
+class FrameFolder(Dataset[dict[str, Any]]):
+    """A folder that is a frame (it has ``calib.json``), or a folder of such folders, in the order of their names.
+
+    ``calib.json`` holds (keys not named here are ignored, so notes and licences may stand beside)::
+
+        {
+          "cameras": [                       one or more, in the order of the sample's images
+            {
+              "name": "CAM_FRONT",           unique
+              "file": "front.jpg",           JPEG or PNG, relative to the folder
+              "width": 1600, "height": 900,  pixels; the image must agree
+              "K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],      pixels, (0, 0) is the centre of the top-left pixel
+              "distortion": null,            or {"model": "radtan" | "fisheye", "coeffs": [...]} in OpenCV's order
+              "cam2ego": 4x4,                camera (right, down, forward) to ego (forward, left, up), metres
+              "mask": "front_mask.png"       optional; bright = scene, black = own car
+            }
+          ],
+          "ground_z_m": 0.0,                 height of the road in the ego frame; 0 if left out
+          "ego2world": 4x4,                  optional: the ego's pose, for sequences
+          "boxes_3d": [[x, y, z, length, width, height, yaw], ...],   optional: centre, metres, radians, ego frame
+          "lidar": {"file": "lidar.npy"}     optional: names the points; lidar.npy is found without it
+        }
+
+    The points are a float .npy of shape (P, >=3), x y z first, in the ego frame, metres.
+
+    A sample is a dict: ``images`` (N, 3, h, w) uint8 RGB, or a list where sizes differ; ``rig`` (names, lenses, masks,
+    ground); ``K`` (N, 3, 3) and ``cam2ego`` (N, 4, 4) float64; ``token`` (the folder's name); and, where the frame has
+    them, ``points`` (P, >=3) float32, ``boxes_3d`` (B, >=7) float32 and ``ego2world`` (4, 4) float64. The numbers of
+    points and boxes vary: batch with ``batch_size=None`` or a ``collate_fn`` that keeps them as lists.
+
+    Args:
+        root: The folder.
+        reduce: Decode the images at 1, 1/2 or 1/4 of their size; the rig follows (see ``decode_images``).
+        load_points: Whether to read the points.
+
+    Raises:
+        DataError: No frame under ``root``; on access, a file that is missing, broken or inconsistent.
+        CalibrationError: On access, an impossible calibration, by camera.
+    """
+
+    def __init__(self, root: str | Path, *, reduce: Reduce = 1, load_points: bool = True) -> None:
+        check_reduce(reduce)
+        self.root = Path(root)
+        self.reduce = reduce
+        self.load_points = load_points
+        self._frames = _find_frames(self.root)
+        self._index = {folder.name: k for k, folder in enumerate(self._frames)}
+        self._last_rig: tuple[str, Rig] | None = None
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    @property
+    def tokens(self) -> list[str]:
+        """The frames' names in order."""
+        return [folder.name for folder in self._frames]
+
+    def by_token(self, token: str) -> dict[str, Any]:
+        """The sample of a frame by its folder's name.
+
+        Raises:
+            DataError: No such frame.
+        """
+        if token not in self._index:
+            some = ", ".join(self.tokens[:5])
+            raise DataError(f"{self.root}: expected the name of a frame, got {token!r}; the frames are {some} …")
+        return self[self._index[token]]
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        folder = self._frames[index]
+        calib = _read_calibration(folder)
+        where = str(folder / CALIBRATION_FILE)
+        rig = self._rig(calib, folder, where)
+        files = [_image_file(entry, folder, where) for entry in calib["cameras"]]
+        sizes = [(int(entry["height"]), int(entry["width"])) for entry in calib["cameras"]]
+        sample: dict[str, Any] = {
+            "images": decode_images(files, names=rig.names, sizes=sizes, reduce=self.reduce),
+            "rig": rig,
+            "K": torch.from_numpy(rig.K),
+            "cam2ego": torch.from_numpy(rig.cam2ego),
+            "token": folder.name,
+        }
+        if self.load_points and (points := _read_points(calib, folder, where)) is not None:
+            sample["points"] = points
+        if calib.get("boxes_3d") is not None:
+            sample["boxes_3d"] = _boxes(calib["boxes_3d"], where)
+        if calib.get("ego2world") is not None:
+            sample["ego2world"] = _pose(calib["ego2world"], where)
+        return sample
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_last_rig": None}
+
+    def _rig(self, calib: Mapping[str, Any], folder: Path, where: str) -> Rig:
+        """The frame's rig; the last one itself where the calibration is the same, as it is along most drives."""
+        masks = [entry.get("mask") if isinstance(entry, Mapping) else None for entry in calib["cameras"]]
+        bare = [_calibration_of(entry) for entry in calib["cameras"]]
+        data = {"name": calib.get("name", calib.get("dataset", "")), "cameras": bare}
+        data["ground_z_m"] = calib.get("ground_z_m", 0.0)
+        key = json.dumps([data, [mask and str((folder / str(mask)).resolve()) for mask in masks]])
+        if self._last_rig is None or self._last_rig[0] != key:
+            rig = Rig.from_dict(data, where=where)
+            cameras = [_with_mask(camera, file, folder, where) for camera, file in zip(rig, masks, strict=True)]
+            self._last_rig = key, reduced_rig(rig.with_cameras(cameras), self.reduce)
+        return self._last_rig[1]
+
+
+def _find_frames(root: Path) -> list[Path]:
+    if not root.is_dir():
+        raise DataError(f"frame folder {root}: expected a folder, found none")
+    if (root / CALIBRATION_FILE).is_file():
+        return [root.resolve()]  # resolved, so that "." has a name
+    frames = sorted(folder for folder in root.iterdir() if (folder / CALIBRATION_FILE).is_file())
+    if not frames:
+        raise DataError(
+            f"frame folder {root}: expected {CALIBRATION_FILE}, or folders that have one, found neither; "
+            "FrameFolder's documentation has the format"
+        )
+    return frames
+
+
+def _read_calibration(folder: Path) -> dict[str, Any]:
+    path = folder / CALIBRATION_FILE
+    try:
+        calib = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise DataError(f"{path}: expected a calibration, found no file") from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise DataError(f"{path}: expected JSON, got {error}") from None
+    if not isinstance(calib, dict) or not isinstance(calib.get("cameras"), list):
+        raise DataError(f"{path}: expected an object with a list 'cameras', got {type(calib).__name__}")
+    return calib
+
+
+def _calibration_of(entry: Any) -> Any:
+    """What of a camera's entry decides the rig: timestamps and files change every frame."""
+    if not isinstance(entry, Mapping):
+        return entry
+    return {key: entry.get(key) for key in ("name", "width", "height", "K", "cam2ego", "distortion")}
+
+
+def _image_file(entry: Mapping[str, Any], folder: Path, where: str) -> Path:
+    file = entry.get("file")
+    if not isinstance(file, str) or not file:
+        raise DataError(f"{where}: camera {entry['name']!r}: file: expected an image's file name, got {file!r}")
+    return folder / file
+
+
+def _with_mask(camera: Camera, file: Any, folder: Path, where: str) -> Camera:
+    if file is None:
+        return camera
+    label = f"{where}: camera {camera.name!r}"
+    try:
+        mask = _cached_mask(str((folder / str(file)).resolve()))
+    except CalibrationError:
+        mask = read_mask(file, folder, label)  # raises again, in this frame's name
+    try:
+        return replace(camera, mask=mask)
+    except CalibrationError as error:
+        raise CalibrationError(f"{where}: {error}") from None
+
+
+@lru_cache(maxsize=_CACHED_MASKS)
+def _cached_mask(path: str) -> BoolArray:
+    return read_mask(path, Path(path).parent, "rig")
+
+
+def _read_points(calib: Mapping[str, Any], folder: Path, where: str) -> torch.Tensor | None:
+    entry = calib.get("lidar")
+    named = entry.get("file") if isinstance(entry, Mapping) else entry
+    if named is not None and not isinstance(named, str):
+        raise DataError(f"{where}: lidar: expected {{'file': name}}, got {entry!r}")
+    path = folder / (named or POINTS_FILE)
+    if not path.is_file():
+        if named is None:
+            return None
+        raise DataError(
+            f"{where}: lidar: expected the points {path}, found no file; copy it, remove the key 'lidar', "
+            "or pass load_points=False"
+        )
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise DataError(f"points {path}: expected a .npy array of numbers, got {error}") from None
+    return checked_points(array, str(path))
+
+
+def checked_points(array: Any, where: str) -> torch.Tensor:
+    """(P, >=3) float32 tensor of points.
+
+    Raises:
+        DataError: Another shape or type, or coordinates that are not finite.
+    """
+    if not isinstance(array, np.ndarray) or array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind != "f":
+        got = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+        raise DataError(f"points {where}: expected a float array of shape (P, >=3), got {got}")
+    bad = int((~np.isfinite(array[:, :3]).all(axis=1)).sum())
+    if bad:
+        fix = "drop them: points[np.isfinite(points[:, :3]).all(1)]"
+        raise DataError(f"points {where}: expected finite coordinates, got {bad} points with NaN or infinity; {fix}")
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
+
+
+def _boxes(rows: Any, where: str) -> torch.Tensor:
+    expected = "rows of x y z length width height yaw (at least 7 finite numbers, sizes above 0)"
+    try:
+        array = np.array(rows, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{where}: boxes_3d: expected {expected}, got {error}") from None
+    if array.size == 0:
+        array = array.reshape(0, 7)
+    if array.ndim != 2 or array.shape[1] < 7:
+        raise DataError(f"{where}: boxes_3d: expected {expected}, got shape {array.shape}")
+    bad = np.flatnonzero(~np.isfinite(array[:, :7]).all(axis=1) | (array[:, 3:6] <= 0).any(axis=1))
+    if len(bad):
+        raise DataError(f"{where}: boxes_3d: expected {expected}, got row {bad[0]}: {array[bad[0]].tolist()}")
+    return torch.from_numpy(array.astype(np.float32))
+
+
+def _pose(value: Any, where: str) -> torch.Tensor:
+    try:
+        pose = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        pose = np.zeros(0)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise DataError(f"{where}: ego2world: expected 4x4 finite numbers, got {value!r}")
+    return torch.from_numpy(pose)

@@ -1,0 +1,40 @@
+"""Fixtures that several test modules share."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def data_root() -> Path:
+    """The folder of real frames; a test that needs it is skipped where it is missing."""
+    repository = Path(__file__).parents[1]
+    root = Path(os.environ.get("ARBIVIEW_DATA", repository / ".." / "shared" / "data"))
+    if not root.is_dir():
+        pytest.skip(f"no real frames at {root}: set ARBIVIEW_DATA to their folder")
+    return root.resolve()
+
+
+@pytest.fixture(scope="session")
+def nuscenes_root(data_root: Path) -> Path:
+    """One real keyframe, both as a frame folder and in nuScenes tables."""
+    return _frame(data_root, "nuscenes-one")
+
+
+@pytest.fixture(scope="session")
+def ddad_root(data_root: Path) -> Path:
+    """One real frame with masks of the own car."""
+    return _frame(data_root, "ddad-one")
+
+
+@pytest.fixture(scope="session")
+def fisheye_root(data_root: Path) -> Path:
+    """Four real fisheye cameras, as PNGs."""
+    return _frame(data_root, "surround-fisheye")
+
+
+def _frame(data_root: Path, name: str) -> Path:
+    if not (data_root / name).is_dir():
+        pytest.skip(f"no frame {name} in {data_root}")
+    return data_root / name

@@ -1,0 +1,249 @@
+"""Frame folders: the sample, real frames, DataLoader, and folders that are not right."""
+
+import json
+import pickle
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug.camera import Camera
+from arbiview_aug.datasets import FrameFolder
+from arbiview_aug.errors import CalibrationError, DataError
+from arbiview_aug.rig import Rig
+
+Change = Callable[[dict[str, Any]], None]
+
+
+def frame(folder: Path, change: Change | None = None, *, lidar: bool = True) -> Path:
+    """A folder with two cameras of different lenses; ``change`` edits the calibration before it is written."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rig = Rig(
+        [
+            Camera.looking(name="front", azimuth_deg=0, width_px=64, height_px=48, horizontal_fov_deg=80),
+            Camera.looking(
+                name="back",
+                azimuth_deg=180,
+                width_px=64,
+                height_px=48,
+                horizontal_fov_deg=120,
+                lens="fisheye",
+                distortion=(0.01, 0.0, 0.0, 0.0),
+            ),
+        ],
+        ground_z_m=-0.3,
+    )
+    calib = rig.to_dict()
+    for k, camera in enumerate(calib["cameras"]):
+        camera["file"] = f"{camera['name']}.png"
+        cv2.imwrite(str(folder / camera["file"]), np.full((48, 64, 3), (10, 20, 30 + k), np.uint8))
+    mask = np.full((48, 64), 255, np.uint8)
+    mask[40:] = 0
+    cv2.imwrite(str(folder / "mask.png"), mask)
+    calib["cameras"][1]["mask"] = "mask.png"
+    calib["boxes_3d"] = [[5, 1, 0.5, 4, 2, 1.5, 0.3]]
+    calib["ego2world"] = np.diag([1.0, 1, 1, 1]).tolist()
+    if lidar:
+        np.save(folder / "lidar.npy", np.arange(12, dtype=np.float64).reshape(3, 4))
+    if change:
+        change(calib)
+    (folder / "calib.json").write_text(json.dumps(calib))
+    return folder
+
+
+def test_the_sample(tmp_path: Path) -> None:
+    dataset = FrameFolder(frame(tmp_path / "one"))
+    assert len(dataset) == 1
+    sample = dataset[0]
+    assert sorted(sample) == ["K", "boxes_3d", "cam2ego", "ego2world", "images", "points", "rig", "token"]
+    assert sample["images"].shape == (2, 3, 48, 64) and sample["images"].dtype == torch.uint8
+    assert sample["images"][1, :, 0, 0].tolist() == [31, 20, 10]  # RGB
+    rig = sample["rig"]
+    assert rig.names == ["front", "back"] and rig.ground_z_m == -0.3
+    assert rig["back"].lens == "fisheye" and rig["back"].distortion == (0.01, 0.0, 0.0, 0.0)
+    assert rig["front"].mask is None and not rig["back"].mask[40:].any() and rig["back"].mask[:40].all()
+    assert sample["K"].dtype == sample["cam2ego"].dtype == sample["ego2world"].dtype == torch.float64
+    np.testing.assert_array_equal(sample["K"], rig.K)
+    np.testing.assert_array_equal(sample["cam2ego"], rig.cam2ego)
+    assert sample["points"].shape == (3, 4) and sample["points"].dtype == torch.float32
+    assert sample["boxes_3d"].shape == (1, 7) and sample["boxes_3d"].dtype == torch.float32
+    assert sample["token"] == "one"
+
+
+def test_a_folder_of_frames_in_the_order_of_their_names(tmp_path: Path) -> None:
+    for name in ("c", "a", "b"):
+        frame(tmp_path / name)
+    (tmp_path / "notes").mkdir()
+    dataset = FrameFolder(tmp_path)
+    assert dataset.tokens == ["a", "b", "c"]
+    assert [sample["token"] for sample in dataset] == ["a", "b", "c"]  # type: ignore[attr-defined]
+    assert dataset.by_token("b")["token"] == "b"
+    with pytest.raises(DataError, match="expected the name of a frame, got 'z'; the frames are a, b, c"):
+        dataset.by_token("z")
+
+
+def test_frames_of_one_calibration_share_their_rig(tmp_path: Path) -> None:
+    def next_frame(calib: dict[str, Any]) -> None:
+        calib["cameras"][0]["timestamp"] = 17
+        calib["cameras"][1]["mask"] = "../a/mask.png"
+
+    def another_vehicle(calib: dict[str, Any]) -> None:
+        calib["cameras"][0]["cam2ego"][2][3] += 0.1
+
+    frame(tmp_path / "a")
+    frame(tmp_path / "b", next_frame)
+    frame(tmp_path / "c", another_vehicle)
+    a, b, c = (sample["rig"] for sample in FrameFolder(tmp_path))  # type: ignore[attr-defined]
+    assert a is b and a != c
+
+
+def test_optional_parts_may_be_absent(tmp_path: Path) -> None:
+    def bare(calib: dict[str, Any]) -> None:
+        del calib["boxes_3d"], calib["ego2world"], calib["cameras"][1]["mask"]
+
+    sample = FrameFolder(frame(tmp_path / "a", bare, lidar=False))[0]
+    assert sorted(sample) == ["K", "cam2ego", "images", "rig", "token"]
+    assert "points" not in FrameFolder(frame(tmp_path / "b"), load_points=False)[0]
+    empty = FrameFolder(frame(tmp_path / "c", lambda calib: calib.update(boxes_3d=[])))[0]
+    assert empty["boxes_3d"].shape == (0, 7)
+
+
+def test_reduce_takes_the_rig_along(tmp_path: Path) -> None:
+    sample = FrameFolder(frame(tmp_path), reduce=2)[0]
+    assert sample["images"].shape == (2, 3, 24, 32)
+    assert sample["rig"].sizes == [(24, 32)] * 2
+    full = FrameFolder(tmp_path)[0]
+    A = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
+    np.testing.assert_allclose(sample["K"], A @ full["K"].numpy(), atol=1e-12)
+    assert not sample["rig"]["back"].mask[20:].any() and sample["rig"]["back"].mask[:20].all()
+    with pytest.raises(ValueError, match="reduce: expected 1, 2 or 4, got 8"):
+        FrameFolder(tmp_path, reduce=8)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_in_a_data_loader(tmp_path: Path, workers: int) -> None:
+    for name in ("a", "b"):
+        frame(tmp_path / name)
+    loader = torch.utils.data.DataLoader(FrameFolder(tmp_path), batch_size=None, num_workers=workers)
+    samples = list(loader)
+    assert [sample["token"] for sample in samples] == ["a", "b"]
+    assert samples[0]["images"].permute(0, 2, 3, 1).is_contiguous()  # the layout survives the worker
+
+
+def test_pickles(tmp_path: Path) -> None:
+    dataset = FrameFolder(frame(tmp_path))
+    rig = dataset[0]["rig"]
+    assert pickle.loads(pickle.dumps(dataset))[0]["rig"] == rig
+
+
+# --- real frames ------------------------------------------------------------------------------------------------------
+def test_real_frames(data_root: Path) -> None:
+    dataset = FrameFolder(data_root)
+    assert len(dataset) > 0
+    for sample in dataset:  # type: ignore[attr-defined]
+        assert [tuple(image.shape[-2:]) for image in sample["images"]] == sample["rig"].sizes
+
+
+def test_real_masks_lens_and_ground(ddad_root: Path, fisheye_root: Path) -> None:
+    sample = FrameFolder(ddad_root, reduce=4)[0]
+    assert sample["rig"].ground_z_m == 0.09
+    assert all(camera.mask is not None and 0.4 < camera.mask.mean() <= 1 for camera in sample["rig"])
+    assert sample["points"].shape == (47230, 4)
+    assert {camera.lens for camera in FrameFolder(fisheye_root)[0]["rig"]} == {"fisheye"}
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+def edit(key: str, value: Any, camera: int | None = None) -> Change:
+    return lambda calib: (calib if camera is None else calib["cameras"][camera]).update({key: value})
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (edit("K", [[np.nan, 0, 32], [0, 40, 24], [0, 0, 1]], 0), CalibrationError, "'front': K: expected finite"),
+        (edit("K", [[1, 2], [3, 4]], 0), CalibrationError, r"'front': K: expected shape \(3, 3\)"),
+        (edit("cam2ego", np.diag([1, 1, -1, 1]).tolist(), 0), CalibrationError, "'front': cam2ego: expected a rot"),
+        (edit("distortion", {"model": "mei", "coeffs": [1]}, 1), CalibrationError, "'back': lens: expected one of"),
+        (edit("distortion", {"model": "fisheye", "coeffs": [1]}, 1), CalibrationError, "4 coefficients for a fisheye"),
+        (edit("name", "front", 1), CalibrationError, "front more than once"),
+        (edit("width", 1600, 0), DataError, r"'front': image .*expected 1600x48 \(w x h\) as calibrated, got 64x48"),
+        (edit("cameras", []), CalibrationError, "at least one camera"),
+        (edit("cameras", None), DataError, "expected an object with a list 'cameras'"),
+        (edit("cameras", ["front"]), CalibrationError, "camera 0: expected a mapping, got str"),
+        (edit("file", None, 0), DataError, "'front': file: expected an image's file name, got None"),
+        (edit("file", "gone.png", 1), DataError, r"'back': image .*gone\.png: expected an image file, found none"),
+        (edit("mask", "gone.png", 0), CalibrationError, r"'front': mask: expected an image file .*gone\.png"),
+        (edit("mask", 7, 0), CalibrationError, "'front': mask: expected a"),
+        (edit("boxes_3d", [[1, 2, 3]]), DataError, r"boxes_3d: expected rows of x y z .*got shape \(1, 3\)"),
+        (edit("boxes_3d", [[0, 0, 0, 4, -2, 1, 0]]), DataError, "boxes_3d: .*sizes above 0.*got row 0"),
+        (edit("boxes_3d", [[0, 0, 0, 4, 2, 1, 0], [0]]), DataError, "boxes_3d: expected rows"),
+        (edit("ego2world", [[1, 0], [0, 1]]), DataError, "ego2world: expected 4x4 finite numbers"),
+        (edit("lidar", {"file": "gone.npy"}), DataError, r"lidar: expected the points .*gone\.npy, found no file"),
+        (edit("lidar", 3), DataError, "lidar: expected {'file': name}, got 3"),
+        (edit("ground_z_m", "low"), CalibrationError, "ground_z_m: expected a finite height"),
+    ],
+)
+def test_bad_calibrations(tmp_path: Path, change: Change, error: type[Exception], message: str) -> None:
+    dataset = FrameFolder(frame(tmp_path / "broken", change))
+    with pytest.raises(error, match=message) as raised:
+        dataset[0]
+    assert "broken" in str(raised.value)  # the frame is named, whatever went wrong
+
+
+def test_swapped_width_and_height(tmp_path: Path) -> None:
+    def swap(calib: dict[str, Any]) -> None:
+        for camera in calib["cameras"]:
+            camera.update(width=48, height=64, mask=None)
+
+    with pytest.raises(DataError, match=r"expected 48x64 .*got 64x48; the calibration's width and height look swapped"):
+        FrameFolder(frame(tmp_path, swap))[0]
+
+
+def test_mask_of_another_size(tmp_path: Path) -> None:
+    frame(tmp_path / "broken")
+    cv2.imwrite(str(tmp_path / "broken" / "mask.png"), np.ones((24, 32), np.uint8))
+    with pytest.raises(CalibrationError, match=r"broken.*'back': mask: expected shape \(48, 64\)"):
+        FrameFolder(tmp_path)[0]
+
+
+def test_bad_points(tmp_path: Path) -> None:
+    frame(tmp_path)
+    dataset = FrameFolder(tmp_path)
+    for array, message in (
+        (np.zeros((5, 2)), r"points .*expected a float array of shape \(P, >=3\), got float64 \(5, 2\)"),
+        (np.zeros((5, 3), int), r"got int64 \(5, 3\)"),
+        (np.array([[0, 0, np.nan], [1, 1, 1]]), "got 1 points with NaN or infinity"),
+    ):
+        np.save(tmp_path / "lidar.npy", array)
+        with pytest.raises(DataError, match=message):
+            dataset[0]
+    np.save(tmp_path / "lidar.npy", np.array([{}]), allow_pickle=True)
+    with pytest.raises(DataError, match=r"lidar\.npy: expected a \.npy array of numbers"):
+        dataset[0]
+    np.save(tmp_path / "lidar.npy", np.zeros((500, 3)))
+    data = (tmp_path / "lidar.npy").read_bytes()
+    (tmp_path / "lidar.npy").write_bytes(data[:1000])
+    with pytest.raises(DataError, match=r"lidar\.npy: expected a \.npy array of numbers"):
+        dataset[0]
+
+
+def test_folders_that_are_none(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="expected a folder, found none"):
+        FrameFolder(tmp_path / "gone")
+    with pytest.raises(DataError, match=r"expected calib\.json, or folders that have one, found neither"):
+        FrameFolder(tmp_path)
+    frame(tmp_path)
+    dataset = FrameFolder(tmp_path)
+    with pytest.raises(IndexError):
+        dataset[1]
+    (tmp_path / "calib.json").write_text("{")
+    with pytest.raises(DataError, match=r"calib\.json: expected JSON, got"):
+        dataset[0]
+    shutil.rmtree(tmp_path)
+    with pytest.raises(DataError, match="expected a calibration, found no file"):
+        dataset[0]
