@@ -337,11 +337,11 @@ class Camera:
         xd = (uv[..., 0] - self.K[0, 2] - self.K[0, 1] * yd) / self.K[0, 0]
         directions = undistort(self.lens, self.distortion, self.fold_limit, xd, yd)
         if self.lens == "pinhole":
-            return Rays(directions, np.isfinite(directions).all(-1))
+            return Rays(directions, np.asarray(np.isfinite(directions).all(-1)))
         again = self.project_cam(directions)
         with np.errstate(invalid="ignore"):
             near = np.abs(again.uv - uv).max(-1) <= UNPROJECT_TOLERANCE_PX
-        return Rays(directions, np.asarray(again.valid & near))
+        return Rays(directions, again.valid & near)
 
     def contains(self, uv: FloatArray) -> BoolArray:
         """Whether pixels (..., 2) lie between the outermost pixel centres, where bilinear sampling reads no border."""
