@@ -2,5 +2,15 @@
 
 from arbiview_aug.datasets.frame_folder import FrameFolder
 from arbiview_aug.datasets.images import decode_images, reduced_camera, reduced_rig
+from arbiview_aug.datasets.nuscenes import NuScenesDataset
+from arbiview_aug.datasets.wrappers import RetargetedDataset, RetargetedIterable
 
-__all__ = ["FrameFolder", "decode_images", "reduced_camera", "reduced_rig"]
+__all__ = [
+    "FrameFolder",
+    "NuScenesDataset",
+    "RetargetedDataset",
+    "RetargetedIterable",
+    "decode_images",
+    "reduced_camera",
+    "reduced_rig",
+]
