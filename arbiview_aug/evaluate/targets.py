@@ -1,0 +1,86 @@
+"""Target rigs to evaluate on: the paper's six configurations, yawed rigs, shifted rigs.
+
+Targets are made from the source rig, camera by camera. They carry no car-body masks: those are the source's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from arbiview_aug.camera import FloatArray
+from arbiview_aug.rig import Rig
+
+PAPER_SHARES = (0.2, -0.2, 0.4, -0.4, 0.5, -0.25)
+"""The paper's configurations: each camera yawed by this share of the azimuth spacing to its neighbour.
+
+With the spacing of nuScenes (55 degrees, at the back 70) these are its yaws of 11/14, 22/28, 27.5/35 and 13.75/17.5.
+"""
+
+YAWS_DEG = (11.0, -11.0, 22.0, -22.0, 35.0, -35.0)
+UP_M = 0.6
+
+_NUSCENES_CAMERAS = {
+    "CAM_FRONT",
+    "CAM_FRONT_RIGHT",
+    "CAM_BACK_RIGHT",
+    "CAM_BACK",
+    "CAM_BACK_LEFT",
+    "CAM_FRONT_LEFT",
+}
+_SAME_DIRECTION_DEG = 5.0
+
+
+def spacing_deg(rig: Rig) -> FloatArray:
+    """(N,) azimuth spacing of each camera to its neighbour.
+
+    On rigs with nuScenes' camera names the paper's own figures: 55 degrees, 70 for CAM_BACK. On others the smaller
+    one of the two gaps to the next camera on either side, where cameras within 5 degrees count as the same direction
+    (a telephoto beside a wide camera); a camera without a neighbour has its own horizontal field of view.
+    """
+    if _NUSCENES_CAMERAS.issuperset(rig.names):
+        return np.array([70.0 if name == "CAM_BACK" else 55.0 for name in rig.names])
+    azimuth = np.array([camera.azimuth_deg for camera in rig])
+    spacing = []
+    for k, camera in enumerate(rig):
+        gaps = np.abs((azimuth - azimuth[k] + 180) % 360 - 180)
+        gaps = gaps[gaps > _SAME_DIRECTION_DEG]
+        spacing.append(float(gaps.min()) if len(gaps) else camera.fov_deg[0])
+    return np.array(spacing)
+
+
+def paper_target(rig: Rig, share: float) -> Rig:
+    """One configuration of the paper: each camera yawed (left for a positive share) by its share of the spacing."""
+    cameras = [
+        camera.turned(yaw_deg=share * float(spacing)) for camera, spacing in zip(rig, spacing_deg(rig), strict=True)
+    ]
+    return without_masks(rig.with_cameras(cameras))
+
+
+def paper_targets(rig: Rig) -> list[Rig]:
+    """The paper's six configurations."""
+    return [paper_target(rig, share) for share in PAPER_SHARES]
+
+
+def yawed_targets(rig: Rig, yaws_deg: Sequence[float] = YAWS_DEG) -> list[Rig]:
+    """All cameras turned about their own centres."""
+    return [without_masks(rig.turned(yaw_deg=yaw)) for yaw in yaws_deg]
+
+
+def shifted_target(rig: Rig, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0, *, yaw_deg: float = 0.0) -> Rig:
+    """All cameras moved along the ego's axes, and turned."""
+    return without_masks(rig.shifted(x_m, y_m, z_m).turned(yaw_deg=yaw_deg))
+
+
+def standard_targets(rig: Rig) -> dict[str, list[Rig]]:
+    """What accuracy is reported on: ``yaw`` (±11, ±22, ±35 degrees), ``up`` (0.6 m) and ``paper`` (six)."""
+    return {"yaw": yawed_targets(rig), "up": [shifted_target(rig, z_m=UP_M)], "paper": paper_targets(rig)}
+
+
+def without_masks(rig: Rig) -> Rig:
+    """The same rig without car-body masks."""
+    if all(camera.mask is None for camera in rig):
+        return rig
+    return rig.with_cameras([replace(camera, mask=None) for camera in rig])

@@ -1,0 +1,99 @@
+"""Metrics against a true view on cases worked out by hand; scores and image conversions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug.errors import SampleError
+from arbiview_aug.evaluate.images import as_arrays, as_tensors, to_bytes
+from arbiview_aug.evaluate.scores import errors, mean_of, psnr_db, ssim, ssim_map
+from arbiview_aug.evaluate.truth import truth_metrics
+
+
+def test_regions() -> None:
+    truth = np.full((40, 60, 3), 100, np.uint8)
+    image = truth.copy()
+    image[:, 30:] = 110  # right half: 10 off
+    image[30:] = 140  # bottom quarter: 40 off
+    coverage = np.zeros((40, 60), bool)
+    coverage[:30] = True
+    ground = np.zeros((40, 60), bool)
+    ground[20:] = True
+    sky = ~ground
+    row = truth_metrics(image, truth, coverage=coverage, classes={"ground": ground, "sky": sky})
+    assert row["mae"] == pytest.approx((0.75 * 0.5 * 10) + 0.25 * 40)
+    assert row["covered_mae"] == pytest.approx(5.0) and row["hole_mae"] == pytest.approx(40.0)
+    assert row["hole_psnr_db"] == pytest.approx(10 * np.log10(255**2 / 40**2))
+    assert row["covered_ground_mae"] == pytest.approx(5.0) and row["ground_mae"] == pytest.approx((5 + 40) / 2)
+    shares = {"": 1.0, "covered_": 0.75, "hole_": 0.25, "ground_": 0.5, "sky_": 0.5, "covered_ground_": 0.25}
+    assert {k: row[f"{k}share"] for k in shares} == pytest.approx(shares)
+    # A region without pixels has no errors, and does not spoil a mean.
+    assert row["hole_sky_share"] == 0 and "hole_sky_psnr_db" not in row
+    assert row["covered_ssim"] > row["hole_ssim"]
+
+
+def test_own_car_does_not_count() -> None:
+    truth = np.full((20, 20, 3), 50, np.uint8)
+    image = truth.copy()
+    image[10:] = 0
+    valid = np.zeros((20, 20), bool)
+    valid[:10] = True
+    row = truth_metrics(image, truth, valid=valid)
+    assert row["mae"] == 0 and row["share"] == 1.0
+
+
+def test_float_images_are_scored_with_their_fractions() -> None:
+    truth = np.full((8, 8, 3), 50, np.uint8)
+    assert truth_metrics(truth + 0.25, truth)["mae"] == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"truth": np.zeros((8, 9, 3), np.uint8)}, r"truth: expected the rendered image's shape \(8, 8, 3\)"),
+        ({"coverage": np.ones((8, 8), np.uint8)}, r"coverage: expected a bool mask of \(8, 8\), got uint8"),
+        ({"valid": np.ones((8, 9), bool)}, r"valid: expected a bool mask of \(8, 8\), got bool of \(8, 9\)"),
+        ({"classes": {"sky": np.ones((9, 8), bool)}}, r"sky: expected a bool mask"),
+    ],
+)
+def test_messages(changes: dict, message: str) -> None:
+    image = np.zeros((8, 8, 3), np.uint8)
+    with pytest.raises(SampleError, match=message):
+        truth_metrics(**{"image": image, "truth": image, **changes})
+
+
+def test_errors_by_hand() -> None:
+    e = errors(np.array([[10, 20, 30]], np.uint8), np.array([[13, 16, 30]], np.uint8))
+    assert e == pytest.approx((1, 10 * np.log10(255**2 / (25 / 3)), 7 / 3, (25 / 3) ** 0.5))
+    assert errors(np.zeros((0, 3)), np.zeros((0, 3))) is None
+    assert psnr_db(255.0**2) == 0
+
+
+def test_ssim_properties() -> None:
+    image = np.random.default_rng(0).uniform(0, 255, (40, 50, 3))
+    assert ssim(image, image) == pytest.approx(1.0)
+    assert ssim(image, 255 - image) < 0
+    flat_one, flat_two = np.full((20, 20, 3), 100.0), np.full((20, 20, 3), 120.0)
+    c1 = (0.01 * 255) ** 2
+    expected = (2 * 100 * 120 + c1) / (100**2 + 120**2 + c1)  # no structure: the luminance term alone
+    np.testing.assert_allclose(ssim_map(flat_one, flat_two), expected)
+
+
+def test_means_skip_what_a_row_lacks() -> None:
+    assert mean_of([{"a": 1.0, "b": 4.0}, {"a": 3.0}]) == {"a": 2.0, "b": 4.0}
+    assert mean_of([]) == {}
+
+
+def test_tensors_become_arrays_on_one_scale() -> None:
+    tensors = torch.tensor([[[0, 51], [102, 255]]], dtype=torch.uint8).repeat(2, 3, 1, 1)
+    from_bytes, from_floats = as_arrays(tensors), as_arrays(list(tensors.float() / 255))
+    for a, b in zip(from_bytes, from_floats, strict=True):
+        assert a.shape == (2, 2, 3) and a.dtype == np.uint8 and b.dtype == np.float32
+        np.testing.assert_allclose(a, b, atol=1e-4)
+    back = as_tensors(from_floats)
+    assert all(torch.equal(x, y) for x, y in zip(back, tensors, strict=True))
+    assert to_bytes(np.array([[[-3.0, 254.6, 300.0]]])).tolist() == [[[0, 255, 255]]]
+    with pytest.raises(SampleError, match=r"images: expected \(3, h, w\) each, got \(2, 2, 3\)"):
+        as_arrays([torch.zeros(2, 2, 3)])
