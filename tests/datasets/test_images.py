@@ -126,9 +126,7 @@ def test_convention_reduced_camera_is_not_a_resize_for_odd_sizes() -> None:
     np.testing.assert_allclose(small.K, A @ full.K, atol=1e-12)
     wrong = full.resize(small.size)
     assert abs(wrong.K[0, 0] - small.K[0, 0]) > 1e-3
-    np.testing.assert_allclose(
-        reduced_camera(camera(100, 200), 4).K, camera(100, 200).resize((25, 50)).K, atol=1e-9
-    )
+    np.testing.assert_allclose(reduced_camera(camera(100, 200), 4).K, camera(100, 200).resize((25, 50)).K, atol=1e-9)
 
 
 def test_a_reduced_mask_is_scene_where_all_of_its_pixels_are() -> None:
