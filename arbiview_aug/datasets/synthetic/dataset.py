@@ -1,0 +1,240 @@
+"""SyntheticDrive: a map-style dataset of street scenes seen by any rig, and the truth behind them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from arbiview_aug.camera import Camera
+from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, cast, find_candidates, scene_from
+from arbiview_aug.datasets.synthetic.render import Renderer, stack_or_list
+from arbiview_aug.datasets.synthetic.scene import Material, Scene, SceneClass
+from arbiview_aug.datasets.synthetic.street import make_scene
+from arbiview_aug.rig import Rig
+
+LIDAR_POSITION_M = (0.9, 0.0, 1.9)
+"""Ego x, y and height over the road: a roof-mounted sensor, as on nuScenes' vehicles."""
+LIDAR_BEAMS_DEG = (-30.67, 10.67)
+"""Elevations of the lowest and the highest of 32 beams (Velodyne HDL-32E)."""
+LIDAR_COLUMNS = 1088
+LIDAR_RANGE_M = (1.0, 90.0)
+LIDAR_NOISE_M = 0.02
+_BEAMS = 32
+
+
+class RenderedViews(NamedTuple):
+    """The truth for one rig: tensors (N, ...) where all cameras have one size, else lists of N.
+
+    Attributes:
+        images: (3, h, w) uint8 RGB a camera; black where the lens sees nothing.
+        depth_m: (h, w) float32 z in the camera frame along the ray through each pixel's centre; infinite for the sky
+            and where the lens sees nothing.
+        classes: (h, w) uint8 ``SceneClass`` of that ray.
+        instances: (h, w) int16 row of ``boxes_3d`` of that ray, -1 for none.
+    """
+
+    images: Tensor | list[Tensor]
+    depth_m: Tensor | list[Tensor]
+    classes: Tensor | list[Tensor]
+    instances: Tensor | list[Tensor]
+
+    def visible_pixels(self, num_boxes: int) -> Tensor:
+        """(N, num_boxes) int64: how many pixels of each camera show each box's object."""
+        return torch.stack(
+            [torch.bincount(v.flatten().long() + 1, minlength=num_boxes + 1)[1:] for v in self.instances]
+        )
+
+
+class SyntheticDrive(Dataset[dict[str, Any]]):
+    """Procedural streets as camera samples with LiDAR-like points and 3D boxes, in the rig's ego frame.
+
+    Scene ``index`` depends on (seed, index) alone, never on the rig: different rigs see the same street, from the
+    same place, standing on its road. Datasets with different seeds share no street.
+
+    ``drive[i]`` is a dict: ``images`` (N, 3, h, w) uint8 (a list where sizes differ), ``rig``, ``K`` (N, 3, 3) and
+    ``cam2ego`` (N, 4, 4) float64, ``points`` (P, 4) float32 x y z intensity (0 to 255), ``boxes_3d`` (B, 7) float32
+    centre x y z, length, width, height, yaw, ``box_classes`` (B,) int64 ``BoxClass``, ``token``.
+
+    Args:
+        rig: The cameras; their masks do not matter here (what a mask hides is rendered all the same).
+        num_frames: Length of the dataset.
+        seed: Of the world, not negative.
+        supersampling: Rays across a pixel at outlines; 1 switches antialiasing of outlines off.
+        lidar: Whether samples carry ``points``.
+        device: Where to render; what is returned lies on the CPU. Two kinds of device agree to rounding, not in bits.
+
+    Raises:
+        TypeError: ``rig`` is not a ``Rig``.
+        ValueError: A count or seed out of range.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        *,
+        num_frames: int,
+        seed: int = 0,
+        supersampling: int = 2,
+        lidar: bool = True,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.rig = _checked_rig(rig)
+        self.num_frames = _checked_count("num_frames", num_frames, 1, 1 << 40)
+        self.seed = _checked_count("seed", seed, 0, 1 << 60)
+        self.lidar = bool(lidar)
+        self._renderer = Renderer(supersampling=_checked_count("supersampling", supersampling, 1, 8), device=device)
+        self._scene: tuple[int, Scene] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_scene": None}
+
+    def __len__(self) -> int:
+        return self.num_frames
+
+    def __repr__(self) -> str:
+        return f"SyntheticDrive({len(self)} frames, seed {self.seed}, rig {self.rig.name or 'unnamed'}: {len(self.rig)} cameras)"
+
+    def scene(self, index: int) -> Scene:
+        """The street as plain data.
+
+        Raises:
+            IndexError: Past the end.
+        """
+        index = self._checked_index(index)
+        if self._scene is None or self._scene[0] != index:
+            self._scene = (index, make_scene(self.seed, index))
+        return self._scene[1]
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        scene = self.scene(index)
+        views = [self._renderer.render(scene, camera, self.rig.ground_z_m) for camera in self.rig]
+        sample: dict[str, Any] = {
+            "images": stack_or_list([v.image for v in views]),
+            "rig": self.rig,
+            "K": torch.from_numpy(self.rig.K),
+            "cam2ego": torch.from_numpy(self.rig.cam2ego),
+            "boxes_3d": torch.from_numpy(scene.boxes_ego(self.rig.ground_z_m).astype(np.float32)),
+            "box_classes": torch.from_numpy(scene.box_classes.copy()),
+            "token": f"synthetic-{self.seed}-{self._checked_index(index)}",
+        }
+        if self.lidar:
+            sample["points"] = self.points(index)
+        return sample
+
+    def render(self, index: int, rig: Rig | None = None) -> RenderedViews:
+        """The true views of scene ``index`` for any rig; the dataset's own by default.
+
+        ``rig``'s road is put on the scene's road, so it needs no conversion between ego frames.
+
+        Raises:
+            IndexError: Past the end.
+            TypeError: ``rig`` is not a ``Rig``.
+        """
+        rig = self.rig if rig is None else _checked_rig(rig)
+        scene = self.scene(index)
+        views = [self._renderer.render(scene, camera, rig.ground_z_m) for camera in rig]
+        return RenderedViews(*(stack_or_list([v[k] for v in views]) for k in range(4)))
+
+    @torch.no_grad()
+    def points(self, index: int) -> Tensor:
+        """(P, 4) float32 LiDAR-like points x y z intensity (0 to 255) of scene ``index``, in the rig's ego frame.
+
+        32 beams from 1.9 m over the road, first returns within 90 m, with Gaussian range noise of 2 cm (one sigma).
+        """
+        index = self._checked_index(index)
+        scene, device = self.scene(index), self._renderer.device
+        elevation = np.radians(np.linspace(*LIDAR_BEAMS_DEG, _BEAMS))
+        azimuth = np.linspace(0, 2 * math.pi, LIDAR_COLUMNS, endpoint=False)
+        el, az = (a.ravel() for a in np.meshgrid(elevation, azimuth, indexing="xy"))  # columns are neighbours
+        ego = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], 1)
+        R, position = scene.ego2street[:3, :3], np.array(LIDAR_POSITION_M)
+        origin = R @ position + scene.ego2street[:3, 3]
+        street = (ego @ R.T).astype(np.float32).reshape(LIDAR_COLUMNS // 8, 8 * _BEAMS, 3)
+        rays = torch.from_numpy(street).to(device).transpose(1, 2).contiguous()
+        local = scene_from(scene, origin, device)
+        distance, hit = cast(local, rays, find_candidates(local, rays))
+        t, row = distance.cpu().numpy().ravel().astype(np.float64), hit.cpu().numpy().ravel()
+        rng = np.random.default_rng(np.random.SeedSequence([self.seed, index, 1]))
+        noise, gain = rng.normal(0, LIDAR_NOISE_M, len(t)), rng.uniform(0.8, 1.2, len(t))
+        keep = (t > LIDAR_RANGE_M[0]) & (t < LIDAR_RANGE_M[1])
+        points = position + ego[keep] * (t + noise)[keep, None]
+        points[:, 2] += self.rig.ground_z_m
+        albedo = scene.color.mean(1)[row.clip(0)]
+        albedo = np.where(row == GROUND_ID, 0.5 * scene.street.asphalt, albedo)[keep]
+        # Glass sends little back, retro-reflective plates much.
+        material = np.where(row[keep] >= 0, scene.material[row[keep].clip(0)], -1)
+        albedo = albedo * np.select([material == Material.GLASSHOUSE, material == Material.SIGN], [0.3, 3.0], 1.0)
+        intensity = (albedo * gain[keep] * 90).clip(0, 255)
+        return torch.from_numpy(np.concatenate([points, intensity[:, None]], 1).astype(np.float32))
+
+    def _checked_index(self, index: int) -> int:
+        if not isinstance(index, int | np.integer) or isinstance(index, bool):
+            raise TypeError(f"SyntheticDrive index: expected an int, got {type(index).__name__}")
+        n = len(self)
+        if not -n <= index < n:
+            raise IndexError(f"SyntheticDrive has {n} frames, got index {index}")
+        return int(index) % n
+
+
+def _checked_rig(rig: Any) -> Rig:
+    if not isinstance(rig, Rig):
+        raise TypeError(f"SyntheticDrive rig: expected a Rig (load_rig(name) gives one), got {type(rig).__name__}")
+    return rig
+
+
+def _checked_count(name: str, value: Any, low: int, high: int) -> int:
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or not low <= value <= high:
+        raise ValueError(f"SyntheticDrive {name}: expected a whole number from {low} to {high}, got {value!r}")
+    return int(value)
+
+
+def demo_source_rig(size: tuple[int, int] = (256, 704)) -> Rig:
+    """A sedan-like six-camera rig at 1.5 m: nuScenes' azimuths, 65 degrees wide, 90 at the back. ``size`` is (h, w)."""
+    layout = (
+        ("front", 0.0, 65.0, (1.7, 0.0)),
+        ("front_left", 55.0, 65.0, (1.5, 0.5)),
+        ("front_right", -55.0, 65.0, (1.5, -0.5)),
+        ("back_left", 110.0, 65.0, (1.0, 0.5)),
+        ("back_right", -110.0, 65.0, (1.0, -0.5)),
+        ("back", 180.0, 90.0, (0.0, 0.0)),
+    )
+    return _ring(layout, 1.5, size, "sedan")
+
+
+def demo_target_rig(size: tuple[int, int] = (256, 704)) -> Rig:
+    """A van-like five-camera rig at 2.1 m: Waymo's azimuths, 65 degrees wide. ``size`` is (h, w)."""
+    layout = (
+        ("front", 0.0, 65.0, (1.5, 0.0)),
+        ("front_left", 45.0, 65.0, (1.45, 0.15)),
+        ("front_right", -45.0, 65.0, (1.45, -0.15)),
+        ("side_left", 90.0, 65.0, (1.35, 0.2)),
+        ("side_right", -90.0, 65.0, (1.35, -0.2)),
+    )
+    return _ring(layout, 2.1, size, "van")
+
+
+def _ring(
+    layout: Sequence[tuple[str, float, float, tuple[float, float]]], height_m: float, size: tuple[int, int], name: str
+) -> Rig:
+    cameras = [
+        Camera.looking(
+            name=camera,
+            azimuth_deg=azimuth,
+            position_m=(x, y, height_m),
+            width_px=size[1],
+            height_px=size[0],
+            horizontal_fov_deg=fov,
+        )
+        for camera, azimuth, fov, (x, y) in layout
+    ]
+    return Rig(cameras, ground_z_m=0.0, name=name)
+
+
+GROUND_CLASSES = (SceneClass.GROUND, SceneClass.SIDEWALK)
+"""What a vehicle or a person stands on."""

@@ -1,0 +1,230 @@
+"""Things on the street, built from primitives: vehicles, pedestrians, trees, lamp posts, signs, buildings.
+
+Every labelled object touches all six sides of its 3D box: the wheels carry its width and its lowest point, the roof
+its height, the body its length.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from arbiview_aug.datasets.synthetic.scene import BoxClass, Material, Placed, SceneBuilder, SceneClass
+
+Color = tuple[float, float, float]
+Range = tuple[float, float]
+
+# Length, width and height in metres: published sizes of production vehicles, from small cars to city buses.
+VEHICLE_SIZES: dict[BoxClass, tuple[Range, Range, Range]] = {
+    BoxClass.CAR: ((3.6, 4.95), (1.66, 1.95), (1.40, 1.80)),
+    BoxClass.VAN: ((4.8, 6.4), (1.90, 2.10), (1.95, 2.75)),
+    BoxClass.TRUCK: ((6.2, 9.0), (2.20, 2.50), (2.80, 3.60)),
+    BoxClass.BUS: ((9.0, 12.0), (2.50, 2.55), (2.95, 3.40)),
+}
+_PAINTS: tuple[Color, ...] = (
+    (0.85, 0.85, 0.86), (0.80, 0.81, 0.83), (0.62, 0.64, 0.66), (0.40, 0.42, 0.44), (0.16, 0.17, 0.19),
+    (0.10, 0.10, 0.12), (0.55, 0.10, 0.10), (0.12, 0.20, 0.42), (0.18, 0.32, 0.24), (0.72, 0.58, 0.22),
+    (0.45, 0.36, 0.28), (0.30, 0.44, 0.58),
+)  # fmt: skip
+_CLOTHES: tuple[Color, ...] = (
+    (0.15, 0.17, 0.25), (0.55, 0.14, 0.16), (0.78, 0.77, 0.72), (0.20, 0.35, 0.50), (0.70, 0.55, 0.15),
+    (0.12, 0.12, 0.13), (0.35, 0.45, 0.30), (0.60, 0.40, 0.50),
+)  # fmt: skip
+_WALLS: tuple[Color, ...] = (
+    (0.62, 0.55, 0.46), (0.55, 0.33, 0.26), (0.70, 0.68, 0.63), (0.48, 0.47, 0.46), (0.66, 0.60, 0.42),
+    (0.40, 0.30, 0.26), (0.58, 0.62, 0.64), (0.74, 0.66, 0.58), (0.36, 0.38, 0.42),
+)  # fmt: skip
+TIRE: Color = (0.09, 0.09, 0.095)
+DARK: Color = (0.11, 0.11, 0.12)
+
+
+def _pick(rng: np.random.Generator, colors: tuple[Color, ...], spread: float = 0.05) -> Color:
+    base = np.array(colors[int(rng.integers(len(colors)))]) + rng.normal(0, spread, 3)
+    return tuple(float(c) for c in base.clip(0.05, 0.92))  # type: ignore[return-value]
+
+
+def vehicle_size(rng: np.random.Generator, cls: BoxClass) -> tuple[float, float, float]:
+    """Length, width and height in metres."""
+    length, width, height = VEHICLE_SIZES[cls]
+    # Height is drawn on its own: a detector must not be able to read it off the footprint.
+    return float(rng.uniform(*length)), float(rng.uniform(*width)), float(rng.uniform(*height))
+
+
+def add_vehicle(
+    builder: SceneBuilder,
+    rng: np.random.Generator,
+    cls: BoxClass,
+    size: tuple[float, float, float],
+    xy: tuple[float, float],
+    yaw: float,
+) -> None:
+    """A vehicle on the road plane and its box."""
+    length, width, height = size
+    row = builder.add_box(np.array([*xy, height / 2]), size, yaw, cls)
+    place = builder.place((*xy, 0.0), yaw, SceneClass.VEHICLE, row)
+    paint = _pick(rng, _PAINTS)
+    x, y = length / 2, width / 2 - 0.02  # wheels stand out by 2 cm and give the width
+    radius = min(0.25 + 0.05 * height, 0.48)
+    if cls is BoxClass.CAR:
+        waist = float(rng.uniform(0.52, 0.60)) * height
+        place.box((-x, x), (-y, y), (0.20, waist), Material.PAINT, paint, taper=(0.10, 0.06, 0.03, 0.03))
+        rear = float(rng.choice([0.06, 0.3, 0.55])) * length / 2  # estate, hatchback, saloon
+        place.box(
+            (-x + 0.08 + rear * 0.55, 0.22 * length),
+            (-y + 0.05, y - 0.05),
+            (waist, height),
+            Material.GLASSHOUSE,
+            paint,
+            taper=(0.16 * length, 0.08 + rear * 0.45, 0.16, 0.16),
+            param=(1.0, 0, 0, 0),
+        )
+    elif cls is BoxClass.VAN:
+        waist = 0.48 * height
+        place.box((-x, x), (-y, y), (0.24, waist), Material.PAINT, paint, taper=(0.08, 0, 0, 0))
+        cargo = float(rng.random() < 0.5)
+        place.box(
+            (-x, x - 0.75),
+            (-y, y),
+            (waist, height),
+            Material.GLASSHOUSE,
+            paint,
+            taper=(0.40, 0.03, 0.10, 0.10),
+            param=(0.35 if cargo else 1.0, 0, 0, 0),
+        )
+    elif cls is BoxClass.TRUCK:
+        cab = float(rng.uniform(1.7, 2.2))
+        top = height * float(rng.uniform(0.72, 0.9))
+        cab_color = _pick(rng, _PAINTS)
+        place.box((x - cab, x), (-y + 0.05, y - 0.05), (0.45, 1.35), Material.PAINT, cab_color)
+        place.box(
+            (x - cab, x), (-y + 0.05, y - 0.05), (1.35, top), Material.GLASSHOUSE, cab_color,
+            taper=(0.22, 0, 0.04, 0.04), param=(1.0, 0, 0, 0),
+        )  # fmt: skip
+        place.box((-x, x - cab - 0.15), (-y, y), (0.95, height), Material.ROUGH, paint, param=(0.5, 0.05, 0, 0))
+        place.box((-x + 0.1, x - cab), (-0.45, 0.45), (0.5, 0.95), Material.PLAIN, DARK)
+    else:
+        place.box((-x, x), (-y, y), (0.32, height), Material.COACH, paint, taper=(0.10, 0.02, 0.02, 0.02))
+    reach = 0.62 * x if cls is not BoxClass.TRUCK else 0.68 * x
+    for side in (-1, 1):
+        for end in (-1, 1):
+            center = (end * reach, side * (width / 2 - 0.11), radius)
+            place.cylinder(center, (radius, radius), 0.11, Material.WHEEL, TIRE, lateral=True)
+
+
+def add_pedestrian(
+    builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float], yaw: float
+) -> None:
+    """A standing or walking person and their box."""
+    height = float(rng.uniform(1.5, 1.92))
+    length, width = float(rng.uniform(0.34, 0.52)), float(rng.uniform(0.46, 0.60))
+    center = np.array([xyz[0], xyz[1], xyz[2] + height / 2])
+    row = builder.add_box(center, (length, width, height), yaw, BoxClass.PEDESTRIAN)
+    place = builder.place(xyz, yaw, SceneClass.PEDESTRIAN, row)
+    trousers, jacket = _pick(rng, _CLOTHES), _pick(rng, _CLOTHES)
+    skin = _pick(rng, ((0.80, 0.62, 0.52), (0.55, 0.38, 0.28), (0.35, 0.24, 0.18)), 0.02)
+    hip, shoulder, head = 0.48 * height, 0.83 * height, 0.115
+    stride = length / 2 - 0.075
+    for side in (-1, 1):
+        leg = (side * stride * 0.9, side * width * 0.17, hip / 2)
+        place.cylinder(leg, (0.075, 0.07), hip / 2, Material.PLAIN, trousers)
+    torso = ((hip + shoulder) / 2, (shoulder - hip) / 2)
+    place.cylinder((0, 0, torso[0]), (0.15, width / 2 - 0.09), torso[1], Material.ROUGH, jacket, param=(0.1, 0.1, 0, 0))
+    for side in (-1, 1):
+        # The swinging arms carry the box's length and width.
+        arm = (-side * (length / 2 - 0.055), side * (width / 2 - 0.055), torso[0])
+        place.cylinder(arm, (0.055, 0.055), torso[1] * 0.95, Material.PLAIN, jacket)
+    place.ellipsoid((0, 0, height - head), (0.10, 0.085, head), Material.PLAIN, skin)
+
+
+def add_tree(builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float]) -> None:
+    """Trunk and a crown of several ellipsoids."""
+    place = builder.place(xyz, float(rng.uniform(0, 6.28)), SceneClass.VEGETATION)
+    height, trunk = float(rng.uniform(4.5, 10)), float(rng.uniform(0.09, 0.22))
+    fork = height * float(rng.uniform(0.35, 0.5))
+    bark = _pick(rng, ((0.30, 0.25, 0.20), (0.36, 0.33, 0.29)), 0.03)
+    place.cylinder((0, 0, fork * 0.6), (trunk, trunk), fork * 0.6, Material.ROUGH, bark, param=(0.12, 0.35, 0, 0))
+    spread = (height - fork) * float(rng.uniform(0.38, 0.6))
+    green = _pick(rng, ((0.24, 0.36, 0.14), (0.18, 0.30, 0.12), (0.34, 0.38, 0.14), (0.42, 0.32, 0.12)), 0.03)
+    for k in range(int(rng.integers(4, 7))):
+        turn, out = 2.4 * k, spread * float(rng.uniform(0.25, 0.55)) * (k > 0)
+        radius = spread * float(rng.uniform(0.55, 0.85))
+        z = fork + (height - fork) * float(rng.uniform(0.3, 0.75))
+        place.ellipsoid(
+            (out * np.cos(turn), out * np.sin(turn), z),
+            (radius, radius, radius * float(rng.uniform(0.7, 1.0))),
+            Material.LEAF,
+            green,
+        )
+
+
+def add_bush(builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float]) -> None:
+    """A low ellipsoid of leaves."""
+    place = builder.place(xyz, float(rng.uniform(0, 6.28)), SceneClass.VEGETATION)
+    r = rng.uniform(0.5, 1.1, 2)
+    green = _pick(rng, ((0.20, 0.32, 0.14), (0.28, 0.34, 0.16)), 0.03)
+    height = float(rng.uniform(0.5, 0.9))
+    place.ellipsoid((0, 0, height * 0.6), (float(r[0]), float(r[1]), height), Material.LEAF, green)
+
+
+def add_lamp_post(builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float], yaw: float) -> None:
+    """A tall pole whose arm (local x) reaches over the road."""
+    place = builder.place(xyz, yaw, SceneClass.POLE)
+    height, grey = float(rng.uniform(5.5, 8.5)), float(rng.uniform(0.25, 0.55))
+    metal: Color = (grey, grey, grey * 1.03)
+    place.cylinder((0, 0, height / 2), (0.075, 0.075), height / 2, Material.PLAIN, metal)
+    place.cylinder((0, 0, 0.5), (0.12, 0.12), 0.5, Material.PLAIN, metal)
+    place.box((0, 1.7), (-0.04, 0.04), (height - 0.1, height), Material.PLAIN, metal)
+    place.box((1.2, 1.9), (-0.12, 0.12), (height - 0.16, height - 0.02), Material.PLAIN, (0.75, 0.74, 0.68))
+
+
+def add_sign(builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float], yaw: float) -> None:
+    """A post with one or two plates that face local -x."""
+    place = builder.place(xyz, yaw, SceneClass.POLE)
+    height = float(rng.uniform(2.3, 3.0))
+    place.cylinder((0, 0, height / 2), (0.035, 0.035), height / 2, Material.PLAIN, (0.52, 0.53, 0.54))
+    colors: tuple[Color, ...] = ((0.78, 0.12, 0.12), (0.10, 0.25, 0.62), (0.85, 0.72, 0.10), (0.90, 0.90, 0.90))
+    for k in range(int(rng.integers(1, 3))):
+        w, z = float(rng.uniform(0.25, 0.36)), height - 0.35 - 0.7 * k
+        place.box((-0.06, -0.04), (-w, w), (z - 0.3, z + 0.3), Material.SIGN, _pick(rng, colors, 0.02))
+
+
+def add_traffic_light(builder: SceneBuilder, xyz: tuple[float, float, float], yaw: float) -> None:
+    """A signal head on a post, facing local -x."""
+    place = builder.place(xyz, yaw, SceneClass.POLE)
+    place.cylinder((0, 0, 1.7), (0.06, 0.06), 1.7, Material.PLAIN, (0.25, 0.26, 0.26))
+    place.box((-0.28, -0.07), (-0.16, 0.16), (2.5, 3.4), Material.SIGN, DARK, param=(1.0, 0, 0, 0))
+
+
+def add_building(
+    builder: SceneBuilder,
+    rng: np.random.Generator,
+    x: Range,
+    y: Range,
+    base_m: float,
+    height: float,
+) -> None:
+    """A block with windows, and now and then a set-back top storey, bays or an awning over the ground floor."""
+    place: Placed = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.BUILDING)
+    wall = _pick(rng, _WALLS)
+    bay, storey = float(rng.uniform(2.2, 4.2)), float(rng.uniform(2.9, 3.6))
+    # bay width, storey height, share of the wall that is glass, whether the ground floor is shops
+    param = (bay, storey, float(rng.uniform(0.42, 0.72)), float(rng.random() < 0.55))
+    place.box(x, y, (base_m - 0.05, height), Material.FACADE, wall, param=param)
+    trim: Color = (wall[0] * 0.8, wall[1] * 0.8, wall[2] * 0.8)
+    edge = 0.25
+    place.box(
+        (x[0] - edge, x[1] + edge), (y[0] - edge, y[1] + edge), (height, height + 0.4), Material.ROUGH, trim,
+        param=(0.8, 0.08, 0, 0),
+    )  # fmt: skip
+    front, outward = (y[0], -1.0) if y[0] > 0 else (y[1], 1.0)
+    if param[3] and rng.random() < 0.6:
+        cloth = _pick(rng, _CLOTHES)
+        a = float(rng.uniform(x[0] + 0.3, (x[0] + x[1]) / 2))
+        b = min(a + float(rng.uniform(3, 7)), x[1] - 0.2)
+        ends = sorted((front, front + outward * float(rng.uniform(0.8, 1.3))))
+        place.box((a, b), (ends[0], ends[1]), (2.75, 3.0), Material.ROUGH, cloth, param=(0.4, 0.1, 0, 0))
+    if height > 9 and rng.random() < 0.4:
+        for _ in range(int(rng.integers(1, 3))):
+            a = float(rng.uniform(x[0] + 0.5, max(x[0] + 0.6, x[1] - 3.5)))
+            ends = sorted((front, front + outward * 0.7))
+            place.box((a, min(a + 2.6, x[1])), (ends[0], ends[1]), (storey, height * 0.85), Material.FACADE, wall,
+                      param=(2.6, storey, 0.7, 0.0))  # fmt: skip

@@ -1,0 +1,296 @@
+"""Images, depth, classes and instances of a scene for any camera.
+
+Two passes. The first casts one ray through every pixel's centre: it gives depth, class, instance and the colour of
+pixels inside one surface, whose texture is filtered analytically. The second casts ``supersampling``² rays through
+pixels at outlines, and through tiles with something thinner than a pixel and a half.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from arbiview_aug.camera import Camera
+from arbiview_aug.datasets.synthetic.raycast import (
+    GROUND_ID,
+    SKY_ID,
+    Candidates,
+    LocalScene,
+    cast,
+    find_candidates,
+    scene_from,
+)
+from arbiview_aug.datasets.synthetic.scene import Scene, SceneClass
+from arbiview_aug.datasets.synthetic.shading import Hits, SceneTables, faces, shade
+
+TILE_PX = 16
+_PACKET_PX = 16
+"""Outline pixels that share a packet in the second pass."""
+_THIN_PX = 1.5
+
+
+class CameraView(NamedTuple):
+    """What one camera sees; the last three are of the ray through each pixel's centre.
+
+    Attributes:
+        image: (3, h, w) uint8 RGB; black where the lens sees nothing.
+        depth_m: (h, w) float32 z in the camera frame; infinite for the sky and where the lens sees nothing.
+        classes: (h, w) uint8 ``SceneClass``.
+        instances: (h, w) int16 row of the 3D boxes, -1 for none.
+    """
+
+    image: Tensor
+    depth_m: Tensor
+    classes: Tensor
+    instances: Tensor
+
+
+class CameraRays(NamedTuple):
+    """A camera's rays by tile, in the ego frame: they depend on the camera alone.
+
+    Attributes:
+        directions: (n, 3, 256) unit rays of the pixel centres, tiles in rows.
+        right, down: (n, 3, 256) change of direction by one pixel.
+        pitch: (n, 256) angle between neighbouring pixels, radians.
+        valid: (n, 256) bool, whether the lens sees anything there.
+        axis: (3,) the optical axis, float32.
+    """
+
+    directions: Tensor
+    right: Tensor
+    down: Tensor
+    pitch: Tensor
+    valid: Tensor
+    axis: Tensor
+
+
+def camera_rays(camera: Camera, device: torch.device) -> CameraRays:
+    """The rays of ``camera``; float64 geometry, rounded at the end."""
+    rays, valid = camera.unproject(camera.pixel_grid())
+    valid = valid & np.isfinite(rays).all(-1)
+    # Where the lens sees nothing any direction will do, as long as it does not widen the tile.
+    rays = np.where(valid[..., None], rays, camera.cam2ego[:3, 2])
+    right, down = _differences(rays, valid, 1), _differences(rays, valid, 0)
+    pitch = np.sqrt(np.linalg.norm(right, axis=-1) * np.linalg.norm(down, axis=-1)).clip(1e-6, 0.3)
+    if not valid.all():
+        rays = _fill_by_tile(rays, valid)
+
+    def put(array: np.ndarray) -> Tensor:
+        dtype = bool if array.dtype == bool else np.float32
+        return _to_tiles(torch.from_numpy(np.ascontiguousarray(array, dtype=dtype)).to(device))
+
+    axis = torch.from_numpy(camera.cam2ego[:3, 2].astype(np.float32)).to(device)
+    return CameraRays(put(rays), put(right), put(down), put(pitch)[:, 0], put(valid)[:, 0], axis)
+
+
+def _differences(rays: np.ndarray, valid: np.ndarray, axis: int) -> np.ndarray:
+    """Central differences between valid neighbours, one-sided at the borders."""
+    if rays.shape[axis] < 2:
+        other = 1 - axis
+        return np.full_like(rays, 1e-3) if rays.shape[other] < 2 else _differences(rays, valid, other)
+    n = rays.shape[axis]
+    before, after = np.arange(n).clip(1) - 1, np.arange(n).clip(max=n - 2) + 1
+    sides = []
+    for a, b in ((np.arange(n), after), (before, np.arange(n))):
+        good = (valid.take(a, axis) & valid.take(b, axis))[..., None] & (
+            (a != b)[:, None, None] if axis == 0 else (a != b)[None, :, None]
+        )
+        sides.append((np.where(good, rays.take(b, axis) - rays.take(a, axis), 0), good))
+    count = sides[0][1].astype(int) + sides[1][1]
+    return (sides[0][0] + sides[1][0]) / np.maximum(count, 1)
+
+
+def _fill_by_tile(rays: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Gives invalid pixels a valid ray of their own tile, so that they do not widen its pyramid."""
+    rays = rays.copy()
+    for top in range(0, rays.shape[0], TILE_PX):
+        for left in range(0, rays.shape[1], TILE_PX):
+            tile = np.s_[top : top + TILE_PX, left : left + TILE_PX]
+            if valid[tile].any() and not valid[tile].all():
+                rays[tile][~valid[tile]] = rays[tile][valid[tile]][0]
+    return rays
+
+
+def _to_tiles(a: Tensor) -> Tensor:
+    """(h, w[, c]) to (tiles, c, 256); the last rows and columns are repeated to fill tiles."""
+    h, w = a.shape[:2]
+    a = a.reshape(h, w, -1)
+    rows = torch.arange(-(-h // TILE_PX) * TILE_PX, device=a.device).clamp(max=h - 1)
+    cols = torch.arange(-(-w // TILE_PX) * TILE_PX, device=a.device).clamp(max=w - 1)
+    a = a[rows][:, cols]
+    a = a.view(len(rows) // TILE_PX, TILE_PX, len(cols) // TILE_PX, TILE_PX, -1)
+    return a.permute(0, 2, 4, 1, 3).reshape(-1, a.shape[-1], TILE_PX * TILE_PX).contiguous()
+
+
+def _from_tiles(a: Tensor, size: tuple[int, int]) -> Tensor:
+    """(tiles, 256[, c]) to (h, w[, c])."""
+    rows, cols = -(-size[0] // TILE_PX), -(-size[1] // TILE_PX)
+    rest = a.shape[2:]
+    a = a.view(rows, cols, TILE_PX, TILE_PX, *rest).transpose(1, 2).reshape(rows * TILE_PX, cols * TILE_PX, *rest)
+    return a[: size[0], : size[1]]
+
+
+class Renderer:
+    """Renders scenes on one device; keeps the rays of the last cameras and the tables of the last scene."""
+
+    def __init__(self, *, supersampling: int = 2, device: torch.device | str = "cpu", cached_cameras: int = 24) -> None:
+        self.supersampling = supersampling
+        self.device = torch.device(device)
+        self._cached_cameras = cached_cameras
+        self._rays: OrderedDict[bytes, CameraRays] = OrderedDict()
+        self._tables: SceneTables | None = None
+
+    def __getstate__(self) -> dict[str, object]:
+        # The caches are large and cheap to make again: they do not travel to workers.
+        return {**self.__dict__, "_rays": OrderedDict(), "_tables": None}
+
+    def rays(self, camera: Camera) -> CameraRays:
+        """The camera's rays, from the cache where it has them."""
+        key = camera.content_key
+        if key not in self._rays:
+            self._rays[key] = camera_rays(camera, self.device)
+            while len(self._rays) > self._cached_cameras:
+                self._rays.popitem(last=False)
+        self._rays.move_to_end(key)
+        return self._rays[key]
+
+    def tables(self, scene: Scene) -> SceneTables:
+        """The scene's tables on the device."""
+        if self._tables is None or self._tables.scene is not scene:
+            self._tables = SceneTables.build(scene, self.device)
+        return self._tables
+
+    @torch.no_grad()
+    def render(self, scene: Scene, camera: Camera, ground_z_m: float) -> CameraView:
+        """One camera's view of ``scene`` whose road lies at ``ground_z_m`` in the camera's ego frame."""
+        tables, camera_ = self.tables(scene), self.rays(camera)
+        pose = scene.ego2street
+        origin = pose[:3, :3] @ (camera.center_m - (0, 0, ground_z_m)) + pose[:3, 3]
+        start = torch.from_numpy(origin.astype(np.float32)).to(self.device)
+        rays = _turned(camera_.directions, scene)
+        local = scene_from(scene, origin, self.device)
+        candidates = find_candidates(local, rays)
+        t, hit = cast(local, rays, candidates)
+        t = torch.where(camera_.valid, t, torch.inf)
+        hit = torch.where(camera_.valid, hit, SKY_ID)
+
+        hits = _flat_hits(start, rays, t, hit, camera_.pitch)
+        face = faces(tables, hits.point, hits.primitive)
+        color = shade(tables, hits, face).view(*t.shape, 3)
+        if self.supersampling > 1:
+            key = torch.where(hit >= 0, hit * 8 + face.view_as(hit), hit)
+            outline = _to_tiles(_outlines(_from_tiles(key, camera.size)))[:, 0]
+            thin = local.thickness[candidates.primitive] < _THIN_PX * camera_.pitch.amax(1)[candidates.packet] * (
+                local.distance[candidates.primitive].clamp_min(0.1)
+            )
+            busy = torch.zeros(len(rays), dtype=torch.bool, device=self.device)
+            busy[candidates.packet[thin]] = True
+            chosen = (outline | busy[:, None]) & camera_.valid
+            self._refine(color, chosen, tables, local, candidates, camera_, start)
+
+        image = (_from_tiles(color, camera.size) * 255 + 0.5).to(torch.uint8)
+        valid = _from_tiles(camera_.valid, camera.size)
+        depth = t * _dot_axis(camera_.directions, camera_.axis)
+        depth = torch.where(torch.isfinite(t), depth, torch.inf)
+        classes = torch.from_numpy(scene.cls).to(self.device)[hit.clamp_min(0)]
+        classes = torch.where(hit == GROUND_ID, int(SceneClass.GROUND), classes)
+        classes = torch.where(hit == SKY_ID, int(SceneClass.SKY), classes)
+        classes = torch.where(camera_.valid, classes, int(SceneClass.VOID))
+        instances = torch.where(hit >= 0, torch.from_numpy(scene.instance).to(self.device)[hit.clamp_min(0)], -1)
+        return CameraView(
+            image=(image * valid[..., None]).permute(2, 0, 1).contiguous().cpu(),
+            depth_m=_from_tiles(depth, camera.size).contiguous().cpu(),
+            classes=_from_tiles(classes, camera.size).to(torch.uint8).contiguous().cpu(),
+            instances=_from_tiles(instances, camera.size).to(torch.int16).contiguous().cpu(),
+        )
+
+    def _refine(
+        self,
+        color: Tensor,
+        chosen: Tensor,
+        tables: SceneTables,
+        local: LocalScene,
+        candidates: Candidates,
+        camera: CameraRays,
+        start: Tensor,
+    ) -> None:
+        """Replaces the colours (n, 256, 3) of chosen pixels by the mean over their subpixel rays."""
+        tile, slot = chosen.nonzero(as_tuple=True)
+        if not len(tile):
+            return
+        s = self.supersampling
+        offsets = [((k + 0.5) / s - 0.5) for k in range(s)]
+        d, r, b = (a[tile, :, slot] for a in (camera.directions, camera.right, camera.down))  # [m, 3]
+        sub = torch.stack([d + u * r + v * b for v in offsets for u in offsets], 1)  # [m, s*s, 3]
+        sub = sub / (sub[..., 0] ** 2 + sub[..., 1] ** 2 + sub[..., 2] ** 2).sqrt()[..., None]
+        # Pixels of a tile share packets of _PACKET_PX pixels, the last one filled up with its tile's first ray.
+        counts = torch.bincount(tile, minlength=len(chosen))
+        packets = (counts + _PACKET_PX - 1) // _PACKET_PX
+        first_pixel, first_packet = counts.cumsum(0) - counts, packets.cumsum(0) - packets
+        rank = torch.arange(len(tile), device=tile.device) - first_pixel[tile]
+        packet, place = first_packet[tile] + rank // _PACKET_PX, rank % _PACKET_PX
+        owner = torch.repeat_interleave(torch.arange(len(chosen), device=tile.device), packets)
+        rays = sub[first_pixel[owner]][:, :1].expand(-1, _PACKET_PX, -1).repeat_interleave(s * s, 1).clone()
+        rays = rays.view(len(owner), _PACKET_PX, s * s, 3)
+        rays[packet, place] = sub
+        rays = _turned(rays.view(len(owner), -1, 3).transpose(1, 2), tables.scene)
+        t, hit = cast(local, rays, _for_packets(candidates, owner, len(chosen)))
+        pitch = (camera.pitch[tile, slot] / s)[:, None].expand(-1, s * s).reshape(-1)
+        t, hit = (a.view(len(owner), _PACKET_PX, -1)[packet, place].reshape(-1) for a in (t, hit))
+        direction = rays.transpose(1, 2).reshape(len(owner), _PACKET_PX, s * s, 3)[packet, place].reshape(-1, 3)
+        hits = _hits(start, direction, t, hit, pitch)
+        shaded = shade(tables, hits, faces(tables, hits.point, hit)).view(-1, s * s, 3)
+        total = shaded[:, 0].clone()
+        for k in range(1, s * s):
+            total += shaded[:, k]
+        color[tile, slot] = total / (s * s)
+
+
+def _turned(rays: Tensor, scene: Scene) -> Tensor:
+    """Directions (n, 3, R) from the ego frame to the street frame, written out: see ``raycast``."""
+    c, s = float(scene.ego2street[0, 0]), float(scene.ego2street[1, 0])
+    x, y, z = rays.unbind(1)
+    return torch.stack([c * x - s * y, s * x + c * y, z], 1)
+
+
+def _flat_hits(start: Tensor, rays: Tensor, t: Tensor, hit: Tensor, pitch: Tensor) -> Hits:
+    return _hits(start, rays.transpose(1, 2).reshape(-1, 3), t.reshape(-1), hit.reshape(-1), pitch.reshape(-1))
+
+
+def _hits(start: Tensor, direction: Tensor, t: Tensor, hit: Tensor, pitch: Tensor) -> Hits:
+    reach = torch.where(torch.isfinite(t), t, 0.0)
+    return Hits(start + direction * reach[:, None], direction, reach, pitch, hit)
+
+
+def _dot_axis(rays: Tensor, axis: Tensor) -> Tensor:
+    return rays[:, 0] * axis[0] + rays[:, 1] * axis[1] + rays[:, 2] * axis[2]
+
+
+def _outlines(key: Tensor) -> Tensor:
+    """(h, w) bool: pixels with a direct neighbour of another key."""
+    out = torch.zeros_like(key, dtype=torch.bool)
+    across, down = key[:, 1:] != key[:, :-1], key[1:] != key[:-1]
+    out[:, 1:] |= across
+    out[:, :-1] |= across
+    out[1:] |= down
+    out[:-1] |= down
+    return out
+
+
+def _for_packets(candidates: Candidates, owner: Tensor, tiles: int) -> Candidates:
+    """The tiles' candidates repeated for packets (m,) that belong to tiles ``owner``."""
+    counts = torch.bincount(candidates.packet, minlength=tiles)
+    first = counts.cumsum(0) - counts
+    packet = torch.repeat_interleave(torch.arange(len(owner), device=owner.device), counts[owner])
+    start = counts[owner].cumsum(0) - counts[owner]
+    rank = torch.arange(len(packet), device=owner.device) - start[packet]
+    return Candidates(packet, candidates.primitive[first[owner[packet]] + rank], rank)
+
+
+def stack_or_list(tensors: list[Tensor]) -> Tensor | list[Tensor]:
+    """One tensor where all shapes agree, else the list."""
+    return torch.stack(tensors) if len({a.shape for a in tensors}) == 1 else tensors
