@@ -1,0 +1,58 @@
+"""``python -m arbiview_aug COMMAND``: each command is a module with ``main(argv)``, imported when it is asked for."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module, metadata
+
+from arbiview_aug.environment import warn_about_cv2_wheels
+
+COMMANDS = {
+    "inspect": ("arbiview_aug.inspect", "show rigs: tables, differences, a picture"),
+}
+"""Module and one-line help of each command."""
+
+
+def usage() -> str:
+    """What can be asked for."""
+    lines = [f"  {name:<9} {summary}" for name, (_, summary) in COMMANDS.items()]
+    return "\n".join(
+        [
+            "usage: python -m arbiview_aug [--version] COMMAND ...",
+            "",
+            "commands:",
+            *lines,
+            "",
+            "python -m arbiview_aug COMMAND --help explains each.",
+        ]
+    )
+
+
+def version() -> str:
+    """The installed version; a source tree that was never installed has none."""
+    try:
+        return metadata.version("arbiview_aug")
+    except metadata.PackageNotFoundError:
+        return "(not installed)"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit status: 0 done, 2 wrong usage."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments[:1] == ["--version"]:
+        print(f"arbiview_aug {version()}")
+        return 0
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(usage())
+        return 0 if arguments else 2
+    name, *rest = arguments
+    if name not in COMMANDS:
+        print(f"python -m arbiview_aug: unknown command {name!r}\n\n{usage()}", file=sys.stderr)
+        return 2
+    warn_about_cv2_wheels()
+    return int(import_module(COMMANDS[name][0]).main(rest) or 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
