@@ -7,7 +7,7 @@ and rays that miss need no special cases, and a point X = o + d / q is handled a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 
@@ -24,7 +24,13 @@ WALL_CENTER_M = (1.0, 0.0)
 
 
 class Surface(Protocol):
-    """Anything that says how far away the scene is."""
+    """Anything that says how far away the scene is; hashable, and equal when it describes the same scene.
+
+    Attributes:
+        smooth: Without creases: a map over it may be interpolated by what its values on a grid show.
+    """
+
+    smooth: ClassVar[bool]
 
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """Inverse distances (...,) in 1/m, 0 <= q <= ``MAX_INVERSE_DISTANCE``.
@@ -40,6 +46,8 @@ class Surface(Protocol):
 class Far:
     """Everything is infinitely far away: the paper's rotation-only model (Sec. FAVS, Stage 1)."""
 
+    smooth: ClassVar[bool] = True
+
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """Zeros (...,)."""
         return np.zeros(directions.shape[:-1])
@@ -54,6 +62,7 @@ class Ground:
         radius_m: Radius of the upright cylinder about ``WALL_CENTER_M``; 20 to 60 m are within 0.5 dB of each other.
     """
 
+    smooth: ClassVar[bool] = False
     ground_z_m: float = 0.0
     radius_m: float = 40.0
 
@@ -77,6 +86,7 @@ class Street:
         sharpness: k; infinity is the hard minimum with its crease.
     """
 
+    smooth: ClassVar[bool] = True
     ground_z_m: float = 0.0
     half_length_m: float = 50.0
     half_width_m: float = 20.0

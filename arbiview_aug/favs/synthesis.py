@@ -1,0 +1,117 @@
+"""Executing a render plan: images in, target views out; OpenCV on the CPU, or torch on any device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import torch
+
+from arbiview_aug import sampling
+from arbiview_aug.plan import RenderPlan
+from arbiview_aug.sampling import Scratch
+
+
+def render_opencv(
+    plan: RenderPlan, images: Sequence[torch.Tensor], scratch: Scratch | None = None
+) -> list[torch.Tensor]:
+    """Target views by OpenCV, for CPU images; not differentiable.
+
+    Args:
+        plan: The plan for these images' rig.
+        images: N images (3, H, W): uint8, or float in [0, 1].
+        scratch: Buffers to reuse between calls.
+
+    Returns:
+        M views (3, h, w) of the images' type, black where no source sees; slices of one (M, 3, h, w) block where all
+        targets have one size.
+    """
+    scratch = scratch or Scratch()
+    dtype = images[0].dtype
+    work = torch.uint8 if dtype == torch.uint8 else torch.float32
+    atlas = sampling.fill_atlas(plan.layout, [image.detach().to(work) for image in images], scratch)
+    views = _empty_views(plan, work)
+    for k, (target, view) in enumerate(zip(plan.targets, views, strict=True)):
+        h, w = target.source_camera.shape
+        if not target.pairs:
+            view.zero_()
+            continue
+        buffer = scratch.get(f"view{h}x{w}", (h, w, 3), atlas.dtype)
+        rendered = sampling.remap(atlas, target.at, plan.interpolation, dst=buffer)
+        for band in target.bands:
+            bh, bw = band.weight.shape
+            part = rendered[band.y : band.y + bh, band.x : band.x + bw]
+            second = sampling.remap(atlas, band.at, plan.interpolation)
+            part[...] = cv2.blendLinear(part, second, 1 - band.weight, band.weight)
+        cv2.split(rendered, list(views[k].numpy()))
+    return [view.to(dtype) for view in views]
+
+
+def render_torch(plan: RenderPlan, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+    """Target views by ``grid_sample``: batches, any device, differentiable in the images.
+
+    Args:
+        plan: The plan for these images' rig, shared by the batch.
+        images: N images (B, 3, H, W): uint8, or float in [0, 1]; sampled in float32.
+
+    Returns:
+        M views (B, 3, h, w) of the images' type.
+    """
+    dtype, device = images[0].dtype, images[0].device
+    atlas = sampling.torch_atlas(plan.layout, images)
+    views = []
+    for target in plan.targets:
+        coverage = torch.from_numpy(target.coverage).to(device)
+        grid = sampling.torch_grid(target.at.to_float(), plan.layout.size, device)
+        view = sampling.grid_sample(atlas, grid, plan.interpolation) * coverage
+        for band in target.bands:
+            bh, bw = band.weight.shape
+            part = (slice(None), slice(None), slice(band.y, band.y + bh), slice(band.x, band.x + bw))
+            second = sampling.grid_sample(
+                atlas, sampling.torch_grid(band.at.to_float(), plan.layout.size, device), plan.interpolation
+            )
+            weight = torch.from_numpy(band.weight).to(device)
+            blended = view.clone()
+            blended[part] = torch.lerp(view[part], second, weight.expand_as(second))
+            view = blended
+        views.append(_rounded(view, dtype))
+    return views
+
+
+def render_labels(
+    plan: RenderPlan, labels: Sequence[torch.Tensor], fill: float
+) -> list[torch.Tensor]:
+    """Label maps of the target views: the winning source's nearest label, ``fill`` where none sees.
+
+    Args:
+        plan: The plan for these labels' rig.
+        labels: N maps (..., H, W) of any type and device.
+        fill: Value of uncovered pixels.
+    """
+    rendered = []
+    for target in plan.targets:
+        positions = target.at.to_float()
+        out = labels[0].new_full((*labels[0].shape[:-2], *target.source_camera.shape), fill)
+        for pair in target.pairs:
+            slot = plan.layout.slot(pair.source, pair.level)
+            won = target.source_camera == pair.source
+            uv = slot.to_source(positions[won])
+            label = labels[pair.source]
+            h, w = label.shape[-2:]
+            pixel = np.floor(uv + 0.5).astype(np.int64).clip(0, (w - 1, h - 1))
+            x, y = (torch.from_numpy(np.ascontiguousarray(pixel[:, k])).to(label.device) for k in (0, 1))
+            out[..., torch.from_numpy(won).to(label.device)] = label[..., y, x]
+        rendered.append(out)
+    return rendered
+
+
+def _empty_views(plan: RenderPlan, dtype: torch.dtype) -> list[torch.Tensor]:
+    sizes = [t.source_camera.shape for t in plan.targets]
+    if len(set(sizes)) == 1:
+        return list(torch.empty((len(sizes), 3, *sizes[0]), dtype=dtype))
+    return [torch.empty((3, *size), dtype=dtype) for size in sizes]
+
+
+def _rounded(view: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
+    return torch.round(view).clamp(0, 255).to(dtype) if dtype == torch.uint8 else view.to(dtype)

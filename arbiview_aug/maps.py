@@ -1,0 +1,384 @@
+"""Where a target camera's pixels lie in a source image, over a surface: cheaply, and to a stated precision.
+
+Maps are evaluated in float64 on the nodes of a coarse grid and interpolated: cubically to half the spacing, bilinearly
+from there. Cells whose error bound exceeds the tolerance, and cells on the border of what can be projected, are
+evaluated pixel by pixel. Directions are held plane by plane, (3, ny, nx) in memory: three times faster than (ny, nx, 3).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from arbiview_aug.camera import BoolArray, Camera, FloatArray
+from arbiview_aug.sampling import Slot
+from arbiview_aug.surface import Surface
+
+Box = tuple[int, int, int, int]
+"""(first row, last row, first column, last column); of nodes both inclusive, of pixels the last exclusive."""
+
+_SMALL_SIDE_PX = 64  # targets with a shorter side are evaluated pixel by pixel: a coarse grid could step over a source
+_REFINEMENT = 2  # the cubic step halves the spacing once
+_CUBIC = np.array([[-1.0, 9.0, 9.0, -1.0]]) / 16  # mid-point of the cubic through four nodes
+_CORNERS = tuple((a, b) for a in (slice(None, -1), slice(1, None)) for b in (slice(None, -1), slice(1, None)))
+_FAR_AWAY_PX = 1e5  # float32 maps stay precise and int16 conversion saturates harmlessly
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Coarse nodes of a target image: node (j, i) lies at pixel (offset + step i, offset + step j).
+
+    Attributes:
+        size: (h, w) of the image.
+        step: Spacing in pixels; 1 means every pixel is a node.
+    """
+
+    size: tuple[int, int]
+    step: int
+
+    @classmethod
+    def for_size(cls, size: tuple[int, int], step: int) -> Grid:
+        """The grid of a target image; small images are evaluated pixel by pixel."""
+        return cls(size, 1 if min(size) < _SMALL_SIDE_PX else step)
+
+    @property
+    def offset(self) -> float:
+        """Position of the first node: cv2.resize puts it at (step - 1) / 2; two nodes lie outside, for the cubic."""
+        return (self.step - 1) / 2 - 2 * self.step if self.step > 1 else 0.0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx)."""
+        if self.step == 1:
+            return self.size
+        return tuple(math.ceil((n - 1 - self.offset) / self.step) + 2 for n in self.size)  # type: ignore[return-value]
+
+    def nodes(self) -> FloatArray:
+        """(ny, nx, 2) pixel positions of the nodes."""
+        ny, nx = self.shape
+        x, y = np.meshgrid(self.offset + self.step * np.arange(nx), self.offset + self.step * np.arange(ny))
+        return np.stack([x, y], -1)
+
+    def strips(self, rows_px: int) -> Iterator[tuple[int, int]]:
+        """First and last node row of strips about ``rows_px`` high that cover the image."""
+        shared = 0 if self.step == 1 else 1  # cells lie between nodes: neighbouring strips share a row of nodes
+        count, ny = max(rows_px // self.step, 1), self.shape[0]
+        for j0 in range(0, ny - shared, count):
+            rows = j0, min(j0 + count, ny - 1) if shared else min(j0 + count, ny) - 1
+            y0, y1, _, _ = self.pixels((*rows, 0, 0))
+            if y1 > y0:
+                yield rows
+
+    def pixels(self, nodes: Box) -> Box:
+        """The image's pixels between nodes j0..j1 and i0..i1."""
+        j0, j1, i0, i1 = nodes
+        if self.step == 1:
+            return j0, j1 + 1, i0, i1 + 1
+        h, w = self.size
+        first = round(self.offset + 0.5)
+        y0, y1, x0, x1 = (first + self.step * n for n in (j0, j1, i0, i1))
+        return max(y0, 0), min(y1, h), max(x0, 0), min(x1, w)
+
+    def upsample(self, values: npt.NDArray[np.floating], nodes: Box) -> npt.NDArray[np.float32]:
+        """Bilinear interpolation of node values (ny, nx[, 2]) to the pixels between ``nodes``."""
+        j0, j1, i0, i1 = nodes
+        part = np.ascontiguousarray(values[j0 : j1 + 1, i0 : i1 + 1], dtype=np.float32)
+        return part if self.step == 1 else self._enlarged(part, nodes, self.step)
+
+    def upsample_refined(self, uv: FloatArray, nodes: Box, slot: Slot) -> npt.NDArray[np.float32]:
+        """Source pixels (ny, nx, 2) as atlas positions of the pixels between ``nodes``, halving the spacing cubically."""
+        j0, j1, i0, i1 = nodes
+        if self.step == 1:
+            return slot.from_source(uv[j0 : j1 + 1, i0 : i1 + 1]).astype(np.float32)
+        ny, nx = uv.shape[:2]
+        m0, m1, n0, n1 = max(j0 - 1, 0), min(j1 + 1, ny - 1), max(i0 - 1, 0), min(i1 + 1, nx - 1)
+        part = slot.from_source(uv[m0 : m1 + 1, n0 : n1 + 1]).astype(np.float32)
+        fine = np.empty((2 * part.shape[0] - 1, 2 * part.shape[1] - 1, 2), np.float32)
+        across = cv2.filter2D(part, -1, _CUBIC, anchor=(1, 0), borderType=cv2.BORDER_REPLICATE)
+        fine[::2, ::2], fine[::2, 1::2] = part, across[:, :-1]
+        even = np.ascontiguousarray(fine[::2])
+        fine[1::2] = cv2.filter2D(even, -1, _CUBIC.T, anchor=(0, 1), borderType=cv2.BORDER_REPLICATE)[:-1]
+        top, left = 2 * (j0 - m0), 2 * (i0 - n0)
+        fine = np.ascontiguousarray(fine[top : top + 2 * (j1 - j0) + 1, left : left + 2 * (i1 - i0) + 1])
+        return self._enlarged(fine, nodes, self.step // 2)
+
+    def _enlarged(self, part: npt.NDArray[np.float32], nodes: Box, spacing: int) -> npt.NDArray[np.float32]:
+        full = cv2.resize(part, (part.shape[1] * spacing, part.shape[0] * spacing), interpolation=cv2.INTER_LINEAR)
+        y0, y1, x0, x1 = self.pixels(nodes)
+        # Node j0 lies at row (spacing - 1) / 2 of the enlarged block, and at offset + step j0 of the image.
+        dy = round((spacing - 1) / 2 - self.offset - self.step * nodes[0])
+        dx = round((spacing - 1) / 2 - self.offset - self.step * nodes[2])
+        return full[y0 + dy : y1 + dy, x0 + dx : x1 + dx]
+
+
+class TargetRays:
+    """A target camera's viewing rays on the nodes of its grid, and where they meet each surface asked for.
+
+    ``sparse`` holds every fourth node, for a first glance at each source.
+    """
+
+    def __init__(self, camera: Camera, step: int, counters: Counter[str]) -> None:
+        self.camera, self.counters = camera, counters
+        self.grid = Grid.for_size(camera.size, step)
+        self.nodes = self.grid.nodes()
+        self.directions, self.valid = ego_rays(camera, self.nodes)
+        self._inverse: dict[Surface, FloatArray] = {}
+        ny, nx = self.grid.shape
+        self.sparse_index = np.ix_(np.unique(np.r_[0:ny:4, ny - 1]), np.unique(np.r_[0:nx:4, nx - 1]))
+        planes = np.ascontiguousarray(np.moveaxis(self.directions[self.sparse_index], -1, 0))
+        self.sparse = np.moveaxis(planes, 0, -1), self.valid[self.sparse_index]
+
+    def inverse_distance(self, surface: Surface) -> FloatArray:
+        """(ny, nx) on the nodes; evaluated once for each surface."""
+        if surface not in self._inverse:
+            self._inverse[surface] = surface.inverse_distance(self.camera.center_m, self.directions)
+            self.counters[f"surface_{type(surface).__name__.lower()}"] += 1
+        return self._inverse[surface]
+
+
+class PairMap:
+    """Where one source sees one target.
+
+    Attributes:
+        uv: (ny, nx, 2) source pixels on the nodes, float64.
+        valid: (ny, nx) bool.
+        nodes: The nodes around everything that the source may see, or None if it sees nothing.
+    """
+
+    def __init__(self, rays: TargetRays, source: Camera, surface: Surface, tolerance_px: float) -> None:
+        self.rays, self.source, self.surface = rays, source, surface
+        self.offset_m = rays.camera.center_m - source.center_m
+        self.nodes: Box | None = None
+        if rays.grid.step > 1 and not self._glance():
+            return
+        self.uv, self.valid = project_rays(source, rays.directions, rays.inverse_distance(surface), self.offset_m)
+        self.valid &= rays.valid
+        self._exact = np.zeros((0, 0), bool)
+        if rays.grid.step == 1:
+            self.nodes = _bounds(self.valid & source.contains(self.uv), 0)
+        else:
+            self.nodes = self._classify(tolerance_px)
+
+    def _glance(self) -> bool:
+        """Whether any cell four times as large may hold a pixel of the source: most pairs end here."""
+        directions, valid = self.rays.sparse
+        q = self.rays.inverse_distance(self.surface)[self.rays.sparse_index]
+        uv, projected = project_rays(self.source, directions, q, self.offset_m)
+        whole, border = self._cells_that_may_see(uv, projected & valid)
+        return bool(whole.any() or border.any())
+
+    def _classify(self, tolerance_px: float) -> Box | None:
+        """Sort the cells: seeing nothing, interpolated, exact. Returns the nodes around those in use."""
+        whole, border = self._cells_that_may_see(self.uv, self.valid)
+        use = whole | border
+        box = _bounds(use, 1)
+        if box is None:
+            return None
+        self._exact = border | (whole & self._too_curved(box, tolerance_px))
+        exact = int(np.count_nonzero(self._exact))
+        self.rays.counters["cells_exact"] += exact
+        self.rays.counters["cells_interpolated"] += int(np.count_nonzero(use)) - exact
+        return box
+
+    def _cells_that_may_see(self, uv: FloatArray, valid: BoolArray) -> tuple[BoolArray, BoolArray]:
+        """Cells with four valid corners not all beyond one side of the image; cells on the border of validity."""
+        h, w = self.source.size
+        u, v = uv[..., 0], uv[..., 1]
+        beyond = (u < 0).view(np.uint8) | (u > w - 1).view(np.uint8) << 1
+        beyond |= (v < 0).view(np.uint8) << 2 | (v > h - 1).view(np.uint8) << 3
+        sides = [beyond[c] for c in _CORNERS]
+        not_beyond = (sides[0] & sides[1] & sides[2] & sides[3]) == 0
+        if valid.all():
+            return not_beyond, np.zeros(not_beyond.shape, bool)
+        all_valid = valid[_CORNERS[0]] & valid[_CORNERS[1]] & valid[_CORNERS[2]] & valid[_CORNERS[3]]
+        near = valid
+        if self.source.lens == "pinhole" and self.rays.camera.lens == "pinhole":
+            # Towards the plane z = 0 a pinhole's pixels run off to infinity: valid corners an image away stay away.
+            near = near & (u > -w) & (v > -h) & (u < 2 * w) & (v < 2 * h)
+        touched = (near[_CORNERS[0]] | near[_CORNERS[1]] | near[_CORNERS[2]] | near[_CORNERS[3]]).astype(np.uint8)
+        border = ~all_valid & (cv2.dilate(touched, np.ones((3, 3), np.uint8)) > 0)
+        return not_beyond & all_valid, border
+
+    def _too_curved(self, box: Box, tolerance_px: float) -> BoolArray:
+        """Cells whose interpolation may be off by more than the tolerance.
+
+        Bilinear interpolation over a spacing s errs by at most (|f_xx| + |f_yy|) s² / 8, the cubic mid-point by
+        3/128 of the fourth difference; both are read off the nodes. Where the surface has creases, the cells' centres
+        are evaluated too: a crease shows there with at least half its largest error.
+        """
+        bound = np.zeros(tuple(n - 1 for n in self.uv.shape[:2]))
+        j0, j1, i0, i1 = box
+        m0, n0 = max(j0 - 2, 0), max(i0 - 2, 0)
+        around = self.uv[m0 : j1 + 3, n0 : i1 + 3]
+        error = np.zeros(around.shape[:2])
+        for axis in (0, 1):
+            second = _larger(np.diff(around, 2, axis=axis))
+            fourth = _larger(np.diff(around, 4, axis=axis)) if around.shape[axis] > 4 else None
+            pad = [(0, 0), (0, 0)]
+            pad[axis] = (1, 1)
+            error += np.pad(second, pad, mode="edge") / (8 * _REFINEMENT**2)
+            if fourth is not None:
+                pad[axis] = (2, 2)
+                error += np.pad(fourth, pad, mode="edge") * (3 / 128)
+        cell = cv2.dilate(error, np.ones((2, 2), np.uint8), anchor=(0, 0))[j0 - m0 : j1 - m0, i0 - n0 : i1 - n0]
+        if not self.surface.smooth:
+            half = self.rays.grid.step / 2
+            centre, _ = self._evaluate(self.rays.nodes[j0:j1, i0:i1] + half)
+            uv = self.uv[j0 : j1 + 1, i0 : i1 + 1]
+            mean = sum(uv[c] for c in _CORNERS) / 4
+            cell = np.maximum(cell, 2 * _larger(mean - centre) / _REFINEMENT)
+        bound[j0:j1, i0:i1] = cell
+        return bound > tolerance_px
+
+    def _evaluate(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Source pixels of target pixels (..., 2) in float64, and where they are valid."""
+        directions, ray_valid = ego_rays(self.rays.camera, pixels)
+        q = self.surface.inverse_distance(self.rays.camera.center_m, directions)
+        uv, valid = project_rays(self.source, directions, q, self.offset_m)
+        return uv, valid & ray_valid
+
+    def full_resolution(self, slot: Slot, nodes: Box) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
+        """Atlas positions and visibility over the pixels between some of the nodes in use.
+
+        Args:
+            slot: Where the source lies in the atlas. Its affine change of coordinates is applied to the nodes, where
+                it is exact and costs nothing.
+            nodes: The part to evaluate.
+
+        Returns:
+            (h, w, 2) float32 positions, and (h, w) uint8, 255 where the source sees the pixel.
+        """
+        grid, source = self.rays.grid, self.source
+        at = grid.upsample_refined(self.uv, nodes, slot)
+        if grid.step == 1:
+            y0, y1, x0, x1 = grid.pixels(nodes)
+            at[~self.valid[y0:y1, x0:x1]] = -_FAR_AWAY_PX
+        else:
+            self._patch_exact(at, nodes, slot)
+        # Slack: a pixel on the very border must not drop out by a rounding of float32.
+        slack = 1e-3
+        low = slot.from_source(np.array([-slack, -slack]))
+        high = slot.from_source(np.array([source.width_px - 1 + slack, source.height_px - 1 + slack]))
+        visible = cv2.inRange(at, tuple(low), tuple(high))
+        if source.mask is not None:
+            visible &= _mask_at(source, slot, at)
+        if slot.level:
+            # The outer half pixel of the full image lies outside the halved one: read its border pixel.
+            h, w = slot.size
+            at = np.clip(at, (slot.x, slot.y), (slot.x + w - 1, slot.y + h - 1), dtype=np.float32)
+        return at, visible
+
+    @cached_property
+    def _exact_pixels(self) -> tuple[npt.NDArray[np.int64], FloatArray, BoolArray]:
+        """Pixels (n, 2) of the cells that cannot be interpolated, row by row of cells; their source pixels; validity."""
+        grid = self.rays.grid
+        j, i = np.nonzero(self._exact)
+        steps = np.arange(grid.step)
+        first = round(grid.offset + 0.5)
+        py = (first + grid.step * j)[:, None, None] + steps[None, :, None]  # [cells, step, 1]
+        px = (first + grid.step * i)[:, None, None] + steps[None, None, :]
+        py, px = np.broadcast_arrays(py, px)
+        pixels = np.stack([px.ravel(), py.ravel()], -1)
+        uv, valid = self._evaluate(pixels.astype(np.float64))
+        return pixels, uv, valid
+
+    def _patch_exact(self, at: npt.NDArray[np.float32], nodes: Box, slot: Slot) -> None:
+        """Put the exactly evaluated pixels into their places."""
+        j0, j1 = nodes[:2]
+        if not self._exact[j0:j1].any():
+            return
+        y0, y1, x0, x1 = self.rays.grid.pixels(nodes)
+        pixels, uv, valid = self._exact_pixels
+        start, stop = np.searchsorted(pixels[:: self.rays.grid.step**2, 1], [y0, y1]) * self.rays.grid.step**2
+        px, py = pixels[start:stop].T
+        inside = (py >= y0) & (py < y1) & (px >= x0) & (px < x1)
+        exact = np.clip(slot.from_source(uv[start:stop][inside]), -_FAR_AWAY_PX, _FAR_AWAY_PX)
+        exact = np.where(valid[start:stop][inside, None], exact, -_FAR_AWAY_PX)
+        at[py[inside] - y0, px[inside] - x0] = exact
+
+
+def ego_rays(camera: Camera, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Unit ego-frame rays of pixels (..., 2), as a (..., 3) view of plane-major memory, and their validity."""
+    directions, valid = camera.unproject_cam(pixels)
+    planes = np.ascontiguousarray(np.moveaxis(directions, -1, 0)).reshape(3, -1)
+    turned = (camera.cam2ego[:3, :3] @ planes).reshape(3, *pixels.shape[:-1])
+    return np.moveaxis(turned, 0, -1), valid
+
+
+def project_rays(
+    source: Camera, directions: FloatArray, inverse_distance: FloatArray, offset_m: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Source pixels of scene points on target rays, homogeneously: infinity is inverse distance 0.
+
+    Args:
+        source: The camera that recorded the image.
+        directions: (..., 3) unit rays of the target in the ego frame.
+        inverse_distance: (...,) along them, 1/m.
+        offset_m: (3,) the target's centre minus the source's, metres.
+
+    Returns:
+        Pixels (..., 2) and validity (...,).
+    """
+    R = source.cam2ego[:3, :3].T
+    planes = np.moveaxis(directions, -1, 0).reshape(3, -1)
+    points = R @ planes
+    if np.any(offset_m):
+        points += (R @ offset_m)[:, None] * inverse_distance.reshape(1, -1)
+    uv, _, valid = source.project_cam(np.moveaxis(points.reshape(3, *directions.shape[:-1]), 0, -1))
+    return uv, valid
+
+
+def _bounds(use: BoolArray, extra: int) -> Box | None:
+    """First and last row and column of True entries; ``extra`` more at the end (nodes around cells)."""
+    rows, columns = np.flatnonzero(use.any(axis=1)), np.flatnonzero(use.any(axis=0))
+    if len(rows) == 0:
+        return None
+    return int(rows[0]), int(rows[-1]) + extra, int(columns[0]), int(columns[-1]) + extra
+
+
+def _larger(vectors: FloatArray) -> FloatArray:
+    """The larger absolute component of (..., 2); a reduction over so short an axis would be ten times slower."""
+    return np.maximum(np.abs(vectors[..., 0]), np.abs(vectors[..., 1]))
+
+
+def _mask_at(source: Camera, slot: Slot, at: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+    """255 where all bilinear taps around atlas positions (h, w, 2) lie on the scene, not on the own car."""
+    assert source.mask is not None
+    safe = source.mask.astype(np.uint8) * 255
+    if slot.level:
+        # A halved pixel is clean where every pixel in it is.
+        clean = cv2.resize(safe, slot.size[::-1], interpolation=cv2.INTER_AREA)
+        safe = np.where(clean == 255, 255, 0).astype(np.uint8)
+    safe = cv2.erode(safe, np.ones((3, 3), np.uint8), borderValue=255)
+    local = cv2.subtract(at, (slot.x, slot.y, 0, 0)) if slot.x or slot.y else at
+    return cv2.remap(safe, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+
+
+def edge_distance(source: Camera, uv: FloatArray) -> FloatArray:
+    """Signed distance (px) of source pixels (..., 2) to the border of what the source sees, negative outside."""
+    u, v = uv[..., 0], uv[..., 1]
+    edge = np.minimum(np.minimum(u, source.width_px - 1 - u), np.minimum(v, source.height_px - 1 - v))
+    if source.mask is None:
+        return edge
+    coarse = cv2.resize(source.mask.astype(np.float32), None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)
+    free = np.pad((coarse >= 1).astype(np.uint8), 1, constant_values=1)
+    distance = cv2.distanceTransform(free, cv2.DIST_L2, 3)[1:-1, 1:-1] * 8
+    index = np.clip(np.clip(uv, -8, _FAR_AWAY_PX) / 8, 0, (coarse.shape[1] - 1, coarse.shape[0] - 1)).astype(np.int64)
+    return np.where(edge >= 0, np.minimum(edge, distance[index[..., 1], index[..., 0]]), edge)
+
+
+def resolution(uv: FloatArray, step: int) -> FloatArray:
+    """Source pixels per target pixel along the worse axis (ny, nx): the smaller singular value of the map's Jacobian."""
+    if min(uv.shape[:2]) < 2:
+        return np.ones(uv.shape[:2])
+    by_y, by_x = np.gradient(uv, step, axis=(0, 1))
+    a, b, c, d = by_x[..., 0], by_y[..., 0], by_x[..., 1], by_y[..., 1]
+    half_sum, determinant = (a * a + b * b + c * c + d * d) / 2, a * d - b * c
+    return np.sqrt(np.maximum(half_sum - np.sqrt(np.maximum(half_sum**2 - determinant**2, 0)), 0))

@@ -1,0 +1,118 @@
+"""The render plan: everything about a (source rig, target rig) pair that does not depend on image content.
+
+For every target camera (``arbiview_aug.target_plan``): which sources see it, over which surface and why, where each
+pixel is read, which source wins it, and the narrow bands along seams that are blended. Executing a plan is reading images at maps
+(``arbiview_aug.sampling``); building one is cheap enough for calibrations that change with every frame: maps are
+evaluated in float64 on a coarse grid and interpolated wherever that is exact to ``map_tolerance_px``, and pixel by
+pixel elsewhere.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter, OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+
+from arbiview_aug.camera import BoolArray
+from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.rig import Rig, content_order
+from arbiview_aug.sampling import AtlasLayout, Scratch
+from arbiview_aug.target_plan import TargetDraft, TargetPlan
+
+@dataclass(frozen=True)
+class RenderPlan:
+    """Everything needed to render a target rig from a source rig's images; plain data, picklable.
+
+    Attributes:
+        source: The source rig.
+        target: The target rig in the source's ego frame, on the source's road.
+        layout: Where the sources lie in the atlas.
+        targets: One plan for each target camera.
+        interpolation: ``linear`` or ``nearest``.
+        counters: What was evaluated while building: pairs by surface, cells interpolated and exact, bands.
+    """
+
+    source: Rig
+    target: Rig
+    layout: AtlasLayout
+    targets: tuple[TargetPlan, ...]
+    interpolation: str
+    counters: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held by the maps."""
+        return sum(t.nbytes for t in self.targets)
+
+    @property
+    def coverage(self) -> list[BoolArray]:
+        """(h, w) for each target camera."""
+        return [t.coverage for t in self.targets]
+
+
+class PlanCache:
+    """Plans by content key, the least recently used dropped once ``max_bytes`` are held. Pickles as empty."""
+
+    def __init__(self, max_bytes: int = 512 * 2**20) -> None:
+        self.max_bytes = max_bytes
+        self.hits = self.misses = 0
+        self._plans: OrderedDict[bytes, RenderPlan] = OrderedDict()
+
+    def get(self, key: bytes, build: Callable[[], RenderPlan]) -> RenderPlan:
+        """The plan of this key, built if it is not held."""
+        if key in self._plans:
+            self.hits += 1
+            self._plans.move_to_end(key)
+            return self._plans[key]
+        self.misses += 1
+        plan = build()
+        self._plans[key] = plan
+        held = self.nbytes
+        while held > self.max_bytes and len(self._plans) > 1:
+            held -= self._plans.popitem(last=False)[1].nbytes
+        return plan
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held by all plans."""
+        return sum(plan.nbytes for plan in self._plans.values())
+
+    def __len__(self) -> int:
+        return len(self._plans)
+
+    def __reduce__(self) -> tuple[type[PlanCache], tuple[int]]:
+        return PlanCache, (self.max_bytes,)
+
+
+def plan_key(source: Rig, target: Rig, surface: str, config: FavsConfig) -> bytes:
+    """Content key of a plan: the calibrations, the surface and the settings, no names."""
+    settings = tuple(getattr(config, f.name) for f in fields(config))
+    return hashlib.sha256(repr((source.content_key, target.content_key, surface, settings)).encode()).digest()
+
+
+def build_plan(source: Rig, target: Rig, *, surface: str = "auto", config: FavsConfig | None = None) -> RenderPlan:
+    """Plan how ``target`` is rendered from ``source``'s images.
+
+    Args:
+        source: The rig that recorded the images.
+        target: The rig to render, in its own ego frame: the two roads are made to coincide.
+        surface: ``far``, ``ground``, ``street``; or ``auto``: for each pair of target and source camera, ``far``
+            where their centres coincide or the worst-case parallax is below ``config.far_parallax_px``, else
+            ``street``.
+        config: Settings; the ``fast`` preset by default.
+
+    Returns:
+        The plan. Targets that no source sees have zero coverage.
+    """
+    config = config or FavsConfig()
+    target = target.in_frame_of(source)
+    counters: Counter[str] = Counter()
+    order = content_order(source.cameras)
+    drafts = [TargetDraft(source, order, camera, surface, config, counters) for camera in target]
+    used = [(region.source, region.level) for draft in drafts for region in draft.regions]
+    layout = AtlasLayout.for_sources(source.sizes, used)
+    scratch = Scratch()
+    targets = tuple(draft.finish(layout, scratch) for draft in drafts)
+    counters["bands"] = sum(len(t.bands) for t in targets)
+    return RenderPlan(source, target, layout, targets, config.interpolation, dict(counters))

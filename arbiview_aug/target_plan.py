@@ -1,0 +1,344 @@
+"""How one target view is rendered: which sources see it, over which surface, who wins each pixel, blended seams."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from arbiview_aug import sampling
+from arbiview_aug.camera import BoolArray, Camera, FloatArray
+from arbiview_aug.favs.adaptive_fusion import distance_weight, primary_weight, quality_weight
+from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.maps import Box, PairMap, TargetRays, edge_distance, resolution
+from arbiview_aug.rig import Rig
+from arbiview_aug.sampling import AtlasLayout, FixedMap, Scratch
+from arbiview_aug.surface import depth_uncertainty, make_surface, worst_parallax_px
+
+SAME_CENTER_M = 1e-6
+"""Centres closer than this coincide: a homography is exact whatever the scene."""
+
+_STRIP_PX = 128  # rows worked on at once: they fit a cache, and slanted seams make narrow rectangles
+_LEAST_SHARE = 1 / 256  # a source that adds less than this to a pixel cannot change a grey level
+
+
+@dataclass(frozen=True)
+class PairReport:
+    """Why and how one source serves one target; ``explain`` prints it.
+
+    Attributes:
+        source: Index of the source camera in the source rig.
+        surface: The surface its pixels are read over.
+        reason: Why that surface.
+        baseline_m: Distance between the two optical centres.
+        parallax_px: Expected displacement from unknown depth: the median over the pixels that the source wins.
+        share: Share of the target's pixels that it wins.
+        level: How many times its image is halved before it is read.
+    """
+
+    source: int
+    surface: str
+    reason: str
+    baseline_m: float
+    parallax_px: float
+    share: float
+    level: int
+
+
+@dataclass(frozen=True)
+class Band:
+    """A rectangle in which a second source is blended into the winning one.
+
+    Attributes:
+        y: First row in the target.
+        x: First column.
+        source: Index of the second source.
+        at: Where it is read.
+        weight: (h, w) float32 share of the second source, at most 0.5; 0 where it adds nothing.
+    """
+
+    y: int
+    x: int
+    source: int
+    at: FixedMap
+    weight: npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class TargetPlan:
+    """How one target view is rendered.
+
+    Attributes:
+        at: Where each pixel reads its winning source in the atlas.
+        source_camera: (h, w) int8 index of the winning source, -1 where no source sees the pixel.
+        bands: Blended rectangles along the seams.
+        pairs: One report for each source that wins any pixel.
+    """
+
+    at: FixedMap
+    source_camera: npt.NDArray[np.int8]
+    bands: tuple[Band, ...]
+    pairs: tuple[PairReport, ...]
+
+    @property
+    def coverage(self) -> BoolArray:
+        """(h, w) True where some source sees the pixel."""
+        return self.source_camera >= 0
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held."""
+        bands = sum(b.at.nbytes + b.weight.nbytes for b in self.bands)
+        return self.at.nbytes + self.source_camera.nbytes + bands
+
+
+@dataclass
+class _Region:
+    """What one source contributes to one target."""
+
+    source: int
+    level: int
+    surface: str
+    reason: str
+    baseline_m: float
+    pair: PairMap
+    score: npt.NDArray[np.float32]  # [ny, nx] stage-4 weight on the nodes, 0 where not visible
+    parallax: npt.NDArray[np.float32]  # [ny, nx] expected displacement, target pixels
+    border_px: npt.NDArray[np.float32]  # [ny, nx] distance to the border of what the source sees, target pixels
+
+
+@dataclass(frozen=True)
+class _Visible:
+    """A strip of a region at full resolution."""
+
+    source: int
+    box: Box  # y0, y1, x0, x1
+    at: npt.NDArray[np.float32]  # [box h, box w, 2] atlas positions
+    visible: npt.NDArray[np.uint8]  # [box h, box w] 255 where the source sees the pixel
+    weight: npt.NDArray[np.float32]  # [box h, box w] seam weight
+
+
+class TargetDraft:
+    """Builds one target's plan in two steps: what each source sees, then who wins and where seams are blended."""
+
+    def __init__(
+        self, source: Rig, order: list[int], camera: Camera, surface: str, config: FavsConfig, counters: Counter[str]
+    ) -> None:
+        self.source, self.camera, self.surface, self.config = source, camera, surface, config
+        self.counters = counters
+        self.rays = TargetRays(camera, config.grid_step_px, counters)
+        self.grid = self.rays.grid
+        # In content order, so that ties never depend on the order of the source list.
+        self.regions = [region for k in order if (region := self._region(k)) is not None]
+
+    # --- what a source sees -------------------------------------------------------------------------------------------
+    def _choose_surface(self, baseline_m: float, focal_px: float) -> tuple[str, str]:
+        if baseline_m < SAME_CENTER_M:
+            return "far", "centres coincide: exact"
+        if self.surface != "auto":
+            return self.surface, "asked for"
+        worst = worst_parallax_px(baseline_m, focal_px)
+        if worst < self.config.far_parallax_px:
+            return "far", f"worst-case parallax {worst:.2f} px"
+        return "street", f"centres {baseline_m:.2f} m apart"
+
+    def _region(self, index: int) -> _Region | None:
+        source = self.source[index]
+        offset_m = self.camera.center_m - source.center_m
+        baseline_m = float(np.linalg.norm(offset_m))
+        focal_px = float(self.camera.K[0, 0])
+        name, reason = self._choose_surface(baseline_m, focal_px)
+        surface = make_surface(name, self.source.ground_z_m)
+        pair = PairMap(self.rays, source, surface, self.config.map_tolerance_px)
+        if pair.nodes is None:
+            return None
+        self.counters[f"pairs_{name}"] += 1
+        pixels_per_pixel = resolution(pair.uv, self.grid.step)
+        edge_px = edge_distance(source, pair.uv)
+        seen = pair.valid & (edge_px >= 0)
+        level = self._level(pixels_per_pixel[seen], source.size) if self.config.antialias else 0
+        parallax = self._expected_parallax(offset_m, focal_px, self.rays.inverse_distance(surface))
+        score = (
+            distance_weight(edge_px, min(source.size) / 2, self.config.distance_gamma)
+            * quality_weight(parallax, pixels_per_pixel)
+            * primary_weight(baseline_m < SAME_CENTER_M, self.config.primary_bonus)
+        )
+        return _Region(
+            source=index,
+            level=level,
+            surface=name,
+            reason=reason,
+            baseline_m=baseline_m,
+            pair=pair,
+            score=np.where(seen, score, 0).astype(np.float32),
+            parallax=parallax.astype(np.float32),
+            border_px=(edge_px / np.maximum(pixels_per_pixel, 1e-3)).astype(np.float32),
+        )
+
+    def _expected_parallax(self, offset_m: FloatArray, focal_px: float, q: FloatArray) -> FloatArray:
+        """Displacement (target px) that the unknown depth around a surface may cause: offset across the ray x spread."""
+        along_m = self.rays.directions @ offset_m
+        across_m = np.sqrt(np.maximum(offset_m @ offset_m - along_m**2, 0))
+        return focal_px * across_m * depth_uncertainty(q)
+
+    @staticmethod
+    def _level(resolution: FloatArray, size: tuple[int, int]) -> int:
+        """Halvings: the largest power of two not above the minification, of most of what is seen."""
+        if resolution.size == 0:
+            return 0
+        # 2 % of tolerance: a target of exactly half size must read the halved source.
+        level = int(max(0, math.floor(math.log2(max(1.02 * float(np.quantile(resolution, 0.2)), 1e-6)))))
+        while level and min(sampling.level_size(size, level)) < 2:
+            level -= 1
+        return level
+
+    # --- who wins -----------------------------------------------------------------------------------------------------
+    def finish(self, layout: AtlasLayout, scratch: Scratch) -> TargetPlan:
+        """Winners, maps into the atlas, and blended bands; strip by strip, so that the work stays in the cache."""
+        h, w = self.camera.size
+        fixed = FixedMap(np.empty((h, w, 2), np.int16), np.empty((h, w), np.uint16))
+        winner = np.full((h, w), -1, np.int8)
+        weights = self._seam_weights()
+        shared = np.sum([weight > 0 for weight in weights], axis=0) > 1 if len(weights) > 1 else None
+        bands: list[Band] = []
+        for rows in self.grid.strips(_STRIP_PX):
+            y0, y1, _, _ = self.grid.pixels((*rows, 0, 0))
+            at = scratch.get("at", (y1 - y0, w, 2), np.float32)
+            at.fill(sampling.OUTSIDE)
+            best = scratch.get("best", (y1 - y0, w), np.float32)
+            best.fill(-1)  # a source that sees a pixel beats none, even with a weight of 0
+            seen = []
+            for region, weight in zip(self.regions, weights, strict=True):
+                part = self._visible(region, weight, rows, layout)
+                if part is None:
+                    continue
+                seen.append(part)
+                top, bottom, left, right = part.box
+                held = best[top - y0 : bottom - y0, left:right]
+                wins = cv2.bitwise_and(part.visible, cv2.compare(part.weight, held, cv2.CMP_GT))
+                cv2.copyTo(part.weight, wins, held)
+                cv2.copyTo(part.at, wins, at[top - y0 : bottom - y0, left:right])
+                np.copyto(winner[top:bottom, left:right], np.int8(region.source), where=wins > 0)
+            fixed.fill_rows(y0, y1, at)
+            if shared is not None and len(seen) > 1 and self.config.seam_width > 0:
+                bands.extend(self._bands(seen, winner, shared, rows))
+        if self.config.interpolation == "nearest":
+            fixed = fixed.rounded()
+        return TargetPlan(fixed, winner, tuple(bands), tuple(self._reports(winner)))
+
+    def _visible(
+        self, region: _Region, weight: npt.NDArray[np.float32], rows: tuple[int, int], layout: AtlasLayout
+    ) -> _Visible | None:
+        """One strip of a region at full resolution, or nothing."""
+        assert region.pair.nodes is not None
+        j0, j1, i0, i1 = region.pair.nodes
+        nodes = (max(j0, rows[0]), min(j1, rows[1]), i0, i1)
+        box = self.grid.pixels(nodes)
+        if box[1] <= box[0] or box[3] <= box[2]:
+            return None
+        at, visible = region.pair.full_resolution(layout.slot(region.source, region.level), nodes)
+        return _Visible(region.source, box, at, visible, self.grid.upsample(weight, nodes))
+
+    def _seam_weights(self) -> list[npt.NDArray[np.float32]]:
+        """Weights on the nodes: each source's winning area, softened over the seam width, fading at its own border."""
+        scores = [region.score for region in self.regions]
+        width_px = self.config.seam_width * self.camera.width_px
+        if width_px == 0 or len(scores) < 2:
+            return scores
+        best = np.maximum.reduce(scores)
+        radius = max(1, round(width_px / self.grid.step / 2))
+        weights: list[npt.NDArray[np.float32]] = []
+        taken = np.zeros(best.shape, bool)
+        for region, score in zip(self.regions, scores, strict=True):
+            label = (score == best) & (score > 0) & ~taken
+            taken |= label
+            # Two passes of a box make a smooth ramp.
+            soft = label.astype(np.float32)
+            for _ in range(2):
+                soft = cv2.blur(soft, (2 * radius + 1, 2 * radius + 1), borderType=cv2.BORDER_REPLICATE)
+            weights.append(soft * np.clip(region.border_px / width_px, 0, 1))
+        return weights
+
+    def _bands(
+        self, seen: list[_Visible], winner: npt.NDArray[np.int8], shared: BoolArray, rows: tuple[int, int]
+    ) -> Iterator[Band]:
+        """The blended rectangles of one strip: runs of node columns where two sources have weight."""
+        # Pixels lie between nodes: one node more on each side.
+        columns = shared[max(rows[0] - 1, 0) : rows[1] + 2].any(axis=0)
+        columns[1:] |= columns[:-1].copy()
+        columns[:-1] |= columns[1:].copy()
+        for i0, i1 in _runs(columns):
+            yield from self._bands_in(self.grid.pixels((*rows, i0, i1)), seen, winner)
+
+    def _bands_in(self, box: Box, seen: list[_Visible], winner: npt.NDArray[np.int8]) -> Iterator[Band]:
+        """The second sources within one rectangle of pixels."""
+        y0, y1, x0, x1 = box
+        local = [s for s in seen if _overlap(box, s.box)]
+        if y1 <= y0 or x1 <= x0 or len(local) < 2:
+            return
+        weight = np.zeros((len(local), y1 - y0, x1 - x0), np.float32)
+        at = np.full((*weight.shape, 2), sampling.OUTSIDE, np.float32)
+        for k, s in enumerate(local):
+            b0, _, c0, _ = s.box
+            t, b, le, r = _overlap(box, s.box)
+            mine, here = (slice(t - b0, b - b0), slice(le - c0, r - c0)), (slice(t - y0, b - y0), slice(le - x0, r - x0))
+            weight[k][here] = np.where(s.visible[mine] > 0, s.weight[mine], 0)
+            at[k][here] = s.at[mine]
+        index = np.array([s.source for s in local])
+        is_winner = winner[None, y0:y1, x0:x1] == index[:, None, None]
+        first = np.where(is_winner, weight, 0).max(axis=0)
+        others = np.where(is_winner, 0, weight)
+        second, second_weight = others.argmax(axis=0), others.max(axis=0)
+        share = second_weight / np.maximum(first + second_weight, 1e-30)
+        for k, source in enumerate(index.tolist()):
+            adds = (second == k) & (share >= _LEAST_SHARE)
+            if not adds.any():
+                continue
+            ys, xs = np.flatnonzero(adds.any(axis=1)), np.flatnonzero(adds.any(axis=0))
+            tight = (slice(ys[0], ys[-1] + 1), slice(xs[0], xs[-1] + 1))
+            # Where this source adds nothing its positions may lie in a neighbour in the atlas: read nothing there.
+            positions = np.where(adds[..., None], at[k], np.float32(sampling.OUTSIDE))[tight]
+            part = np.where(adds, share, 0).astype(np.float32)[tight]
+            fixed = FixedMap.from_float(np.ascontiguousarray(positions))
+            yield Band(y0 + int(ys[0]), x0 + int(xs[0]), source, fixed, part)
+
+    def _reports(self, winner: npt.NDArray[np.int8]) -> list[PairReport]:
+        # Node values are read at the pixel nearest to each node: precise enough for a report.
+        pixel = np.round(self.rays.nodes).astype(int).clip(0, [self.camera.width_px - 1, self.camera.height_px - 1])
+        on_nodes = winner[pixel[..., 1], pixel[..., 0]]
+        reports = []
+        for region in self.regions:
+            share = cv2.countNonZero(cv2.inRange(winner, region.source, region.source)) / winner.size
+            if share == 0:
+                continue
+            won = region.parallax[on_nodes == region.source]
+            reports.append(
+                PairReport(
+                    source=region.source,
+                    surface=region.surface,
+                    reason=region.reason,
+                    baseline_m=region.baseline_m,
+                    parallax_px=float(np.median(won)) if won.size else 0.0,
+                    share=share,
+                    level=region.level,
+                )
+            )
+        return sorted(reports, key=lambda r: -r.share)
+
+
+def _runs(flags: BoolArray) -> Iterator[tuple[int, int]]:
+    """First and last index of each run of True."""
+    edges = np.flatnonzero(np.diff(np.r_[False, flags, False].astype(np.int8)))
+    for start, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        yield start, stop - 1
+
+
+def _overlap(one: Box, two: Box) -> Box | tuple[()]:
+    """The common part of two pixel boxes, or nothing."""
+    y0, y1, x0, x1 = max(one[0], two[0]), min(one[1], two[1]), max(one[2], two[2]), min(one[3], two[3])
+    return (y0, y1, x0, x1) if y1 > y0 and x1 > x0 else ()
