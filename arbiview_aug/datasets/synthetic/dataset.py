@@ -98,7 +98,8 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         return self.num_frames
 
     def __repr__(self) -> str:
-        return f"SyntheticDrive({len(self)} frames, seed {self.seed}, rig {self.rig.name or 'unnamed'}: {len(self.rig)} cameras)"
+        rig = f"rig {self.rig.name or '(unnamed)'}: {len(self.rig)} cameras"
+        return f"SyntheticDrive({len(self)} frames, seed {self.seed}, {rig})"
 
     def scene(self, index: int) -> Scene:
         """The street as plain data.
@@ -113,7 +114,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         scene = self.scene(index)
-        views = [self._renderer.render(scene, camera, self.rig.ground_z_m) for camera in self.rig]
+        views = self._renderer.render(scene, self.rig.cameras, self.rig.ground_z_m)
         sample: dict[str, Any] = {
             "images": stack_or_list([v.image for v in views]),
             "rig": self.rig,
@@ -138,7 +139,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         """
         rig = self.rig if rig is None else _checked_rig(rig)
         scene = self.scene(index)
-        views = [self._renderer.render(scene, camera, rig.ground_z_m) for camera in rig]
+        views = self._renderer.render(scene, rig.cameras, rig.ground_z_m)
         return RenderedViews(*(stack_or_list([v[k] for v in views]) for k in range(4)))
 
     @torch.no_grad()

@@ -169,7 +169,7 @@ def slab_color(street: Street, salt: int, p: Tensor, top: Tensor, fx: Tensor, fy
     tone = 1 + 0.14 * (cell_hash(i, j, salt + 72) - 0.5) * fade(f, 0.6)
     joints = torch.maximum(pulses(x, 0.6, 0.02, fx), pulses(y, 0.6, 0.02, fy))
     color = base * (dark * tone * (1 - 0.4 * joints))[:, None]
-    green = torch.tensor([0.24, 0.33, 0.13], device=x.device)
+    green = torch.tensor([0.25, 0.29, 0.15], device=x.device)
     blades = (
         1
         + 0.20 * octave(x, y, 0.9, f, salt + 73)
@@ -178,7 +178,9 @@ def slab_color(street: Street, salt: int, p: Tensor, top: Tensor, fx: Tensor, fy
     )
     grass = green * blades[:, None]
     away = (corner > 2.6).float()
-    lawn = band(behind, half[1], 1e4, fy) * away
+    # Yards: some plots are paved, some are lawns.
+    plot = cell_hash((x * (1 / 19.0)).floor().to(torch.int32), left.to(torch.int32), salt + 77) < 0.6
+    lawn = band(behind, half[1], 1e4, fy) * away * plot
     verge = band(behind, _scalar(0.16, y), 0.16 + half[2], fy) * away
     color = mix(color, grass, torch.maximum(lawn, verge))
     stones = torch.maximum(pulses(x, 1.0, 0.015, fx), pulses(y, 1.0, 0.015, fy))
@@ -244,8 +246,8 @@ def _cast_shadows(scene: Scene, xs, ys, sun, window) -> None:  # type: ignore[no
         else:
             A = scene.rotation[k].T / scene.half[k][:, None]
             e = A @ d
-            o = [np.float32(A[m, 0]) * (x - np.float32(scene.center[k, 0])) + np.float32(A[m, 1]) * (y - np.float32(scene.center[k, 1]))
-                 - np.float32(A[m, 2] * scene.center[k, 2]) for m in range(3)]  # fmt: skip
+            A32, c = A.astype(np.float32), scene.center[k].astype(np.float32)
+            o = [row[0] * (x - c[0]) + row[1] * (y - c[1]) - row[2] * c[2] for row in A32]
             if scene.kind[k] == CYLINDER:
                 t0, t1 = ((s - o[2]) / np.float32(e[2] or 1e-9) for s in (-1, 1))
                 e[2] = 0

@@ -38,7 +38,8 @@ DARK: Color = (0.11, 0.11, 0.12)
 
 
 def _pick(rng: np.random.Generator, colors: tuple[Color, ...], spread: float = 0.05) -> Color:
-    base = np.array(colors[int(rng.integers(len(colors)))]) + rng.normal(0, spread, 3)
+    # Brightness varies more than hue.
+    base = np.array(colors[int(rng.integers(len(colors)))]) + rng.normal(0, spread) + rng.normal(0, spread / 4, 3)
     return tuple(float(c) for c in base.clip(0.05, 0.92))  # type: ignore[return-value]
 
 
@@ -64,9 +65,11 @@ def add_vehicle(
     paint = _pick(rng, _PAINTS)
     x, y = length / 2, width / 2 - 0.02  # wheels stand out by 2 cm and give the width
     radius = min(0.25 + 0.05 * height, 0.48)
+    reach = (0.68 if cls is BoxClass.TRUCK else 0.62) * x
+    arch = (reach, radius, 0.0, 0.0)
     if cls is BoxClass.CAR:
         waist = float(rng.uniform(0.52, 0.60)) * height
-        place.box((-x, x), (-y, y), (0.20, waist), Material.PAINT, paint, taper=(0.10, 0.06, 0.03, 0.03))
+        place.box((-x, x), (-y, y), (0.20, waist), Material.PAINT, paint, taper=(0.10, 0.06, 0.03, 0.03), param=arch)
         rear = float(rng.choice([0.06, 0.3, 0.55])) * length / 2  # estate, hatchback, saloon
         place.box(
             (-x + 0.08 + rear * 0.55, 0.22 * length),
@@ -79,7 +82,7 @@ def add_vehicle(
         )
     elif cls is BoxClass.VAN:
         waist = 0.48 * height
-        place.box((-x, x), (-y, y), (0.24, waist), Material.PAINT, paint, taper=(0.08, 0, 0, 0))
+        place.box((-x, x), (-y, y), (0.24, waist), Material.PAINT, paint, taper=(0.08, 0, 0, 0), param=arch)
         cargo = float(rng.random() < 0.5)
         place.box(
             (-x, x - 0.75),
@@ -103,7 +106,6 @@ def add_vehicle(
         place.box((-x + 0.1, x - cab), (-0.45, 0.45), (0.5, 0.95), Material.PLAIN, DARK)
     else:
         place.box((-x, x), (-y, y), (0.32, height), Material.COACH, paint, taper=(0.10, 0.02, 0.02, 0.02))
-    reach = 0.62 * x if cls is not BoxClass.TRUCK else 0.68 * x
     for side in (-1, 1):
         for end in (-1, 1):
             center = (end * reach, side * (width / 2 - 0.11), radius)
@@ -121,17 +123,22 @@ def add_pedestrian(
     place = builder.place(xyz, yaw, SceneClass.PEDESTRIAN, row)
     trousers, jacket = _pick(rng, _CLOTHES), _pick(rng, _CLOTHES)
     skin = _pick(rng, ((0.80, 0.62, 0.52), (0.55, 0.38, 0.28), (0.35, 0.24, 0.18)), 0.02)
+    sleeve: Color = (jacket[0] * 0.85, jacket[1] * 0.85, jacket[2] * 0.85)
     hip, shoulder, head = 0.48 * height, 0.83 * height, 0.115
     stride = length / 2 - 0.075
     for side in (-1, 1):
         leg = (side * stride * 0.9, side * width * 0.17, hip / 2)
         place.cylinder(leg, (0.075, 0.07), hip / 2, Material.PLAIN, trousers)
     torso = ((hip + shoulder) / 2, (shoulder - hip) / 2)
-    place.cylinder((0, 0, torso[0]), (0.15, width / 2 - 0.09), torso[1], Material.ROUGH, jacket, param=(0.1, 0.1, 0, 0))
+    middle, reach = (0.0, 0.0, torso[0]), (0.14, width / 2 - 0.08)
+    place.cylinder(middle, (reach[0] * 0.9, reach[1] * 0.88), torso[1], Material.ROUGH, jacket, param=(0.1, 0.06, 0, 0))
+    place.ellipsoid((0, 0, shoulder - 0.06), (reach[0], width / 2 - 0.03, 0.10), Material.PLAIN, jacket)
+    place.cylinder((0, 0, shoulder + 0.04), (0.055, 0.055), 0.09, Material.PLAIN, skin)
     for side in (-1, 1):
         # The swinging arms carry the box's length and width.
         arm = (-side * (length / 2 - 0.055), side * (width / 2 - 0.055), torso[0])
-        place.cylinder(arm, (0.055, 0.055), torso[1] * 0.95, Material.PLAIN, jacket)
+        place.cylinder(arm, (0.055, 0.055), torso[1] * 0.92, Material.PLAIN, sleeve)
+        place.ellipsoid((arm[0], arm[1], hip - 0.03), (0.045, 0.045, 0.08), Material.PLAIN, skin)
     place.ellipsoid((0, 0, height - head), (0.10, 0.085, head), Material.PLAIN, skin)
 
 
@@ -141,28 +148,32 @@ def add_tree(builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, 
     height, trunk = float(rng.uniform(4.5, 10)), float(rng.uniform(0.09, 0.22))
     fork = height * float(rng.uniform(0.35, 0.5))
     bark = _pick(rng, ((0.30, 0.25, 0.20), (0.36, 0.33, 0.29)), 0.03)
-    place.cylinder((0, 0, fork * 0.6), (trunk, trunk), fork * 0.6, Material.ROUGH, bark, param=(0.12, 0.35, 0, 0))
-    spread = (height - fork) * float(rng.uniform(0.38, 0.6))
-    green = _pick(rng, ((0.24, 0.36, 0.14), (0.18, 0.30, 0.12), (0.34, 0.38, 0.14), (0.42, 0.32, 0.12)), 0.03)
-    for k in range(int(rng.integers(4, 7))):
-        turn, out = 2.4 * k, spread * float(rng.uniform(0.25, 0.55)) * (k > 0)
-        radius = spread * float(rng.uniform(0.55, 0.85))
-        z = fork + (height - fork) * float(rng.uniform(0.3, 0.75))
+    place.cylinder((0, 0, fork * 0.6), (trunk, trunk), fork * 0.6, Material.ROUGH, bark, param=(0.12, 0.12, 0, 0))
+    spread = (height - fork) * float(rng.uniform(0.38, 0.55))
+    green = _pick(rng, ((0.22, 0.31, 0.13), (0.17, 0.26, 0.11), (0.30, 0.33, 0.14), (0.36, 0.28, 0.12)), 0.02)
+    for k in range(int(rng.integers(7, 11))):
+        # The golden angle spreads the lumps evenly around the trunk.
+        turn, out = 2.4 * k, spread * float(rng.uniform(0.35, 0.8)) * (k > 0)
+        radius = spread * float(rng.uniform(0.36, 0.58)) * (1.25 if k == 0 else 1.0)
+        z = fork + (height - fork) * float(rng.uniform(0.18, 0.80))
         place.ellipsoid(
             (out * np.cos(turn), out * np.sin(turn), z),
-            (radius, radius, radius * float(rng.uniform(0.7, 1.0))),
+            (radius, radius, radius * float(rng.uniform(0.65, 0.95))),
             Material.LEAF,
             green,
         )
 
 
-def add_bush(builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float]) -> None:
-    """A low ellipsoid of leaves."""
+def add_bush(
+    builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float], *, scale: float = 1.0
+) -> None:
+    """Low ellipsoids of leaves."""
     place = builder.place(xyz, float(rng.uniform(0, 6.28)), SceneClass.VEGETATION)
-    r = rng.uniform(0.5, 1.1, 2)
-    green = _pick(rng, ((0.20, 0.32, 0.14), (0.28, 0.34, 0.16)), 0.03)
-    height = float(rng.uniform(0.5, 0.9))
-    place.ellipsoid((0, 0, height * 0.6), (float(r[0]), float(r[1]), height), Material.LEAF, green)
+    green = _pick(rng, ((0.20, 0.28, 0.13), (0.26, 0.30, 0.15)), 0.02)
+    for _ in range(4):
+        x, y = rng.normal(0, 0.4 * scale, 2)
+        r, height = scale * float(rng.uniform(0.35, 0.65)), scale * float(rng.uniform(0.35, 0.75))
+        place.ellipsoid((float(x), float(y), height * 0.6), (r, r * 0.9, height), Material.LEAF, green)
 
 
 def add_lamp_post(builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float], yaw: float) -> None:
@@ -201,14 +212,18 @@ def add_building(
     y: Range,
     base_m: float,
     height: float,
+    *,
+    detailed: bool = True,
 ) -> None:
-    """A block with windows, and now and then a set-back top storey, bays or an awning over the ground floor."""
+    """A block with windows; detailed ones have a cornice, now and then bays or an awning over the ground floor."""
     place: Placed = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.BUILDING)
     wall = _pick(rng, _WALLS)
     bay, storey = float(rng.uniform(2.2, 4.2)), float(rng.uniform(2.9, 3.6))
     # bay width, storey height, share of the wall that is glass, whether the ground floor is shops
     param = (bay, storey, float(rng.uniform(0.42, 0.72)), float(rng.random() < 0.55))
     place.box(x, y, (base_m - 0.05, height), Material.FACADE, wall, param=param)
+    if not detailed:
+        return
     trim: Color = (wall[0] * 0.8, wall[1] * 0.8, wall[2] * 0.8)
     edge = 0.25
     place.box(
@@ -228,3 +243,16 @@ def add_building(
             ends = sorted((front, front + outward * 0.7))
             place.box((a, min(a + 2.6, x[1])), (ends[0], ends[1]), (storey, height * 0.85), Material.FACADE, wall,
                       param=(2.6, storey, 0.7, 0.0))  # fmt: skip
+
+
+def add_barrier(
+    builder: SceneBuilder, rng: np.random.Generator, x: Range, y: Range, base_m: float, *, hedge: bool
+) -> None:
+    """A garden wall or a hedge between buildings."""
+    height = base_m + float(rng.uniform(0.9, 2.0))
+    if hedge:
+        place = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.VEGETATION)
+        place.box(x, y, (base_m - 0.05, height), Material.LEAF, _pick(rng, ((0.19, 0.27, 0.12),), 0.02))
+        return
+    place = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.BUILDING)
+    place.box(x, y, (base_m - 0.05, height), Material.ROUGH, _pick(rng, _WALLS), param=(1.2, 0.08, 0, 0))

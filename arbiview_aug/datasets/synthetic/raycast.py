@@ -20,7 +20,7 @@ SKY_ID, GROUND_ID = -1, -2
 """Ids of what is no primitive."""
 
 _NARROWEST_COS = 0.2
-"""A packet with a ray further than 78 degrees off its axis is not bounded by a pyramid: it is tested with everything."""
+"""A packet with a ray further than 78 degrees off its axis has no pyramid around it: it meets everything."""
 
 _PAIRS_PER_STEP = 96
 """Packets handled at a time: the temporaries of 96 x 6 x 256 floats stay in the cache of one core."""
@@ -169,11 +169,11 @@ def cast(local: LocalScene, rays: Tensor, candidates: Candidates) -> tuple[Tenso
             chosen = (open_ & (local.is_box[primitive] == boxes)).nonzero()[:, 0]
             for part in chosen.split(_PAIRS_PER_STEP):
                 n, p = packet[part], primitive[part]
-                near = t[n]
-                found = meet(local, p, rays[n])
+                near = t.index_select(0, n)
+                found = meet(local, p, rays.index_select(0, n))
                 nearer = found < near
                 t[n] = torch.where(nearer, found, near)
-                hit[n] = torch.where(nearer, local.order[p][:, None], hit[n])
+                hit[n] = torch.where(nearer, local.order[p][:, None], hit.index_select(0, n))
     return t, hit
 
 
@@ -187,7 +187,7 @@ def _ground(local: LocalScene, rays: Tensor) -> tuple[Tensor, Tensor]:
 
 def _meet_box(local: LocalScene, p: Tensor, rays: Tensor) -> Tensor:
     """Distance (n, R) at which rays (n, 3, R) enter box p (n,); infinite where they miss or start inside."""
-    normal = local.normals[p]
+    normal = local.normals.index_select(0, p)
     speed = (
         normal[:, :, 0:1] * rays[:, None, 0]
         + normal[:, :, 1:2] * rays[:, None, 1]

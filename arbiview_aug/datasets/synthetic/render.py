@@ -8,6 +8,7 @@ pixels at outlines, and through tiles with something thinner than a pixel and a 
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,8 @@ TILE_PX = 16
 _PACKET_PX = 16
 """Outline pixels that share a packet in the second pass."""
 _THIN_PX = 1.5
+_BATCH_PX = 1_500_000
+"""Pixels shaded together at most: about 150 MB of intermediate results."""
 
 
 class CameraView(NamedTuple):
@@ -165,89 +168,124 @@ class Renderer:
         return self._tables
 
     @torch.no_grad()
-    def render(self, scene: Scene, camera: Camera, ground_z_m: float) -> CameraView:
-        """One camera's view of ``scene`` whose road lies at ``ground_z_m`` in the camera's ego frame."""
-        tables, camera_ = self.tables(scene), self.rays(camera)
+    def render(self, scene: Scene, cameras: Sequence[Camera], ground_z_m: float) -> list[CameraView]:
+        """Views of ``scene`` whose road lies at ``ground_z_m`` in the cameras' ego frame."""
+        views: list[CameraView] = []
+        batch: list[Camera] = []
+        for camera in cameras:
+            # Small cameras are shaded together: fewer, longer tensor operations.
+            if batch and sum(c.width_px * c.height_px for c in (*batch, camera)) > _BATCH_PX:
+                views += self._render_batch(scene, batch, ground_z_m)
+                batch = []
+            batch.append(camera)
+        return views + self._render_batch(scene, batch, ground_z_m)
+
+    def _render_batch(self, scene: Scene, cameras: list[Camera], ground_z_m: float) -> list[CameraView]:
+        tables = self.tables(scene)
+        casts = [self._cast(scene, camera, ground_z_m) for camera in cameras]
+        hits = _joined([c.hits for c in casts])
+        face = faces(tables, hits.point, hits.primitive)
+        sizes = [len(c.hits.t) for c in casts]
+        colors = list(shade(tables, hits, face).split(sizes))
+        if self.supersampling > 1:
+            key = torch.where(hits.primitive >= 0, hits.primitive * 8 + face, hits.primitive)
+            fine = [self._cast_outlines(c, k, scene) for c, k in zip(casts, key.split(sizes), strict=True)]
+            hits = _joined([f[1] for f in fine])
+            means = self._means(shade(tables, hits, faces(tables, hits.point, hits.primitive)))
+            for color, (chosen, _), mean in zip(colors, fine, means.split([len(f[0]) for f in fine]), strict=True):
+                color[chosen] = mean
+        return [self._view(scene, c, color) for c, color in zip(casts, colors, strict=True)]
+
+    def _means(self, color: Tensor) -> Tensor:
+        """(m, 3) means of (m * s * s, 3) colours; a fixed order of summation."""
+        samples = color.view(-1, self.supersampling**2, 3)
+        total = samples[:, 0].clone()
+        for k in range(1, samples.shape[1]):
+            total += samples[:, k]
+        return total / samples.shape[1]
+
+    def _cast(self, scene: Scene, camera: Camera, ground_z_m: float) -> _Cast:
+        """First pass: one ray through every pixel's centre."""
+        rays = self.rays(camera)
         pose = scene.ego2street
         origin = pose[:3, :3] @ (camera.center_m - (0, 0, ground_z_m)) + pose[:3, 3]
         start = torch.from_numpy(origin.astype(np.float32)).to(self.device)
-        rays = _turned(camera_.directions, scene)
+        directions = _turned(rays.directions, scene)
         local = scene_from(scene, origin, self.device)
-        candidates = find_candidates(local, rays)
-        t, hit = cast(local, rays, candidates)
-        t = torch.where(camera_.valid, t, torch.inf)
-        hit = torch.where(camera_.valid, hit, SKY_ID)
+        candidates = find_candidates(local, directions)
+        t, hit = cast(local, directions, candidates)
+        t = torch.where(rays.valid, t, torch.inf)
+        hit = torch.where(rays.valid, hit, SKY_ID)
+        flat = directions.transpose(1, 2).reshape(-1, 3)
+        hits = _hits(start, flat, t.reshape(-1), hit.reshape(-1), rays.pitch.reshape(-1))
+        return _Cast(camera, rays, start, local, candidates, t, hit, hits)
 
-        hits = _flat_hits(start, rays, t, hit, camera_.pitch)
-        face = faces(tables, hits.point, hits.primitive)
-        color = shade(tables, hits, face).view(*t.shape, 3)
-        if self.supersampling > 1:
-            key = torch.where(hit >= 0, hit * 8 + face.view_as(hit), hit)
-            outline = _to_tiles(_outlines(_from_tiles(key, camera.size)))[:, 0]
-            thin = local.thickness[candidates.primitive] < _THIN_PX * camera_.pitch.amax(1)[candidates.packet] * (
-                local.distance[candidates.primitive].clamp_min(0.1)
-            )
-            busy = torch.zeros(len(rays), dtype=torch.bool, device=self.device)
-            busy[candidates.packet[thin]] = True
-            chosen = (outline | busy[:, None]) & camera_.valid
-            self._refine(color, chosen, tables, local, candidates, camera_, start)
+    def _cast_outlines(self, first: _Cast, key: Tensor, scene: Scene) -> tuple[Tensor, Hits]:
+        """Second pass: rows (m,) of the pixels that need several rays, and the (m * s * s) hits of those."""
+        rays, candidates, s = first.rays, first.candidates, self.supersampling
+        outline = _to_tiles(_outlines(_from_tiles(key.view_as(first.hit), first.camera.size)))[:, 0]
+        distance = first.local.distance[candidates.primitive].clamp_min(0.1)
+        pixel = rays.pitch.amax(1)[candidates.packet] * distance
+        busy = torch.zeros(len(outline), dtype=torch.bool, device=self.device)
+        busy[candidates.packet[first.local.thickness[candidates.primitive] < _THIN_PX * pixel]] = True
+        tile, slot = ((outline | busy[:, None]) & rays.valid).nonzero(as_tuple=True)
 
-        image = (_from_tiles(color, camera.size) * 255 + 0.5).to(torch.uint8)
-        valid = _from_tiles(camera_.valid, camera.size)
-        depth = t * _dot_axis(camera_.directions, camera_.axis)
-        depth = torch.where(torch.isfinite(t), depth, torch.inf)
-        classes = torch.from_numpy(scene.cls).to(self.device)[hit.clamp_min(0)]
-        classes = torch.where(hit == GROUND_ID, int(SceneClass.GROUND), classes)
-        classes = torch.where(hit == SKY_ID, int(SceneClass.SKY), classes)
-        classes = torch.where(camera_.valid, classes, int(SceneClass.VOID))
-        instances = torch.where(hit >= 0, torch.from_numpy(scene.instance).to(self.device)[hit.clamp_min(0)], -1)
-        return CameraView(
-            image=(image * valid[..., None]).permute(2, 0, 1).contiguous().cpu(),
-            depth_m=_from_tiles(depth, camera.size).contiguous().cpu(),
-            classes=_from_tiles(classes, camera.size).to(torch.uint8).contiguous().cpu(),
-            instances=_from_tiles(instances, camera.size).to(torch.int16).contiguous().cpu(),
-        )
-
-    def _refine(
-        self,
-        color: Tensor,
-        chosen: Tensor,
-        tables: SceneTables,
-        local: LocalScene,
-        candidates: Candidates,
-        camera: CameraRays,
-        start: Tensor,
-    ) -> None:
-        """Replaces the colours (n, 256, 3) of chosen pixels by the mean over their subpixel rays."""
-        tile, slot = chosen.nonzero(as_tuple=True)
-        if not len(tile):
-            return
-        s = self.supersampling
         offsets = [((k + 0.5) / s - 0.5) for k in range(s)]
-        d, r, b = (a[tile, :, slot] for a in (camera.directions, camera.right, camera.down))  # [m, 3]
+        d, r, b = (a[tile, :, slot] for a in (rays.directions, rays.right, rays.down))  # [m, 3]
         sub = torch.stack([d + u * r + v * b for v in offsets for u in offsets], 1)  # [m, s*s, 3]
         sub = sub / (sub[..., 0] ** 2 + sub[..., 1] ** 2 + sub[..., 2] ** 2).sqrt()[..., None]
         # Pixels of a tile share packets of _PACKET_PX pixels, the last one filled up with its tile's first ray.
-        counts = torch.bincount(tile, minlength=len(chosen))
+        counts = torch.bincount(tile, minlength=len(outline))
         packets = (counts + _PACKET_PX - 1) // _PACKET_PX
         first_pixel, first_packet = counts.cumsum(0) - counts, packets.cumsum(0) - packets
         rank = torch.arange(len(tile), device=tile.device) - first_pixel[tile]
         packet, place = first_packet[tile] + rank // _PACKET_PX, rank % _PACKET_PX
-        owner = torch.repeat_interleave(torch.arange(len(chosen), device=tile.device), packets)
-        rays = sub[first_pixel[owner]][:, :1].expand(-1, _PACKET_PX, -1).repeat_interleave(s * s, 1).clone()
-        rays = rays.view(len(owner), _PACKET_PX, s * s, 3)
-        rays[packet, place] = sub
-        rays = _turned(rays.view(len(owner), -1, 3).transpose(1, 2), tables.scene)
-        t, hit = cast(local, rays, _for_packets(candidates, owner, len(chosen)))
-        pitch = (camera.pitch[tile, slot] / s)[:, None].expand(-1, s * s).reshape(-1)
+        owner = torch.repeat_interleave(torch.arange(len(outline), device=tile.device), packets)
+        packed = sub[first_pixel[owner]][:, None, :1].expand(-1, _PACKET_PX, s * s, -1).clone()
+        packed[packet, place] = sub
+        packed = _turned(packed.view(len(owner), -1, 3).transpose(1, 2), scene)
+        t, hit = cast(first.local, packed, _for_packets(candidates, owner, len(outline)))
         t, hit = (a.view(len(owner), _PACKET_PX, -1)[packet, place].reshape(-1) for a in (t, hit))
-        direction = rays.transpose(1, 2).reshape(len(owner), _PACKET_PX, s * s, 3)[packet, place].reshape(-1, 3)
-        hits = _hits(start, direction, t, hit, pitch)
-        shaded = shade(tables, hits, faces(tables, hits.point, hit)).view(-1, s * s, 3)
-        total = shaded[:, 0].clone()
-        for k in range(1, s * s):
-            total += shaded[:, k]
-        color[tile, slot] = total / (s * s)
+        direction = packed.transpose(1, 2).reshape(len(owner), _PACKET_PX, s * s, 3)[packet, place].reshape(-1, 3)
+        pitch = (rays.pitch[tile, slot] / s).repeat_interleave(s * s)
+        return tile * outline.shape[1] + slot, _hits(first.start, direction, t, hit, pitch)
+
+    def _view(self, scene: Scene, first: _Cast, color: Tensor) -> CameraView:
+        """Tiles back to images, on the CPU."""
+        size, hit, rays = first.camera.size, first.hit, first.rays
+        axis = rays.directions[:, 0] * rays.axis[0] + rays.directions[:, 1] * rays.axis[1]
+        depth = first.t * (axis + rays.directions[:, 2] * rays.axis[2])
+        depth = torch.where(torch.isfinite(first.t), depth, torch.inf)
+        row = hit.clamp_min(0)
+        classes = torch.from_numpy(scene.cls).to(self.device)[row]
+        classes = torch.where(hit == GROUND_ID, int(SceneClass.GROUND), classes)
+        classes = torch.where(hit == SKY_ID, int(SceneClass.SKY), classes)
+        classes = torch.where(rays.valid, classes, int(SceneClass.VOID))
+        instances = torch.where(hit >= 0, torch.from_numpy(scene.instance).to(self.device)[row], -1)
+        image = (color.view(*hit.shape, 3) * 255 + 0.5).to(torch.uint8) * rays.valid[..., None]
+        return CameraView(
+            image=_from_tiles(image, size).permute(2, 0, 1).contiguous().cpu(),
+            depth_m=_from_tiles(depth, size).contiguous().cpu(),
+            classes=_from_tiles(classes.to(torch.uint8), size).contiguous().cpu(),
+            instances=_from_tiles(instances.to(torch.int16), size).contiguous().cpu(),
+        )
+
+
+class _Cast(NamedTuple):
+    """A camera's first pass; tiles (n, 256) unless said otherwise."""
+
+    camera: Camera
+    rays: CameraRays
+    start: Tensor  # [3] the camera's centre, street frame
+    local: LocalScene
+    candidates: Candidates
+    t: Tensor
+    hit: Tensor
+    hits: Hits  # flat
+
+
+def _joined(hits: list[Hits]) -> Hits:
+    return Hits(*(torch.cat(parts) for parts in zip(*hits, strict=True)))
 
 
 def _turned(rays: Tensor, scene: Scene) -> Tensor:
@@ -257,17 +295,9 @@ def _turned(rays: Tensor, scene: Scene) -> Tensor:
     return torch.stack([c * x - s * y, s * x + c * y, z], 1)
 
 
-def _flat_hits(start: Tensor, rays: Tensor, t: Tensor, hit: Tensor, pitch: Tensor) -> Hits:
-    return _hits(start, rays.transpose(1, 2).reshape(-1, 3), t.reshape(-1), hit.reshape(-1), pitch.reshape(-1))
-
-
 def _hits(start: Tensor, direction: Tensor, t: Tensor, hit: Tensor, pitch: Tensor) -> Hits:
     reach = torch.where(torch.isfinite(t), t, 0.0)
     return Hits(start + direction * reach[:, None], direction, reach, pitch, hit)
-
-
-def _dot_axis(rays: Tensor, axis: Tensor) -> Tensor:
-    return rays[:, 0] * axis[0] + rays[:, 1] * axis[1] + rays[:, 2] * axis[2]
 
 
 def _outlines(key: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 from arbiview_aug.datasets.synthetic.ground import light_map, road_color, sample_light, slab_color
 from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, SKY_ID
 from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, Material, Scene
-from arbiview_aug.datasets.synthetic.texture import band, cell_hash, fade, mix, noise, octave, pulses, step
+from arbiview_aug.datasets.synthetic.texture import band, cell_hash, fade, mix, noise, noise_3d, octave, pulses, step
 
 _CHUNK = 32768
 """Hits shaded at a time: each temporary stays in the cache."""
@@ -87,7 +87,7 @@ def faces(tables: SceneTables, point: Tensor, primitive: Tensor) -> Tensor:
     rows = (primitive >= 0).nonzero()[:, 0]
     rows = rows[tables.kind[primitive[rows]] == BOX]
     for part in rows.split(_CHUNK):
-        planes, p = tables.planes[primitive[part]], point[part]
+        planes, p = tables.planes.index_select(0, primitive[part]), point.index_select(0, part)
         beyond = (
             planes[:, :, 0] * p[:, 0:1] + planes[:, :, 1] * p[:, 1:2] + planes[:, :, 2] * p[:, 2:3] - planes[:, :, 3]
         )
@@ -104,7 +104,7 @@ def shade(tables: SceneTables, hits: Hits, face: Tensor) -> Tensor:
     for m in (-1, *Material):
         for rows in (material == int(m)).nonzero()[:, 0].split(_CHUNK):
             if len(rows):
-                part = Hits(*(a[rows] for a in hits))
+                part = Hits(*(a.index_select(0, rows) for a in hits))
                 color = (
                     sky_color(tables.scene, part.direction, part.pitch)
                     if m == -1
@@ -121,8 +121,8 @@ def _lit(tables: SceneTables, hits: Hits, face: Tensor, material: int) -> Tensor
         normal = torch.zeros_like(hits.point)
         normal[:, 2] = 1
     else:
-        half, rotation = tables.half[hits.primitive], tables.rotation[hits.primitive]
-        offset = hits.point - tables.center[hits.primitive]
+        half, rotation = (a.index_select(0, hits.primitive) for a in (tables.half, tables.rotation))
+        offset = hits.point - tables.center.index_select(0, hits.primitive)
         local = offset[:, 0:1] * rotation[:, 0] + offset[:, 1:2] * rotation[:, 1] + offset[:, 2:3] * rotation[:, 2]
         normal = _normals(tables, hits.primitive, face, local, half, rotation)
     slant = across / _dot(normal, hits.direction).abs().clamp_min(0.01)
@@ -140,12 +140,14 @@ def _lit(tables: SceneTables, hits: Hits, face: Tensor, material: int) -> Tensor
         if material == Material.ROAD:
             color = road_color(street, salt, x, y, fx, fy)
         else:
-            color = slab_color(street, salt, hits.point, face == 4, fx, fy, tables.color[hits.primitive])
+            color = slab_color(
+                street, salt, hits.point, face == 4, fx, fy, tables.color.index_select(0, hits.primitive)
+            )
         shine = sky_share * (ambient * (0.62 + 0.38 * normal[:, 2]) + 0.95 * toward * sun_share)
     else:
         surface = _Surface(
             tables, hits.point, local, half, face, hits.direction, normal, across, slant,
-            tables.color[hits.primitive], tables.param[hits.primitive], hits.primitive,
+            tables.color.index_select(0, hits.primitive), tables.param.index_select(0, hits.primitive), hits.primitive,
         )  # fmt: skip
         color = _MATERIALS[Material(material)](surface)
         # What faces down sees the road instead of the sky; close to the road there is less light.
@@ -163,7 +165,7 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 
 def _normals(tables: SceneTables, k: Tensor, face: Tensor, local: Tensor, half: Tensor, rotation: Tensor) -> Tensor:
     kind = tables.kind[k]
-    flat = tables.planes[k, face, :3]
+    flat = tables.planes.view(-1, 4).index_select(0, k * 6 + face)[:, :3]
     gradient = local / (half * half)
     # A cylinder's cap, where the axis coordinate is at its end, and its side.
     cap = (local[:, 2].abs() > half[:, 2] * (1 - 1e-4) - 1e-5) & (kind == CYLINDER)
@@ -252,9 +254,10 @@ def _facade(s: _Surface) -> Tensor:
     color = mix(color, _glass(s, 0.34) * (1 + (0.4 * h[2] - 0.2) * resolved)[:, None], ground * (1 - upper))
     hue = [cell_hash(k, i.to(torch.int32) // 2, salt + 120 + m) for m in range(3)]
     color = mix(color, 0.12 + 0.6 * torch.stack(hue, 1), shops * band(v, 2.65, 3.15, s.across) * 0.85 * resolved)
-    plinth = (1 - shops) * band(v, 0.0, 0.6, s.across)
+    height = s.point[:, 2]  # over the road: bays begin a storey up and have no doors
+    plinth = (1 - shops) * band(height, 0.0, 0.7, s.across)
     color = mix(color, s.color * 0.6, plinth)
-    door = (1 - shops) * band(v, 0.0, 2.2, s.across) * band((u - length / 2).abs(), 0.0, 0.55, s.slant)
+    door = (1 - shops) * band(height, 0.0, 2.3, s.across) * band((u - length / 2).abs(), 0.0, 0.55, s.slant)
     color = mix(color, torch.tensor([0.16, 0.13, 0.11], device=u.device), door)
     roof = torch.tensor([0.40, 0.39, 0.38], device=u.device)
     return torch.where((s.face < 4)[:, None], color, roof)
@@ -405,11 +408,11 @@ def _sign(s: _Surface) -> Tensor:
 def _leaf(s: _Surface) -> Tensor:
     p, f, salt = s.point, s.across, s.tables.scene.salt + 140
     tone = torch.ones_like(f)
-    for k, (wavelength, strength) in enumerate(((1.1, 0.25), (0.42, 0.35), (0.17, 0.40), (0.08, 0.35))):
-        u, v = p[:, 0] + 0.71 * p[:, 2], p[:, 1] - 0.63 * p[:, 2] + 0.35 * p[:, 0]
-        tone = tone + strength * octave(u, v, wavelength, f, salt + k)
+    for k, (wavelength, strength) in enumerate(((0.9, 0.30), (0.35, 0.40), (0.14, 0.55))):
+        x, y, z = (p * (1 / wavelength)).unbind(1)
+        tone = tone + strength * noise_3d(x, y, z, salt + k) * fade(f, wavelength)
     depth = 0.62 + 0.38 * (s.local[:, 2] / s.half[:, 2]).clamp(-1, 1)
-    return s.color * (tone.clamp(0.15, 2.2) * depth)[:, None]
+    return s.color * (tone.clamp(0.25, 2.2) * depth)[:, None]
 
 
 def _plain(s: _Surface) -> Tensor:

@@ -171,18 +171,47 @@ class _World:
                     setback = walk + float(rng.choice([rng.uniform(0, 0.8), rng.uniform(1.5, 7)]))
                     height = float(rng.choice([rng.uniform(5, 10), rng.uniform(10, 18), rng.uniform(18, 38)]))
                     depth = float(rng.uniform(9, 16))
-                    if rng.random() < 0.88:
+                    built = rng.random() < 0.88
+                    if built:
                         ys = sorted((self.side_y(side, setback), self.side_y(side, setback + depth)))
                         objects.add_building(self.builder, rng, (x, x + width), (ys[0], ys[1]), base, height)
                     if rng.random() < 0.35:
                         ys = sorted((self.side_y(side, setback + 22), self.side_y(side, setback + 40)))
                         tall = float(rng.uniform(25, 60))
                         objects.add_building(self.builder, rng, (x, x + width), (ys[0], ys[1]), base, tall)
-                    x += width + float(rng.choice([0.05, 0.05, rng.uniform(2, 9)]))
+                    gap = float(rng.choice([0.05, 0.05, rng.uniform(2, 9)]))
+                    if not built or (gap > 1 and rng.random() < 0.7):
+                        ys = sorted((self.side_y(side, walk + 0.3), self.side_y(side, walk + 0.8)))
+                        span = (x if not built else x + width, min(x + width + gap, end - walk))
+                        hedge = bool(rng.random() < 0.5)
+                        if span[1] > span[0] + 0.3:
+                            objects.add_barrier(self.builder, rng, span, (ys[0], ys[1]), base, hedge=hedge)
+                    x += width + gap
+        self._add_background()
         for direction in (-1, 1):
             if rng.random() < 0.7:
                 xs = sorted((direction * float(rng.uniform(185, 240)), direction * 258.0))
                 objects.add_building(self.builder, rng, (xs[0], xs[1]), (-60, 60), 0.0, float(rng.uniform(14, 45)))
+
+    def _add_background(self) -> None:
+        """A closed row of houses or trees far behind, so that gaps do not open onto an empty plain."""
+        rng, base = self.rng, self.street.kerb_m
+        for side in (-1, 1):
+            for start, end in self.blocks:
+                x = max(start + 3, -200.0)
+                while x < min(end - 10, 200.0):
+                    width = min(float(rng.uniform(14, 34)), end - 3 - x)
+                    near = float(rng.uniform(44, 62))
+                    if rng.random() < 0.7:
+                        ys = sorted((self.side_y(side, near), self.side_y(side, near + 14)))
+                        tall = float(rng.uniform(7, 24))
+                        xs = (x, x + width)
+                        objects.add_building(self.builder, rng, xs, (ys[0], ys[1]), base, tall, detailed=False)
+                    else:
+                        for k in range(int(width / 6)):
+                            y = self.side_y(side, near - float(rng.uniform(0, 6)))
+                            objects.add_bush(self.builder, rng, (x + 6 * k, y, base), scale=float(rng.uniform(4, 8)))
+                    x += width + 0.1
 
     def add_parked(self) -> None:
         """Rows of parked vehicles along the kerbs."""

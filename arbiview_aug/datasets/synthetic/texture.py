@@ -38,6 +38,15 @@ def noise(x: Tensor, y: Tensor, salt: int) -> Tensor:
     return (low + (high - low) * v) * 2 - 1
 
 
+def noise_3d(x: Tensor, y: Tensor, z: Tensor, salt: int) -> Tensor:
+    """Value noise in [-1, 1] over space, lattice spacing 1: slices far apart in the plane, blended along z."""
+    k = z.floor()
+    w = z - k
+    w = w * w * (3 - 2 * w)
+    low = noise(x + 57 * k, y + 113 * k, salt)
+    return low + (noise(x + 57 * (k + 1), y + 113 * (k + 1), salt) - low) * w
+
+
 def octave(x: Tensor, y: Tensor, wavelength_m: float, footprint: Tensor, salt: int) -> Tensor:
     """Noise of one wavelength (metres), faded out where the footprint reaches it."""
     return noise(x * (1 / wavelength_m), y * (1 / wavelength_m), salt) * fade(footprint, wavelength_m)
