@@ -358,10 +358,11 @@ class Camera:
         """The camera of the image resized to (h, w): outer edges stay, so centres move by half pixels."""
         h, w = size
         A = resize_matrix(self.size, size)
-        mask = self.mask
-        if mask is not None:
-            mask = cv2.resize(mask.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST_EXACT).astype(bool)
-        return replace(self, width_px=w, height_px=h, K=A @ self.K, mask=mask)
+        camera = replace(self, width_px=w, height_px=h, K=A @ self.K, mask=None)
+        if self.mask is None:
+            return camera
+        mask = cv2.resize(self.mask.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST_EXACT)
+        return replace(camera, mask=mask.astype(bool))
 
     def crop(self, top: int, left: int, size: tuple[int, int]) -> Camera:
         """The camera of the window of ``size`` (h, w) whose first pixel is (left, top); it may exceed the image.
@@ -372,14 +373,15 @@ class Camera:
         K = self.K.copy()
         K[0, 2] -= left
         K[1, 2] -= top
-        mask = None
-        if self.mask is not None:
-            mask = np.zeros((h, w), bool)
-            y0, y1 = max(0, top), min(self.height_px, top + h)
-            x0, x1 = max(0, left), min(self.width_px, left + w)
-            if y1 > y0 and x1 > x0:
-                mask[y0 - top : y1 - top, x0 - left : x1 - left] = self.mask[y0:y1, x0:x1]
-        return replace(self, width_px=w, height_px=h, K=K, mask=mask)
+        camera = replace(self, width_px=w, height_px=h, K=K, mask=None)
+        if self.mask is None:
+            return camera
+        mask = np.zeros((h, w), bool)
+        y0, y1 = max(0, top), min(self.height_px, top + h)
+        x0, x1 = max(0, left), min(self.width_px, left + w)
+        if y1 > y0 and x1 > x0:
+            mask[y0 - top : y1 - top, x0 - left : x1 - left] = self.mask[y0:y1, x0:x1]
+        return replace(camera, mask=mask)
 
     def moved(self, ego2ego: Any) -> Camera:
         """The same camera in another ego frame: ``cam2ego`` becomes ``ego2ego @ cam2ego``."""

@@ -183,6 +183,14 @@ def test_resize_and_crop_carry_the_mask() -> None:
     assert window.mask[:10, 10:].all() and not window.mask[10:].any()
 
 
+@pytest.mark.parametrize("mask", [None, np.ones((480, 640), bool)])
+def test_empty_resizes_and_crops_are_refused_by_name(mask: np.ndarray | None) -> None:
+    camera = make(mask=mask)
+    for change in (lambda: camera.resize((0, 5)), lambda: camera.crop(0, 0, (-3, 5))):
+        with pytest.raises(CalibrationError, match=r"camera 'front': height_px: expected a whole number of pixels"):
+            change()
+
+
 def test_undistorted_keeps_pose_and_intrinsics_and_moves_the_mask() -> None:
     mask = np.ones((480, 640), bool)
     mask[:, :60] = False
