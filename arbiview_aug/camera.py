@@ -20,7 +20,16 @@ import cv2
 import numpy as np
 
 from arbiview_aug.errors import CalibrationError
-from arbiview_aug.lens import COEFFICIENT_COUNTS, BoolArray, FloatArray, Lens, distort, fold_limit, undistort
+from arbiview_aug.lens import (
+    COEFFICIENT_COUNTS,
+    BoolArray,
+    FloatArray,
+    Lens,
+    distort,
+    fold_limit,
+    intrinsics_for_fov,
+    undistort,
+)
 
 ROTATION_TOLERANCE = 1e-4
 """Largest entry of |R Rᵀ - I| that is still a rotation: published calibrations carry 5 to 7 digits."""
@@ -222,7 +231,7 @@ class Camera:
         if (K is None) == (horizontal_fov_deg is None):
             raise CalibrationError(f"camera {name!r}: expected either K or horizontal_fov_deg, got both or none")
         if horizontal_fov_deg is not None:
-            K = _intrinsics_for_fov(name, horizontal_fov_deg, width_px, height_px, lens, distortion)
+            K = intrinsics_for_fov(name, horizontal_fov_deg, width_px, height_px, lens, distortion)
         angles = (azimuth_deg, elevation_deg, roll_deg)
         if not all(map(math.isfinite, angles)):
             raise CalibrationError(f"camera {name!r}: expected finite angles, got {angles}")
@@ -439,23 +448,3 @@ def resize_matrix(size: tuple[int, int], new_size: tuple[int, int]) -> FloatArra
     """(3, 3) pixel map of a resize between (h, w) sizes: x' = s x + (s - 1) / 2, so that outer edges coincide."""
     sy, sx = new_size[0] / size[0], new_size[1] / size[1]
     return np.array([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5], [0.0, 0.0, 1.0]])
-
-
-def _intrinsics_for_fov(
-    name: str, fov_deg: float, width_px: int, height_px: int, lens: str, distortion: tuple[float, ...]
-) -> FloatArray:
-    """Square-pixel K with a central principal point whose outer image edges span ``fov_deg``."""
-    largest = 360.0 if lens == "fisheye" else 180.0
-    if not 0 < fov_deg < largest:
-        raise CalibrationError(
-            f"camera {name!r}: horizontal_fov_deg: expected between 0 and {largest:g} for a {lens} lens, "
-            f"got {fov_deg:g}"
-        )
-    half = np.array(math.radians(fov_deg) / 2)
-    x, _, valid = distort(lens, distortion, fold_limit(lens, distortion), np.sin(half), np.array(0.0), np.cos(half))
-    if not valid or x <= 0:
-        raise CalibrationError(
-            f"camera {name!r}: horizontal_fov_deg: expected an angle inside the lens's unfolded branch, got {fov_deg:g}"
-        )
-    focal = width_px / 2 / float(x)
-    return np.array([[focal, 0, (width_px - 1) / 2], [0, focal, (height_px - 1) / 2], [0, 0, 1.0]])

@@ -12,6 +12,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from arbiview_aug.errors import CalibrationError
+
 Lens = Literal["pinhole", "radtan", "fisheye"]
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -160,3 +162,23 @@ def _smallest_positive_root(polynomial: FloatArray) -> float:
     inverse = np.roots(polynomial[::-1])
     real = inverse.real[(np.abs(inverse.imag) < 1e-9 * np.abs(inverse)) & (inverse.real > 0)]
     return float(1 / real.max()) if real.max(initial=0.0) > MIN_DEPTH else math.inf
+
+
+def intrinsics_for_fov(
+    name: str, fov_deg: float, width_px: int, height_px: int, lens: str, distortion: tuple[float, ...]
+) -> FloatArray:
+    """Square-pixel K with a central principal point whose outer image edges span ``fov_deg``."""
+    largest = 360.0 if lens == "fisheye" else 180.0
+    if not 0 < fov_deg < largest:
+        raise CalibrationError(
+            f"camera {name!r}: horizontal_fov_deg: expected between 0 and {largest:g} for a {lens} lens, "
+            f"got {fov_deg:g}"
+        )
+    half = np.array(math.radians(fov_deg) / 2)
+    x, _, valid = distort(lens, distortion, fold_limit(lens, distortion), np.sin(half), np.array(0.0), np.cos(half))
+    if not valid or x <= 0:
+        raise CalibrationError(
+            f"camera {name!r}: horizontal_fov_deg: expected an angle inside the lens's unfolded branch, got {fov_deg:g}"
+        )
+    focal = width_px / 2 / float(x)
+    return np.array([[focal, 0, (width_px - 1) / 2], [0, focal, (height_px - 1) / 2], [0, 0, 1.0]])
