@@ -1,1 +1,26 @@
 """Re-render the labelled camera samples of one vehicle as the cameras of another would have seen them."""
+
+from arbiview_aug.camera import Camera
+from arbiview_aug.datasets.wrappers import RetargetedDataset, RetargetedIterable
+from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, SampleTypeError
+from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.random_rig import RandomRig
+from arbiview_aug.rig import Rig, load_rig, shipped_rigs
+from arbiview_aug.transforms import RigRetarget
+
+__all__ = [
+    "ArbiviewError",
+    "CalibrationError",
+    "Camera",
+    "DataError",
+    "FavsConfig",
+    "RandomRig",
+    "RetargetedDataset",
+    "RetargetedIterable",
+    "Rig",
+    "RigRetarget",
+    "SampleError",
+    "SampleTypeError",
+    "load_rig",
+    "shipped_rigs",
+]

@@ -26,6 +26,7 @@ Box = tuple[int, int, int, int]
 
 _SMALL_SIDE_PX = 64  # targets with a shorter side are evaluated pixel by pixel: a coarse grid could step over a source
 _REFINEMENT = 2  # the cubic step halves the spacing once
+_SAFETY = 1.5  # curvature between the nodes may exceed what the nodes show
 _CUBIC = np.array([[-1.0, 9.0, 9.0, -1.0]]) / 16  # mid-point of the cubic through four nodes
 _CORNERS = tuple((a, b) for a in (slice(None, -1), slice(1, None)) for b in (slice(None, -1), slice(1, None)))
 _FAR_AWAY_PX = 1e5  # float32 maps stay precise and int16 conversion saturates harmlessly
@@ -66,6 +67,16 @@ class Grid:
         x, y = np.meshgrid(self.offset + self.step * np.arange(nx), self.offset + self.step * np.arange(ny))
         return np.stack([x, y], -1)
 
+    def extended(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Node values (ny, nx) with those outside the image replaced by the nearest inside it, where there is one."""
+        if self.step == 1:
+            return values
+        first = math.ceil(-self.offset / self.step)
+        last = [int((n - 1 - self.offset) // self.step) for n in self.size]
+        inside = values[first : last[0] + 1, first : last[1] + 1]
+        after = [n - 1 - end for n, end in zip(values.shape, last, strict=True)]
+        return np.pad(inside, ((first, after[0]), (first, after[1])), mode="edge")
+
     def strips(self, rows_px: int) -> Iterator[tuple[int, int]]:
         """First and last node row of strips about ``rows_px`` high that cover the image."""
         shared = 0 if self.step == 1 else 1  # cells lie between nodes: neighbouring strips share a row of nodes
@@ -85,6 +96,14 @@ class Grid:
         first = round(self.offset + 0.5)
         y0, y1, x0, x1 = (first + self.step * n for n in (j0, j1, i0, i1))
         return max(y0, 0), min(y1, h), max(x0, 0), min(x1, w)
+
+    def cells_to_pixels(self, cells: BoolArray, nodes: Box) -> npt.NDArray[np.uint8]:
+        """255 for the pixels between ``nodes`` whose cell (ny - 1, nx - 1) is True."""
+        j0, j1, i0, i1 = nodes
+        part = np.repeat(np.repeat(cells[j0:j1, i0:i1].astype(np.uint8) * 255, self.step, axis=0), self.step, axis=1)
+        y0, y1, x0, x1 = self.pixels(nodes)
+        top, left = round(self.offset + 0.5) + self.step * j0, round(self.offset + 0.5) + self.step * i0
+        return part[y0 - top : y1 - top, x0 - left : x1 - left]
 
     def upsample(self, values: npt.NDArray[np.floating], nodes: Box) -> npt.NDArray[np.float32]:
         """Bilinear interpolation of node values (ny, nx[, 2]) to the pixels between ``nodes``."""
@@ -161,6 +180,7 @@ class PairMap:
         self.uv, self.valid = project_rays(source, rays.directions, rays.inverse_distance(surface), self.offset_m)
         self.valid &= rays.valid
         self._exact = np.zeros((0, 0), bool)
+        self._use: BoolArray | None = None
         if rays.grid.step == 1:
             self.nodes = _bounds(self.valid & source.contains(self.uv), 0)
         else:
@@ -181,6 +201,8 @@ class PairMap:
         box = _bounds(use, 1)
         if box is None:
             return None
+        # Invalid nodes hold placeholders that may lie inside the image.
+        self._use = None if self.valid.all() else use
         self._exact = border | (whole & self._too_curved(box, tolerance_px))
         exact = int(np.count_nonzero(self._exact))
         self.rays.counters["cells_exact"] += exact
@@ -210,8 +232,9 @@ class PairMap:
         """Cells whose interpolation may be off by more than the tolerance.
 
         Bilinear interpolation over a spacing s errs by at most (|f_xx| + |f_yy|) s² / 8, the cubic mid-point by
-        3/128 of the fourth difference; both are read off the nodes. Where the surface has creases, the cells' centres
-        are evaluated too: a crease shows there with at least half its largest error.
+        3/128 of the fourth difference; both are read off the nodes. Where the surface has creases the refinement earns
+        nothing, and the cells' centres are evaluated too: a crease shows there with at least half its largest error,
+        which the cubic may double.
         """
         bound = np.zeros(tuple(n - 1 for n in self.uv.shape[:2]))
         j0, j1, i0, i1 = box
@@ -223,17 +246,17 @@ class PairMap:
             fourth = _larger(np.diff(around, 4, axis=axis)) if around.shape[axis] > 4 else None
             pad = [(0, 0), (0, 0)]
             pad[axis] = (1, 1)
-            error += np.pad(second, pad, mode="edge") / (8 * _REFINEMENT**2)
+            error += np.pad(second, pad, mode="edge") * (_SAFETY / 8 / (_REFINEMENT**2 if self.surface.smooth else 1))
             if fourth is not None:
                 pad[axis] = (2, 2)
-                error += np.pad(fourth, pad, mode="edge") * (3 / 128)
+                error += np.pad(fourth, pad, mode="edge") * (_SAFETY * 3 / 128)
         cell = cv2.dilate(error, np.ones((2, 2), np.uint8), anchor=(0, 0))[j0 - m0 : j1 - m0, i0 - n0 : i1 - n0]
         if not self.surface.smooth:
             half = self.rays.grid.step / 2
             centre, _ = self._evaluate(self.rays.nodes[j0:j1, i0:i1] + half)
             uv = self.uv[j0 : j1 + 1, i0 : i1 + 1]
             mean = sum(uv[c] for c in _CORNERS) / 4
-            cell = np.maximum(cell, 2 * _larger(mean - centre) / _REFINEMENT)
+            cell = np.maximum(cell, 4 * _larger(mean - centre))
         bound[j0:j1, i0:i1] = cell
         return bound > tolerance_px
 
@@ -267,6 +290,8 @@ class PairMap:
         low = slot.from_source(np.array([-slack, -slack]))
         high = slot.from_source(np.array([source.width_px - 1 + slack, source.height_px - 1 + slack]))
         visible = cv2.inRange(at, tuple(low), tuple(high))
+        if self._use is not None:
+            visible &= grid.cells_to_pixels(self._use, nodes)
         if source.mask is not None:
             visible &= _mask_at(source, slot, at)
         if slot.level:
@@ -296,7 +321,8 @@ class PairMap:
             return
         y0, y1, x0, x1 = self.rays.grid.pixels(nodes)
         pixels, uv, valid = self._exact_pixels
-        start, stop = np.searchsorted(pixels[:: self.rays.grid.step**2, 1], [y0, y1]) * self.rays.grid.step**2
+        step, first = self.rays.grid.step, round(self.rays.grid.offset + 0.5)
+        start, stop = np.searchsorted(pixels[:: step**2, 1], [first + step * j0, first + step * j1]) * step**2
         px, py = pixels[start:stop].T
         inside = (py >= y0) & (py < y1) & (px >= x0) & (px < x1)
         exact = np.clip(slot.from_source(uv[start:stop][inside]), -_FAR_AWAY_PX, _FAR_AWAY_PX)
@@ -369,7 +395,7 @@ def edge_distance(source: Camera, uv: FloatArray) -> FloatArray:
         return edge
     coarse = cv2.resize(source.mask.astype(np.float32), None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)
     free = np.pad((coarse >= 1).astype(np.uint8), 1, constant_values=1)
-    distance = cv2.distanceTransform(free, cv2.DIST_L2, 3)[1:-1, 1:-1] * 8
+    distance = cv2.distanceTransform(free, cv2.DIST_L2, 3)[1:-1, 1:-1].clip(max=1e6) * 8  # without any masked pixel: the largest float
     index = np.clip(np.clip(uv, -8, _FAR_AWAY_PX) / 8, 0, (coarse.shape[1] - 1, coarse.shape[0] - 1)).astype(np.int64)
     return np.where(edge >= 0, np.minimum(edge, distance[index[..., 1], index[..., 0]]), edge)
 

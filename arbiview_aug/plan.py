@@ -20,6 +20,7 @@ from arbiview_aug.rig import Rig, content_order
 from arbiview_aug.sampling import AtlasLayout, Scratch
 from arbiview_aug.target_plan import TargetDraft, TargetPlan
 
+
 @dataclass(frozen=True)
 class RenderPlan:
     """Everything needed to render a target rig from a source rig's images; plain data, picklable.

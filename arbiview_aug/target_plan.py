@@ -175,7 +175,7 @@ class TargetDraft:
             reason=reason,
             baseline_m=baseline_m,
             pair=pair,
-            score=np.where(seen, score, 0).astype(np.float32),
+            score=self.grid.extended(np.where(seen, score, 0).astype(np.float32)),
             parallax=parallax.astype(np.float32),
             border_px=(edge_px / np.maximum(pixels_per_pixel, 1e-3)).astype(np.float32),
         )

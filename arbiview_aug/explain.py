@@ -1,0 +1,66 @@
+"""A render plan in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from arbiview_aug.plan import RenderPlan
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Why a plan is what it is; ``str`` prints it, ``as_dict`` gives plain data.
+
+    Attributes:
+        plan: The plan.
+    """
+
+    plan: RenderPlan
+
+    def as_dict(self) -> list[dict[str, Any]]:
+        """One entry for each target camera: coverage, share to invent, and its sources with surface and reason."""
+        entries = []
+        for camera, target in zip(self.plan.target, self.plan.targets, strict=True):
+            coverage = float(target.coverage.mean())
+            entries.append(
+                {
+                    "camera": camera.name,
+                    "coverage": coverage,
+                    "to_invent": 1 - coverage,
+                    "sources": [
+                        {
+                            "camera": self.plan.source[pair.source].name,
+                            "share": pair.share,
+                            "surface": pair.surface,
+                            "reason": pair.reason,
+                            "baseline_m": pair.baseline_m,
+                            "parallax_px": pair.parallax_px,
+                            "halved": pair.level,
+                        }
+                        for pair in target.pairs
+                    ],
+                }
+            )
+        return entries
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.plan.source.name or 'source'} -> {self.plan.target.name or 'target'}: "
+            f"{len(self.plan.source)} cameras to {len(self.plan.target)}"
+        ]
+        for entry in self.as_dict():
+            to_invent = entry["to_invent"]
+            note = f", {to_invent:.1%} that no camera saw: masked, or for a generator to invent" if to_invent else ""
+            lines.append(f"  {entry['camera']}: {entry['coverage']:.1%} covered{note}")
+            if not entry["sources"]:
+                lines.append("    no source camera looks there")
+            for s in entry["sources"]:
+                parallax = f", about {s['parallax_px']:.1f} px of parallax where depth is unknown" if s["parallax_px"] else ""
+                halved = f", read at 1/{2 ** s['halved']} size" if s["halved"] else ""
+                lines.append(
+                    f"    {s['share']:6.1%} from {s['camera']} over the {s['surface']} surface ({s['reason']}{parallax}{halved})"
+                )
+        return "\n".join(lines)
+
+    __repr__ = __str__
