@@ -34,7 +34,7 @@ class RenderedViews(NamedTuple):
     Attributes:
         images: (3, h, w) uint8 RGB a camera; black where the lens sees nothing.
         depth_m: (h, w) float32 z in the camera frame along the ray through each pixel's centre; infinite for the sky
-            and where the lens sees nothing.
+            and where the lens sees nothing; negative past 90 degrees off a fisheye's axis.
         classes: (h, w) uint8 ``SceneClass`` of that ray.
         instances: (h, w) int16 row of ``boxes_3d`` of that ray, -1 for none.
     """

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
+import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, Scene, SceneClass, Street
 from arbiview_aug.datasets.synthetic.texture import band, cell_hash, fade, mix, noise, octave, pulses, step
+
+FloatGrid = npt.NDArray[np.float32]
+_Window = Callable[[np.ndarray, np.ndarray], tuple[slice, slice]]
 
 SHADOW_CELL_M = 0.125
 SHADOW_X_M, SHADOW_Y_M = (-80.0, 80.0), (-32.0, 32.0)
@@ -192,7 +197,7 @@ def _scalar(value: float, like: Tensor) -> Tensor:
     return torch.tensor(value, dtype=like.dtype, device=like.device)
 
 
-def light_map(scene: Scene) -> np.ndarray:
+def light_map(scene: Scene) -> FloatGrid:
     """(2, rows along y, columns along x) float32: share of the sky's and of the sun's light that reaches the ground."""
     xs = np.arange(SHADOW_X_M[0], SHADOW_X_M[1], SHADOW_CELL_M, dtype=np.float32) + SHADOW_CELL_M / 2
     ys = np.arange(SHADOW_Y_M[0], SHADOW_Y_M[1], SHADOW_CELL_M, dtype=np.float32) + SHADOW_CELL_M / 2
@@ -222,7 +227,7 @@ def light_map(scene: Scene) -> np.ndarray:
     return both[0].numpy()
 
 
-def _cast_shadows(scene: Scene, xs, ys, sun, window) -> None:  # type: ignore[no-untyped-def]
+def _cast_shadows(scene: Scene, xs: FloatGrid, ys: FloatGrid, sun: FloatGrid, window: _Window) -> None:
     """Sets ``sun`` to 0 where a ray to the sun meets a primitive."""
     d = np.array(scene.light.sun)
     shift = d[:2] / d[2]
@@ -231,38 +236,40 @@ def _cast_shadows(scene: Scene, xs, ys, sun, window) -> None:  # type: ignore[no
         rows, cols = window(foot.min(0), foot.max(0))
         if rows.start == rows.stop or cols.start == cols.stop:
             continue
-        x, y = xs[None, cols], ys[rows, None]
-        if scene.kind[k] == BOX:
-            n, b = scene.planes[k, :, :3], scene.planes[k, :, 3]
-            enter, leave = np.float32(-np.inf), np.float32(np.inf)
-            for normal, offset in zip(n, b, strict=True):
-                speed = float(normal @ d) or -1e-9
-                t = (np.float32(offset / speed) - np.float32(normal[0] / speed) * x) - np.float32(normal[1] / speed) * y
-                if speed < 0:
-                    enter = np.maximum(enter, t)
-                else:
-                    leave = np.minimum(leave, t)
-            hit = (enter < leave) & (leave > 0)
-        else:
-            A = scene.rotation[k].T / scene.half[k][:, None]
-            e = A @ d
-            A32, c = A.astype(np.float32), scene.center[k].astype(np.float32)
-            o = [row[0] * (x - c[0]) + row[1] * (y - c[1]) - row[2] * c[2] for row in A32]
-            if scene.kind[k] == CYLINDER:
-                t0, t1 = ((s - o[2]) / np.float32(e[2] or 1e-9) for s in (-1, 1))
-                e[2] = 0
-                o[2] = np.zeros_like(o[2])
-            a = np.float32(e @ e)
-            beta = np.float32(e[0]) * o[0] + np.float32(e[1]) * o[1] + np.float32(e[2]) * o[2]
-            root = beta * beta - a * (o[0] ** 2 + o[1] ** 2 + o[2] ** 2 - 1)
-            half = np.sqrt(np.maximum(root, 0))
-            enter, leave = (-beta - half) / a, (half - beta) / a
-            if scene.kind[k] == CYLINDER:
-                enter, leave = np.maximum(enter, np.minimum(t0, t1)), np.minimum(leave, np.maximum(t0, t1))
-            hit = (root > 0) & (enter < leave) & (leave > 0)
+        shaded = _shaded_by_box if scene.kind[k] == BOX else _shaded_by_quadric
         # Leaves let some light through.
         dim = 0.75 if scene.cls[k] == SceneClass.VEGETATION else 1.0
-        sun[rows, cols] *= 1 - np.float32(dim) * hit
+        sun[rows, cols] *= 1 - np.float32(dim) * shaded(scene, int(k), xs[None, cols], ys[rows, None], d)
+
+
+def _shaded_by_box(scene: Scene, k: int, x: FloatGrid, y: FloatGrid, d: np.ndarray) -> npt.NDArray[np.bool_]:
+    """(rows, columns): rays along ``d`` from the points (x, y, 0) that pass through box ``k``."""
+    enter, leave = (np.full((y.shape[0], x.shape[1]), s * np.inf, np.float32) for s in (-1, 1))
+    for plane in scene.planes[k]:
+        speed = float(plane[:3] @ d) or -1e-9
+        t = (np.float32(plane[3] / speed) - np.float32(plane[0] / speed) * x) - np.float32(plane[1] / speed) * y
+        if speed < 0:
+            np.maximum(enter, t, out=enter)
+        else:
+            np.minimum(leave, t, out=leave)
+    return np.asarray((enter < leave) & (leave > 0))
+
+
+def _shaded_by_quadric(scene: Scene, k: int, x: FloatGrid, y: FloatGrid, d: np.ndarray) -> npt.NDArray[np.bool_]:
+    """As ``_shaded_by_box`` for an ellipsoid or a capped cylinder."""
+    A, c = (scene.rotation[k].T / scene.half[k][:, None]).astype(np.float32), scene.center[k].astype(np.float32)
+    ox, oy, oz = (row[0] * (x - c[0]) + row[1] * (y - c[1]) - row[2] * c[2] for row in A)
+    ex, ey, ez = A @ d.astype(np.float32)
+    flat = scene.kind[k] == CYLINDER
+    rz, ez_ = (0 * oz, np.float32(0)) if flat else (oz, ez)
+    a, beta = ex * ex + ey * ey + ez_ * ez_, ex * ox + ey * oy + ez_ * rz
+    root = beta * beta - a * (ox * ox + oy * oy + rz * rz - 1)
+    half = np.sqrt(np.maximum(root, 0))
+    enter, leave = (-beta - half) / a, (half - beta) / a
+    if flat:
+        t0, t1 = (-1 - oz) / (ez or np.float32(1e-9)), (1 - oz) / (ez or np.float32(1e-9))
+        enter, leave = np.maximum(enter, np.minimum(t0, t1)), np.minimum(leave, np.maximum(t0, t1))
+    return np.asarray((root > 0) & (enter < leave) & (leave > 0))
 
 
 def sample_light(table: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:

@@ -6,6 +6,8 @@ its height, the body its length.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from arbiview_aug.datasets.synthetic.scene import BoxClass, Material, Placed, SceneBuilder, SceneClass
@@ -73,7 +75,7 @@ def add_vehicle(
         rear = float(rng.choice([0.06, 0.3, 0.55])) * length / 2  # estate, hatchback, saloon
         place.box(
             (-x + 0.08 + rear * 0.55, 0.22 * length),
-            (-y + 0.05, y - 0.05),
+            (-y + 0.03, y - 0.03),  # flush with the body's leaning flanks
             (waist, height),
             Material.GLASSHOUSE,
             paint,
@@ -132,7 +134,7 @@ def add_pedestrian(
     torso = ((hip + shoulder) / 2, (shoulder - hip) / 2)
     middle, reach = (0.0, 0.0, torso[0]), (0.14, width / 2 - 0.08)
     place.cylinder(middle, (reach[0] * 0.9, reach[1] * 0.88), torso[1], Material.ROUGH, jacket, param=(0.1, 0.06, 0, 0))
-    place.ellipsoid((0, 0, shoulder - 0.06), (reach[0], width / 2 - 0.03, 0.10), Material.PLAIN, jacket)
+    place.ellipsoid((0, 0, shoulder - 0.03), (0.085, width / 2 - 0.03, 0.075), Material.PLAIN, sleeve)
     place.cylinder((0, 0, shoulder + 0.04), (0.055, 0.055), 0.09, Material.PLAIN, skin)
     for side in (-1, 1):
         # The swinging arms carry the box's length and width.
@@ -142,14 +144,17 @@ def add_pedestrian(
     place.ellipsoid((0, 0, height - head), (0.10, 0.085, head), Material.PLAIN, skin)
 
 
-def add_tree(builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float]) -> None:
-    """Trunk and a crown of several ellipsoids."""
+def add_tree(
+    builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float], *, reach_m: float = math.inf
+) -> None:
+    """Trunk and a crown of several ellipsoids, which reaches out at most ``reach_m`` from the trunk."""
     place = builder.place(xyz, float(rng.uniform(0, 6.28)), SceneClass.VEGETATION)
     height, trunk = float(rng.uniform(4.5, 10)), float(rng.uniform(0.09, 0.22))
     fork = height * float(rng.uniform(0.35, 0.5))
     bark = _pick(rng, ((0.30, 0.25, 0.20), (0.36, 0.33, 0.29)), 0.03)
     place.cylinder((0, 0, fork * 0.6), (trunk, trunk), fork * 0.6, Material.ROUGH, bark, param=(0.12, 0.12, 0, 0))
-    spread = (height - fork) * float(rng.uniform(0.38, 0.55))
+    # No lump reaches further than (0.8 + 0.58) spreads.
+    spread = min((height - fork) * float(rng.uniform(0.38, 0.55)), reach_m / 1.38)
     green = _pick(rng, ((0.22, 0.31, 0.13), (0.17, 0.26, 0.11), (0.30, 0.33, 0.14), (0.36, 0.28, 0.12)), 0.02)
     for k in range(int(rng.integers(7, 11))):
         # The golden angle spreads the lumps evenly around the trunk.
@@ -249,7 +254,7 @@ def add_barrier(
     builder: SceneBuilder, rng: np.random.Generator, x: Range, y: Range, base_m: float, *, hedge: bool
 ) -> None:
     """A garden wall or a hedge between buildings."""
-    height = base_m + float(rng.uniform(0.9, 2.0))
+    height = base_m + float(rng.uniform(0.9, 1.4 if hedge else 2.0))
     if hedge:
         place = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.VEGETATION)
         place.box(x, y, (base_m - 0.05, height), Material.LEAF, _pick(rng, ((0.19, 0.27, 0.12),), 0.02))

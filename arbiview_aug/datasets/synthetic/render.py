@@ -41,7 +41,8 @@ class CameraView(NamedTuple):
 
     Attributes:
         image: (3, h, w) uint8 RGB; black where the lens sees nothing.
-        depth_m: (h, w) float32 z in the camera frame; infinite for the sky and where the lens sees nothing.
+        depth_m: (h, w) float32 z in the camera frame; infinite for the sky and where the lens sees
+            nothing; negative past 90 degrees off a fisheye's axis.
         classes: (h, w) uint8 ``SceneClass``.
         instances: (h, w) int16 row of the 3D boxes, -1 for none.
     """

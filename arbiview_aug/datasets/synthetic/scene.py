@@ -263,12 +263,24 @@ class Placed:
         axes = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]).T if lateral else np.eye(3)
         self._add(CYLINDER, np.array(center), axes, half, None, None, _SIGNS * half, material, color, param)
 
-    def _add(self, kind, middle, axes, half, normals, offsets, corners, material, color, param) -> None:  # type: ignore[no-untyped-def]
+    def _add(
+        self,
+        kind: int,
+        middle: FloatArray,
+        axes: FloatArray,
+        half: FloatArray,
+        normals: FloatArray | None,
+        offsets: FloatArray | None,
+        corners: FloatArray,
+        material: Material,
+        color: tuple[float, float, float],
+        param: tuple[float, float, float, float],
+    ) -> None:
         b = self.builder
         rotation = self.rotation @ axes
         center = self.origin + self.rotation @ middle
         planes = np.zeros((6, 4))
-        if normals is not None:
+        if normals is not None and offsets is not None:
             planes[:, :3] = normals @ rotation.T
             planes[:, 3] = offsets + planes[:, :3] @ center
         b.kind.append(kind)

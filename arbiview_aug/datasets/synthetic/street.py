@@ -73,7 +73,7 @@ def _layout(rng: np.random.Generator) -> tuple[Street, np.ndarray]:
         zebra=bool(rng.random() < 0.7),
         solid_centre=bool(rng.random() < 0.5),
         yellow_centre=bool(rng.random() < 0.25),
-        asphalt=float(rng.uniform(0.27, 0.44)),
+        asphalt=float(rng.uniform(0.30, 0.46)),
         wear=float(rng.uniform(0.6, 1.4)),
     )
     lane = int(rng.integers(lanes))
@@ -276,7 +276,10 @@ class _World:
                 x = k * trees + float(rng.normal(0, 0.5))
                 on_lamp = abs((x - offset + lamps / 2) % lamps - lamps / 2) < 1.5
                 if planted and rng.random() < 0.8 and abs(x) < 85 and not (self.at_crossing(x, 4) or on_lamp):
-                    objects.add_tree(self.builder, rng, (x, self.side_y(side, 1.0), base))
+                    # Crowns stay off the vehicle's own place: its cameras would be inside the leaves.
+                    y = self.side_y(side, 1.0)
+                    reach = abs(y - float(self.ego2street[1, 3])) - 2.0 if abs(x) < 10 else math.inf
+                    objects.add_tree(self.builder, rng, (x, y, base), reach_m=max(reach, 0.5))
             for _ in range(int(rng.integers(2, 6))):
                 x = float(rng.uniform(-45, 60))
                 if not self.at_crossing(x, 1):
