@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from importlib import import_module, metadata
 
 from arbiview_aug.environment import warn_about_cv2_wheels
+from arbiview_aug.errors import ArbiviewError
 
 COMMANDS = {
+    "demo": ("arbiview_aug.demo", "the main job on a synthetic street or on real frames, with numbers and a picture"),
     "inspect": ("arbiview_aug.inspect", "show rigs: tables, differences, a picture"),
 }
 """Module and one-line help of each command."""
@@ -38,7 +40,7 @@ def version() -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command and return its exit status: 0 done, 2 wrong usage."""
+    """Run a command and return its exit status: 0 done, 2 wrong usage or data that cannot be used, said in one line."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] == ["--version"]:
         print(f"arbiview_aug {version()}")
@@ -51,7 +53,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"python -m arbiview_aug: unknown command {name!r}\n\n{usage()}", file=sys.stderr)
         return 2
     warn_about_cv2_wheels()
-    return int(import_module(COMMANDS[name][0]).main(rest) or 0)
+    try:
+        return int(import_module(COMMANDS[name][0]).main(rest) or 0)
+    except ArbiviewError as error:
+        print(f"python -m arbiview_aug {name}: {error}", file=sys.stderr)
+        return 2
 
 
 if __name__ == "__main__":

@@ -1,0 +1,382 @@
+"""``python -m arbiview_aug demo``: the main job once, on a synthetic street or on real frames, with numbers and a picture.
+
+The synthetic street is ray-cast for the target rig too, so the rendered views are compared with the true ones. Real
+frames have no truth: there the views are compared with LiDAR points coloured by the source cameras, if there are any
+(see ``evaluate.sparse``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from tqdm import tqdm
+
+from arbiview_aug.camera import BoolArray
+from arbiview_aug.datasets import FrameFolder, NuScenesDataset
+from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE
+from arbiview_aug.datasets.synthetic import (
+    GROUND_CLASSES,
+    RenderedViews,
+    SceneClass,
+    SyntheticDrive,
+    demo_source_rig,
+    demo_target_rig,
+)
+from arbiview_aug.errors import DataError
+from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
+from arbiview_aug.evaluate.pictures import contact_sheet, outline_coverage, save_picture
+from arbiview_aug.evaluate.scores import mean_of
+from arbiview_aug.evaluate.sparse import ColouredPoints, coloured_points, equalised, sparse_metrics
+from arbiview_aug.evaluate.truth import truth_metrics
+from arbiview_aug.favs.config import Quality
+from arbiview_aug.rig import Rig, load_rig, shipped_rigs
+from arbiview_aug.surface import SurfaceName
+from arbiview_aug.transforms import RigRetarget
+
+PICTURE_FILE = "demo.png"
+_REAL_TARGET = "waymo"
+_COMPARED: tuple[SurfaceName, ...] = ("ground", "far")
+_NUSCENES_VERSIONS = ("v1.0-mini", "v1.0-trainval")  # the first of these that is there, else whichever v1.0-*
+_TIMED_CALLS = 5
+_RING_START_DEG = 200.0  # a ring is drawn from the left over the front to the right; what looks back comes last
+
+
+@dataclass(frozen=True)
+class _Data:
+    """What the demo runs on: samples, the rig to render, and the true views where they can be known."""
+
+    samples: Any
+    target: Rig
+    truth: Callable[[int], RenderedViews] | None
+
+
+@dataclass(frozen=True)
+class _Reference:
+    """What a frame's target views are compared with: true views, or coloured LiDAR points, or nothing.
+
+    Attributes:
+        truth: The true views, and the class of every pixel.
+        points: LiDAR points with the source cameras' colours; where exposures differ, the colours differ.
+        even_images: The source images with exposures made even, and the points coloured from those.
+    """
+
+    truth: RenderedViews | None = None
+    points: ColouredPoints | None = None
+    even_images: list[Image] | None = None
+    even_points: ColouredPoints | None = None
+
+
+@dataclass(frozen=True)
+class _Rendered:
+    """One retargeted sample: the rig as mounted on the source, its views, and where some source saw them."""
+
+    rig: Rig
+    views: list[Image]
+    coverage: list[BoolArray]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Retarget, explain, compare, and write the contact sheet."""
+    arguments = _parser().parse_args(argv)
+    picture_path = _picture_path(arguments.output)
+    data = _load(arguments)
+    count = min(arguments.frames, len(data.samples))
+    surfaces = list(dict.fromkeys((arguments.surface, *_COMPARED)))
+    rows: dict[str, list[dict[str, float]]] = {surface: [] for surface in surfaces}
+    plan_ms: list[float] = []
+    frame_ms: list[float] = []
+    first: tuple[dict[str, Any], _Reference, _Rendered] | None = None
+    with _notes(), tqdm(total=count * (2 + len(surfaces)), unit="step", leave=False) as progress:
+        transforms = {s: RigRetarget(data.target, quality=arguments.quality, surface=s) for s in surfaces}
+        chosen = transforms[arguments.surface]
+        for index in range(count):
+            progress.set_description(f"frame {index + 1}/{count}: source views")
+            sample = data.samples[index]
+            progress.update()
+            progress.set_description(f"frame {index + 1}/{count}: what to compare with")
+            reference = _reference(sample, None if data.truth is None else data.truth(index))
+            progress.update()
+            for times, ms in zip((plan_ms, frame_ms), _timings(chosen, sample), strict=True):
+                times.append(ms)
+            for surface, retarget in transforms.items():
+                progress.set_description(f"frame {index + 1}/{count}: target views, surface {surface}")
+                rows[surface].extend(_rows(reference, retarget, sample))
+                progress.update()
+            first = first or (sample, reference, _render(chosen, sample))
+    assert first is not None
+    sample, reference, rendered = first
+    print(f"{sample['rig']!r}\n\n{data.target!r}\n\n{chosen.explain(sample)}\n")
+    means = {surface: mean_of(found) for surface, found in rows.items()}
+    print(_table(means, reference, f"{len(data.target)} cameras, {count} frame{'s' if count > 1 else ''}"))
+    size = "x".join(map(str, rendered.rig.sizes[0][::-1]))
+    print(
+        f"\n{statistics.median(frame_ms):.1f} ms a frame: {len(sample['rig'])} source images to {len(data.target)} views "
+        f"of {size}, quality {arguments.quality}, {cv2.getNumThreads()} threads. The plan behind it takes "
+        f"{statistics.median(plan_ms):.0f} ms, once for each calibration."
+    )
+    sheet = _sheet(sample, reference, rendered, arguments.width)
+    print(f"picture: {save_picture(picture_path, sheet)}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m arbiview_aug demo",
+        description="Retarget a synthetic street, or real frames, to another vehicle's cameras: the plan in words, "
+        "metrics, time, and one contact sheet.",
+    )
+    parser.add_argument(
+        "--data",
+        metavar="FOLDER",
+        help="real frames: a frame folder (calib.json and images), a folder of such folders, or a nuScenes root "
+        "(default: a synthetic street)",
+    )
+    parser.add_argument(
+        "--target",
+        metavar="RIG",
+        help=f"the rig to render: a shipped one ({', '.join(shipped_rigs())}), or a rig file (default: a higher "
+        f"five-camera rig; with --data, {_REAL_TARGET})",
+    )
+    parser.add_argument(
+        "--output",
+        default="output",
+        metavar="DIR",
+        help=f"folder for {PICTURE_FILE}, or a picture file ending in .png or .jpg (default: %(default)s)",
+    )
+    parser.add_argument("--quality", choices=get_args(Quality), default="fast", help="(default: %(default)s)")
+    parser.add_argument("--surface", choices=get_args(SurfaceName), default="auto", help="(default: %(default)s)")
+    parser.add_argument("--frames", type=_count, default=1, metavar="N", help="how many (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of the synthetic streets (default: %(default)s)")
+    parser.add_argument(
+        "--size",
+        type=_size,
+        metavar="HxW",
+        help="render at this height and width; on a synthetic street the source cameras too (default: 256x704 on a "
+        "synthetic street, with --data the rig's own)",
+    )
+    parser.add_argument(
+        "--width", type=_count, default=1800, metavar="PX", help="of the contact sheet (default: %(default)s)"
+    )
+    return parser
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number above 0, got {text!r}")
+    return value
+
+
+def _size(text: str) -> tuple[int, int]:
+    height, _, width = text.partition("x")
+    if not (height.isdecimal() and width.isdecimal() and int(height) and int(width)):
+        raise argparse.ArgumentTypeError(f"expected HEIGHTxWIDTH such as 256x704, got {text!r}")
+    return int(height), int(width)
+
+
+def _picture_path(output: str) -> Path:
+    """Where the sheet goes; found out before any work, so that a folder that cannot be made costs nothing."""
+    path = Path(output)
+    if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        path = path / PICTURE_FILE
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"--output {output}: expected a folder that can be written to, got {error.strerror}") from None
+    return path
+
+
+def _load(arguments: argparse.Namespace) -> _Data:
+    target = None if arguments.target is None else load_rig(arguments.target)
+    if arguments.data is not None:
+        target = target or load_rig(_REAL_TARGET)
+        return _Data(open_data(arguments.data), _resized(target, arguments.size), None)
+    size = {} if arguments.size is None else {"size": arguments.size}
+    source = demo_source_rig(**size)
+    target = demo_target_rig(**size) if target is None else _resized(target, arguments.size or source.sizes[0])
+    drive = SyntheticDrive(source, num_frames=arguments.frames, seed=arguments.seed)
+    return _Data(drive, target, lambda index: drive.render(index, target))
+
+
+def _resized(rig: Rig, size: tuple[int, int] | None) -> Rig:
+    return rig if size is None else rig.resized(size)
+
+
+def open_data(folder: str | Path) -> FrameFolder | NuScenesDataset:
+    """The reader that fits a folder: frame folders (also where there are nuScenes tables beside), else nuScenes.
+
+    Raises:
+        DataError: Neither.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise DataError(f"--data {root}: expected a folder, found none")
+    if (root / CALIBRATION_FILE).is_file() or any(root.glob(f"*/{CALIBRATION_FILE}")):
+        return FrameFolder(root)
+    versions = sorted(path.name for path in root.glob("v1.0-*") if path.is_dir())
+    if not versions:
+        raise DataError(
+            f"--data {root}: expected a frame folder ({CALIBRATION_FILE} in it or in its folders) or a nuScenes root "
+            "(with a folder of tables such as v1.0-mini), found neither"
+        )
+    version = next((v for v in _NUSCENES_VERSIONS if v in versions), versions[0])
+    return NuScenesDataset(root, version, load_boxes=False)
+
+
+@contextmanager
+def _notes() -> Iterator[None]:
+    """Warnings as one line each at the end, out of the progress bar's way."""
+    with warnings.catch_warnings(record=True) as caught:
+        yield
+    for message in dict.fromkeys(str(warning.message) for warning in caught):
+        print(f"note: {message}\n")
+
+
+# --- work -------------------------------------------------------------------------------------------------------------
+def _render(retarget: RigRetarget, sample: dict[str, Any], images: list[Image] | None = None) -> _Rendered:
+    out = retarget(sample if images is None else {**sample, "images": as_tensors(images)})
+    rig = retarget.prepare(sample["rig"]).target
+    return _Rendered(rig, as_arrays(out["images"]), [mask.numpy() for mask in out["coverage"]])
+
+
+def _timings(retarget: RigRetarget, sample: dict[str, Any]) -> tuple[float, float]:
+    """Milliseconds to build the plan, and for a frame once it stands."""
+    start = time.perf_counter()
+    retarget.prepare(sample["rig"])
+    plan_ms = 1e3 * (time.perf_counter() - start)
+    retarget(sample)  # the first call allocates its buffers
+    calls = []
+    for _ in range(_TIMED_CALLS):
+        start = time.perf_counter()
+        retarget(sample)
+        calls.append(1e3 * (time.perf_counter() - start))
+    return plan_ms, statistics.median(calls)
+
+
+def _reference(sample: dict[str, Any], truth: RenderedViews | None) -> _Reference:
+    if truth is not None or "points" not in sample:
+        return _Reference(truth)
+    rig, images, points = sample["rig"], as_arrays(sample["images"]), sample["points"].numpy().astype(np.float64)
+    even: list[Image] = list(equalised(rig, images, points))
+    return _Reference(
+        points=coloured_points(rig, images, points), even_images=even, even_points=coloured_points(rig, even, points)
+    )
+
+
+def _rows(reference: _Reference, retarget: RigRetarget, sample: dict[str, Any]) -> list[dict[str, float]]:
+    """Metrics, one row a target camera."""
+    rendered = _render(retarget, sample)
+    rows = [{"seen": float(coverage.mean())} for coverage in rendered.coverage]
+    if reference.truth is not None:
+        truths, classes = as_arrays(reference.truth.images), [view.numpy() for view in reference.truth.classes]
+        for row, view, coverage, truth, of in zip(rows, rendered.views, rendered.coverage, truths, classes, strict=True):
+            row |= truth_metrics(view, truth, coverage=coverage, classes=_regions(of), valid=of != SceneClass.VOID)
+    if reference.points is not None:
+        _add_sparse(rows, rendered, reference.points, "")
+    if reference.even_points is not None:
+        _add_sparse(rows, _render(retarget, sample, reference.even_images), reference.even_points, "even_")
+    return rows
+
+
+def _add_sparse(rows: list[dict[str, float]], rendered: _Rendered, points: ColouredPoints, prefix: str) -> None:
+    for row, camera, view, coverage in zip(rows, rendered.rig, rendered.views, rendered.coverage, strict=True):
+        score = sparse_metrics(view, camera, points, coverage=coverage)
+        if score is not None:
+            row |= {prefix + name: value for name, value in score.as_dict().items()}
+
+
+def _regions(classes: npt.NDArray[np.uint8]) -> dict[str, BoolArray]:
+    ground, sky = np.isin(classes, [int(c) for c in GROUND_CLASSES]), classes == SceneClass.SKY
+    return {"ground": ground, "sky": sky, "object": ~ground & ~sky & (classes != SceneClass.VOID)}
+
+
+# --- what is shown ----------------------------------------------------------------------------------------------------
+_TRUTH_COLUMNS = (
+    ("seen", "seen", 100, "%"),
+    ("PSNR, seen", "covered_psnr_db", 1, " dB"),
+    ("on ground", "covered_ground_psnr_db", 1, " dB"),
+    ("on objects", "covered_object_psnr_db", 1, " dB"),
+    ("on sky", "covered_sky_psnr_db", 1, " dB"),
+    ("MAE, seen", "covered_mae", 1, ""),
+    ("SSIM, seen", "covered_ssim", 1, ""),
+    ("PSNR, all", "psnr_db", 1, " dB"),
+)
+_SPARSE_COLUMNS = (
+    ("seen", "seen", 100, "%"),
+    ("PSNR", "psnr_db", 1, " dB"),
+    ("where seen", "covered_psnr_db", 1, " dB"),
+    ("even exposure", "even_psnr_db", 1, " dB"),
+    ("on ground", "even_ground_psnr_db", 1, " dB"),
+    ("elsewhere", "even_other_psnr_db", 1, " dB"),
+    ("MAE", "even_mae", 1, ""),
+    ("SSIM", "even_ssim", 1, ""),
+)
+"""Heading, metric, factor and unit of each column of the two tables."""
+
+
+def _table(means: dict[str, dict[str, float]], reference: _Reference, of_what: str) -> str:
+    if reference.truth is not None:
+        title = f"Against the true views ({of_what}; grey levels 0-255; 'all' counts what no camera saw as black)"
+        columns = _TRUTH_COLUMNS
+    elif reference.points is not None:
+        title = (
+            f"Against {len(reference.points)} LiDAR points with the source cameras' colours ({of_what}; grey levels "
+            "0-255;\nfrom 'even exposure' on, the cameras' exposures are made even first: exposure is not geometry)"
+        )
+        columns = _SPARSE_COLUMNS
+    else:
+        title, columns = f"No truth and no LiDAR points to compare with ({of_what})", _TRUTH_COLUMNS[:1]
+    lines = [f"{title}:", "  surface" + "".join(f"{heading:>15}" for heading, *_ in columns)]
+    for surface, row in means.items():
+        cells = [_cell(row.get(metric), factor, unit) for _, metric, factor, unit in columns]
+        lines.append(f"  {surface:<7}" + "".join(f"{cell:>15}" for cell in cells))
+    return "\n".join(lines)
+
+
+def _cell(value: float | None, factor: float, unit: str) -> str:
+    if value is None:
+        return "-"
+    digits = 1 if unit else 3 if value <= 1 else 2
+    return f"{value * factor:.{digits}f}{unit}"
+
+
+def _sheet(
+    sample: dict[str, Any], reference: _Reference, rendered: _Rendered, width_px: int
+) -> npt.NDArray[np.uint8]:
+    """Source ring, target views, the same with what nobody saw hatched, and the truth; each row from left to right."""
+    source: Rig = sample["rig"]
+    ring, order = _left_to_right(source), _left_to_right(rendered.rig)
+    images = as_arrays(sample["images"])
+    hatched = [outline_coverage(v, c) for v, c in zip(rendered.views, rendered.coverage, strict=True)]
+    seen = float(np.mean([c.mean() for c in rendered.coverage]))
+    names = rendered.rig.names
+    missing = [f"{n}: {1 - c.mean():.1%} unseen" for n, c in zip(names, rendered.coverage, strict=True)]
+    rows = [
+        (f"What {source.name or 'the source'} recorded: {len(source)} cameras", images, source.names, ring),
+        (f"The same moment as {rendered.rig.name or 'the target'} would have seen it", rendered.views, names, order),
+        (f"Hatched: what no source camera saw ({1 - seen:.1%})", hatched, missing, order),
+    ]
+    if reference.truth is not None:
+        rows.append(("The truth: the street rendered for the target's cameras", as_arrays(reference.truth.images), names, order))
+    return contact_sheet(
+        [[pictures[k] for k in places] for _, pictures, _, places in rows],
+        [[captions[k] for k in places] for _, _, captions, places in rows],
+        titles=[title for title, *_ in rows],
+        width_px=width_px,
+    )
+
+
+def _left_to_right(rig: Rig) -> list[int]:
+    """Indices of the cameras as a panorama shows them."""
+    return sorted(range(len(rig)), key=lambda k: -((rig[k].azimuth_deg + _RING_START_DEG) % 360))
