@@ -137,9 +137,9 @@ def test_a_rig_on_another_ground_height_sees_the_same_pixels():
 
 def test_instances_fill_their_boxes():
     """Surface points of every well visible object lie in its box and reach the sides that face the camera."""
-    drive = SyntheticDrive(demo_source_rig((128, 352)), num_frames=6, seed=1)
+    drive = SyntheticDrive(demo_source_rig((128, 352)), num_frames=4, seed=1)
     checked = 0
-    for index in range(6):
+    for index in range(4):
         boxes = drive.scene(index).boxes_ego(0.0)
         views = drive.render(index)
         for camera, depth, instances in zip(drive.rig, views.depth_m, views.instances, strict=True):
@@ -155,7 +155,7 @@ def test_instances_fill_their_boxes():
                 )
                 assert (np.abs(local) <= boxes[row, 3:6] / 2 + 0.01).all()
                 checked += 1
-    assert checked > 50
+    assert checked > 40
 
 
 def test_isolated_vehicles_outlines_agree_with_their_boxes():
@@ -219,10 +219,9 @@ def test_every_object_touches_the_six_sides_of_its_box(cls):
 
 
 def test_lidar_points_lie_on_what_the_cameras_see():
-    rig = demo_source_rig((256, 704))
-    sample = SyntheticDrive(rig, num_frames=2, seed=6)[1]
+    rig = demo_source_rig((160, 440))
     drive = SyntheticDrive(rig, num_frames=2, seed=6)
-    points = sample["points"].double().numpy()
+    points = drive.points(1).double().numpy()
     assert points.shape[1] == 4 and 20_000 < len(points) < 35_000
     assert points[:, 3].min() >= 0 and points[:, 3].max() <= 255
     assert np.abs(points[np.hypot(points[:, 0], points[:, 1]) < 4, 2]).max() < 3.0

@@ -207,9 +207,8 @@ def _rough(s: Surface) -> Tensor:
     f = torch.maximum(s.across, s.slant)
     salt = s.scene.salt + 130
     scale = s.param[:, 0].clamp_min(0.02)
-    grain = noise(u / scale * 1.7 + s.local[:, 1] / scale, s.local[:, 2] / scale * 0.6, salt) * (
-        1.5 - 1.5 * f / scale
-    ).clamp(0, 1)
+    along = torch.where(s.face >= 4, s.local[:, 1], s.local[:, 2] * 0.6 + s.local[:, 1] * (s.face >= 2))
+    grain = noise(u / scale * 1.7, along / scale, salt) * (1.5 - 1.5 * f / scale).clamp(0, 1)
     joints = pulses(u, scale, 0.02, s.slant) * (scale > 0.3)
     return s.color * ((1 + s.param[:, 1] * 2 * grain) * (1 - 0.22 * joints))[:, None]
 

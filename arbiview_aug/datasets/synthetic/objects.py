@@ -31,6 +31,9 @@ _CLOTHES: tuple[Color, ...] = (
     (0.15, 0.17, 0.25), (0.55, 0.14, 0.16), (0.78, 0.77, 0.72), (0.20, 0.35, 0.50), (0.70, 0.55, 0.15),
     (0.12, 0.12, 0.13), (0.35, 0.45, 0.30), (0.60, 0.40, 0.50),
 )  # fmt: skip
+_TROUSERS: tuple[Color, ...] = (
+    (0.13, 0.17, 0.28), (0.10, 0.10, 0.11), (0.38, 0.33, 0.26), (0.28, 0.29, 0.31), (0.20, 0.16, 0.14)
+)  # fmt: skip
 _WALLS: tuple[Color, ...] = (
     (0.62, 0.55, 0.46), (0.55, 0.33, 0.26), (0.70, 0.68, 0.63), (0.48, 0.47, 0.46), (0.66, 0.60, 0.42),
     (0.40, 0.30, 0.26), (0.58, 0.62, 0.64), (0.74, 0.66, 0.58), (0.36, 0.38, 0.42),
@@ -123,7 +126,7 @@ def add_pedestrian(
     center = np.array([xyz[0], xyz[1], xyz[2] + height / 2])
     row = builder.add_box(center, (length, width, height), yaw, BoxClass.PEDESTRIAN)
     place = builder.place(xyz, yaw, SceneClass.PEDESTRIAN, row)
-    trousers, jacket = _pick(rng, _CLOTHES), _pick(rng, _CLOTHES)
+    trousers, jacket = _pick(rng, _TROUSERS), _pick(rng, _CLOTHES)
     skin = _pick(rng, ((0.80, 0.62, 0.52), (0.55, 0.38, 0.28), (0.35, 0.24, 0.18)), 0.02)
     sleeve: Color = (jacket[0] * 0.85, jacket[1] * 0.85, jacket[2] * 0.85)
     hip, shoulder, head = 0.48 * height, 0.83 * height, 0.115

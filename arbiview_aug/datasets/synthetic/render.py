@@ -244,9 +244,9 @@ class Renderer:
         owner = torch.repeat_interleave(torch.arange(len(outline), device=tile.device), packets)
         packed = sub[first_pixel[owner]][:, None, :1].expand(-1, _PACKET_PX, s * s, -1).clone()
         packed[packet, place] = sub
-        packed = _turned(packed.view(len(owner), -1, 3).transpose(1, 2), scene)
+        packed = _turned(packed.view(len(owner), _PACKET_PX * s * s, 3).transpose(1, 2), scene)
         t, hit = cast(first.local, packed, _for_packets(candidates, owner, len(outline)))
-        t, hit = (a.view(len(owner), _PACKET_PX, -1)[packet, place].reshape(-1) for a in (t, hit))
+        t, hit = (a.view(len(owner), _PACKET_PX, s * s)[packet, place].reshape(-1) for a in (t, hit))
         direction = packed.transpose(1, 2).reshape(len(owner), _PACKET_PX, s * s, 3)[packet, place].reshape(-1, 3)
         pitch = (rays.pitch[tile, slot] / s).repeat_interleave(s * s)
         return tile * outline.shape[1] + slot, _hits(first.start, direction, t, hit, pitch)
