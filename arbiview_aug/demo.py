@@ -1,4 +1,4 @@
-"""``python -m arbiview_aug demo``: the main job once, on a synthetic street or on real frames, with numbers and a picture.
+"""``python -m arbiview_aug demo``: the main job on a synthetic street or on real frames, with numbers and a picture.
 
 The synthetic street is ray-cast for the target rig too, so the rendered views are compared with the true ones. Real
 frames have no truth: there the views are compared with LiDAR points coloured by the source cameras, if there are any
@@ -121,8 +121,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(_table(means, reference, f"{len(data.target)} cameras, {count} frame{'s' if count > 1 else ''}"))
     size = "x".join(map(str, rendered.rig.sizes[0][::-1]))
     print(
-        f"\n{statistics.median(frame_ms):.1f} ms a frame: {len(sample['rig'])} source images to {len(data.target)} views "
-        f"of {size}, quality {arguments.quality}, {cv2.getNumThreads()} threads. The plan behind it takes "
+        f"\n{statistics.median(frame_ms):.1f} ms a frame: {len(sample['rig'])} source images to {len(data.target)} "
+        f"views of {size}, quality {arguments.quality}, {cv2.getNumThreads()} threads. The plan behind it takes "
         f"{statistics.median(plan_ms):.0f} ms, once for each calibration."
     )
     sheet = _sheet(sample, reference, rendered, arguments.width)
@@ -157,7 +157,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--quality", choices=get_args(Quality), default="fast", help="(default: %(default)s)")
     parser.add_argument("--surface", choices=get_args(SurfaceName), default="auto", help="(default: %(default)s)")
     parser.add_argument("--frames", type=_count, default=1, metavar="N", help="how many (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of the synthetic streets (default: %(default)s)")
+    parser.add_argument("--seed", type=_seed, default=0, help="of the synthetic streets (default: %(default)s)")
     parser.add_argument(
         "--size",
         type=_size,
@@ -176,6 +176,10 @@ def _count(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"expected a whole number above 0, got {text!r}")
     return value
+
+
+def _seed(text: str) -> int:
+    return _count(str(int(text) + 1)) - 1
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -205,7 +209,7 @@ def _load(arguments: argparse.Namespace) -> _Data:
     size = {} if arguments.size is None else {"size": arguments.size}
     source = demo_source_rig(**size)
     target = demo_target_rig(**size) if target is None else _resized(target, arguments.size or source.sizes[0])
-    drive = SyntheticDrive(source, num_frames=arguments.frames, seed=arguments.seed)
+    drive = SyntheticDrive(source, num_frames=arguments.frames, seed=arguments.seed, lidar=False)
     return _Data(drive, target, lambda index: drive.render(index, target))
 
 
@@ -279,9 +283,10 @@ def _rows(reference: _Reference, retarget: RigRetarget, sample: dict[str, Any]) 
     rendered = _render(retarget, sample)
     rows = [{"seen": float(coverage.mean())} for coverage in rendered.coverage]
     if reference.truth is not None:
-        truths, classes = as_arrays(reference.truth.images), [view.numpy() for view in reference.truth.classes]
-        for row, view, coverage, truth, of in zip(rows, rendered.views, rendered.coverage, truths, classes, strict=True):
-            row |= truth_metrics(view, truth, coverage=coverage, classes=_regions(of), valid=of != SceneClass.VOID)
+        true = zip(as_arrays(reference.truth.images), reference.truth.classes, strict=True)
+        for row, view, coverage, (truth, of) in zip(rows, rendered.views, rendered.coverage, true, strict=True):
+            regions, valid = _regions(of.numpy()), of.numpy() != SceneClass.VOID
+            row |= truth_metrics(view, truth, coverage=coverage, classes=regions, valid=valid)
     if reference.points is not None:
         _add_sparse(rows, rendered, reference.points, "")
     if reference.even_points is not None:
@@ -303,72 +308,82 @@ def _regions(classes: npt.NDArray[np.uint8]) -> dict[str, BoolArray]:
 
 # --- what is shown ----------------------------------------------------------------------------------------------------
 _TRUTH_COLUMNS = (
-    ("seen", "seen", 100, "%"),
-    ("PSNR, seen", "covered_psnr_db", 1, " dB"),
-    ("on ground", "covered_ground_psnr_db", 1, " dB"),
-    ("on objects", "covered_object_psnr_db", 1, " dB"),
-    ("on sky", "covered_sky_psnr_db", 1, " dB"),
-    ("MAE, seen", "covered_mae", 1, ""),
-    ("SSIM, seen", "covered_ssim", 1, ""),
-    ("PSNR, all", "psnr_db", 1, " dB"),
+    ("seen", "seen"),
+    ("PSNR dB", "covered_psnr_db"),
+    ("ground", "covered_ground_psnr_db"),
+    ("objects", "covered_object_psnr_db"),
+    ("sky", "covered_sky_psnr_db"),
+    ("MAE", "covered_mae"),
+    ("SSIM", "covered_ssim"),
+    ("whole view", "psnr_db"),
 )
 _SPARSE_COLUMNS = (
-    ("seen", "seen", 100, "%"),
-    ("PSNR", "psnr_db", 1, " dB"),
-    ("where seen", "covered_psnr_db", 1, " dB"),
-    ("even exposure", "even_psnr_db", 1, " dB"),
-    ("on ground", "even_ground_psnr_db", 1, " dB"),
-    ("elsewhere", "even_other_psnr_db", 1, " dB"),
-    ("MAE", "even_mae", 1, ""),
-    ("SSIM", "even_ssim", 1, ""),
+    ("seen", "seen"),
+    ("raw dB", "psnr_db"),
+    ("even dB", "even_psnr_db"),
+    ("covered", "even_covered_psnr_db"),
+    ("ground", "even_ground_psnr_db"),
+    ("other", "even_other_psnr_db"),
+    ("MAE", "even_mae"),
+    ("SSIM", "even_ssim"),
 )
-"""Heading, metric, factor and unit of each column of the two tables."""
+"""Heading and metric of each column of the two tables."""
 
 
 def _table(means: dict[str, dict[str, float]], reference: _Reference, of_what: str) -> str:
+    columns: tuple[tuple[str, str], ...]
+    notes: tuple[str, ...] = ()
     if reference.truth is not None:
-        title = f"Against the true views ({of_what}; grey levels 0-255; 'all' counts what no camera saw as black)"
-        columns = _TRUTH_COLUMNS
-    elif reference.points is not None:
-        title = (
-            f"Against {len(reference.points)} LiDAR points with the source cameras' colours ({of_what}; grey levels "
-            "0-255;\nfrom 'even exposure' on, the cameras' exposures are made even first: exposure is not geometry)"
+        title, columns = f"Against the true views ({of_what}), where some source camera saw", _TRUTH_COLUMNS
+        notes = (
+            "seen: share of the target's pixels. ground, objects, sky: PSNR there. MAE in grey levels of 255.",
+            "whole view: PSNR with everything else left black.",
         )
+    elif reference.points is not None:
+        title = f"Against {len(reference.points)} LiDAR points with the colours that the source cameras saw ({of_what})"
         columns = _SPARSE_COLUMNS
+        notes = (
+            "seen: share of the target's pixels. raw: PSNR of all points, those on unseen pixels against black.",
+            "even and all that follows: the cameras' exposures are made even first, since exposure is not geometry.",
+        )
     else:
-        title, columns = f"No truth and no LiDAR points to compare with ({of_what})", _TRUTH_COLUMNS[:1]
-    lines = [f"{title}:", "  surface" + "".join(f"{heading:>15}" for heading, *_ in columns)]
+        title, columns = f"No true views and no LiDAR points to compare with ({of_what})", _TRUTH_COLUMNS[:1]
+    lines = [f"{title}:", f"  {'surface':<7}" + "".join(f"{heading:>{_width(heading)}}" for heading, _ in columns)]
     for surface, row in means.items():
-        cells = [_cell(row.get(metric), factor, unit) for _, metric, factor, unit in columns]
-        lines.append(f"  {surface:<7}" + "".join(f"{cell:>15}" for cell in cells))
-    return "\n".join(lines)
+        cells = [f"{_cell(metric, row.get(metric)):>{_width(heading)}}" for heading, metric in columns]
+        lines.append(f"  {surface:<7}" + "".join(cells))
+    return "\n".join([*lines, *(f"  {note}" for note in notes)])
 
 
-def _cell(value: float | None, factor: float, unit: str) -> str:
+def _width(heading: str) -> int:
+    return max(7, len(heading)) + 2
+
+
+def _cell(metric: str, value: float | None) -> str:
     if value is None:
         return "-"
-    digits = 1 if unit else 3 if value <= 1 else 2
-    return f"{value * factor:.{digits}f}{unit}"
+    if metric == "seen":
+        return f"{value:.1%}"
+    return f"{value:.4f}" if metric.endswith("ssim") else f"{value:.2f}"
 
 
-def _sheet(
-    sample: dict[str, Any], reference: _Reference, rendered: _Rendered, width_px: int
-) -> npt.NDArray[np.uint8]:
+def _sheet(sample: dict[str, Any], reference: _Reference, rendered: _Rendered, width_px: int) -> npt.NDArray[np.uint8]:
     """Source ring, target views, the same with what nobody saw hatched, and the truth; each row from left to right."""
     source: Rig = sample["rig"]
     ring, order = _left_to_right(source), _left_to_right(rendered.rig)
     images = as_arrays(sample["images"])
-    hatched = [outline_coverage(v, c) for v, c in zip(rendered.views, rendered.coverage, strict=True)]
-    seen = float(np.mean([c.mean() for c in rendered.coverage]))
-    names = rendered.rig.names
-    missing = [f"{n}: {1 - c.mean():.1%} unseen" for n, c in zip(names, rendered.coverage, strict=True)]
+    names, target = rendered.rig.names, rendered.rig.name or "the target"
+    unseen = [1 - float(coverage.mean()) for coverage in rendered.coverage]
     rows = [
         (f"What {source.name or 'the source'} recorded: {len(source)} cameras", images, source.names, ring),
-        (f"The same moment as {rendered.rig.name or 'the target'} would have seen it", rendered.views, names, order),
-        (f"Hatched: what no source camera saw ({1 - seen:.1%})", hatched, missing, order),
+        (f"The same moment, retargeted to {target}: {len(names)} cameras", rendered.views, names, order),
     ]
+    if any(unseen):
+        hatched: list[Image] = [outline_coverage(v, c) for v, c in zip(rendered.views, rendered.coverage, strict=True)]
+        captions = [f"{name}: {share:.1%} unseen" for name, share in zip(names, unseen, strict=True)]
+        rows.append((f"Hatched: what no source camera saw, {np.mean(unseen):.1%}", hatched, captions, order))
     if reference.truth is not None:
-        rows.append(("The truth: the street rendered for the target's cameras", as_arrays(reference.truth.images), names, order))
+        rows.append((f"The truth: what {target} would have seen", as_arrays(reference.truth.images), names, order))
     return contact_sheet(
         [[pictures[k] for k in places] for _, pictures, _, places in rows],
         [[captions[k] for k in places] for _, _, captions, places in rows],

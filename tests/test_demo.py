@@ -1,0 +1,107 @@
+"""``python -m arbiview_aug demo``, at a tiny size."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+
+from arbiview_aug.__main__ import main
+from arbiview_aug.datasets import FrameFolder, NuScenesDataset
+from arbiview_aug.demo import open_data
+from arbiview_aug.errors import DataError
+
+
+def numbers(printed: str, surface: str) -> list[float]:
+    """The table's row of a surface."""
+    line = next(line for line in printed.splitlines() if line.split()[:1] == [surface])
+    return [float(cell.rstrip("%")) for cell in line.split()[1:]]
+
+
+def test_synthetic_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["demo", "--size", "64x176", "--output", str(tmp_path), "--width", "900"]) == 0
+    printed = capsys.readouterr().out
+    assert "sedan -> van: 6 cameras to 5" in printed and "over the street surface" in printed
+    assert "Against the true views (5 cameras, 1 frame)" in printed and "ms a frame" in printed
+    auto, far = numbers(printed, "auto"), numbers(printed, "far")
+    seen, psnr, ground, _, _, mae, ssim, whole = auto
+    assert 80 < seen < 100 and whole < psnr and 0 < mae < 50 and 0.2 < ssim < 1
+    # 0.6 m higher, the road is where a plane says it is and not infinitely far away.
+    assert ground > far[2] + 3
+    sheet = cv2.imread(str(tmp_path / "demo.png"))
+    assert sheet is not None and sheet.shape[1] == 900 and 200 < sheet.shape[0] < 900
+    assert sheet.std() > 20
+    assert f"picture: {tmp_path / 'demo.png'}" in printed
+
+
+@pytest.mark.parametrize("reader", ["frame folder", "tables"])
+def test_real_keyframe(reader: str, nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = nuscenes_root
+    if reader == "tables":
+        root = tmp_path / "tables"
+        root.mkdir()
+        for name in ("samples", "v1.0-mini"):
+            (root / name).symlink_to(nuscenes_root / name)
+    picture = tmp_path / "sheet.jpg"
+    assert main(["demo", "--data", str(root), "--size", "160x288", "--output", str(picture), "--frames", "3"]) == 0
+    printed = capsys.readouterr().out
+    assert "6 cameras to 5" in printed and "LiDAR points" in printed and "(5 cameras, 1 frame)" in printed
+    seen, _, even, covered, ground, *_ = numbers(printed, "auto")
+    assert seen > 95 and even > 15 and covered >= even and ground > numbers(printed, "far")[4] + 5
+    assert cv2.imread(str(picture)) is not None
+
+
+def test_lenses_without_points(fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--target", "ddad", "--size", "120x200", "--output", str(tmp_path), "--surface", "far"]
+    assert main(["demo", "--data", str(fisheye_root), *arguments]) == 0
+    printed = capsys.readouterr().out
+    assert "No true views and no LiDAR points" in printed
+    assert numbers(printed, "far")[0] > 80 and numbers(printed, "ground")[0] > 80
+
+
+def test_frame_folders_win_over_tables(tmp_path: Path) -> None:
+    (tmp_path / "v1.0-mini").mkdir()
+    with pytest.raises(DataError, match=r"table|scene\.json|v1\.0-mini"):
+        open_data(tmp_path)
+    (tmp_path / "frame").mkdir()
+    (tmp_path / "frame" / "calib.json").write_text(json.dumps({"cameras": []}))
+    assert isinstance(open_data(tmp_path), FrameFolder)
+
+
+def test_readers(nuscenes_root: Path) -> None:
+    assert isinstance(open_data(nuscenes_root), FrameFolder)
+    assert not isinstance(open_data(nuscenes_root), NuScenesDataset)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--data", "no such folder"], "--data no such folder: expected a folder, found none"),
+        (["--data", "."], "expected a frame folder"),
+        (["--target", "tesla"], "expected a file or one of the shipped rigs"),
+        (["--output", "file/below"], "--output file/below: expected a folder that can be written to"),
+    ],
+)
+def test_errors_are_one_line(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    assert main(["demo", *arguments]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("python -m arbiview_aug demo: ") and message in said and len(said.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--size", "704"], ["--size", "0x3"], ["--seed", "-1"], ["--frames", "0"], ["--surface", "flat"]]
+)
+def test_wrong_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["demo", *arguments])
+    assert "error: argument" in capsys.readouterr().err
