@@ -1,8 +1,8 @@
 """Where a target camera's pixels lie in a source image, over a surface: cheaply, and to a stated precision.
 
-Maps are evaluated in float64 on the nodes of a coarse grid and interpolated: cubically to half the spacing, bilinearly
-from there. Cells whose error bound exceeds the tolerance, and cells on the border of what can be projected, are
-evaluated pixel by pixel. Directions are held plane by plane, (3, ny, nx) in memory: three times faster than (ny, nx, 3).
+Maps are evaluated in float64 on the nodes of a coarse grid and interpolated: cubically to a quarter of the spacing,
+bilinearly from there. Cells whose error bound exceeds the tolerance, and cells on the border of what can be projected, are
+evaluated pixel by pixel. Directions are held plane by plane, (3, ny, nx) in memory, which is three times faster.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,8 +26,8 @@ Box = tuple[int, int, int, int]
 """(first row, last row, first column, last column); of nodes both inclusive, of pixels the last exclusive."""
 
 _SMALL_SIDE_PX = 64  # targets with a shorter side are evaluated pixel by pixel: a coarse grid could step over a source
-_REFINEMENT = 2  # the cubic step halves the spacing once
-_SAFETY = 1.5  # curvature between the nodes may exceed what the nodes show
+_HALVINGS = 2  # cubic steps before the bilinear one: a quarter of the spacing, a sixteenth of its error
+_SAFETY = 2.0  # curvature between the nodes may exceed what the nodes show
 _CUBIC = np.array([[-1.0, 9.0, 9.0, -1.0]]) / 16  # mid-point of the cubic through four nodes
 _CORNERS = tuple((a, b) for a in (slice(None, -1), slice(1, None)) for b in (slice(None, -1), slice(1, None)))
 _FAR_AWAY_PX = 1e5  # float32 maps stay precise and int16 conversion saturates harmlessly
@@ -111,30 +112,41 @@ class Grid:
         part = np.ascontiguousarray(values[j0 : j1 + 1, i0 : i1 + 1], dtype=np.float32)
         return part if self.step == 1 else self._enlarged(part, nodes, self.step)
 
-    def upsample_refined(self, uv: FloatArray, nodes: Box, slot: Slot) -> npt.NDArray[np.float32]:
-        """Source pixels (ny, nx, 2) as atlas positions of the pixels between ``nodes``, halving the spacing cubically."""
-        j0, j1, i0, i1 = nodes
-        if self.step == 1:
-            return slot.from_source(uv[j0 : j1 + 1, i0 : i1 + 1]).astype(np.float32)
-        ny, nx = uv.shape[:2]
-        m0, m1, n0, n1 = max(j0 - 1, 0), min(j1 + 1, ny - 1), max(i0 - 1, 0), min(i1 + 1, nx - 1)
-        part = slot.from_source(uv[m0 : m1 + 1, n0 : n1 + 1]).astype(np.float32)
-        fine = np.empty((2 * part.shape[0] - 1, 2 * part.shape[1] - 1, 2), np.float32)
-        across = cv2.filter2D(part, -1, _CUBIC, anchor=(1, 0), borderType=cv2.BORDER_REPLICATE)
-        fine[::2, ::2], fine[::2, 1::2] = part, across[:, :-1]
-        even = np.ascontiguousarray(fine[::2])
-        fine[1::2] = cv2.filter2D(even, -1, _CUBIC.T, anchor=(0, 1), borderType=cv2.BORDER_REPLICATE)[:-1]
-        top, left = 2 * (j0 - m0), 2 * (i0 - n0)
-        fine = np.ascontiguousarray(fine[top : top + 2 * (j1 - j0) + 1, left : left + 2 * (i1 - i0) + 1])
-        return self._enlarged(fine, nodes, self.step // 2)
+    def refined(self, values: npt.NDArray[np.float32], nodes: Box) -> npt.NDArray[np.float32]:
+        """Node values (ny, nx, 2) between ``nodes`` on a grid ``2**_HALVINGS`` times as fine."""
+        # Each halving misses one neighbour at the border of its input.
+        e, n = _HALVINGS, 2**_HALVINGS
+        (j0, j1, i0, i1), (ny, nx) = nodes, values.shape[:2]
+        m0, m1, n0, n1 = max(j0 - e, 0), min(j1 + e, ny - 1), max(i0 - e, 0), min(i1 + e, nx - 1)
+        fine = np.ascontiguousarray(values[m0 : m1 + 1, n0 : n1 + 1])
+        for _ in range(_HALVINGS):
+            fine = _halved_spacing(fine)
+        top, left = n * (j0 - m0), n * (i0 - n0)
+        return np.ascontiguousarray(fine[top : top + n * (j1 - j0) + 1, left : left + n * (i1 - i0) + 1])
+
+    def upsample_refined(self, fine: npt.NDArray[np.float32], of: Box, rows: tuple[int, int]) -> Any:
+        """Pixels between node rows ``rows`` of values that were ``refined`` between the nodes ``of``."""
+        n = 2**_HALVINGS
+        part = fine[n * (rows[0] - of[0]) : n * (rows[1] - of[0]) + 1]
+        return self._enlarged(part, (*rows, of[2], of[3]), self.step // n)
 
     def _enlarged(self, part: npt.NDArray[np.float32], nodes: Box, spacing: int) -> npt.NDArray[np.float32]:
-        full = cv2.resize(part, (part.shape[1] * spacing, part.shape[0] * spacing), interpolation=cv2.INTER_LINEAR)
+        full: Any = cv2.resize(part, (part.shape[1] * spacing, part.shape[0] * spacing), interpolation=cv2.INTER_LINEAR)
         y0, y1, x0, x1 = self.pixels(nodes)
         # Node j0 lies at row (spacing - 1) / 2 of the enlarged block, and at offset + step j0 of the image.
         dy = round((spacing - 1) / 2 - self.offset - self.step * nodes[0])
         dx = round((spacing - 1) / 2 - self.offset - self.step * nodes[2])
         return full[y0 + dy : y1 + dy, x0 + dx : x1 + dx]
+
+
+def _halved_spacing(part: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Node values (ny, nx, 2) on a grid twice as fine, (2 ny - 1, 2 nx - 1, 2): cubic between four nodes each way."""
+    fine = np.empty((2 * part.shape[0] - 1, 2 * part.shape[1] - 1, 2), np.float32)
+    across = cv2.filter2D(part, -1, _CUBIC, anchor=(1, 0), borderType=cv2.BORDER_REPLICATE)
+    fine[::2, ::2], fine[::2, 1::2] = part, across[:, :-1]
+    even = np.ascontiguousarray(fine[::2])
+    fine[1::2] = cv2.filter2D(even, -1, _CUBIC.T, anchor=(0, 1), borderType=cv2.BORDER_REPLICATE)[:-1]
+    return fine
 
 
 class TargetRays:
@@ -171,7 +183,7 @@ class PairMap:
         nodes: The nodes around everything that the source may see, or None if it sees nothing.
     """
 
-    def __init__(self, rays: TargetRays, source: Camera, surface: Surface, tolerance_px: float) -> None:
+    def __init__(self, rays: TargetRays, source: Camera, surface: Surface) -> None:
         self.rays, self.source, self.surface = rays, source, surface
         self.offset_m = rays.camera.center_m - source.center_m
         self.nodes: Box | None = None
@@ -181,10 +193,12 @@ class PairMap:
         self.valid &= rays.valid
         self._exact = np.zeros((0, 0), bool)
         self._use: BoolArray | None = None
+        self._whole: BoolArray | None = None
+        self._fine: tuple[Slot, npt.NDArray[np.float32]] | None = None
         if rays.grid.step == 1:
             self.nodes = _bounds(self.valid & source.contains(self.uv), 0)
         else:
-            self.nodes = self._classify(tolerance_px)
+            self.nodes = self._classify()
 
     def _glance(self) -> bool:
         """Whether any cell four times as large may hold a pixel of the source: most pairs end here."""
@@ -194,20 +208,23 @@ class PairMap:
         whole, border = self._cells_that_may_see(uv, projected & valid)
         return bool(whole.any() or border.any())
 
-    def _classify(self, tolerance_px: float) -> Box | None:
-        """Sort the cells: seeing nothing, interpolated, exact. Returns the nodes around those in use."""
-        whole, border = self._cells_that_may_see(self.uv, self.valid)
-        use = whole | border
-        box = _bounds(use, 1)
-        if box is None:
-            return None
+    def _classify(self) -> Box | None:
+        """Sort the cells: seeing nothing, whole, on a border of validity. Returns the nodes around those in use."""
+        self._whole, border = self._cells_that_may_see(self.uv, self.valid)
+        use = self._whole | border
         # Invalid nodes hold placeholders that may lie inside the image.
         self._use = None if self.valid.all() else use
-        self._exact = border | (whole & self._too_curved(box, tolerance_px))
-        exact = int(np.count_nonzero(self._exact))
-        self.rays.counters["cells_exact"] += exact
-        self.rays.counters["cells_interpolated"] += int(np.count_nonzero(use)) - exact
-        return box
+        self._exact = border
+        return _bounds(use, 1)
+
+    def set_tolerance(self, tolerance_px: float) -> None:
+        """Mark the cells whose interpolation may be off by more than this, in source pixels, for exact evaluation."""
+        if self._whole is None or self.nodes is None:
+            return
+        self._exact = self._exact | (self._whole & self._too_curved(self.nodes, tolerance_px))
+        counters, exact = self.rays.counters, int(np.count_nonzero(self._exact))
+        counters["cells_exact"] += exact
+        counters["cells_interpolated"] += int(np.count_nonzero(self._whole & ~self._exact))
 
     def _cells_that_may_see(self, uv: FloatArray, valid: BoolArray) -> tuple[BoolArray, BoolArray]:
         """Cells with four valid corners not all beyond one side of the image; cells on the border of validity."""
@@ -246,7 +263,7 @@ class PairMap:
             fourth = _larger(np.diff(around, 4, axis=axis)) if around.shape[axis] > 4 else None
             pad = [(0, 0), (0, 0)]
             pad[axis] = (1, 1)
-            error += np.pad(second, pad, mode="edge") * (_SAFETY / 8 / (_REFINEMENT**2 if self.surface.smooth else 1))
+            error += np.pad(second, pad, mode="edge") * (_SAFETY / 8 / (4**_HALVINGS if self.surface.smooth else 1))
             if fourth is not None:
                 pad[axis] = (2, 2)
                 error += np.pad(fourth, pad, mode="edge") * (_SAFETY * 3 / 128)
@@ -267,29 +284,36 @@ class PairMap:
         uv, valid = project_rays(self.source, directions, q, self.offset_m)
         return uv, valid & ray_valid
 
-    def full_resolution(self, slot: Slot, nodes: Box) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
-        """Atlas positions and visibility over the pixels between some of the nodes in use.
+    def full_resolution(
+        self, slot: Slot, rows: tuple[int, int]
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
+        """Atlas positions and visibility over the pixels between some rows of the nodes in use.
 
         Args:
             slot: Where the source lies in the atlas. Its affine change of coordinates is applied to the nodes, where
                 it is exact and costs nothing.
-            nodes: The part to evaluate.
+            rows: First and last row of nodes.
 
         Returns:
             (h, w, 2) float32 positions, and (h, w) uint8, 255 where the source sees the pixel.
         """
+        assert self.nodes is not None
         grid, source = self.rays.grid, self.source
-        at = grid.upsample_refined(self.uv, nodes, slot)
+        nodes = (*rows, *self.nodes[2:])
         if grid.step == 1:
             y0, y1, x0, x1 = grid.pixels(nodes)
+            at = slot.from_source(self.uv[y0:y1, x0:x1]).astype(np.float32)
             at[~self.valid[y0:y1, x0:x1]] = -_FAR_AWAY_PX
         else:
+            if self._fine is None or self._fine[0] != slot:
+                self._fine = slot, grid.refined(slot.from_source(self.uv).astype(np.float32), self.nodes)
+            at = grid.upsample_refined(self._fine[1], self.nodes, rows)
             self._patch_exact(at, nodes, slot)
         # Slack: a pixel on the very border must not drop out by a rounding of float32.
         slack = 1e-3
         low = slot.from_source(np.array([-slack, -slack]))
         high = slot.from_source(np.array([source.width_px - 1 + slack, source.height_px - 1 + slack]))
-        visible = cv2.inRange(at, tuple(low), tuple(high))
+        visible: Any = cv2.inRange(at, tuple(low), tuple(high))
         if self._use is not None:
             visible &= grid.cells_to_pixels(self._use, nodes)
         if source.mask is not None:
@@ -302,7 +326,7 @@ class PairMap:
 
     @cached_property
     def _exact_pixels(self) -> tuple[npt.NDArray[np.int64], FloatArray, BoolArray]:
-        """Pixels (n, 2) of the cells that cannot be interpolated, row by row of cells; their source pixels; validity."""
+        """Pixels (n, 2) of the cells that cannot be interpolated, in rows of cells; their source pixels; validity."""
         grid = self.rays.grid
         j, i = np.nonzero(self._exact)
         steps = np.arange(grid.step)
@@ -380,10 +404,10 @@ def _mask_at(source: Camera, slot: Slot, at: npt.NDArray[np.float32]) -> npt.NDA
     safe = source.mask.astype(np.uint8) * 255
     if slot.level:
         # A halved pixel is clean where every pixel in it is.
-        clean = cv2.resize(safe, slot.size[::-1], interpolation=cv2.INTER_AREA)
+        clean: Any = cv2.resize(safe, slot.size[::-1], interpolation=cv2.INTER_AREA)
         safe = np.where(clean == 255, 255, 0).astype(np.uint8)
-    safe = cv2.erode(safe, np.ones((3, 3), np.uint8), borderValue=255)
-    local = cv2.subtract(at, (slot.x, slot.y, 0, 0)) if slot.x or slot.y else at
+    safe = np.asarray(cv2.erode(safe, np.ones((3, 3), np.uint8), borderValue=255), np.uint8)
+    local = at - np.array([slot.x, slot.y], np.float32) if slot.x or slot.y else at
     return cv2.remap(safe, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
 
 
@@ -395,16 +419,17 @@ def edge_distance(source: Camera, uv: FloatArray) -> FloatArray:
         return edge
     coarse = cv2.resize(source.mask.astype(np.float32), None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)
     free = np.pad((coarse >= 1).astype(np.uint8), 1, constant_values=1)
-    distance = cv2.distanceTransform(free, cv2.DIST_L2, 3)[1:-1, 1:-1].clip(max=1e6) * 8  # without any masked pixel: the largest float
+    distance = cv2.distanceTransform(free, cv2.DIST_L2, 3)[1:-1, 1:-1]
+    distance = np.minimum(distance, 1e6) * 8  # it is the largest float where nothing is masked
     index = np.clip(np.clip(uv, -8, _FAR_AWAY_PX) / 8, 0, (coarse.shape[1] - 1, coarse.shape[0] - 1)).astype(np.int64)
     return np.where(edge >= 0, np.minimum(edge, distance[index[..., 1], index[..., 0]]), edge)
 
 
 def resolution(uv: FloatArray, step: int) -> FloatArray:
-    """Source pixels per target pixel along the worse axis (ny, nx): the smaller singular value of the map's Jacobian."""
+    """Source pixels per target pixel along the worse axis (ny, nx): the smaller singular value of the Jacobian."""
     if min(uv.shape[:2]) < 2:
         return np.ones(uv.shape[:2])
-    by_y, by_x = np.gradient(uv, step, axis=(0, 1))
+    by_y, by_x = np.gradient(uv, step, axis=0), np.gradient(uv, step, axis=1)
     a, b, c, d = by_x[..., 0], by_y[..., 0], by_x[..., 1], by_y[..., 1]
     half_sum, determinant = (a * a + b * b + c * c + d * d) / 2, a * d - b * c
     return np.sqrt(np.maximum(half_sum - np.sqrt(np.maximum(half_sum**2 - determinant**2, 0)), 0))

@@ -1,10 +1,10 @@
 """The render plan: everything about a (source rig, target rig) pair that does not depend on image content.
 
 For every target camera (``arbiview_aug.target_plan``): which sources see it, over which surface and why, where each
-pixel is read, which source wins it, and the narrow bands along seams that are blended. Executing a plan is reading images at maps
-(``arbiview_aug.sampling``); building one is cheap enough for calibrations that change with every frame: maps are
-evaluated in float64 on a coarse grid and interpolated wherever that is exact to ``map_tolerance_px``, and pixel by
-pixel elsewhere.
+pixel is read, which source wins it, and the narrow bands along seams that are blended. Executing a plan is reading
+images at maps (``arbiview_aug.sampling``); building one is cheap enough for calibrations that change with every
+frame: maps are evaluated in float64 on a coarse grid and interpolated wherever that is exact to ``map_tolerance_px``,
+and pixel by pixel elsewhere (``arbiview_aug.maps``).
 """
 
 from __future__ import annotations

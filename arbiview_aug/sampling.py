@@ -20,8 +20,6 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from arbiview_aug.camera import FloatArray
-
 OUTSIDE = -16
 """Whole-pixel coordinate of a map entry that reads nothing: far enough that no bilinear tap touches the atlas."""
 
@@ -51,8 +49,8 @@ class FixedMap:
 
     def to_float(self) -> npt.NDArray[np.float32]:
         """The (h, w, 2) positions that are read."""
-        fraction = np.stack([self.frac & 31, self.frac >> 5], -1).astype(np.float32) / 32
-        return self.xy + fraction
+        fraction = np.stack([self.frac & 31, self.frac >> 5], -1).astype(np.float32) / np.float32(32)
+        return np.asarray(self.xy + fraction, np.float32)
 
     @property
     def nbytes(self) -> int:
@@ -73,7 +71,7 @@ class Slot:
     def from_source(self, uv: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
         """Atlas positions of source pixels (..., 2): halving keeps outer edges, so x' = (x + 0.5) / 2^level - 0.5."""
         half = (uv + 0.5) / 2**self.level - 0.5 if self.level else uv
-        return half + (self.x, self.y) if self.x or self.y else half
+        return half + np.array([self.x, self.y]) if self.x or self.y else half
 
     def to_source(self, at: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
         """The inverse of ``from_source``."""
@@ -219,7 +217,7 @@ def torch_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Te
     return atlas
 
 
-def torch_grid(uv: FloatArray | npt.NDArray[np.float32], atlas_size: tuple[int, int], device: torch.device) -> torch.Tensor:
+def torch_grid(uv: npt.NDArray[np.floating], atlas_size: tuple[int, int], device: torch.device) -> torch.Tensor:
     """``grid_sample``'s (h, w, 2) float32 grid (align_corners=True) of atlas positions (h, w, 2)."""
     h, w = atlas_size
     scale = np.array([max(w - 1, 1), max(h - 1, 1)])

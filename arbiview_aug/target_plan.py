@@ -154,7 +154,7 @@ class TargetDraft:
         focal_px = float(self.camera.K[0, 0])
         name, reason = self._choose_surface(baseline_m, focal_px)
         surface = make_surface(name, self.source.ground_z_m)
-        pair = PairMap(self.rays, source, surface, self.config.map_tolerance_px)
+        pair = PairMap(self.rays, source, surface)
         if pair.nodes is None:
             return None
         self.counters[f"pairs_{name}"] += 1
@@ -162,6 +162,7 @@ class TargetDraft:
         edge_px = edge_distance(source, pair.uv)
         seen = pair.valid & (edge_px >= 0)
         level = self._level(pixels_per_pixel[seen], source.size) if self.config.antialias else 0
+        pair.set_tolerance(self.config.map_tolerance_px * 2**level)
         parallax = self._expected_parallax(offset_m, focal_px, self.rays.inverse_distance(surface))
         score = (
             distance_weight(edge_px, min(source.size) / 2, self.config.distance_gamma)
@@ -181,7 +182,7 @@ class TargetDraft:
         )
 
     def _expected_parallax(self, offset_m: FloatArray, focal_px: float, q: FloatArray) -> FloatArray:
-        """Displacement (target px) that the unknown depth around a surface may cause: offset across the ray x spread."""
+        """Displacement (target px) that unknown depth around a surface may cause: offset across the ray x spread."""
         along_m = self.rays.directions @ offset_m
         across_m = np.sqrt(np.maximum(offset_m @ offset_m - along_m**2, 0))
         return focal_px * across_m * depth_uncertainty(q)
@@ -204,7 +205,7 @@ class TargetDraft:
         fixed = FixedMap(np.empty((h, w, 2), np.int16), np.empty((h, w), np.uint16))
         winner = np.full((h, w), -1, np.int8)
         weights = self._seam_weights()
-        shared = np.sum([weight > 0 for weight in weights], axis=0) > 1 if len(weights) > 1 else None
+        shared = np.count_nonzero([weight > 0 for weight in weights], axis=0) > 1
         bands: list[Band] = []
         for rows in self.grid.strips(_STRIP_PX):
             y0, y1, _, _ = self.grid.pixels((*rows, 0, 0))
@@ -223,9 +224,10 @@ class TargetDraft:
                 wins = cv2.bitwise_and(part.visible, cv2.compare(part.weight, held, cv2.CMP_GT))
                 cv2.copyTo(part.weight, wins, held)
                 cv2.copyTo(part.at, wins, at[top - y0 : bottom - y0, left:right])
-                np.copyto(winner[top:bottom, left:right], np.int8(region.source), where=wins > 0)
+                own = np.full(wins.shape, region.source, np.int8)
+                cv2.copyTo(own, wins, winner[top:bottom, left:right])
             fixed.fill_rows(y0, y1, at)
-            if shared is not None and len(seen) > 1 and self.config.seam_width > 0:
+            if len(seen) > 1 and self.config.seam_width > 0:
                 bands.extend(self._bands(seen, winner, shared, rows))
         if self.config.interpolation == "nearest":
             fixed = fixed.rounded()
@@ -241,7 +243,7 @@ class TargetDraft:
         box = self.grid.pixels(nodes)
         if box[1] <= box[0] or box[3] <= box[2]:
             return None
-        at, visible = region.pair.full_resolution(layout.slot(region.source, region.level), nodes)
+        at, visible = region.pair.full_resolution(layout.slot(region.source, region.level), nodes[:2])
         return _Visible(region.source, box, at, visible, self.grid.upsample(weight, nodes))
 
     def _seam_weights(self) -> list[npt.NDArray[np.float32]]:
@@ -269,7 +271,7 @@ class TargetDraft:
     ) -> Iterator[Band]:
         """The blended rectangles of one strip: runs of node columns where two sources have weight."""
         # Pixels lie between nodes: one node more on each side.
-        columns = shared[max(rows[0] - 1, 0) : rows[1] + 2].any(axis=0)
+        columns = np.logical_or.reduce(shared[max(rows[0] - 1, 0) : rows[1] + 2])
         columns[1:] |= columns[:-1].copy()
         columns[:-1] |= columns[1:].copy()
         for i0, i1 in _runs(columns):
@@ -278,18 +280,19 @@ class TargetDraft:
     def _bands_in(self, box: Box, seen: list[_Visible], winner: npt.NDArray[np.int8]) -> Iterator[Band]:
         """The second sources within one rectangle of pixels."""
         y0, y1, x0, x1 = box
-        local = [s for s in seen if _overlap(box, s.box)]
+        local = [(s, common) for s in seen if (common := _overlap(box, s.box)) is not None]
         if y1 <= y0 or x1 <= x0 or len(local) < 2:
             return
         weight = np.zeros((len(local), y1 - y0, x1 - x0), np.float32)
         at = np.full((*weight.shape, 2), sampling.OUTSIDE, np.float32)
-        for k, s in enumerate(local):
+        for k, (s, common) in enumerate(local):
             b0, _, c0, _ = s.box
-            t, b, le, r = _overlap(box, s.box)
-            mine, here = (slice(t - b0, b - b0), slice(le - c0, r - c0)), (slice(t - y0, b - y0), slice(le - x0, r - x0))
+            t, b, le, r = common
+            mine = slice(t - b0, b - b0), slice(le - c0, r - c0)
+            here = slice(t - y0, b - y0), slice(le - x0, r - x0)
             weight[k][here] = np.where(s.visible[mine] > 0, s.weight[mine], 0)
             at[k][here] = s.at[mine]
-        index = np.array([s.source for s in local])
+        index = np.array([s.source for s, _ in local])
         is_winner = winner[None, y0:y1, x0:x1] == index[:, None, None]
         first = np.where(is_winner, weight, 0).max(axis=0)
         others = np.where(is_winner, 0, weight)
@@ -307,28 +310,26 @@ class TargetDraft:
             fixed = FixedMap.from_float(np.ascontiguousarray(positions))
             yield Band(y0 + int(ys[0]), x0 + int(xs[0]), source, fixed, part)
 
-    def _reports(self, winner: npt.NDArray[np.int8]) -> list[PairReport]:
+    def _reports(self, winner: npt.NDArray[np.int8]) -> Iterator[PairReport]:
+        """What each source that wins any pixel does, largest share first."""
         # Node values are read at the pixel nearest to each node: precise enough for a report.
-        pixel = np.round(self.rays.nodes).astype(int).clip(0, [self.camera.width_px - 1, self.camera.height_px - 1])
-        on_nodes = winner[pixel[..., 1], pixel[..., 0]]
-        reports = []
-        for region in self.regions:
-            share = cv2.countNonZero(cv2.inRange(winner, region.source, region.source)) / winner.size
-            if share == 0:
+        pixel = np.round(self.rays.nodes[:, :1, 1]), np.round(self.rays.nodes[:1, :, 0])
+        y, x = (p.astype(np.int64).clip(0, n - 1) for p, n in zip(pixel, self.camera.size, strict=True))
+        on_nodes = winner[y, x]
+        counts = cv2.calcHist([winner.view(np.uint8)], [0], None, [256], [0, 256]).reshape(-1)
+        for region in sorted(self.regions, key=lambda r: -counts[r.source]):
+            if counts[region.source] == 0:
                 continue
             won = region.parallax[on_nodes == region.source]
-            reports.append(
-                PairReport(
-                    source=region.source,
-                    surface=region.surface,
-                    reason=region.reason,
-                    baseline_m=region.baseline_m,
-                    parallax_px=float(np.median(won)) if won.size else 0.0,
-                    share=share,
-                    level=region.level,
-                )
+            yield PairReport(
+                source=region.source,
+                surface=region.surface,
+                reason=region.reason,
+                baseline_m=region.baseline_m,
+                parallax_px=float(np.median(won)) if won.size else 0.0,
+                share=float(counts[region.source]) / winner.size,
+                level=region.level,
             )
-        return sorted(reports, key=lambda r: -r.share)
 
 
 def _runs(flags: BoolArray) -> Iterator[tuple[int, int]]:
@@ -338,7 +339,7 @@ def _runs(flags: BoolArray) -> Iterator[tuple[int, int]]:
         yield start, stop - 1
 
 
-def _overlap(one: Box, two: Box) -> Box | tuple[()]:
+def _overlap(one: Box, two: Box) -> Box | None:
     """The common part of two pixel boxes, or nothing."""
     y0, y1, x0, x1 = max(one[0], two[0]), min(one[1], two[1]), max(one[2], two[2]), min(one[3], two[3])
-    return (y0, y1, x0, x1) if y1 > y0 and x1 > x0 else ()
+    return (y0, y1, x0, x1) if y1 > y0 and x1 > x0 else None

@@ -149,7 +149,7 @@ def test_masked_source_pixels_never_contribute() -> None:
             uv = slot.to_source(view.at.to_float()[view.source_camera == 0])
             for dx in (0, 1):
                 for dy in (0, 1):
-                    tap = np.floor(uv + 1e-3).astype(int) + (dx, dy)
+                    tap = np.floor(uv + 1e-3).astype(int) + np.array([dx, dy])
                     tap = tap.clip(0, [rig[0].width_px - 1, rig[0].height_px - 1])
                     assert mask[tap[:, 1], tap[:, 0]].all()
 
@@ -197,7 +197,8 @@ def test_plans_pickle_and_the_cache_is_bounded() -> None:
 
 def test_plan_key_knows_content_not_names() -> None:
     rig = load_rig("nuscenes")
-    renamed = Rig([Camera(**{**vars_of(c), "name": c.name + "x"}) for c in rig], ground_z_m=rig.ground_z_m, name="other")
+    cameras = [Camera(**{**vars_of(c), "name": c.name + "x"}) for c in rig]
+    renamed = Rig(cameras, ground_z_m=rig.ground_z_m, name="other")
     config = FavsConfig()
     assert plan_key(rig, renamed, "auto", config) == plan_key(renamed, rig, "auto", config)
     for other in (plan_key(rig, rig.shifted(x_m=1e-9), "auto", config), plan_key(rig, rig, "far", config),

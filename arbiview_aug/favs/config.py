@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -33,17 +32,20 @@ class FavsConfig:
     """``auto`` calls a pair far when no scene point beyond 2 m could shift by more than this between the centres."""
 
     grid_step_px: int = 8
-    """Spacing of the coarse grid on which maps are evaluated in float64 before they are interpolated."""
+    """Spacing of the coarse grid on which maps are evaluated in float64 before they are interpolated; 1 evaluates
+    every pixel."""
 
     map_tolerance_px: float = 1 / 64
     """Cells whose interpolation error may exceed this are evaluated exactly; with the 1/64 px that fixed-point maps
     round by, maps stay within 1/32 px of float64."""
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value, low, high = getattr(self, field.name), *_RANGES.get(field.name, (None, None))
-            if low is not None and not low <= value <= high:
-                raise ValueError(f"FavsConfig.{field.name}: expected {low:g} to {high:g}, got {value!r}")
+        for name, (low, high) in _RANGES.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ValueError(f"FavsConfig.{name}: expected {low:g} to {high:g}, got {value!r}")
+        if self.grid_step_px not in (1, 4, 8, 16, 32):
+            raise ValueError(f"FavsConfig.grid_step_px: expected 1, 4, 8, 16 or 32, got {self.grid_step_px!r}")
         if self.interpolation not in ("linear", "nearest"):
             raise ValueError(f"FavsConfig.interpolation: expected 'linear' or 'nearest', got {self.interpolation!r}")
 
@@ -53,7 +55,6 @@ _RANGES: dict[str, tuple[float, float]] = {
     "distance_gamma": (0.0, 16.0),
     "primary_bonus": (1.0, 1e12),
     "far_parallax_px": (0.0, 1e3),
-    "grid_step_px": (1, 64),
     "map_tolerance_px": (1e-6, 1.0),
 }
 

@@ -10,10 +10,9 @@ from arbiview_aug.favs.geometric_transformation import check_homography, h_geom,
 from arbiview_aug.rig import load_rig
 
 
-def camera(azimuth_deg: float = 0.0, position_m=(0.0, 0.0, 1.5), fov_deg: float = 70.0, elevation_deg: float = 0.0) -> Camera:
+def camera(azimuth_deg: float = 0.0, position_m=(0.0, 0.0, 1.5)) -> Camera:
     return Camera.looking(
-        name="c", azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, position_m=position_m, width_px=640,
-        height_px=360, horizontal_fov_deg=fov_deg,
+        name="c", azimuth_deg=azimuth_deg, position_m=position_m, width_px=640, height_px=360, horizontal_fov_deg=70.0
     )
 
 
