@@ -141,10 +141,13 @@ class Grid:
 
 def _halved_spacing(part: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """Node values (ny, nx, 2) on a grid twice as fine, (2 ny - 1, 2 nx - 1, 2): cubic between four nodes each way."""
-    fine = np.empty((2 * part.shape[0] - 1, 2 * part.shape[1] - 1, 2), np.float32)
     across = cv2.filter2D(part, -1, _CUBIC, anchor=(1, 0), borderType=cv2.BORDER_REPLICATE)
-    fine[::2, ::2], fine[::2, 1::2] = part, across[:, :-1]
-    even = np.ascontiguousarray(fine[::2])
+    even = np.empty((part.shape[0], 2 * part.shape[1] - 1, 2), np.float32)
+    # Pairs of float32 are moved as one float64: strided copies of them are several times faster.
+    as_pairs = even.view(np.float64)[..., 0]
+    as_pairs[:, ::2], as_pairs[:, 1::2] = part.view(np.float64)[..., 0], across.view(np.float64)[:, :-1, 0]
+    fine = np.empty((2 * part.shape[0] - 1, even.shape[1], 2), np.float32)
+    fine[::2] = even
     fine[1::2] = cv2.filter2D(even, -1, _CUBIC.T, anchor=(0, 1), borderType=cv2.BORDER_REPLICATE)[:-1]
     return fine
 

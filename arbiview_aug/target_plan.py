@@ -207,6 +207,7 @@ class TargetDraft:
         weights = self._seam_weights()
         shared = np.count_nonzero([weight > 0 for weight in weights], axis=0) > 1
         bands: list[Band] = []
+        won_px: Counter[int] = Counter()
         for rows in self.grid.strips(_STRIP_PX):
             y0, y1, _, _ = self.grid.pixels((*rows, 0, 0))
             at = scratch.get("at", (y1 - y0, w, 2), np.float32)
@@ -227,11 +228,13 @@ class TargetDraft:
                 own = np.full(wins.shape, region.source, np.int8)
                 cv2.copyTo(own, wins, winner[top:bottom, left:right])
             fixed.fill_rows(y0, y1, at)
+            for part in seen:
+                won_px[part.source] += cv2.countNonZero(cv2.compare(winner[y0:y1], float(part.source), cv2.CMP_EQ))
             if len(seen) > 1 and self.config.seam_width > 0:
                 bands.extend(self._bands(seen, winner, shared, rows))
         if self.config.interpolation == "nearest":
             fixed = fixed.rounded()
-        return TargetPlan(fixed, winner, tuple(bands), tuple(self._reports(winner)))
+        return TargetPlan(fixed, winner, tuple(bands), tuple(self._reports(winner, won_px)))
 
     def _visible(
         self, region: _Region, weight: npt.NDArray[np.float32], rows: tuple[int, int], layout: AtlasLayout
@@ -310,15 +313,14 @@ class TargetDraft:
             fixed = FixedMap.from_float(np.ascontiguousarray(positions))
             yield Band(y0 + int(ys[0]), x0 + int(xs[0]), source, fixed, part)
 
-    def _reports(self, winner: npt.NDArray[np.int8]) -> Iterator[PairReport]:
+    def _reports(self, winner: npt.NDArray[np.int8], won_px: Counter[int]) -> Iterator[PairReport]:
         """What each source that wins any pixel does, largest share first."""
         # Node values are read at the pixel nearest to each node: precise enough for a report.
         pixel = np.round(self.rays.nodes[:, :1, 1]), np.round(self.rays.nodes[:1, :, 0])
         y, x = (p.astype(np.int64).clip(0, n - 1) for p, n in zip(pixel, self.camera.size, strict=True))
         on_nodes = winner[y, x]
-        counts = cv2.calcHist([winner.view(np.uint8)], [0], None, [256], [0, 256]).reshape(-1)
-        for region in sorted(self.regions, key=lambda r: -counts[r.source]):
-            if counts[region.source] == 0:
+        for region in sorted(self.regions, key=lambda r: -won_px[r.source]):
+            if won_px[region.source] == 0:
                 continue
             won = region.parallax[on_nodes == region.source]
             yield PairReport(
@@ -327,7 +329,7 @@ class TargetDraft:
                 reason=region.reason,
                 baseline_m=region.baseline_m,
                 parallax_px=float(np.median(won)) if won.size else 0.0,
-                share=float(counts[region.source]) / winner.size,
+                share=won_px[region.source] / winner.size,
                 level=region.level,
             )
 
