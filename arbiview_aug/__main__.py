@@ -10,6 +10,7 @@ from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import ArbiviewError
 
 COMMANDS = {
+    "bench": ("arbiview_aug.bench", "measure speed, on your own data too"),
     "demo": ("arbiview_aug.demo", "the main job on a synthetic street or on real frames, with numbers and a picture"),
     "inspect": ("arbiview_aug.inspect", "show rigs: tables, differences, a picture"),
 }

@@ -179,7 +179,10 @@ def _count(text: str) -> int:
 
 
 def _seed(text: str) -> int:
-    return _count(str(int(text) + 1)) - 1
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 0, got {text!r}")
+    return value
 
 
 def _size(text: str) -> tuple[int, int]:
