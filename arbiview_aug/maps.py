@@ -168,6 +168,7 @@ class TargetRays:
         self.sparse_index = np.ix_(np.unique(np.r_[0:ny:4, ny - 1]), np.unique(np.r_[0:nx:4, nx - 1]))
         planes = np.ascontiguousarray(np.moveaxis(self.directions[self.sparse_index], -1, 0))
         self.sparse = np.moveaxis(planes, 0, -1), self.valid[self.sparse_index]
+        self.half_angle = half_angle(camera)
 
     def inverse_distance(self, surface: Surface) -> FloatArray:
         """(ny, nx) on the nodes; evaluated once for each surface."""
@@ -190,7 +191,7 @@ class PairMap:
         self.rays, self.source, self.surface = rays, source, surface
         self.offset_m = rays.camera.center_m - source.center_m
         self.nodes: Box | None = None
-        if rays.grid.step > 1 and not self._glance():
+        if self._look_apart() or (rays.grid.step > 1 and not self._glance()):
             return
         self.uv, self.valid = project_rays(source, rays.directions, rays.inverse_distance(surface), self.offset_m)
         self.valid &= rays.valid
@@ -203,8 +204,15 @@ class PairMap:
         else:
             self.nodes = self._classify()
 
+    def _look_apart(self) -> bool:
+        """Whether the two viewing cones, widened by the parallax of the nearest scene point, cannot meet."""
+        q = self.rays.inverse_distance(self.surface)
+        parallax = math.atan(float(np.linalg.norm(self.offset_m)) * float(q.max()))
+        apart = math.acos(float(np.clip(self.rays.camera.cam2ego[:3, 2] @ self.source.cam2ego[:3, 2], -1, 1)))
+        return apart > self.rays.half_angle + half_angle(self.source) + parallax + 0.01
+
     def _glance(self) -> bool:
-        """Whether any cell four times as large may hold a pixel of the source: most pairs end here."""
+        """Whether any cell four times as large may hold a pixel of the source."""
         directions, valid = self.rays.sparse
         q = self.rays.inverse_distance(self.surface)[self.rays.sparse_index]
         uv, projected = project_rays(self.source, directions, q, self.offset_m)
@@ -357,6 +365,17 @@ class PairMap:
         at[py[inside] - y0, px[inside] - x0] = exact
 
 
+def half_angle(camera: Camera) -> float:
+    """Radians between the optical axis and the farthest ray of the image; π where the lens folds inside it."""
+    h, w = camera.size
+    x, y = np.linspace(-0.5, w - 0.5, 9), np.linspace(-0.5, h - 0.5, 9)
+    border = np.stack(np.meshgrid(x, y), -1)
+    directions, valid = camera.unproject_cam(border)
+    if not valid.all():
+        return math.pi
+    return math.acos(float(np.clip(directions[..., 2].min(), -1, 1)))
+
+
 def ego_rays(camera: Camera, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Unit ego-frame rays of pixels (..., 2), as a (..., 3) view of plane-major memory, and their validity."""
     directions, valid = camera.unproject_cam(pixels)
@@ -432,7 +451,15 @@ def resolution(uv: FloatArray, step: int) -> FloatArray:
     """Source pixels per target pixel along the worse axis (ny, nx): the smaller singular value of the Jacobian."""
     if min(uv.shape[:2]) < 2:
         return np.ones(uv.shape[:2])
-    by_y, by_x = np.gradient(uv, step, axis=0), np.gradient(uv, step, axis=1)
-    a, b, c, d = by_x[..., 0], by_y[..., 0], by_x[..., 1], by_y[..., 1]
+    (a, c), (b, d) = (_derivative(uv, axis, step) for axis in (1, 0))
     half_sum, determinant = (a * a + b * b + c * c + d * d) / 2, a * d - b * c
     return np.sqrt(np.maximum(half_sum - np.sqrt(np.maximum(half_sum**2 - determinant**2, 0)), 0))
+
+
+def _derivative(uv: FloatArray, axis: int, step: int) -> tuple[FloatArray, FloatArray]:
+    """Forward differences of u and v (ny, nx) along an axis, the last one repeated."""
+    last = [slice(None), slice(None)]
+    last[axis] = slice(-1, None)
+    difference = np.diff(uv, axis=axis) / step
+    difference = np.concatenate([difference, difference[tuple(last)]], axis=axis)
+    return difference[..., 0], difference[..., 1]

@@ -193,7 +193,7 @@ class TargetDraft:
         if resolution.size == 0:
             return 0
         # 2 % of tolerance: a target of exactly half size must read the halved source.
-        level = int(max(0, math.floor(math.log2(max(1.02 * float(np.quantile(resolution, 0.2)), 1e-6)))))
+        level = int(max(0, math.floor(math.log2(max(1.02 * float(np.quantile(resolution[::4], 0.2)), 1e-6)))))
         while level and min(sampling.level_size(size, level)) < 2:
             level -= 1
         return level
