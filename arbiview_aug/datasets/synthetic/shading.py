@@ -70,11 +70,11 @@ def faces(tables: SceneTables, point: Tensor, primitive: Tensor) -> Tensor:
     face = torch.zeros_like(primitive)
     rows = (primitive >= 0).nonzero()[:, 0]
     rows = rows[tables.kind[primitive[rows]] == BOX]
+    by_part = [tables.planes[:, :, c].contiguous() for c in range(4)]
     for part in rows.split(_CHUNK):
-        planes, p = tables.planes.index_select(0, primitive[part]), point.index_select(0, part)
-        beyond = (
-            planes[:, :, 0] * p[:, 0:1] + planes[:, :, 1] * p[:, 1:2] + planes[:, :, 2] * p[:, 2:3] - planes[:, :, 3]
-        )
+        k, p = primitive[part], point.index_select(0, part)
+        nx, ny, nz, b = (table.index_select(0, k) for table in by_part)  # [m, 6] each
+        beyond = nx * p[:, 0:1] + ny * p[:, 1:2] + nz * p[:, 2:3] - b
         face[part] = beyond.argmax(1)
     return face
 
@@ -145,6 +145,8 @@ def _lit(tables: SceneTables, hits: Hits, face: Tensor, material: int) -> Tensor
 def _normals(tables: SceneTables, k: Tensor, face: Tensor, local: Tensor, half: Tensor, rotation: Tensor) -> Tensor:
     kind = tables.kind[k]
     flat = tables.planes.view(-1, 4).index_select(0, k * 6 + face)[:, :3]
+    if bool((kind == BOX).all()):
+        return flat
     gradient = local / (half * half)
     # A cylinder's cap, where the axis coordinate is at its end, and its side.
     cap = (local[:, 2].abs() > half[:, 2] * (1 - 1e-4) - 1e-5) & (kind == CYLINDER)
