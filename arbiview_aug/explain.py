@@ -55,12 +55,16 @@ class Explanation:
             lines.append(f"  {entry['camera']}: {entry['coverage']:.1%} covered{note}")
             if not entry["sources"]:
                 lines.append("    no source camera looks there")
-            for s in entry["sources"]:
-                parallax = f", about {s['parallax_px']:.1f} px of parallax where depth is unknown" if s["parallax_px"] else ""
-                halved = f", read at 1/{2 ** s['halved']} size" if s["halved"] else ""
-                lines.append(
-                    f"    {s['share']:6.1%} from {s['camera']} over the {s['surface']} surface ({s['reason']}{parallax}{halved})"
-                )
+            lines.extend(f"    {_source_line(source)}" for source in entry["sources"])
         return "\n".join(lines)
 
     __repr__ = __str__
+
+
+def _source_line(source: dict[str, Any]) -> str:
+    why = [source["reason"]]
+    if source["parallax_px"]:
+        why.append(f"about {source['parallax_px']:.1f} px of parallax where depth is unknown")
+    if source["halved"]:
+        why.append(f"read at 1/{2 ** source['halved']} size")
+    return f"{source['share']:6.1%} from {source['camera']} over the {source['surface']} surface ({', '.join(why)})"

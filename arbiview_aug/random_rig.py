@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import torch
 
-from arbiview_aug.errors import CalibrationError
+from arbiview_aug.errors import CalibrationError, SampleError
 from arbiview_aug.rig import Rig, load_rig
 
 Range = float | tuple[float, float]
@@ -32,8 +32,10 @@ class RandomRig:
         forward_m: The rig moved forward.
         lateral_m: The rig moved to the left.
         focal_scale: Focal lengths scaled about the principal point.
-        per: ``sample``: a draw for each sample, from torch's RNG (seeded per worker and epoch by the DataLoader).
-            ``sequence``: one draw for all samples of one ``sequence_key``, the same in every worker of an epoch.
+        per: ``sample``: a draw for each call, from torch's RNG (seeded per worker and epoch by the DataLoader).
+            ``sequence``: one draw for all samples of one ``sequence_key``, the same in every worker. It follows the
+            DataLoader's seed, so each epoch that starts its workers anew draws anew; without workers, or with
+            persistent ones, ``set_epoch`` before each epoch does it.
         sequence_key: Which entry of a sample names its sequence.
     """
 
@@ -65,25 +67,50 @@ class RandomRig:
             "focal_scale": focal_scale,
         }
         self.ranges = {name: _range(name, value) for name, value in given.items()}
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        if not self._epoch.is_shared():  # a copy, or from a file
+            self._epoch.share_memory_()
 
     def draw(self, rng: torch.Generator | None = None) -> dict[str, float]:
         """Random parameters, uniform in their ranges; from torch's global RNG unless ``rng`` is given."""
         u = torch.rand(len(self.ranges), generator=rng, dtype=torch.float64).tolist()
         return {name: low + (high - low) * x for (name, (low, high)), x in zip(self.ranges.items(), u, strict=True)}
 
+    def set_epoch(self, epoch: int) -> None:
+        """Let ``per="sequence"`` draw anew; reaches workers that run already. See the class."""
+        self._epoch.fill_(epoch)
+
     def draw_for(self, sample: Mapping[str, Any], rng: torch.Generator | None = None) -> dict[str, float]:
-        """Parameters for a sample, following ``per``."""
+        """Parameters for a sample, following ``per``.
+
+        Raises:
+            SampleError: No sequence to draw for, or a batch of several.
+        """
         if self.per == "sample":
             return self.draw(rng)
-        if self.sequence_key not in sample:
-            raise CalibrationError(
-                f"RandomRig(per='sequence'): expected {self.sequence_key!r} in the sample, got {', '.join(map(str, sample))}"
-            )
         # Workers of one epoch share a base seed; sequences may be split between workers.
         worker = torch.utils.data.get_worker_info()
-        seed = torch.initial_seed() if worker is None else worker.seed - worker.id
-        digest = hashlib.sha256(f"{seed} {sample[self.sequence_key]}".encode()).digest()
+        if worker is not None:
+            seed = worker.seed - worker.id
+        else:
+            seed = torch.initial_seed() if rng is None else rng.initial_seed()
+        digest = hashlib.sha256(f"{seed} {int(self._epoch)} {self._sequence(sample)}".encode()).digest()
         return self.draw(torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1))
+
+    def _sequence(self, sample: Mapping[str, Any]) -> Any:
+        key = self.sequence_key
+        if key not in sample:
+            keys = ", ".join(map(str, sample))
+            raise SampleError(f"RandomRig(per='sequence'): expected {key!r} in the sample, got {keys}")
+        value = sample[key]
+        if not isinstance(value, list | tuple):
+            return value
+        if len(set(value)) != 1:
+            raise SampleError(f"RandomRig(per='sequence'): {key}: expected one sequence a batch, got {len(set(value))}")
+        return value[0]
 
     def rig(self, params: Mapping[str, float]) -> Rig:
         """The rig of drawn parameters: the same numbers give the same rig.

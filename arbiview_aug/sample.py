@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 
-from arbiview_aug.camera import Camera
+from arbiview_aug.camera import BoolArray, Camera
 from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.rig import Rig
+from arbiview_aug.tensors import leading_shape, split
 
-CALIBRATION_KEYS = ("images", "rig", "K", "cam2ego", "distortion", "lens", "ground_z_m")
-"""Keys that describe the source's cameras; they are replaced by the target's or consumed."""
+CALIBRATION_KEYS = (
+    "images",
+    "rig",
+    "K",
+    "cam2ego",
+    "distortion",
+    "lens",
+    "ground_z_m",
+    "coverage",
+    "ignore",
+    "retarget_params",
+)
+"""Keys that describe the source's images; they are replaced by the target's or consumed."""
 
-PIXEL_BOUND_KEYS = ("boxes_2d", "labels_2d", "centers_2d", "depths", "depth", "keypoints_2d", "neighbours")
-"""Keys known to speak of the source's pixels: dropped, because they would be stale in the target's views."""
+_OFF_CENTER = 0.2  # share of the image's size by which both coordinates of a principal point never lie off its centre
 
 
 @dataclass(frozen=True)
@@ -37,42 +49,48 @@ def check_inputs(sample: Any, source_rig: Rig | None) -> list[SourceFrame]:
     """The frames of a sample, one for each element of its leading dimensions (one if there are none).
 
     Args:
-        sample: The sample dict; see DESIGN's contract in ``RigRetarget``.
+        sample: The sample dict; see the contract in ``RigRetarget``.
         source_rig: The rig of every sample, where the transform was given one.
 
     Raises:
         SampleError: Missing calibration, mismatched counts or sizes, values out of range.
         SampleTypeError: PIL images, numpy arrays and the like, with the conversion to use.
+        CalibrationError: K, cam2ego or a lens that no real camera has.
     """
     if not isinstance(sample, Mapping):
         raise SampleTypeError(f"sample: expected a dict, got {type(sample).__name__}")
     if "images" not in sample:
         raise SampleError(f"sample: expected a key 'images', got {', '.join(map(str, sample)) or 'an empty dict'}")
     images = sample["images"]
+    _check_container(images)
     lead = leading_shape(images)
-    if not lead:
-        return [_frame(_image_tuple(images), sample, source_rig, None)]
-    flat = images.reshape(-1, *images.shape[-4:])
+    if 0 in lead:
+        raise SampleError(f"images: expected at least one frame, got the leading dimensions {lead}")
+    try:
+        of_frames = split(images, lead)
+    except ValueError as error:
+        raise SampleError(f"images: {error}") from None
+    indices = list(np.ndindex(*lead))
     return [
-        _frame(_image_tuple(flat[b]), sample, source_rig, np.unravel_index(b, lead)) for b in range(flat.shape[0])
+        _frame(_checked_images(frame), sample, source_rig, lead, index)
+        for frame, index in zip(of_frames, indices, strict=True)
     ]
 
 
-def leading_shape(images: Any) -> tuple[int, ...]:
-    """Batch dimensions of (..., N, 3, H, W) images; none for lists."""
-    return tuple(images.shape[:-4]) if isinstance(images, torch.Tensor) and images.ndim > 4 else ()
-
-
-def _image_tuple(images: Any) -> tuple[torch.Tensor, ...]:
+# --- images -----------------------------------------------------------------------------------------------------------
+def _check_container(images: Any) -> None:
     if isinstance(images, torch.Tensor):
-        if images.ndim != 4:
+        if images.ndim < 4:
             raise SampleError(f"images: expected shape (..., N, 3, H, W), got {tuple(images.shape)}")
-    elif isinstance(images, Sequence) and not isinstance(images, str | bytes):
+    elif isinstance(images, list | tuple):
         for k, image in enumerate(images):
             if not isinstance(image, torch.Tensor):
                 raise _not_a_tensor(f"images[{k}]", image)
     else:
         raise _not_a_tensor("images", images)
+
+
+def _checked_images(images: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
     if len(images) == 0:
         raise SampleError("images: expected at least one image, got none")
     for k, image in enumerate(images):
@@ -94,30 +112,37 @@ def _not_a_tensor(what: str, value: Any) -> SampleTypeError:
 
 
 def _check_image(k: int, image: torch.Tensor) -> None:
-    if image.ndim != 3 or image.shape[0] != 3:
-        shape = tuple(image.shape)
+    shape = tuple(image.shape)
+    if image.ndim != 3 or shape[0] != 3:
         fix = ""
-        if image.ndim == 3 and shape[-1] in (1, 3, 4):
-            fix = "; permute(2, 0, 1) puts the channels first"
-        elif (image.ndim == 3 and shape[0] == 1) or image.ndim == 2:
+        if image.ndim == 2 or (image.ndim == 3 and shape[0] == 1):
             fix = "; expand grey images to three channels: image.expand(3, -1, -1)"
         elif image.ndim == 3 and shape[0] == 4:
             fix = "; drop the alpha channel: image[:3]"
+        elif image.ndim == 3 and shape[-1] in (1, 3, 4):
+            fix = "; permute(2, 0, 1) puts the channels first"
         raise SampleError(f"images[{k}]: expected an RGB image (3, H, W), got shape {shape}{fix}")
-    if 0 in image.shape:
-        raise SampleError(f"images[{k}]: expected pixels, got shape {tuple(image.shape)}")
+    if 0 in shape:
+        raise SampleError(f"images[{k}]: expected pixels, got shape {shape}")
     if image.dtype == torch.uint8:
         return
     if not image.dtype.is_floating_point:
         raise SampleTypeError(f"images[{k}]: expected uint8 or float, got {image.dtype}; convert with .to(torch.uint8)")
-    low, high = (float(x) for x in image.detach().aminmax())
-    if not (low >= -1e-3 and high <= 1 + 1e-3):  # also catches NaN
+    low, high = (float(x) for x in image.detach().aminmax())  # NaN wherever the image has one
+    if not (low >= -1e-3 and high <= 1 + 1e-3):
         fix = "divide by 255" if high > 1.5 and low >= 0 else "normalise after retargeting, not before"
+        if not (math.isfinite(low) and math.isfinite(high)):
+            fix = "mend them first: torch.nan_to_num(images)"
         raise SampleError(f"images[{k}]: expected floats in [0, 1], got {low:g} to {high:g}; {fix}")
 
 
+# --- calibration ------------------------------------------------------------------------------------------------------
 def _frame(
-    images: tuple[torch.Tensor, ...], sample: Mapping[str, Any], source_rig: Rig | None, index: Any
+    images: tuple[torch.Tensor, ...],
+    sample: Mapping[str, Any],
+    source_rig: Rig | None,
+    lead: tuple[int, ...],
+    index: tuple[int, ...],
 ) -> SourceFrame:
     rig = sample.get("rig")
     if rig is None:
@@ -133,10 +158,10 @@ def _frame(
             raise SampleError(
                 f"camera {camera.name!r}: expected an image of (h, w) = {camera.size}, as calibrated, got {size}; {fix}"
             )
-    return SourceFrame(images, rig)
+    return SourceFrame(images, _without_hidden_pixels(rig, sample, lead, index))
 
 
-def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any], index: Any) -> Rig:
+def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any], index: tuple[int, ...]) -> Rig:
     """A rig from the sample's K, cam2ego and, where present, lens, distortion and ground_z_m."""
     missing = [key for key in ("K", "cam2ego") if sample.get(key) is None]
     if missing:
@@ -144,74 +169,106 @@ def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any
             f"sample: expected calibration, 'rig' or 'K' and 'cam2ego', missing {', '.join(missing)}; "
             "or pass source_rig= to the transform"
         )
-    K, cam2ego = (_as_array(key, sample[key], index) for key in ("K", "cam2ego"))
+    K, cam2ego = (_numbers(key, sample[key], index) for key in ("K", "cam2ego"))
     for key, array, shape in (("K", K, (3, 3)), ("cam2ego", cam2ego, (4, 4))):
-        if array.shape != (len(images), *shape):
-            raise SampleError(f"{key}: expected shape {(len(images), *shape)} for {len(images)} images, got {array.shape}")
-    lenses = sample.get("lens") or ["pinhole"] * len(images)
+        expected = (len(images), *shape)
+        if array.shape != expected:
+            raise SampleError(f"{key}: expected shape {expected} for {len(images)} images, got {array.shape}")
+    lenses = _lenses(sample, len(images), index)
     cameras = []
     for k, image in enumerate(images):
         h, w = image.shape[-2:]
+        _check_principal_point(k, K[k], (h, w))
+        lens, distortion = lenses[k]
         name = f"camera {k}"
-        if not (-0.5 <= K[k, 0, 2] <= w - 0.5 and -0.5 <= K[k, 1, 2] <= h - 0.5):
-            raise SampleError(
-                f"K[{k}]: expected a principal point inside the image of (h, w) = {(h, w)}, got "
-                f"({K[k, 0, 2]:g}, {K[k, 1, 2]:g}); K of another image size? (Camera.resize scales K; a camera that is "
-                "really so comes as rig=)"
-            )
-        coefficients: tuple[float, ...] = ()
-        if lenses[k] != "pinhole":
-            coefficients = tuple(_as_array("distortion", sample["distortion"], index)[k].tolist())
-            coefficients = coefficients[:4] if lenses[k] == "fisheye" else coefficients
         cameras.append(
-            Camera(
-                name=name, width_px=w, height_px=h, K=K[k], cam2ego=cam2ego[k], lens=lenses[k], distortion=coefficients
-            )
+            Camera(name=name, width_px=w, height_px=h, K=K[k], cam2ego=cam2ego[k], lens=lens, distortion=distortion)
         )
-    return Rig(cameras, ground_z_m=float(sample.get("ground_z_m", 0.0)))
+    ground_z_m = sample.get("ground_z_m", 0.0)
+    of_frame = _numbers("ground_z_m", ground_z_m, index if np.ndim(ground_z_m) else ())
+    return Rig(cameras, ground_z_m=float(of_frame))
 
 
-def _as_array(key: str, value: Any, index: Any) -> np.ndarray:
+def _check_principal_point(k: int, K: np.ndarray, size: tuple[int, int]) -> None:
+    """Refuse a K that was made for another image size; NaN is left to ``Camera``."""
+    h, w = size
+    x, y = (K[0, 2] + 0.5) / w, (K[1, 2] + 0.5) / h
+    outside = min(x, y) < 0 or max(x, y) > 1
+    scaled = max(x, y) < 0.5 - _OFF_CENTER or min(x, y) > 0.5 + _OFF_CENTER
+    if outside or scaled:
+        where = "inside the image" if outside else "near the middle of the image"
+        raise SampleError(
+            f"K[{k}]: expected a principal point {where} of (h, w) = {(h, w)}, got ({K[0, 2]:g}, {K[1, 2]:g}); "
+            "K of another image size? Camera.resize scales K; a camera that is really so comes as rig="
+        )
+
+
+def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> list[tuple[Any, tuple[float, ...]]]:
+    """Lens and coefficients of each camera; zeros that pad them to a common number are left out."""
+    names, distortion = sample.get("lens"), sample.get("distortion")
+    coefficients = None if distortion is None else _numbers("distortion", distortion, index)
+    if names is None:
+        if coefficients is not None and coefficients.any():
+            raise SampleError("distortion: expected 'lens' beside it, one of pinhole, radtan, fisheye a camera")
+        return [("pinhole", ())] * count
+    if isinstance(names, str) or len(names) != count:
+        raise SampleError(f"lens: expected a list of {count} names, one a camera, got {names!r}")
+    lenses = [_entry(name, index) for name in names]
+    if all(lens == "pinhole" for lens in lenses):
+        return [("pinhole", ())] * count
+    if coefficients is None or coefficients.ndim != 2 or len(coefficients) != count:
+        got = "none" if coefficients is None else f"shape {coefficients.shape}"
+        raise SampleError(f"distortion: expected shape ({count}, up to 8) for the lenses {lenses}, got {got}")
+    result = []
+    for lens, row in zip(lenses, coefficients.tolist(), strict=True):
+        needed = {"pinhole": 0, "fisheye": 4}.get(lens, len(row))
+        result.append((lens, tuple(row) if any(row[needed:]) else tuple(row[:needed])))
+    return result
+
+
+def _entry(name: Any, index: tuple[int, ...]) -> Any:
+    """A camera's lens; ``default_collate`` makes a list of a batch's."""
+    for i in index:
+        if isinstance(name, str):
+            break
+        name = name[i]
+    return name
+
+
+def _without_hidden_pixels(rig: Rig, sample: Mapping[str, Any], lead: tuple[int, ...], index: tuple[int, ...]) -> Rig:
+    """The rig, masked where an earlier retargeting saw nothing (``coverage``) or the own car (``ignore``)."""
+    masks: list[BoolArray | None] = [camera.mask for camera in rig]
+    for key in ("coverage", "ignore"):
+        if sample.get(key) is None:
+            continue
+        try:
+            maps = split(sample[key], lead)[np.ravel_multi_index(index, lead) if lead else 0]
+            hidden = [~m if key == "coverage" else m for m in maps]
+            for k, (camera, pixels) in enumerate(zip(rig, hidden, strict=True)):
+                if tuple(pixels.shape) != camera.size or pixels.dtype != torch.bool:
+                    raise ValueError(f"got {pixels.dtype} {tuple(pixels.shape)}")
+                if pixels.any():
+                    seen = ~pixels.cpu().numpy()
+                    held = masks[k]
+                    masks[k] = seen if held is None else held & seen
+        except (TypeError, ValueError, AttributeError) as error:
+            raise SampleError(
+                f"{key}: expected a bool map of the size of each image, as an earlier retargeting gives it ({error}); "
+                "rename the key if it is something else"
+            ) from None
+    if all(new is camera.mask for new, camera in zip(masks, rig, strict=True)):
+        return rig
+    return rig.with_cameras([replace(camera, mask=mask) for camera, mask in zip(rig, masks, strict=True)])
+
+
+def _numbers(key: str, value: Any, index: tuple[int, ...]) -> np.ndarray:
+    """An entry of the calibration for one frame, float64."""
     try:
-        array = np.asarray(value.detach().cpu() if isinstance(value, torch.Tensor) else value, dtype=np.float64)
+        plain = value.detach().cpu().double().numpy() if isinstance(value, torch.Tensor) else value
+        array = np.asarray(plain, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise SampleTypeError(f"{key}: expected a tensor of numbers, got {type(value).__name__} ({error})") from None
-    if index is None:
-        return array
     try:
-        return array[tuple(index)]
+        return np.asarray(array[index])
     except IndexError:
         raise SampleError(f"{key}: expected the images' leading dimensions, got shape {array.shape}") from None
-
-
-def check_other_keys(
-    sample: Mapping[str, Any], sizes: Sequence[tuple[int, int]], label_keys: Sequence[str], pass_keys: Sequence[str]
-) -> list[str]:
-    """Which keys hold label maps; refuses whatever else may speak of the source's pixels.
-
-    Raises:
-        SampleError: A tensor of the images' height and width, or a torchvision tv_tensor, that nobody named.
-    """
-    absent = [key for key in label_keys if key not in sample]
-    if absent:
-        raise SampleError(f"label_keys: expected {', '.join(absent)} in the sample, got {', '.join(map(str, sample))}")
-    labels = list(label_keys)
-    for key, value in sample.items():
-        if key in CALIBRATION_KEYS or key in PIXEL_BOUND_KEYS or key in labels or key in pass_keys:
-            continue
-        first = value[0] if isinstance(value, list | tuple) and value else value
-        if type(first).__module__.startswith("torchvision.tv_tensors"):
-            if type(first).__name__ == "Mask":
-                labels.append(key)
-                continue
-            raise SampleError(
-                f"{key}: a tv_tensors.{type(first).__name__} speaks of the source's pixels and would be stale; "
-                f"drop it, or name it in pass_keys=({key!r},)"
-            )
-        shape = tuple(getattr(first, "shape", ()))
-        if len(shape) >= 2 and shape[-2:] in sizes:
-            raise SampleError(
-                f"{key}: shape {shape} looks like a map over the source's pixels and would be stale; name it in "
-                f"label_keys=({key!r},) to render it, or in pass_keys=({key!r},) to keep it as it is"
-            )
-    return labels

@@ -1,0 +1,197 @@
+"""What goes with the images: label maps rendered like them, labels in the ego frame moved, and nothing left stale."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+
+from arbiview_aug.errors import SampleError, SampleTypeError
+from arbiview_aug.favs.synthesis import render_labels
+from arbiview_aug.plan import RenderPlan
+from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame
+from arbiview_aug.tensors import gathered, nearest_resized, rewrapped, split, stacked
+
+PIXEL_BOUND_KEYS = (
+    "boxes_2d",
+    "labels_2d",
+    "centers_2d",
+    "depths",
+    "depth",
+    "keypoints_2d",
+    "neighbours",
+    "source_camera",
+    "confidence",
+    "generated",
+)
+"""Keys known to speak of the source's pixels: dropped, because they would be stale in the target's views."""
+
+EGO_KEYS = ("points", "boxes_3d", "ego2world")
+"""Keys known to be in the ego frame: they pass, or move with ``label_frame="target"``."""
+
+_MOST_NESTED = 64  # entries of a list that are looked at: longer lists are tokens or numbers
+
+
+# --- which keys are what ----------------------------------------------------------------------------------------------
+def check_other_keys(
+    sample: Mapping[str, Any],
+    sizes: Sequence[tuple[int, ...]],
+    label_keys: Sequence[str],
+    pass_keys: Sequence[str],
+) -> list[str]:
+    """Which keys hold label maps; refuses whatever else may speak of the source's pixels.
+
+    Args:
+        sample: The sample dict.
+        sizes: The (h, w) of its images.
+        label_keys: Named by the user as label maps.
+        pass_keys: Named by the user as harmless.
+
+    Raises:
+        SampleError: A tensor of the images' height and width, or a torchvision tv_tensor, that nobody named.
+    """
+    absent = [key for key in label_keys if key not in sample]
+    if absent:
+        raise SampleError(f"label_keys: expected {', '.join(absent)} in the sample, got {', '.join(map(str, sample))}")
+    labels = list(label_keys)
+    for key, value in sample.items():
+        if key in (*CALIBRATION_KEYS, *PIXEL_BOUND_KEYS, *EGO_KEYS, *labels, *pass_keys):
+            continue
+        first = value[0] if isinstance(value, list | tuple) and value else value
+        if _tv_tensor(first) == "Mask":
+            labels.append(key)
+            continue
+        for leaf in _leaves(value):
+            if kind := _tv_tensor(leaf):
+                raise SampleError(
+                    f"{key}: a tv_tensors.{kind} speaks of the source's pixels and would be stale; "
+                    f"drop it, or name it in pass_keys=({key!r},)"
+                )
+            shape = tuple(getattr(leaf, "shape", ()))
+            if any(pair in sizes for pair in pairwise(shape)):
+                raise SampleError(
+                    f"{key}: shape {shape} looks like a map over the source's pixels and would be stale; name it in "
+                    f"label_keys=({key!r},) to render it, or in pass_keys=({key!r},) to keep it as it is"
+                )
+    return labels
+
+
+def _tv_tensor(value: Any) -> str:
+    kind = type(value)
+    return kind.__name__ if kind.__module__.startswith("torchvision.tv_tensors") else ""
+
+
+def _leaves(value: Any) -> Iterator[Any]:
+    if isinstance(value, Mapping):
+        for entry in value.values():
+            yield from _leaves(entry)
+    elif isinstance(value, list | tuple):
+        for entry in value[:_MOST_NESTED]:
+            yield from _leaves(entry)
+    else:
+        yield value
+
+
+# --- label maps -------------------------------------------------------------------------------------------------------
+def target_labels(
+    key: str,
+    value: Any,
+    frames: Sequence[SourceFrame],
+    lead: tuple[int, ...],
+    views: Sequence[RenderPlan | tuple[int, int]],
+    fill: float,
+) -> Any:
+    """The label maps (..., N, H, W) of a sample in the target's views.
+
+    Args:
+        key: Named in error messages.
+        value: A tensor, or a list of one (..., Hi, Wi) tensor a camera.
+        frames: The frames of the sample.
+        lead: Its leading dimensions.
+        views: The plan of each frame; or, where the frame is only resized, its new size.
+        fill: Value of pixels that no source sees (False for bool maps).
+
+    Raises:
+        SampleError: Maps that do not belong to the images, or a fill that their type cannot hold.
+        SampleTypeError: Maps that are no tensors.
+    """
+    if not all(isinstance(v, torch.Tensor) for v in (value if isinstance(value, list | tuple) else [value])):
+        raise SampleTypeError(f"{key}: expected label maps as tensors, got {type(value).__name__}; use torch.as_tensor")
+    try:
+        of_frames = split(value, lead)
+    except ValueError as error:
+        raise SampleError(f"{key}: {error}") from None
+    rendered = []
+    for frame, view, maps in zip(frames, views, of_frames, strict=True):
+        _check_maps(key, maps, frame)
+        plain = [label.as_subclass(torch.Tensor) for label in maps]
+        if isinstance(view, RenderPlan):
+            rendered.append(stacked(render_labels(view, plain, _checked_fill(key, fill, plain[0].dtype))))
+        else:
+            rendered.append(stacked([nearest_resized(label, view) for label in plain]))
+    return rewrapped(gathered(rendered, lead), value)
+
+
+def _check_maps(key: str, maps: Any, frame: SourceFrame) -> None:
+    if len(maps) != len(frame.images):
+        raise SampleError(f"{key}: expected {len(frame.images)} label maps, one an image, got {len(maps)}")
+    for camera, label in zip(frame.rig, maps, strict=True):
+        size = tuple(label.shape[-2:])
+        if size != camera.size:
+            raise SampleError(f"{key}: camera {camera.name!r}: expected a map of (h, w) = {camera.size}, got {size}")
+
+
+def _checked_fill(key: str, fill: float, dtype: torch.dtype) -> float:
+    if dtype == torch.bool:
+        return False
+    if not dtype.is_floating_point:
+        limits = torch.iinfo(dtype)
+        if fill != int(fill) or not limits.min <= fill <= limits.max:
+            raise SampleError(f"{key}: label_fill: expected a value of {dtype}, got {fill!r}")
+    return fill
+
+
+# --- labels in the ego frame ------------------------------------------------------------------------------------------
+def move_to_target(out: dict[str, Any], ego2ego: torch.Tensor, lead: tuple[int, ...]) -> None:
+    """Poses, points and boxes of an output sample into the target's ego frame, which differs by a translation.
+
+    Args:
+        out: The output; its entries are replaced, never written to.
+        ego2ego: (*lead, 4, 4) source's ego frame to target's.
+        lead: Leading dimensions.
+    """
+    out["ego2ego"] = ego2ego
+    out["cam2ego"] = ego2ego[..., None, :, :].to(out["cam2ego"]) @ out["cam2ego"]
+    for key in ("points", "boxes_3d"):
+        if out.get(key) is not None:
+            out[key] = _translated(key, out[key], ego2ego[..., :3, 3], lead)
+    if out.get("ego2world") is not None:
+        pose = out["ego2world"]
+        inverse = torch.linalg.inv(ego2ego)
+        if isinstance(pose, np.ndarray):
+            out["ego2world"] = pose @ inverse.numpy()
+        else:
+            out["ego2world"] = pose @ inverse.to(pose)
+
+
+def _translated(key: str, value: Any, offset_m: torch.Tensor, lead: tuple[int, ...]) -> Any:
+    """Points or boxes (*lead, P, C) moved by (*lead, 3); lists have an entry for each frame."""
+    if isinstance(value, list | tuple):
+        offsets = offset_m.reshape(-1, 3).expand(len(value) if not lead else -1, 3)
+        if len(offsets) != len(value):
+            raise SampleError(f"{key}: expected {len(offsets)} entries, one a frame, got {len(value)}")
+        return [_translated(key, v, o, ()) for v, o in zip(value, offsets, strict=True)]
+    if isinstance(value, np.ndarray):
+        return _translated(key, torch.tensor(value), offset_m, lead).numpy()
+    if not isinstance(value, torch.Tensor) or not value.is_floating_point():
+        kind = value.dtype if isinstance(value, torch.Tensor) else type(value).__name__
+        raise SampleTypeError(f"{key}: label_frame='target': expected a float tensor, got {kind}")
+    if value.ndim < len(lead) + 1 or value.shape[-1] < 3 or tuple(value.shape[: len(lead)]) != lead:
+        expected = ", ".join((*map(str, lead), "count", ">=3"))
+        raise SampleError(f"{key}: expected shape ({expected}), got {tuple(value.shape)}")
+    moved = value.clone()
+    moved[..., :3] += offset_m.reshape(*lead, *(1,) * (value.ndim - len(lead) - 1), 3).to(moved)
+    return moved

@@ -1,0 +1,93 @@
+"""Per-camera tensors of a sample: stacked or in lists, with and without leading dimensions, wrapped as they came."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+
+def leading_shape(images: Any) -> tuple[int, ...]:
+    """Batch dimensions of images: of a (..., N, 3, H, W) tensor, or of a list of N (..., 3, Hi, Wi) tensors."""
+    if isinstance(images, torch.Tensor):
+        return tuple(images.shape[:-4])
+    if isinstance(images, list | tuple) and images and isinstance(images[0], torch.Tensor):
+        return tuple(images[0].shape[:-3])
+    return ()
+
+
+def split(value: Any, lead: tuple[int, ...]) -> list[Any]:
+    """The entries of each frame: of a (*lead, ...) tensor, or of a list of one (*lead, ...) tensor a camera.
+
+    Raises:
+        ValueError: Other leading dimensions.
+    """
+    if not lead:
+        return [value]
+    if isinstance(value, list | tuple):
+        return [list(frame) for frame in zip(*(split(v, lead) for v in value), strict=True)]
+    if tuple(value.shape[: len(lead)]) != lead:
+        raise ValueError(f"expected the images' leading dimensions {lead}, got shape {tuple(value.shape)}")
+    return list(value.reshape(math.prod(lead), *value.shape[len(lead) :]).unbind(0))
+
+
+def stacked(views: list[torch.Tensor]) -> torch.Tensor | list[torch.Tensor]:
+    """One tensor where all sizes agree, without copying the slices of one block; a list otherwise."""
+    if len({view.shape for view in views}) > 1:
+        return views
+    base = views[0]._base
+    if base is not None and base.shape == (len(views), *views[0].shape) and all(v._base is base for v in views):
+        return base
+    return torch.stack(views)
+
+
+def covered(winners: Sequence[np.ndarray], device: torch.device) -> torch.Tensor | list[torch.Tensor]:
+    """Coverage, new memory, of (h, w) int8 winning sources: stacked where all sizes agree."""
+    if len({winner.shape for winner in winners}) > 1:
+        return [torch.from_numpy(winner >= 0).to(device) for winner in winners]
+    block = np.empty((len(winners), *winners[0].shape), bool)
+    for winner, coverage in zip(winners, block, strict=True):
+        np.greater_equal(winner, 0, out=coverage)
+    return torch.from_numpy(block).to(device)
+
+
+def gathered(parts: Sequence[Any], lead: tuple[int, ...]) -> Any:
+    """What ``stacked`` gave for each frame of a batch, back in the batch's leading dimensions."""
+    if not lead:
+        return parts[0]
+    if isinstance(parts[0], list):
+        return [torch.stack(views).reshape(*lead, *views[0].shape) for views in zip(*parts, strict=True)]
+    return torch.stack(list(parts)).reshape(*lead, *parts[0].shape)
+
+
+def rewrapped(value: Any, like: Any) -> Any:
+    """The value as the tv_tensor class of the input, where that was one."""
+    first = like[0] if isinstance(like, list | tuple) else like
+    if not type(first).__module__.startswith("torchvision.tv_tensors"):
+        return value
+    from torchvision import tv_tensors
+
+    if isinstance(value, list):
+        return [tv_tensors.wrap(v, like=first) for v in value]
+    return tv_tensors.wrap(value, like=first)
+
+
+def resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    """A (3, H, W) image at (h, w), antialiased; a copy where the size is right already."""
+    if tuple(image.shape[-2:]) == size:
+        return image.clone()
+    out = torch.nn.functional.interpolate(
+        image[None].float(), size=size, mode="bilinear", antialias=True, align_corners=False
+    )[0]
+    return out.round().clamp(0, 255).to(image.dtype) if image.dtype == torch.uint8 else out.to(image.dtype)
+
+
+def nearest_resized(label: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    """A (..., H, W) label map at (h, w): the label at each new pixel's centre."""
+    h, w = label.shape[-2:]
+    y = ((torch.arange(size[0], device=label.device) + 0.5) * h / size[0]).long().clamp(max=h - 1)
+    x = ((torch.arange(size[1], device=label.device) + 0.5) * w / size[1]).long().clamp(max=w - 1)
+    return label[..., y[:, None], x]

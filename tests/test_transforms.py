@@ -1,0 +1,713 @@
+"""``RigRetarget``'s sample contract: what goes in, what comes out, what stays and what is refused."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import default_collate
+
+from arbiview_aug import Camera, RandomRig, Rig, RigRetarget, SampleError, SampleTypeError, load_rig
+
+SIZE = (36, 64)
+EXECUTIONS = ["opencv", "torch"]
+
+
+@pytest.fixture(autouse=True)
+def no_warnings() -> Iterator[None]:
+    """A warning that no test expects is an error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        yield
+
+
+def ring(count: int = 4, size: tuple[int, int] = SIZE, **changes: Any) -> Rig:
+    """Cameras all around with overlaps, 1.5 m above the road."""
+    h, w = size
+    cameras = [
+        Camera.looking(
+            name=f"c{k}",
+            azimuth_deg=360 / count * k,
+            position_m=(0.5 * np.cos(2 * np.pi * k / count), 0.5 * np.sin(2 * np.pi * k / count), 1.5),
+            width_px=w,
+            height_px=h,
+            horizontal_fov_deg=360 / count + 30,
+        )
+        for k in range(count)
+    ]
+    return Rig(cameras, name="ring", **changes)
+
+
+def with_mask(rig: Rig) -> Rig:
+    """The bottom rows of the first camera show the own car."""
+    mask = np.ones(rig[0].size, bool)
+    mask[-6:] = False
+    cameras = [changed(c, mask=mask) if k == 0 else c for k, c in enumerate(rig)]
+    return rig.with_cameras(cameras)
+
+
+def changed(camera: Camera, **changes: Any) -> Camera:
+    fields = ("name", "width_px", "height_px", "K", "cam2ego", "lens", "distortion", "mask")
+    return Camera(**{**{f: getattr(camera, f) for f in fields}, **changes})
+
+
+def with_lens(rig: Rig, lens: str = "radtan") -> Rig:
+    coefficients = (-0.1, 0.01, 0.001, -0.001, 0.0) if lens == "radtan" else (-0.02, 0.003, 0.0, 0.0)
+    cameras = [changed(c, lens=lens, distortion=coefficients) if k % 2 == 0 else c for k, c in enumerate(rig)]
+    return rig.with_cameras(cameras)
+
+
+def pictures(rig: Rig, dtype: torch.dtype = torch.uint8, seed: int = 0) -> Any:
+    """Smooth pictures, so that a small shift makes a small difference; a list where sizes differ."""
+    generator = torch.Generator().manual_seed(seed)
+    images = []
+    for camera in rig:
+        coarse = torch.rand((1, 3, 5, 7), generator=generator)
+        image = torch.nn.functional.interpolate(coarse, size=camera.size, mode="bicubic", align_corners=True)[0]
+        image = image.clamp(0, 1)
+        images.append((image * 255).round().to(torch.uint8) if dtype == torch.uint8 else image.to(dtype))
+    return torch.stack(images) if len(set(rig.sizes)) == 1 else images
+
+
+def sample_of(rig: Rig, dtype: torch.dtype = torch.uint8, seed: int = 0, **more: Any) -> dict[str, Any]:
+    """A sample with its calibration in tensors."""
+    calibration = {"K": torch.from_numpy(rig.K), "cam2ego": torch.from_numpy(rig.cam2ego)}
+    return {"images": pictures(rig, dtype, seed), **calibration, **more}
+
+
+def same(one: Any, two: Any) -> bool:
+    """Equal in content, type and dtype, through dicts and lists."""
+    if isinstance(one, torch.Tensor):
+        return type(one) is type(two) and one.dtype == two.dtype and torch.equal(one, two)
+    if isinstance(one, dict):
+        return list(one) == list(two) and all(same(one[k], two[k]) for k in one)
+    if isinstance(one, list | tuple):
+        return len(one) == len(two) and all(map(same, one, two))
+    return bool(one == two)
+
+
+# --- images and calibration -------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("execution", EXECUTIONS)
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.float16, torch.float64])
+def test_the_output(dtype: torch.dtype, execution: str) -> None:
+    source, target = ring(), ring(5, (30, 50)).turned(yaw_deg=20)
+    out = RigRetarget(target, execution=execution)(sample_of(source, dtype))
+    assert list(out) == ["images", "K", "cam2ego", "ground_z_m", "coverage"]
+    assert out["images"].shape == (5, 3, 30, 50) and out["images"].dtype == dtype
+    assert out["coverage"].shape == (5, 30, 50) and out["coverage"].dtype == torch.bool
+    assert out["coverage"].float().mean() > 0.8
+    np.testing.assert_array_equal(out["K"], target.K)
+    np.testing.assert_array_equal(out["cam2ego"], target.cam2ego)
+    assert (out["images"].movedim(1, -1)[~out["coverage"]] == 0).all()
+
+
+def test_every_dtype_shows_the_same() -> None:
+    source, retarget = ring(), RigRetarget(ring().turned(yaw_deg=20))
+    expected = retarget(sample_of(source))["images"].float() / 255
+    for dtype in (torch.float32, torch.float16, torch.float64, torch.bfloat16):
+        images = retarget(sample_of(source, dtype))["images"]
+        assert images.dtype == dtype and (images.float() - expected).abs().max() < 0.01
+
+
+def test_mixed_target_sizes_give_lists_unless_a_size_is_asked_for() -> None:
+    base = ring()
+    target = base.with_cameras([base[0].resize((18, 32)), *base.cameras[1:]])
+    out = RigRetarget(target, outputs=("source_camera",))(sample_of(base))
+    sizes = [(18, 32), SIZE, SIZE, SIZE]
+    for key, shape in (("images", (3,)), ("coverage", ()), ("source_camera", ())):
+        assert isinstance(out[key], list) and [tuple(v.shape) for v in out[key]] == [(*shape, *s) for s in sizes]
+    assert out["source_camera"][0].dtype == torch.int8
+    out = RigRetarget(target, size=(24, 40))(sample_of(base))
+    assert out["images"].shape == (4, 3, 24, 40)
+    np.testing.assert_array_equal(out["K"], target.resized((24, 40)).K)
+
+
+def test_mixed_source_sizes_come_as_a_list() -> None:
+    base = ring()
+    source = base.with_cameras([base[0].resize((18, 32)), *base.cameras[1:]])
+    out = RigRetarget(base)(sample_of(source))
+    assert out["images"].shape == (4, 3, *SIZE)
+
+
+def test_source_camera_says_who_won() -> None:
+    source = ring()
+    out = RigRetarget(source, outputs=["source_camera"])(sample_of(source))
+    assert out["source_camera"].dtype == torch.int8
+    assert torch.equal(out["source_camera"] >= 0, out["coverage"])
+    inner = out["source_camera"][:, 4:-4, 4:-4]
+    assert torch.equal(inner, torch.arange(4, dtype=torch.int8)[:, None, None].expand_as(inner))
+
+
+def test_calibration_follows_the_inputs_dtype() -> None:
+    source, retarget = ring(), RigRetarget(ring(5))
+    sample = sample_of(source)
+    sample["K"], sample["cam2ego"] = sample["K"].float(), sample["cam2ego"].half().double()
+    sample["cam2ego"] = torch.from_numpy(source.cam2ego)
+    out = retarget(sample)
+    assert out["K"].dtype == torch.float32 and out["cam2ego"].dtype == torch.float64
+    whole = {**sample_of(source), "K": torch.from_numpy(source.K).round().long()}
+    assert retarget(whole)["K"].dtype == torch.float64  # whole numbers would cut the target's
+    bare = {"images": sample["images"], "rig": source}
+    assert retarget(bare)["K"].dtype == torch.float64
+
+
+def test_the_rig_wins_and_is_consumed() -> None:
+    source, retarget = ring(), RigRetarget(ring().turned(yaw_deg=10))
+    expected = retarget(sample_of(source))
+    wrong = source.turned(yaw_deg=90)
+    out = retarget({**sample_of(wrong), "images": pictures(source), "rig": source})
+    assert "rig" not in out and same(out["images"], expected["images"])
+    by_constructor = RigRetarget(ring().turned(yaw_deg=10), source_rig=source)({"images": pictures(source)})
+    assert same(by_constructor["images"], expected["images"])
+    both = RigRetarget(ring().turned(yaw_deg=10), source_rig=wrong)({"images": pictures(source), "rig": source})
+    assert same(both["images"], expected["images"])
+
+
+def test_target_masks_become_ignore() -> None:
+    target = with_mask(ring())
+    out = RigRetarget(target)(sample_of(ring()))
+    assert out["ignore"].shape == (4, *SIZE) and out["ignore"].dtype == torch.bool
+    np.testing.assert_array_equal(out["ignore"][0], ~target[0].mask)
+    assert not out["ignore"][1:].any()
+
+
+@pytest.mark.parametrize("lens", ["radtan", "fisheye"])
+def test_lens_targets_and_retargeting_again(lens: str) -> None:
+    source, target = ring(), with_lens(ring(), lens)
+    out = RigRetarget(target)(sample_of(source))
+    assert out["lens"] == [lens, "pinhole", lens, "pinhole"]
+    assert out["distortion"].shape == (4, 8) and out["distortion"].dtype == torch.float64
+    assert tuple(out["distortion"][0, : len(target[0].distortion)].tolist()) == target[0].distortion
+    assert not out["distortion"][1].any()
+
+    back = RigRetarget(source)(out)
+    assert "lens" not in back and "distortion" not in back
+    error = (back["images"].int() - sample_of(source)["images"].int()).abs().movedim(1, -1)
+    middle = (slice(None), slice(6, -6), slice(12, -12))  # neighbours show other things there
+    assert back["coverage"][middle].all() and error[middle].float().mean() < 2
+
+    collated = default_collate([out, out])
+    again = RigRetarget(source)(collated)
+    assert same(again["images"], torch.stack([back["images"]] * 2))
+
+
+def test_uncovered_pixels_stay_uncovered_when_retargeted_again() -> None:
+    source = ring().with_cameras([ring()[0]])
+    turned = source.turned(yaw_deg=40)
+    first = RigRetarget(turned)(sample_of(source))
+    assert not first["coverage"].all()
+    again = RigRetarget(turned)(first)
+    assert not (again["coverage"] & ~first["coverage"]).any()
+    assert again["coverage"].sum() > 0.8 * first["coverage"].sum()
+
+
+def test_a_batch_of_sources_with_different_lenses() -> None:
+    source = with_lens(ring())
+    plain = RigRetarget(source, size=SIZE, p=0.5)(sample_of(ring()), params={"skipped": 1.0})
+    lensed = RigRetarget(source, size=SIZE, p=0.5)(sample_of(ring()), params={"skipped": 0.0})
+    assert plain["lens"] == ["pinhole"] * 4 and lensed["lens"] == source_lenses(source)
+    batch = default_collate([plain, lensed])
+    assert [list(names) for names in batch["lens"]] == [["pinhole", lens] for lens in lensed["lens"]]
+    out = RigRetarget(ring().turned(yaw_deg=5))(batch)
+    for k, single in enumerate((plain, lensed)):
+        assert same(out["images"][k], RigRetarget(ring().turned(yaw_deg=5))(single)["images"])
+    skipping = RigRetarget(source, size=SIZE, p=0.5)
+    assert skipping(batch, params={"skipped": 1.0})["lens"] == [["pinhole", lens] for lens in lensed["lens"]]
+
+
+def source_lenses(rig: Rig) -> list[str]:
+    return [camera.lens for camera in rig]
+
+
+# --- other entries ----------------------------------------------------------------------------------------------------
+def test_other_entries_are_the_same_objects_and_the_input_stays() -> None:
+    source = ring()
+    others = {
+        "token": "abc",
+        "points": torch.rand(10, 4),
+        "boxes_3d": torch.rand(2, 7),
+        "anything": {"nested": [1, 2]},
+        "odd": object(),
+    }
+    sample = {**others, **sample_of(source), "rig": source}
+    before = dict(sample)
+    images = sample["images"].clone()
+    out = RigRetarget(ring(5, (20, 40)))(sample)
+    assert all(out[key] is value for key, value in others.items())
+    assert sample.keys() == before.keys() and all(sample[key] is before[key] for key in sample)
+    assert torch.equal(sample["images"], images)
+    assert list(out)[:5] == list(others)  # order kept
+
+
+def test_outputs_collate() -> None:
+    source = ring()
+    retarget = RigRetarget(
+        RandomRig(with_mask(with_lens(source)), yaw_deg=20), label_keys=["classes"], outputs=["source_camera"]
+    )
+    sample = sample_of(source, token="t", classes=torch.zeros((4, *SIZE), dtype=torch.uint8))
+    batch = default_collate([retarget(sample) for _ in range(2)])
+    assert batch["images"].shape == (2, 4, 3, *SIZE) and batch["coverage"].shape == (2, 4, *SIZE)
+    assert batch["classes"].shape == (2, 4, *SIZE) and batch["ignore"].shape == (2, 4, *SIZE)
+    assert batch["distortion"].shape == (2, 4, 8) and batch["ground_z_m"].shape == (2,)
+    assert batch["retarget_params"]["yaw_deg"].shape == (2,) and batch["token"] == ["t", "t"]
+
+
+def test_pixel_bound_keys_are_dropped_with_one_warning() -> None:
+    source, retarget = ring(), RigRetarget(ring().turned(yaw_deg=3))
+    sample = sample_of(source, boxes_2d=torch.rand(3, 4), depth=torch.rand(4, *SIZE), neighbours=[])
+    with pytest.warns(UserWarning, match="drops boxes_2d, depth, neighbours: they speak of the source's pixels"):
+        out = retarget(sample)
+    assert not {"boxes_2d", "depth", "neighbours"} & set(out)
+    retarget(sample)  # without a second warning
+
+
+def test_pixel_bound_keys_can_be_kept_or_rendered() -> None:
+    source = ring()
+    sample = sample_of(source, boxes_2d=torch.rand(3, 4), depth=torch.rand(4, *SIZE))
+    out = RigRetarget(source, pass_keys=["boxes_2d"], label_keys=["depth"], label_fill=0)(sample)
+    assert out["boxes_2d"] is sample["boxes_2d"]
+    inner = (slice(None), slice(2, -2), slice(2, -2))
+    assert torch.equal(out["depth"][inner], sample["depth"][inner])
+
+
+@pytest.mark.parametrize("shape", [SIZE, (4, *SIZE), (4, 2, *SIZE), (4, *SIZE, 2)])
+@pytest.mark.parametrize("nested", [False, True])
+def test_a_map_over_the_sources_pixels_is_refused(shape: tuple[int, ...], nested: bool) -> None:
+    value: Any = [{"flow": torch.zeros(shape)}] if nested else np.zeros(shape)
+    sample = sample_of(ring(), flow=value)
+    with pytest.raises(SampleError, match=r"flow: shape .* would be stale; name it in label_keys=\('flow',\)"):
+        RigRetarget(ring())(sample)
+    assert RigRetarget(ring(), pass_keys=["flow"])(sample)["flow"] is value
+
+
+def test_bounding_boxes_are_refused() -> None:
+    tv_tensors = pytest.importorskip("torchvision.tv_tensors")
+    boxes = tv_tensors.BoundingBoxes(torch.rand(2, 4), format="XYXY", canvas_size=SIZE)
+    for value in (boxes, {"boxes": boxes}):
+        sample = sample_of(ring(), target=value)
+        with pytest.raises(SampleError, match=r"target: a tv_tensors.BoundingBoxes .* pass_keys=\('target',\)"):
+            RigRetarget(ring())(sample)
+        assert RigRetarget(ring(), pass_keys=["target"])(sample)["target"] is value
+
+
+# --- label maps -------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int64, torch.float32])
+def test_label_maps_are_the_winning_sources(dtype: torch.dtype) -> None:
+    source, target = ring(), ring().turned(yaw_deg=30)
+    values = torch.arange(4)[:, None, None].expand(4, *SIZE).to(dtype).contiguous()
+    retarget = RigRetarget(target, label_keys=["classes"], label_fill=77, outputs=["source_camera"])
+    out = retarget(sample_of(source, classes=values))
+    assert out["classes"].dtype == dtype and out["classes"].shape == (4, *SIZE)
+    expected = torch.where(out["coverage"], out["source_camera"].to(dtype), torch.tensor(77, dtype=dtype))
+    assert torch.equal(out["classes"], expected)
+
+
+def test_bool_labels_are_false_where_nobody_sees() -> None:
+    source = ring().with_cameras([ring()[0]])
+    sample = sample_of(source, moving=torch.ones((1, *SIZE), dtype=torch.bool))
+    out = RigRetarget(source.turned(yaw_deg=30), label_keys=["moving"])(sample)
+    assert out["moving"].dtype == torch.bool and torch.equal(out["moving"], out["coverage"])
+
+
+def test_label_maps_that_do_not_fit() -> None:
+    def labels(value: Any, **settings: Any) -> Any:
+        return RigRetarget(ring(), label_keys=["classes"], **settings)(sample_of(ring(), classes=value))
+
+    with pytest.raises(SampleError, match="classes: expected 4 label maps, one an image, got 3"):
+        labels(torch.zeros((3, *SIZE)))
+    with pytest.raises(SampleError, match=r"classes: camera 'camera 0': expected a map of \(h, w\) = \(36, 64\), got"):
+        labels(torch.zeros((4, 64, 36)))
+    with pytest.raises(SampleError, match=r"classes: label_fill: expected a value of torch.int8, got 255"):
+        labels(torch.zeros((4, *SIZE), dtype=torch.int8))
+    labels(torch.zeros((4, *SIZE), dtype=torch.int8), label_fill=-1)
+    with pytest.raises(SampleTypeError, match="classes: expected label maps as tensors, got ndarray"):
+        labels(np.zeros((4, *SIZE)))
+    with pytest.raises(SampleError, match="label_keys: expected classes in the sample, got images, K, cam2ego"):
+        RigRetarget(ring(), label_keys=["classes"])(sample_of(ring()))
+
+
+# --- torchvision ------------------------------------------------------------------------------------------------------
+def test_tv_tensors_are_wrapped_again() -> None:
+    tv_tensors = pytest.importorskip("torchvision.tv_tensors")
+    source = ring()
+    sample = sample_of(source)
+    mask = tv_tensors.Mask(torch.arange(4, dtype=torch.uint8)[:, None, None].expand(4, *SIZE))
+    wrapped = {**sample, "images": tv_tensors.Image(sample["images"]), "classes": mask}
+    retarget = RigRetarget(source.turned(yaw_deg=10), outputs=["source_camera"])
+    out, plain = retarget(wrapped), retarget(sample)
+    assert type(out["images"]) is tv_tensors.Image and type(out["classes"]) is tv_tensors.Mask
+    assert type(out["coverage"]) is torch.Tensor
+    assert torch.equal(out["images"].as_subclass(torch.Tensor), plain["images"])
+    covered = out["coverage"]
+    assert torch.equal(out["classes"].as_subclass(torch.Tensor)[covered], out["source_camera"][covered].to(torch.uint8))
+    lists = {**sample, "images": [tv_tensors.Image(image) for image in sample["images"]]}
+    assert type(retarget(lists)["images"]) is tv_tensors.Image
+
+
+def test_inside_a_torchvision_pipeline() -> None:
+    tv_tensors = pytest.importorskip("torchvision.tv_tensors")
+    from torchvision.transforms import v2
+
+    source = ring()
+    sample = sample_of(source)
+    sample["images"] = tv_tensors.Image(sample["images"])
+    retarget = RigRetarget(source.turned(yaw_deg=10))
+    out = v2.Compose([retarget, v2.RandomPhotometricDistort(p=1), v2.ToDtype(torch.float32, scale=True)])(sample)
+    plain = retarget(sample)
+    assert out["images"].dtype == torch.float32 and out["images"].shape == plain["images"].shape
+    assert torch.equal(out["K"], plain["K"]) and torch.equal(out["coverage"], plain["coverage"])
+
+
+# --- batches ----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("execution", EXECUTIONS)
+@pytest.mark.parametrize("lead", [(2,), (1, 2)])
+def test_leading_dimensions_equal_the_single_calls(lead: tuple[int, ...], execution: str) -> None:
+    rigs = [with_lens(ring()), with_lens(ring()).shifted(x_m=0.4).turned(yaw_deg=7)]  # a calibration each
+    labels = [torch.randint(0, 9, (4, *SIZE), generator=torch.Generator().manual_seed(k)) for k in range(2)]
+    target = with_mask(with_lens(ring(3, (20, 40), ground_z_m=-0.33)))
+    retarget = RigRetarget(
+        target, execution=execution, label_keys=["classes"], outputs=["source_camera"], label_frame="target"
+    )
+    singles = []
+    for k, rig in enumerate(rigs):
+        distortion = torch.zeros(4, 8, dtype=torch.float64)
+        for row, camera in zip(distortion, rig, strict=True):
+            row[: len(camera.distortion)] = torch.tensor(camera.distortion)
+        lens = [camera.lens for camera in rig]
+        more = {"distortion": distortion, "lens": lens, "ground_z_m": 0.1 * k, "points": torch.rand(5, 4)}
+        singles.append({**sample_of(rig, seed=k), **more, "ego2world": torch.eye(4).double(), "classes": labels[k]})
+    batch = default_collate(singles)
+    batch["lens"] = singles[0]["lens"]
+    for key, value in batch.items():
+        if isinstance(value, torch.Tensor):
+            batch[key] = value.reshape(*lead, *value.shape[1:])
+    out = retarget(batch)
+    expected = default_collate([retarget(single) for single in singles])
+    assert set(out) == set(expected)
+    for key, value in expected.items():
+        if isinstance(value, torch.Tensor):
+            assert same(out[key], value.reshape(*lead, *value.shape[1:])), key
+    assert out["lens"] == [camera.lens for camera in target]
+
+
+def test_frames_of_one_calibration_go_through_torch_together() -> None:
+    source = ring()
+    retarget = RigRetarget(ring().turned(yaw_deg=10), execution="torch")
+    singles = [sample_of(source, torch.float32, seed=k) for k in range(3)]
+    out = retarget(default_collate(singles))
+    for k, single in enumerate(singles):
+        assert torch.allclose(out["images"][k], retarget(single)["images"], atol=1e-6)
+    assert len(retarget.plans) == 1 and retarget.plans.misses == 1
+
+
+def test_a_batch_of_lists() -> None:
+    base = ring()
+    source = base.with_cameras([base[0].resize((18, 32)), *base.cameras[1:]])
+    target = base.with_cameras([*base.cameras[:3], base[3].resize((18, 32))])
+    singles = [{**sample_of(source, seed=k), "classes": pictures(source, seed=k)} for k in range(2)]
+    for single in singles:
+        single["classes"] = [image[0] for image in single["classes"]]
+    retarget = RigRetarget(target, label_keys=["classes"])
+    out, expected = retarget(default_collate(singles)), default_collate([retarget(single) for single in singles])
+    for key in ("images", "coverage", "classes"):
+        assert isinstance(out[key], list) and same(out[key], expected[key])
+
+
+# --- skipping ---------------------------------------------------------------------------------------------------------
+def test_skipping_needs_a_size_and_equal_counts() -> None:
+    with pytest.raises(ValueError, match=r"p < 1: expected size=\(h, w\)"):
+        RigRetarget(ring(), p=0.5)
+    with pytest.raises(SampleError, match="p < 1: expected the target to have the source's 4 cameras, got 5"):
+        RigRetarget(ring(5), p=0.5, size=SIZE)(sample_of(ring()))
+
+
+@pytest.mark.parametrize("lensed", ["neither", "source", "target"])
+@pytest.mark.parametrize("masked", ["neither", "source", "target"])
+def test_skipped_samples_collate_with_retargeted_ones(masked: str, lensed: str) -> None:
+    source, target = ring(), ring().turned(yaw_deg=20)
+    if lensed != "neither":
+        source, target = (with_lens(source), target) if lensed == "source" else (source, with_lens(target))
+    if masked != "neither":
+        source, target = (with_mask(source), target) if masked == "source" else (source, with_mask(target))
+    sample = {"images": pictures(source), "rig": source, "classes": torch.ones((4, *SIZE), dtype=torch.uint8)}
+    retarget = RigRetarget(target, p=0.5, size=(18, 32), label_keys=["classes"], outputs=["source_camera"])
+    outs = {flag: retarget(sample, params={"skipped": flag}) for flag in (0.0, 1.0)}
+    assert list(outs[0.0]) == list(outs[1.0])
+    assert ("lens" in outs[0.0]) == (lensed != "neither") and ("ignore" in outs[0.0]) == (masked != "neither")
+    batch = default_collate(list(outs.values()))
+    assert batch["images"].shape == (2, 4, 3, 18, 32) and batch["classes"].shape == (2, 4, 18, 32)
+    skipped = outs[1.0]
+    assert skipped["coverage"].all() and (skipped["classes"] == 1).all()
+    np.testing.assert_array_equal(skipped["K"], source.resized((18, 32)).K)
+    np.testing.assert_array_equal(skipped["cam2ego"], source.cam2ego)
+    if masked == "source":
+        np.testing.assert_array_equal(skipped["ignore"][0], ~source.resized((18, 32))[0].mask)
+        assert not outs[0.0]["ignore"].any()
+
+
+def test_a_skipped_sample_is_the_resized_source_in_memory_of_its_own() -> None:
+    source = ring()
+    sample = sample_of(source)
+    before = sample["images"].clone()
+    out = RigRetarget(source, p=0.0, size=SIZE)(sample)
+    assert torch.equal(out["images"], before)
+    out["images"].zero_()
+    assert torch.equal(sample["images"], before)
+    half = RigRetarget(source, p=0.0, size=(18, 32))(sample)["images"].float()
+    expected = before.float().reshape(4, 3, 18, 2, 32, 2).mean((3, 5))
+    assert (half - expected).abs().mean() < 2  # a wider, antialiasing filter
+
+
+def test_p_is_the_share_of_retargeted_samples() -> None:
+    source = ring(4, (4, 6))
+    retarget = RigRetarget(source, p=0.7, size=(4, 6), rng=torch.Generator().manual_seed(0))
+    skipped = [retarget(sample_of(source))["retarget_params"]["skipped"] for _ in range(300)]
+    assert set(skipped) == {0.0, 1.0} and 0.2 < np.mean(skipped) < 0.4
+
+
+# --- draws ------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("p", [1.0, 0.5])
+def test_replay_is_bit_identical(p: float) -> None:
+    source = ring()
+    retarget = RigRetarget(RandomRig(ring(), yaw_deg=15, height_m=0.3, focal_scale=0.1), p=p, size=SIZE)
+    torch.manual_seed(0)
+    for _ in range(4):
+        out = retarget(sample_of(source))
+        assert all(isinstance(value, float) for value in out["retarget_params"].values())
+        assert same(retarget(sample_of(source), params=out["retarget_params"]), out)
+        batch = default_collate([out, out])  # numbers from a collated batch
+        params = {name: value[1] for name, value in batch["retarget_params"].items()}
+        assert same(retarget(sample_of(source), params=params), out)
+
+
+def test_parameters_of_an_earlier_retargeting_do_not_linger() -> None:
+    source = ring()
+    first = RigRetarget(RandomRig(ring(), yaw_deg=5))(sample_of(source))
+    assert "retarget_params" not in RigRetarget(ring())(first)
+    with pytest.raises(SampleError, match="params: expected none for a fixed target rig, got yaw_deg"):
+        RigRetarget(ring())(sample_of(source), params={"yaw_deg": 3.0})
+
+
+def test_rigs_drawn_for_each_sample_do_not_fill_the_cache() -> None:
+    retarget = RigRetarget(RandomRig(ring(), yaw_deg=15))
+    for _ in range(3):
+        retarget(sample_of(ring()))
+    assert len(retarget.plans) == 1
+
+
+def test_a_generator_draws_and_is_refused_in_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = ring()
+    torch.manual_seed(1)
+    state = torch.get_rng_state()
+    draws = []
+    for _ in range(2):
+        retarget = RigRetarget(RandomRig(ring(), yaw_deg=15), rng=torch.Generator().manual_seed(5))
+        draws.append(retarget(sample_of(source))["retarget_params"])
+    assert draws[0] == draws[1] and torch.equal(torch.get_rng_state(), state)
+    monkeypatch.setattr(torch.utils.data, "get_worker_info", lambda: object())
+    with pytest.raises(SampleError, match="rng: a generator repeats itself in every DataLoader worker"):
+        retarget(sample_of(source))
+
+
+# --- frames of reference ----------------------------------------------------------------------------------------------
+def test_convention_labels_in_the_targets_frame() -> None:
+    """An AV2-like target: its origin, the rear axle, is 0.33 m above its road; the source's is on the road."""
+    source, target = ring(), ring(3, ground_z_m=-0.33)
+    points, boxes = torch.rand(10, 4), torch.rand(2, 9).double()
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = torch.tensor([100.0, 50.0, 2.0])
+    sample = sample_of(source, points=points, boxes_3d=boxes, ego2world=pose)
+    heights = [c.center_m[2] - target.ground_z_m for c in target]  # 1.83 m above the road
+
+    here = RigRetarget(target)(sample)
+    np.testing.assert_allclose(here["cam2ego"][:, 2, 3], heights)  # the source's road is at 0
+    assert here["points"] is points and here["ego2world"] is pose and here["ground_z_m"] == 0
+    assert "ego2ego" not in here
+
+    there = RigRetarget(target, label_frame="target")(sample)
+    np.testing.assert_allclose(there["cam2ego"], target.cam2ego)
+    np.testing.assert_allclose(there["cam2ego"][:, 2, 3] - there["ground_z_m"], heights)
+    assert there["ground_z_m"] == -0.33
+    expected = torch.eye(4, dtype=torch.float64)
+    expected[2, 3] = -0.33  # what lies on the road is 0.33 m below the target's origin
+    assert torch.equal(there["ego2ego"], expected)
+    np.testing.assert_allclose(there["points"][:, 2], points[:, 2] - 0.33, atol=1e-6)
+    np.testing.assert_array_equal(there["points"][:, [0, 1, 3]], points[:, [0, 1, 3]])
+    np.testing.assert_allclose(there["boxes_3d"][:, 2], boxes[:, 2] - 0.33)
+    np.testing.assert_array_equal(there["boxes_3d"][:, 3:], boxes[:, 3:])
+    # A point keeps its place in the world.
+    p_here, p_there = (torch.cat([s["points"][0, :3].double(), torch.ones(1)]) for s in (here, there))
+    np.testing.assert_allclose(there["ego2world"] @ p_there, pose @ p_here, atol=1e-6)
+    assert torch.equal(there["images"], here["images"])
+
+
+def test_the_roads_height_survives_a_second_retargeting() -> None:
+    source = ring(ground_z_m=-0.33)
+    first = RigRetarget(ring())({"images": pictures(source), "rig": source})
+    assert first["ground_z_m"] == -0.33
+    second = RigRetarget(ring())(first)
+    np.testing.assert_allclose(second["cam2ego"], first["cam2ego"])
+
+
+@pytest.mark.parametrize("container", ["list", "array"])
+def test_points_in_lists_and_arrays_move_too(container: str) -> None:
+    source, retarget = ring(), RigRetarget(ring(ground_z_m=-0.5), label_frame="target")
+    points = torch.rand(6, 3)
+    given: Any = [points, points[:2]] if container == "list" else points.numpy()
+    sample = default_collate([sample_of(source)] * 2) if container == "list" else sample_of(source)
+    out = retarget({**sample, "points": given})["points"]
+    moved = points - torch.tensor([0, 0, 0.5])
+    if container == "list":
+        assert len(out) == 2 and torch.equal(out[0], moved) and torch.equal(out[1], moved[:2])
+    else:
+        np.testing.assert_array_equal(out, moved)
+
+
+def test_labels_that_cannot_move() -> None:
+    retarget = RigRetarget(ring(ground_z_m=-0.5), label_frame="target")
+    with pytest.raises(SampleTypeError, match="boxes_3d: label_frame='target': expected a float tensor, got str"):
+        retarget(sample_of(ring(), boxes_3d="none"))
+    with pytest.raises(SampleTypeError, match=r"points: .*expected a float tensor, got torch.int64"):
+        retarget(sample_of(ring(), points=torch.zeros(3, 3, dtype=torch.int64)))
+    with pytest.raises(SampleError, match=r"points: expected shape \(2, count, >=3\), got \(7, 3\)"):
+        retarget({**default_collate([sample_of(ring())] * 2), "points": torch.zeros(7, 3)})
+
+
+# --- the transform as an object ---------------------------------------------------------------------------------------
+def test_copies_and_pickles() -> None:
+    retarget = RigRetarget(RandomRig(ring(), yaw_deg=5), size=SIZE, rng=torch.Generator().manual_seed(1))
+    sample = sample_of(ring())
+    expected = copy.deepcopy(retarget)(sample)
+    retarget.plan(ring(), ring())
+    for other in (copy.deepcopy(retarget), pickle.loads(pickle.dumps(retarget))):
+        assert len(other.plans) == 0
+        assert same(other(sample), expected)
+    fixed = RigRetarget("waymo", size=SIZE)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        fixed(sample)
+        assert same(pickle.loads(pickle.dumps(fixed))(sample), fixed(sample))
+    assert len(pickle.dumps(fixed)) < 20_000  # plans stay behind
+
+
+def test_repr_says_what_it_does() -> None:
+    text = repr(RigRetarget("waymo", size=(256, 704), p=0.5))
+    assert all(part in text for part in ("RigRetarget", "waymo", "auto", "(256, 704)", "p=0.5", "FavsConfig"))
+    assert "yaw_deg -5..5" in repr(RigRetarget(RandomRig("waymo", yaw_deg=5)))
+    assert "unnamed" in repr(RigRetarget(Rig(ring().cameras)))
+
+
+def test_prepare_builds_the_plan_that_samples_use() -> None:
+    source = ring()
+    retarget = RigRetarget(ring().turned(yaw_deg=5), source_rig=source, size=(18, 32))
+    retarget.prepare()
+    retarget({"images": pictures(source)})
+    retarget({"images": pictures(source), "rig": ring()})  # an equal rig
+    assert retarget.plans.misses == 1
+    for bad in (RigRetarget(ring()), RigRetarget(RandomRig(ring()), source_rig=source)):
+        with pytest.raises(ValueError, match="prepare: expected a source rig and a fixed target rig"):
+            bad.prepare()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"path": "magic"}, "path: expected one of favs, got 'magic'"),
+        ({"quality": "best"}, "quality: expected one of draft, fast"),
+        ({"surface": "sphere"}, "surface: expected one of .*far.* got 'sphere'"),
+        ({"label_frame": "world"}, "label_frame: expected one of source, target, got 'world'"),
+        ({"execution": "jax"}, "execution: expected one of auto, opencv, torch, got 'jax'"),
+        ({"outputs": ["depth"]}, "outputs: expected one of source_camera, got 'depth'"),
+        ({"p": 1.5}, "p: expected a probability from 0 to 1, got 1.5"),
+        ({"p": float("nan")}, "p: expected a probability"),
+        ({"size": 256}, r"size: expected \(h, w\) in pixels, got 256"),
+        ({"size": (0, 704)}, r"size: expected \(h, w\) in pixels"),
+    ],
+)
+def test_impossible_settings(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        RigRetarget(ring(), **settings)
+
+
+# --- warnings ---------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("execution", EXECUTIONS)
+def test_a_rig_that_sees_nothing_of_the_sources(execution: str) -> None:
+    source = ring().with_cameras([ring()[0]])
+    behind = source.turned(yaw_deg=180)
+    retarget = RigRetarget(behind, execution=execution, label_keys=["classes"], label_fill=9)
+    sample = sample_of(source, classes=torch.ones((1, *SIZE), dtype=torch.uint8))
+    with pytest.warns(UserWarning, match=r"target rig 'ring' cannot be reached from this data: covered are c0 0%"):
+        out = retarget(sample)
+    assert not out["coverage"].any() and not out["images"].any() and (out["classes"] == 9).all()
+    assert "no source camera looks there" in str(retarget.explain(sample))
+    retarget(sample)
+    retarget({**sample, "cam2ego": sample["cam2ego"] + 0.0})  # once, whatever comes
+
+
+# --- executions, gradients and memory ---------------------------------------------------------------------------------
+def test_gradients_flow_to_the_images() -> None:
+    source = ring()
+    sample = sample_of(source, torch.float32)
+    sample["images"].requires_grad_()
+    out = RigRetarget(ring().turned(yaw_deg=10))(sample)
+    out["images"].sum().backward()
+    gradient = sample["images"].grad
+    assert gradient is not None and gradient.isfinite().all() and gradient.abs().sum() > 0
+    # Bilinear weights sum to 1: every covered value passes a gradient of 1 on.
+    assert gradient.sum() == pytest.approx(3 * float(out["coverage"].sum()), rel=0.01)
+    plain = RigRetarget(ring().turned(yaw_deg=10))(sample_of(source, torch.float32))
+    assert (out["images"].detach() - plain["images"]).abs().mean() < 1e-3
+    with pytest.raises(SampleError, match="execution='opencv': expected CPU images without gradients"):
+        RigRetarget(ring(), execution="opencv")(sample)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_on_a_gpu() -> None:
+    source, retarget = ring(), RigRetarget(with_mask(ring().turned(yaw_deg=10)), label_keys=["classes"])
+    sample = default_collate([sample_of(source, classes=torch.ones((4, *SIZE), dtype=torch.uint8))] * 2)
+    expected = RigRetarget(with_mask(ring().turned(yaw_deg=10)), label_keys=["classes"], execution="torch")(sample)
+    out = retarget({key: value.cuda() for key, value in sample.items()})
+    for key in ("images", "coverage", "ignore", "classes", "K", "cam2ego"):
+        assert out[key].device.type == "cuda", key
+    assert (out["images"].cpu().int() - expected["images"].int()).abs().max() <= 1
+    assert torch.equal(out["coverage"].cpu(), expected["coverage"])
+    assert torch.equal(out["classes"].cpu(), expected["classes"])
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.float64])
+@pytest.mark.parametrize("execution", EXECUTIONS)
+def test_outputs_own_their_memory(execution: str, dtype: torch.dtype) -> None:
+    source = ring()
+    target = with_mask(source.turned(yaw_deg=10))
+    retarget = RigRetarget(target, execution=execution, outputs=["source_camera"])
+    samples = [sample_of(source, dtype, seed=k) for k in range(2)]
+    first = retarget(samples[0])
+    kept = copy.deepcopy(first)
+    second = retarget(samples[1])
+    assert same(first, kept) and not torch.equal(first["images"], second["images"])
+    given = samples[0]["images"].clone()
+    for value in first.values():
+        if isinstance(value, torch.Tensor):
+            value.zero_()
+    assert torch.equal(samples[0]["images"], given)
+    assert same(retarget(samples[0]), kept)  # neither the cached plan nor the rigs were touched
+
+
+def test_explain_changes_nothing_but_the_random_state() -> None:
+    source = ring()
+    retarget, sample = RigRetarget(ring().turned(yaw_deg=5)), sample_of(source)
+    expected = retarget(sample)
+    retarget.explain(sample)
+    assert same(retarget(sample), expected) and retarget.plans.misses == 1
+
+
+def test_a_shipped_rig_by_name() -> None:
+    nuscenes = load_rig("nuscenes").resized(0.05)
+    out = RigRetarget("waymo", size=(20, 30))({"images": pictures(nuscenes), "rig": nuscenes})
+    assert out["images"].shape == (5, 3, 20, 30)
