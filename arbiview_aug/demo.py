@@ -34,7 +34,7 @@ from arbiview_aug.datasets.synthetic import (
     demo_target_rig,
 )
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
+from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors, to_bytes
 from arbiview_aug.evaluate.pictures import contact_sheet, outline_coverage, save_picture
 from arbiview_aug.evaluate.scores import mean_of
 from arbiview_aug.evaluate.sparse import ColouredPoints, coloured_points, equalised, sparse_metrics
@@ -382,7 +382,7 @@ def _sheet(sample: dict[str, Any], reference: _Reference, rendered: _Rendered, w
         (f"The same moment, retargeted to {target}: {len(names)} cameras", rendered.views, names, order),
     ]
     if any(unseen):
-        hatched: list[Image] = [outline_coverage(v, c) for v, c in zip(rendered.views, rendered.coverage, strict=True)]
+        hatched = _hatched(rendered, width_px)
         captions = [f"{name}: {share:.1%} unseen" for name, share in zip(names, unseen, strict=True)]
         rows.append((f"Hatched: what no source camera saw, {np.mean(unseen):.1%}", hatched, captions, order))
     if reference.truth is not None:
@@ -393,6 +393,19 @@ def _sheet(sample: dict[str, Any], reference: _Reference, rendered: _Rendered, w
         titles=[title for title, *_ in rows],
         width_px=width_px,
     )
+
+
+def _hatched(rendered: _Rendered, width_px: int) -> list[Image]:
+    """The views with what nobody saw hatched, at about the size of the sheet: finer lines would blur into a colour."""
+    height = round(width_px / sum(view.shape[1] / view.shape[0] for view in rendered.views))
+    pictures: list[Image] = []
+    for view, coverage in zip(rendered.views, rendered.coverage, strict=True):
+        scale = min(1.0, height / view.shape[0])
+        size = max(1, round(view.shape[1] * scale)), max(1, round(view.shape[0] * scale))
+        seen = cv2.resize(coverage.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        small = cv2.resize(to_bytes(view), size, interpolation=cv2.INTER_AREA)
+        pictures.append(outline_coverage(np.asarray(small, np.uint8), np.asarray(seen)))
+    return pictures
 
 
 def _left_to_right(rig: Rig) -> list[int]:
