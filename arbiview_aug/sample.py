@@ -192,15 +192,19 @@ def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any
 def _check_principal_point(k: int, K: np.ndarray, size: tuple[int, int]) -> None:
     """Refuse a K that was made for another image size; NaN is left to ``Camera``."""
     h, w = size
-    x, y = (K[0, 2] + 0.5) / w, (K[1, 2] + 0.5) / h
-    outside = min(x, y) < 0 or max(x, y) > 1
-    scaled = max(x, y) < 0.5 - _OFF_CENTER or min(x, y) > 0.5 + _OFF_CENTER
-    if outside or scaled:
-        where = "inside the image" if outside else "near the middle of the image"
-        raise SampleError(
-            f"K[{k}]: expected a principal point {where} of (h, w) = {(h, w)}, got ({K[0, 2]:g}, {K[1, 2]:g}); "
-            "K of another image size? Camera.resize scales K; a camera that is really so comes as rig="
-        )
+    x, y = (K[0, 2] + 0.5) / w - 0.5, (K[1, 2] + 0.5) / h - 0.5  # from the image's centre, as a share of its size
+    in_turned = max(abs((K[0, 2] + 0.5) / h - 0.5), abs((K[1, 2] + 0.5) / w - 0.5))
+    outside = max(abs(x), abs(y)) > 0.5
+    scaled = max(x, y) < -_OFF_CENTER or min(x, y) > _OFF_CENTER
+    swapped = max(abs(x), abs(y)) > 0.12 and in_turned < 0.05
+    if not (outside or scaled or swapped):
+        return
+    where = "inside the image" if outside else "near the middle of the image"
+    fix = "height and width are swapped" if swapped else "K of another image size? Camera.resize scales K"
+    raise SampleError(
+        f"K[{k}]: expected a principal point {where} of (h, w) = {(h, w)}, got ({K[0, 2]:g}, {K[1, 2]:g}); "
+        f"{fix}; a camera that is really so comes as rig="
+    )
 
 
 def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> list[tuple[Any, tuple[float, ...]]]:

@@ -1,0 +1,141 @@
+"""The house: imports point upward only, and importing the package costs what torch costs and little more."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "arbiview_aug"
+
+LAYERS: list[tuple[str, ...]] = [
+    ("errors", "environment"),
+    ("lens",),
+    ("camera",),
+    ("rig",),
+    ("surface",),
+    ("sampling",),
+    ("favs.config", "favs.geometric_transformation", "favs.adaptive_fusion"),
+    ("maps",),
+    ("target_plan",),
+    ("plan",),
+    ("favs.synthesis",),
+    ("tensors", "random_rig", "explain"),
+    ("sample",),
+    ("labels",),
+    ("datasets", "transforms"),
+    ("evaluate",),
+    ("bench", "convert", "demo", "inspect"),
+    ("__main__",),
+]
+"""From the ground up: a module imports from layers below its own; the modules of one name, or folder, among themselves.
+
+``arbiview_aug/__init__`` gathers the public face and stands above all. What is imported within functions counts too.
+"""
+
+HEAVY = ("diffusers", "torchvision", "sklearn", "kornia", "scipy", "matplotlib", "PIL", "ray", "accelerate")
+LIMIT_S = 0.4
+
+
+def modules() -> dict[str, Path]:
+    """Dotted names below the package; a package's ``__init__`` goes by the package's name."""
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        name = ".".join(part for part in parts if part != "__init__")
+        if name:
+            found[name] = path
+    return found
+
+
+def layer(name: str) -> int | None:
+    """The layer of a module: that of its longest listed prefix."""
+    parts = name.split(".")
+    for length in range(len(parts), 0, -1):
+        prefix = ".".join(parts[:length])
+        for k, names in enumerate(LAYERS):
+            if prefix in names:
+                return k
+    return None
+
+
+def imports(path: Path, known: dict[str, Path]) -> set[str]:
+    """The package's modules that a file imports, wherever in the file."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path.name}: a relative import"
+            names = [f"{node.module}.{alias.name}" for alias in node.names] + [str(node.module)]
+        else:
+            continue
+        for name in names:
+            below = name.removeprefix("arbiview_aug.")
+            if name.startswith("arbiview_aug.") and below in known:
+                found.add(below)
+    return found
+
+
+def unit(name: str) -> str:
+    """What may import within itself: a folder that is one entry of ``LAYERS``, or a module."""
+    listed = {entry for names in LAYERS for entry in names}
+    top = name.split(".")[0]
+    return top if top in listed else name
+
+
+def test_imports_point_upward_only() -> None:
+    known = modules()
+    wrong = []
+    for name, path in known.items():
+        if name == "favs":  # an empty ``__init__``
+            assert not imports(path, known)
+            continue
+        own = layer(name)
+        if own is None:
+            wrong.append(f"{name} has no place in LAYERS")
+            continue
+        for other in imports(path, known) - {name, "favs"}:
+            if unit(other) == unit(name):
+                continue
+            above = layer(other)
+            if above is None or above >= own:
+                wrong.append(f"{name} imports {other}, which is not below it")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_every_layer_is_in_order_of_use() -> None:
+    """The list says no more than there is, but for the parts that are to come."""
+    known = modules()
+    to_come = {"convert", "demo"}
+    for names in LAYERS:
+        for name in names:
+            assert name in known or name in to_come, name
+
+
+def test_importing_loads_nothing_heavy() -> None:
+    code = (
+        "import sys, torch; had = set(sys.modules); import arbiview_aug\n"
+        f"print([m for m in {HEAVY} if m in sys.modules and m not in had])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def seconds(code: str) -> float:
+    start = time.perf_counter()
+    subprocess.run([sys.executable, "-c", code], timeout=120, check=True)
+    return time.perf_counter() - start
+
+
+@pytest.mark.slow
+def test_importing_costs_little_more_than_torch() -> None:
+    """Pairs in turn, so that a busy machine slows both; the best of three of each."""
+    pairs = [(seconds("import torch"), seconds("import torch; import arbiview_aug")) for _ in range(3)]
+    torch_s, both_s = (min(times) for times in zip(*pairs, strict=True))
+    print(f"import torch {torch_s:.2f} s, with arbiview_aug {both_s:.2f} s: {both_s - torch_s:+.2f} s")
+    assert both_s - torch_s <= LIMIT_S

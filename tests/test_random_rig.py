@@ -1,0 +1,162 @@
+"""Random rigs: what is drawn, how often, and that the numbers give the same rig again."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import CalibrationError, RandomRig, SampleError, load_rig
+
+NEUTRAL = {
+    "yaw_deg": 0.0,
+    "pitch_deg": 0.0,
+    "roll_deg": 0.0,
+    "height_m": 0.0,
+    "forward_m": 0.0,
+    "lateral_m": 0.0,
+    "focal_scale": 1.0,
+}
+
+
+def test_nothing_varies_by_default() -> None:
+    random_rig = RandomRig("waymo")
+    assert random_rig.draw() == NEUTRAL
+    assert random_rig.rig(NEUTRAL) == load_rig("waymo")
+
+
+def test_half_widths_and_ranges() -> None:
+    random_rig = RandomRig("waymo", yaw_deg=5, height_m=(0.5, 1.0), focal_scale=0.2, roll_deg=(2, 2))
+    torch.manual_seed(0)
+    draws = [random_rig.draw() for _ in range(500)]
+    bounds = {"yaw_deg": (-5, 5), "height_m": (0.5, 1.0), "focal_scale": (0.8, 1.2)}
+    for name, (low, high) in bounds.items():
+        values = np.array([draw[name] for draw in draws])
+        assert low <= values.min() < low + 0.1 * (high - low) and high - 0.1 * (high - low) < values.max() <= high
+        assert abs(values.mean() - (low + high) / 2) < 0.05 * (high - low)
+    assert {draw["roll_deg"] for draw in draws} == {2.0}
+    assert {draw["pitch_deg"] for draw in draws} == {0.0}
+
+
+@pytest.mark.parametrize("name", NEUTRAL)
+def test_convention_each_parameter_does_what_its_name_says(name: str) -> None:
+    base = load_rig("nuscenes")
+    rig = RandomRig(base).rig({**NEUTRAL, name: 1.25 if name == "focal_scale" else 2.0})
+    for before, after in zip(base, rig, strict=True):
+        moved = after.center_m - before.center_m
+        axis = {"forward_m": 0, "lateral_m": 1, "height_m": 2}.get(name)
+        np.testing.assert_allclose(moved, 2.0 * np.eye(3)[axis] if axis is not None else np.zeros(3), atol=1e-12)
+        turn_rad = np.arccos(np.clip((np.trace(before.cam2ego[:3, :3].T @ after.cam2ego[:3, :3]) - 1) / 2, -1, 1))
+        turned_deg = 2.0 if name in ("yaw_deg", "pitch_deg", "roll_deg") else 0.0
+        assert math.degrees(turn_rad) == pytest.approx(turned_deg, abs=1e-5)
+        if name == "yaw_deg":  # positive to the left
+            assert (after.azimuth_deg - before.azimuth_deg + 180) % 360 - 180 == pytest.approx(2.0, abs=0.05)
+        if name == "pitch_deg":  # positive up
+            assert after.elevation_deg > before.elevation_deg + 1.9
+        scale = 1.25 if name == "focal_scale" else 1.0
+        np.testing.assert_allclose(after.K[:2, :2], before.K[:2, :2] * scale)
+        np.testing.assert_array_equal(after.K[:2, 2], before.K[:2, 2])
+    assert rig.ground_z_m == base.ground_z_m and rig.names == base.names
+
+
+def test_numbers_are_plain_and_replay() -> None:
+    random_rig = RandomRig("nuscenes", yaw_deg=10, pitch_deg=3, height_m=0.5, focal_scale=0.1)
+    params = random_rig.draw()
+    again = json.loads(json.dumps(params))
+    assert random_rig.rig(again) == random_rig.rig(params)
+    collated = {name: torch.tensor(value, dtype=torch.float64) for name, value in params.items()}
+    assert random_rig.rig(collated) == random_rig.rig(params)
+
+
+def test_draws_follow_torchs_seed_or_a_generator() -> None:
+    random_rig = RandomRig("waymo", yaw_deg=10)
+    torch.manual_seed(3)
+    one, two = random_rig.draw(), random_rig.draw()
+    torch.manual_seed(3)
+    assert (random_rig.draw(), random_rig.draw()) == (one, two) and one != two
+    state = torch.get_rng_state()
+    assert random_rig.draw(torch.Generator().manual_seed(1)) == random_rig.draw(torch.Generator().manual_seed(1))
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def by_sequence(**settings: Any) -> RandomRig:
+    return RandomRig("waymo", yaw_deg=10, per="sequence", **settings)
+
+
+def test_one_draw_a_sequence() -> None:
+    torch.manual_seed(0)
+    random_rig = by_sequence()
+    state = torch.get_rng_state()
+    first = random_rig.draw_for({"scene_token": "a"})
+    assert random_rig.draw_for({"scene_token": "a"}) == first != random_rig.draw_for({"scene_token": "b"})
+    assert torch.equal(torch.get_rng_state(), state)  # nothing else that is random changes
+    assert by_sequence().draw_for({"scene_token": "a"}) == first  # the same in every worker of a seed
+    torch.manual_seed(1)
+    assert random_rig.draw_for({"scene_token": "a"}) != first
+    assert by_sequence(sequence_key="drive").draw_for({"drive": 7})
+    generators = [torch.Generator().manual_seed(seed) for seed in (5, 5, 6)]
+    five, again, six = (random_rig.draw_for({"scene_token": "a"}, rng) for rng in generators)
+    assert five == again != six
+
+
+def test_set_epoch_draws_anew_and_reaches_copies_in_other_processes() -> None:
+    torch.manual_seed(0)
+    random_rig = by_sequence()
+    draws = []
+    for epoch in (0, 1, 0):
+        random_rig.set_epoch(epoch)
+        draws.append(random_rig.draw_for({"scene_token": "a"}))
+    assert draws[0] == draws[2] != draws[1]
+    for other in (copy.deepcopy(random_rig), pickle.loads(pickle.dumps(random_rig))):
+        assert other._epoch.is_shared()
+        other.set_epoch(1)
+        assert other.draw_for({"scene_token": "a"}) == draws[1]
+    assert random_rig.draw_for({"scene_token": "a"}) == draws[0]
+
+
+def test_batches_of_sequences() -> None:
+    random_rig = by_sequence()
+    assert random_rig.draw_for({"scene_token": ["a", "a"]}) == random_rig.draw_for({"scene_token": "a"})
+    with pytest.raises(SampleError, match="scene_token: expected one sequence a batch, got 2"):
+        random_rig.draw_for({"scene_token": ["a", "b"]})
+    with pytest.raises(SampleError, match="expected 'scene_token' in the sample, got images, token"):
+        random_rig.draw_for({"images": 0, "token": 0})
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"yaw_deg": "wide"}, "yaw_deg: expected a half-width or a .low, high., got 'wide'"),
+        ({"yaw_deg": (3, 1)}, "yaw_deg: expected a half-width"),
+        ({"yaw_deg": -1}, "yaw_deg: expected a half-width"),
+        ({"height_m": float("nan")}, "height_m: expected a half-width"),
+        ({"height_m": (0, float("inf"))}, "height_m: expected a half-width"),
+        ({"height_m": (0, 1, 2)}, "height_m: expected a half-width"),
+        ({"focal_scale": 1.0}, "focal_scale: expected a half-width or a positive .low, high., got 1.0"),
+        ({"focal_scale": (0.0, 2.0)}, "focal_scale: expected a half-width or a positive"),
+        ({"per": "epoch"}, "per: expected 'sample' or 'sequence', got 'epoch'"),
+    ],
+)
+def test_impossible_settings(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(CalibrationError, match=f"RandomRig: {message}"):
+        RandomRig("waymo", **settings)
+
+
+def test_parameters_that_are_not_its_own() -> None:
+    with pytest.raises(CalibrationError, match=r"expected the parameters yaw_deg, .*focal_scale, got yaw_deg"):
+        RandomRig("waymo").rig({"yaw_deg": 1.0})
+    with pytest.raises(CalibrationError, match=r"expected the parameters .* got .*, tilt"):
+        RandomRig("waymo").rig({**NEUTRAL, "tilt": 1.0})
+
+
+def test_repr() -> None:
+    assert repr(RandomRig("waymo", yaw_deg=5, focal_scale=0.1)) == (
+        "RandomRig(waymo: yaw_deg -5..5, focal_scale 0.9..1.1; per sample)"
+    )
+    assert "nothing varies" in repr(RandomRig("waymo"))
