@@ -298,6 +298,14 @@ class Camera:
         """
         return fold_limit(self.lens, self.distortion)
 
+    @cached_property
+    def half_angle_rad(self) -> float:
+        """Angle between the optical axis and the image's farthest ray; π where the lens cannot be inverted there."""
+        h, w = self.size
+        border = np.stack(np.meshgrid(np.linspace(-0.5, w - 0.5, 9), np.linspace(-0.5, h - 0.5, 9)), -1)
+        directions, valid = self.unproject_cam(border)
+        return math.acos(float(np.clip(directions[..., 2].min(), -1, 1))) if valid.all() else math.pi
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Camera):
             return NotImplemented

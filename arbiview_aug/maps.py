@@ -1,16 +1,14 @@
 """Where a target camera's pixels lie in a source image, over a surface: cheaply, and to a stated precision.
 
-Maps are evaluated in float64 on the nodes of a coarse grid and interpolated: cubically to a quarter of the spacing,
-bilinearly from there. Cells whose error bound exceeds the tolerance, and cells on the border of what can be projected, are
-evaluated pixel by pixel. Directions are held plane by plane, (3, ny, nx) in memory, which is three times faster.
+Maps are evaluated in float64 on the nodes of a coarse grid and interpolated (``arbiview_aug.grid``). Cells whose error
+bound exceeds the tolerance, and cells on the border of what can be projected, are evaluated pixel by pixel. Directions
+are held plane by plane, (3, ny, nx) in memory: three times faster.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -19,137 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
+from arbiview_aug.grid import HALVINGS, Box, Grid
 from arbiview_aug.sampling import Slot
 from arbiview_aug.surface import Surface
 
-Box = tuple[int, int, int, int]
-"""(first row, last row, first column, last column); of nodes both inclusive, of pixels the last exclusive."""
-
-_SMALL_SIDE_PX = 64  # targets with a shorter side are evaluated pixel by pixel: a coarse grid could step over a source
-_HALVINGS = 2  # cubic steps before the bilinear one: a quarter of the spacing, a sixteenth of its error
 _SAFETY = 2.0  # curvature between the nodes may exceed what the nodes show
-_CUBIC = np.array([[-1.0, 9.0, 9.0, -1.0]]) / 16  # mid-point of the cubic through four nodes
 _CORNERS = tuple((a, b) for a in (slice(None, -1), slice(1, None)) for b in (slice(None, -1), slice(1, None)))
 _FAR_AWAY_PX = 1e5  # float32 maps stay precise and int16 conversion saturates harmlessly
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Coarse nodes of a target image: node (j, i) lies at pixel (offset + step i, offset + step j).
-
-    Attributes:
-        size: (h, w) of the image.
-        step: Spacing in pixels; 1 means every pixel is a node.
-    """
-
-    size: tuple[int, int]
-    step: int
-
-    @classmethod
-    def for_size(cls, size: tuple[int, int], step: int) -> Grid:
-        """The grid of a target image; small images are evaluated pixel by pixel."""
-        return cls(size, 1 if min(size) < _SMALL_SIDE_PX else step)
-
-    @property
-    def offset(self) -> float:
-        """Position of the first node: cv2.resize puts it at (step - 1) / 2; two nodes lie outside, for the cubic."""
-        return (self.step - 1) / 2 - 2 * self.step if self.step > 1 else 0.0
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(ny, nx)."""
-        if self.step == 1:
-            return self.size
-        return tuple(math.ceil((n - 1 - self.offset) / self.step) + 2 for n in self.size)  # type: ignore[return-value]
-
-    def nodes(self) -> FloatArray:
-        """(ny, nx, 2) pixel positions of the nodes."""
-        ny, nx = self.shape
-        x, y = np.meshgrid(self.offset + self.step * np.arange(nx), self.offset + self.step * np.arange(ny))
-        return np.stack([x, y], -1)
-
-    def extended(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Node values (ny, nx) with those outside the image replaced by the nearest inside it, where there is one."""
-        if self.step == 1:
-            return values
-        first = math.ceil(-self.offset / self.step)
-        last = [int((n - 1 - self.offset) // self.step) for n in self.size]
-        inside = values[first : last[0] + 1, first : last[1] + 1]
-        after = [n - 1 - end for n, end in zip(values.shape, last, strict=True)]
-        return np.pad(inside, ((first, after[0]), (first, after[1])), mode="edge")
-
-    def strips(self, rows_px: int) -> Iterator[tuple[int, int]]:
-        """First and last node row of strips about ``rows_px`` high that cover the image."""
-        shared = 0 if self.step == 1 else 1  # cells lie between nodes: neighbouring strips share a row of nodes
-        count, ny = max(rows_px // self.step, 1), self.shape[0]
-        for j0 in range(0, ny - shared, count):
-            rows = j0, min(j0 + count, ny - 1) if shared else min(j0 + count, ny) - 1
-            y0, y1, _, _ = self.pixels((*rows, 0, 0))
-            if y1 > y0:
-                yield rows
-
-    def pixels(self, nodes: Box) -> Box:
-        """The image's pixels between nodes j0..j1 and i0..i1."""
-        j0, j1, i0, i1 = nodes
-        if self.step == 1:
-            return j0, j1 + 1, i0, i1 + 1
-        h, w = self.size
-        first = round(self.offset + 0.5)
-        y0, y1, x0, x1 = (first + self.step * n for n in (j0, j1, i0, i1))
-        return max(y0, 0), min(y1, h), max(x0, 0), min(x1, w)
-
-    def cells_to_pixels(self, cells: BoolArray, nodes: Box) -> npt.NDArray[np.uint8]:
-        """255 for the pixels between ``nodes`` whose cell (ny - 1, nx - 1) is True."""
-        j0, j1, i0, i1 = nodes
-        part = np.repeat(np.repeat(cells[j0:j1, i0:i1].astype(np.uint8) * 255, self.step, axis=0), self.step, axis=1)
-        y0, y1, x0, x1 = self.pixels(nodes)
-        top, left = round(self.offset + 0.5) + self.step * j0, round(self.offset + 0.5) + self.step * i0
-        return part[y0 - top : y1 - top, x0 - left : x1 - left]
-
-    def upsample(self, values: npt.NDArray[np.floating], nodes: Box) -> npt.NDArray[np.float32]:
-        """Bilinear interpolation of node values (ny, nx[, 2]) to the pixels between ``nodes``."""
-        j0, j1, i0, i1 = nodes
-        part = np.ascontiguousarray(values[j0 : j1 + 1, i0 : i1 + 1], dtype=np.float32)
-        return part if self.step == 1 else self._enlarged(part, nodes, self.step)
-
-    def refined(self, values: npt.NDArray[np.float32], nodes: Box) -> npt.NDArray[np.float32]:
-        """Node values (ny, nx, 2) between ``nodes`` on a grid ``2**_HALVINGS`` times as fine."""
-        # Each halving misses one neighbour at the border of its input.
-        e, n = _HALVINGS, 2**_HALVINGS
-        (j0, j1, i0, i1), (ny, nx) = nodes, values.shape[:2]
-        m0, m1, n0, n1 = max(j0 - e, 0), min(j1 + e, ny - 1), max(i0 - e, 0), min(i1 + e, nx - 1)
-        fine = np.ascontiguousarray(values[m0 : m1 + 1, n0 : n1 + 1])
-        for _ in range(_HALVINGS):
-            fine = _halved_spacing(fine)
-        top, left = n * (j0 - m0), n * (i0 - n0)
-        return np.ascontiguousarray(fine[top : top + n * (j1 - j0) + 1, left : left + n * (i1 - i0) + 1])
-
-    def upsample_refined(self, fine: npt.NDArray[np.float32], of: Box, rows: tuple[int, int]) -> Any:
-        """Pixels between node rows ``rows`` of values that were ``refined`` between the nodes ``of``."""
-        n = 2**_HALVINGS
-        part = fine[n * (rows[0] - of[0]) : n * (rows[1] - of[0]) + 1]
-        return self._enlarged(part, (*rows, of[2], of[3]), self.step // n)
-
-    def _enlarged(self, part: npt.NDArray[np.float32], nodes: Box, spacing: int) -> npt.NDArray[np.float32]:
-        full: Any = cv2.resize(part, (part.shape[1] * spacing, part.shape[0] * spacing), interpolation=cv2.INTER_LINEAR)
-        y0, y1, x0, x1 = self.pixels(nodes)
-        # Node j0 lies at row (spacing - 1) / 2 of the enlarged block, and at offset + step j0 of the image.
-        dy = round((spacing - 1) / 2 - self.offset - self.step * nodes[0])
-        dx = round((spacing - 1) / 2 - self.offset - self.step * nodes[2])
-        return full[y0 + dy : y1 + dy, x0 + dx : x1 + dx]
-
-
-def _halved_spacing(part: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Node values (ny, nx, 2) on a grid twice as fine, (2 ny - 1, 2 nx - 1, 2): cubic between four nodes each way."""
-    across = cv2.filter2D(part, -1, _CUBIC, anchor=(1, 0), borderType=cv2.BORDER_REPLICATE)
-    even = np.empty((part.shape[0], 2 * part.shape[1] - 1, 2), np.float32)
-    # Pairs of float32 are moved as one float64: strided copies of them are several times faster.
-    as_pairs = even.view(np.float64)[..., 0]
-    as_pairs[:, ::2], as_pairs[:, 1::2] = part.view(np.float64)[..., 0], across.view(np.float64)[:, :-1, 0]
-    fine = np.empty((2 * part.shape[0] - 1, even.shape[1], 2), np.float32)
-    fine[::2] = even
-    fine[1::2] = cv2.filter2D(even, -1, _CUBIC.T, anchor=(0, 1), borderType=cv2.BORDER_REPLICATE)[:-1]
-    return fine
 
 
 class TargetRays:
@@ -168,7 +42,6 @@ class TargetRays:
         self.sparse_index = np.ix_(np.unique(np.r_[0:ny:4, ny - 1]), np.unique(np.r_[0:nx:4, nx - 1]))
         planes = np.ascontiguousarray(np.moveaxis(self.directions[self.sparse_index], -1, 0))
         self.sparse = np.moveaxis(planes, 0, -1), self.valid[self.sparse_index]
-        self.half_angle = half_angle(camera)
 
     def inverse_distance(self, surface: Surface) -> FloatArray:
         """(ny, nx) on the nodes; evaluated once for each surface."""
@@ -209,19 +82,20 @@ class PairMap:
         q = self.rays.inverse_distance(self.surface)
         parallax = math.atan(float(np.linalg.norm(self.offset_m)) * float(q.max()))
         apart = math.acos(float(np.clip(self.rays.camera.cam2ego[:3, 2] @ self.source.cam2ego[:3, 2], -1, 1)))
-        return apart > self.rays.half_angle + half_angle(self.source) + parallax + 0.01
+        return apart > self.rays.camera.half_angle_rad + self.source.half_angle_rad + parallax + 0.01
 
     def _glance(self) -> bool:
         """Whether any cell four times as large may hold a pixel of the source."""
         directions, valid = self.rays.sparse
         q = self.rays.inverse_distance(self.surface)[self.rays.sparse_index]
         uv, projected = project_rays(self.source, directions, q, self.offset_m)
-        whole, border = self._cells_that_may_see(uv, projected & valid)
+        whole, border = self._cells_that_may_see(directions, q, uv, projected & valid)
         return bool(whole.any() or border.any())
 
     def _classify(self) -> Box | None:
         """Sort the cells: seeing nothing, whole, on a border of validity. Returns the nodes around those in use."""
-        self._whole, border = self._cells_that_may_see(self.uv, self.valid)
+        q = self.rays.inverse_distance(self.surface)
+        self._whole, border = self._cells_that_may_see(self.rays.directions, q, self.uv, self.valid)
         use = self._whole | border
         # Invalid nodes hold placeholders that may lie inside the image.
         self._use = None if self.valid.all() else use
@@ -237,24 +111,19 @@ class PairMap:
         counters["cells_exact"] += exact
         counters["cells_interpolated"] += int(np.count_nonzero(self._whole & ~self._exact))
 
-    def _cells_that_may_see(self, uv: FloatArray, valid: BoolArray) -> tuple[BoolArray, BoolArray]:
-        """Cells with four valid corners not all beyond one side of the image; cells on the border of validity."""
-        h, w = self.source.size
-        u, v = uv[..., 0], uv[..., 1]
-        beyond = (u < 0).view(np.uint8) | (u > w - 1).view(np.uint8) << 1
-        beyond |= (v < 0).view(np.uint8) << 2 | (v > h - 1).view(np.uint8) << 3
+    def _cells_that_may_see(
+        self, directions: FloatArray, q: FloatArray, uv: FloatArray, valid: BoolArray
+    ) -> tuple[BoolArray, BoolArray]:
+        """Cells whose corners are valid and not all beyond one side of the image; such cells with an invalid corner."""
+        beyond = beyond_image(self.source, directions, q, self.offset_m, uv, valid)
         sides = [beyond[c] for c in _CORNERS]
-        not_beyond = (sides[0] & sides[1] & sides[2] & sides[3]) == 0
+        use = (sides[0] & sides[1] & sides[2] & sides[3]) == 0
         if valid.all():
-            return not_beyond, np.zeros(not_beyond.shape, bool)
-        all_valid = valid[_CORNERS[0]] & valid[_CORNERS[1]] & valid[_CORNERS[2]] & valid[_CORNERS[3]]
-        near = valid
-        if self.source.lens == "pinhole" and self.rays.camera.lens == "pinhole":
-            # Towards the plane z = 0 a pinhole's pixels run off to infinity: valid corners an image away stay away.
-            near = near & (u > -w) & (v > -h) & (u < 2 * w) & (v < 2 * h)
-        touched = (near[_CORNERS[0]] | near[_CORNERS[1]] | near[_CORNERS[2]] | near[_CORNERS[3]]).astype(np.uint8)
-        border = ~all_valid & (cv2.dilate(touched, np.ones((3, 3), np.uint8)) > 0)
-        return not_beyond & all_valid, border
+            return use, np.zeros(use.shape, bool)
+        corners = [valid[c] for c in _CORNERS]
+        all_valid = corners[0] & corners[1] & corners[2] & corners[3]
+        touched = (corners[0] | corners[1] | corners[2] | corners[3]).astype(np.uint8)
+        return use & all_valid, use & ~all_valid & (cv2.dilate(touched, np.ones((3, 3), np.uint8)) > 0)
 
     def _too_curved(self, box: Box, tolerance_px: float) -> BoolArray:
         """Cells whose interpolation may be off by more than the tolerance.
@@ -274,7 +143,7 @@ class PairMap:
             fourth = _larger(np.diff(around, 4, axis=axis)) if around.shape[axis] > 4 else None
             pad = [(0, 0), (0, 0)]
             pad[axis] = (1, 1)
-            error += np.pad(second, pad, mode="edge") * (_SAFETY / 8 / (4**_HALVINGS if self.surface.smooth else 1))
+            error += np.pad(second, pad, mode="edge") * (_SAFETY / 8 / (4**HALVINGS if self.surface.smooth else 1))
             if fourth is not None:
                 pad[axis] = (2, 2)
                 error += np.pad(fourth, pad, mode="edge") * (_SAFETY * 3 / 128)
@@ -365,17 +234,6 @@ class PairMap:
         at[py[inside] - y0, px[inside] - x0] = exact
 
 
-def half_angle(camera: Camera) -> float:
-    """Radians between the optical axis and the farthest ray of the image; π where the lens folds inside it."""
-    h, w = camera.size
-    x, y = np.linspace(-0.5, w - 0.5, 9), np.linspace(-0.5, h - 0.5, 9)
-    border = np.stack(np.meshgrid(x, y), -1)
-    directions, valid = camera.unproject_cam(border)
-    if not valid.all():
-        return math.pi
-    return math.acos(float(np.clip(directions[..., 2].min(), -1, 1)))
-
-
 def ego_rays(camera: Camera, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Unit ego-frame rays of pixels (..., 2), as a (..., 3) view of plane-major memory, and their validity."""
     directions, valid = camera.unproject_cam(pixels)
@@ -398,13 +256,43 @@ def project_rays(
     Returns:
         Pixels (..., 2) and validity (...,).
     """
+    uv, _, valid = source.project_cam(_source_points(source, directions, inverse_distance, offset_m))
+    return uv, valid
+
+
+def _source_points(
+    source: Camera, directions: FloatArray, inverse_distance: FloatArray, offset_m: FloatArray
+) -> FloatArray:
+    """The scene points in the source's frame (..., 3), up to a positive scale; plane by plane in memory."""
     R = source.cam2ego[:3, :3].T
-    planes = np.moveaxis(directions, -1, 0).reshape(3, -1)
-    points = R @ planes
+    points = R @ np.moveaxis(directions, -1, 0).reshape(3, -1)
     if np.any(offset_m):
         points += (R @ offset_m)[:, None] * inverse_distance.reshape(1, -1)
-    uv, _, valid = source.project_cam(np.moveaxis(points.reshape(3, *directions.shape[:-1]), 0, -1))
-    return uv, valid
+    return np.moveaxis(points.reshape(3, *directions.shape[:-1]), 0, -1)
+
+
+def beyond_image(
+    source: Camera, directions: FloatArray, q: FloatArray, offset_m: FloatArray, uv: FloatArray, valid: BoolArray
+) -> npt.NDArray[np.uint8]:
+    """Outcodes (...,): which of the image's borders, or the camera's plane, a scene point lies beyond; 0 is unknown.
+
+    For pinholes they are read off homogeneous coordinates, which know their side behind the camera too (clipping as
+    in computer graphics): a cell with one bit in common holds no pixel of the image.
+    """
+    h, w = source.size
+    if source.lens == "pinhole":
+        points = _source_points(source, directions, q, offset_m)
+        K, z = source.K, points[..., 2]
+        x = K[0, 0] * points[..., 0] + K[0, 1] * points[..., 1] + K[0, 2] * z
+        y = K[1, 1] * points[..., 1] + K[1, 2] * z
+        tests = [x < 0, x > (w - 1) * z, y < 0, y > (h - 1) * z, z < 0]
+    else:
+        u, v = uv[..., 0], uv[..., 1]
+        tests = [valid & (u < 0), valid & (u > w - 1), valid & (v < 0), valid & (v > h - 1)]
+    code = np.zeros(valid.shape, np.uint8)
+    for bit, test in enumerate(tests):
+        code |= test.view(np.uint8) << bit
+    return code
 
 
 def _bounds(use: BoolArray, extra: int) -> Box | None:

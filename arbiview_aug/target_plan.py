@@ -15,7 +15,8 @@ from arbiview_aug import sampling
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.favs.adaptive_fusion import distance_weight, primary_weight, quality_weight
 from arbiview_aug.favs.config import FavsConfig
-from arbiview_aug.maps import Box, PairMap, TargetRays, edge_distance, resolution
+from arbiview_aug.grid import Box
+from arbiview_aug.maps import PairMap, TargetRays, edge_distance, resolution
 from arbiview_aug.rig import Rig
 from arbiview_aug.sampling import AtlasLayout, FixedMap, Scratch
 from arbiview_aug.surface import depth_uncertainty, make_surface, worst_parallax_px
@@ -229,7 +230,8 @@ class TargetDraft:
                 cv2.copyTo(own, wins, winner[top:bottom, left:right])
             fixed.fill_rows(y0, y1, at)
             for part in seen:
-                won_px[part.source] += cv2.countNonZero(cv2.compare(winner[y0:y1], float(part.source), cv2.CMP_EQ))
+                own = cv2.inRange(winner[y0:y1], part.source, part.source)  # type: ignore[call-overload]
+                won_px[part.source] += cv2.countNonZero(own)
             if len(seen) > 1 and self.config.seam_width > 0:
                 bands.extend(self._bands(seen, winner, shared, rows))
         if self.config.interpolation == "nearest":

@@ -20,6 +20,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("surface",),
     ("sampling",),
     ("favs.config", "favs.geometric_transformation", "favs.adaptive_fusion"),
+    ("grid",),
     ("maps",),
     ("target_plan",),
     ("plan",),
