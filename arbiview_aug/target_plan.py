@@ -230,8 +230,8 @@ class TargetDraft:
                 cv2.copyTo(own, wins, winner[top:bottom, left:right])
             fixed.fill_rows(y0, y1, at)
             for part in seen:
-                own = cv2.inRange(winner[y0:y1], part.source, part.source)  # type: ignore[call-overload]
-                won_px[part.source] += cv2.countNonZero(own)
+                won = cv2.inRange(winner[y0:y1], part.source, part.source)  # type: ignore[call-overload]
+                won_px[part.source] += cv2.countNonZero(won)
             if len(seen) > 1 and self.config.seam_width > 0:
                 bands.extend(self._bands(seen, winner, shared, rows))
         if self.config.interpolation == "nearest":
