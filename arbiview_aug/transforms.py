@@ -59,8 +59,8 @@ class RigRetarget(torch.nn.Module):
         surface: ``far``, ``ground``, ``street``; ``auto`` decides per pair of cameras.
         size: (h, w) of every output image; the target cameras are resized to it.
         p: Probability of retargeting. A skipped sample keeps its own cameras, resized to ``size``, with full coverage;
-            so ``p < 1`` needs ``size`` and equal camera counts. Skipped or not, the keys are the same: lenses and
-            masks of either rig give ``lens``, ``distortion`` and ``ignore``.
+            so ``p < 1`` needs ``size`` and equal camera counts. The output then always has ``lens``, ``distortion``
+            and ``ignore``, whichever rig they come from: batches collate.
         rng: A generator for the draws instead of torch's global one; only outside DataLoader workers.
         label_frame: ``source``: output poses, points and boxes are in the source's ego frame. ``target``: they (and
             ``ego2world``) are moved into the target's, and ``ego2ego`` (..., 4, 4) is returned.
@@ -226,7 +226,7 @@ class RigRetarget(torch.nn.Module):
         for frame, view, images in zip(frames, views, self._images(frames, views), strict=True):
             device = frame.images[0].device
             rig = view.target if isinstance(view, RenderPlan) else frame.rig.resized(view)
-            part = self._described(rig, frame.rig, device)
+            part = self._described(rig, device)
             part["images"] = stacked(images)
             if isinstance(view, RenderPlan):
                 winners = [target.source_camera for target in view.targets]
@@ -260,20 +260,19 @@ class RigRetarget(torch.nn.Module):
                 done[b] = [image[k] for image in rendered]
         return [done[b] for b in range(len(frames))]
 
-    def _described(self, rig: Rig, source: Rig, device: torch.device) -> dict[str, Any]:
-        """The calibration that goes with a frame's images; which keys there are never depends on a draw."""
+    def _described(self, rig: Rig, device: torch.device) -> dict[str, Any]:
+        """The calibration that goes with a frame's images; which keys there are depends on the settings alone."""
         base = self.target.base if isinstance(self.target, RandomRig) else self.target
-        possible = [*base, *source] if self.p < 1 else [*base]
         part: dict[str, Any] = {
             "K": torch.from_numpy(rig.K),
             "cam2ego": torch.from_numpy(rig.cam2ego),
             "ground_z_m": rig.ground_z_m,
         }
-        if any(c.lens != "pinhole" for c in possible):
+        if self.p < 1 or any(c.lens != "pinhole" for c in base):
             padded = [(*c.distortion, *(0.0,) * (8 - len(c.distortion))) for c in rig]
             part["distortion"] = torch.tensor(padded, dtype=torch.float64)
             part["lens"] = [c.lens for c in rig]
-        if any(c.mask is not None for c in possible):
+        if self.p < 1 or any(c.mask is not None for c in base):
             masks = [np.ones(c.size, bool) if c.mask is None else c.mask for c in rig]
             part["ignore"] = stacked([torch.from_numpy(~m).to(device) for m in masks])
         return part

@@ -211,7 +211,7 @@ def test_a_batch_of_sources_with_different_lenses() -> None:
     source = with_lens(ring())
     plain = RigRetarget(source, size=SIZE, p=0.5)(sample_of(ring()), params={"skipped": 1.0})
     lensed = RigRetarget(source, size=SIZE, p=0.5)(sample_of(ring()), params={"skipped": 0.0})
-    assert plain["lens"] == ["pinhole"] * 4 and lensed["lens"] == source_lenses(source)
+    assert plain["lens"] == ["pinhole"] * 4 and lensed["lens"] == lenses_of(source)
     batch = default_collate([plain, lensed])
     assert [list(names) for names in batch["lens"]] == [["pinhole", lens] for lens in lensed["lens"]]
     out = RigRetarget(ring().turned(yaw_deg=5))(batch)
@@ -221,7 +221,7 @@ def test_a_batch_of_sources_with_different_lenses() -> None:
     assert skipping(batch, params={"skipped": 1.0})["lens"] == [["pinhole", lens] for lens in lensed["lens"]]
 
 
-def source_lenses(rig: Rig) -> list[str]:
+def lenses_of(rig: Rig) -> list[str]:
     return [camera.lens for camera in rig]
 
 
@@ -439,16 +439,30 @@ def test_skipped_samples_collate_with_retargeted_ones(masked: str, lensed: str) 
     retarget = RigRetarget(target, p=0.5, size=(18, 32), label_keys=["classes"], outputs=["source_camera"])
     outs = {flag: retarget(sample, params={"skipped": flag}) for flag in (0.0, 1.0)}
     assert list(outs[0.0]) == list(outs[1.0])
-    assert ("lens" in outs[0.0]) == (lensed != "neither") and ("ignore" in outs[0.0]) == (masked != "neither")
+    assert outs[0.0]["lens"] == lenses_of(target) and outs[1.0]["lens"] == lenses_of(source)
     batch = default_collate(list(outs.values()))
     assert batch["images"].shape == (2, 4, 3, 18, 32) and batch["classes"].shape == (2, 4, 18, 32)
     skipped = outs[1.0]
     assert skipped["coverage"].all() and (skipped["classes"] == 1).all()
     np.testing.assert_array_equal(skipped["K"], source.resized((18, 32)).K)
     np.testing.assert_array_equal(skipped["cam2ego"], source.cam2ego)
+    if masked != "target":
+        assert not outs[0.0]["ignore"].any()
     if masked == "source":
         np.testing.assert_array_equal(skipped["ignore"][0], ~source.resized((18, 32))[0].mask)
-        assert not outs[0.0]["ignore"].any()
+
+
+def test_samples_of_different_vehicles_collate() -> None:
+    retarget = RigRetarget(ring().turned(yaw_deg=20), p=0.5, size=SIZE)
+    torch.manual_seed(0)
+    vehicles = [ring(), with_mask(ring()), with_lens(ring())]
+    outs = [retarget({"images": pictures(rig), "rig": rig}) for rig in vehicles * 4]
+    assert len({tuple(out) for out in outs}) == 1
+    default_collate(outs)
+    # Retargeted again, some with holes in their coverage.
+    again = RigRetarget(ring().turned(yaw_deg=3), p=0.5, size=SIZE)
+    default_collate([again(out) for out in outs])
+    again(default_collate(outs))
 
 
 def test_a_skipped_sample_is_the_resized_source_in_memory_of_its_own() -> None:
