@@ -20,7 +20,8 @@ MAX_INVERSE_DISTANCE = 100.0
 """Nothing is nearer to a camera than 1 cm: keeps points finite when a camera touches a surface."""
 
 WALL_CENTER_M = (1.0, 0.0)
-"""Centre of the far wall in the ego frame: the middle of a car's cameras when the origin is its rear axle."""
+"""Centre of the far wall in the ego frame: the middle of a car's cameras when the origin is its rear axle.
+0 and 2 m ahead are within 0.05 dB."""
 
 
 class Surface(Protocol):
@@ -77,7 +78,20 @@ class Street:
     """The road joined softly to an elliptical far wall: no crease, houses nearer at the sides than ahead.
 
     The p-norm of two inverse distances, (q_road^k + q_wall^k)^(1/k), is a smooth minimum of the distances: it
-    follows the road where the road is near, and the wall where the road is beyond it or above the horizon.
+    follows the road where the road is near, and the wall where the road is beyond it or above the horizon. The
+    distance shrinks by 16 % where the two cross, 1.5 % where the road is at half the wall's distance, 0.1 % at a
+    quarter.
+
+    The defaults are round numbers on a flat optimum, measured on one nuScenes and one DDAD frame, DDAD's next frame,
+    and 20 synthetic streets (turned, 0.6 m higher, 0.5 m forward); differences below 0.2 dB are noise:
+
+    - Semi-axes: 40 to 60 by 17.5 to 25 m lie within 0.3 dB of each other on turned views and 0.5 on lifted ones; 12 m
+      at the sides loses up to 0.8, 30 m gains at most 0.2 over ``Ground``. 50 m ahead is as good as 40 m, better on
+      DDAD by 0.1 to 0.2; 40 m is taken because nuScenes lifted by 0.6 m stays 0.22 behind the reference
+      renderer with it and 0.29 with 50 m, and 0.25 is the limit set: a choice within noise, made on one frame.
+    - k: 3 to 8, and joins of compact support, lie within 0.3 dB on real frames. 3 is best by 0.1 on most views, as
+      objects stand in front of the wall, but loses 0.7 dB against ``Ground`` on ground pixels seen from 0.6 m higher;
+      4 loses 0.2, 6 loses 0.15.
 
     Attributes:
         ground_z_m: Height of the road in the ego frame.
@@ -88,9 +102,9 @@ class Street:
 
     smooth: ClassVar[bool] = True
     ground_z_m: float = 0.0
-    half_length_m: float = 50.0
+    half_length_m: float = 40.0
     half_width_m: float = 20.0
-    sharpness: float = 3.0
+    sharpness: float = 4.0
 
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """The smooth join of plane and wall, 1/m (...,)."""
