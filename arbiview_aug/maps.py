@@ -309,22 +309,22 @@ def _larger(vectors: FloatArray) -> FloatArray:
 
 
 def _mask_at(source: Camera, slot: Slot, at: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-    """255 where all bilinear taps around atlas positions (h, w, 2) lie on the scene, not on the own car."""
+    """255 where every bilinear tap with a weight at atlas positions (h, w, 2) lies on the scene, not on the own car."""
     assert source.mask is not None
-    safe = source.mask.astype(np.uint8) * 255
+    clean: Any = source.mask.astype(np.uint8) * 255
     if slot.level:
         # A halved pixel is clean where every pixel in it is.
-        clean: Any = cv2.resize(safe, slot.size[::-1], interpolation=cv2.INTER_AREA)
-        safe = np.where(clean == 255, 255, 0).astype(np.uint8)
-    safe = np.asarray(cv2.erode(safe, np.ones((3, 3), np.uint8), borderValue=255), np.uint8)
+        clean = cv2.compare(cv2.resize(clean, slot.size[::-1], interpolation=cv2.INTER_AREA), 255, cv2.CMP_EQ)
     local = at - np.array([slot.x, slot.y], np.float32) if slot.x or slot.y else at
-    return cv2.remap(safe, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+    share = cv2.remap(clean, local, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+    return np.asarray(cv2.compare(share, 255, cv2.CMP_EQ), np.uint8)
 
 
 def edge_distance(source: Camera, uv: FloatArray) -> FloatArray:
-    """Signed distance (px) of source pixels (..., 2) to the border of what the source sees, negative outside."""
+    """Distance (px) of source pixels (..., 2) to the border of what the source sees: the outermost centres are 0.5
+    inside it; negative outside the image."""
     u, v = uv[..., 0], uv[..., 1]
-    edge = np.minimum(np.minimum(u, source.width_px - 1 - u), np.minimum(v, source.height_px - 1 - v))
+    edge = np.minimum(np.minimum(u, source.width_px - 1 - u), np.minimum(v, source.height_px - 1 - v)) + 0.5
     if source.mask is None:
         return edge
     coarse = cv2.resize(source.mask.astype(np.float32), None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)

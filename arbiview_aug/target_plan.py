@@ -161,7 +161,7 @@ class TargetDraft:
         self.counters[f"pairs_{name}"] += 1
         pixels_per_pixel = resolution(pair.uv, self.grid.step)
         edge_px = edge_distance(source, pair.uv)
-        seen = pair.valid & (edge_px >= 0)
+        seen = pair.valid & (edge_px > 0)
         level = self._level(pixels_per_pixel[seen], source.size) if self.config.antialias else 0
         pair.set_tolerance(self.config.map_tolerance_px * 2**level)
         parallax = self._expected_parallax(offset_m, focal_px, self.rays.inverse_distance(surface))
