@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-Quality = Literal["draft", "fast"]
+PlanQuality = Literal["draft", "fast"]
+Quality = Literal["draft", "fast", "paper"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,10 +42,7 @@ class FavsConfig:
     round by, maps stay within 1/32 px of float64."""
 
     def __post_init__(self) -> None:
-        for name, (low, high) in _RANGES.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ValueError(f"FavsConfig.{name}: expected {low:g} to {high:g}, got {value!r}")
+        _check_ranges(self, _RANGES)
         if self.grid_step_px not in (1, 4, 8, 16, 32):
             raise ValueError(f"FavsConfig.grid_step_px: expected 1, 4, 8, 16 or 32, got {self.grid_step_px!r}")
         if self.interpolation not in ("linear", "nearest"):
@@ -59,6 +58,155 @@ _RANGES: dict[str, tuple[float, float]] = {
 }
 
 
+@dataclass(frozen=True, kw_only=True)
+class PaperConfig:
+    """``quality="paper"``: stages 1 to 4 as published (Sec. FAVS), the far surface, every frame on its own.
+
+    The paper names its parameters without giving values; each is a field with its reason, and each stage and weight
+    has a switch for the ablation. Lengths named ``_px`` are target pixels at a target width of 800 px and scale with
+    the width, so that one setting serves every image size.
+    """
+
+    use_feature_matching: bool = True
+    """Stage 2: correct H_geometric by matched features."""
+
+    use_object_alignment: bool = True
+    """Stage 3: shift H_base by the objects' mean offset."""
+
+    use_distance_weight: bool = True
+    """Stage 4: w_distance."""
+
+    use_gradient_weight: bool = True
+    """Stage 4: w_gradient."""
+
+    use_quality_weight: bool = True
+    """Stage 4: w_quality."""
+
+    use_primary_weight: bool = True
+    """Stage 4: w_primary."""
+
+    # --- stage 2 ----
+    ratio: float = 0.75
+    """Lowe's ratio d1 / d2: the paper's value."""
+
+    max_features: int = 2000
+    """SIFT keeps the strongest so many in each overlap: matching time is bounded, and strips rarely have more."""
+
+    overlap_margin_px: float = 8.0
+    """Added around the overlap's bounding box: a SIFT descriptor looks about so far beyond its keypoint."""
+
+    min_overlap_px: float = 16.0
+    """Overlaps narrower than this hold no keypoint whose descriptor stays inside."""
+
+    ransac_px: float = 2.0
+    """Largest distance between a match and M: below 1 px noise rejects right matches, above 4 px depths mix."""
+
+    min_matches: int = 10
+    """Acceptance 1: four matches always fit a homography exactly, and six do so by chance in repeating texture."""
+
+    max_area_ratio: float = 16.0
+    """Acceptance 2: check_homography's bound, relative to the two cameras' focal lengths."""
+
+    consistent_px: float = 6.0
+    """Up to this corner motion H_feature is taken whole: calibration errors of about half a degree."""
+
+    inconsistent_px: float = 24.0
+    """Acceptance 3, the paper's threshold; α rises linearly between the two. On real frames wrong homographies moved
+    corners by 85 px and cost 3 dB."""
+
+    # --- stage 3 ----
+    cluster_radius_px: float = 30.0
+    """DBSCAN's ε: keypoints of one car 20 m away lie about so far apart."""
+
+    min_samples: int = 4
+    """DBSCAN's min_samples: below it the centroid of an object is as noisy as a match."""
+
+    cluster_spread_px: float = 2.0
+    """confidence_j = 1 / (1 + (s_j / this)²), where s_j is how much the offsets differ within the cluster: one object
+    moves as a whole."""
+
+    type_weights: tuple[tuple[str, float], ...] = (
+        ("upright", 1.0),
+        ("far", 1.0),
+        ("ground", 0.25),
+        ("vehicle", 1.0),
+        ("pedestrian", 1.0),
+    )
+    """type_weight_j by type. Without a detector the type is geometric: on the road (``ground``), across the horizon
+    (``upright``), above it (``far``). Road marks move most with a camera's position and would drag everything along."""
+
+    other_type_weight: float = 0.5
+    """type_weight_j of any other type that a detector names."""
+
+    ground_reach_m: float = 40.0
+    """A cluster whose top still meets the road nearer than this lies on it; nearer the horizon one cannot tell."""
+
+    beta: float = 0.5
+    """β, the adjustment strength in [0, 1]: half, because ΔT moves the background along with the objects."""
+
+    max_shift_px: float = 12.0
+    """A longer ΔT is declined, for the reason of ``inconsistent_px``: it is a mismatch or one near object."""
+
+    # --- stage 4 ----
+    distance_gamma: float = 1.0
+    """γ of (d / d_max)^γ: powers from 0.5 to 4 are within measurement noise of each other."""
+
+    gradient_sigma: float = 16.0
+    """σ in grey levels a pixel: texture of the road lies below it, edges of objects above."""
+
+    unmatched_quality: float = 0.5
+    """w_quality of a source without accepted matches; with them it rises to 1 with the share of inliers."""
+
+    primary_bonus: float = 4.0
+    """w_primary of the primary camera: it leads wherever it sees, and the others still fade in at its border."""
+
+    def __post_init__(self) -> None:
+        _check_ranges(self, _PAPER_RANGES)
+        if not self.consistent_px < self.inconsistent_px:
+            raise ValueError(
+                f"PaperConfig.consistent_px: expected less than inconsistent_px={self.inconsistent_px!r}, "
+                f"got {self.consistent_px!r}"
+            )
+        for kind, weight in self.type_weights:
+            if not 0 <= weight <= 1e6:
+                raise ValueError(f"PaperConfig.type_weights: {kind}: expected a number from 0 to 1e+06, got {weight!r}")
+
+    def type_weight(self, kind: str) -> float:
+        """type_weight_j of a type."""
+        return dict(self.type_weights).get(kind, self.other_type_weight)
+
+
+_PAPER_RANGES: dict[str, tuple[float, float]] = {
+    "ratio": (0.0, 1.0),
+    "max_features": (4, 1e6),
+    "overlap_margin_px": (0.0, 1e3),
+    "min_overlap_px": (1.0, 1e4),
+    "ransac_px": (1e-3, 100.0),
+    "min_matches": (4, 1e6),
+    "max_area_ratio": (1.0, 1e6),
+    "consistent_px": (0.0, 1e4),
+    "inconsistent_px": (0.0, 1e4),
+    "cluster_radius_px": (1e-3, 1e4),
+    "min_samples": (1, 1e6),
+    "cluster_spread_px": (1e-3, 1e3),
+    "other_type_weight": (0.0, 1e6),
+    "ground_reach_m": (0.0, 1e4),
+    "beta": (0.0, 1.0),
+    "max_shift_px": (0.0, 1e4),
+    "distance_gamma": (0.0, 16.0),
+    "gradient_sigma": (1e-3, 1e6),
+    "unmatched_quality": (1e-6, 1.0),
+    "primary_bonus": (1.0, 1e12),
+}
+
+
+def _check_ranges(config: Any, ranges: dict[str, tuple[float, float]]) -> None:
+    for name, (low, high) in ranges.items():
+        value = getattr(config, name)
+        if not low <= value <= high:
+            raise ValueError(f"{type(config).__name__}.{name}: expected {low:g} to {high:g}, got {value!r}")
+
+
 def draft() -> FavsConfig:
     """Winning source, nearest sampling, no blending."""
     return FavsConfig(interpolation="nearest", seam_width=0.0)
@@ -69,15 +217,22 @@ def fast() -> FavsConfig:
     return FavsConfig()
 
 
-def favs_config(quality: Any) -> FavsConfig:
+def paper() -> PaperConfig:
+    """Stages 1 to 4 as published: a named baseline, slower and less accurate on real frames than ``fast``."""
+    return PaperConfig()
+
+
+def favs_config(quality: Any) -> FavsConfig | PaperConfig:
     """A preset by name, or a config passed through.
 
     Raises:
         ValueError: An unknown preset.
     """
-    if isinstance(quality, FavsConfig):
+    if isinstance(quality, FavsConfig | PaperConfig):
         return quality
-    presets = {"draft": draft, "fast": fast}
+    presets: dict[str, Callable[[], FavsConfig | PaperConfig]] = {"draft": draft, "fast": fast, "paper": paper}
     if quality not in presets:
-        raise ValueError(f"quality: expected one of {', '.join(presets)} or a FavsConfig, got {quality!r}")
+        raise ValueError(
+            f"quality: expected one of {', '.join(presets)}, a FavsConfig or a PaperConfig, got {quality!r}"
+        )
     return presets[quality]()
