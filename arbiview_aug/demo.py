@@ -40,7 +40,7 @@ from arbiview_aug.evaluate.pictures import contact_sheet, outline_coverage, save
 from arbiview_aug.evaluate.scores import mean_of
 from arbiview_aug.evaluate.sparse import ColouredPoints, coloured_points, equalised, sparse_metrics
 from arbiview_aug.evaluate.truth import truth_metrics
-from arbiview_aug.favs.config import Quality
+from arbiview_aug.favs.config import PlanQuality
 from arbiview_aug.rig import Rig, load_rig, shipped_rigs
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.transforms import RigRetarget
@@ -155,7 +155,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help=f"folder for {PICTURE_FILE}, or a picture file ending in .png or .jpg (default: %(default)s)",
     )
-    parser.add_argument("--quality", choices=get_args(Quality), default="fast", help="(default: %(default)s)")
+    parser.add_argument("--quality", choices=get_args(PlanQuality), default="fast", help="(default: %(default)s)")
     parser.add_argument("--surface", choices=get_args(SurfaceName), default="auto", help="(default: %(default)s)")
     parser.add_argument("--frames", type=_count, default=1, metavar="N", help="how many (default: %(default)s)")
     parser.add_argument("--seed", type=_seed, default=0, help="of the synthetic streets (default: %(default)s)")

@@ -1,10 +1,14 @@
-"""A render plan in words."""
+"""A render plan, or a rendering by ``quality="paper"``, in words."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from arbiview_aug.camera import FloatArray
+from arbiview_aug.favs.paper import PaperRendering, SourceReport
 from arbiview_aug.plan import RenderPlan
 
 
@@ -59,6 +63,71 @@ class Explanation:
         return "\n".join(lines)
 
     __repr__ = __str__
+
+
+@dataclass(frozen=True)
+class PaperExplanation:
+    """What the published stages did to a frame; ``str`` prints it, ``as_dict`` gives plain data.
+
+    Attributes:
+        rendering: The frame.
+    """
+
+    rendering: PaperRendering
+
+    def as_dict(self) -> list[dict[str, Any]]:
+        """One entry for each target camera: coverage, share to invent, and what each stage made of its sources."""
+        entries = []
+        for camera, view in zip(self.rendering.target, self.rendering.targets, strict=True):
+            coverage = float(view.coverage.mean())
+            entries.append(
+                {
+                    "camera": camera.name,
+                    "coverage": coverage,
+                    "to_invent": 1 - coverage,
+                    "sources": [self._source(report, camera.center_m) for report in view.reports],
+                }
+            )
+        return entries
+
+    def _source(self, report: SourceReport, center_m: FloatArray) -> dict[str, Any]:
+        camera = self.rendering.source[report.source]
+        return {
+            "camera": camera.name,
+            "share": report.share,
+            "surface": "far",
+            "primary": report.primary,
+            "baseline_m": float(np.linalg.norm(camera.center_m - center_m)),
+            "matches": report.features.good_matches,
+            "inliers": report.features.inliers,
+            "consistency_px": report.features.consistency_px,
+            "alpha": report.features.alpha,
+            "features": report.features.reason,
+            "shift_px": report.objects.shift_px.tolist(),
+            "objects": report.objects.reason,
+        }
+
+    def __str__(self) -> str:
+        rendering = self.rendering
+        lines = [
+            f"{rendering.source.name or 'source'} -> {rendering.target.name or 'target'}: {len(rendering.source)} "
+            f"cameras to {len(rendering.target)}, stages 1 to 4 as published, far surface"
+        ]
+        for entry in self.as_dict():
+            lines.append(f"  {entry['camera']}: {entry['coverage']:.1%} covered")
+            if not entry["sources"]:
+                lines.append("    no source camera looks there")
+            for source in entry["sources"]:
+                lines.append(f"    {source['share']:6.1%} from {source['camera']}: {_stages(source)}")
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+def _stages(source: dict[str, Any]) -> str:
+    if source["primary"]:
+        return "the primary camera, the reference of the others"
+    return f"features: {source['features']}; objects: {source['objects']}"
 
 
 def _source_line(source: dict[str, Any]) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.errors import SampleError, SampleTypeError
+from arbiview_aug.favs.paper import PaperRendering, paper_labels
 from arbiview_aug.favs.synthesis import render_labels
 from arbiview_aug.plan import RenderPlan
 from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame
@@ -101,7 +102,7 @@ def target_labels(
     value: Any,
     frames: Sequence[SourceFrame],
     lead: tuple[int, ...],
-    views: Sequence[RenderPlan | tuple[int, int]],
+    views: Sequence[RenderPlan | PaperRendering | tuple[int, int]],
     fill: float,
 ) -> Any:
     """The label maps (..., N, H, W) of a sample in the target's views.
@@ -111,7 +112,8 @@ def target_labels(
         value: A tensor, or a list of one (..., Hi, Wi) tensor a camera.
         frames: The frames of the sample.
         lead: Its leading dimensions.
-        views: The plan of each frame; or, where the frame is only resized, its new size.
+        views: The plan of each frame, or its rendering by ``quality="paper"``; or, where the frame is only resized,
+            its new size.
         fill: Value of pixels that no source sees (False for bool maps).
 
     Raises:
@@ -130,6 +132,8 @@ def target_labels(
         plain = [label.as_subclass(torch.Tensor) for label in maps]
         if isinstance(view, RenderPlan):
             rendered.append(stacked(render_labels(view, plain, _checked_fill(key, fill, plain[0].dtype))))
+        elif isinstance(view, PaperRendering):
+            rendered.append(stacked(paper_labels(view, plain, _checked_fill(key, fill, plain[0].dtype))))
         else:
             rendered.append(stacked([nearest_resized(label, view) for label in plain]))
     return rewrapped(gathered(rendered, lead), value)

@@ -15,8 +15,9 @@ import torch
 
 from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError
-from arbiview_aug.explain import Explanation
-from arbiview_aug.favs.config import FavsConfig, Quality, favs_config
+from arbiview_aug.explain import Explanation, PaperExplanation
+from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
+from arbiview_aug.favs.paper import PaperRendering, check_pinhole, render_paper
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
 from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_target, target_labels
 from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
@@ -28,6 +29,9 @@ from arbiview_aug.surface import SurfaceName
 from arbiview_aug.tensors import covered, gathered, leading_shape, resized, rewrapped, stacked
 
 Execution = Literal["auto", "opencv", "torch"]
+View = RenderPlan | PaperRendering | tuple[int, int]
+"""How a frame is made: by a plan, by the published stages (and then it is rendered already), or only resized."""
+
 _OUTPUTS = ("source_camera",)
 _UNREACHABLE = 0.5  # a target camera of which less than this is covered is worth a warning
 
@@ -55,8 +59,9 @@ class RigRetarget(torch.nn.Module):
         target_rig: A ``Rig``, the name of a shipped one, a rig file, or a ``RandomRig``.
         source_rig: The rig of every sample that carries none.
         path: ``favs``: stitching.
-        quality: ``draft``, ``fast``, or a ``FavsConfig``.
-        surface: ``far``, ``ground``, ``street``; ``auto`` decides per pair of cameras.
+        quality: ``draft``, ``fast``, or a ``FavsConfig``; ``paper`` or a ``PaperConfig``: stages 1 to 4 as published,
+            on the CPU, for pinhole cameras.
+        surface: ``far``, ``ground``, ``street``; ``auto`` decides per pair of cameras (``paper``: always ``far``).
         size: (h, w) of every output image; the target cameras are resized to it.
         p: Probability of retargeting. A skipped sample keeps its own cameras, resized to ``size``, with full coverage;
             so ``p < 1`` needs ``size`` and equal camera counts. The output then always has ``lens``, ``distortion``
@@ -115,6 +120,8 @@ class RigRetarget(torch.nn.Module):
             self.target = load_rig(target_rig)
         self.source_rig = source_rig if isinstance(source_rig, Rig) or source_rig is None else load_rig(source_rig)
         self.config = favs_config(quality)
+        if isinstance(self.config, PaperConfig):
+            self._check_paper(surface, execution)
         self.path, self.surface, self.p, self.rng = path, surface, float(p), rng
         self.size = None if size is None else _checked_size(size)
         self.label_frame, self.label_keys, self.label_fill = label_frame, tuple(label_keys), label_fill
@@ -126,6 +133,14 @@ class RigRetarget(torch.nn.Module):
         self._scratch = Scratch()
         self._warned: set[str] = set()
         self._limited_process: int | None = None
+
+    def _check_paper(self, surface: str, execution: str) -> None:
+        """What the published stages cannot do."""
+        if surface not in ("auto", "far"):
+            raise ValueError(f"surface: quality='paper' knows the far surface: expected auto or far, got {surface!r}")
+        if execution == "torch":
+            raise ValueError("execution: quality='paper' runs in OpenCV: expected auto or opencv, got 'torch'")
+        check_pinhole(self.target if isinstance(self.target, Rig) else self.target.base)
 
     def extra_repr(self) -> str:
         """Target and settings, for ``repr``."""
@@ -149,9 +164,9 @@ class RigRetarget(torch.nn.Module):
         sizes = {tuple(image.shape[-2:]) for frame in frames for image in frame.images}
         labels = check_other_keys(sample, list(sizes), self.label_keys, self.pass_keys)
         target, skip, drawn = self._draw(sample, frames, params)
-        views: list[RenderPlan | tuple[int, int]] = []
+        views: list[View] = []
         for frame in frames:
-            views.append(self.size if skip and self.size else self.plan(frame.rig, target))
+            views.append(self.size if skip and self.size else self._view(frame, target))
         parts = self._rendered(frames, views)
         out = self._kept(sample, labels)
         out["images"] = rewrapped(gathered([part["images"] for part in parts], lead), sample["images"])
@@ -219,16 +234,16 @@ class RigRetarget(torch.nn.Module):
 
     # --- images ---------------------------------------------------------------------------------------------------
     def _rendered(
-        self, frames: Sequence[SourceFrame], views: Sequence[RenderPlan | tuple[int, int]]
+        self, frames: Sequence[SourceFrame], views: Sequence[View]
     ) -> list[dict[str, Any]]:
         """Images, calibration and masks of each frame: rendered by its plan, or resized."""
         parts = []
         for frame, view, images in zip(frames, views, self._images(frames, views), strict=True):
             device = frame.images[0].device
-            rig = view.target if isinstance(view, RenderPlan) else frame.rig.resized(view)
+            rig = view.target if not isinstance(view, tuple) else frame.rig.resized(view)
             part = self._described(rig, device)
             part["images"] = stacked(images)
-            if isinstance(view, RenderPlan):
+            if not isinstance(view, tuple):
                 winners = [target.source_camera for target in view.targets]
             else:
                 winners = [np.full(view, k, np.int8) for k in range(len(rig))]
@@ -239,13 +254,15 @@ class RigRetarget(torch.nn.Module):
         return parts
 
     def _images(
-        self, frames: Sequence[SourceFrame], views: Sequence[RenderPlan | tuple[int, int]]
+        self, frames: Sequence[SourceFrame], views: Sequence[View]
     ) -> list[list[torch.Tensor]]:
         """The target images of each frame; frames that share a plan go through torch together."""
         done: dict[int, list[torch.Tensor]] = {}
         together: dict[int, list[int]] = {}
         for b, (frame, view) in enumerate(zip(frames, views, strict=True)):
-            if not isinstance(view, RenderPlan):
+            if isinstance(view, PaperRendering):
+                done[b] = [target.image for target in view.targets]
+            elif isinstance(view, tuple):
                 done[b] = [resized(image, view) for image in frame.images]
             elif self._uses_torch(frame):
                 together.setdefault(id(view), []).append(b)
@@ -277,13 +294,28 @@ class RigRetarget(torch.nn.Module):
             part["ignore"] = stacked([torch.from_numpy(~m).to(device) for m in masks])
         return part
 
-    def plan(self, source: Rig, target: Rig) -> RenderPlan:
-        """The cached render plan of a pair of rigs."""
-        key = plan_key(source, target, self.surface, self.config)
-        return self.plans.get(key, lambda: self._built(source, target))
+    def _view(self, frame: SourceFrame, target: Rig) -> RenderPlan | PaperRendering:
+        """The plan of a frame, or the frame rendered by the published stages, for which nothing can be planned."""
+        if not isinstance(self.config, PaperConfig):
+            return self.plan(frame.rig, target)
+        rendering = render_paper(frame.rig, target.in_frame_of(frame.rig), frame.images, self.config)
+        self._warn_unreachable(rendering)
+        return rendering
 
-    def _built(self, source: Rig, target: Rig) -> RenderPlan:
-        plan = build_plan(source, target, surface=self.surface, config=self.config)
+    def plan(self, source: Rig, target: Rig) -> RenderPlan:
+        """The cached render plan of a pair of rigs.
+
+        Raises:
+            ValueError: With ``quality="paper"``.
+        """
+        if isinstance(self.config, PaperConfig):
+            raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
+        config = self.config
+        key = plan_key(source, target, self.surface, config)
+        return self.plans.get(key, lambda: self._built(source, target, config))
+
+    def _built(self, source: Rig, target: Rig, config: FavsConfig) -> RenderPlan:
+        plan = build_plan(source, target, surface=self.surface, config=config)
         self._warn_unreachable(plan)
         return plan
 
@@ -294,7 +326,7 @@ class RigRetarget(torch.nn.Module):
             source: The rig of the samples; ``source_rig`` by default.
 
         Raises:
-            ValueError: No source rig, or a random target.
+            ValueError: No source rig, a random target, or ``quality="paper"``.
         """
         source = source or self.source_rig
         if source is None or self._fixed_target is None:
@@ -308,21 +340,24 @@ class RigRetarget(torch.nn.Module):
         return self.execution == "torch" or (self.execution == "auto" and wanted)
 
     # --- words ------------------------------------------------------------------------------------------------------
-    def explain(self, sample: Mapping[str, Any]) -> Explanation:
+    def explain(self, sample: Mapping[str, Any]) -> Explanation | PaperExplanation:
         """How a sample would be rendered: sources, surfaces and why, coverage, expected parallax; print it.
+
+        With ``quality="paper"``: what each stage made of each source.
 
         A random target is explained for one draw; no state changes, except that the draw advances the RNG.
         """
         frame = check_inputs(sample, self.source_rig)[0]
         target, _, _ = self._draw(sample, [frame], None)
-        return Explanation(self.plan(frame.rig, target))
+        view = self._view(frame, target)
+        return PaperExplanation(view) if isinstance(view, PaperRendering) else Explanation(view)
 
     def _warn_once(self, topic: str, message: str) -> None:
         if topic not in self._warned:
             self._warned.add(topic)
             warnings.warn(message, stacklevel=4)
 
-    def _warn_unreachable(self, plan: RenderPlan) -> None:
+    def _warn_unreachable(self, plan: RenderPlan | PaperRendering) -> None:
         if "unreachable" in self._warned:
             return
         shares = [float(coverage.mean()) for coverage in plan.coverage]
