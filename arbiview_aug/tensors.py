@@ -91,3 +91,17 @@ def nearest_resized(label: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     y = ((torch.arange(size[0], device=label.device) + 0.5) * h / size[0]).long().clamp(max=h - 1)
     x = ((torch.arange(size[1], device=label.device) + 0.5) * w / size[1]).long().clamp(max=w - 1)
     return label[..., y[:, None], x]
+
+
+def like(value: torch.Tensor, given: Any) -> torch.Tensor:
+    """The calibration in the dtype and on the device of the sample's own; float64 where it has none."""
+    if isinstance(given, torch.Tensor) and given.is_floating_point():
+        return value.to(dtype=given.dtype, device=given.device)
+    return value
+
+
+def lens_names(names: Sequence[list[str]], lead: tuple[int, ...]) -> list[Any]:
+    """A name for each camera; where the frames of a batch differ, all of theirs, as ``default_collate`` has them."""
+    if all(frame == names[0] for frame in names):
+        return names[0]
+    return [np.array(of_camera, dtype=object).reshape(lead).tolist() for of_camera in zip(*names, strict=True)]

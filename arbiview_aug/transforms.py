@@ -17,7 +17,7 @@ from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError
 from arbiview_aug.explain import Explanation, PaperExplanation
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
-from arbiview_aug.favs.paper import PaperRendering, check_pinhole, render_paper
+from arbiview_aug.favs.paper import PaperRendering, check_pinhole, check_settings, render_paper
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
 from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_target, target_labels
 from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
@@ -26,7 +26,7 @@ from arbiview_aug.rig import Rig, load_rig
 from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame, check_inputs
 from arbiview_aug.sampling import Scratch
 from arbiview_aug.surface import SurfaceName
-from arbiview_aug.tensors import covered, gathered, leading_shape, resized, rewrapped, stacked
+from arbiview_aug.tensors import covered, gathered, leading_shape, lens_names, like, resized, rewrapped, stacked
 
 Execution = Literal["auto", "opencv", "torch"]
 View = RenderPlan | PaperRendering | tuple[int, int]
@@ -121,7 +121,8 @@ class RigRetarget(torch.nn.Module):
         self.source_rig = source_rig if isinstance(source_rig, Rig) or source_rig is None else load_rig(source_rig)
         self.config = favs_config(quality)
         if isinstance(self.config, PaperConfig):
-            self._check_paper(surface, execution)
+            check_settings(surface, execution)
+            check_pinhole(self.target if isinstance(self.target, Rig) else self.target.base)
         self.path, self.surface, self.p, self.rng = path, surface, float(p), rng
         self.size = None if size is None else _checked_size(size)
         self.label_frame, self.label_keys, self.label_fill = label_frame, tuple(label_keys), label_fill
@@ -133,14 +134,6 @@ class RigRetarget(torch.nn.Module):
         self._scratch = Scratch()
         self._warned: set[str] = set()
         self._limited_process: int | None = None
-
-    def _check_paper(self, surface: str, execution: str) -> None:
-        """What the published stages cannot do."""
-        if surface not in ("auto", "far"):
-            raise ValueError(f"surface: quality='paper' knows the far surface: expected auto or far, got {surface!r}")
-        if execution == "torch":
-            raise ValueError("execution: quality='paper' runs in OpenCV: expected auto or opencv, got 'torch'")
-        check_pinhole(self.target if isinstance(self.target, Rig) else self.target.base)
 
     def extra_repr(self) -> str:
         """Target and settings, for ``repr``."""
@@ -171,14 +164,14 @@ class RigRetarget(torch.nn.Module):
         out = self._kept(sample, labels)
         out["images"] = rewrapped(gathered([part["images"] for part in parts], lead), sample["images"])
         for key in ("K", "cam2ego"):
-            out[key] = _like(gathered([part[key] for part in parts], lead), sample.get(key))
+            out[key] = like(gathered([part[key] for part in parts], lead), sample.get(key))
         grounds = [part["ground_z_m"] for part in parts]
         out["ground_z_m"] = torch.tensor(grounds, dtype=torch.float64).reshape(lead) if lead else grounds[0]
         for key in ("coverage", "ignore", "distortion", *self.outputs):
             if key in parts[0]:
                 out[key] = gathered([part[key] for part in parts], lead)
         if "lens" in parts[0]:
-            out["lens"] = _lens_names([part["lens"] for part in parts], lead)
+            out["lens"] = lens_names([part["lens"] for part in parts], lead)
         for key in labels:
             out[key] = target_labels(key, sample[key], frames, lead, views, self.label_fill)
         if drawn:
@@ -398,17 +391,3 @@ def _checked_size(size: Any) -> tuple[int, int]:
     if min(h, w) < 1:
         raise ValueError(f"size: expected (h, w) in pixels, got {size!r}")
     return h, w
-
-
-def _like(value: torch.Tensor, given: Any) -> torch.Tensor:
-    """The calibration in the dtype and on the device of the sample's own; float64 where it has none."""
-    if isinstance(given, torch.Tensor) and given.is_floating_point():
-        return value.to(dtype=given.dtype, device=given.device)
-    return value
-
-
-def _lens_names(names: Sequence[list[str]], lead: tuple[int, ...]) -> list[Any]:
-    """A name for each camera; where the frames of a batch differ, all of theirs, as ``default_collate`` has them."""
-    if all(frame == names[0] for frame in names):
-        return names[0]
-    return [np.array(of_camera, dtype=object).reshape(lead).tolist() for of_camera in zip(*names, strict=True)]

@@ -2,8 +2,10 @@
 
 For every target camera: one source is primary; every source is warped by H_geometric (stage 1), matched to the
 primary's warp (stage 2), shifted by its objects (stage 3), warped again by its final homography, and averaged with
-w_distance · w_gradient · w_quality · w_primary (stage 4). A named baseline: stages 2 and 3 cost accuracy on real
-frames, and nothing can be planned ahead.
+w_distance · w_gradient · w_quality · w_primary (stage 4). A named baseline: nothing can be planned ahead.
+
+Sparse PSNR by ``evaluate``, two real frames at half resolution, equalised, mean of five yaws: stages 1 and 4 alone
+24.38 dB (nuScenes) and 23.01 (DDAD), all four 24.39 and 23.62; the ``fast`` preset on its own surface 28.82 and 26.35.
 """
 
 from __future__ import annotations
@@ -151,6 +153,14 @@ def check_pinhole(*rigs: Rig) -> None:
                     f"camera {camera.name!r}: quality='paper' renders by homographies and needs a pinhole lens, got "
                     f"{camera.lens}; use .undistorted()"
                 )
+
+
+def check_settings(surface: str, execution: str) -> None:
+    """Refuse settings of ``RigRetarget`` that the published stages do not have."""
+    if surface not in ("auto", "far"):
+        raise ValueError(f"surface: quality='paper' knows the far surface: expected auto or far, got {surface!r}")
+    if execution == "torch":
+        raise ValueError("execution: quality='paper' runs in OpenCV: expected auto or opencv, got 'torch'")
 
 
 def _render_view(
