@@ -20,6 +20,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from arbiview_aug.tone import ToneCurve
+
 OUTSIDE = -16
 """Whole-pixel coordinate of a map entry that reads nothing: far enough that no bilinear tap touches the atlas."""
 
@@ -151,9 +153,14 @@ def interleaved(image: torch.Tensor) -> np.ndarray | None:
     return array.numpy() if array.is_contiguous() else None
 
 
-def fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor], scratch: Scratch) -> np.ndarray:
-    """The atlas (rows, columns, 3) of (3, H, W) uint8 or float32 CPU images; channels-last stacks are not copied."""
-    block = _stacked_block(layout, images)
+def fill_atlas(
+    layout: AtlasLayout, images: Sequence[torch.Tensor], scratch: Scratch, curves: Sequence[ToneCurve] | None = None
+) -> np.ndarray:
+    """The atlas (rows, columns, 3) of (3, H, W) uint8 or float32 CPU images; channels-last stacks are not copied.
+
+    With tone curves, one for each image, everything is copied: the images themselves are the user's.
+    """
+    block = _stacked_block(layout, images) if curves is None else None
     if block is not None:
         return block
     dtype = np.uint8 if images[0].dtype == torch.uint8 else np.float32
@@ -163,10 +170,14 @@ def fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor], scratch: Scr
         place = atlas[slot.y : slot.y + h, slot.x : slot.x + w]
         image = interleaved(images[slot.source])
         if image is not None:
-            place[...] = halved(image, slot.level)
+            image = halved(image, slot.level)
         else:
             planes = images[slot.source].contiguous().numpy()
-            cv2.merge([halved(plane, slot.level) for plane in planes], dst=place)
+            image = cv2.merge([halved(plane, slot.level) for plane in planes], dst=place)
+        if curves is not None and curves[slot.source].gain != 1:
+            curves[slot.source].write(image, place)
+        elif image is not place:
+            place[...] = image
     return atlas
 
 
@@ -204,8 +215,14 @@ def remap(atlas: np.ndarray, at: FixedMap, interpolation: str, dst: np.ndarray |
 
 
 # --- torch ------------------------------------------------------------------------------------------------------------
-def torch_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Tensor:
-    """The atlas (B, 3, rows, columns) float32 of (B, 3, H, W) images in 0..255 or [0, 1]; differentiable."""
+def torch_atlas(
+    layout: AtlasLayout, images: Sequence[torch.Tensor], curves: Sequence[Sequence[ToneCurve] | None] | None = None
+) -> torch.Tensor:
+    """The atlas (B, 3, rows, columns) float32 of (B, 3, H, W) images in 0..255 or [0, 1]; differentiable.
+
+    Tone curves, where given, are one for each image, for each frame of the batch that has any.
+    """
+    whole = images[0].dtype == torch.uint8
     batch, device = images[0].shape[0], images[0].device
     atlas = torch.zeros((batch, 3, *layout.size), dtype=torch.float32, device=device)
     for slot in layout.slots:
@@ -213,10 +230,20 @@ def torch_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Te
         image = images[slot.source].float()
         for _ in range(slot.level):
             image = torch.nn.functional.avg_pool2d(image, 2)
-            if images[0].dtype == torch.uint8:
+            if whole:
                 image = torch.floor(image + 0.5)  # as OpenCV rounds its halved uint8 images
+        if curves is not None:
+            frames = zip(image, curves, strict=True)
+            image = torch.stack([_toned(one, of[slot.source], whole) if of else one for one, of in frames])
         atlas[:, :, slot.y : slot.y + h, slot.x : slot.x + w] = image
     return atlas
+
+
+def _toned(image: torch.Tensor, curve: ToneCurve, whole: bool) -> torch.Tensor:
+    """An image after its curve; rounded where the OpenCV execution looks whole numbers up in a table."""
+    if curve.gain == 1:
+        return image
+    return torch.floor(curve.of_tensor(image, 255.0) + 0.5).clamp(0, 255) if whole else curve.of_tensor(image)
 
 
 def torch_grid(uv: npt.NDArray[np.floating], atlas_size: tuple[int, int], device: torch.device) -> torch.Tensor:

@@ -17,6 +17,7 @@ from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError
 from arbiview_aug.explain import Explanation
 from arbiview_aug.favs.config import FavsConfig, Quality, favs_config
+from arbiview_aug.favs.photometric import Harmonise, Harmoniser, PhotometricReport
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
 from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_target, target_labels
 from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
@@ -57,6 +58,9 @@ class RigRetarget(torch.nn.Module):
         path: ``favs``: stitching.
         quality: ``draft``, ``fast``, or a ``FavsConfig``.
         surface: ``far``, ``ground``, ``street``; ``auto`` decides per pair of cameras.
+        harmonise: Bring the sources to one exposure (``arbiview_aug.favs.photometric``): True or a ``HarmoniseConfig``
+            estimates a gain for each camera in every frame; numbers are gains to use as they are. Off by default.
+            Samples that ``p`` skips keep their colours.
         size: (h, w) of every output image; the target cameras are resized to it.
         p: Probability of retargeting. A skipped sample keeps its own cameras, resized to ``size``, with full coverage;
             so ``p < 1`` needs ``size`` and equal camera counts. The output then always has ``lens``, ``distortion``
@@ -85,6 +89,7 @@ class RigRetarget(torch.nn.Module):
         path: Literal["favs"] = "favs",
         quality: Quality | FavsConfig = "fast",
         surface: SurfaceName = "auto",
+        harmonise: Harmonise = None,
         size: tuple[int, int] | None = None,
         p: float = 1.0,
         rng: torch.Generator | None = None,
@@ -115,6 +120,7 @@ class RigRetarget(torch.nn.Module):
             self.target = load_rig(target_rig)
         self.source_rig = source_rig if isinstance(source_rig, Rig) or source_rig is None else load_rig(source_rig)
         self.config = favs_config(quality)
+        self.harmoniser = Harmoniser(harmonise)
         self.path, self.surface, self.p, self.rng = path, surface, float(p), rng
         self.size = None if size is None else _checked_size(size)
         self.label_frame, self.label_keys, self.label_fill = label_frame, tuple(label_keys), label_fill
@@ -130,7 +136,8 @@ class RigRetarget(torch.nn.Module):
     def extra_repr(self) -> str:
         """Target and settings, for ``repr``."""
         target = self.target if isinstance(self.target, RandomRig) else (self.target.name or "unnamed rig")
-        return f"target={target}, surface={self.surface}, size={self.size}, p={self.p:g}, {self.config}"
+        settings = f"surface={self.surface}, harmonise={self.harmoniser}, size={self.size}, p={self.p:g}"
+        return f"target={target}, {settings}, {self.config}"
 
     # --- the transform --------------------------------------------------------------------------------------------
     def forward(self, sample: Mapping[str, Any], params: Mapping[str, float] | None = None) -> dict[str, Any]:
@@ -250,12 +257,14 @@ class RigRetarget(torch.nn.Module):
             elif self._uses_torch(frame):
                 together.setdefault(id(view), []).append(b)
             else:
-                done[b] = render_opencv(view, frame.images, self._scratch)
+                curves = self.harmoniser.curves(frame.rig, frame.images)
+                done[b] = render_opencv(view, frame.images, self._scratch, curves)
         for members in together.values():
             plan = views[members[0]]
             assert isinstance(plan, RenderPlan)
             sources = zip(*(frames[b].images for b in members), strict=True)
-            rendered = render_torch(plan, [torch.stack(images) for images in sources])
+            toned = [self.harmoniser.curves(frames[b].rig, frames[b].images) for b in members]
+            rendered = render_torch(plan, [torch.stack(images) for images in sources], toned)
             for k, b in enumerate(members):
                 done[b] = [image[k] for image in rendered]
         return [done[b] for b in range(len(frames))]
@@ -315,7 +324,13 @@ class RigRetarget(torch.nn.Module):
         """
         frame = check_inputs(sample, self.source_rig)[0]
         target, _, _ = self._draw(sample, [frame], None)
-        return Explanation(self.plan(frame.rig, target))
+        asked = self.harmoniser.estimates or self.harmoniser.gains is not None
+        return Explanation(self.plan(frame.rig, target), self.harmonisation(sample) if asked else None)
+
+    def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
+        """The gains that a sample's source images would get, and why; of a batch, its first frame."""
+        frame = check_inputs(sample, self.source_rig)[0]
+        return self.harmoniser.report(frame.rig, frame.images)
 
     def _warn_once(self, topic: str, message: str) -> None:
         if topic not in self._warned:

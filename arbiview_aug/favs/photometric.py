@@ -11,6 +11,8 @@ chessboard) is fitted to, the other half decides whether the gains are accepted.
 
 from __future__ import annotations
 
+import math
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
@@ -21,14 +23,16 @@ import numpy.typing as npt
 import torch
 
 from arbiview_aug.camera import BoolArray
+from arbiview_aug.errors import SampleError
 from arbiview_aug.maps import edge_distance, ego_rays, project_rays
 from arbiview_aug.neighbours import adjacent_pairs, half_way_view, odd_tiles
 from arbiview_aug.rig import Rig, content_order
+from arbiview_aug.sampling import Slot, halved, interleaved, level_size
 from arbiview_aug.surface import make_surface
 from arbiview_aug.tone import KNEE, ToneCurve
 
 _VIEW_SIZE, _TILE_PX = (225, 400), 16  # the evaluation's views and tiles at half resolution
-_SOURCE_WIDTH_PX = 400  # sources are reduced to about this width: exposure is seen at any resolution, edges mislead
+_SOURCE_WIDTH_PX = 320  # sources are halved down to no less: exposure is seen at any resolution, edges mislead
 _Pixels = npt.NDArray[np.float32]
 
 
@@ -117,7 +121,7 @@ class Overlap(NamedTuple):
     Attributes:
         a: Index of one camera in content order.
         b: Index of the other.
-        at: Where each of the two reduced sources is read, (2, n, 2) float32, fitted pixels first.
+        at: Where each of the two halved sources is read, (2, n, 2) float32, fitted pixels first.
         fitted: How many pixels are fitted to; the others are held out.
     """
 
@@ -132,12 +136,12 @@ class Overlaps(NamedTuple):
 
     Attributes:
         order: Indices of the rig's cameras in content order: the result must not depend on the list's.
-        sizes: (h, w) to which each camera's image is reduced, in content order.
+        levels: How many times each camera's image is halved before it is read, in content order.
         pairs: The adjacent pairs that see enough in common.
     """
 
     order: tuple[int, ...]
-    sizes: tuple[tuple[int, int], ...]
+    levels: tuple[int, ...]
     pairs: tuple[Overlap, ...]
 
 
@@ -146,31 +150,29 @@ def find_overlaps(rig: Rig, config: HarmoniseConfig | None = None) -> Overlaps:
     config = config or HarmoniseConfig()
     order = tuple(content_order(rig.cameras))
     rig = rig.with_cameras([rig[k] for k in order])
-    sizes = []
-    for h, w in rig.sizes:
-        scale = min(1.0, _SOURCE_WIDTH_PX / w)
-        sizes.append((max(1, round(h * scale)), max(1, round(w * scale))))
-    small = [camera.resize(size) for camera, size in zip(rig, sizes, strict=True)]
+    levels = tuple(max(0, math.floor(math.log2(w / _SOURCE_WIDTH_PX))) for _, w in rig.sizes)
+    slots = [Slot(k, level, 0, 0, level_size(rig[k].size, level)) for k, level in enumerate(levels)]
     even = ~odd_tiles(_VIEW_SIZE, _TILE_PX)
-    held_out = odd_tiles(_VIEW_SIZE, _TILE_PX // 2)
+    held_out = odd_tiles(_VIEW_SIZE, _TILE_PX // 2)[even]
     surface = make_surface("street", rig.ground_z_m)
     pairs = []
     for a, b in adjacent_pairs(rig):
         view = half_way_view(rig[a], rig[b], _VIEW_SIZE)
-        rays, both = ego_rays(view, view.pixel_grid())
-        both = both & even
+        rays, valid = ego_rays(view, view.pixel_grid()[even])
         q = surface.inverse_distance(view.center_m, rays)
-        read = []
-        for source in (small[a], small[b]):
-            uv, valid = project_rays(source, rays, q, view.center_m - source.center_m)
-            # A pixel and more away from border and own car: reduced pixels mix what lies beside them.
-            both &= valid & (edge_distance(source, uv) > 1.5)
-            read.append(uv)
-        fit, test = both & ~held_out, both & held_out
-        if min(fit.sum(), test.sum()) >= config.min_pixels:
-            at = np.stack([np.concatenate([uv[fit], uv[test]]) for uv in read]).astype(np.float32)
-            pairs.append(Overlap(a, b, at, int(fit.sum())))
-    return Overlaps(order, tuple(sizes), tuple(pairs))
+        both = np.flatnonzero(valid)
+        reads: list[npt.NDArray[np.floating]] = []
+        for k in (a, b):
+            uv, valid = project_rays(rig[k], rays[both], q[both], view.center_m - rig[k].center_m)
+            # Halved pixels mix what lies beside them: keep away from border and own car.
+            seen = valid & (edge_distance(rig[k], uv) > 1.5 * 2 ** levels[k])
+            both = both[seen]
+            reads = [read[seen] for read in reads] + [slots[k].from_source(uv[seen])]
+        fitted = np.concatenate([np.flatnonzero(~held_out[both]), np.flatnonzero(held_out[both])])
+        count = int((~held_out[both]).sum())
+        if min(count, len(both) - count) >= config.min_pixels:
+            pairs.append(Overlap(a, b, np.stack(reads)[:, fitted].astype(np.float32), count))
+    return Overlaps(order, levels, tuple(pairs))
 
 
 def estimate_gains(
@@ -196,10 +198,8 @@ def estimate_gains(
     none = (1.0,) * len(rig)
     if not overlaps.pairs:
         return PhotometricReport(none, False, "no two cameras overlap enough")
-    small = [_reduced(images[k], size) for k, size in zip(overlaps.order, overlaps.sizes, strict=True)]
-    seen = [
-        (pair, _read(small[pair.a], pair.at[0]), _read(small[pair.b], pair.at[1])) for pair in overlaps.pairs
-    ]
+    small = [_reduced(images[k], level) for k, level in zip(overlaps.order, overlaps.levels, strict=True)]
+    seen = [(pair, _read(small[pair.a], pair.at[0]), _read(small[pair.b], pair.at[1])) for pair in overlaps.pairs]
     measured = [_log_ratio(one[: pair.fitted], two[: pair.fitted], config) for pair, one, two in seen]
     if all(ratio is None for ratio in measured):
         return PhotometricReport(none, False, "too few pixels in the overlaps are neither dark nor saturated")
@@ -221,19 +221,18 @@ def estimate_gains(
     return PhotometricReport(gains, True, words, before, after)
 
 
-def _reduced(image: torch.Tensor, size: tuple[int, int]) -> _Pixels:
-    """The image (h, w, 3) float32 in [0, 1], averaged down."""
+def _reduced(image: torch.Tensor, level: int) -> _Pixels:
+    """The image (h, w, 3) float32 in [0, 1], halved ``level`` times."""
     image = image.detach()
+    top = np.float32(255 if image.dtype == torch.uint8 else 1)
     if image.device.type != "cpu" or image.dtype not in (torch.uint8, torch.float32):
-        scale = 255.0 if image.dtype == torch.uint8 else 1.0
-        mean = torch.nn.functional.interpolate(image[None].float() / scale, size=size, mode="area")[0]
-        return np.ascontiguousarray(mean.permute(1, 2, 0).cpu().numpy())
-    if image.permute(1, 2, 0).is_contiguous():
-        small = cv2.resize(image.permute(1, 2, 0).numpy(), size[::-1], interpolation=cv2.INTER_AREA)
+        planes = torch.nn.functional.avg_pool2d(image.float(), 2**level).cpu().numpy()
+        small = np.ascontiguousarray(planes.transpose(1, 2, 0))
+    elif (array := interleaved(image)) is not None:
+        small = halved(array, level)
     else:
-        planes = image.contiguous().numpy()
-        small = np.stack([cv2.resize(plane, size[::-1], interpolation=cv2.INTER_AREA) for plane in planes], -1)
-    return small.astype(np.float32) / np.float32(255 if image.dtype == torch.uint8 else 1)
+        small = np.stack([halved(plane, level) for plane in image.contiguous().numpy()], -1)
+    return small.astype(np.float32) / top
 
 
 def _read(image: _Pixels, at: _Pixels) -> _Pixels:
@@ -282,3 +281,80 @@ def _raw_db(pairs: Sequence[tuple[npt.NDArray[np.floating], npt.NDArray[np.float
     """PSNR in dB between the two readings of each pair, mean over pairs."""
     errors = [float(np.mean(np.square(one - two, dtype=np.float64))) for one, two in pairs]
     return float(np.mean([-10 * np.log10(max(error, 1e-10)) for error in errors]))
+
+
+Harmonise = bool | HarmoniseConfig | Sequence[float] | None
+"""What a user can ask for: no harmonisation, gains estimated for every frame, or gains of their own."""
+
+
+class Harmoniser:
+    """A user's choice of harmonisation, as tone curves for a frame.
+
+    Holds the overlaps of the last few calibrations, nothing of any image. Pickles without them.
+
+    Args:
+        choice: None and False: no harmonisation; True or a ``HarmoniseConfig``: gains estimated for every frame;
+            numbers: gains, one for each source camera, used as they are.
+
+    Raises:
+        ValueError: Anything else, or gains that are not positive numbers.
+    """
+
+    def __init__(self, choice: Harmonise = None) -> None:
+        self.config = choice if isinstance(choice, HarmoniseConfig) else HarmoniseConfig()
+        self.estimates = choice is True or isinstance(choice, HarmoniseConfig)
+        self.gains = None if self.estimates or choice is None or choice is False else _checked_gains(choice)
+        self._overlaps: OrderedDict[bytes, Overlaps] = OrderedDict()
+
+    def __repr__(self) -> str:
+        if self.gains is not None:
+            return f"({', '.join(f'{gain:g}' for gain in self.gains)})"
+        return repr(self.config) if self.estimates else "off"
+
+    def __reduce__(self) -> tuple[type[Harmoniser], tuple[Harmonise]]:
+        return Harmoniser, (self.config if self.estimates else self.gains,)
+
+    def report(self, rig: Rig, images: Sequence[torch.Tensor]) -> PhotometricReport:
+        """The gains of a frame, and why.
+
+        Raises:
+            SampleError: A number of gains that is not the frame's number of cameras.
+        """
+        if self.gains is not None:
+            if len(self.gains) != len(rig):
+                raise SampleError(f"harmonise: expected a gain for each of {len(rig)} cameras, got {len(self.gains)}")
+            return PhotometricReport(self.gains, True, "given")
+        if not self.estimates:
+            return PhotometricReport((1.0,) * len(rig), False, "harmonise is off")
+        return estimate_gains(rig, images, self.config, overlaps=self._overlaps_of(rig))
+
+    def curves(self, rig: Rig, images: Sequence[torch.Tensor]) -> tuple[ToneCurve, ...] | None:
+        """A tone curve for each camera, or None where the images stay as they are."""
+        if self.gains is None and not self.estimates:
+            return None
+        gains = self.report(rig, images).gains
+        return None if all(g == 1 for g in gains) else tuple(ToneCurve(g, self.config.knee) for g in gains)
+
+    def _overlaps_of(self, rig: Rig) -> Overlaps:
+        key = rig.content_key
+        if key not in self._overlaps:
+            self._overlaps[key] = find_overlaps(rig, self.config)
+            while len(self._overlaps) > _HELD_RIGS:
+                self._overlaps.popitem(last=False)
+        self._overlaps.move_to_end(key)
+        return self._overlaps[key]
+
+
+_HELD_RIGS = 8  # about 0.2 MB each; every frame of a drive may have a calibration of its own
+
+
+def _checked_gains(choice: object) -> tuple[float, ...]:
+    try:
+        gains = tuple(float(gain) for gain in choice)  # type: ignore[attr-defined]
+    except (TypeError, ValueError):
+        gains = ()
+    if not gains or not all(math.isfinite(gain) and gain > 0 for gain in gains):
+        raise ValueError(
+            f"harmonise: expected None, a bool, a HarmoniseConfig or a positive gain for each camera, got {choice!r}"
+        )
+    return gains
