@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-KNEE = 0.85
+KNEE = 0.9
 """Where a gain begins to fade, as a share of the scale: see ``HarmoniseConfig.knee``."""
 
 

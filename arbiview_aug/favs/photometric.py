@@ -53,8 +53,9 @@ class HarmoniseConfig:
 
     knee: float = KNEE
     """Where a gain begins to fade towards saturation, as a share of the scale: a saturated sky has lost its
-    brightness, and a darker one beside a bright road would be wrong. 0.75 to 0.99 are within 0.15 dB of each other on
-    nuScenes and DDAD frames, 0.5 loses 1.1 on nuScenes."""
+    brightness, and a darker one beside a bright road would be wrong. Overlaps of nuScenes and DDAD frames are within
+    0.15 dB from 0.75 to 0.99; against synthetic truth higher is better, by 0.5 dB at most; but a gain of 0.5 with a
+    knee of 0.95 stretches the greys above it tenfold, which shows in clouds."""
 
     dark: float = 0.03
     """Pixels below this share of the scale say nothing of exposure: noise and black level."""
@@ -96,7 +97,7 @@ class PhotometricReport:
     """What harmonisation does to a frame, and why; ``str`` says it in words.
 
     Attributes:
-        gains: One for each source camera, geometric mean 1 before the clamp; all 1 where they were declined.
+        gains: One for each source camera, median 1 before the clamp; all 1 where they were declined.
         accepted: Whether the images are changed.
         reason: Why, or why not.
         raw_db_before: PSNR between neighbours on held-out tiles, mean over pairs; None where nothing was measured.
@@ -264,9 +265,15 @@ def _solve(
     measured: Sequence[tuple[float, float] | None],
     config: HarmoniseConfig,
 ) -> npt.NDArray[np.float64]:
-    """Log-gains that bring every pair together, weighted, with the prior; they sum to 0 in every connected group."""
+    """Log-gains that bring every pair together, weighted, with the prior; their median is 0 in every connected group.
+
+    Pairs know nothing of the common level. Around the median one odd camera gives way and the others keep their
+    exposure; around the mean all would move (against the truth of synthetic streets with one camera exposed by 0.7 or
+    1.3: 51 to 84 % of the lost PSNR back, 68 to 100 % with the median).
+    """
     normal = np.eye(count) / config.prior_log_gain**2
     right = np.zeros(count)
+    group = np.arange(count)
     for pair, ratio in zip(pairs, measured, strict=True):
         if ratio is None:
             continue
@@ -274,7 +281,11 @@ def _solve(
         row[pair.a], row[pair.b] = 1, -1
         normal += np.outer(row, row) / ratio[1]
         right -= row * ratio[0] / ratio[1]
-    return np.asarray(np.linalg.solve(normal, right))
+        group[group == group[pair.b]] = group[pair.a]
+    log_gains = np.asarray(np.linalg.solve(normal, right))
+    for name in np.unique(group):
+        log_gains[group == name] -= np.median(log_gains[group == name])
+    return log_gains
 
 
 def _raw_db(pairs: Sequence[tuple[npt.NDArray[np.floating], npt.NDArray[np.floating]]]) -> float:
