@@ -43,6 +43,15 @@ class TargetRays:
         planes = np.ascontiguousarray(np.moveaxis(self.directions[self.sparse_index], -1, 0))
         self.sparse = np.moveaxis(planes, 0, -1), self.valid[self.sparse_index]
 
+    def detailed(self, surface: Surface) -> BoolArray | None:
+        """Cells (ny - 1, nx - 1) so near to a surface's detail that they, or their cubic neighbours, could miss it."""
+        spacing = float(np.linalg.norm(np.diff(self.directions, axis=1), axis=-1).max(initial=0.0))
+        near = surface.detailed(self.camera.center_m, self.directions, spacing)
+        if near is None:
+            return None
+        # A node's value reaches three cells away through two cubic halvings.
+        return cv2.dilate(near.astype(np.uint8), np.ones((8, 8), np.uint8), anchor=(3, 3))[:-1, :-1] > 0
+
     def inverse_distance(self, surface: Surface) -> FloatArray:
         """(ny, nx) on the nodes; evaluated once for each surface."""
         if surface not in self._inverse:
@@ -66,7 +75,7 @@ class PairMap:
         self.nodes: Box | None = None
         if self._look_apart() or (rays.grid.step > 1 and not self._glance()):
             return
-        self.uv, self.valid = project_rays(source, rays.directions, rays.inverse_distance(surface), self.offset_m)
+        self.uv, self.valid = self._seen(rays.directions, rays.inverse_distance(surface))
         self.valid &= rays.valid
         self._exact = np.zeros((0, 0), bool)
         self._use: BoolArray | None = None
@@ -155,14 +164,24 @@ class PairMap:
             mean = sum(uv[c] for c in _CORNERS) / 4
             cell = np.maximum(cell, 4 * _larger(mean - centre))
         bound[j0:j1, i0:i1] = cell
-        return bound > tolerance_px
+        too_curved = bound > tolerance_px
+        detailed = self.rays.detailed(self.surface)
+        return too_curved if detailed is None else too_curved | detailed
 
     def _evaluate(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Source pixels of target pixels (..., 2) in float64, and where they are valid."""
         directions, ray_valid = ego_rays(self.rays.camera, pixels)
         q = self.surface.inverse_distance(self.rays.camera.center_m, directions)
-        uv, valid = project_rays(self.source, directions, q, self.offset_m)
+        uv, valid = self._seen(directions, q)
         return uv, valid & ray_valid
+
+    def _seen(self, directions: FloatArray, q: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Source pixels of scene points, valid where the scene does not hide them from the source."""
+        uv, valid = project_rays(self.source, directions, q, self.offset_m)
+        towards = directions + q[..., None] * self.offset_m  # from the source, scaled by q
+        length = np.linalg.norm(towards, axis=-1)
+        hidden = self.surface.hides(self.source.center_m, towards / length[..., None], q / length)
+        return uv, valid if hidden is None else valid & ~hidden
 
     def full_resolution(
         self, slot: Slot, rows: tuple[int, int]

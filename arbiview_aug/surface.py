@@ -11,9 +11,9 @@ from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 
-from arbiview_aug.camera import FloatArray
+from arbiview_aug.camera import BoolArray, FloatArray
 
-SurfaceName = Literal["auto", "far", "ground", "street"]
+SurfaceName = Literal["auto", "far", "ground", "street", "objects"]
 """Surfaces a user can ask for. ``auto`` decides per pair of target and source camera (see ``plan``)."""
 
 MAX_INVERSE_DISTANCE = 100.0
@@ -42,9 +42,29 @@ class Surface(Protocol):
         """
         ...
 
+    def hides(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> BoolArray | None:
+        """Whether the scene itself stands between ``origin`` and points on unit rays; None where it never does."""
+        ...
+
+    def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray | None:
+        """Rays within an angle of detail that a coarse grid could miss; None where there is none."""
+        ...
+
+
+class _Static:
+    """A surface that hides nothing and has no detail of its own."""
+
+    def hides(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> BoolArray | None:
+        """Nothing."""
+        return None
+
+    def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray | None:
+        """None."""
+        return None
+
 
 @dataclass(frozen=True)
-class Far:
+class Far(_Static):
     """Everything is infinitely far away: the paper's rotation-only model (Sec. FAVS, Stage 1)."""
 
     smooth: ClassVar[bool] = True
@@ -55,7 +75,7 @@ class Far:
 
 
 @dataclass(frozen=True)
-class Ground:
+class Ground(_Static):
     """The road plane up to a cylinder: the plain reference surface.
 
     Attributes:
@@ -74,7 +94,7 @@ class Ground:
 
 
 @dataclass(frozen=True)
-class Street:
+class Street(_Static):
     """The road joined softly to an elliptical far wall: no crease, houses nearer at the sides than ahead.
 
     The p-norm of two inverse distances, (q_road^k + q_wall^k)^(1/k), is a smooth minimum of the distances: it
@@ -114,13 +134,6 @@ class Street:
         ratio = beyond / np.maximum(near, 1e-300)
         joined = near * (1 + ratio**self.sharpness) ** (1 / self.sharpness)
         return np.minimum(joined, MAX_INVERSE_DISTANCE)
-
-
-def make_surface(name: str, ground_z_m: float) -> Surface:
-    """The surface of a name (not ``auto``) over a road at ``ground_z_m``."""
-    if name == "far":
-        return Far()
-    return Ground(ground_z_m=ground_z_m) if name == "ground" else Street(ground_z_m=ground_z_m)
 
 
 def plane_inverse_distance(origin: FloatArray, directions: FloatArray, ground_z_m: float) -> FloatArray:

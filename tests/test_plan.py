@@ -11,7 +11,7 @@ from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.maps import ego_rays, project_rays
 from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
 from arbiview_aug.rig import Rig, load_rig
-from arbiview_aug.surface import make_surface
+from arbiview_aug.objects import scene_surfaces
 
 MAP_TOLERANCE_PX = 1 / 32
 
@@ -20,7 +20,7 @@ def reference(plan: RenderPlan, k: int, surface: str, source: int) -> tuple[np.n
     """Source pixels and visibility of every target pixel, evaluated one by one in float64."""
     camera, recorded = plan.target[k], plan.source[source]
     directions, ray_valid = ego_rays(camera, camera.pixel_grid())
-    q = make_surface(surface, plan.source.ground_z_m).inverse_distance(camera.center_m, directions)
+    q = scene_surfaces(plan.source.ground_z_m, None)[surface].inverse_distance(camera.center_m, directions)
     uv, valid = project_rays(recorded, directions, q, camera.center_m - recorded.center_m)
     return uv, valid & ray_valid & recorded.contains(uv)
 
