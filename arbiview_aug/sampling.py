@@ -134,11 +134,11 @@ class Scratch:
         self._local = threading.local()
 
     def get(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> np.ndarray:
-        """A buffer of this shape and type with undefined content."""
+        """A buffer of this shape and type with undefined, but finite content: bilinear taps of weight 0 read it."""
         buffers = self._local.__dict__
         held = buffers.get(name)
         if held is None or held.shape != shape or held.dtype != dtype:
-            buffers[name] = held = np.empty(shape, dtype)
+            buffers[name] = held = np.zeros(shape, dtype)
         return held
 
     def __reduce__(self) -> tuple[type[Scratch], tuple[()]]:
@@ -177,10 +177,12 @@ def _stacked_block(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> np.nd
     first = interleaved(images[0])
     if first is None:
         return None
-    step = first.nbytes
+    step, storage = first.nbytes, images[0].untyped_storage()
     for k, image in enumerate(images):
         if image.data_ptr() != images[0].data_ptr() + k * step or image.stride() != images[0].stride():
             return None
+        if image.untyped_storage().data_ptr() != storage.data_ptr():
+            return None  # neighbours in memory by chance, or slices of one numpy array
     h, w = images[0].shape[1:]
     stack = torch.as_strided(images[0], (len(images) * h, w, 3), (w * 3, 3, 1))
     return stack.numpy()
