@@ -18,8 +18,9 @@ import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.grid import HALVINGS, Box, Grid
+from arbiview_aug.objects import Surface
 from arbiview_aug.sampling import Slot
-from arbiview_aug.surface import Surface
+from arbiview_aug.surface import Static
 
 _SAFETY = 2.0  # curvature between the nodes may exceed what the nodes show
 _CORNERS = tuple((a, b) for a in (slice(None, -1), slice(1, None)) for b in (slice(None, -1), slice(1, None)))
@@ -43,14 +44,10 @@ class TargetRays:
         planes = np.ascontiguousarray(np.moveaxis(self.directions[self.sparse_index], -1, 0))
         self.sparse = np.moveaxis(planes, 0, -1), self.valid[self.sparse_index]
 
-    def detailed(self, surface: Surface) -> BoolArray | None:
-        """Cells (ny - 1, nx - 1) so near to a surface's detail that they, or their cubic neighbours, could miss it."""
-        spacing = float(np.linalg.norm(np.diff(self.directions, axis=1), axis=-1).max(initial=0.0))
-        near = surface.detailed(self.camera.center_m, self.directions, spacing)
-        if near is None:
-            return None
-        # A node's value reaches three cells away through two cubic halvings.
-        return cv2.dilate(near.astype(np.uint8), np.ones((8, 8), np.uint8), anchor=(3, 3))[:-1, :-1] > 0
+    @cached_property
+    def spacing_rad(self) -> float:
+        """Largest angle between neighbouring nodes' rays."""
+        return float(np.sqrt((np.diff(self.directions, axis=1) ** 2).sum(-1)).max(initial=0.0))
 
     def inverse_distance(self, surface: Surface) -> FloatArray:
         """(ny, nx) on the nodes; evaluated once for each surface."""
@@ -165,8 +162,18 @@ class PairMap:
             cell = np.maximum(cell, 4 * _larger(mean - centre))
         bound[j0:j1, i0:i1] = cell
         too_curved = bound > tolerance_px
-        detailed = self.rays.detailed(self.surface)
-        return too_curved if detailed is None else too_curved | detailed
+        return too_curved if isinstance(self.surface, Static) else too_curved | self._detailed()
+
+    def _detailed(self) -> BoolArray:
+        """Cells (ny - 1, nx - 1) so near to the surface's detail, as target or source see it, that they could miss it.
+
+        They include those whose cubic neighbours could: a node reaches three cells away through two halvings.
+        """
+        towards, _ = self._from_source(self.rays.directions, self.rays.inverse_distance(self.surface))
+        near = np.zeros(self.valid.shape, bool)
+        for origin, rays in ((self.rays.camera.center_m, self.rays.directions), (self.source.center_m, towards)):
+            near |= self.surface.detailed(origin, rays, self.rays.spacing_rad)
+        return cv2.dilate(near.astype(np.uint8), np.ones((8, 8), np.uint8), anchor=(3, 3))[:-1, :-1] > 0
 
     def _evaluate(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Source pixels of target pixels (..., 2) in float64, and where they are valid."""
@@ -178,10 +185,16 @@ class PairMap:
     def _seen(self, directions: FloatArray, q: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Source pixels of scene points, valid where the scene does not hide them from the source."""
         uv, valid = project_rays(self.source, directions, q, self.offset_m)
-        towards = directions + q[..., None] * self.offset_m  # from the source, scaled by q
-        length = np.linalg.norm(towards, axis=-1)
-        hidden = self.surface.hides(self.source.center_m, towards / length[..., None], q / length)
-        return uv, valid if hidden is None else valid & ~hidden
+        if isinstance(self.surface, Static):
+            return uv, valid
+        towards, from_source = self._from_source(directions, q)
+        return uv, valid & ~self.surface.hides(self.source.center_m, towards, from_source, 1 / self.source.K[0, 0])
+
+    def _from_source(self, directions: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Unit rays (..., 3) from the source to scene points on target rays, and inverse distances along them."""
+        towards = directions + q[..., None] * self.offset_m  # scaled by q
+        length = np.sqrt((towards * towards).sum(-1))
+        return towards / length[..., None], q / length
 
     def full_resolution(
         self, slot: Slot, rows: tuple[int, int]
@@ -333,10 +346,11 @@ def _mask_at(source: Camera, slot: Slot, at: npt.NDArray[np.float32]) -> npt.NDA
     clean: Any = source.mask.astype(np.uint8) * 255
     if slot.level:
         # A halved pixel is clean where every pixel in it is.
-        clean = cv2.compare(cv2.resize(clean, slot.size[::-1], interpolation=cv2.INTER_AREA), 255, cv2.CMP_EQ)
+        halved = cv2.resize(clean, slot.size[::-1], interpolation=cv2.INTER_AREA)
+        clean = np.where(halved == 255, 255, 0).astype(np.uint8)
     local = at - np.array([slot.x, slot.y], np.float32) if slot.x or slot.y else at
     share = cv2.remap(clean, local, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-    return np.asarray(cv2.compare(share, 255, cv2.CMP_EQ), np.uint8)
+    return np.where(share == 255, 255, 0).astype(np.uint8)
 
 
 def edge_distance(source: Camera, uv: FloatArray) -> FloatArray:

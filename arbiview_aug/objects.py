@@ -16,13 +16,15 @@ import numpy as np
 
 from arbiview_aug.camera import BoolArray, FloatArray
 from arbiview_aug.errors import SampleError
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Far, Ground, Street, Surface
+from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Far, Ground, Static, Street
 
 _BLOCK = 512
 
-HIDING_MARGIN_M = 0.15
-"""A point this close behind the face of a box still belongs to it: labels are drawn with a few centimetres of air."""
+AIR_M = 0.03
+"""Boxes are drawn this much too tight or too wide by labellers; for hiding they are enlarged by it, and by a pixel."""
 
+_LEAST_INCIDENCE = 0.2
+"""Sine of the flattest angle (12 degrees) at which a source may look along a face and still be read for it."""
 
 @dataclass(frozen=True, eq=False)
 class Objects:
@@ -39,12 +41,19 @@ class Objects:
 
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """The nearer of street and boxes, 1/m (...,)."""
-        return np.maximum(self.street.inverse_distance(origin, directions), self._boxes_ahead(origin, directions))
+        return np.maximum(self.street.inverse_distance(origin, directions), self._boxes_ahead(origin, directions)[0])
 
-    def hides(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> BoolArray:
-        """Whether a box stands between ``origin`` and the points at these inverse distances along unit rays."""
-        first = self._boxes_ahead(origin, directions)
-        return first * (1 - HIDING_MARGIN_M * inverse_distance) > inverse_distance * (1 + 1e-6)
+    def hides(
+        self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
+    ) -> BoolArray:
+        """Whether a box stands between ``origin`` and points at these inverse distances along unit rays.
+
+        Boxes are enlarged by ``AIR_M`` and by the angle of a pixel, so that no pixel mixed with an object's colour is
+        read for what lies behind it. A box's own face lies behind its enlarged one by little, unless it is seen at
+        less than 12 degrees: then it counts as hidden.
+        """
+        first, air_m = self._boxes_ahead(origin, directions, AIR_M, pixel_rad)
+        return first * (1 - air_m / _LEAST_INCIDENCE * inverse_distance) > inverse_distance
 
     def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
         """Rays (...,) that pass a box within an angle, where nothing may be interpolated."""
@@ -63,10 +72,13 @@ class Objects:
             angle = float(np.arcsin(radius_m / distance_m)) if distance_m > radius_m else np.pi
             yield box, towards / max(distance_m, 1e-9), angle
 
-    def _boxes_ahead(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+    def _boxes_ahead(
+        self, origin: FloatArray, directions: FloatArray, air_m: float = 0.0, air_rad: float = 0.0
+    ) -> tuple[FloatArray, FloatArray]:
         """Inverse distance to the first box face along each ray, 0 where there is none (slab method).
 
-        Rays are handled in blocks, which are neighbours in the image: most boxes miss most blocks.
+        Rays are handled in blocks, which are neighbours in the image: most boxes miss most blocks. Boxes may be
+        enlarged on all sides by a length and an angle; how much the first one was is returned too, in metres.
         """
         n = math.prod(directions.shape[:-1])
         count = max(1, -(-n // _BLOCK))
@@ -74,12 +86,18 @@ class Objects:
         centre = rays.mean(axis=1)
         centre /= np.maximum(np.linalg.norm(centre, axis=-1, keepdims=True), 1e-9)
         spread = np.arccos(np.clip(np.einsum("bnk,bk->bn", rays, centre).min(axis=1), -1, 1))
-        q = np.zeros((count, _BLOCK))
+        q, air = np.zeros((count, _BLOCK)), np.zeros((count, _BLOCK))
         for box, towards, angle in self._outside(origin):
-            passing = np.arccos(np.clip(centre @ towards, -1, 1)) <= angle + spread
+            more_m = air_m + air_rad * float(np.linalg.norm(box[:3] - origin))
+            widened = angle + 2 * more_m / max(float(np.linalg.norm(box[:3] - origin)), 1e-9)
+            passing = np.arccos(np.clip(centre @ towards, -1, 1)) <= widened + spread
             if passing.any():
-                q[passing] = np.maximum(q[passing], _first_face(box, origin, rays[passing]))
-        return q.reshape(-1)[:n].reshape(directions.shape[:-1])
+                larger = box + np.array([0, 0, 0, 2 * more_m, 2 * more_m, 2 * more_m, 0])
+                face = _first_face(larger, origin, rays[passing])
+                air[passing] = np.where(face > q[passing], more_m, air[passing])
+                q[passing] = np.maximum(q[passing], face)
+        shape = directions.shape[:-1]
+        return q.reshape(-1)[:n].reshape(shape), air.reshape(-1)[:n].reshape(shape)
 
 
 def _first_face(box: FloatArray, origin: FloatArray, directions: FloatArray) -> FloatArray:
@@ -118,6 +136,9 @@ def checked_boxes(boxes: Any) -> FloatArray:
         bad = int(np.flatnonzero(~np.isfinite(array).all(1) | (array[:, 3:6] <= 0).any(1))[0])
         raise SampleError(f"boxes_3d[{bad}]: expected finite numbers and positive sizes, got {array[bad].tolist()}")
     return array
+
+
+Surface = Static | Objects
 
 
 def scene_surfaces(ground_z_m: float, boxes: FloatArray | None) -> dict[str, Surface]:

@@ -111,9 +111,9 @@ def build_plan(
         target: The rig to render, in its own ego frame: the two roads are made to coincide.
         surface: ``far``, ``ground``, ``street``, ``objects`` (needs boxes); or ``auto``: for each pair of target and
             source camera, ``far`` where their centres coincide or the worst-case parallax is below
-            ``config.far_parallax_px``, else ``objects`` where there are boxes, else ``street``.
+            ``config.far_parallax_px``, else ``street``.
         config: Settings; the ``fast`` preset by default.
-        boxes: (B, 7) objects of the scene in the source's ego frame.
+        boxes: (B, 7) objects of the scene in the source's ego frame, for ``objects``.
 
     Returns:
         The plan. Targets that no source sees have zero coverage.

@@ -6,12 +6,13 @@ and rays that miss need no special cases, and a point X = o + d / q is handled a
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol
+from typing import ClassVar, Literal
 
 import numpy as np
 
-from arbiview_aug.camera import BoolArray, FloatArray
+from arbiview_aug.camera import FloatArray
 
 SurfaceName = Literal["auto", "far", "ground", "street", "objects"]
 """Surfaces a user can ask for. ``auto`` decides per pair of target and source camera (see ``plan``)."""
@@ -24,8 +25,8 @@ WALL_CENTER_M = (1.0, 0.0)
 0 and 2 m ahead are within 0.05 dB."""
 
 
-class Surface(Protocol):
-    """Anything that says how far away the scene is; hashable, and equal when it describes the same scene.
+class Static(ABC):
+    """A surface without objects: it hides nothing from any camera; hashable, equal when it describes the same scene.
 
     Attributes:
         smooth: Without creases: a map over it may be interpolated by what its values on a grid show.
@@ -33,6 +34,7 @@ class Surface(Protocol):
 
     smooth: ClassVar[bool]
 
+    @abstractmethod
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """Inverse distances (...,) in 1/m, 0 <= q <= ``MAX_INVERSE_DISTANCE``.
 
@@ -40,31 +42,10 @@ class Surface(Protocol):
             origin: (3,) the rays' common start in the ego frame, metres.
             directions: (..., 3) unit directions in the ego frame.
         """
-        ...
-
-    def hides(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> BoolArray | None:
-        """Whether the scene itself stands between ``origin`` and points on unit rays; None where it never does."""
-        ...
-
-    def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray | None:
-        """Rays within an angle of detail that a coarse grid could miss; None where there is none."""
-        ...
-
-
-class _Static:
-    """A surface that hides nothing and has no detail of its own."""
-
-    def hides(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> BoolArray | None:
-        """Nothing."""
-        return None
-
-    def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray | None:
-        """None."""
-        return None
 
 
 @dataclass(frozen=True)
-class Far(_Static):
+class Far(Static):
     """Everything is infinitely far away: the paper's rotation-only model (Sec. FAVS, Stage 1)."""
 
     smooth: ClassVar[bool] = True
@@ -75,7 +56,7 @@ class Far(_Static):
 
 
 @dataclass(frozen=True)
-class Ground(_Static):
+class Ground(Static):
     """The road plane up to a cylinder: the plain reference surface.
 
     Attributes:
@@ -94,7 +75,7 @@ class Ground(_Static):
 
 
 @dataclass(frozen=True)
-class Street(_Static):
+class Street(Static):
     """The road joined softly to an elliptical far wall: no crease, houses nearer at the sides than ahead.
 
     The p-norm of two inverse distances, (q_road^k + q_wall^k)^(1/k), is a smooth minimum of the distances: it

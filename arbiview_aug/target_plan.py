@@ -17,9 +17,10 @@ from arbiview_aug.favs.adaptive_fusion import distance_weight, primary_weight, q
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.grid import Box
 from arbiview_aug.maps import PairMap, TargetRays, edge_distance, resolution
+from arbiview_aug.objects import Surface
 from arbiview_aug.rig import Rig
 from arbiview_aug.sampling import AtlasLayout, FixedMap, Scratch
-from arbiview_aug.surface import Surface, depth_uncertainty, worst_parallax_px
+from arbiview_aug.surface import depth_uncertainty, worst_parallax_px
 
 SAME_CENTER_M = 1e-6
 """Centres closer than this coincide: a homography is exact whatever the scene."""
@@ -154,8 +155,7 @@ class TargetDraft:
         worst = worst_parallax_px(baseline_m, focal_px)
         if worst < self.config.far_parallax_px:
             return "far", f"worst-case parallax {worst:.2f} px"
-        best = "objects" if "objects" in self.surfaces else "street"
-        return best, f"centres {baseline_m:.2f} m apart"
+        return "street", f"centres {baseline_m:.2f} m apart"
 
     def _region(self, index: int) -> _Region | None:
         source = self.source[index]
