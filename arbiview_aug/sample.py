@@ -30,6 +30,7 @@ CALIBRATION_KEYS = (
 )
 """Keys that describe the source's images; they are replaced by the target's or consumed."""
 
+MAX_CAMERAS = 128  # winning sources are int8
 _OFF_CENTER = 0.2  # share of the image's size by which both coordinates of a principal point never lie off its centre
 
 
@@ -165,6 +166,8 @@ def _frame(
         rig = source_rig if source_rig is not None else _rig_from_tensors(images, sample, index)
     if not isinstance(rig, Rig):
         raise SampleTypeError(f"rig: expected an arbiview_aug.Rig, got {type(rig).__name__}; use load_rig(path)")
+    if len(rig) > MAX_CAMERAS:
+        raise SampleError(f"images: expected at most {MAX_CAMERAS} cameras, got {len(rig)}")
     if len(rig) != len(images):
         raise SampleError(f"images: expected {len(rig)} images for cameras {', '.join(rig.names)}, got {len(images)}")
     for camera, image in zip(rig, images, strict=True):
@@ -231,7 +234,7 @@ def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> li
         if coefficients is not None and coefficients.any():
             raise SampleError("distortion: expected 'lens' beside it, one of pinhole, radtan, fisheye a camera")
         return [("pinhole", ())] * count
-    if isinstance(names, str) or len(names) != count:
+    if not isinstance(names, list | tuple) or len(names) != count:
         raise SampleError(f"lens: expected a list of {count} names, one a camera, got {names!r}")
     lenses = [_entry(name, index) for name in names]
     if all(lens == "pinhole" for lens in lenses):

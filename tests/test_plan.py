@@ -41,6 +41,10 @@ CASES = {
     "radtan source": ("nuplan", lambda: half_size("argoverse2")),
     "fisheye target": ("nuscenes", lambda: half_size("fisheye_surround")),
     "fisheye source": ("fisheye_surround", lambda: half_size("nuscenes")),
+    "radtan source, fisheye target": ("waymo", lambda: half_size("fisheye_surround")),
+    "narrow lens between the nodes": ("nuplan", lambda: load_rig("fisheye_surround").resized(0.12)),
+    "at the wall": ("nuscenes", lambda: half_size("nuscenes").shifted(x_m=38.0)),
+    "far away": ("nuscenes", lambda: half_size("nuscenes").shifted(x_m=-150.0, z_m=20.0)),
     "pitched and rolled": ("ddad", lambda: half_size("ddad").turned(yaw_deg=40, pitch_deg=-20, roll_deg=30)),
 }
 

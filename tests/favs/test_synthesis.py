@@ -125,9 +125,9 @@ def test_no_view_depends_on_memory_that_no_image_fills(monkeypatch: pytest.Monke
     narrow, wide = load_rig("nuscenes").resized((45, 80)), load_rig("nuscenes").resized((90, 160))
     rig = narrow.with_cameras([*list(narrow)[:3], *list(wide)[3:]])
     plan = build_plan(rig, rig)
-    garbage = lambda shape, dtype: np.full(shape, np.nan, dtype)  # noqa: E731 - what np.empty may hold
-    monkeypatch.setattr(np, "empty", garbage)
-    views = render_opencv(plan, [image / 255 for image in noise_images(rig)])
+    images = [image / 255 for image in noise_images(rig)]
+    monkeypatch.setattr(np, "empty", lambda shape, dtype: np.full(shape, np.nan, dtype))  # what it may hold
+    views = render_opencv(plan, images)
     assert all(view.isfinite().all() for view in views)
 
 
