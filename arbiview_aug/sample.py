@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug.camera import BoolArray, Camera
+from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError, SampleTypeError
+from arbiview_aug.objects import checked_boxes
 from arbiview_aug.rig import Rig
 from arbiview_aug.tensors import leading_shape, split
 
@@ -76,6 +77,21 @@ def check_inputs(sample: Any, source_rig: Rig | None) -> list[SourceFrame]:
         _frame(_checked_images(frame), sample, source_rig, lead, index)
         for frame, index in zip(of_frames, indices, strict=True)
     ]
+
+
+def boxes_of_frames(sample: Mapping[str, Any], lead: tuple[int, ...]) -> list[FloatArray]:
+    """(B, 7) boxes of each frame of a sample, in the source's ego frame.
+
+    Raises:
+        SampleError: No boxes, or impossible ones.
+    """
+    boxes = sample.get("boxes_3d")
+    if boxes is None:
+        raise SampleError(
+            "surface='objects': expected 'boxes_3d' (B, 7) in the sample, got none; an empty (0, 7) tensor says that "
+            "nothing stands there"
+        )
+    return [checked_boxes(frame) for frame in (split(boxes, lead) if lead else [boxes])]
 
 
 # --- images -----------------------------------------------------------------------------------------------------------

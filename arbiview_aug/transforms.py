@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import torch
 
+from arbiview_aug.camera import FloatArray
 from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError
 from arbiview_aug.explain import Explanation
@@ -23,7 +24,7 @@ from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_targ
 from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
 from arbiview_aug.random_rig import RandomRig
 from arbiview_aug.rig import Rig, load_rig
-from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame, check_inputs
+from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame, boxes_of_frames, check_inputs
 from arbiview_aug.sampling import Scratch
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.tensors import covered, gathered, leading_shape, resized, rewrapped, stacked
@@ -57,7 +58,8 @@ class RigRetarget(torch.nn.Module):
         source_rig: The rig of every sample that carries none.
         path: ``favs``: stitching.
         quality: ``draft``, ``fast``, or a ``FavsConfig``.
-        surface: ``far``, ``ground``, ``street``; ``auto`` decides per pair of cameras.
+        surface: ``far``, ``ground``, ``street``; ``objects``: the sample's ``boxes_3d`` stand on the street, so that
+            objects keep their height when cameras move; ``auto`` decides per pair of cameras between far and street.
         harmonise: Bring the sources to one exposure (``arbiview_aug.favs.photometric``): True or a ``HarmoniseConfig``
             estimates a gain for each camera in every frame; numbers are gains to use as they are. Off by default.
             Samples that ``p`` skips keep their colours.
@@ -157,8 +159,9 @@ class RigRetarget(torch.nn.Module):
         labels = check_other_keys(sample, list(sizes), self.label_keys, self.pass_keys)
         target, skip, drawn = self._draw(sample, frames, params)
         views: list[RenderPlan | tuple[int, int]] = []
-        for frame in frames:
-            views.append(self.size if skip and self.size else self.plan(frame.rig, target))
+        scenes = self._scenes(sample, len(frames), lead)
+        for frame, boxes in zip(frames, scenes, strict=True):
+            views.append(self.size if skip and self.size else self.plan(frame.rig, target, boxes))
         parts = self._rendered(frames, views)
         out = self._kept(sample, labels)
         out["images"] = rewrapped(gathered([part["images"] for part in parts], lead), sample["images"])
@@ -286,13 +289,17 @@ class RigRetarget(torch.nn.Module):
             part["ignore"] = stacked([torch.from_numpy(~m).to(device) for m in masks])
         return part
 
-    def plan(self, source: Rig, target: Rig) -> RenderPlan:
-        """The cached render plan of a pair of rigs."""
-        key = plan_key(source, target, self.surface, self.config)
-        return self.plans.get(key, lambda: self._built(source, target))
+    def _scenes(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[FloatArray | None]:
+        """The boxes of each frame, where the surface stands on them."""
+        return boxes_of_frames(sample, lead) if self.surface == "objects" else [None] * count
 
-    def _built(self, source: Rig, target: Rig) -> RenderPlan:
-        plan = build_plan(source, target, surface=self.surface, config=self.config)
+    def plan(self, source: Rig, target: Rig, boxes: FloatArray | None = None) -> RenderPlan:
+        """The cached render plan of a pair of rigs, and of the objects that stand there."""
+        key = plan_key(source, target, self.surface, self.config, boxes)
+        return self.plans.get(key, lambda: self._built(source, target, boxes))
+
+    def _built(self, source: Rig, target: Rig, boxes: FloatArray | None) -> RenderPlan:
+        plan = build_plan(source, target, surface=self.surface, config=self.config, boxes=boxes)
         self._warn_unreachable(plan)
         return plan
 
@@ -322,10 +329,12 @@ class RigRetarget(torch.nn.Module):
 
         A random target is explained for one draw; no state changes, except that the draw advances the RNG.
         """
-        frame = check_inputs(sample, self.source_rig)[0]
-        target, _, _ = self._draw(sample, [frame], None)
+        frames, lead = check_inputs(sample, self.source_rig), leading_shape(sample["images"])
+        target, _, _ = self._draw(sample, frames[:1], None)
+        (boxes,) = self._scenes(sample, len(frames), lead)[:1]
         asked = self.harmoniser.estimates or self.harmoniser.gains is not None
-        return Explanation(self.plan(frame.rig, target), self.harmonisation(sample) if asked else None)
+        plan = self.plan(frames[0].rig, target, boxes)
+        return Explanation(plan, self.harmonisation(sample) if asked else None)
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
         """The gains that a sample's source images would get, and why; of a batch, its first frame."""

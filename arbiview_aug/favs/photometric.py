@@ -28,7 +28,7 @@ from arbiview_aug.maps import edge_distance, ego_rays, project_rays
 from arbiview_aug.neighbours import adjacent_pairs, half_way_view, odd_tiles
 from arbiview_aug.rig import Rig, content_order
 from arbiview_aug.sampling import Slot, halved, interleaved, level_size
-from arbiview_aug.surface import make_surface
+from arbiview_aug.surface import Street
 from arbiview_aug.tone import KNEE, ToneCurve
 
 _VIEW_SIZE, _TILE_PX = (225, 400), 16  # the evaluation's views and tiles at half resolution
@@ -155,7 +155,7 @@ def find_overlaps(rig: Rig, config: HarmoniseConfig | None = None) -> Overlaps:
     slots = [Slot(k, level, 0, 0, level_size(rig[k].size, level)) for k, level in enumerate(levels)]
     even = ~odd_tiles(_VIEW_SIZE, _TILE_PX)
     held_out = odd_tiles(_VIEW_SIZE, _TILE_PX // 2)[even]
-    surface = make_surface("street", rig.ground_z_m)
+    surface = Street(ground_z_m=rig.ground_z_m)
     pairs = []
     for a, b in adjacent_pairs(rig):
         view = half_way_view(rig[a], rig[b], _VIEW_SIZE)
