@@ -306,6 +306,12 @@ class Camera:
         directions, valid = self.unproject_cam(border)
         return math.acos(float(np.clip(directions[..., 2].min(), -1, 1))) if valid.all() else math.pi
 
+    @property
+    def cone_rad(self) -> float:
+        """Angle off the optical axis beyond which no point falls into the image."""
+        fold = self.fold_limit if self.lens == "fisheye" else math.atan(self.fold_limit)
+        return min(self.half_angle_rad, fold)
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Camera):
             return NotImplemented

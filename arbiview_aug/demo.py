@@ -20,7 +20,6 @@ from typing import Any, get_args
 import cv2
 import numpy as np
 import numpy.typing as npt
-import torch
 from tqdm import tqdm
 
 from arbiview_aug.camera import BoolArray
@@ -98,7 +97,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     plan_ms: list[float] = []
     frame_ms: list[float] = []
     first: tuple[dict[str, Any], _Reference, _Rendered] | None = None
-    with _notes(), _one_torch_thread(), tqdm(total=count * (2 + len(surfaces)), unit="step", leave=False) as progress:
+    with _notes(), tqdm(total=count * (2 + len(surfaces)), unit="step", leave=False) as progress:
         transforms = {s: RigRetarget(data.target, quality=arguments.quality, surface=s) for s in surfaces}
         chosen = transforms[arguments.surface]
         for index in range(count):
@@ -249,17 +248,6 @@ def _notes() -> Iterator[None]:
         yield
     for message in dict.fromkeys(str(warning.message) for warning in caught):
         print(f"note: {message}\n")
-
-
-@contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    """The street is cast in thousands of small steps: on a busy machine threads spend most of them waiting."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 # --- work -------------------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ import numpy as np
 
 from arbiview_aug.camera import FloatArray
 from arbiview_aug.favs.paper import PaperRendering, SourceReport
+from arbiview_aug.favs.photometric import PhotometricReport
 from arbiview_aug.plan import RenderPlan
 
 
@@ -18,9 +19,11 @@ class Explanation:
 
     Attributes:
         plan: The plan.
+        harmonisation: The sources' gains and why, where harmonisation was asked for.
     """
 
     plan: RenderPlan
+    harmonisation: PhotometricReport | None = None
 
     def as_dict(self) -> list[dict[str, Any]]:
         """One entry for each target camera: coverage, share to invent, and its sources with surface and reason."""
@@ -53,6 +56,8 @@ class Explanation:
             f"{self.plan.source.name or 'source'} -> {self.plan.target.name or 'target'}: "
             f"{len(self.plan.source)} cameras to {len(self.plan.target)}"
         ]
+        if self.harmonisation is not None:
+            lines.append(f"  {self.harmonisation}")
         for entry in self.as_dict():
             to_invent = entry["to_invent"]
             note = f", {to_invent:.1%} that no camera saw: masked, or for a generator to invent" if to_invent else ""

@@ -54,7 +54,7 @@ class Grid:
         """(ny, nx)."""
         if self.step == 1:
             return self.size
-        return tuple(math.ceil((n - 1 - self.offset) / self.step) + 2 for n in self.size)  # type: ignore[return-value]
+        return tuple(math.ceil((n - 1 - self.offset) / self.step) + 3 for n in self.size)  # type: ignore[return-value]
 
     def nodes(self) -> FloatArray:
         """(ny, nx, 2) pixel positions of the nodes."""

@@ -122,6 +122,8 @@ def target_labels(
     """
     if not all(isinstance(v, torch.Tensor) for v in (value if isinstance(value, list | tuple) else [value])):
         raise SampleTypeError(f"{key}: expected label maps as tensors, got {type(value).__name__}; use torch.as_tensor")
+    if isinstance(value, torch.Tensor) and value.ndim < len(lead) + 3:
+        raise SampleError(f"{key}: expected label maps of shape (..., N, H, W), got {tuple(value.shape)}")
     try:
         of_frames = split(value, lead)
     except ValueError as error:
@@ -153,7 +155,7 @@ def _checked_fill(key: str, fill: float, dtype: torch.dtype) -> float:
         return False
     if not dtype.is_floating_point:
         limits = torch.iinfo(dtype)
-        if fill != int(fill) or not limits.min <= fill <= limits.max:
+        if not limits.min <= fill <= limits.max or fill != int(fill):  # NaN fails the first
             raise SampleError(f"{key}: label_fill: expected a value of {dtype}, got {fill!r}")
     return fill
 
@@ -177,8 +179,11 @@ def move_to_target(out: dict[str, Any], ego2ego: torch.Tensor, lead: tuple[int, 
         inverse = torch.linalg.inv(ego2ego)
         if isinstance(pose, np.ndarray):
             out["ego2world"] = pose @ inverse.numpy()
-        else:
+        elif isinstance(pose, torch.Tensor) and pose.is_floating_point():
             out["ego2world"] = pose @ inverse.to(pose)
+        else:
+            kind = pose.dtype if isinstance(pose, torch.Tensor) else type(pose).__name__
+            raise SampleTypeError(f"ego2world: label_frame='target': expected a float tensor, got {kind}")
 
 
 def _translated(key: str, value: Any, offset_m: torch.Tensor, lead: tuple[int, ...]) -> Any:

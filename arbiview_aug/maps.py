@@ -18,8 +18,9 @@ import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.grid import HALVINGS, Box, Grid
-from arbiview_aug.sampling import Slot
-from arbiview_aug.surface import Surface
+from arbiview_aug.objects import Surface
+from arbiview_aug.sampling import Slot, halved
+from arbiview_aug.surface import Static
 
 _SAFETY = 2.0  # curvature between the nodes may exceed what the nodes show
 _CORNERS = tuple((a, b) for a in (slice(None, -1), slice(1, None)) for b in (slice(None, -1), slice(1, None)))
@@ -42,6 +43,11 @@ class TargetRays:
         self.sparse_index = np.ix_(np.unique(np.r_[0:ny:4, ny - 1]), np.unique(np.r_[0:nx:4, nx - 1]))
         planes = np.ascontiguousarray(np.moveaxis(self.directions[self.sparse_index], -1, 0))
         self.sparse = np.moveaxis(planes, 0, -1), self.valid[self.sparse_index]
+
+    @cached_property
+    def spacing_rad(self) -> float:
+        """Largest angle between neighbouring nodes' rays."""
+        return float(np.sqrt((np.diff(self.directions, axis=1) ** 2).sum(-1)).max(initial=0.0))
 
     def inverse_distance(self, surface: Surface) -> FloatArray:
         """(ny, nx) on the nodes; evaluated once for each surface."""
@@ -66,7 +72,7 @@ class PairMap:
         self.nodes: Box | None = None
         if self._look_apart() or (rays.grid.step > 1 and not self._glance()):
             return
-        self.uv, self.valid = project_rays(source, rays.directions, rays.inverse_distance(surface), self.offset_m)
+        self.uv, self.valid = self._seen(rays.directions, rays.inverse_distance(surface))
         self.valid &= rays.valid
         self._exact = np.zeros((0, 0), bool)
         self._use: BoolArray | None = None
@@ -80,7 +86,12 @@ class PairMap:
     def _look_apart(self) -> bool:
         """Whether the two viewing cones, widened by the parallax of the nearest scene point, cannot meet."""
         q = self.rays.inverse_distance(self.surface)
-        parallax = math.atan(float(np.linalg.norm(self.offset_m)) * float(q.max()))
+        # Law of sines: a point at 1 / q is seen from the two centres in directions that differ by at most asin(b q);
+        # by any angle where it is nearer than the baseline b.
+        nearness = float(np.linalg.norm(self.offset_m)) * float(q.max())
+        if nearness >= 1:
+            return False
+        parallax = math.asin(nearness)
         apart = math.acos(float(np.clip(self.rays.camera.cam2ego[:3, 2] @ self.source.cam2ego[:3, 2], -1, 1)))
         return apart > self.rays.camera.half_angle_rad + self.source.half_angle_rad + parallax + 0.01
 
@@ -95,7 +106,7 @@ class PairMap:
     def _classify(self) -> Box | None:
         """Sort the cells: seeing nothing, whole, on a border of validity. Returns the nodes around those in use."""
         q = self.rays.inverse_distance(self.surface)
-        self._whole, border = self._cells_that_may_see(self.rays.directions, q, self.uv, self.valid)
+        self._whole, border = self._cells_that_may_see(self.rays.directions, q, self.uv, self.valid, self._detailed)
         use = self._whole | border
         # Invalid nodes hold placeholders that may lie inside the image.
         self._use = None if self.valid.all() else use
@@ -106,13 +117,21 @@ class PairMap:
         """Mark the cells whose interpolation may be off by more than this, in source pixels, for exact evaluation."""
         if self._whole is None or self.nodes is None:
             return
-        self._exact = self._exact | (self._whole & self._too_curved(self.nodes, tolerance_px))
+        curved = self._too_curved(self.nodes, tolerance_px)
+        self._exact = self._exact | (self._whole & curved)
+        if self._use is None and (curved & ~self._whole).any():
+            self._use = self._whole  # interpolation may overshoot into the image
         counters, exact = self.rays.counters, int(np.count_nonzero(self._exact))
         counters["cells_exact"] += exact
         counters["cells_interpolated"] += int(np.count_nonzero(self._whole & ~self._exact))
 
     def _cells_that_may_see(
-        self, directions: FloatArray, q: FloatArray, uv: FloatArray, valid: BoolArray
+        self,
+        directions: FloatArray,
+        q: FloatArray,
+        uv: FloatArray,
+        valid: BoolArray,
+        detailed: BoolArray | None = None,
     ) -> tuple[BoolArray, BoolArray]:
         """Cells whose corners are valid and not all beyond one side of the image; such cells with an invalid corner."""
         beyond = beyond_image(self.source, directions, q, self.offset_m, uv, valid)
@@ -123,7 +142,22 @@ class PairMap:
         corners = [valid[c] for c in _CORNERS]
         all_valid = corners[0] & corners[1] & corners[2] & corners[3]
         touched = (corners[0] | corners[1] | corners[2] | corners[3]).astype(np.uint8)
-        return use & all_valid, use & ~all_valid & (cv2.dilate(touched, np.ones((3, 3), np.uint8)) > 0)
+        near = cv2.dilate(touched, np.ones((3, 3), np.uint8)) > 0
+        if self.source.lens != "pinhole":
+            near |= self._cells_near_lens(directions, q)
+        if detailed is not None:
+            near |= detailed  # a gap between two objects may lie between hidden corners
+        return use & all_valid, use & ~all_valid & near
+
+    def _cells_near_lens(self, directions: FloatArray, q: FloatArray) -> BoolArray:
+        """Cells that may reach into the cone of the lens's image, although no corner of theirs may lie in it."""
+        points = _source_points(self.source, directions, q, self.offset_m)
+        unit = points / np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), 1e-300)
+        off_axis = np.arccos(np.clip(unit[..., 2], -1, 1))
+        nearest = np.minimum.reduce([off_axis[c] for c in _CORNERS])
+        first, second, third, fourth = (unit[c] for c in _CORNERS)
+        widest = np.minimum((first * fourth).sum(-1), (second * third).sum(-1))
+        return np.asarray(nearest <= self.source.cone_rad + np.arccos(np.clip(widest, -1, 1)))
 
     def _too_curved(self, box: Box, tolerance_px: float) -> BoolArray:
         """Cells whose interpolation may be off by more than the tolerance.
@@ -155,14 +189,43 @@ class PairMap:
             mean = sum(uv[c] for c in _CORNERS) / 4
             cell = np.maximum(cell, 4 * _larger(mean - centre))
         bound[j0:j1, i0:i1] = cell
-        return bound > tolerance_px
+        too_curved = bound > tolerance_px
+        return too_curved if self._detailed is None else too_curved | self._detailed
+
+    @cached_property
+    def _detailed(self) -> BoolArray | None:
+        """Cells (ny - 1, nx - 1) so near to the surface's detail, as target or source see it, that they could miss it.
+
+        They include those whose cubic neighbours could: a node reaches three cells away through two halvings.
+        """
+        if isinstance(self.surface, Static):
+            return None
+        towards, _ = self._from_source(self.rays.directions, self.rays.inverse_distance(self.surface))
+        near = np.zeros(self.valid.shape, bool)
+        for origin, rays in ((self.rays.camera.center_m, self.rays.directions), (self.source.center_m, towards)):
+            near |= self.surface.detailed(origin, rays, self.rays.spacing_rad)
+        return cv2.dilate(near.astype(np.uint8), np.ones((8, 8), np.uint8), anchor=(3, 3))[:-1, :-1] > 0
 
     def _evaluate(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Source pixels of target pixels (..., 2) in float64, and where they are valid."""
         directions, ray_valid = ego_rays(self.rays.camera, pixels)
         q = self.surface.inverse_distance(self.rays.camera.center_m, directions)
-        uv, valid = project_rays(self.source, directions, q, self.offset_m)
+        uv, valid = self._seen(directions, q)
         return uv, valid & ray_valid
+
+    def _seen(self, directions: FloatArray, q: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Source pixels of scene points, valid where the scene does not hide them from the source."""
+        uv, valid = project_rays(self.source, directions, q, self.offset_m)
+        if isinstance(self.surface, Static):
+            return uv, valid
+        towards, from_source = self._from_source(directions, q)
+        return uv, valid & ~self.surface.hides(self.source.center_m, towards, from_source, 1 / self.source.K[0, 0])
+
+    def _from_source(self, directions: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Unit rays (..., 3) from the source to scene points on target rays, and inverse distances along them."""
+        towards = directions + q[..., None] * self.offset_m  # scaled by q
+        length = np.sqrt((towards * towards).sum(-1))
+        return towards / length[..., None], q / length
 
     def full_resolution(
         self, slot: Slot, rows: tuple[int, int]
@@ -193,6 +256,8 @@ class PairMap:
         slack = 1e-3
         low = slot.from_source(np.array([-slack, -slack]))
         high = slot.from_source(np.array([source.width_px - 1 + slack, source.height_px - 1 + slack]))
+        # Halving leaves out the last row or column of an odd size: nothing is known there.
+        high = np.minimum(high, np.array([slot.x + slot.size[1], slot.y + slot.size[0]]) - 0.5)
         visible: Any = cv2.inRange(at, tuple(low), tuple(high))
         if self._use is not None:
             visible &= grid.cells_to_pixels(self._use, nodes)
@@ -313,11 +378,10 @@ def _mask_at(source: Camera, slot: Slot, at: npt.NDArray[np.float32]) -> npt.NDA
     assert source.mask is not None
     clean: Any = source.mask.astype(np.uint8) * 255
     if slot.level:
-        # A halved pixel is clean where every pixel in it is.
-        clean = cv2.compare(cv2.resize(clean, slot.size[::-1], interpolation=cv2.INTER_AREA), 255, cv2.CMP_EQ)
+        clean = cv2.inRange(halved(clean, slot.level), 255, 255)  # a halved pixel is clean where all in it are
     local = at - np.array([slot.x, slot.y], np.float32) if slot.x or slot.y else at
     share = cv2.remap(clean, local, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-    return np.asarray(cv2.compare(share, 255, cv2.CMP_EQ), np.uint8)
+    return np.asarray(cv2.inRange(share, 255, 255), np.uint8)  # cv2.compare refuses a single pixel
 
 
 def edge_distance(source: Camera, uv: FloatArray) -> FloatArray:
@@ -327,7 +391,9 @@ def edge_distance(source: Camera, uv: FloatArray) -> FloatArray:
     edge = np.minimum(np.minimum(u, source.width_px - 1 - u), np.minimum(v, source.height_px - 1 - v)) + 0.5
     if source.mask is None:
         return edge
-    coarse = cv2.resize(source.mask.astype(np.float32), None, fx=1 / 8, fy=1 / 8, interpolation=cv2.INTER_AREA)
+    h, w = source.size
+    whole = cv2.copyMakeBorder(source.mask.astype(np.float32), 0, -h % 8, 0, -w % 8, cv2.BORDER_REPLICATE)
+    coarse = cv2.resize(whole, (-(-w // 8), -(-h // 8)), interpolation=cv2.INTER_AREA)
     free = np.pad((coarse >= 1).astype(np.uint8), 1, constant_values=1)
     distance = cv2.distanceTransform(free, cv2.DIST_L2, 3)[1:-1, 1:-1]
     distance = np.minimum(distance, 1e6) * 8  # it is the largest float where nothing is masked

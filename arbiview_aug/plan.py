@@ -14,8 +14,9 @@ from collections import Counter, OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 
-from arbiview_aug.camera import BoolArray
+from arbiview_aug.camera import BoolArray, FloatArray
 from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.objects import scene_surfaces
 from arbiview_aug.rig import Rig, content_order
 from arbiview_aug.sampling import AtlasLayout, Scratch
 from arbiview_aug.target_plan import TargetDraft, TargetPlan
@@ -86,22 +87,33 @@ class PlanCache:
         return PlanCache, (self.max_bytes,)
 
 
-def plan_key(source: Rig, target: Rig, surface: str, config: FavsConfig) -> bytes:
-    """Content key of a plan: the calibrations, the surface and the settings, no names."""
+def plan_key(
+    source: Rig, target: Rig, surface: str, config: FavsConfig, boxes: FloatArray | None = None
+) -> bytes:
+    """Content key of a plan: the calibrations, the scene, the surface and the settings, no names."""
     settings = tuple(getattr(config, f.name) for f in fields(config))
-    return hashlib.sha256(repr((source.content_key, target.content_key, surface, settings)).encode()).digest()
+    scene = None if boxes is None else boxes.tobytes()
+    return hashlib.sha256(repr((source.content_key, target.content_key, surface, settings, scene)).encode()).digest()
 
 
-def build_plan(source: Rig, target: Rig, *, surface: str = "auto", config: FavsConfig | None = None) -> RenderPlan:
+def build_plan(
+    source: Rig,
+    target: Rig,
+    *,
+    surface: str = "auto",
+    config: FavsConfig | None = None,
+    boxes: FloatArray | None = None,
+) -> RenderPlan:
     """Plan how ``target`` is rendered from ``source``'s images.
 
     Args:
         source: The rig that recorded the images.
         target: The rig to render, in its own ego frame: the two roads are made to coincide.
-        surface: ``far``, ``ground``, ``street``; or ``auto``: for each pair of target and source camera, ``far``
-            where their centres coincide or the worst-case parallax is below ``config.far_parallax_px``, else
-            ``street``.
+        surface: ``far``, ``ground``, ``street``, ``objects`` (needs boxes); or ``auto``: for each pair of target and
+            source camera, ``far`` where their centres coincide or the worst-case parallax is below
+            ``config.far_parallax_px``, else ``street``.
         config: Settings; the ``fast`` preset by default.
+        boxes: (B, 7) objects of the scene in the source's ego frame, for ``objects``.
 
     Returns:
         The plan. Targets that no source sees have zero coverage.
@@ -110,7 +122,8 @@ def build_plan(source: Rig, target: Rig, *, surface: str = "auto", config: FavsC
     target = target.in_frame_of(source)
     counters: Counter[str] = Counter()
     order = content_order(source.cameras)
-    drafts = [TargetDraft(source, order, camera, surface, config, counters) for camera in target]
+    surfaces = scene_surfaces(source.ground_z_m, boxes)
+    drafts = [TargetDraft(source, order, camera, surface, surfaces, config, counters) for camera in target]
     used = [(region.source, region.level) for draft in drafts for region in draft.regions]
     layout = AtlasLayout.for_sources(source.sizes, used)
     scratch = Scratch()

@@ -245,20 +245,26 @@ def load_rig(name_or_path: str | Path) -> Rig:
     Raises:
         CalibrationError: An unknown name, a missing or unreadable file, or an impossible calibration.
     """
-    text: str
+    if not isinstance(name_or_path, str | Path):
+        got = type(name_or_path).__name__
+        raise CalibrationError(f"rig: expected a shipped rig's name or the path of a rig file, got {got}")
     if isinstance(name_or_path, str) and name_or_path in shipped_rigs():
         text = (resources.files("arbiview_aug") / "rigs" / f"{name_or_path}.yaml").read_text()
         return Rig.from_dict(yaml.safe_load(text), where=f"rig {name_or_path}")
     path = Path(name_or_path)
     where = f"rig file {path}"
-    if not path.is_file():
+    try:
+        found = path.is_file()
+    except (OSError, ValueError):  # a name that no file can have
+        found = False
+    if not found:
         raise CalibrationError(
             f"{where}: expected a file or one of the shipped rigs ({', '.join(shipped_rigs())}), found neither"
         )
     try:
         text = path.read_text()
         data = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, yaml.YAMLError, RecursionError) as error:
+    except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:  # ValueError: YAML's impossible dates too
         raise CalibrationError(f"{where}: expected plain YAML or JSON, got {' '.join(str(error).split())}") from None
     return Rig.from_dict(data, folder=path.parent, where=where)
 

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug.camera import BoolArray, Camera
+from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError, SampleTypeError
+from arbiview_aug.objects import checked_boxes
 from arbiview_aug.rig import Rig
 from arbiview_aug.tensors import leading_shape, split
 
@@ -29,6 +30,7 @@ CALIBRATION_KEYS = (
 )
 """Keys that describe the source's images; they are replaced by the target's or consumed."""
 
+MAX_CAMERAS = 128  # winning sources are int8
 _OFF_CENTER = 0.2  # share of the image's size by which both coordinates of a principal point never lie off its centre
 
 
@@ -75,6 +77,21 @@ def check_inputs(sample: Any, source_rig: Rig | None) -> list[SourceFrame]:
         _frame(_checked_images(frame), sample, source_rig, lead, index)
         for frame, index in zip(of_frames, indices, strict=True)
     ]
+
+
+def boxes_of_frames(sample: Mapping[str, Any], lead: tuple[int, ...]) -> list[FloatArray]:
+    """(B, 7) boxes of each frame of a sample, in the source's ego frame.
+
+    Raises:
+        SampleError: No boxes, or impossible ones.
+    """
+    boxes = sample.get("boxes_3d")
+    if boxes is None:
+        raise SampleError(
+            "surface='objects': expected 'boxes_3d' (B, 7) in the sample, got none; an empty (0, 7) tensor says that "
+            "nothing stands there"
+        )
+    return [checked_boxes(frame) for frame in (split(boxes, lead) if lead else [boxes])]
 
 
 # --- images -----------------------------------------------------------------------------------------------------------
@@ -149,6 +166,8 @@ def _frame(
         rig = source_rig if source_rig is not None else _rig_from_tensors(images, sample, index)
     if not isinstance(rig, Rig):
         raise SampleTypeError(f"rig: expected an arbiview_aug.Rig, got {type(rig).__name__}; use load_rig(path)")
+    if len(rig) > MAX_CAMERAS:
+        raise SampleError(f"images: expected at most {MAX_CAMERAS} cameras, got {len(rig)}")
     if len(rig) != len(images):
         raise SampleError(f"images: expected {len(rig)} images for cameras {', '.join(rig.names)}, got {len(images)}")
     for camera, image in zip(rig, images, strict=True):
@@ -215,7 +234,7 @@ def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> li
         if coefficients is not None and coefficients.any():
             raise SampleError("distortion: expected 'lens' beside it, one of pinhole, radtan, fisheye a camera")
         return [("pinhole", ())] * count
-    if isinstance(names, str) or len(names) != count:
+    if not isinstance(names, list | tuple) or len(names) != count:
         raise SampleError(f"lens: expected a list of {count} names, one a camera, got {names!r}")
     lenses = [_entry(name, index) for name in names]
     if all(lens == "pinhole" for lens in lenses):

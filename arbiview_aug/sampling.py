@@ -20,6 +20,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from arbiview_aug.tone import ToneCurve
+
 OUTSIDE = -16
 """Whole-pixel coordinate of a map entry that reads nothing: far enough that no bilinear tap touches the atlas."""
 
@@ -134,11 +136,11 @@ class Scratch:
         self._local = threading.local()
 
     def get(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> np.ndarray:
-        """A buffer of this shape and type with undefined content."""
+        """A buffer of this shape and type with undefined, but finite content: bilinear taps of weight 0 read it."""
         buffers = self._local.__dict__
         held = buffers.get(name)
         if held is None or held.shape != shape or held.dtype != dtype:
-            buffers[name] = held = np.empty(shape, dtype)
+            buffers[name] = held = np.zeros(shape, dtype)
         return held
 
     def __reduce__(self) -> tuple[type[Scratch], tuple[()]]:
@@ -151,9 +153,14 @@ def interleaved(image: torch.Tensor) -> np.ndarray | None:
     return array.numpy() if array.is_contiguous() else None
 
 
-def fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor], scratch: Scratch) -> np.ndarray:
-    """The atlas (rows, columns, 3) of (3, H, W) uint8 or float32 CPU images; channels-last stacks are not copied."""
-    block = _stacked_block(layout, images)
+def fill_atlas(
+    layout: AtlasLayout, images: Sequence[torch.Tensor], scratch: Scratch, curves: Sequence[ToneCurve] | None = None
+) -> np.ndarray:
+    """The atlas (rows, columns, 3) of (3, H, W) uint8 or float32 CPU images; channels-last stacks are not copied.
+
+    With tone curves, one for each image, everything is copied: the images themselves are the user's.
+    """
+    block = _stacked_block(layout, images) if curves is None else None
     if block is not None:
         return block
     dtype = np.uint8 if images[0].dtype == torch.uint8 else np.float32
@@ -163,10 +170,14 @@ def fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor], scratch: Scr
         place = atlas[slot.y : slot.y + h, slot.x : slot.x + w]
         image = interleaved(images[slot.source])
         if image is not None:
-            place[...] = halved(image, slot.level)
+            image = halved(image, slot.level)
         else:
             planes = images[slot.source].contiguous().numpy()
-            cv2.merge([halved(plane, slot.level) for plane in planes], dst=place)
+            image = cv2.merge([halved(plane, slot.level) for plane in planes], dst=place)
+        if curves is not None and curves[slot.source].gain != 1:
+            curves[slot.source].write(image, place)
+        elif image is not place:
+            place[...] = image
     return atlas
 
 
@@ -177,10 +188,12 @@ def _stacked_block(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> np.nd
     first = interleaved(images[0])
     if first is None:
         return None
-    step = first.nbytes
+    step, storage = first.nbytes, images[0].untyped_storage()
     for k, image in enumerate(images):
         if image.data_ptr() != images[0].data_ptr() + k * step or image.stride() != images[0].stride():
             return None
+        if image.untyped_storage().data_ptr() != storage.data_ptr():
+            return None  # neighbours in memory by chance, or slices of one numpy array
     h, w = images[0].shape[1:]
     stack = torch.as_strided(images[0], (len(images) * h, w, 3), (w * 3, 3, 1))
     return stack.numpy()
@@ -202,8 +215,14 @@ def remap(atlas: np.ndarray, at: FixedMap, interpolation: str, dst: np.ndarray |
 
 
 # --- torch ------------------------------------------------------------------------------------------------------------
-def torch_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Tensor:
-    """The atlas (B, 3, rows, columns) float32 of (B, 3, H, W) images in 0..255 or [0, 1]; differentiable."""
+def torch_atlas(
+    layout: AtlasLayout, images: Sequence[torch.Tensor], curves: Sequence[Sequence[ToneCurve] | None] | None = None
+) -> torch.Tensor:
+    """The atlas (B, 3, rows, columns) float32 of (B, 3, H, W) images in 0..255 or [0, 1]; differentiable.
+
+    Tone curves, where given, are one for each image, for each frame of the batch that has any.
+    """
+    whole = images[0].dtype == torch.uint8
     batch, device = images[0].shape[0], images[0].device
     atlas = torch.zeros((batch, 3, *layout.size), dtype=torch.float32, device=device)
     for slot in layout.slots:
@@ -211,10 +230,20 @@ def torch_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Te
         image = images[slot.source].float()
         for _ in range(slot.level):
             image = torch.nn.functional.avg_pool2d(image, 2)
-            if images[0].dtype == torch.uint8:
+            if whole:
                 image = torch.floor(image + 0.5)  # as OpenCV rounds its halved uint8 images
+        if curves is not None:
+            frames = zip(image, curves, strict=True)
+            image = torch.stack([_toned(one, of[slot.source], whole) if of else one for one, of in frames])
         atlas[:, :, slot.y : slot.y + h, slot.x : slot.x + w] = image
     return atlas
+
+
+def _toned(image: torch.Tensor, curve: ToneCurve, whole: bool) -> torch.Tensor:
+    """An image after its curve; rounded where the OpenCV execution looks whole numbers up in a table."""
+    if curve.gain == 1:
+        return image
+    return torch.floor(curve.of_tensor(image, 255.0) + 0.5).clamp(0, 255) if whole else curve.of_tensor(image)
 
 
 def torch_grid(uv: npt.NDArray[np.floating], atlas_size: tuple[int, int], device: torch.device) -> torch.Tensor:

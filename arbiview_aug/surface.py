@@ -6,14 +6,15 @@ and rays that miss need no special cases, and a point X = o + d / q is handled a
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from arbiview_aug.camera import FloatArray
 
-SurfaceName = Literal["auto", "far", "ground", "street"]
+SurfaceName = Literal["auto", "far", "ground", "street", "objects"]
 """Surfaces a user can ask for. ``auto`` decides per pair of target and source camera (see ``plan``)."""
 
 MAX_INVERSE_DISTANCE = 100.0
@@ -24,8 +25,8 @@ WALL_CENTER_M = (1.0, 0.0)
 0 and 2 m ahead are within 0.05 dB."""
 
 
-class Surface(Protocol):
-    """Anything that says how far away the scene is; hashable, and equal when it describes the same scene.
+class Static(ABC):
+    """A surface without objects: it hides nothing from any camera; hashable, equal when it describes the same scene.
 
     Attributes:
         smooth: Without creases: a map over it may be interpolated by what its values on a grid show.
@@ -33,6 +34,7 @@ class Surface(Protocol):
 
     smooth: ClassVar[bool]
 
+    @abstractmethod
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """Inverse distances (...,) in 1/m, 0 <= q <= ``MAX_INVERSE_DISTANCE``.
 
@@ -40,11 +42,10 @@ class Surface(Protocol):
             origin: (3,) the rays' common start in the ego frame, metres.
             directions: (..., 3) unit directions in the ego frame.
         """
-        ...
 
 
 @dataclass(frozen=True)
-class Far:
+class Far(Static):
     """Everything is infinitely far away: the paper's rotation-only model (Sec. FAVS, Stage 1)."""
 
     smooth: ClassVar[bool] = True
@@ -55,7 +56,7 @@ class Far:
 
 
 @dataclass(frozen=True)
-class Ground:
+class Ground(Static):
     """The road plane up to a cylinder: the plain reference surface.
 
     Attributes:
@@ -74,7 +75,7 @@ class Ground:
 
 
 @dataclass(frozen=True)
-class Street:
+class Street(Static):
     """The road joined softly to an elliptical far wall: no crease, houses nearer at the sides than ahead.
 
     The p-norm of two inverse distances, (q_road^k + q_wall^k)^(1/k), is a smooth minimum of the distances: it
@@ -114,13 +115,6 @@ class Street:
         ratio = beyond / np.maximum(near, 1e-300)
         joined = near * (1 + ratio**self.sharpness) ** (1 / self.sharpness)
         return np.minimum(joined, MAX_INVERSE_DISTANCE)
-
-
-def make_surface(name: str, ground_z_m: float) -> Surface:
-    """The surface of a name (not ``auto``) over a road at ``ground_z_m``."""
-    if name == "far":
-        return Far()
-    return Ground(ground_z_m=ground_z_m) if name == "ground" else Street(ground_z_m=ground_z_m)
 
 
 def plane_inverse_distance(origin: FloatArray, directions: FloatArray, ground_z_m: float) -> FloatArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -17,9 +17,10 @@ from arbiview_aug.favs.adaptive_fusion import distance_weight, primary_weight, q
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.grid import Box
 from arbiview_aug.maps import PairMap, TargetRays, edge_distance, resolution
+from arbiview_aug.objects import Surface
 from arbiview_aug.rig import Rig
 from arbiview_aug.sampling import AtlasLayout, FixedMap, Scratch
-from arbiview_aug.surface import depth_uncertainty, make_surface, worst_parallax_px
+from arbiview_aug.surface import depth_uncertainty, worst_parallax_px
 
 SAME_CENTER_M = 1e-6
 """Centres closer than this coincide: a homography is exact whatever the scene."""
@@ -128,9 +129,17 @@ class TargetDraft:
     """Builds one target's plan in two steps: what each source sees, then who wins and where seams are blended."""
 
     def __init__(
-        self, source: Rig, order: list[int], camera: Camera, surface: str, config: FavsConfig, counters: Counter[str]
+        self,
+        source: Rig,
+        order: list[int],
+        camera: Camera,
+        surface: str,
+        surfaces: Mapping[str, Surface],
+        config: FavsConfig,
+        counters: Counter[str],
     ) -> None:
         self.source, self.camera, self.surface, self.config = source, camera, surface, config
+        self.surfaces = surfaces
         self.counters = counters
         self.rays = TargetRays(camera, config.grid_step_px, counters)
         self.grid = self.rays.grid
@@ -154,7 +163,7 @@ class TargetDraft:
         baseline_m = float(np.linalg.norm(offset_m))
         focal_px = float(self.camera.K[0, 0])
         name, reason = self._choose_surface(baseline_m, focal_px)
-        surface = make_surface(name, self.source.ground_z_m)
+        surface = self.surfaces[name]
         pair = PairMap(self.rays, source, surface)
         if pair.nodes is None:
             return None

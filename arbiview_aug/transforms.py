@@ -13,17 +13,19 @@ import cv2
 import numpy as np
 import torch
 
+from arbiview_aug.camera import FloatArray
 from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError
 from arbiview_aug.explain import Explanation, PaperExplanation
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
 from arbiview_aug.favs.paper import PaperRendering, check_pinhole, check_settings, render_paper
+from arbiview_aug.favs.photometric import Harmonise, Harmoniser, PhotometricReport
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
 from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_target, target_labels
 from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
 from arbiview_aug.random_rig import RandomRig
 from arbiview_aug.rig import Rig, load_rig
-from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame, check_inputs
+from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame, boxes_of_frames, check_inputs
 from arbiview_aug.sampling import Scratch
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.tensors import covered, gathered, leading_shape, lens_names, like, resized, rewrapped, stacked
@@ -61,7 +63,12 @@ class RigRetarget(torch.nn.Module):
         path: ``favs``: stitching.
         quality: ``draft``, ``fast``, or a ``FavsConfig``; ``paper`` or a ``PaperConfig``: stages 1 to 4 as published,
             on the CPU, for pinhole cameras.
-        surface: ``far``, ``ground``, ``street``; ``auto`` decides per pair of cameras (``paper``: always ``far``).
+        surface: ``far``, ``ground``, ``street``; ``objects``: the sample's ``boxes_3d`` stand on the street, so that
+            objects keep their height when cameras move; ``auto`` decides per pair of cameras between far and street
+            (``paper``: always ``far``).
+        harmonise: Bring the sources to one exposure (``arbiview_aug.favs.photometric``): True or a ``HarmoniseConfig``
+            estimates a gain for each camera in every frame; numbers are gains to use as they are. Off by default.
+            Samples that ``p`` skips keep their colours.
         size: (h, w) of every output image; the target cameras are resized to it.
         p: Probability of retargeting. A skipped sample keeps its own cameras, resized to ``size``, with full coverage;
             so ``p < 1`` needs ``size`` and equal camera counts. The output then always has ``lens``, ``distortion``
@@ -90,6 +97,7 @@ class RigRetarget(torch.nn.Module):
         path: Literal["favs"] = "favs",
         quality: Quality | FavsConfig = "fast",
         surface: SurfaceName = "auto",
+        harmonise: Harmonise = None,
         size: tuple[int, int] | None = None,
         p: float = 1.0,
         rng: torch.Generator | None = None,
@@ -120,9 +128,12 @@ class RigRetarget(torch.nn.Module):
             self.target = load_rig(target_rig)
         self.source_rig = source_rig if isinstance(source_rig, Rig) or source_rig is None else load_rig(source_rig)
         self.config = favs_config(quality)
+        self.harmoniser = Harmoniser(harmonise)
         if isinstance(self.config, PaperConfig):
             check_settings(surface, execution)
             check_pinhole(self.target if isinstance(self.target, Rig) else self.target.base)
+            if harmonise is not None and harmonise is not False:
+                raise ValueError("harmonise: quality='paper' is as published: expected None, got " + repr(harmonise))
         self.path, self.surface, self.p, self.rng = path, surface, float(p), rng
         self.size = None if size is None else _checked_size(size)
         self.label_frame, self.label_keys, self.label_fill = label_frame, tuple(label_keys), label_fill
@@ -138,7 +149,8 @@ class RigRetarget(torch.nn.Module):
     def extra_repr(self) -> str:
         """Target and settings, for ``repr``."""
         target = self.target if isinstance(self.target, RandomRig) else (self.target.name or "unnamed rig")
-        return f"target={target}, surface={self.surface}, size={self.size}, p={self.p:g}, {self.config}"
+        settings = f"surface={self.surface}, harmonise={self.harmoniser}, size={self.size}, p={self.p:g}"
+        return f"target={target}, {settings}, {self.config}"
 
     # --- the transform --------------------------------------------------------------------------------------------
     def forward(self, sample: Mapping[str, Any], params: Mapping[str, float] | None = None) -> dict[str, Any]:
@@ -158,8 +170,9 @@ class RigRetarget(torch.nn.Module):
         labels = check_other_keys(sample, list(sizes), self.label_keys, self.pass_keys)
         target, skip, drawn = self._draw(sample, frames, params)
         views: list[View] = []
-        for frame in frames:
-            views.append(self.size if skip and self.size else self._view(frame, target))
+        scenes = self._scenes(sample, len(frames), lead)
+        for frame, boxes in zip(frames, scenes, strict=True):
+            views.append(self.size if skip and self.size else self._view(frame, target, boxes))
         parts = self._rendered(frames, views)
         out = self._kept(sample, labels)
         out["images"] = rewrapped(gathered([part["images"] for part in parts], lead), sample["images"])
@@ -260,12 +273,14 @@ class RigRetarget(torch.nn.Module):
             elif self._uses_torch(frame):
                 together.setdefault(id(view), []).append(b)
             else:
-                done[b] = render_opencv(view, frame.images, self._scratch)
+                curves = self.harmoniser.curves(frame.rig, frame.images)
+                done[b] = render_opencv(view, frame.images, self._scratch, curves)
         for members in together.values():
             plan = views[members[0]]
             assert isinstance(plan, RenderPlan)
             sources = zip(*(frames[b].images for b in members), strict=True)
-            rendered = render_torch(plan, [torch.stack(images) for images in sources])
+            toned = [self.harmoniser.curves(frames[b].rig, frames[b].images) for b in members]
+            rendered = render_torch(plan, [torch.stack(images) for images in sources], toned)
             for k, b in enumerate(members):
                 done[b] = [image[k] for image in rendered]
         return [done[b] for b in range(len(frames))]
@@ -287,16 +302,20 @@ class RigRetarget(torch.nn.Module):
             part["ignore"] = stacked([torch.from_numpy(~m).to(device) for m in masks])
         return part
 
-    def _view(self, frame: SourceFrame, target: Rig) -> RenderPlan | PaperRendering:
+    def _scenes(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[FloatArray | None]:
+        """The boxes of each frame, where the surface stands on them."""
+        return boxes_of_frames(sample, lead) if self.surface == "objects" else [None] * count
+
+    def _view(self, frame: SourceFrame, target: Rig, boxes: FloatArray | None) -> RenderPlan | PaperRendering:
         """The plan of a frame, or the frame rendered by the published stages, for which nothing can be planned."""
         if not isinstance(self.config, PaperConfig):
-            return self.plan(frame.rig, target)
+            return self.plan(frame.rig, target, boxes)
         rendering = render_paper(frame.rig, target.in_frame_of(frame.rig), frame.images, self.config)
         self._warn_unreachable(rendering)
         return rendering
 
-    def plan(self, source: Rig, target: Rig) -> RenderPlan:
-        """The cached render plan of a pair of rigs.
+    def plan(self, source: Rig, target: Rig, boxes: FloatArray | None = None) -> RenderPlan:
+        """The cached render plan of a pair of rigs, and of the objects that stand there.
 
         Raises:
             ValueError: With ``quality="paper"``.
@@ -304,11 +323,11 @@ class RigRetarget(torch.nn.Module):
         if isinstance(self.config, PaperConfig):
             raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
         config = self.config
-        key = plan_key(source, target, self.surface, config)
-        return self.plans.get(key, lambda: self._built(source, target, config))
+        key = plan_key(source, target, self.surface, config, boxes)
+        return self.plans.get(key, lambda: self._built(source, target, config, boxes))
 
-    def _built(self, source: Rig, target: Rig, config: FavsConfig) -> RenderPlan:
-        plan = build_plan(source, target, surface=self.surface, config=config)
+    def _built(self, source: Rig, target: Rig, config: FavsConfig, boxes: FloatArray | None) -> RenderPlan:
+        plan = build_plan(source, target, surface=self.surface, config=config, boxes=boxes)
         self._warn_unreachable(plan)
         return plan
 
@@ -340,10 +359,19 @@ class RigRetarget(torch.nn.Module):
 
         A random target is explained for one draw; no state changes, except that the draw advances the RNG.
         """
+        frames, lead = check_inputs(sample, self.source_rig), leading_shape(sample["images"])
+        target, _, _ = self._draw(sample, frames[:1], None)
+        (boxes,) = self._scenes(sample, len(frames), lead)[:1]
+        asked = self.harmoniser.estimates or self.harmoniser.gains is not None
+        view = self._view(frames[0], target, boxes)
+        if isinstance(view, PaperRendering):
+            return PaperExplanation(view)
+        return Explanation(view, self.harmonisation(sample) if asked else None)
+
+    def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
+        """The gains that a sample's source images would get, and why; of a batch, its first frame."""
         frame = check_inputs(sample, self.source_rig)[0]
-        target, _, _ = self._draw(sample, [frame], None)
-        view = self._view(frame, target)
-        return PaperExplanation(view) if isinstance(view, PaperRendering) else Explanation(view)
+        return self.harmoniser.report(frame.rig, frame.images)
 
     def _warn_once(self, topic: str, message: str) -> None:
         if topic not in self._warned:

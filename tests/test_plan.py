@@ -9,9 +9,9 @@ import pytest
 from arbiview_aug.camera import Camera
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.maps import ego_rays, project_rays
+from arbiview_aug.objects import scene_surfaces
 from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
 from arbiview_aug.rig import Rig, load_rig
-from arbiview_aug.surface import make_surface
 
 MAP_TOLERANCE_PX = 1 / 32
 
@@ -20,7 +20,7 @@ def reference(plan: RenderPlan, k: int, surface: str, source: int) -> tuple[np.n
     """Source pixels and visibility of every target pixel, evaluated one by one in float64."""
     camera, recorded = plan.target[k], plan.source[source]
     directions, ray_valid = ego_rays(camera, camera.pixel_grid())
-    q = make_surface(surface, plan.source.ground_z_m).inverse_distance(camera.center_m, directions)
+    q = scene_surfaces(plan.source.ground_z_m, None)[surface].inverse_distance(camera.center_m, directions)
     uv, valid = project_rays(recorded, directions, q, camera.center_m - recorded.center_m)
     return uv, valid & ray_valid & recorded.contains(uv)
 
@@ -41,6 +41,10 @@ CASES = {
     "radtan source": ("nuplan", lambda: half_size("argoverse2")),
     "fisheye target": ("nuscenes", lambda: half_size("fisheye_surround")),
     "fisheye source": ("fisheye_surround", lambda: half_size("nuscenes")),
+    "radtan source, fisheye target": ("waymo", lambda: half_size("fisheye_surround")),
+    "narrow lens between the nodes": ("nuplan", lambda: load_rig("fisheye_surround").resized(0.12)),
+    "at the wall": ("nuscenes", lambda: half_size("nuscenes").shifted(x_m=38.0)),
+    "far away": ("nuscenes", lambda: half_size("nuscenes").shifted(x_m=-150.0, z_m=20.0)),
     "pitched and rolled": ("ddad", lambda: half_size("ddad").turned(yaw_deg=40, pitch_deg=-20, roll_deg=30)),
 }
 

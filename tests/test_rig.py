@@ -110,6 +110,7 @@ def test_bad_files(tmp_path: Path, data: object, message: str) -> None:
         "cameras: [!!python/name:os.system '']",
         "cameras: [{{unclosed",
         "a: \x00",
+        "date: 2001-13-45",
     ],
 )
 def test_malicious_or_broken_yaml_is_refused(tmp_path: Path, text: str) -> None:
@@ -123,6 +124,10 @@ def test_malicious_or_broken_yaml_is_refused(tmp_path: Path, text: str) -> None:
 def test_missing_file_names_the_shipped_rigs() -> None:
     with pytest.raises(CalibrationError, match=r"expected a file or one of the shipped rigs \(argoverse2, .*waymo\)"):
         load_rig("tesla")
+    with pytest.raises(CalibrationError, match="found neither"):
+        load_rig("x" * 5000)  # no file can have this name
+    with pytest.raises(CalibrationError, match="expected a shipped rig's name or the path of a rig file, got int"):
+        load_rig(3)  # type: ignore[arg-type]
 
 
 def test_broken_json_and_bytes(tmp_path: Path) -> None:

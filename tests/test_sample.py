@@ -118,6 +118,11 @@ CALIBRATION: dict[str, tuple[dict[str, Any], str]] = {
     "unknown lens": (with_distortion(np.zeros((2, 4)), ["cubic"] * 2), "lens: expected one of pinhole, .* got 'cubic'"),
     "one lens": (sample(lens=["radtan"]), r"lens: expected a list of 2 names, one a camera, got \['radtan'\]"),
     "a lens for all": (sample(lens="radtan"), "lens: expected a list of 2 names"),
+    "a number for a lens": (sample(lens=5), "lens: expected a list of 2 names, one a camera, got 5"),
+    "more cameras than int8 counts": (
+        {"images": torch.zeros(129, 3, 1, 1), "rig": Rig([c.resize((1, 1)) for c in rig(129)])},
+        "images: expected at most 128 cameras, got 129",
+    ),
     "no coefficients": (sample(lens=["radtan"] * 2), r"distortion: expected shape \(2, up to 8\) .* got none"),
     "coefficients of one": (with_distortion([0.1] * 4, ["radtan"] * 2), r"distortion: expected shape \(2, up to 8\)"),
     "three coefficients": (with_distortion([[0.1] * 3] * 2, ["radtan"] * 2), "expected 4 or 5 or 8 coeff.* got 3"),

@@ -325,6 +325,10 @@ def test_label_maps_that_do_not_fit() -> None:
         labels(torch.zeros((4, 64, 36)))
     with pytest.raises(SampleError, match=r"classes: label_fill: expected a value of torch.int8, got 255"):
         labels(torch.zeros((4, *SIZE), dtype=torch.int8))
+    with pytest.raises(SampleError, match=r"classes: label_fill: expected a value of torch.int32, got nan"):
+        labels(torch.zeros((4, *SIZE), dtype=torch.int32), label_fill=float("nan"))
+    with pytest.raises(SampleError, match=r"classes: expected label maps of shape \(..., N, H, W\), got \(\)"):
+        labels(torch.tensor(3))
     labels(torch.zeros((4, *SIZE), dtype=torch.int8), label_fill=-1)
     with pytest.raises(SampleTypeError, match="classes: expected label maps as tensors, got ndarray"):
         labels(np.zeros((4, *SIZE)))
@@ -589,6 +593,8 @@ def test_labels_that_cannot_move() -> None:
         retarget(sample_of(ring(), boxes_3d="none"))
     with pytest.raises(SampleTypeError, match=r"points: .*expected a float tensor, got torch.int64"):
         retarget(sample_of(ring(), points=torch.zeros(3, 3, dtype=torch.int64)))
+    with pytest.raises(SampleTypeError, match="ego2world: label_frame='target': expected a float tensor, got list"):
+        retarget(sample_of(ring(), ego2world=np.eye(4).tolist()))
     with pytest.raises(SampleError, match=r"points: expected shape \(2, count, >=3\), got \(7, 3\)"):
         retarget({**default_collate([sample_of(ring())] * 2), "points": torch.zeros(7, 3)})
 

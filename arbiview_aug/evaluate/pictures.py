@@ -136,10 +136,10 @@ def outline_coverage(image: Image, coverage: BoolArray, *, colour: Colour = HOLE
 def save_picture(path: str | Path, picture: Picture) -> Path:
     """Write a picture as PNG or JPEG, by its suffix; folders are made."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         written = cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-    except cv2.error:
+    except (OSError, cv2.error):
         written = False
     if not written:
         raise DataError(f"picture {path}: expected a name ending in .png or .jpg, in a folder that can be written to")

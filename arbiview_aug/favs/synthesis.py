@@ -11,10 +11,14 @@ import torch
 from arbiview_aug import sampling
 from arbiview_aug.plan import RenderPlan
 from arbiview_aug.sampling import Scratch
+from arbiview_aug.tone import ToneCurve
 
 
 def render_opencv(
-    plan: RenderPlan, images: Sequence[torch.Tensor], scratch: Scratch | None = None
+    plan: RenderPlan,
+    images: Sequence[torch.Tensor],
+    scratch: Scratch | None = None,
+    curves: Sequence[ToneCurve] | None = None,
 ) -> list[torch.Tensor]:
     """Target views by OpenCV, for CPU images; not differentiable.
 
@@ -22,6 +26,7 @@ def render_opencv(
         plan: The plan for these images' rig.
         images: N images (3, H, W): uint8, or float in [0, 1].
         scratch: Buffers to reuse between calls.
+        curves: A tone curve for each image; the images themselves are not changed.
 
     Returns:
         M views (3, h, w) of the images' type, black where no source sees; slices of one (M, 3, h, w) block where all
@@ -30,7 +35,7 @@ def render_opencv(
     scratch = scratch or Scratch()
     dtype = images[0].dtype
     work = torch.uint8 if dtype == torch.uint8 else torch.float32
-    atlas = sampling.fill_atlas(plan.layout, [image.detach().to(work) for image in images], scratch)
+    atlas = sampling.fill_atlas(plan.layout, [image.detach().to(work) for image in images], scratch, curves)
     views = _empty_views(plan, work)
     for k, (target, view) in enumerate(zip(plan.targets, views, strict=True)):
         h, w = target.source_camera.shape
@@ -48,18 +53,21 @@ def render_opencv(
     return [view.to(dtype) for view in views]
 
 
-def render_torch(plan: RenderPlan, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+def render_torch(
+    plan: RenderPlan, images: Sequence[torch.Tensor], curves: Sequence[Sequence[ToneCurve] | None] | None = None
+) -> list[torch.Tensor]:
     """Target views by ``grid_sample``: batches, any device, differentiable in the images.
 
     Args:
         plan: The plan for these images' rig, shared by the batch.
         images: N images (B, 3, H, W): uint8, or float in [0, 1]; sampled in float32.
+        curves: For each frame of the batch nothing, or a tone curve for each image.
 
     Returns:
         M views (B, 3, h, w) of the images' type.
     """
     dtype, device = images[0].dtype, images[0].device
-    atlas = sampling.torch_atlas(plan.layout, images)
+    atlas = sampling.torch_atlas(plan.layout, images, curves)
     views = []
     for target in plan.targets:
         coverage = torch.from_numpy(target.coverage).to(device)

@@ -20,19 +20,11 @@ from arbiview_aug.datasets.synthetic import (
     demo_target_rig,
     make_scene,
 )
+from arbiview_aug.datasets.synthetic.raycast import cast
 from arbiview_aug.datasets.synthetic.texture import band, noise, pulses
 from arbiview_aug.rig import Rig
 
 SIZE = (64, 176)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Small tensors: threads would only wait for one another on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
@@ -98,17 +90,41 @@ def test_same_arguments_give_the_same_bits(drive):
     assert not torch.equal(first["images"], SyntheticDrive(drive.rig, num_frames=5, seed=1)[3]["images"])
 
 
-def test_threads_and_global_seeds_change_nothing(drive):
-    before = drive[0]
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_threads_and_global_seeds_change_nothing(drive, threads):
+    before, usual = drive[0], torch.get_num_threads()
     try:
-        torch.set_num_threads(2)
+        torch.set_num_threads(threads)
         torch.manual_seed(7)
         np.random.seed(7)  # noqa: NPY002 - the global state that must not matter
         state = torch.get_rng_state()
         assert equal(before, drive[0])
         assert torch.equal(state, torch.get_rng_state())
+        assert torch.get_num_threads() == threads
     finally:
-        torch.set_num_threads(1)
+        torch.set_num_threads(usual)
+
+
+def test_one_torch_thread_while_a_street_is_cast(drive, monkeypatch):
+    """Thousands of small steps: on a busy machine threads spend most of them waiting for one another."""
+    seen = []
+
+    def noting(*args):
+        seen.append(torch.get_num_threads())
+        return cast(*args)
+
+    usual = torch.get_num_threads()
+    for module in ("render", "dataset"):
+        monkeypatch.setattr(f"arbiview_aug.datasets.synthetic.{module}.cast", noting)
+    try:
+        torch.set_num_threads(3)
+        drive[0]
+        assert len(seen) == 13 and set(seen) == {1}  # six cameras in two passes, and the LiDAR
+        with pytest.raises(IndexError):
+            drive.points(5)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(usual)
 
 
 def test_workers_return_the_same_bits(drive):

@@ -15,15 +15,6 @@ from arbiview_aug.rig import Rig
 SIZE = (96, 256)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Small tensors: threads would only wait for one another on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 def forward_camera(**changes) -> Camera:
     values = dict(name="front", azimuth_deg=0.0, position_m=(1.7, 0.0, 1.5), horizontal_fov_deg=65.0)
     return Camera.looking(**{**values, "width_px": 352, "height_px": 128, **changes})

@@ -85,6 +85,8 @@ def test_save_picture(tmp_path: Path) -> None:
     np.testing.assert_array_equal(cv2.imread(str(path))[..., ::-1], picture)
     with pytest.raises(DataError, match=r"expected a name ending in .png or .jpg"):
         save_picture(tmp_path / "sheet.words", picture)
+    with pytest.raises(DataError, match="in a folder that can be written to"):
+        save_picture(path / "below_a_file" / "sheet.png", picture)
 
 
 def tinted(picture: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:

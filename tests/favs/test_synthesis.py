@@ -111,6 +111,26 @@ def test_memory_layouts_and_dtypes_give_the_same_views() -> None:
         assert differences(expected, [(v.float() * 255).round() for v in half]).max() <= 1
 
 
+def test_slices_of_one_numpy_array_render_like_any_images() -> None:
+    rig = load_rig("nuscenes").resized(0.1)
+    plan = build_plan(rig, rig.turned(yaw_deg=5))
+    block = np.stack([image.permute(1, 2, 0).numpy() for image in noise_images(rig)])  # [N, H, W, 3]
+    slices = [torch.from_numpy(image).permute(2, 0, 1) for image in block]  # adjacent, each with a storage of its own
+    expected = render_opencv(plan, [image.contiguous() for image in slices])
+    assert differences(expected, render_opencv(plan, slices)).max() == 0
+
+
+def test_no_view_depends_on_memory_that_no_image_fills(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images of different widths leave gaps in the atlas; a bilinear tap of weight 0 there times NaN is NaN."""
+    narrow, wide = load_rig("nuscenes").resized((45, 80)), load_rig("nuscenes").resized((90, 160))
+    rig = narrow.with_cameras([*list(narrow)[:3], *list(wide)[3:]])
+    plan = build_plan(rig, rig)
+    images = [image / 255 for image in noise_images(rig)]
+    monkeypatch.setattr(np, "empty", lambda shape, dtype: np.full(shape, np.nan, dtype))  # what it may hold
+    views = render_opencv(plan, images)
+    assert all(view.isfinite().all() for view in views)
+
+
 def test_results_do_not_share_memory_with_buffers() -> None:
     rig = load_rig("nuscenes").resized(0.1)
     plan, scratch = build_plan(rig, rig.turned(yaw_deg=5)), Scratch()

@@ -16,6 +16,7 @@ from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, cast, find_candid
 from arbiview_aug.datasets.synthetic.render import Renderer, stack_or_list
 from arbiview_aug.datasets.synthetic.scene import Material, Scene, SceneClass
 from arbiview_aug.datasets.synthetic.street import make_scene
+from arbiview_aug.datasets.synthetic.threads import one_torch_thread
 from arbiview_aug.rig import Rig
 
 LIDAR_POSITION_M = (0.9, 0.0, 1.9)
@@ -143,6 +144,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         return RenderedViews(*(stack_or_list([v[k] for v in views]) for k in range(4)))
 
     @torch.no_grad()
+    @one_torch_thread()
     def points(self, index: int) -> Tensor:
         """(P, 4) float32 LiDAR-like points x y z intensity (0 to 255) of scene ``index``, in the rig's ego frame.
 

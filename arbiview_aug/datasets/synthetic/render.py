@@ -27,6 +27,7 @@ from arbiview_aug.datasets.synthetic.raycast import (
 )
 from arbiview_aug.datasets.synthetic.scene import Scene, SceneClass
 from arbiview_aug.datasets.synthetic.shading import Hits, SceneTables, faces, shade
+from arbiview_aug.datasets.synthetic.threads import one_torch_thread
 
 TILE_PX = 16
 _PACKET_PX = 16
@@ -169,6 +170,7 @@ class Renderer:
         return self._tables
 
     @torch.no_grad()
+    @one_torch_thread()
     def render(self, scene: Scene, cameras: Sequence[Camera], ground_z_m: float) -> list[CameraView]:
         """Views of ``scene`` whose road lies at ``ground_z_m`` in the cameras' ego frame."""
         views: list[CameraView] = []
