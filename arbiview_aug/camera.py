@@ -37,6 +37,8 @@ ROTATION_TOLERANCE = 1e-4
 UNPROJECT_TOLERANCE_PX = 1e-6
 """A ray counts as found when projecting it again lands this close to its pixel."""
 
+_MAX_COEFFICIENT = 1e6  # real lenses stay below 1e3, and near 1e300 their polynomials overflow
+
 MAX_SIZE_PX = 32766
 """Largest image side: OpenCV's remap needs sizes below 32767."""
 
@@ -170,8 +172,8 @@ class Camera:
             expected = " or ".join(map(str, counts)) + f" coefficients for a {self.lens} lens"
             fix = "name the lens: lens='radtan' or lens='fisheye'" if self.lens == "pinhole" else ""
             raise self._error("distortion", expected, str(len(coefficients)), fix)
-        if not all(map(math.isfinite, coefficients)):
-            raise self._error("distortion", "finite numbers", repr(coefficients))
+        if not all(abs(k) <= _MAX_COEFFICIENT for k in coefficients):  # also catches NaN
+            raise self._error("distortion", f"finite numbers up to {_MAX_COEFFICIENT:g}", repr(coefficients))
         return coefficients
 
     def _checked_mask(self, mask: Any) -> BoolArray:
