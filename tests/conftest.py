@@ -1,7 +1,9 @@
 """Fixtures that several test modules share."""
 
+import importlib.util
 import os
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -32,6 +34,19 @@ def ddad_root(data_root: Path) -> Path:
 def fisheye_root(data_root: Path) -> Path:
     """Four real fisheye cameras, as PNGs."""
     return _frame(data_root, "surround-fisheye")
+
+
+@pytest.fixture(scope="session")
+def referee(data_root: Path) -> ModuleType:
+    """The evaluation protocol, which ``evaluate`` must agree with; the test is skipped where it is missing."""
+    path = data_root.parent / "referee.py"
+    if not path.is_file():
+        pytest.skip(f"no evaluation protocol {path}: it lies beside the data folder")
+    spec = importlib.util.spec_from_file_location("referee", path)
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def _frame(data_root: Path, name: str) -> Path:

@@ -67,6 +67,13 @@ def test_the_commands_run(
     assert any(path.is_file() for path in tmp_path.rglob("*"))
 
 
+def test_measurements_name_tests_that_are_there() -> None:
+    named = re.findall(r"`python -m pytest -m (\w+) (\S+) -s`", README)
+    assert named == [("slow", "tests/acceptance")]
+    for mark, folder in named:
+        assert any(f"pytest.mark.{mark}" in path.read_text() for path in (ROOT / folder).glob("test_*.py"))
+
+
 def test_pictures_and_files_exist() -> None:
     (picture,) = re.findall(r"!\[[^]]*\]\(([^)]+)\)", README)
     assert 0 < (ROOT / picture).stat().st_size <= LARGEST_PICTURE_BYTES

@@ -1,0 +1,101 @@
+"""Accuracy against true views: 20 synthetic streets, the demo's six-camera rig moved and turned, 256x704.
+
+A move's PSNR on a street is over the covered pixels of all six views together; the tables hold means over the streets.
+Run with ``-s`` for the tables.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from arbiview_aug.datasets.synthetic import GROUND_CLASSES, SyntheticDrive, demo_source_rig
+from arbiview_aug.evaluate.scores import psnr_db
+from arbiview_aug.rig import Rig
+from arbiview_aug.surface import SurfaceName
+from arbiview_aug.transforms import RigRetarget
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+SEEDS = range(20)
+SIZE = (256, 704)
+SINGLE: tuple[SurfaceName, ...] = ("street", "ground", "far")
+SURFACES: tuple[SurfaceName, ...] = ("auto", *SINGLE)
+MOVES = ("0.6 m higher", "0.5 m forward", "turned by 20°")
+GAIN_OVER_FAR_DB = 3.0
+LARGEST_LOSS_DB = 0.1
+"""What ``auto`` may lose to the best single surface on covered pixels."""
+
+
+class Psnr(NamedTuple):
+    """(streets,) each: on covered pixels of the road and the pavements, and on all covered pixels."""
+
+    ground: np.ndarray
+    covered: np.ndarray
+
+
+Scores = dict[tuple[str, str], Psnr]
+"""By (move, surface)."""
+
+
+def moved(rig: Rig, move: str) -> Rig:
+    if move == "0.6 m higher":
+        return rig.shifted(z_m=0.6)
+    return rig.shifted(x_m=0.5) if move == "0.5 m forward" else rig.turned(yaw_deg=20)
+
+
+@pytest.fixture(scope="module")
+def scores() -> Scores:
+    """All numbers, printed as tables."""
+    start, source = time.perf_counter(), demo_source_rig(SIZE)
+    targets = {move: moved(source, move) for move in MOVES}
+    retargets = {(m, s): RigRetarget(target, surface=s) for m, target in targets.items() for s in SURFACES}
+    rows: dict[tuple[str, str], list[tuple[float, float]]] = {key: [] for key in retargets}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for seed in SEEDS:
+            drive = SyntheticDrive(source, num_frames=1, seed=seed, lidar=False)
+            sample, truth = drive[0], {move: drive.render(0, target) for move, target in targets.items()}
+            for (move, surface), retarget in retargets.items():
+                out = retarget(sample)
+                squares = (out["images"].float() - truth[move].images).square().mean(1).numpy()
+                covered = out["coverage"].numpy()
+                ground = covered & np.isin(truth[move].classes.numpy(), [int(c) for c in GROUND_CLASSES])
+                rows[move, surface].append(tuple(psnr_db(float(squares[part].mean())) for part in (ground, covered)))
+    found = {key: Psnr(*np.array(values).T) for key, values in rows.items()}
+    for name in Psnr._fields:
+        print(f"\n{table(name, found)}")
+    print(f"({time.perf_counter() - start:.0f} s)")
+    return found
+
+
+def table(field: str, found: Scores) -> str:
+    """Means over the streets; in brackets, by how much the worst street is below the best single surface."""
+    title = f"PSNR in dB, {field} pixels (worst of {len(SEEDS)} streets)"
+    lines = [f"{title:<52}" + "".join(f"{move:>18}" for move in MOVES)]
+    for surface in SURFACES:
+        cells = []
+        for move in MOVES:
+            values = {s: getattr(found[move, s], field) for s in SURFACES}
+            best = np.max([values[s] for s in SINGLE], axis=0)
+            cells.append(f"{values[surface].mean():.2f} ({(values[surface] - best).min():+.2f})")
+        lines.append(f"  {surface:<50}" + "".join(f"{cell:>18}" for cell in cells))
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("move", MOVES)
+@pytest.mark.parametrize("surface", ["ground", "street"])
+def test_a_road_beats_far_on_the_ground(scores: Scores, move: str, surface: str) -> None:
+    gain = scores[move, surface].ground - scores[move, "far"].ground
+    assert gain.mean() >= GAIN_OVER_FAR_DB
+    assert gain.min() > 0
+
+
+@pytest.mark.parametrize("move", MOVES)
+def test_auto_is_as_good_as_the_best_single_surface(scores: Scores, move: str) -> None:
+    best = max(scores[move, surface].covered.mean() for surface in SINGLE)
+    assert scores[move, "auto"].covered.mean() >= best - LARGEST_LOSS_DB
