@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from arbiview_aug.camera import UNPROJECT_TOLERANCE_PX, Camera
+from arbiview_aug.errors import CalibrationError
 from arbiview_aug.lens import _radtan, _radtan_jacobian, fold_limit
 
 K = np.array([[410.0, 0.0, 318.0], [0.0, 405.0, 242.0], [0.0, 0.0, 1.0]])
@@ -147,10 +148,17 @@ def test_radtan_jacobian_agrees_with_differences() -> None:
     np.testing.assert_allclose(bb, (up[1] - down[1]) / 2 / h, atol=1e-8)
 
 
-@pytest.mark.parametrize("coefficient", [1e300, -1e300, 1e12, -1e12])
+@pytest.mark.parametrize("coefficient", [1e6, -1e6])
 @pytest.mark.parametrize("lens", ["radtan", "fisheye"])
 def test_absurd_coefficients_stay_finite(lens: str, coefficient: float) -> None:
     camera = make("pinhole", lens=lens, distortion=(coefficient, 0.0, 0.0, 0.0))
     with np.errstate(all="ignore"):
         rays = camera.resize((24, 32)).unproject(camera.resize((24, 32)).pixel_grid())
     assert np.isfinite(rays.directions).all()
+
+
+@pytest.mark.parametrize("coefficient", [1e300, -1e12])
+@pytest.mark.parametrize("lens", ["radtan", "fisheye"])
+def test_impossible_coefficients_are_refused(lens: str, coefficient: float) -> None:
+    with pytest.raises(CalibrationError, match=r"distortion: expected finite numbers up to 1e\+06"):
+        make("pinhole", lens=lens, distortion=(coefficient, 0.0, 0.0, 0.0))
