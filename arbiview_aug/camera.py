@@ -30,6 +30,7 @@ from arbiview_aug.lens import (
     intrinsics_for_fov,
     undistort,
 )
+from arbiview_aug.rotations import CAMERA_AXES_IN_EGO, nearest_rotation, rotation_x, rotation_z
 
 ROTATION_TOLERANCE = 1e-4
 """Largest entry of |R Rᵀ - I| that is still a rotation: published calibrations carry 5 to 7 digits."""
@@ -435,29 +436,6 @@ class Camera:
         pixel = np.round(uv).clip(0, [self.width_px - 1, self.height_px - 1]).astype(int)
         seen = valid & self.contains(uv)
         return replace(pinhole, mask=self.mask[pixel[..., 1], pixel[..., 0]] & seen)
-
-
-CAMERA_AXES_IN_EGO = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""Columns: the resting camera's x (right), y (down) and z (forward) axes in the ego frame."""
-CAMERA_AXES_IN_EGO.setflags(write=False)
-
-
-def rotation_x(angle_deg: float) -> FloatArray:
-    """(3, 3) right-handed rotation about x."""
-    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
-    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-
-
-def rotation_z(angle_deg: float) -> FloatArray:
-    """(3, 3) right-handed rotation about z."""
-    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def nearest_rotation(R: FloatArray) -> FloatArray:
-    """The proper rotation closest to R in the Frobenius norm (orthogonal Procrustes)."""
-    U, _, Vt = np.linalg.svd(R)
-    return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
 
 
 def resize_matrix(size: tuple[int, int], new_size: tuple[int, int]) -> FloatArray:

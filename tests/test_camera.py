@@ -9,8 +9,9 @@ import re
 import numpy as np
 import pytest
 
-from arbiview_aug.camera import MAX_SIZE_PX, Camera, nearest_rotation
+from arbiview_aug.camera import MAX_SIZE_PX, Camera
 from arbiview_aug.errors import ArbiviewError, CalibrationError
+from arbiview_aug.rotations import nearest_rotation
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
 POSE = Camera.looking(

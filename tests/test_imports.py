@@ -15,6 +15,7 @@ PACKAGE = Path(__file__).parents[1] / "arbiview_aug"
 LAYERS: list[tuple[str, ...]] = [
     ("errors", "environment"),
     ("lens",),
+    ("rotations",),
     ("camera",),
     ("rig",),
     ("surface", "grid", "neighbours", "tone"),

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from arbiview_aug.camera import FloatArray
+from arbiview_aug.datasets.nuscenes import CAMERA_RING
 from arbiview_aug.rig import Rig
 
 PAPER_SHARES = (0.2, -0.2, 0.4, -0.4, 0.5, -0.25)
@@ -22,14 +23,6 @@ With the spacing of nuScenes (55 degrees, at the back 70) these are its yaws of 
 YAWS_DEG = (11.0, -11.0, 22.0, -22.0, 35.0)
 UP_M = 0.6
 
-_NUSCENES_CAMERAS = {
-    "CAM_FRONT",
-    "CAM_FRONT_RIGHT",
-    "CAM_BACK_RIGHT",
-    "CAM_BACK",
-    "CAM_BACK_LEFT",
-    "CAM_FRONT_LEFT",
-}
 _SAME_DIRECTION_DEG = 5.0
 
 
@@ -40,7 +33,7 @@ def spacing_deg(rig: Rig) -> FloatArray:
     one of the two gaps to the next camera on either side, where cameras within 5 degrees count as the same direction
     (a telephoto beside a wide camera); a camera without a neighbour has its own horizontal field of view.
     """
-    if _NUSCENES_CAMERAS.issuperset(rig.names):
+    if set(CAMERA_RING).issuperset(rig.names):
         return np.array([70.0 if name == "CAM_BACK" else 55.0 for name in rig.names])
     azimuth = np.array([camera.azimuth_deg for camera in rig])
     spacing = []

@@ -311,7 +311,7 @@ def paper_labels(rendering: PaperRendering, labels: Sequence[torch.Tensor], fill
     return rendered
 
 
-# --- helpers ----------------------------------------------------------------------------------------------------------
+# --- details ----------------------------------------------------------------------------------------------------------
 def _source_pixels(camera: Camera, H: FloatArray, size: tuple[int, int]) -> tuple[npt.NDArray[np.float32], BoolArray]:
     """(h, w, 2) float32 source pixel of each target pixel, and (h, w) whether it lies in front and in the image."""
     back = np.linalg.inv(H)  # positive third coordinates in front, as H

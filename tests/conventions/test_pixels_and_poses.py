@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from arbiview_aug.camera import Camera, rotation_z
+from arbiview_aug.camera import Camera
 from arbiview_aug.rig import Rig
+from arbiview_aug.rotations import rotation_z
 
 
 def camera(**changes: object) -> Camera:
