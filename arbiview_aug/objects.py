@@ -18,13 +18,14 @@ from arbiview_aug.camera import BoolArray, FloatArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Far, Ground, Static, Street
 
-_BLOCK = 512
+_BLOCK = 512  # rays looked at together: eight coarse cells in a row
 
 AIR_M = 0.03
 """Boxes are drawn this much too tight or too wide by labellers; for hiding they are enlarged by it, and by a pixel."""
 
 _LEAST_INCIDENCE = 0.2
 """Sine of the flattest angle (12 degrees) at which a source may look along a face and still be read for it."""
+
 
 @dataclass(frozen=True, eq=False)
 class Objects:
