@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,7 @@ def _known_miss(name: str) -> list[pytest.MarkDecorator]:
 
 
 @pytest.mark.bench
+@pytest.mark.xfail("CI" in os.environ, reason="on shared machines ratios are reported, not asserted", strict=False)
 @pytest.mark.parametrize(
     ("name", "bound"), [pytest.param(name, bound, marks=_known_miss(name)) for name, bound in BOUNDED]
 )
