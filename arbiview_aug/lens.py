@@ -148,9 +148,7 @@ def fold_limit(lens: str, distortion: tuple[float, ...]) -> float:
     k1, k2, _, _, k3, k4, k5, k6 = (*distortion, *(0.0,) * (8 - len(distortion)))
     numerator = np.array([k3, 0, k2, 0, k1, 0, 1, 0.0])  # r (1 + k1 r^2 + k2 r^4 + k3 r^6)
     denominator = np.array([k6, 0, k5, 0, k4, 0, 1.0])
-    slope = np.polysub(
-        np.polymul(np.polyder(numerator), denominator), np.polymul(numerator, np.polyder(denominator))
-    )
+    slope = np.polysub(np.polymul(np.polyder(numerator), denominator), np.polymul(numerator, np.polyder(denominator)))
     return min(_smallest_positive_root(slope), _smallest_positive_root(denominator))
 
 

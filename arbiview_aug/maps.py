@@ -18,9 +18,8 @@ import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.grid import HALVINGS, Box, Grid
-from arbiview_aug.objects import Surface
 from arbiview_aug.sampling import Slot, halved
-from arbiview_aug.surface import Static
+from arbiview_aug.surface import Static, Surface
 
 _SAFETY = 2.0  # curvature between the nodes may exceed what the nodes show
 _CORNERS = tuple((a, b) for a in (slice(None, -1), slice(1, None)) for b in (slice(None, -1), slice(1, None)))

@@ -41,9 +41,7 @@ def half_way_view(a: Camera, b: Camera, size: tuple[int, int] = VIEW_SIZE) -> Ca
     cam2ego[:3, 3] = (a.center_m + b.center_m) / 2
     narrower = max((a, b), key=lambda c: c.K[0, 0] / c.width_px)
     scale = np.diag([size[1] / narrower.width_px, size[0] / narrower.height_px, 1.0])
-    return Camera(
-        name=f"{a.name}+{b.name}", width_px=size[1], height_px=size[0], K=scale @ narrower.K, cam2ego=cam2ego
-    )
+    return Camera(name=f"{a.name}+{b.name}", width_px=size[1], height_px=size[0], K=scale @ narrower.K, cam2ego=cam2ego)
 
 
 def odd_tiles(size: tuple[int, int], tile_px: int = TILE_PX) -> BoolArray:

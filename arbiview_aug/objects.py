@@ -16,7 +16,7 @@ import numpy as np
 
 from arbiview_aug.camera import BoolArray, FloatArray
 from arbiview_aug.errors import SampleError
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Far, Ground, Static, Street
+from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Street, Surface
 
 _BLOCK = 512  # rays looked at together: eight coarse cells in a row
 
@@ -28,7 +28,7 @@ _LEAST_INCIDENCE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class Objects:
+class Objects(Surface):
     """Boxes standing on the street.
 
     Attributes:
@@ -137,15 +137,3 @@ def checked_boxes(boxes: Any) -> FloatArray:
         bad = int(np.flatnonzero(~np.isfinite(array).all(1) | (array[:, 3:6] <= 0).any(1))[0])
         raise SampleError(f"boxes_3d[{bad}]: expected finite numbers and positive sizes, got {array[bad].tolist()}")
     return array
-
-
-Surface = Static | Objects
-
-
-def scene_surfaces(ground_z_m: float, boxes: FloatArray | None) -> dict[str, Surface]:
-    """The surfaces that can be asked for by name over a road at ``ground_z_m``; ``objects`` where there are boxes."""
-    street = Street(ground_z_m=ground_z_m)
-    surfaces: dict[str, Surface] = {"far": Far(), "ground": Ground(ground_z_m=ground_z_m), "street": street}
-    if boxes is not None:
-        surfaces["objects"] = Objects(street, boxes)
-    return surfaces

@@ -13,12 +13,13 @@ import hashlib
 from collections import Counter, OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
+from functools import lru_cache
 
-from arbiview_aug.camera import BoolArray, FloatArray
+from arbiview_aug.camera import BoolArray
 from arbiview_aug.favs.config import FavsConfig
-from arbiview_aug.objects import scene_surfaces
 from arbiview_aug.rig import Rig, content_order
 from arbiview_aug.sampling import AtlasLayout, Scratch
+from arbiview_aug.scene import Scene
 from arbiview_aug.target_plan import TargetDraft, TargetPlan
 
 
@@ -87,13 +88,11 @@ class PlanCache:
         return PlanCache, (self.max_bytes,)
 
 
-def plan_key(
-    source: Rig, target: Rig, surface: str, config: FavsConfig, boxes: FloatArray | None = None
-) -> bytes:
+def plan_key(source: Rig, target: Rig, surface: str, config: FavsConfig, scene: Scene | None = None) -> bytes:
     """Content key of a plan: the calibrations, the scene, the surface and the settings, no names."""
     settings = tuple(getattr(config, f.name) for f in fields(config))
-    scene = None if boxes is None else boxes.tobytes()
-    return hashlib.sha256(repr((source.content_key, target.content_key, surface, settings, scene)).encode()).digest()
+    geometry = (scene or Scene()).key
+    return hashlib.sha256(repr((source.content_key, target.content_key, surface, settings, geometry)).encode()).digest()
 
 
 def build_plan(
@@ -102,7 +101,7 @@ def build_plan(
     *,
     surface: str = "auto",
     config: FavsConfig | None = None,
-    boxes: FloatArray | None = None,
+    scene: Scene | None = None,
 ) -> RenderPlan:
     """Plan how ``target`` is rendered from ``source``'s images.
 
@@ -113,7 +112,7 @@ def build_plan(
             source camera, ``far`` where their centres coincide or the worst-case parallax is below
             ``config.far_parallax_px``, else ``street``.
         config: Settings; the ``fast`` preset by default.
-        boxes: (B, 7) objects of the scene in the source's ego frame, for ``objects``.
+        scene: What is known of the geometry, in the source's ego frame.
 
     Returns:
         The plan. Targets that no source sees have zero coverage.
@@ -122,8 +121,9 @@ def build_plan(
     target = target.in_frame_of(source)
     counters: Counter[str] = Counter()
     order = content_order(source.cameras)
-    surfaces = scene_surfaces(source.ground_z_m, boxes)
-    drafts = [TargetDraft(source, order, camera, surface, surfaces, config, counters) for camera in target]
+    known = scene or Scene()
+    surface_by_name = lru_cache(None)(lambda name: known.surface(name, source.ground_z_m))
+    drafts = [TargetDraft(source, order, camera, surface, surface_by_name, config, counters) for camera in target]
     used = [(region.source, region.level) for draft in drafts for region in draft.regions]
     layout = AtlasLayout.for_sources(source.sizes, used)
     scratch = Scratch()

@@ -142,6 +142,7 @@ class Rig:
 
     def resized(self, size: tuple[int, int] | float) -> Rig:
         """All cameras resized to (h, w), or by a scale."""
+
         def new(c: Camera) -> tuple[int, int]:
             if isinstance(size, tuple):
                 return size
@@ -314,5 +315,3 @@ def read_mask(file: Any, folder: Path | None, label: str) -> np.ndarray:
 def content_order(cameras: Sequence[Camera]) -> list[int]:
     """Indices of cameras in an order that depends on their calibration alone, never on their place in the list."""
     return sorted(range(len(cameras)), key=lambda k: (cameras[k].content_key, k))
-
-

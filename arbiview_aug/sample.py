@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug.camera import BoolArray, Camera, FloatArray
+from arbiview_aug.camera import BoolArray, Camera
 from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.objects import checked_boxes
 from arbiview_aug.rig import Rig
+from arbiview_aug.scene import Scene
 from arbiview_aug.tensors import leading_shape, split
 
 CALIBRATION_KEYS = (
@@ -79,19 +80,24 @@ def check_inputs(sample: Any, source_rig: Rig | None) -> list[SourceFrame]:
     ]
 
 
-def boxes_of_frames(sample: Mapping[str, Any], lead: tuple[int, ...]) -> list[FloatArray]:
-    """(B, 7) boxes of each frame of a sample, in the source's ego frame.
+def scenes_of_frames(sample: Mapping[str, Any], lead: tuple[int, ...], surface: str) -> list[Scene]:
+    """What each frame of a sample says of the geometry, in the source's ego frame.
+
+    Args:
+        sample: The sample dict, its images checked.
+        lead: Leading dimensions of its images.
+        surface: The surface asked for: what it does not use is not read.
 
     Raises:
-        SampleError: No boxes, or impossible ones.
+        SampleError: Geometry that the surface needs is missing or impossible.
     """
     boxes = sample.get("boxes_3d")
-    if boxes is None:
+    if surface == "objects" and boxes is None:
         raise SampleError(
             "surface='objects': expected 'boxes_3d' (B, 7) in the sample, got none; an empty (0, 7) tensor says that "
             "nothing stands there"
         )
-    return [checked_boxes(frame) for frame in (split(boxes, lead) if lead else [boxes])]
+    return [Scene(boxes=checked_boxes(frame)) for frame in (split(boxes, lead) if lead else [boxes])]
 
 
 # --- images -----------------------------------------------------------------------------------------------------------

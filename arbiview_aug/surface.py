@@ -12,7 +12,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from arbiview_aug.camera import FloatArray
+from arbiview_aug.camera import BoolArray, FloatArray
 
 SurfaceName = Literal["auto", "far", "ground", "street", "objects"]
 """Surfaces a user can ask for. ``auto`` decides per pair of target and source camera (see ``plan``)."""
@@ -25,11 +25,12 @@ WALL_CENTER_M = (1.0, 0.0)
 0 and 2 m ahead are within 0.05 dB."""
 
 
-class Static(ABC):
-    """A surface without objects: it hides nothing from any camera; hashable, equal when it describes the same scene.
+class Surface(ABC):
+    """What a ray meets, seen from any centre; hashable.
 
     Attributes:
-        smooth: Without creases: a map over it may be interpolated by what its values on a grid show.
+        smooth: Without creases (away from ``detailed`` rays): a map over it may be interpolated by what its values on
+            a grid show.
     """
 
     smooth: ClassVar[bool]
@@ -42,6 +43,41 @@ class Static(ABC):
             origin: (3,) the rays' common start in the ego frame, metres.
             directions: (..., 3) unit directions in the ego frame.
         """
+
+    @abstractmethod
+    def hides(
+        self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
+    ) -> BoolArray:
+        """Whether something stands between a source's centre and scene points.
+
+        Args:
+            origin: (3,) the source's centre in the ego frame, metres.
+            directions: (..., 3) unit directions towards the points, ego frame.
+            inverse_distance: (...,) of the points along them, 1/m.
+            pixel_rad: Angle of one of the source's pixels.
+        """
+
+    @abstractmethod
+    def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
+        """Rays (...,) that pass some detail within an angle, where nothing may be interpolated."""
+
+    def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
+        """Spread (...,) in 1/m of the true inverse distance around this surface's ``inverse_distance``."""
+        return depth_uncertainty(inverse_distance)
+
+
+class Static(Surface):
+    """A surface without objects: it hides nothing from any camera, and has no detail; equal for the same scene."""
+
+    def hides(
+        self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
+    ) -> BoolArray:
+        """Nothing (...,)."""
+        return np.zeros(inverse_distance.shape, bool)
+
+    def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
+        """Nowhere (...,)."""
+        return np.zeros(directions.shape[:-1], bool)
 
 
 @dataclass(frozen=True)

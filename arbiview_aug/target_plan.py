@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -17,10 +17,9 @@ from arbiview_aug.favs.adaptive_fusion import distance_weight, primary_weight, q
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.grid import Box
 from arbiview_aug.maps import PairMap, TargetRays, edge_distance, resolution
-from arbiview_aug.objects import Surface
 from arbiview_aug.rig import Rig
 from arbiview_aug.sampling import AtlasLayout, FixedMap, Scratch
-from arbiview_aug.surface import depth_uncertainty, worst_parallax_px
+from arbiview_aug.surface import Surface, worst_parallax_px
 
 SAME_CENTER_M = 1e-6
 """Centres closer than this coincide: a homography is exact whatever the scene."""
@@ -134,12 +133,12 @@ class TargetDraft:
         order: list[int],
         camera: Camera,
         surface: str,
-        surfaces: Mapping[str, Surface],
+        surface_by_name: Callable[[str], Surface],
         config: FavsConfig,
         counters: Counter[str],
     ) -> None:
         self.source, self.camera, self.surface, self.config = source, camera, surface, config
-        self.surfaces = surfaces
+        self.surface_by_name = surface_by_name
         self.counters = counters
         self.rays = TargetRays(camera, config.grid_step_px, counters)
         self.grid = self.rays.grid
@@ -163,7 +162,7 @@ class TargetDraft:
         baseline_m = float(np.linalg.norm(offset_m))
         focal_px = float(self.camera.K[0, 0])
         name, reason = self._choose_surface(baseline_m, focal_px)
-        surface = self.surfaces[name]
+        surface = self.surface_by_name(name)
         pair = PairMap(self.rays, source, surface)
         if pair.nodes is None:
             return None
@@ -173,7 +172,7 @@ class TargetDraft:
         seen = pair.valid & (edge_px > 0)
         level = self._level(pixels_per_pixel[seen], source.size) if self.config.antialias else 0
         pair.set_tolerance(self.config.map_tolerance_px * 2**level)
-        parallax = self._expected_parallax(offset_m, focal_px, self.rays.inverse_distance(surface))
+        parallax = self._expected_parallax(offset_m, focal_px, surface)
         score = (
             distance_weight(edge_px, min(source.size) / 2, self.config.distance_gamma)
             * quality_weight(parallax, pixels_per_pixel)
@@ -191,11 +190,12 @@ class TargetDraft:
             border_px=(edge_px / np.maximum(pixels_per_pixel, 1e-3)).astype(np.float32),
         )
 
-    def _expected_parallax(self, offset_m: FloatArray, focal_px: float, q: FloatArray) -> FloatArray:
+    def _expected_parallax(self, offset_m: FloatArray, focal_px: float, surface: Surface) -> FloatArray:
         """Displacement (target px) that unknown depth around a surface may cause: offset across the ray x spread."""
+        q = self.rays.inverse_distance(surface)
         along_m = self.rays.directions @ offset_m
         across_m = np.sqrt(np.maximum(offset_m @ offset_m - along_m**2, 0))
-        return focal_px * across_m * depth_uncertainty(q)
+        return focal_px * across_m * surface.uncertainty(self.camera.center_m, self.rays.directions, q)
 
     @staticmethod
     def _level(resolution: FloatArray, size: tuple[int, int]) -> int:

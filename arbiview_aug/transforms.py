@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import torch
 
-from arbiview_aug.camera import FloatArray
 from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError
 from arbiview_aug.explain import Explanation, PaperExplanation
@@ -25,8 +24,9 @@ from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_targ
 from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
 from arbiview_aug.random_rig import RandomRig
 from arbiview_aug.rig import Rig, load_rig
-from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame, boxes_of_frames, check_inputs
+from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame, check_inputs, scenes_of_frames
 from arbiview_aug.sampling import Scratch
+from arbiview_aug.scene import Scene
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.tensors import covered, gathered, leading_shape, lens_names, like, resized, rewrapped, stacked
 
@@ -171,8 +171,8 @@ class RigRetarget(torch.nn.Module):
         target, skip, drawn = self._draw(sample, frames, params)
         views: list[View] = []
         scenes = self._scenes(sample, len(frames), lead)
-        for frame, boxes in zip(frames, scenes, strict=True):
-            views.append(self.size if skip and self.size else self._view(frame, target, boxes))
+        for frame, scene in zip(frames, scenes, strict=True):
+            views.append(self.size if skip and self.size else self._view(frame, target, scene))
         parts = self._rendered(frames, views)
         out = self._kept(sample, labels)
         out["images"] = rewrapped(gathered([part["images"] for part in parts], lead), sample["images"])
@@ -239,9 +239,7 @@ class RigRetarget(torch.nn.Module):
         return {k: v for k, v in sample.items() if k in rendered or k not in (*CALIBRATION_KEYS, *stale)}
 
     # --- images ---------------------------------------------------------------------------------------------------
-    def _rendered(
-        self, frames: Sequence[SourceFrame], views: Sequence[View]
-    ) -> list[dict[str, Any]]:
+    def _rendered(self, frames: Sequence[SourceFrame], views: Sequence[View]) -> list[dict[str, Any]]:
         """Images, calibration and masks of each frame: rendered by its plan, or resized."""
         parts = []
         for frame, view, images in zip(frames, views, self._images(frames, views), strict=True):
@@ -259,9 +257,7 @@ class RigRetarget(torch.nn.Module):
             parts.append(part)
         return parts
 
-    def _images(
-        self, frames: Sequence[SourceFrame], views: Sequence[View]
-    ) -> list[list[torch.Tensor]]:
+    def _images(self, frames: Sequence[SourceFrame], views: Sequence[View]) -> list[list[torch.Tensor]]:
         """The target images of each frame; frames that share a plan go through torch together."""
         done: dict[int, list[torch.Tensor]] = {}
         together: dict[int, list[int]] = {}
@@ -302,20 +298,20 @@ class RigRetarget(torch.nn.Module):
             part["ignore"] = stacked([torch.from_numpy(~m).to(device) for m in masks])
         return part
 
-    def _scenes(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[FloatArray | None]:
-        """The boxes of each frame, where the surface stands on them."""
-        return boxes_of_frames(sample, lead) if self.surface == "objects" else [None] * count
+    def _scenes(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[Scene | None]:
+        """What each frame's sample says of the geometry, as far as the surface uses it."""
+        return scenes_of_frames(sample, lead, self.surface) if self.surface == "objects" else [None] * count
 
-    def _view(self, frame: SourceFrame, target: Rig, boxes: FloatArray | None) -> RenderPlan | PaperRendering:
+    def _view(self, frame: SourceFrame, target: Rig, scene: Scene | None) -> RenderPlan | PaperRendering:
         """The plan of a frame, or the frame rendered by the published stages, for which nothing can be planned."""
         if not isinstance(self.config, PaperConfig):
-            return self.plan(frame.rig, target, boxes)
+            return self.plan(frame.rig, target, scene)
         rendering = render_paper(frame.rig, target.in_frame_of(frame.rig), frame.images, self.config)
         self._warn_unreachable(rendering)
         return rendering
 
-    def plan(self, source: Rig, target: Rig, boxes: FloatArray | None = None) -> RenderPlan:
-        """The cached render plan of a pair of rigs, and of the objects that stand there.
+    def plan(self, source: Rig, target: Rig, scene: Scene | None = None) -> RenderPlan:
+        """The cached render plan of a pair of rigs in a scene.
 
         Raises:
             ValueError: With ``quality="paper"``.
@@ -323,11 +319,11 @@ class RigRetarget(torch.nn.Module):
         if isinstance(self.config, PaperConfig):
             raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
         config = self.config
-        key = plan_key(source, target, self.surface, config, boxes)
-        return self.plans.get(key, lambda: self._built(source, target, config, boxes))
+        key = plan_key(source, target, self.surface, config, scene)
+        return self.plans.get(key, lambda: self._built(source, target, config, scene))
 
-    def _built(self, source: Rig, target: Rig, config: FavsConfig, boxes: FloatArray | None) -> RenderPlan:
-        plan = build_plan(source, target, surface=self.surface, config=config, boxes=boxes)
+    def _built(self, source: Rig, target: Rig, config: FavsConfig, scene: Scene | None) -> RenderPlan:
+        plan = build_plan(source, target, surface=self.surface, config=config, scene=scene)
         self._warn_unreachable(plan)
         return plan
 
@@ -361,9 +357,9 @@ class RigRetarget(torch.nn.Module):
         """
         frames, lead = check_inputs(sample, self.source_rig), leading_shape(sample["images"])
         target, _, _ = self._draw(sample, frames[:1], None)
-        (boxes,) = self._scenes(sample, len(frames), lead)[:1]
+        (scene,) = self._scenes(sample, len(frames), lead)[:1]
         asked = self.harmoniser.estimates or self.harmoniser.gains is not None
-        view = self._view(frames[0], target, boxes)
+        view = self._view(frames[0], target, scene)
         if isinstance(view, PaperRendering):
             return PaperExplanation(view)
         return Explanation(view, self.harmonisation(sample) if asked else None)

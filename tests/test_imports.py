@@ -20,6 +20,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("rig",),
     ("surface", "grid", "neighbours", "tone"),
     ("objects",),
+    ("scene",),
     ("sampling",),
     ("favs.config", "favs.geometric_transformation", "favs.adaptive_fusion"),
     ("favs.feature_matching",),

@@ -12,6 +12,7 @@ from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.favs.synthesis import render_opencv
 from arbiview_aug.objects import Objects, checked_boxes
 from arbiview_aug.plan import build_plan
+from arbiview_aug.scene import Scene
 from arbiview_aug.surface import Street
 
 EYE = np.array([0.0, 0.0, 1.5])
@@ -98,7 +99,7 @@ def test_vehicles_are_truer_than_over_a_static_surface(street: tuple[SyntheticDr
         vehicle = truth.classes.numpy() == SceneClass.VEHICLE
         error = {}
         for surface in ("street", "objects"):
-            plan = build_plan(rig, rig.shifted(**move), surface=surface, boxes=checked_boxes(sample["boxes_3d"]))
+            plan = build_plan(rig, rig.shifted(**move), surface=surface, scene=Scene(checked_boxes(sample["boxes_3d"])))
             views = torch.stack(render_opencv(plan, list(sample["images"]))).float()
             squared = ((views - truth.images.float()) ** 2).mean(1).numpy()
             error[surface] = squared[vehicle & np.stack(plan.coverage)].mean()
@@ -115,7 +116,7 @@ def test_what_a_car_hid_is_a_hole_and_not_its_colour() -> None:
     directions = camera.unproject(camera.pixel_grid()).directions
     hit = Objects(Street(), CAR)._boxes_ahead(camera.center_m, directions)[0] > 0
     image = np.where(hit[..., None], np.array([220, 20, 20]), np.array([90, 90, 90])).astype(np.uint8)
-    plan = build_plan(rig, rig.shifted(z_m=1.5), surface="objects", boxes=CAR)
+    plan = build_plan(rig, rig.shifted(z_m=1.5), surface="objects", scene=Scene(CAR))
     view = render_opencv(plan, [torch.from_numpy(image).permute(2, 0, 1)])[0].permute(1, 2, 0).numpy()
     target, coverage = plan.target[0], plan.coverage[0]
     rays = target.unproject(target.pixel_grid()).directions
@@ -134,8 +135,8 @@ def test_coarse_grid_equals_pixel_by_pixel_evaluation(street: tuple[SyntheticDri
     drive, rig = street
     boxes = checked_boxes(drive[0]["boxes_3d"])
     target = rig.shifted(z_m=0.7)
-    coarse = build_plan(rig, target, surface="objects", boxes=boxes)
-    exact = build_plan(rig, target, surface="objects", boxes=boxes, config=FavsConfig(grid_step_px=1))
+    coarse = build_plan(rig, target, surface="objects", scene=Scene(boxes))
+    exact = build_plan(rig, target, surface="objects", scene=Scene(boxes), config=FavsConfig(grid_step_px=1))
     for a, b in zip(coarse.coverage, exact.coverage, strict=True):
         assert (a != b).mean() < 0.002
 

@@ -9,9 +9,9 @@ import pytest
 from arbiview_aug.camera import Camera
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.maps import ego_rays, project_rays
-from arbiview_aug.objects import scene_surfaces
 from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
 from arbiview_aug.rig import Rig, load_rig
+from arbiview_aug.scene import Scene
 
 MAP_TOLERANCE_PX = 1 / 32
 
@@ -20,7 +20,7 @@ def reference(plan: RenderPlan, k: int, surface: str, source: int) -> tuple[np.n
     """Source pixels and visibility of every target pixel, evaluated one by one in float64."""
     camera, recorded = plan.target[k], plan.source[source]
     directions, ray_valid = ego_rays(camera, camera.pixel_grid())
-    q = scene_surfaces(plan.source.ground_z_m, None)[surface].inverse_distance(camera.center_m, directions)
+    q = Scene().surface(surface, plan.source.ground_z_m).inverse_distance(camera.center_m, directions)
     uv, valid = project_rays(recorded, directions, q, camera.center_m - recorded.center_m)
     return uv, valid & ray_valid & recorded.contains(uv)
 
@@ -169,8 +169,10 @@ def test_a_target_that_nobody_sees_has_no_coverage() -> None:
 
 def test_minifying_targets_read_halved_sources() -> None:
     source = load_rig("nuscenes")
-    levels = {r: {p.level for v in build_plan(source, source.resized(r)).targets for p in v.pairs if p.share > 0.5}
-              for r in (1.0, 0.6, 0.5, 0.25)}
+    levels = {
+        r: {p.level for v in build_plan(source, source.resized(r)).targets for p in v.pairs if p.share > 0.5}
+        for r in (1.0, 0.6, 0.5, 0.25)
+    }
     assert levels == {1.0: {0}, 0.6: {0}, 0.5: {1}, 0.25: {2}}
 
 
@@ -203,6 +205,9 @@ def test_plan_key_knows_content_not_names() -> None:
     renamed = Rig(cameras, ground_z_m=rig.ground_z_m, name="other")
     config = FavsConfig()
     assert plan_key(rig, renamed, "auto", config) == plan_key(renamed, rig, "auto", config)
-    for other in (plan_key(rig, rig.shifted(x_m=1e-9), "auto", config), plan_key(rig, rig, "far", config),
-                  plan_key(rig, rig, "auto", FavsConfig(seam_width=0.01))):
+    for other in (
+        plan_key(rig, rig.shifted(x_m=1e-9), "auto", config),
+        plan_key(rig, rig, "far", config),
+        plan_key(rig, rig, "auto", FavsConfig(seam_width=0.01)),
+    ):
         assert other != plan_key(rig, rig, "auto", config)

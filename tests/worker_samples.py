@@ -18,9 +18,7 @@ PER_SEQUENCE = 4
 def rig(size: tuple[int, int] = SIZE) -> Rig:
     """Four cameras all around."""
     cameras = [
-        Camera.looking(
-            name=f"c{k}", azimuth_deg=90.0 * k, width_px=size[1], height_px=size[0], horizontal_fov_deg=120
-        )
+        Camera.looking(name=f"c{k}", azimuth_deg=90.0 * k, width_px=size[1], height_px=size[0], horizontal_fov_deg=120)
         for k in range(4)
     ]
     return Rig(cameras, name="ring")

@@ -87,9 +87,7 @@ def render_torch(
     return views
 
 
-def render_labels(
-    plan: RenderPlan, labels: Sequence[torch.Tensor], fill: float
-) -> list[torch.Tensor]:
+def render_labels(plan: RenderPlan, labels: Sequence[torch.Tensor], fill: float) -> list[torch.Tensor]:
     """Label maps of the target views: the winning source's nearest label, ``fill`` where none sees.
 
     Args:

@@ -63,9 +63,7 @@ def test_two_workers_against_one(monkeypatch: pytest.MonkeyPatch, capsys: pytest
     before, load = torch.get_num_threads(), os.getloadavg()[0]
     torch.set_num_threads(1)
     try:
-        loaders = {
-            n: DataLoader(dataset, batch_size=None, num_workers=n, persistent_workers=n > 0) for n in (0, 1, 2)
-        }
+        loaders = {n: DataLoader(dataset, batch_size=None, num_workers=n, persistent_workers=n > 0) for n in (0, 1, 2)}
         for n in loaders:
             epoch_s(loaders[n])  # workers start, buffers are made
         rounds, machine = [], [counted(2) / counted(1)]

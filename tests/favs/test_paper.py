@@ -115,8 +115,14 @@ def test_coverage_is_that_of_the_far_surface() -> None:
 def test_stage_switches(pair_images) -> None:
     images = [pair_images[0], photo(PAIR[1].turned(yaw_deg=0.3), panorama())]
     views = {}
-    for name in ("feature_matching", "object_alignment", "distance_weight", "quality_weight", "gradient_weight",
-                 "primary_weight"):
+    for name in (
+        "feature_matching",
+        "object_alignment",
+        "distance_weight",
+        "quality_weight",
+        "gradient_weight",
+        "primary_weight",
+    ):
         on = replace(OFF, **{f"use_{name}": True})
         views[name] = render_paper(PAIR, MIDDLE, images, on).targets[0]
     plain = render_paper(PAIR, MIDDLE, images, OFF).targets[0]
@@ -232,8 +238,13 @@ def test_rig_retarget_renders_by_it(pair_images) -> None:
     assert torch.equal(out["segmentation"][0].int() % 255, out["source_camera"][0].int().clamp(min=0))
     assert out["token"] == "a" and np.array_equal(out["K"][0], MIDDLE[0].K)
     assert len(retarget.plans) == 0
-    batch = retarget({**sample, "images": sample["images"].expand(2, -1, -1, -1, -1),
-                      "segmentation": sample["segmentation"].expand(2, -1, -1, -1)})
+    batch = retarget(
+        {
+            **sample,
+            "images": sample["images"].expand(2, -1, -1, -1, -1),
+            "segmentation": sample["segmentation"].expand(2, -1, -1, -1),
+        }
+    )
     assert torch.equal(batch["images"][1], out["images"])
 
 

@@ -173,11 +173,13 @@ def test_uncovered_pixels_are_black() -> None:
 def test_seams_are_blended_and_draft_does_not() -> None:
     rig = load_rig("nuscenes").resized(0.4)
     grey = [torch.full((3, *c.size), 60 + 30 * k, dtype=torch.uint8) for k, c in enumerate(rig)]
+
     def largest_step(plan: RenderPlan) -> float:
         view = render_opencv(plan, grey)[0].numpy()[0].astype(int)
         inner = cv2.erode(plan.targets[0].coverage.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
         row = view[view.shape[0] // 2][inner[view.shape[0] // 2]]
         return float(np.abs(np.diff(row)).max())
+
     target = rig.turned(yaw_deg=22)
     assert largest_step(build_plan(rig, target, config=draft())) >= 30
     assert largest_step(build_plan(rig, target)) <= 30
@@ -205,6 +207,7 @@ def test_halving_when_minifying_beats_direct_sampling(nuscenes_root) -> None:
     rig, images = sample["rig"], list(sample["images"])
     small = rig.turned(yaw_deg=4).resized((256, 704))
     fine = render_opencv(build_plan(rig, small.resized((1024, 2816))), images)
+
     def psnr(antialias: bool) -> float:
         plan = build_plan(rig, small, config=FavsConfig(antialias=antialias))
         errors = []
@@ -213,6 +216,7 @@ def test_halving_when_minifying_beats_direct_sampling(nuscenes_root) -> None:
             inner = cv2.erode(target.coverage.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
             errors.append(((view.permute(1, 2, 0).numpy().astype(float) - mean)[inner] ** 2).mean())
         return float(10 * np.log10(255**2 / np.mean(errors)))
+
     assert psnr(True) > psnr(False) + 2
 
 

@@ -1,0 +1,46 @@
+"""What a sample says of the geometry around the vehicle, and the surfaces that can be made of it."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+from arbiview_aug.camera import FloatArray
+from arbiview_aug.objects import Objects
+from arbiview_aug.surface import Far, Ground, Street, Surface
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Geometry that came with a sample, in the source's ego frame; an empty one knows the road alone.
+
+    Attributes:
+        boxes: (B, 7) labelled objects: centre x, y, z, length, width, height (metres), yaw (radians).
+    """
+
+    boxes: FloatArray | None = None
+
+    @property
+    def key(self) -> bytes:
+        """Content hash: scenes with equal keys are the same."""
+        digest = hashlib.sha256()
+        for array in (self.boxes,):
+            digest.update(b"none" if array is None else repr(array.shape).encode() + array.tobytes())
+        return digest.digest()
+
+    def surface(self, name: str, ground_z_m: float) -> Surface:
+        """A surface by name, over a road at ``ground_z_m``.
+
+        Raises:
+            ValueError: An unknown name, or geometry that the scene lacks.
+        """
+        street = Street(ground_z_m=ground_z_m)
+        if name == "far":
+            return Far()
+        if name == "ground":
+            return Ground(ground_z_m=ground_z_m)
+        if name == "street":
+            return street
+        if name == "objects" and self.boxes is not None:
+            return Objects(street, self.boxes)
+        raise ValueError(f"surface: {name!r} is unknown, or the scene has no geometry for it")
