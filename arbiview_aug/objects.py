@@ -16,7 +16,7 @@ import numpy as np
 
 from arbiview_aug.camera import BoolArray, FloatArray
 from arbiview_aug.errors import SampleError
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Street, Surface
+from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Static, Surface
 
 _BLOCK = 512  # rays looked at together: eight coarse cells in a row
 
@@ -37,7 +37,7 @@ class Objects(Surface):
     """
 
     smooth: ClassVar[bool] = True  # away from the boxes; near them every pixel is ``detailed``
-    street: Street
+    street: Static
     boxes: FloatArray
 
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
