@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-PlanQuality = Literal["draft", "fast"]
-Quality = Literal["draft", "fast", "paper"]
+PlanQuality = Literal["draft", "fast", "accurate"]
+Quality = Literal["draft", "fast", "accurate", "paper"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +40,9 @@ class FavsConfig:
     map_tolerance_px: float = 1 / 64
     """Cells whose interpolation error may exceed this are evaluated exactly; with the 1/64 px that fixed-point maps
     round by, maps stay within 1/32 px of float64."""
+
+    overlap_depth: bool = False
+    """Correct the street's distances by what overlapping cameras see of them, frame by frame."""
 
     def __post_init__(self) -> None:
         _check_ranges(self, _RANGES)
@@ -220,6 +223,12 @@ def fast() -> FavsConfig:
     return FavsConfig()
 
 
+def accurate() -> FavsConfig:
+    """``fast`` and depth from overlap (``arbiview_aug.favs.overlap_depth``): slower, as every frame has geometry of its
+    own, unless refinements are reused."""
+    return FavsConfig(overlap_depth=True)
+
+
 def paper() -> PaperConfig:
     """Stages 1 to 4 as published: a named baseline. On the two real frames at hand it is 2.7 and 4.4 dB below ``fast``
     with its own surface (yaw, sparse PSNR), and takes 40 to 100 times as long."""
@@ -234,7 +243,12 @@ def favs_config(quality: Any) -> FavsConfig | PaperConfig:
     """
     if isinstance(quality, FavsConfig | PaperConfig):
         return quality
-    presets: dict[str, Callable[[], FavsConfig | PaperConfig]] = {"draft": draft, "fast": fast, "paper": paper}
+    presets: dict[str, Callable[[], FavsConfig | PaperConfig]] = {
+        "draft": draft,
+        "fast": fast,
+        "accurate": accurate,
+        "paper": paper,
+    }
     if quality not in presets:
         raise ValueError(
             f"quality: expected one of {', '.join(presets)}, a FavsConfig or a PaperConfig, got {quality!r}"

@@ -41,7 +41,7 @@ MIN_PIXELS = 200
 MIN_RISE_DB = 0.2
 """Least rise of the fitted overlap PSNR on held-out tiles: differences below are noise on real frames."""
 
-SMOOTHING_PX = 6.0
+SMOOTHING_PX = 5.0
 """σ of the normalised smoothing of depth, at a view 400 px wide."""
 
 ROUND_TRIP_PX = 0.75
@@ -228,7 +228,8 @@ def _refine(
     trial = _smoothed(along, epipolar, trust * fit)
     changed = strip.q * (1 + trial.change)
     before = _fitted_db(one, two, fit, test)
-    after = _fitted_db(*(_read_over(changed, strip, c, i) for c, i in zip(cameras, images, strict=True)), fit, test)
+    one, two = (_read_over(changed, strip, c, image) for c, image in zip(cameras, images, strict=True))
+    after = _fitted_db(one, two, fit, test)
     words = f"{before:.1f} to {after:.1f} dB on held-out tiles"
     if after - before < MIN_RISE_DB:
         return None, PairReport(*names, False, f"refining would not help, {words}", before, after)
@@ -269,7 +270,7 @@ def _flow(
         cv2.GaussianBlur(inside, (0, 0), 6), 1e-3
     )
     first, second = (np.clip(np.where(both, view, around), 0, 255).astype(np.uint8) for view in grey)
-    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     there: Any = dis.calc(first, second, None)  # type: ignore[call-overload]
     back: Any = dis.calc(second, first, None)  # type: ignore[call-overload]
     h, w = both.shape
@@ -310,7 +311,7 @@ class _Depth(NamedTuple):
     measured: BoolArray
 
 
-def _smoothed(along: FloatArray, squared: FloatArray, weight: FloatArray) -> _Depth:
+def _smoothed(along: FloatArray, squared: FloatArray, weight: npt.NDArray[np.floating]) -> _Depth:
     """Weighted least squares in a Gaussian window: change = Σ w f·e / (Σ w e·e + λ² Σ w)."""
     top, bottom, total = (
         cv2.GaussianBlur(values.astype(np.float32), (0, 0), SMOOTHING_PX)
