@@ -122,7 +122,17 @@ class _Strip(NamedTuple):
     columns: slice
     rays: FloatArray  # (h, w, 3)
     q: FloatArray  # (h, w) of the street
+    fit: BoolArray  # (h, w) seen by both cameras, to measure on
+    test: BoolArray  # (h, w) seen by both cameras, to decide on
     both: BoolArray  # (h, w) seen by both cameras
+
+
+class _Views(NamedTuple):
+    """What all half-way views have in common."""
+
+    fit: BoolArray  # (h, w) even tiles, halved by a finer chessboard: to measure on
+    test: BoolArray  # (h, w) and to decide on
+    inside: FloatArray  # (h, w) in [0, 1], fading to none at the border: nothing may jump there
 
 
 def overlap_depth(rig: Rig, images: Sequence[torch.Tensor]) -> OverlapDepth:
@@ -139,7 +149,9 @@ def overlap_depth(rig: Rig, images: Sequence[torch.Tensor]) -> OverlapDepth:
     rig = rig.with_cameras([rig[k] for k in order])
     images = [images[k] for k in order]
     surface = Street(ground_z_m=rig.ground_z_m)
-    strips = [(a, b, _strip(rig, a, b, surface)) for a, b in adjacent_pairs(rig)]
+    pairs = adjacent_pairs(rig)
+    views = _views()
+    strips = [(a, b, _strip(rig, a, b, surface, views)) for a, b in pairs]
     used = {k for a, b, strip in strips if strip is not None for k in (a, b)}
     small = {k: _small(rig[k], images[k]) for k in used}
     corrections, reports, matched = [], [], 0
@@ -149,7 +161,7 @@ def overlap_depth(rig: Rig, images: Sequence[torch.Tensor]) -> OverlapDepth:
             reports.append(PairReport(*names, False, "they overlap too little"))
             continue
         matched += 1
-        correction, report = _refine(strip, (rig[a], rig[b]), (small[a], small[b]), surface)
+        correction, report = _refine(strip, views, (rig[a], rig[b]), (small[a], small[b]), surface)
         reports.append(report)
         if correction is not None:
             corrections.append(correction)
@@ -172,7 +184,18 @@ def _small(camera: Camera, image: torch.Tensor) -> _Small:
     return _Small(reduced(image, level) * np.float32(255), level)
 
 
-def _strip(rig: Rig, a: int, b: int, surface: Static) -> _Strip | None:
+def _views() -> _Views:
+    h, w = _VIEW_SIZE
+    even, finer = ~odd_tiles(_VIEW_SIZE, _TILE_PX), odd_tiles(_VIEW_SIZE, _TILE_PX // 2)
+    x, y = np.arange(w), np.arange(h)[:, None]
+    border_px = np.minimum(np.minimum(x, w - 1 - x), np.minimum(y, h - 1 - y))
+    return _Views(even & ~finer, even & finer, _fade(1 - border_px / _BORDER_PX))
+
+
+_BORDER_PX = 16.0
+
+
+def _strip(rig: Rig, a: int, b: int, surface: Static, views: _Views) -> _Strip | None:
     """The overlap of two cameras, or None where they share too little."""
     view = half_way_view(rig[a], rig[b], _VIEW_SIZE)
     pixels = view.pixel_grid()
@@ -187,9 +210,9 @@ def _strip(rig: Rig, a: int, b: int, surface: Static) -> _Strip | None:
     )
     rows, columns = slice(y0, y1), slice(x0, x1)
     rays, q, both = _seen_by_both(rig, a, b, view, pixels[rows, columns], surface)
-    strip = _Strip(view, rows, columns, rays, q, both)
-    fit, test = (np.count_nonzero(tiles & both) for tiles in _tiles(strip))
-    return strip if min(fit, test) >= MIN_PIXELS else None
+    fit, test = (tiles[rows, columns] & both for tiles in (views.fit, views.test))
+    few = min(np.count_nonzero(fit), np.count_nonzero(test)) < MIN_PIXELS
+    return None if few else _Strip(view, rows, columns, rays, q, fit, test, both)
 
 
 def _seen_by_both(
@@ -205,22 +228,17 @@ def _seen_by_both(
     return rays, q, seen
 
 
-def _tiles(strip: _Strip) -> tuple[BoolArray, BoolArray]:
-    """Even tiles of the strip, halved by a finer chessboard: to fit to, and to decide on."""
-    even = ~odd_tiles(_VIEW_SIZE, _TILE_PX)[strip.rows, strip.columns]
-    finer = odd_tiles(_VIEW_SIZE, _TILE_PX // 2)[strip.rows, strip.columns]
-    return even & ~finer, even & finer
-
-
 def _refine(
-    strip: _Strip, cameras: tuple[Camera, Camera], images: tuple[_Small, _Small], surface: Static
+    strip: _Strip, views: _Views, cameras: tuple[Camera, Camera], images: tuple[_Small, _Small], surface: Static
 ) -> tuple[Correction | None, PairReport]:
     """The pair's correction where it passes the gate, and why."""
     names = cameras[0].name, cameras[1].name
     one, two = (_read_over(strip.q, strip, c, image) for c, image in zip(cameras, images, strict=True))
-    fit, test = (tiles & strip.both for tiles in _tiles(strip))
+    fit, test = strip.fit, strip.test
     if min(float(view[strip.both].std()) for view in (one, two)) < _BLANK_GREY:
         return None, PairReport(*names, False, "one of the images shows nothing")
+    if max(_repetition(view, strip.both) for view in (one, two)) > _REPEATS:
+        return None, PairReport(*names, False, "the texture repeats itself: matches would be ambiguous")
     flow, trust = _flow(one, two, strip.both)
     if not np.any(trust > 0.5):
         return None, PairReport(*names, False, "nothing in one image is found in the other and back")
@@ -236,10 +254,33 @@ def _refine(
     final = _smoothed(along, epipolar, trust * (fit | test))
     if not final.measured.any():
         return None, PairReport(*names, False, "too little is found in both images", before, after)
-    return _extended(strip, final), PairReport(*names, True, words, before, after)
+    return _extended(strip, final, views), PairReport(*names, True, words, before, after)
 
 
 _BLANK_GREY = 2.0  # spread of grey levels below which an image is blank, or black night
+
+
+_REPEATS = 0.7
+"""Correlation of an overlap with itself, shifted sideways, from which on its texture repeats: gratings have 0.9 and
+more, the overlaps of three real frames 0.35 at most."""
+
+
+def _repetition(image: npt.NDArray[np.float32], inside: BoolArray) -> float:
+    """Highest correlation of a view (h, w, 3) with itself, shifted along its rows beyond where it first fell to 0.3."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    window = inside.astype(np.float32)
+    size = cv2.getOptimalDFTSize(2 * inside.shape[1])
+    mean = cv2.blur(grey * window, (33, 33)) / np.maximum(cv2.blur(window, (33, 33)), 1e-3)
+    detail = (grey - mean) * window
+    spectra = [np.fft.rfft(values, size, axis=1) for values in (detail, detail**2, window)]
+    products = ((0, 0), (1, 2), (2, 1), (2, 2))
+    shifted, here, there, pixels = (
+        np.fft.irfft((spectra[a] * spectra[b].conj()).sum(axis=0), size)[: inside.shape[1] // 2] for a, b in products
+    )
+    correlation = shifted / np.sqrt(np.maximum(here, 1e-6) * np.maximum(there, 1e-6))
+    correlation = correlation[pixels > pixels[0] / 4]  # fewer say nothing
+    fallen = np.flatnonzero(correlation < 0.3)
+    return float(correlation[fallen[0] :].max()) if len(fallen) else 0.0
 
 
 def _read_over(q: FloatArray, strip: _Strip, camera: Camera, small: _Small) -> npt.NDArray[np.float32]:
@@ -271,6 +312,8 @@ def _flow(
     )
     first, second = (np.clip(np.where(both, view, around), 0, 255).astype(np.uint8) for view in grey)
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis.setFinestScale(0)
+    dis.setVariationalRefinementIterations(0)  # half the time, and depth is smoothed anyway
     there: Any = dis.calc(first, second, None)  # type: ignore[call-overload]
     back: Any = dis.calc(second, first, None)  # type: ignore[call-overload]
     h, w = both.shape
@@ -324,7 +367,7 @@ def _smoothed(along: FloatArray, squared: FloatArray, weight: npt.NDArray[np.flo
 _LEAST_SUPPORT = 0.02  # share of the window that was measured; a quarter of it may be at best
 
 
-def _extended(strip: _Strip, depth: _Depth) -> Correction:
+def _extended(strip: _Strip, depth: _Depth, views: _Views) -> Correction:
     """The strip's depth over the whole view: beside it the nearest measured change, then its background's, fading."""
     change = np.zeros(_VIEW_SIZE, np.float32)
     change[strip.rows, strip.columns] = depth.change
@@ -336,7 +379,7 @@ def _extended(strip: _Strip, depth: _Depth) -> Correction:
     beside = np.where(missing == 0, change, cv2.GaussianBlur(by_label[nearest], (0, 0), SMOOTHING_PX))
     near = _fade(distance / FADE_PX)
     change = beside * near + _background(change, missing == 0)[:, None] * (1 - near)
-    share = _fade(distance / BACKGROUND_FADE_PX) * _fade(1 - _border_px() / _BORDER_PX)
+    share = _fade(distance / BACKGROUND_FADE_PX) * views.inside
     return Correction(strip.view, change.astype(np.float32), share.astype(np.float32))
 
 
@@ -359,15 +402,6 @@ _BACKGROUND_QUANTILE = 0.3
 _NEAREST_BACKGROUND = 0.5  # what is nearer than by this change is an object, not the background
 _ROWS_PX = 15.0
 _FEW_PIXELS = 3.0  # a row's background fades where it was measured on fewer pixels
-
-_BORDER_PX = 16.0  # shares fade to none at the view's border: nothing may jump there
-
-
-def _border_px() -> FloatArray:
-    """(h, w) distance to the border of the view."""
-    h, w = _VIEW_SIZE
-    y, x = np.mgrid[0:h, 0:w].astype(np.float64)
-    return np.asarray(np.minimum(np.minimum(x, w - 1 - x), np.minimum(y, h - 1 - y)))
 
 
 def _fade(t: npt.NDArray[Any]) -> npt.NDArray[Any]:
