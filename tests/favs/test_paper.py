@@ -257,6 +257,17 @@ def test_explain_says_what_each_stage_did(pair_images) -> None:
     assert sum(s["share"] for s in sources) == pytest.approx(words.as_dict()[0]["coverage"])
 
 
+def test_detections_in_the_sample_give_types(pair_images) -> None:
+    everywhere = {"boxes": torch.tensor([[0.0, 0, 399, 239]]), "labels": ["vehicle.car"]}
+    sample = {"images": pair_images, "rig": PAIR, "detections": [everywhere, everywhere]}
+    for on in (True, False):
+        retarget = RigRetarget(MIDDLE, quality=PaperConfig(use_detections=on))
+        types = {o.type for r in retarget.explain(sample).rendering.targets[0].reports for o in r.objects.objects}
+        assert types and (types == {"vehicle.car"}) == on
+    with pytest.warns(UserWarning, match="drops detections"):
+        assert "detections" not in retarget(sample)
+
+
 def test_messages(pair_images) -> None:
     for settings, message in [
         ({"surface": "street"}, "surface: quality='paper' knows the far surface: expected auto or far"),
