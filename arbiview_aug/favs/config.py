@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-PlanQuality = Literal["draft", "fast"]
 Quality = Literal["draft", "fast", "paper"]
 
 
