@@ -7,18 +7,19 @@ read from that source: the object's own colours would be smeared behind it. Wher
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
-from arbiview_aug.camera import BoolArray, FloatArray
+from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Street, Surface
-
-_BLOCK = 512  # rays looked at together: eight coarse cells in a row
+from arbiview_aug.grid import Grid
+from arbiview_aug.solids import inverse_distance_of_boxes
+from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Layered, Street
 
 AIR_M = 0.03
 """Boxes are drawn this much too tight or too wide by labellers; for hiding they are enlarged by it, and by a pixel."""
@@ -26,10 +27,15 @@ AIR_M = 0.03
 _LEAST_INCIDENCE = 0.2
 """Sine of the flattest angle (12 degrees) at which a source may look along a face and still be read for it."""
 
+_LENS_STEP_PX = 8  # cells in which rays of a lens are cast or not
+
 
 @dataclass(frozen=True, eq=False)
-class Objects(Surface):
+class Objects(Layered):
     """Boxes standing on the street.
+
+    Plans are built from ``drawn`` and ``shadows``; ``inverse_distance`` and ``hides`` say the same of single rays, and
+    are their plain reference.
 
     Attributes:
         street: What there is without them.
@@ -39,10 +45,59 @@ class Objects(Surface):
     smooth: ClassVar[bool] = True  # away from the boxes; near them every pixel is ``detailed``
     street: Street
     boxes: FloatArray
+    _shadows: dict[Camera, npt.NDArray[np.float32]] = field(default_factory=dict, repr=False)
 
+    @property
+    def background(self) -> Street:
+        """The street."""
+        return self.street
+
+    # --- images -------------------------------------------------------------------------------------------------------
+    def drawn(self, camera: Camera) -> npt.NDArray[np.float32]:
+        """Inverse distance (h, w) in 1/m along each pixel's ray to the nearest box, 0 where there is none."""
+        return self._drawn(camera, self.boxes)
+
+    def shadows(self, camera: Camera) -> npt.NDArray[np.float32]:
+        """Inverse distance (h, w) in 1/m beyond which the points on each pixel's ray are hidden from a source.
+
+        As in ``hides``, by enlarged boxes. A point is looked up at the nearest pixel, where a face seen at a flat angle
+        may be nearer than at the point's own position: the slack grows by half a pixel. Kept for the next target.
+        """
+        if camera not in self._shadows:
+            pixel_rad = float(1 / camera.K[0, 0])
+            first = self._drawn(camera, self._enlarged(camera.center_m, pixel_rad))
+            slack = (AIR_M * first + 1.5 * pixel_rad) / _LEAST_INCIDENCE  # relative to the distance
+            self._shadows[camera] = first / (1 + slack)
+        return self._shadows[camera]
+
+    def _enlarged(self, origin: FloatArray, pixel_rad: float) -> FloatArray:
+        """The boxes that do not hold the origin, wider on all sides by ``AIR_M`` and a pixel."""
+        boxes = self.boxes[~_holding(self.boxes, origin)]
+        more_m = AIR_M + pixel_rad * np.linalg.norm(boxes[:, :3] - origin, axis=-1)
+        boxes[:, 3:6] += 2 * more_m[:, None]
+        return boxes
+
+    def _drawn(self, camera: Camera, boxes: FloatArray) -> npt.NDArray[np.float32]:
+        """Rasterised, or for a lens by casting the rays near the boxes."""
+        if camera.lens == "pinhole":
+            return inverse_distance_of_boxes(camera, boxes)
+        scene = Objects(self.street, boxes)
+        grid = Grid(camera.size, _LENS_STEP_PX)
+        rays, valid = camera.unproject(grid.nodes())
+        spacing = np.where(valid[:, 1:] & valid[:, :-1], np.linalg.norm(np.diff(rays, axis=1), axis=-1), 0)
+        near = valid & scene.detailed(camera.center_m, rays, 2 * float(spacing.max(initial=0.0)))
+        cells = cv2.dilate(near.astype(np.uint8), np.ones((3, 3), np.uint8))[:-1, :-1] > 0
+        ny, nx = grid.shape
+        v, u = np.nonzero(grid.cells_to_pixels(cells, (0, ny - 1, 0, nx - 1)))
+        directions, known = camera.unproject(np.stack([u, v], -1))
+        nearest = np.zeros(camera.size, np.float32)
+        nearest[v, u] = np.where(known, scene._boxes_ahead(camera.center_m, directions), 0)
+        return nearest
+
+    # --- rays ---------------------------------------------------------------------------------------------------------
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """The nearer of street and boxes, 1/m (...,)."""
-        return np.maximum(self.street.inverse_distance(origin, directions), self._boxes_ahead(origin, directions)[0])
+        return np.maximum(self.street.inverse_distance(origin, directions), self._boxes_ahead(origin, directions))
 
     def hides(
         self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
@@ -53,8 +108,9 @@ class Objects(Surface):
         read for what lies behind it. A box's own face lies behind its enlarged one by little, unless it is seen at
         less than 12 degrees: then it counts as hidden.
         """
-        first, air_m = self._boxes_ahead(origin, directions, AIR_M, pixel_rad)
-        return first * (1 - air_m / _LEAST_INCIDENCE * inverse_distance) > inverse_distance
+        scene = Objects(self.street, self._enlarged(origin, pixel_rad))
+        first = scene._boxes_ahead(origin, directions)
+        return first / (1 + (AIR_M * first + pixel_rad) / _LEAST_INCIDENCE) > inverse_distance
 
     def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
         """Rays (...,) that pass a box within an angle, where nothing may be interpolated."""
@@ -65,40 +121,20 @@ class Objects(Surface):
 
     def _outside(self, origin: FloatArray) -> Iterator[tuple[FloatArray, FloatArray, float]]:
         """Boxes that do not hold the origin (the vehicle with the camera does), towards which, within what angle."""
-        for box in self.boxes:
-            if np.all(np.abs(_in_box_frame(box, origin - box[:3])) <= box[3:6] / 2):
-                continue
+        for box in self.boxes[~_holding(self.boxes, origin)]:
             towards = box[:3] - origin
             distance_m, radius_m = float(np.linalg.norm(towards)), float(np.linalg.norm(box[3:6])) / 2
             angle = float(np.arcsin(radius_m / distance_m)) if distance_m > radius_m else np.pi
             yield box, towards / max(distance_m, 1e-9), angle
 
-    def _boxes_ahead(
-        self, origin: FloatArray, directions: FloatArray, air_m: float = 0.0, air_rad: float = 0.0
-    ) -> tuple[FloatArray, FloatArray]:
-        """Inverse distance to the first box face along each ray, 0 where there is none (slab method).
-
-        Rays are handled in blocks, which are neighbours in the image: most boxes miss most blocks. Boxes may be
-        enlarged on all sides by a length and an angle; how much the first one was is returned too, in metres.
-        """
-        n = math.prod(directions.shape[:-1])
-        count = max(1, -(-n // _BLOCK))
-        rays = np.resize(directions.reshape(-1, 3), (count, _BLOCK, 3)) if n else np.zeros((count, _BLOCK, 3))
-        centre = rays.mean(axis=1)
-        centre /= np.maximum(np.linalg.norm(centre, axis=-1, keepdims=True), 1e-9)
-        spread = np.arccos(np.clip(np.einsum("bnk,bk->bn", rays, centre).min(axis=1), -1, 1))
-        q, air = np.zeros((count, _BLOCK)), np.zeros((count, _BLOCK))
+    def _boxes_ahead(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        """Inverse distance (...,) to the first box face along each ray, 0 where there is none (slab method)."""
+        rays = directions.reshape(-1, 3)
+        q = np.zeros(len(rays))
         for box, towards, angle in self._outside(origin):
-            more_m = air_m + air_rad * float(np.linalg.norm(box[:3] - origin))
-            widened = angle + 2 * more_m / max(float(np.linalg.norm(box[:3] - origin)), 1e-9)
-            passing = np.arccos(np.clip(centre @ towards, -1, 1)) <= widened + spread
-            if passing.any():
-                larger = box + np.array([0, 0, 0, 2 * more_m, 2 * more_m, 2 * more_m, 0])
-                face = _first_face(larger, origin, rays[passing])
-                air[passing] = np.where(face > q[passing], more_m, air[passing])
-                q[passing] = np.maximum(q[passing], face)
-        shape = directions.shape[:-1]
-        return q.reshape(-1)[:n].reshape(shape), air.reshape(-1)[:n].reshape(shape)
+            near = np.flatnonzero(rays @ towards >= np.cos(min(angle + 1e-6, np.pi)))
+            q[near] = np.maximum(q[near], _first_face(box, origin, rays[near]))
+        return q.reshape(directions.shape[:-1])
 
 
 def _first_face(box: FloatArray, origin: FloatArray, directions: FloatArray) -> FloatArray:
@@ -118,6 +154,14 @@ def _in_box_frame(box: FloatArray, vectors: FloatArray) -> FloatArray:
     """Ego-frame vectors (..., 3) along the box's length, width and height."""
     c, s = np.cos(box[6]), np.sin(box[6])
     return vectors @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _holding(boxes: FloatArray, origin: FloatArray) -> BoolArray:
+    """Which boxes (B,) a point lies in or on."""
+    c, s = np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
+    x, y, z = (origin - boxes[:, :3]).T
+    local = np.abs(np.stack([c * x + s * y, c * y - s * x, z], axis=-1))
+    return np.asarray((local <= boxes[:, 3:6] / 2).all(axis=-1))
 
 
 def checked_boxes(boxes: Any) -> FloatArray:

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
+import numpy.typing as npt
 
-from arbiview_aug.camera import BoolArray, FloatArray
+from arbiview_aug.camera import BoolArray, Camera, FloatArray
 
 SurfaceName = Literal["auto", "far", "ground", "street", "objects"]
 """Surfaces a user can ask for. ``auto`` decides per pair of target and source camera (see ``plan``)."""
@@ -64,6 +65,27 @@ class Surface(ABC):
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Spread (...,) in 1/m of the true inverse distance around this surface's ``inverse_distance``."""
         return depth_uncertainty(inverse_distance)
+
+
+class Layered(Surface):
+    """A smooth background with solids in front of it, which can be drawn into cameras.
+
+    Pixels that show a solid are mapped one by one; the others by the background, as if there were no solids. Both are
+    hidden where the source's shadow image says so.
+    """
+
+    @property
+    @abstractmethod
+    def background(self) -> Static:
+        """What there is behind the solids."""
+
+    @abstractmethod
+    def drawn(self, camera: Camera) -> npt.NDArray[np.float32]:
+        """Inverse distance (h, w) in 1/m along each pixel's ray to the nearest solid, 0 where there is none."""
+
+    @abstractmethod
+    def shadows(self, camera: Camera) -> npt.NDArray[np.float32]:
+        """Inverse distance (h, w) in 1/m beyond which (farther, smaller) points of each pixel's ray are hidden."""
 
 
 class Static(Surface):

@@ -172,6 +172,7 @@ class TargetDraft:
         seen = pair.valid & (edge_px > 0)
         level = self._level(pixels_per_pixel[seen], source.size) if self.config.antialias else 0
         pair.set_tolerance(self.config.map_tolerance_px * 2**level)
+        seen = pair.visible_nodes(level) & (edge_px > 0)
         parallax = self._expected_parallax(offset_m, focal_px, surface)
         score = (
             distance_weight(edge_px, min(source.size) / 2, self.config.distance_gamma)

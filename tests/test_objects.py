@@ -114,13 +114,13 @@ def test_what_a_car_hid_is_a_hole_and_not_its_colour() -> None:
     )
     rig = Rig([camera])
     directions = camera.unproject(camera.pixel_grid()).directions
-    hit = Objects(Street(), CAR)._boxes_ahead(camera.center_m, directions)[0] > 0
+    hit = Objects(Street(), CAR)._boxes_ahead(camera.center_m, directions) > 0
     image = np.where(hit[..., None], np.array([220, 20, 20]), np.array([90, 90, 90])).astype(np.uint8)
     plan = build_plan(rig, rig.shifted(z_m=1.5), surface="objects", scene=Scene(CAR))
     view = render_opencv(plan, [torch.from_numpy(image).permute(2, 0, 1)])[0].permute(1, 2, 0).numpy()
     target, coverage = plan.target[0], plan.coverage[0]
     rays = target.unproject(target.pixel_grid()).directions
-    on_car = Objects(Street(), CAR)._boxes_ahead(target.center_m, rays)[0] > 0
+    on_car = Objects(Street(), CAR)._boxes_ahead(target.center_m, rays) > 0
     beside = cv2.dilate(on_car.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
     red = (view[..., 0] > 150) & coverage
     assert not red[beside].any()  # no colour of the object outside its silhouette by more than 2 px
