@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -17,12 +18,13 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
-from arbiview_aug.grid import HALVINGS, Box, Grid
+from arbiview_aug.grid import HALVINGS, Box, Grid, runs
 from arbiview_aug.sampling import Slot, halved, level_size
 from arbiview_aug.surface import Layered, Static, Surface
 
 _SAFETY = 2.0  # curvature between the nodes may exceed what the nodes show
 _CORNERS = tuple((a, b) for a in (slice(None, -1), slice(1, None)) for b in (slice(None, -1), slice(1, None)))
+_SHADOW_TILE_PX = 8
 _FAR_AWAY_PX = 1e5  # float32 maps stay precise and int16 conversion saturates harmlessly
 
 
@@ -91,12 +93,13 @@ class TargetRays:
     def solids(self, surface: Layered) -> SolidPixels:
         """The target's pixels that show solids; drawn once for each surface."""
         if surface not in self._solids:
-            drawn = surface.drawn(self.camera)
-            y, x = np.nonzero(drawn)
+            index, inverse_distance = surface.drawn(self.camera)
+            y, x = np.divmod(index, self.camera.width_px)
             pixels = np.stack([x, y], axis=-1)
             directions, _ = ego_rays(self.camera, pixels.astype(np.float64))
-            free = np.asarray(cv2.compare(drawn, 0, cv2.CMP_EQ), np.uint8)  # type: ignore[call-overload]
-            self._solids[surface] = SolidPixels(free, pixels, directions, drawn[y, x].astype(np.float64))
+            free = np.full(self.camera.size, 255, np.uint8)
+            free.reshape(-1)[index] = 0
+            self._solids[surface] = SolidPixels(free, pixels, directions, inverse_distance)
             self.counters["solid_pixels"] += len(pixels)
         return self._solids[surface]
 
@@ -129,6 +132,7 @@ class PairMap:
         self._use: BoolArray | None = None
         self._whole: BoolArray | None = None
         self._fine: tuple[Slot, npt.NDArray[np.float32]] | None = None
+        self._near_shadow: BoolArray | None = None
         if self.solids is not None:
             self._from_source_q = (q / np.maximum(np.sqrt((points * points).sum(-1)), 1e-300)).astype(np.float32)
         if rays.grid.step == 1:
@@ -343,9 +347,12 @@ class PairMap:
         grid = self.rays.grid
         y0, y1, x0, x1 = grid.pixels(nodes)
         shadow = self.whole_surface.shadows(_halved_camera(self.source, slot.level))
-        local = at - np.array([slot.x, slot.y], np.float32) if slot.x or slot.y else at
-        first: Any = cv2.remap(shadow, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
-        visible &= cv2.compare(first, grid.upsample(self._from_source_q, nodes), cv2.CMP_LE).astype(np.uint8)
+        for part in self._parts_near_shadow(shadow, nodes, slot.level):
+            t, b, le, r = grid.pixels(part)
+            here = slice(t - y0, b - y0), slice(le - x0, r - x0)
+            local = at[here] - np.array([slot.x, slot.y], np.float32)
+            first: Any = cv2.remap(shadow, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
+            visible[here] &= cv2.compare(first, grid.upsample(self._from_source_q, part), cv2.CMP_LE).astype(np.uint8)
         visible &= self.rays.solids(self.whole_surface).free[y0:y1, x0:x1]
         solids = self.solids
         start, stop = np.searchsorted(solids.pixels[:, 1], [y0, y1])
@@ -354,6 +361,20 @@ class PairMap:
         lit = ~_in_shadow(shadow, exact - (slot.x, slot.y), solids.inverse_distance[start:stop])
         at[py - y0, px - x0] = exact
         visible[py - y0, px - x0] = lit * np.uint8(255)
+
+    def _parts_near_shadow(self, shadow: npt.NDArray[np.float32], nodes: Box, level: int) -> Iterator[Box]:
+        """The parts of a strip, between its rows of nodes, whose background may be read in a shadow."""
+        if self.rays.grid.step == 1:
+            yield nodes
+            return
+        if self._near_shadow is None:
+            self._near_shadow = _cells_near_shadow(shadow, _at_level(self.uv, level))
+        j0, j1, i0, i1 = nodes
+        for first, last in runs(self._near_shadow[j0:j1, i0:i1].any(axis=0)):
+            part = j0, j1, i0 + first, i0 + last + 1
+            _, _, x0, x1 = self.rays.grid.pixels(part)
+            if x1 > x0:  # nodes lie beyond the image too
+                yield part
 
     @cached_property
     def _exact_pixels(self) -> tuple[npt.NDArray[np.int64], FloatArray, BoolArray]:
@@ -400,12 +421,20 @@ class _SeenSolids(NamedTuple):
 
     @classmethod
     def of(cls, rays: TargetRays, source: Camera, surface: Layered) -> _SeenSolids:
-        solids, offset_m = rays.solids(surface), rays.camera.center_m - source.center_m
-        points = _source_points(source, solids.directions, solids.inverse_distance, offset_m)
+        _, pixels, directions, q = rays.solids(surface)
+        offset_m = rays.camera.center_m - source.center_m
+        if source.lens == "pinhole":
+            # Most solids lie beside most sources: two half-spaces are cheaper than a projection.
+            K, to_source = source.K, source.cam2ego[:3, :3].T
+            sides = np.stack([K[0], (source.width_px - 1) * K[2] - K[0]]) @ to_source
+            left, right = sides @ directions.T + np.outer(sides @ offset_m, q)
+            inside = np.flatnonzero((left >= -1e-6) & (right >= -1e-6))
+            pixels, directions, q = pixels[inside], directions[inside], q[inside]
+        points = _source_points(source, directions, q, offset_m)
         uv, _, valid = source.project_cam(points)
         inside = np.flatnonzero(valid & source.contains(uv))
         length = np.sqrt((points[inside] ** 2).sum(-1))
-        return cls(solids.pixels[inside], uv[inside], solids.inverse_distance[inside] / np.maximum(length, 1e-300))
+        return cls(pixels[inside], uv[inside], q[inside] / np.maximum(length, 1e-300))
 
     def nodes(self, grid: Grid) -> Box | None:
         """The nodes around all of them."""
@@ -433,6 +462,29 @@ def _halved_camera(camera: Camera, level: int) -> Camera:
 def _at_level(uv: FloatArray, level: int) -> FloatArray:
     """Pixels (..., 2) in an image that was halved ``level`` times."""
     return (uv + 0.5) / 2**level - 0.5
+
+
+def _cells_near_shadow(shadow: npt.NDArray[np.float32], uv: FloatArray) -> BoolArray:
+    """Cells (ny - 1, nx - 1) whose corners (ny, nx, 2) span a part of a shadow image that is not free of shadow."""
+    tile = _SHADOW_TILE_PX
+    h, w = shadow.shape
+    rows, columns = -(-h // tile), -(-w // tile)
+    dark = np.zeros((rows * tile, columns * tile), np.uint8)
+    dark[:h, :w] = cv2.compare(shadow, 0, cv2.CMP_GT)  # type: ignore[call-overload]
+    count = cv2.integral((cv2.resize(dark, (columns, rows), interpolation=cv2.INTER_AREA) > 0).astype(np.uint8))
+    (x0, x1), (y0, y1) = (_tiles_between(uv[..., k], n) for k, n in enumerate((columns, rows)))
+    return np.asarray(count[y1, x1] - count[y0, x1] - count[y1, x0] + count[y0, x0] > 0)
+
+
+def _tiles_between(position: FloatArray, count: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """First and last (exclusive) tile along one axis that a cell's corners span, a pixel of slack included: maps bulge
+    between the corners, and positions are rounded."""
+    scaled = np.clip(position / _SHADOW_TILE_PX, -2, count + 2)
+    slack = 1 / _SHADOW_TILE_PX
+    corners = [scaled[c] for c in _CORNERS]
+    low, high = (f(f(corners[0], corners[1]), f(corners[2], corners[3])) for f in (np.minimum, np.maximum))
+    first, last = np.floor(low - slack), np.floor(high + slack) + 1
+    return first.clip(0, count).astype(np.int64), last.clip(0, count).astype(np.int64)
 
 
 def _in_shadow(shadow: npt.NDArray[np.float32], uv: FloatArray, inverse_distance: FloatArray) -> BoolArray:

@@ -18,8 +18,8 @@ import numpy.typing as npt
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.grid import Grid
-from arbiview_aug.solids import inverse_distance_of_boxes
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Layered, Street
+from arbiview_aug.solids import draw_boxes
+from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn, Layered, Street
 
 AIR_M = 0.03
 """Boxes are drawn this much too tight or too wide by labellers; for hiding they are enlarged by it, and by a pixel."""
@@ -53,8 +53,8 @@ class Objects(Layered):
         return self.street
 
     # --- images -------------------------------------------------------------------------------------------------------
-    def drawn(self, camera: Camera) -> npt.NDArray[np.float32]:
-        """Inverse distance (h, w) in 1/m along each pixel's ray to the nearest box, 0 where there is none."""
+    def drawn(self, camera: Camera) -> Drawn:
+        """The pixels of a camera that show boxes."""
         return self._drawn(camera, self.boxes)
 
     def shadows(self, camera: Camera) -> npt.NDArray[np.float32]:
@@ -65,9 +65,11 @@ class Objects(Layered):
         """
         if camera not in self._shadows:
             pixel_rad = float(1 / camera.K[0, 0])
-            first = self._drawn(camera, self._enlarged(camera.center_m, pixel_rad))
+            index, first = self._drawn(camera, self._enlarged(camera.center_m, pixel_rad))
             slack = (AIR_M * first + 1.5 * pixel_rad) / _LEAST_INCIDENCE  # relative to the distance
-            self._shadows[camera] = first / (1 + slack)
+            shadow = np.zeros(camera.size, np.float32)
+            shadow.reshape(-1)[index] = first / (1 + slack)
+            self._shadows[camera] = shadow
         return self._shadows[camera]
 
     def _enlarged(self, origin: FloatArray, pixel_rad: float) -> FloatArray:
@@ -77,10 +79,10 @@ class Objects(Layered):
         boxes[:, 3:6] += 2 * more_m[:, None]
         return boxes
 
-    def _drawn(self, camera: Camera, boxes: FloatArray) -> npt.NDArray[np.float32]:
+    def _drawn(self, camera: Camera, boxes: FloatArray) -> Drawn:
         """Rasterised, or for a lens by casting the rays near the boxes."""
         if camera.lens == "pinhole":
-            return inverse_distance_of_boxes(camera, boxes)
+            return draw_boxes(camera, boxes)
         scene = Objects(self.street, boxes)
         grid = Grid(camera.size, _LENS_STEP_PX)
         rays, valid = camera.unproject(grid.nodes())
@@ -88,11 +90,11 @@ class Objects(Layered):
         near = valid & scene.detailed(camera.center_m, rays, 2 * float(spacing.max(initial=0.0)))
         cells = cv2.dilate(near.astype(np.uint8), np.ones((3, 3), np.uint8))[:-1, :-1] > 0
         ny, nx = grid.shape
-        v, u = np.nonzero(grid.cells_to_pixels(cells, (0, ny - 1, 0, nx - 1)))
+        index = np.flatnonzero(grid.cells_to_pixels(cells, (0, ny - 1, 0, nx - 1)))
+        v, u = np.divmod(index, camera.width_px)
         directions, known = camera.unproject(np.stack([u, v], -1))
-        nearest = np.zeros(camera.size, np.float32)
-        nearest[v, u] = np.where(known, scene._boxes_ahead(camera.center_m, directions), 0)
-        return nearest
+        nearest = np.where(known, scene._boxes_ahead(camera.center_m, directions), 0)
+        return Drawn(index[nearest > 0], nearest[nearest > 0])
 
     # --- rays ---------------------------------------------------------------------------------------------------------
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:

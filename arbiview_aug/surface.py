@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -67,6 +67,18 @@ class Surface(ABC):
         return depth_uncertainty(inverse_distance)
 
 
+class Drawn(NamedTuple):
+    """The pixels of an image that show something.
+
+    Attributes:
+        index: (n,) into the flattened image, ascending.
+        inverse_distance: (n,) along the pixels' rays, 1/m.
+    """
+
+    index: npt.NDArray[np.int64]
+    inverse_distance: FloatArray
+
+
 class Layered(Surface):
     """A smooth background with solids in front of it, which can be drawn into cameras.
 
@@ -80,8 +92,8 @@ class Layered(Surface):
         """What there is behind the solids."""
 
     @abstractmethod
-    def drawn(self, camera: Camera) -> npt.NDArray[np.float32]:
-        """Inverse distance (h, w) in 1/m along each pixel's ray to the nearest solid, 0 where there is none."""
+    def drawn(self, camera: Camera) -> Drawn:
+        """The pixels of a camera that show solids."""
 
     @abstractmethod
     def shadows(self, camera: Camera) -> npt.NDArray[np.float32]:
