@@ -20,11 +20,14 @@ import numpy.typing as npt
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.grid import HALVINGS, Box, Grid, runs
 from arbiview_aug.sampling import Slot, halved, level_size
-from arbiview_aug.surface import Layered, Static, Surface
+from arbiview_aug.surface import Layered, Shadows, Static, Surface
 
 _SAFETY = 2.0  # curvature between the nodes may exceed what the nodes show
 _CORNERS = tuple((a, b) for a in (slice(None, -1), slice(1, None)) for b in (slice(None, -1), slice(1, None)))
 _SHADOW_TILE_PX = 8
+_LEAST_INCIDENCE = 0.05
+"""Sine of the flattest angle at which a source may look along a face: that of the road 30 m from a car's cameras."""
+
 _FAR_AWAY_PX = 1e5  # float32 maps stay precise and int16 conversion saturates harmlessly
 
 
@@ -36,12 +39,14 @@ class SolidPixels(NamedTuple):
         pixels: (n, 2) int64.
         directions: (n, 3) unit rays in the ego frame.
         inverse_distance: (n,) 1/m.
+        face: (n,) as in ``Drawn``.
     """
 
     free: npt.NDArray[np.uint8]
     pixels: npt.NDArray[np.int64]
     directions: FloatArray
     inverse_distance: FloatArray
+    face: npt.NDArray[np.int32]
 
 
 class TargetRays:
@@ -93,13 +98,13 @@ class TargetRays:
     def solids(self, surface: Layered) -> SolidPixels:
         """The target's pixels that show solids; drawn once for each surface."""
         if surface not in self._solids:
-            index, inverse_distance = surface.drawn(self.camera)
+            index, inverse_distance, face = surface.drawn(self.camera)
             y, x = np.divmod(index, self.camera.width_px)
             pixels = np.stack([x, y], axis=-1)
             directions, _ = ego_rays(self.camera, pixels.astype(np.float64))
             free = np.full(self.camera.size, 255, np.uint8)
             free.reshape(-1)[index] = 0
-            self._solids[surface] = SolidPixels(free, pixels, directions, inverse_distance)
+            self._solids[surface] = SolidPixels(free, pixels, directions, inverse_distance, face)
             self.counters["solid_pixels"] += len(pixels)
         return self._solids[surface]
 
@@ -287,12 +292,13 @@ class PairMap:
         if self.solids is None or not isinstance(self.whole_surface, Layered):
             return self.valid
         camera = _halved_camera(self.source, level)
-        shadow = self.whole_surface.shadows(camera)
-        free = self.valid & ~_in_shadow(shadow, _at_level(self.uv, level), self._from_source_q)
+        shadows = self.whole_surface.shadows(camera)
+        pixel, inside = _nearest_pixel(shadows.beyond, _at_level(self.uv, level))
+        free = self.valid & ~(inside & (shadows.beyond[pixel] > self._from_source_q))
         on_solid = self.rays.at_nodes(255 - self.rays.solids(self.whole_surface).free) > 0
         seen = np.zeros(self.rays.camera.size, bool)
         px, py = self.solids.pixels.T
-        seen[py, px] = ~_in_shadow(shadow, _at_level(self.solids.uv, level), self.solids.inverse_distance)
+        seen[py, px] = self.solids.lit(shadows, _at_level(self.solids.uv, level), slice(None))
         return np.where(on_solid, self.rays.at_nodes(seen), free)
 
     def full_resolution(
@@ -339,28 +345,25 @@ class PairMap:
             at = np.clip(at, (slot.x, slot.y), (slot.x + w - 1, slot.y + h - 1), dtype=np.float32)
         return at, visible
 
-    def _put_solids(
-        self, at: npt.NDArray[np.float32], visible: npt.NDArray[np.uint8], nodes: Box, slot: Slot
-    ) -> None:
+    def _put_solids(self, at: npt.NDArray[np.float32], visible: npt.NDArray[np.uint8], nodes: Box, slot: Slot) -> None:
         """What lies in the shadow of solids is not seen; then the pixels that show solids."""
         assert self.solids is not None and isinstance(self.whole_surface, Layered)
         grid = self.rays.grid
         y0, y1, x0, x1 = grid.pixels(nodes)
-        shadow = self.whole_surface.shadows(_halved_camera(self.source, slot.level))
-        for part in self._parts_near_shadow(shadow, nodes, slot.level):
+        shadows = self.whole_surface.shadows(_halved_camera(self.source, slot.level))
+        for part in self._parts_near_shadow(shadows.beyond, nodes, slot.level):
             t, b, le, r = grid.pixels(part)
             here = slice(t - y0, b - y0), slice(le - x0, r - x0)
             local = at[here] - np.array([slot.x, slot.y], np.float32)
-            first: Any = cv2.remap(shadow, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
+            first: Any = cv2.remap(shadows.beyond, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
             visible[here] &= cv2.compare(first, grid.upsample(self._from_source_q, part), cv2.CMP_LE).astype(np.uint8)
         visible &= self.rays.solids(self.whole_surface).free[y0:y1, x0:x1]
         solids = self.solids
-        start, stop = np.searchsorted(solids.pixels[:, 1], [y0, y1])
-        px, py = solids.pixels[start:stop].T
-        exact = slot.from_source(solids.uv[start:stop])
-        lit = ~_in_shadow(shadow, exact - (slot.x, slot.y), solids.inverse_distance[start:stop])
+        strip = slice(*np.searchsorted(solids.pixels[:, 1], [y0, y1]).tolist())
+        px, py = solids.pixels[strip].T
+        exact: Any = slot.from_source(solids.uv[strip])
         at[py - y0, px - x0] = exact
-        visible[py - y0, px - x0] = lit * np.uint8(255)
+        visible[py - y0, px - x0] = solids.lit(shadows, exact - (slot.x, slot.y), strip) * np.uint8(255)
 
     def _parts_near_shadow(self, shadow: npt.NDArray[np.float32], nodes: Box, level: int) -> Iterator[Box]:
         """The parts of a strip, between its rows of nodes, whose background may be read in a shadow."""
@@ -370,7 +373,8 @@ class PairMap:
         if self._near_shadow is None:
             self._near_shadow = _cells_near_shadow(shadow, _at_level(self.uv, level))
         j0, j1, i0, i1 = nodes
-        for first, last in runs(self._near_shadow[j0:j1, i0:i1].any(axis=0)):
+        near: BoolArray = np.logical_or.reduce(self._near_shadow[j0:j1, i0:i1])
+        for first, last in runs(near):
             part = j0, j1, i0 + first, i0 + last + 1
             _, _, x0, x1 = self.rays.grid.pixels(part)
             if x1 > x0:  # nodes lie beyond the image too
@@ -407,34 +411,45 @@ class PairMap:
 
 
 class _SeenSolids(NamedTuple):
-    """The pixels showing solids whose scene points project into a source's image, hidden from it or not.
+    """The pixels showing faces that are turned to a source and project into its image, hidden by others or not.
 
     Attributes:
         pixels: (n, 2) target pixels, row by row.
         uv: (n, 2) source pixels.
         inverse_distance: (n,) from the source, 1/m.
+        solid: (n,) which one.
     """
 
     pixels: npt.NDArray[np.int64]
     uv: FloatArray
     inverse_distance: FloatArray
+    solid: npt.NDArray[np.int32]
 
     @classmethod
     def of(cls, rays: TargetRays, source: Camera, surface: Layered) -> _SeenSolids:
-        _, pixels, directions, q = rays.solids(surface)
+        _, pixels, directions, q, face = rays.solids(surface)
         offset_m = rays.camera.center_m - source.center_m
+        solid, before_m = surface.facing(source.center_m, face)
+        turned = before_m > 0
         if source.lens == "pinhole":
             # Most solids lie beside most sources: two half-spaces are cheaper than a projection.
             K, to_source = source.K, source.cam2ego[:3, :3].T
             sides = np.stack([K[0], (source.width_px - 1) * K[2] - K[0]]) @ to_source
             left, right = sides @ directions.T + np.outer(sides @ offset_m, q)
-            inside = np.flatnonzero((left >= -1e-6) & (right >= -1e-6))
-            pixels, directions, q = pixels[inside], directions[inside], q[inside]
+            turned &= (left >= -1e-6) & (right >= -1e-6)
+        some = np.flatnonzero(turned)
+        pixels, directions, q, solid, before_m = pixels[some], directions[some], q[some], solid[some], before_m[some]
         points = _source_points(source, directions, q, offset_m)
         uv, _, valid = source.project_cam(points)
-        inside = np.flatnonzero(valid & source.contains(uv))
-        length = np.sqrt((points[inside] ** 2).sum(-1))
-        return cls(pixels[inside], uv[inside], q[inside] / np.maximum(length, 1e-300))
+        q /= np.maximum(np.sqrt((points * points).sum(-1)), 1e-300)
+        inside = np.flatnonzero(valid & source.contains(uv) & (before_m * q >= _LEAST_INCIDENCE))
+        return cls(pixels[inside], uv[inside], q[inside], solid[inside])
+
+    def lit(self, shadows: Shadows, at: FloatArray, part: slice) -> BoolArray:
+        """Which of a part of them no other solid hides, by their positions (n, 2) in the shadow images."""
+        pixel, inside = _nearest_pixel(shadows.beyond, at)
+        nearer = shadows.beyond[pixel] > self.inverse_distance[part]
+        return ~(inside & nearer & (shadows.solid[pixel] != self.solid[part]))
 
     def nodes(self, grid: Grid) -> Box | None:
         """The nodes around all of them."""
@@ -487,13 +502,12 @@ def _tiles_between(position: FloatArray, count: int) -> tuple[npt.NDArray[np.int
     return first.clip(0, count).astype(np.int64), last.clip(0, count).astype(np.int64)
 
 
-def _in_shadow(shadow: npt.NDArray[np.float32], uv: FloatArray, inverse_distance: FloatArray) -> BoolArray:
-    """Whether points (...,) seen at pixels (..., 2) of a shadow image are hidden; none is outside it."""
-    h, w = shadow.shape
-    u, v = np.rint(uv[..., 0]), np.rint(uv[..., 1])
+def _nearest_pixel(image: npt.NDArray[Any], at: FloatArray) -> tuple[tuple[Any, Any], BoolArray]:
+    """Rows and columns (...,) nearest to positions (..., 2), and where those lie in the image; elsewhere they are 0."""
+    h, w = image.shape
+    u, v = np.rint(at[..., 0]), np.rint(at[..., 1])
     inside = (u >= 0) & (u < w) & (v >= 0) & (v < h)
-    first = shadow[np.where(inside, v, 0).astype(np.int64), np.where(inside, u, 0).astype(np.int64)]
-    return inside & (first > inverse_distance)
+    return (np.where(inside, v, 0).astype(np.int64), np.where(inside, u, 0).astype(np.int64)), inside
 
 
 def ego_rays(camera: Camera, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:

@@ -27,11 +27,13 @@ class _Faces(NamedTuple):
         inverse_depth: (F, 3) of the face's plane.
         sides: (F, 4, 3), all positive where a pixel shows the face.
         bounds: (F, 4) int, pixels x0, x1, y0, y1 that may show it; the last exclusive.
+        number: (F,) 6 x the box's row + 2 x the axis across the face + 1 for the one further along that axis.
     """
 
     inverse_depth: FloatArray
     sides: FloatArray
     bounds: npt.NDArray[np.int64]
+    number: npt.NDArray[np.int64]
 
 
 def draw_boxes(camera: Camera, boxes: FloatArray) -> Drawn:
@@ -41,9 +43,9 @@ def draw_boxes(camera: Camera, boxes: FloatArray) -> Drawn:
         camera: The camera; a box that holds it is not seen.
         boxes: (B, 7) centre x, y, z, length, width, height (metres), yaw (radians), in the ego frame.
     """
-    nearest = np.zeros(camera.size, np.float32)
+    nearest, shown_face = np.zeros(camera.size, np.float32), np.zeros(camera.size, np.int32)
     columns = np.arange(camera.width_px, dtype=np.float64)
-    for plane, sides, (x0, x1, y0, y1) in zip(*_faces(camera, boxes), strict=True):
+    for plane, sides, (x0, x1, y0, y1), number in zip(*_faces(camera, boxes), strict=True):
         rows = np.arange(y0, y1, dtype=np.float64)
         rest, slope = sides[:, 1:2] * rows + sides[:, 2:], sides[:, :1]  # [4, rows], [4, 1]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -57,16 +59,17 @@ def draw_boxes(camera: Camera, boxes: FloatArray) -> Drawn:
         top, bottom = int(shown[0]), int(shown[-1]) + 1
         left = int(np.ceil(max(low[shown].min(), x0)))
         right = int(np.floor(min(high[shown].max(), x1 - 1))) + 1
-        u, part = columns[left:right], nearest[y0 + top : y0 + bottom, left:right]
-        face = (plane[0] * u)[None] + (plane[1] * rows[top:bottom] + plane[2])[:, None]
-        within = (u >= low[top:bottom, None]) & (u <= high[top:bottom, None])
-        np.maximum(part, face.astype(np.float32), out=part, where=within)
+        u, here = columns[left:right], (slice(y0 + top, y0 + bottom), slice(left, right))
+        face = ((plane[0] * u)[None] + (plane[1] * rows[top:bottom] + plane[2])[:, None]).astype(np.float32)
+        first = (u >= low[top:bottom, None]) & (u <= high[top:bottom, None]) & (face > nearest[here])
+        np.copyto(nearest[here], face, where=first)
+        np.copyto(shown_face[here], number, where=first)
     index = np.flatnonzero(nearest != 0)  # faster than of floats
     v, u = np.divmod(index, camera.width_px)
     y = (v - camera.K[1, 2]) / camera.K[1, 1]
     x = (u - camera.K[0, 2] - camera.K[0, 1] * y) / camera.K[0, 0]
     distance = nearest.reshape(-1)[index] / np.sqrt(x * x + y * y + 1)
-    return Drawn(index, np.minimum(distance, MAX_INVERSE_DISTANCE))
+    return Drawn(index, np.minimum(distance, MAX_INVERSE_DISTANCE), shown_face.reshape(-1)[index])
 
 
 def _faces(camera: Camera, boxes: FloatArray) -> _Faces:
@@ -97,7 +100,7 @@ def _faces(camera: Camera, boxes: FloatArray) -> _Faces:
         e = across[:, k]
         sides[:, 2 * k] = (half[b, e] - start[b, e])[:, None] * plane - rays[b, e]
         sides[:, 2 * k + 1] = (half[b, e] + start[b, e])[:, None] * plane + rays[b, e]
-    return _Faces(plane, sides, _pixel_bounds(pixels, camera.size))
+    return _Faces(plane, sides, _pixel_bounds(pixels, camera.size), 6 * b + 2 * axis + (side > 0))
 
 
 def _pixel_bounds(corners: FloatArray, size: tuple[int, int]) -> npt.NDArray[np.int64]:

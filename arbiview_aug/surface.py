@@ -73,10 +73,24 @@ class Drawn(NamedTuple):
     Attributes:
         index: (n,) into the flattened image, ascending.
         inverse_distance: (n,) along the pixels' rays, 1/m.
+        face: (n,) which face of which solid, a number that the surface knows.
     """
 
     index: npt.NDArray[np.int64]
     inverse_distance: FloatArray
+    face: npt.NDArray[np.int32]
+
+
+class Shadows(NamedTuple):
+    """What solids hide from a source, for each of its pixels.
+
+    Attributes:
+        beyond: (h, w) float32, 1/m: background at a smaller inverse distance along the pixel's ray is hidden.
+        solid: (h, w) int32, the solid that hides it, -1 for none.
+    """
+
+    beyond: npt.NDArray[np.float32]
+    solid: npt.NDArray[np.int32]
 
 
 class Layered(Surface):
@@ -96,8 +110,17 @@ class Layered(Surface):
         """The pixels of a camera that show solids."""
 
     @abstractmethod
-    def shadows(self, camera: Camera) -> npt.NDArray[np.float32]:
-        """Inverse distance (h, w) in 1/m beyond which (farther, smaller) points of each pixel's ray are hidden."""
+    def shadows(self, camera: Camera) -> Shadows:
+        """What solids hide from a source."""
+
+    @abstractmethod
+    def facing(self, origin: FloatArray, face: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int32], FloatArray]:
+        """The solids of faces (n,), and by how many metres a point lies before the faces' planes.
+
+        Args:
+            origin: (3,) the point in the ego frame.
+            face: As in ``Drawn``.
+        """
 
 
 class Static(Surface):

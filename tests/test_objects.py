@@ -49,7 +49,7 @@ def test_boxes_hide_what_is_behind_them_and_not_their_own_faces() -> None:
     scene = Objects(Street(), CAR)
     ray = np.broadcast_to(unit(8, 0, -0.5), (4, 3))
     face = np.linalg.norm([8, 0, -0.5])
-    distances = np.array([face - 1, face, face + 0.05, face + 1.0])
+    distances = np.array([face - 1, face, face + 0.005, face + 0.1])
     assert scene.hides(EYE, ray, 1 / distances, 0.001).tolist() == [False, False, False, True]
     assert scene.hides(EYE, ray[:1], np.zeros(1), 0.001).tolist() == [True]  # the sky behind a car is hidden too
 
@@ -58,15 +58,6 @@ def test_hiding_boxes_are_a_pixel_wider() -> None:
     scene, beside = Objects(Street(), CAR), unit(8, 1.05, -0.5)[None]  # 5 cm beside the front corner
     assert scene.hides(EYE, beside, np.zeros(1), 0.001).tolist() == [False]
     assert scene.hides(EYE, beside, np.zeros(1), 0.01).tolist() == [True]
-
-
-def test_a_face_seen_edge_on_is_not_read() -> None:
-    eye = np.array([0.0, 0.0, 1.6])  # 10 cm above the roof
-    roof = np.array([9.0, 0.0, 1.5]) - eye
-    scene = Objects(Street(), CAR)
-    assert scene.hides(eye, unit(*roof)[None], np.array([1 / np.linalg.norm(roof)]), 0.001).tolist() == [True]
-    steep = np.array([9.0, 0.0, 1.5]) - (above := np.array([5.0, 0.0, 4.0]))
-    assert scene.hides(above, unit(*steep)[None], np.array([1 / np.linalg.norm(steep)]), 0.001).tolist() == [False]
 
 
 def test_any_number_of_rays_gives_the_same_answers() -> None:
@@ -114,13 +105,13 @@ def test_what_a_car_hid_is_a_hole_and_not_its_colour() -> None:
     )
     rig = Rig([camera])
     directions = camera.unproject(camera.pixel_grid()).directions
-    hit = Objects(Street(), CAR)._boxes_ahead(camera.center_m, directions) > 0
+    hit = Objects(Street(), CAR)._boxes_ahead(camera.center_m, directions)[0] > 0
     image = np.where(hit[..., None], np.array([220, 20, 20]), np.array([90, 90, 90])).astype(np.uint8)
     plan = build_plan(rig, rig.shifted(z_m=1.5), surface="objects", scene=Scene(CAR))
     view = render_opencv(plan, [torch.from_numpy(image).permute(2, 0, 1)])[0].permute(1, 2, 0).numpy()
     target, coverage = plan.target[0], plan.coverage[0]
     rays = target.unproject(target.pixel_grid()).directions
-    on_car = Objects(Street(), CAR)._boxes_ahead(target.center_m, rays) > 0
+    on_car = Objects(Street(), CAR)._boxes_ahead(target.center_m, rays)[0] > 0
     beside = cv2.dilate(on_car.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
     red = (view[..., 0] > 150) & coverage
     assert not red[beside].any()  # no colour of the object outside its silhouette by more than 2 px
