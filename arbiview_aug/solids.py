@@ -89,11 +89,12 @@ def _faces(camera: Camera, boxes: FloatArray) -> _Faces:
         values = _SIGNS[:, k] * half[b, across[:, k], None]
         np.put_along_axis(corners, across[:, None, None, k], values[..., None], axis=2)
     seen = (corners - start[b, None]) @ to_box[b] @ camera2ego  # [F, 4, 3]
-    pixels = seen @ camera.K.T
+    pixels: FloatArray = seen @ camera.K.T
     h, w = camera.size
     x, y, z = pixels[..., 0], pixels[..., 1], pixels[..., 2]
     beyond = np.stack([x < 0, x > (w - 1) * z, y < 0, y > (h - 1) * z, z < 0]).all(axis=2).any(axis=0)
-    b, axis, across, side, seen, pixels = (a[~beyond] for a in (b, axis, across, side, seen, pixels))
+    shown = np.flatnonzero(~beyond)
+    b, axis, across, side, pixels = b[shown], axis[shown], across[shown], side[shown], pixels[shown]
     plane = rays[b, axis] / (side * half[b, axis] - start[b, axis])[:, None]
     sides = np.empty((len(b), 4, 3))
     for k in range(2):
@@ -106,9 +107,9 @@ def _faces(camera: Camera, boxes: FloatArray) -> _Faces:
 def _pixel_bounds(corners: FloatArray, size: tuple[int, int]) -> npt.NDArray[np.int64]:
     """x0, x1, y0, y1 (F, 4) around homogeneous pixels (F, 4, 3); the whole image where one lies behind the camera."""
     z = corners[..., 2:]
-    ahead = (z > 0).all(axis=(1, 2))
+    ahead = (z > 0).all(axis=1)  # [F, 1]
     uv = corners[..., :2] / np.where(z > 0, z, 1.0)
     limit = np.array(size[::-1])
-    low = np.where(ahead[:, None], np.floor(uv.min(axis=1).clip(0, limit - 1)), 0)
-    high = np.where(ahead[:, None], np.ceil(uv.max(axis=1).clip(0, limit - 1)) + 1, limit)
+    low = np.where(ahead, np.floor(uv.min(axis=1).clip(0, limit - 1)), 0)
+    high = np.where(ahead, np.ceil(uv.max(axis=1).clip(0, limit - 1)) + 1, limit)
     return np.stack([low, high], axis=-1).reshape(-1, 4).astype(np.int64)

@@ -71,12 +71,12 @@ class Drawn(NamedTuple):
     """The pixels of an image that show something.
 
     Attributes:
-        index: (n,) into the flattened image, ascending.
+        pixel: (n,) into the flattened image, ascending.
         inverse_distance: (n,) along the pixels' rays, 1/m.
         face: (n,) which face of which solid, a number that the surface knows.
     """
 
-    index: npt.NDArray[np.int64]
+    pixel: npt.NDArray[np.int64]
     inverse_distance: FloatArray
     face: npt.NDArray[np.int32]
 
