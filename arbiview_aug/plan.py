@@ -15,11 +15,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
 
-from arbiview_aug.camera import BoolArray
+import numpy as np
+
+from arbiview_aug.camera import BoolArray, FloatArray
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.rig import Rig, content_order
 from arbiview_aug.sampling import AtlasLayout, Scratch
 from arbiview_aug.scene import Scene
+from arbiview_aug.surface import worst_parallax_px
 from arbiview_aug.target_plan import TargetDraft, TargetPlan
 
 
@@ -95,6 +98,20 @@ def plan_key(source: Rig, target: Rig, surface: str, config: FavsConfig, scene: 
     return hashlib.sha256(repr((source.content_key, target.content_key, surface, settings, geometry)).encode()).digest()
 
 
+def baselines_m(source: Rig, target: Rig) -> FloatArray:
+    """(M, N) distances between the target's and the source's optical centres, roads and origins made to coincide."""
+    target = target.in_frame_of(source)
+    return np.asarray(np.linalg.norm(target.cam2ego[:, None, :3, 3] - source.cam2ego[None, :, :3, 3], axis=-1))
+
+
+def needs_geometry(source: Rig, target: Rig, config: FavsConfig) -> bool:
+    """Whether ``auto`` asks for a surface nearer than ``far`` for any pair of cameras."""
+    return any(
+        worst_parallax_px(float(row.max()), float(camera.K[0, 0])) >= config.far_parallax_px
+        for row, camera in zip(baselines_m(source, target), target, strict=True)
+    )
+
+
 def build_plan(
     source: Rig,
     target: Rig,
@@ -110,7 +127,7 @@ def build_plan(
         target: The rig to render, in its own ego frame: the two roads are made to coincide.
         surface: ``far``, ``ground``, ``street``, ``objects`` (needs boxes); or ``auto``: for each pair of target and
             source camera, ``far`` where their centres coincide or the worst-case parallax is below
-            ``config.far_parallax_px``, else ``street``.
+            ``config.far_parallax_px``, else the scene's best.
         config: Settings; the ``fast`` preset by default.
         scene: What is known of the geometry, in the source's ego frame.
 
@@ -123,7 +140,9 @@ def build_plan(
     order = content_order(source.cameras)
     known = scene or Scene()
     surface_by_name = lru_cache(None)(lambda name: known.surface(name, source.ground_z_m))
-    drafts = [TargetDraft(source, order, camera, surface, surface_by_name, config, counters) for camera in target]
+    drafts = [
+        TargetDraft(source, order, camera, surface, known.best, surface_by_name, config, counters) for camera in target
+    ]
     used = [(region.source, region.level) for draft in drafts for region in draft.regions]
     layout = AtlasLayout.for_sources(source.sizes, used)
     scratch = Scratch()

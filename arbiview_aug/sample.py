@@ -80,24 +80,41 @@ def check_inputs(sample: Any, source_rig: Rig | None) -> list[SourceFrame]:
     ]
 
 
-def scenes_of_frames(sample: Mapping[str, Any], lead: tuple[int, ...], surface: str) -> list[Scene]:
+def scenes_of_frames(sample: Mapping[str, Any], count: int, lead: tuple[int, ...], surface: str) -> list[Scene]:
     """What each frame of a sample says of the geometry, in the source's ego frame.
 
     Args:
         sample: The sample dict, its images checked.
+        count: Number of frames.
         lead: Leading dimensions of its images.
         surface: The surface asked for: what it does not use is not read.
 
     Raises:
         SampleError: Geometry that the surface needs is missing or impossible.
     """
-    boxes = sample.get("boxes_3d")
-    if surface == "objects" and boxes is None:
-        raise SampleError(
-            "surface='objects': expected 'boxes_3d' (B, 7) in the sample, got none; an empty (0, 7) tensor says that "
-            "nothing stands there"
-        )
-    return [Scene(boxes=checked_boxes(frame)) for frame in (split(boxes, lead) if lead else [boxes])]
+    boxes = sample.get("boxes_3d") if surface in ("auto", "objects") else None
+    if boxes is None:
+        if surface == "objects":
+            raise SampleError(
+                "surface='objects': expected 'boxes_3d' (B, 7) in the sample, got none; an empty (0, 7) tensor says "
+                "that nothing stands there"
+            )
+        return [Scene()] * count
+    return [Scene(boxes=checked_boxes(frame)) for frame in _of_frames("boxes_3d", boxes, count, lead)]
+
+
+def _of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[np.ndarray]:
+    """Numbers of each frame: a tensor with the images' leading dimensions, or a list with an entry for each frame."""
+    if not lead:
+        return [_numbers(key, value, ())]
+    try:
+        frames = value if isinstance(value, list | tuple) else split(value, lead)
+    except (AttributeError, ValueError):
+        frames = ()
+    if len(frames) != count:
+        got = f"shape {tuple(value.shape)}" if hasattr(value, "shape") else type(value).__name__
+        raise SampleError(f"{key}: expected a tensor {lead} + (n, ...), or a list of {count} of them, got {got}")
+    return [_numbers(key, frame, ()) for frame in frames]
 
 
 # --- images -----------------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from arbiview_aug.camera import FloatArray
 from arbiview_aug.objects import Objects
-from arbiview_aug.surface import Far, Ground, Street, Surface
+from arbiview_aug.surface import Far, Ground, Street, Surface, SurfaceName
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,6 +19,16 @@ class Scene:
     """
 
     boxes: FloatArray | None = None
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing is known but the road."""
+        return self.boxes is None
+
+    @property
+    def best(self) -> SurfaceName:
+        """The surface made of the best geometry that there is: what ``auto`` takes."""
+        return "street" if self.boxes is None else "objects"
 
     @property
     def key(self) -> bytes:

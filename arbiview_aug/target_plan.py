@@ -133,12 +133,13 @@ class TargetDraft:
         order: list[int],
         camera: Camera,
         surface: str,
+        best: str,
         surface_by_name: Callable[[str], Surface],
         config: FavsConfig,
         counters: Counter[str],
     ) -> None:
         self.source, self.camera, self.surface, self.config = source, camera, surface, config
-        self.surface_by_name = surface_by_name
+        self.best, self.surface_by_name = best, surface_by_name
         self.counters = counters
         self.rays = TargetRays(camera, config.grid_step_px, counters)
         self.grid = self.rays.grid
@@ -154,7 +155,7 @@ class TargetDraft:
         worst = worst_parallax_px(baseline_m, focal_px)
         if worst < self.config.far_parallax_px:
             return "far", f"worst-case parallax {worst:.2f} px"
-        return "street", f"centres {baseline_m:.2f} m apart"
+        return self.best, f"centres {baseline_m:.2f} m apart"
 
     def _region(self, index: int) -> _Region | None:
         source = self.source[index]

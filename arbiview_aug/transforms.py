@@ -21,7 +21,7 @@ from arbiview_aug.favs.paper import PaperRendering, check_pinhole, check_setting
 from arbiview_aug.favs.photometric import Harmonise, Harmoniser, PhotometricReport
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
 from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_target, target_labels
-from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
+from arbiview_aug.plan import PlanCache, RenderPlan, baselines_m, build_plan, needs_geometry, plan_key
 from arbiview_aug.random_rig import RandomRig
 from arbiview_aug.rig import Rig, load_rig
 from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame, check_inputs, scenes_of_frames
@@ -36,6 +36,9 @@ View = RenderPlan | PaperRendering | tuple[int, int]
 
 _OUTPUTS = ("source_camera",)
 _UNREACHABLE = 0.5  # a target camera of which less than this is covered is worth a warning
+_MOVED_M = 0.2
+"""A target camera farther than this from every source is worth a warning where only the static street is known: what
+stands 10 m away shifts by more than a degree, and the street does not know that it stands there."""
 
 
 class RigRetarget(torch.nn.Module):
@@ -64,8 +67,9 @@ class RigRetarget(torch.nn.Module):
         quality: ``draft``, ``fast``, or a ``FavsConfig``; ``paper`` or a ``PaperConfig``: stages 1 to 4 as published,
             on the CPU, for pinhole cameras.
         surface: ``far``, ``ground``, ``street``; ``objects``: the sample's ``boxes_3d`` stand on the street, so that
-            objects keep their height when cameras move; ``auto`` decides per pair of cameras between far and street
-            (``paper``: always ``far``).
+            objects keep their height when cameras move; ``auto``: for each pair of cameras ``far`` where their centres
+            coincide, else the best that the sample offers: ``objects`` with ``boxes_3d``, else ``street``, with a
+            warning where cameras move (``paper``: always ``far``).
         harmonise: Bring the sources to one exposure (``arbiview_aug.favs.photometric``): True or a ``HarmoniseConfig``
             estimates a gain for each camera in every frame; numbers are gains to use as they are. Off by default.
             Samples that ``p`` skips keep their colours.
@@ -141,6 +145,7 @@ class RigRetarget(torch.nn.Module):
         # Rigs drawn for each sample never come back: only the last plan is kept.
         once = isinstance(self.target, RandomRig) and self.target.per == "sample"
         self.plans = PlanCache(0 if once else cache_bytes)
+        self._plan_of_frame = PlanCache(0)  # holds one
         self._fixed_target = self._sized(self.target) if isinstance(self.target, Rig) else None
         self._scratch = Scratch()
         self._warned: set[str] = set()
@@ -298,11 +303,13 @@ class RigRetarget(torch.nn.Module):
             part["ignore"] = stacked([torch.from_numpy(~m).to(device) for m in masks])
         return part
 
-    def _scenes(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[Scene | None]:
+    def _scenes(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[Scene]:
         """What each frame's sample says of the geometry, as far as the surface uses it."""
-        return scenes_of_frames(sample, lead, self.surface) if self.surface == "objects" else [None] * count
+        if isinstance(self.config, PaperConfig):
+            return [Scene()] * count
+        return scenes_of_frames(sample, count, lead, self.surface)
 
-    def _view(self, frame: SourceFrame, target: Rig, scene: Scene | None) -> RenderPlan | PaperRendering:
+    def _view(self, frame: SourceFrame, target: Rig, scene: Scene) -> RenderPlan | PaperRendering:
         """The plan of a frame, or the frame rendered by the published stages, for which nothing can be planned."""
         if not isinstance(self.config, PaperConfig):
             return self.plan(frame.rig, target, scene)
@@ -318,13 +325,19 @@ class RigRetarget(torch.nn.Module):
         """
         if isinstance(self.config, PaperConfig):
             raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
-        config = self.config
-        key = plan_key(source, target, self.surface, config, scene)
-        return self.plans.get(key, lambda: self._built(source, target, config, scene))
+        config, known = self.config, scene or Scene()
+        if self.surface == "auto" and not known.is_empty and not needs_geometry(source, target, config):
+            known = Scene()
+        # A frame's geometry never comes back: its plan must not push out those that do.
+        cache = self.plans if known.is_empty else self._plan_of_frame
+        key = plan_key(source, target, self.surface, config, known)
+        return cache.get(key, lambda: self._built(source, target, config, known))
 
-    def _built(self, source: Rig, target: Rig, config: FavsConfig, scene: Scene | None) -> RenderPlan:
+    def _built(self, source: Rig, target: Rig, config: FavsConfig, scene: Scene) -> RenderPlan:
         plan = build_plan(source, target, surface=self.surface, config=config, scene=scene)
         self._warn_unreachable(plan)
+        if self.surface == "auto" and scene.is_empty:
+            self._warn_static(source, target)
         return plan
 
     def prepare(self, source: Rig | None = None) -> RenderPlan:
@@ -386,6 +399,16 @@ class RigRetarget(torch.nn.Module):
                 f"{', '.join(poor)}; train with the coverage mask, or choose another target",
             )
 
+    def _warn_static(self, source: Rig, target: Rig) -> None:
+        moved_m = float(baselines_m(source, target).min(axis=1).max())
+        if moved_m > _MOVED_M:
+            self._warn_once(
+                "static",
+                f"target cameras stand up to {moved_m:.2f} m from the nearest source camera, and the sample does not "
+                "say what stands on the street: objects will lean and stretch, which can harm a detector. Pass "
+                "'boxes_3d' in the samples, mix with untouched ones (p=0.5), or accept it with surface='street'",
+            )
+
     # --- processes --------------------------------------------------------------------------------------------------
     def _limit_threads(self) -> None:
         """OpenCV keeps all its threads in DataLoader workers, where they would fight for the cores."""
@@ -396,9 +419,9 @@ class RigRetarget(torch.nn.Module):
     def __deepcopy__(self, memo: dict[int, Any]) -> RigRetarget:
         clone = self.__class__.__new__(self.__class__)
         memo[id(self)] = clone
-        state = {k: v for k, v in self.__dict__.items() if k not in ("plans", "_scratch")}
+        state = {k: v for k, v in self.__dict__.items() if k not in ("plans", "_plan_of_frame", "_scratch")}
         clone.__dict__.update(copy.deepcopy(state, memo))
-        clone.plans, clone._scratch = PlanCache(self.plans.max_bytes), Scratch()
+        clone.plans, clone._plan_of_frame, clone._scratch = PlanCache(self.plans.max_bytes), PlanCache(0), Scratch()
         return clone
 
 

@@ -23,7 +23,7 @@ def numbers(printed: str, surface: str) -> list[float]:
 def test_synthetic_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demo", "--size", "64x176", "--output", str(tmp_path), "--width", "900"]) == 0
     printed = capsys.readouterr().out
-    assert "sedan -> van: 6 cameras to 5" in printed and "over the street surface" in printed
+    assert "sedan -> van: 6 cameras to 5" in printed and "over the objects surface" in printed
     assert "Against the true views (5 cameras, 1 frame)" in printed and "ms a frame" in printed
     auto, far = numbers(printed, "auto"), numbers(printed, "far")
     seen, psnr, ground, _, _, mae, ssim, whole = auto

@@ -1,5 +1,7 @@
 """Boxes as solids: rays by hand, what they hide, and objects that keep their height when cameras rise."""
 
+import warnings
+
 import cv2
 import numpy as np
 import pytest
@@ -151,3 +153,43 @@ def test_in_a_sample() -> None:
         retarget(sample | {"boxes_3d": torch.zeros(2, 5)})
     with pytest.raises(SampleError, match=r"boxes_3d\[0\]: expected finite numbers and positive sizes"):
         retarget(sample | {"boxes_3d": torch.full((1, 7), float("nan"))})
+
+
+def test_auto_takes_boxes_where_there_are_some_and_warns_where_cameras_move_without() -> None:
+    rig = demo_source_rig((64, 176))
+    sample = {"images": torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8), "rig": rig}
+    boxes = {"boxes_3d": torch.from_numpy(CAR)}
+    lifted = RigRetarget(rig.shifted(z_m=0.5))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert torch.equal(
+            lifted(sample | boxes)["images"], RigRetarget(lifted.target, surface="objects")(sample | boxes)["images"]
+        )
+        RigRetarget(rig.shifted(z_m=0.1))(sample)  # little harm
+        RigRetarget(rig.shifted(z_m=0.5), surface="street")(sample)  # asked for
+    with pytest.warns(UserWarning, match=r"target cameras stand up to 0\.50 m from the nearest source camera"):
+        bare = lifted(sample)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lifted(sample)  # said once
+    assert torch.equal(bare["images"], RigRetarget(lifted.target, surface="street")(sample)["images"])
+
+
+def test_auto_plans_once_where_objects_cannot_matter() -> None:
+    one = Rig([demo_source_rig((64, 176))[0]])
+    turned = RigRetarget(one.turned(yaw_deg=10))
+    for x in (6.0, 7.0, 8.0):
+        boxes = torch.from_numpy(CAR + np.array([x, 0, 0, 0, 0, 0, 0]))
+        turned({"images": torch.zeros((1, 3, 64, 176)), "rig": one, "boxes_3d": boxes})
+    assert (turned.plans.misses, turned.plans.hits) == (1, 2)
+
+
+def test_boxes_of_a_batch_may_differ_in_number() -> None:
+    rig = demo_source_rig((64, 176))
+    images = torch.randint(0, 255, (2, 6, 3, 64, 176), dtype=torch.uint8)
+    retarget = RigRetarget(rig.shifted(z_m=0.5))
+    batch = retarget({"images": images, "rig": rig, "boxes_3d": [torch.zeros(0, 7), torch.from_numpy(CAR)]})
+    alone = retarget({"images": images[1], "rig": rig, "boxes_3d": torch.from_numpy(CAR)})
+    assert torch.equal(batch["images"][1], alone["images"])
+    with pytest.raises(SampleError, match=r"boxes_3d: expected a tensor \(2,\) \+ \(n, \.\.\.\), or a list of 2"):
+        retarget({"images": images, "rig": rig, "boxes_3d": [torch.zeros(0, 7)]})
