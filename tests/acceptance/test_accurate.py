@@ -23,7 +23,7 @@ from arbiview_aug.evaluate.overlap import overlap_scores
 from arbiview_aug.evaluate.scores import psnr_db
 from arbiview_aug.evaluate.sparse import coloured_points, equalised, sparse_metrics
 from arbiview_aug.evaluate.targets import UP_M, YAWS_DEG
-from arbiview_aug.favs.config import PlanQuality
+from arbiview_aug.favs.config import Quality
 from arbiview_aug.favs.overlap_depth import overlap_depth
 from arbiview_aug.favs.synthesis import render_opencv
 from arbiview_aug.plan import build_plan
@@ -35,7 +35,7 @@ from arbiview_aug.transforms import RigRetarget
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 FRAMES = ("nuscenes-one", "ddad-one")
-QUALITIES: tuple[PlanQuality, ...] = ("fast", "accurate")
+QUALITIES: tuple[Quality, ...] = ("fast", "accurate")
 SETS = ("yaw", "up")
 
 
@@ -60,7 +60,7 @@ class Frame:
             self.images = list(equalised(self.rig, self.images, self.lidar))
             self.cameras = referee.equalised(self.cameras, self.lidar)
 
-    def render(self, target: Rig, quality: PlanQuality) -> tuple[list[Image], BoolArray]:
+    def render(self, target: Rig, quality: Quality) -> tuple[list[Image], BoolArray]:
         retarget = RigRetarget(target, source_rig=self.rig, quality=quality)
         out = retarget({"images": as_tensors(self.images)})
         return as_arrays(out["images"]), out["coverage"].numpy()
@@ -199,7 +199,7 @@ def streets() -> Truth:
     targets = dict(
         zip(MOVES, (source.shifted(z_m=0.6), source.shifted(x_m=0.5), source.turned(yaw_deg=20)), strict=True)
     )
-    qualities: tuple[PlanQuality, ...] = ("draft", *QUALITIES)
+    qualities: tuple[Quality, ...] = ("draft", *QUALITIES)
     retargets = {(m, q): RigRetarget(t, quality=q, surface="street") for m, t in targets.items() for q in qualities}
     rows: dict[tuple[str, str], list[tuple[float, float]]] = {key: [] for key in retargets}
     with warnings.catch_warnings():
