@@ -41,7 +41,7 @@ class FavsConfig:
     round by, maps stay within 1/32 px of float64."""
 
     def __post_init__(self) -> None:
-        _check_ranges(self, _RANGES)
+        check_ranges(self, _RANGES)
         if self.grid_step_px not in (1, 4, 8, 16, 32):
             raise ValueError(f"FavsConfig.grid_step_px: expected 1, 4, 8, 16 or 32, got {self.grid_step_px!r}")
         if self.interpolation not in ("linear", "nearest"):
@@ -166,7 +166,7 @@ class PaperConfig:
     Without it the yawed real frames lose 0.2 dB."""
 
     def __post_init__(self) -> None:
-        _check_ranges(self, _PAPER_RANGES)
+        check_ranges(self, _PAPER_RANGES)
         if not self.consistent_px < self.inconsistent_px:
             raise ValueError(
                 f"PaperConfig.consistent_px: expected less than inconsistent_px={self.inconsistent_px!r}, "
@@ -206,7 +206,12 @@ _PAPER_RANGES: dict[str, tuple[float, float]] = {
 }
 
 
-def _check_ranges(config: Any, ranges: dict[str, tuple[float, float]]) -> None:
+def check_ranges(config: Any, ranges: dict[str, tuple[float, float]]) -> None:
+    """Refuse fields of a config outside their (lowest, highest) value.
+
+    Raises:
+        ValueError: With the config's and the field's name.
+    """
     for name, (low, high) in ranges.items():
         value = getattr(config, name)
         if not low <= value <= high:
