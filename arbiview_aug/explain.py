@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
+from arbiview_aug.favs.overlap_depth import OverlapDepth
 from arbiview_aug.favs.paper import PaperRendering, SourceReport
 from arbiview_aug.favs.photometric import PhotometricReport
 from arbiview_aug.plan import RenderPlan
@@ -22,10 +23,12 @@ class Explanation:
     Attributes:
         plan: The plan.
         harmonisation: The sources' gains and why, where harmonisation was asked for.
+        depth: What became of each pair of neighbours, where depth from overlap was asked for and matters.
     """
 
     plan: RenderPlan
     harmonisation: PhotometricReport | None = None
+    depth: OverlapDepth | None = None
 
     def as_dict(self) -> list[dict[str, Any]]:
         """One entry for each target camera: coverage, share to invent, and its sources with surface and reason."""
@@ -52,6 +55,8 @@ class Explanation:
         ]
         if self.harmonisation is not None:
             lines.append(f"  {self.harmonisation}")
+        if self.depth is not None:
+            lines.extend(f"  {line}" for line in str(self.depth).splitlines())
         return "\n".join([*lines, *_lines(self.as_dict(), _source_line)])
 
     __repr__ = __str__

@@ -197,7 +197,7 @@ def estimate_gains(
     none = (1.0,) * len(rig)
     if not overlaps.pairs:
         return PhotometricReport(none, False, "no two cameras overlap enough")
-    small = [_reduced(images[k], level) for k, level in zip(overlaps.order, overlaps.levels, strict=True)]
+    small = [reduced(images[k], level) for k, level in zip(overlaps.order, overlaps.levels, strict=True)]
     seen = [(pair, _read(small[pair.a], pair.at[0]), _read(small[pair.b], pair.at[1])) for pair in overlaps.pairs]
     measured = [_log_ratio(one[: pair.fitted], two[: pair.fitted], config) for pair, one, two in seen]
     if all(ratio is None for ratio in measured):
@@ -220,7 +220,7 @@ def estimate_gains(
     return PhotometricReport(gains, True, words, before, after)
 
 
-def _reduced(image: torch.Tensor, level: int) -> _Pixels:
+def reduced(image: torch.Tensor, level: int) -> _Pixels:
     """The image (h, w, 3) float32 in [0, 1], halved ``level`` times."""
     image = image.detach()
     top = np.float32(255 if image.dtype == torch.uint8 else 1)
