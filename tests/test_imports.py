@@ -27,7 +27,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("favs.object_alignment",),
     ("favs.paper",),
     ("maps",),
-    ("favs.photometric",),
+    ("favs.photometric", "confidence"),
     ("target_plan",),
     ("plan",),
     ("favs.synthesis",),

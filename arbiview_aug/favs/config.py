@@ -41,6 +41,10 @@ class FavsConfig:
     """Cells whose interpolation error may exceed this are evaluated exactly; with the 1/64 px that fixed-point maps
     round by, maps stay within 1/32 px of float64."""
 
+    certainty: bool = False
+    """Plans hold how far the geometry of each pixel can be trusted, one byte a pixel: ``outputs=("confidence",)`` sets
+    it."""
+
     def __post_init__(self) -> None:
         _check_ranges(self, _RANGES)
         if self.grid_step_px not in (1, 4, 8, 16, 32):
