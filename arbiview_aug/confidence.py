@@ -63,28 +63,32 @@ def confidence(
     levels = 1.0 if view.dtype == torch.uint8 else 255.0
     with torch.no_grad():
         doubt = 1 - torch.from_numpy(certain).to(view.device).float() / 255
-        contrast = _contrast(view.detach().float().mean(-3) * levels, covered.float())
+        contrast = _contrast(view.detach(), levels, covered)
         error = _ERROR_PER_CONTRAST * (doubt * (contrast + _LEAST_CONTRAST) + levels * seam)
         return torch.exp(-error / EXPECTED_ERROR_LEVELS) * covered
 
 
-def _contrast(grey: torch.Tensor, covered: torch.Tensor) -> torch.Tensor:
-    """Standard deviation (..., h, w) of covered pixels around each one: the mean of two window sizes."""
-    h, w = grey.shape[-2:]
-    cell = max(1, round(_CELL * w))
+def _contrast(view: torch.Tensor, levels: float, covered: torch.Tensor) -> torch.Tensor:
+    """Standard deviation (..., h, w) of covered grey levels around each pixel: the mean of two window sizes."""
+    h, w = covered.shape
+    cell = max(1, 2 * round(_CELL * w / 2))
+    step = max(1, cell // 2)  # four pixels of each cell tell enough
+    seen = covered[::step, ::step].float()
+    grey = view[..., ::step, ::step].float().mean(-3) * levels
     # Around mid-grey: float32 would lose the variance of bright areas.
-    flat = (grey.reshape(-1, h, w) - 128) * covered
-    moments = torch.stack([covered.expand_as(flat), flat, flat * flat], 1)
+    flat = (grey.reshape(-1, *seen.shape) - 128) * seen
+    moments = torch.stack([seen.expand_as(flat), flat, flat * flat], 1)
+    side = cell // step
     # Zero padding is not covered: it adds nothing to any moment.
-    cells = torch.nn.functional.avg_pool2d(
-        torch.nn.functional.pad(moments, (0, -w % cell, 0, -h % cell)), cell, divisor_override=1
-    )
+    padded = torch.nn.functional.pad(moments, (0, -seen.shape[1] % side, 0, -seen.shape[0] % side))
+    cells = torch.nn.functional.avg_pool2d(padded, side, divisor_override=1)
     spread = torch.zeros_like(cells[:, :1])
-    for side in _WINDOWS:
-        across = torch.nn.functional.avg_pool2d(cells, (1, side), 1, (0, side // 2))
-        count, total, squares = torch.nn.functional.avg_pool2d(across, (side, 1), 1, (side // 2, 0)).split(1, 1)
+    for window in _WINDOWS:
+        across = torch.nn.functional.avg_pool2d(cells, (1, window), 1, (0, window // 2))
+        around = torch.nn.functional.avg_pool2d(across, (window, 1), 1, (window // 2, 0))
+        count, total, squares = around.split(1, 1)
         count = count.clamp(min=1e-6)
         spread += (squares / count - (total / count) ** 2).clamp(min=0).sqrt() / len(_WINDOWS)
     size = [n * cell for n in spread.shape[-2:]]
     smooth = torch.nn.functional.interpolate(spread, size=size, mode="bilinear", align_corners=False)
-    return smooth[:, 0, :h, :w].reshape(grey.shape)
+    return smooth[:, 0, :h, :w].reshape(*view.shape[:-3], h, w)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import time
 import warnings
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +17,6 @@ import pytest
 import torch
 
 from arbiview_aug.confidence import EXPECTED_ERROR_LEVELS
-from arbiview_aug.datasets.frame_folder import FrameFolder
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.transforms import RigRetarget
