@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -16,11 +17,12 @@ from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.confidence import certainty
 from arbiview_aug.favs.adaptive_fusion import distance_weight, primary_weight, quality_weight
 from arbiview_aug.favs.config import FavsConfig
-from arbiview_aug.grid import Box
+from arbiview_aug.grid import Box, runs
 from arbiview_aug.maps import PairMap, TargetRays, edge_distance, resolution
 from arbiview_aug.rig import Rig
 from arbiview_aug.sampling import AtlasLayout, FixedMap, Scratch
 from arbiview_aug.surface import Surface, worst_parallax_px
+from arbiview_aug.tone import Patch, patches
 
 SAME_CENTER_M = 1e-6
 """Centres closer than this coincide: a homography is exact whatever the scene."""
@@ -93,6 +95,11 @@ class TargetPlan:
     def coverage(self) -> BoolArray:
         """(h, w) True where some source sees the pixel."""
         return self.source_camera >= 0
+
+    @cached_property
+    def patches(self) -> list[list[Patch]]:
+        """For each strip of rows, which source wins where, for tone curves; found when first asked for."""
+        return patches(self.source_camera, [pair.source for pair in self.pairs])
 
     @property
     def nbytes(self) -> int:
@@ -179,6 +186,7 @@ class TargetDraft:
         seen = pair.valid & (edge_px > 0)
         level = self._level(pixels_per_pixel[seen], source.size) if self.config.antialias else 0
         pair.set_tolerance(self.config.map_tolerance_px * 2**level)
+        seen = pair.visible_nodes(level) & (edge_px > 0)
         parallax = self._expected_parallax(offset_m, focal_px, surface)
         score = (
             distance_weight(edge_px, min(source.size) / 2, self.config.distance_gamma)
@@ -211,10 +219,9 @@ class TargetDraft:
 
     def _expected_parallax(self, offset_m: FloatArray, focal_px: float, surface: Surface) -> FloatArray:
         """Displacement (target px) that unknown depth around a surface may cause: offset across the ray x spread."""
-        q = self.rays.inverse_distance(surface)
         along_m = self.rays.directions @ offset_m
         across_m = np.sqrt(np.maximum(offset_m @ offset_m - along_m**2, 0))
-        return focal_px * across_m * surface.uncertainty(self.camera.center_m, self.rays.directions, q)
+        return focal_px * across_m * self.rays.uncertainty(surface)
 
     @staticmethod
     def _level(resolution: FloatArray, size: tuple[int, int]) -> int:
@@ -313,7 +320,7 @@ class TargetDraft:
         columns = np.logical_or.reduce(shared[max(rows[0] - 1, 0) : rows[1] + 2])
         columns[1:] |= columns[:-1].copy()
         columns[:-1] |= columns[1:].copy()
-        for i0, i1 in _runs(columns):
+        for i0, i1 in runs(columns):
             yield from self._bands_in(self.grid.pixels((*rows, i0, i1)), seen, winner)
 
     def _bands_in(self, box: Box, seen: list[_Visible], winner: npt.NDArray[np.int8]) -> Iterator[Band]:
@@ -368,13 +375,6 @@ class TargetDraft:
                 share=won_px[region.source] / winner.size,
                 level=region.level,
             )
-
-
-def _runs(flags: BoolArray) -> Iterator[tuple[int, int]]:
-    """First and last index of each run of True."""
-    edges = np.flatnonzero(np.diff(np.r_[False, flags, False].astype(np.int8)))
-    for start, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        yield start, stop - 1
 
 
 def _overlap(one: Box, two: Box) -> Box | None:
