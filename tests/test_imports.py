@@ -28,7 +28,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("favs.object_alignment",),
     ("favs.paper",),
     ("maps",),
-    ("favs.photometric",),
+    ("favs.photometric", "confidence"),
     ("favs.overlap_depth",),
     ("target_plan",),
     ("plan",),
