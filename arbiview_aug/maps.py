@@ -217,8 +217,12 @@ class PairMap:
         uv, valid = project_rays(self.source, directions, q, self.offset_m)
         if isinstance(self.surface, Static):
             return uv, valid
-        towards, from_source = self._from_source(directions, q)
-        return uv, valid & ~self.surface.hides(self.source.center_m, towards, from_source, 1 / self.source.K[0, 0])
+        shown = valid & self.source.contains(uv)  # what lies beside the image need not be asked about
+        if shown.any():
+            towards, from_source = self._from_source(directions[shown], q[shown])
+            pixel_rad = 1 / self.source.K[0, 0]
+            valid[shown] = ~self.surface.hides(self.source.center_m, towards, from_source, pixel_rad)
+        return uv, valid
 
     def _from_source(self, directions: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Unit rays (..., 3) from the source to scene points on target rays, and inverse distances along them."""

@@ -42,7 +42,11 @@ class Objects(Surface):
 
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """The nearer of street and boxes, 1/m (...,)."""
-        return np.maximum(self.street.inverse_distance(origin, directions), self._boxes_ahead(origin, directions)[0])
+        return np.maximum(self.street.inverse_distance(origin, directions), self.faces(origin, directions))
+
+    def faces(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        """Inverse distance to the first box alone, 0 where there is none, 1/m (...,)."""
+        return self._boxes_ahead(origin, directions)[0]
 
     def hides(
         self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
@@ -82,6 +86,8 @@ class Objects(Surface):
         enlarged on all sides by a length and an angle; how much the first one was is returned too, in metres.
         """
         n = math.prod(directions.shape[:-1])
+        if len(self.boxes) == 0:
+            return np.zeros(directions.shape[:-1]), np.zeros(directions.shape[:-1])
         count = max(1, -(-n // _BLOCK))
         rays = np.resize(directions.reshape(-1, 3), (count, _BLOCK, 3)) if n else np.zeros((count, _BLOCK, 3))
         centre = rays.mean(axis=1)
@@ -112,6 +118,15 @@ def _first_face(box: FloatArray, origin: FloatArray, directions: FloatArray) -> 
     leave = np.minimum(np.minimum(far[..., 0], far[..., 1]), far[..., 2])
     hit = (leave >= enter) & (enter > 0)
     return np.where(hit, 1 / np.maximum(enter, 1 / MAX_INVERSE_DISTANCE), 0.0)
+
+
+def within_boxes(boxes: FloatArray, points: FloatArray, air_m: float = 0.0) -> BoolArray:
+    """(P,) points that lie in any box (B, 7), or no farther than ``air_m`` beside its faces."""
+    within = np.zeros(len(points), bool)
+    for box in boxes:
+        near = np.flatnonzero(np.abs(points - box[:3]).max(1) <= np.linalg.norm(box[3:6]) / 2 + 2 * air_m)
+        within[near] |= np.all(np.abs(_in_box_frame(box, points[near] - box[:3])) <= box[3:6] / 2 + air_m, axis=1)
+    return within
 
 
 def _in_box_frame(box: FloatArray, vectors: FloatArray) -> FloatArray:

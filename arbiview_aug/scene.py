@@ -6,6 +6,7 @@ import hashlib
 from dataclasses import dataclass
 
 from arbiview_aug.camera import FloatArray
+from arbiview_aug.lidar import LidarSurface
 from arbiview_aug.objects import Objects
 from arbiview_aug.surface import Far, Ground, Street, Surface, SurfaceName
 
@@ -16,14 +17,16 @@ class Scene:
 
     Attributes:
         boxes: (B, 7) labelled objects: centre x, y, z, length, width, height (metres), yaw (radians).
+        points: (P, 3) measured points, metres.
     """
 
     boxes: FloatArray | None = None
+    points: FloatArray | None = None
 
     @property
     def is_empty(self) -> bool:
         """Whether nothing is known but the road."""
-        return self.boxes is None
+        return self.boxes is None and self.points is None
 
     @property
     def best(self) -> SurfaceName:
@@ -34,7 +37,7 @@ class Scene:
     def key(self) -> bytes:
         """Content hash: scenes with equal keys are the same."""
         digest = hashlib.sha256()
-        for array in (self.boxes,):
+        for array in (self.boxes, self.points):
             digest.update(b"none" if array is None else repr(array.shape).encode() + array.tobytes())
         return digest.digest()
 
@@ -53,4 +56,6 @@ class Scene:
             return street
         if name == "objects" and self.boxes is not None:
             return Objects(street, self.boxes)
+        if name == "lidar" and self.points is not None:
+            return LidarSurface(street, self.points, self.boxes)
         raise ValueError(f"surface: {name!r} is unknown, or the scene has no geometry for it")

@@ -14,7 +14,7 @@ import numpy as np
 
 from arbiview_aug.camera import BoolArray, FloatArray
 
-SurfaceName = Literal["auto", "far", "ground", "street", "objects"]
+SurfaceName = Literal["auto", "far", "ground", "street", "objects", "lidar"]
 """Surfaces a user can ask for. ``auto`` decides per pair of target and source camera (see ``plan``)."""
 
 MAX_INVERSE_DISTANCE = 100.0
