@@ -1,4 +1,4 @@
-"""Measured points as a surface: LiDAR or depth maps where they tell, boxes where they are labelled, the street elsewhere.
+"""Measured points as a surface: LiDAR or depth maps, with labelled boxes before them and the street behind.
 
 No sensor's place is assumed: points are z-buffered and made dense anew for each centre that is asked about
 (``arbiview_aug.panorama``), a target's to find what it sees and a source's to find what is hidden from it.
@@ -13,7 +13,7 @@ import numpy as np
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.objects import Objects, within_boxes
-from arbiview_aug.panorama import CELL_RAD, Panorama, Window, angles, hides, panorama
+from arbiview_aug.panorama import CELL_RAD, Layer, Panorama, Window, angles, panorama
 from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Street, Surface
 
 OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
@@ -74,8 +74,8 @@ class LidarSurface(Surface):
         measured outlines, a little inside: where the LiDAR is silent nothing hides.
         """
         view, row, column = self._view(origin, directions)
-        known = self.street.inverse_distance(origin, directions) + view.hiding_residual(row, column)
-        return hides(known, inverse_distance) | self._objects.hides(origin, directions, inverse_distance, pixel_rad)
+        behind = view.hides(row, column, inverse_distance)
+        return behind | self._objects.hides(origin, directions, inverse_distance, pixel_rad)
 
     def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
         """Rays (...,) near an outline, a slope against the street, or a box."""
@@ -88,7 +88,7 @@ class LidarSurface(Surface):
         unknown = self.street.uncertainty(origin, directions, inverse_distance)
         return np.where(view.is_measured(row, column), _MEASURED_SPREAD * inverse_distance, unknown)
 
-    def _view(self, origin: FloatArray, directions: FloatArray) -> tuple[Panorama, FloatArray, FloatArray]:
+    def _view(self, origin: FloatArray, directions: FloatArray) -> tuple[Panorama, Layer, Layer]:
         """The panorama around a centre that holds the rays, and their rows and columns in it."""
         azimuth, elevation = angles(directions)
         asked = Window.around(azimuth, elevation) if directions.size else Window(0.0, CELL_RAD, 0.0, CELL_RAD)
@@ -96,7 +96,7 @@ class LidarSurface(Surface):
         view = next((p for p in held if p.window.holds(asked)), None)
         if view is None:
             near = ((self._scenery - origin) ** 2).sum(1) < NEAREST_M**2
-            view = panorama(asked, origin, self._scenery[~near], self.street)
+            view = panorama(asked.widened(), origin, self._scenery[~near], self.street)
             held.append(view)
         return view, *view.window.cells(azimuth, elevation)
 
