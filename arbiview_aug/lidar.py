@@ -12,6 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
+from arbiview_aug.errors import SampleError
 from arbiview_aug.objects import Objects, within_boxes
 from arbiview_aug.panorama import CELL_RAD, Layer, Panorama, Window, angles, panorama
 from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Street, Surface
@@ -61,9 +62,7 @@ class LidarSurface(Surface):
         """The points' dense surface, or the box before it, 1/m (...,)."""
         view, row, column = self._view(origin, directions)
         measured = self.street.inverse_distance(origin, directions) + view.residual(row, column)
-        return np.clip(
-            np.maximum(measured, self._objects.faces(origin, directions)), 0.0, MAX_INVERSE_DISTANCE
-        )
+        return np.clip(np.maximum(measured, self._objects.faces(origin, directions)), 0.0, MAX_INVERSE_DISTANCE)
 
     def hides(
         self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
@@ -108,11 +107,30 @@ def own_car(points: FloatArray) -> BoolArray:
     return np.asarray((x > x0) & (x < x1) & (y > y0) & (y < y1))
 
 
+def checked_points(points: FloatArray, key: str = "points") -> FloatArray:
+    """(P, 3) finite points of a sample's (P, >= 3); rows that are not finite are dropped.
+
+    Raises:
+        SampleError: Another shape.
+    """
+    if points.size == 0:
+        return np.zeros((0, 3))
+    if points.ndim != 2 or points.shape[1] < 3:
+        raise SampleError(f"{key}: expected shape (P, >= 3), x y z in the ego frame, got {points.shape}")
+    xyz = points[:, :3]
+    return xyz[np.isfinite(xyz).all(axis=1)]
+
+
 def points_of_depth(camera: Camera, depth_m: FloatArray) -> FloatArray:
     """(P, 3) ego-frame points of a depth map (H, W): z along the optical axis, metres; 0, NaN and inf are unknown.
 
     Pixels closer together than a panorama's cells are left out, and the own car by the camera's mask.
+
+    Raises:
+        SampleError: A map of another size than the camera's.
     """
+    if depth_m.shape != camera.size:
+        raise SampleError(f"depth_m: camera {camera.name!r}: expected a map of {camera.size}, got {depth_m.shape}")
     step = max(1, int(CELL_RAD * float(camera.K[0, 0])))
     pixels = camera.pixel_grid()[::step, ::step]
     depth = depth_m[::step, ::step]

@@ -205,9 +205,7 @@ class PairMap:
         shown = cv2.dilate(self.source.contains(self.uv).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
         j0, j1, i0, i1 = _bounds(shown, 1) or (0, *shown.shape[:1], 0, shown.shape[1])
         part = slice(j0, j1), slice(i0, i1)
-        towards, _ = self._from_source(
-            self.rays.directions[part], self.rays.inverse_distance(self.surface)[part]
-        )
+        towards, _ = self._from_source(self.rays.directions[part], self.rays.inverse_distance(self.surface)[part])
         near[part] |= self.surface.detailed(self.source.center_m, towards, self.rays.spacing_rad)
         return cv2.dilate(near.astype(np.uint8), np.ones((8, 8), np.uint8), anchor=(3, 3))[:-1, :-1] > 0
 

@@ -253,7 +253,7 @@ def _nearer_on_both_sides(distance: Layer) -> Layer:
 
 
 def _layers(residual: Layer, distance: Layer) -> tuple[Layer, Layer, Layer]:
-    """Residuals averaged over ``SMOOTH_RAD`` on the nearer and on the farther side of a step, and the nearer's share."""
+    """Residuals averaged over ``SMOOTH_RAD`` on a step's nearer and on its farther side, and the nearer one's share."""
     kernel = _square(SMOOTH_RAD / 2)
     size = kernel.shape[::-1]
 

@@ -70,9 +70,11 @@ class RigRetarget(torch.nn.Module):
             (for each camera ``{"boxes": (n, 4), "labels": [n names]}`` in source pixels, as torchvision's detectors
             return them) or else ``boxes_3d``, with ``box_names`` (a name each) where there are any.
         surface: ``far``, ``ground``, ``street``; ``objects``: the sample's ``boxes_3d`` stand on the street, so that
-            objects keep their height when cameras move; ``auto``: for each pair of cameras ``far`` where their centres
-            coincide, else the best that the sample offers: ``objects`` with ``boxes_3d``, else ``street``, with a
-            warning where cameras move (``paper``: always ``far``).
+            objects keep their height when cameras move; ``lidar``: its ``points`` (ego frame) or ``depth_m`` (..., N,
+            H, W; z-depth in metres, 0 or NaN where unknown), with ``boxes_3d`` before them where there are any;
+            ``auto``: for each pair of cameras ``far`` where their centres coincide, else the best that the sample
+            offers: ``objects`` with ``boxes_3d``, else ``street``, with a warning where cameras move (``paper``:
+            always ``far``).
         harmonise: Bring the sources to one exposure (``arbiview_aug.favs.photometric``): True or a ``HarmoniseConfig``
             estimates a gain for each camera in every frame; numbers are gains to use as they are. Off by default.
             Samples that ``p`` skips keep their colours.
@@ -178,7 +180,7 @@ class RigRetarget(torch.nn.Module):
         labels = check_other_keys(sample, list(sizes), self.label_keys, self.pass_keys)
         target, skip, drawn = self._draw(sample, frames, params)
         views: list[View] = []
-        scenes = self._scenes(sample, len(frames), lead)
+        scenes = self._scenes(sample, frames, lead)
         found = self._detections(sample, frames, lead)
         for frame, scene, detections in zip(frames, scenes, found, strict=True):
             views.append(self.size if skip and self.size else self._view(frame, target, scene, detections))
@@ -307,11 +309,13 @@ class RigRetarget(torch.nn.Module):
             part["ignore"] = stacked([torch.from_numpy(~m).to(device) for m in masks])
         return part
 
-    def _scenes(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[Scene]:
+    def _scenes(
+        self, sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...]
+    ) -> Sequence[Scene]:
         """What each frame's sample says of the geometry, as far as the surface uses it."""
         if isinstance(self.config, PaperConfig):
-            return [Scene()] * count
-        return scenes_of_frames(sample, count, lead, self.surface)
+            return [Scene()] * len(frames)
+        return scenes_of_frames(sample, frames, lead, self.surface)
 
     def _detections(
         self, sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...]
@@ -384,7 +388,7 @@ class RigRetarget(torch.nn.Module):
         """
         frames, lead = check_inputs(sample, self.source_rig), leading_shape(sample["images"])
         target, _, _ = self._draw(sample, frames[:1], None)
-        scene = self._scenes(sample, len(frames), lead)[0]
+        scene = self._scenes(sample, frames, lead)[0]
         detections = self._detections(sample, frames, lead)[0]
         asked = self.harmoniser.estimates or self.harmoniser.gains is not None
         view = self._view(frames[0], target, scene, detections)
