@@ -32,9 +32,10 @@ scan lines. 1 degree loses 0.1 to 0.3 dB on nuScenes and DDAD, 2.5 is as good.""
 SIDE_RAD = math.radians(0.75)
 """... and off that line by no more than this: half the spacing of 32 scan lines."""
 
-SMOOTH_RAD = math.radians(0.75)
-"""Window in which residuals are averaged and outlines straightened. 0.75 to 1.35 degrees are within 0.2 dB; wider
-windows round off poles."""
+SMOOTH_RAD = math.radians(1.3)
+"""Window in which residuals are averaged and outlines straightened: the spacing of 32 scan lines, over which an average
+of nearest values is linear interpolation. 0.75 degrees gains 0.1 dB, but walls wave by 4 % between the lines; 1.6 loses
+0.7 dB on nuScenes."""
 
 STEP = 0.1
 """Relative change of inverse distance within that window that makes an outline; 0.2 is as good."""
@@ -260,8 +261,10 @@ def _layers(residual: Layer, distance: Layer) -> tuple[Layer, Layer, Layer]:
     def mean(a: Layer) -> Any:
         return cv2.blur(a, size, borderType=cv2.BORDER_REPLICATE)
 
+    # Sides are told apart over twice the window: all that is averaged about a step then knows of it.
+    wide = np.ones((2 * size[0] - 1, 2 * size[0] - 1), np.uint8)
+    nearer = (2 * residual > cv2.dilate(residual, wide) + cv2.erode(residual, wide)).astype(np.float32)
     high, low = cv2.dilate(residual, kernel), cv2.erode(residual, kernel)
-    nearer = (residual > (high + low) / 2).astype(np.float32)
     share, everything, of_near = mean(nearer), mean(residual), mean(residual * nearer)
     near = np.where(share > 1e-3, of_near / np.maximum(share, 1e-3), residual)
     far = np.where(share < 1 - 1e-3, (everything - of_near) / np.maximum(1 - share, 1e-3), residual)
@@ -277,6 +280,8 @@ def _square(radius_rad: float) -> npt.NDArray[np.uint8]:
 def _at(layer: Layer, row: Layer, column: Layer) -> Layer:
     """Bilinear values (...,) of a layer; its border beyond it."""
     n = row.size
+    if n == 0:
+        return np.zeros(row.shape, np.float32)
     width = max(1, min(n, 16384))  # remap wants sizes below 32767
     x, y = (np.zeros((-(-n // width), width), np.float32) for _ in range(2))
     x.reshape(-1)[:n], y.reshape(-1)[:n] = column.reshape(-1), row.reshape(-1)

@@ -105,7 +105,9 @@ def scenes_of_frames(
     points = _points_of_frames(sample, frames, lead) if surface == "lidar" else None
     if boxes is None and points is None:
         return [Scene()] * count
-    solid = [None] * count if boxes is None else map(checked_boxes, _of_frames("boxes_3d", boxes, count, lead))
+    solid: list[FloatArray | None] = [None] * count
+    if boxes is not None:
+        solid = [checked_boxes(of_frame) for of_frame in _of_frames("boxes_3d", boxes, count, lead)]
     return [Scene(b, p) for b, p in zip(solid, points or [None] * count, strict=True)]
 
 

@@ -166,7 +166,7 @@ def test_duplicates_and_order_change_nothing() -> None:
 
 def test_parts_of_a_view_agree_with_the_whole() -> None:
     surface = LidarSurface(Street(), np.concatenate([NEAR, FAR]))
-    rays = towards(wall(12.0, (-3, 3), (0.0, 3.0), 0.02))[0]
+    rays = towards(wall(12.0, (-3, 3), (0.0, 3.0), 0.08))[0]
     parts = np.concatenate([LidarSurface(Street(), surface.points).inverse_distance(EYE, r) for r in rays[:, None]])
     around = np.random.default_rng(0).normal(size=(500, 3))
     around /= np.linalg.norm(around, axis=-1, keepdims=True)
