@@ -10,12 +10,13 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.objects import Objects, within_boxes
 from arbiview_aug.panorama import CELL_RAD, Layer, Panorama, Window, angles, panorama
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Street, Surface
+from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn, Shadows, Street, Surface
 
 OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
 """(x, y) ranges in the ego frame whose returns are the own car's: a car's about the middle of its rear axle."""
@@ -26,60 +27,55 @@ NEAREST_M = 0.5
 BOX_AIR_M = 0.2
 """Points this far outside a box are its object's too: mirrors, and the noise of points and labels."""
 
+_NO_BOX = -2  # in shadows: a point's, no box's
+
 _MEASURED_SPREAD = 0.05
 """Spread of a measured inverse distance, as a share of it: half of STEP, below which densification follows a slope."""
 
 
 @dataclass(frozen=True, eq=False)
 class LidarSurface(Surface):
-    """Points made dense over the street; labelled boxes stand in front of both.
-
-    A box decides within its silhouette, and its object's points are left out of the panoramas: they would blur over
-    its outline. Boxes that hold a camera, and points of the own car, are skipped.
+    """Points made dense over the street. Points of the own car are left out.
 
     Attributes:
         street: What there is where nothing was measured.
         points: (P, 3) in the ego frame, finite, metres.
-        boxes: (B, 7) labelled objects, or None: centre x, y, z, length, width, height (metres), yaw (radians).
     """
 
     smooth: ClassVar[bool] = True  # away from what ``detailed`` says
     street: Street
     points: FloatArray
-    boxes: FloatArray | None = None
-    _objects: Objects = field(init=False)
-    _scenery: FloatArray = field(init=False)
-    _panoramas: dict[bytes, list[Panorama]] = field(init=False)
+    _panoramas: dict[bytes, list[Panorama]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
-        boxes = np.zeros((0, 7)) if self.boxes is None else self.boxes
-        scenery = self.points[~own_car(self.points)]
-        object.__setattr__(self, "_objects", Objects(self.street, boxes))
-        object.__setattr__(self, "_scenery", scenery[~within_boxes(boxes, scenery, BOX_AIR_M)])
-        object.__setattr__(self, "_panoramas", {})
+        object.__setattr__(self, "points", self.points[~own_car(self.points)])
 
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
-        """The points' dense surface, or the box before it, 1/m (...,)."""
+        """The points' dense surface, 1/m (...,)."""
         view, row, column = self._view(origin, directions)
-        measured = self.street.inverse_distance(origin, directions) + view.residual(row, column)
-        return np.clip(np.maximum(measured, self._objects.faces(origin, directions)), 0.0, MAX_INVERSE_DISTANCE)
+        known = self.street.inverse_distance(origin, directions) + view.residual(row, column)
+        return np.clip(known, 0.0, MAX_INVERSE_DISTANCE)
 
     def hides(
         self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
     ) -> BoolArray:
-        """Whether a box, or what was measured for certain, stands between ``origin`` and scene points (...,).
+        """Whether what was measured for certain stands between ``origin`` and scene points (...,).
 
         What is nearer by a tenth of its distance and 0.3 m, as in the evaluation's visibility; and only within
-        measured outlines, a little inside: where the LiDAR is silent nothing hides.
+        measured outlines: where the LiDAR is silent nothing hides.
         """
         view, row, column = self._view(origin, directions)
-        behind = view.hides(row, column, inverse_distance)
-        return behind | self._objects.hides(origin, directions, inverse_distance, pixel_rad)
+        return view.hides(row, column, inverse_distance)
+
+    def before(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        """Inverse distances (...,) beyond which ``hides`` says that points are hidden, 1/m."""
+        view, row, column = self._view(origin, directions)
+        return view.before(row, column)
 
     def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
-        """Rays (...,) near an outline, a slope against the street, or a box."""
+        """Rays (...,) near an outline or a slope against the street."""
         view, row, column = self._view(origin, directions)
-        return view.is_detailed(row, column, margin_rad) | self._objects.detailed(origin, directions, margin_rad)
+        return view.is_detailed(row, column, margin_rad)
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Small where a point is near, the street's elsewhere: 1/m (...,)."""
@@ -94,10 +90,69 @@ class LidarSurface(Surface):
         held = self._panoramas.setdefault(np.asarray(origin, np.float64).tobytes(), [])
         view = next((p for p in held if p.window.holds(asked)), None)
         if view is None:
-            near = ((self._scenery - origin) ** 2).sum(1) < NEAREST_M**2
-            view = panorama(asked.widened(), origin, self._scenery[~near], self.street)
+            near = ((self.points - origin) ** 2).sum(1) < NEAREST_M**2
+            view = panorama(asked.widened(), origin, self.points[~near], self.street)
             held.append(view)
         return view, *view.window.cells(azimuth, elevation)
+
+
+@dataclass(frozen=True, eq=False)
+class LidarObjects(Objects):
+    """Labelled boxes among points made dense: a box decides within its silhouette, what was measured before it wins.
+
+    An object's points are left out of the panoramas, where they would blur over its outline.
+
+    Attributes:
+        street: The points' surface; ``among`` leaves out those within boxes.
+        boxes: (B, 7), as in ``Objects``.
+    """
+
+    street: LidarSurface
+
+    @classmethod
+    def among(cls, street: Street, points: FloatArray, boxes: FloatArray) -> LidarObjects:
+        """Boxes (B, 7) among points (P, 3)."""
+        return cls(LidarSurface(street, points[~within_boxes(boxes, points, BOX_AIR_M)]), boxes)
+
+    def drawn(self, camera: Camera) -> Drawn:
+        """The pixels of a camera that show boxes with nothing measured before them."""
+        pixel, first, face = super().drawn(camera)
+        shown = first >= self._measured_before(camera, pixel)
+        return Drawn(pixel[shown], first[shown], face[shown])
+
+    def shadows(self, camera: Camera) -> Shadows:
+        """What boxes hide from a source; and what was measured before boxes hides them."""
+        new = camera not in self._shadows
+        shadows = super().shadows(camera)
+        if new:
+            pixel = np.flatnonzero(shadows.solid.reshape(-1) >= 0)
+            before = self._measured_before(camera, pixel)
+            nearer = before > shadows.beyond.reshape(-1)[pixel]
+            shadows.beyond.reshape(-1)[pixel[nearer]] = before[nearer]
+            shadows.solid.reshape(-1)[pixel[nearer]] = _NO_BOX
+        return shadows
+
+    def hides(
+        self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
+    ) -> BoolArray:
+        """Whether a box, or what was measured, stands before points (...,)."""
+        by_box = super().hides(origin, directions, inverse_distance, pixel_rad)
+        return by_box | self.street.hides(origin, directions, inverse_distance, pixel_rad)
+
+    def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
+        """Rays (...,) near a box, an outline or a slope against the street."""
+        near_box = super().detailed(origin, directions, margin_rad)
+        return near_box | self.street.detailed(origin, directions, margin_rad)
+
+    def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
+        """Small where a point is near, the street's elsewhere: 1/m (...,)."""
+        return self.street.uncertainty(origin, directions, inverse_distance)
+
+    def _measured_before(self, camera: Camera, pixel: npt.NDArray[np.int64]) -> FloatArray:
+        """Inverse distances (n,) beyond which pixels of a camera (n,) are hidden by what was measured."""
+        v, u = np.divmod(pixel, camera.width_px)
+        directions, _ = camera.unproject(np.stack([u, v], -1).astype(np.float64))
+        return self.street.before(camera.center_m, directions)
 
 
 def own_car(points: FloatArray) -> BoolArray:

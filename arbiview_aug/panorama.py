@@ -149,7 +149,11 @@ class Panorama:
 
     def hides(self, row: Layer, column: Layer, inverse_distance: FloatArray) -> BoolArray:
         """Whether something stands before points (...,): nearer than them by a tenth of its distance and 0.3 m."""
-        return np.asarray(inverse_distance < _hidden_below(_at(self.hiding, row, column)))
+        return np.asarray(inverse_distance < self.before(row, column))
+
+    def before(self, row: Layer, column: Layer) -> FloatArray:
+        """The inverse distance (...,) at which ``hides`` begins, 1/m; 0 where nothing hides."""
+        return np.asarray(_hidden_below(_at(self.hiding, row, column)), np.float64)
 
     def is_measured(self, row: Layer, column: Layer) -> BoolArray:
         """Whether a point lies within ``SUPPORT_RAD`` (...,)."""

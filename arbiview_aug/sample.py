@@ -108,7 +108,8 @@ def scenes_of_frames(
     solid: list[FloatArray | None] = [None] * count
     if boxes is not None:
         solid = [checked_boxes(of_frame) for of_frame in _of_frames("boxes_3d", boxes, count, lead)]
-    return [Scene(b, p) for b, p in zip(solid, points or [None] * count, strict=True)]
+    measured = [None] * count if points is None else points
+    return [Scene(b, p) for b, p in zip(solid, measured, strict=True)]
 
 
 def _points_of_frames(

@@ -6,7 +6,7 @@ import hashlib
 from dataclasses import dataclass
 
 from arbiview_aug.camera import FloatArray
-from arbiview_aug.lidar import LidarSurface
+from arbiview_aug.lidar import LidarObjects, LidarSurface
 from arbiview_aug.objects import Objects
 from arbiview_aug.surface import Far, Ground, Street, Surface, SurfaceName
 
@@ -57,5 +57,7 @@ class Scene:
         if name == "objects" and self.boxes is not None:
             return Objects(street, self.boxes)
         if name == "lidar" and self.points is not None:
-            return LidarSurface(street, self.points, self.boxes)
+            if self.boxes is not None and len(self.boxes):
+                return LidarObjects.among(street, self.points, self.boxes)
+            return LidarSurface(street, self.points)
         raise ValueError(f"surface: {name!r} is unknown, or the scene has no geometry for it")
