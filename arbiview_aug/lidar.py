@@ -16,7 +16,7 @@ from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.objects import Objects, within_boxes
 from arbiview_aug.panorama import CELL_RAD, Layer, Panorama, Window, angles, panorama
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn, Shadows, Street, Surface
+from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn, Shadows, Static, Surface
 
 OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
 """(x, y) ranges in the ego frame whose returns are the own car's: a car's about the middle of its rear axle."""
@@ -43,7 +43,7 @@ class LidarSurface(Surface):
     """
 
     smooth: ClassVar[bool] = True  # away from what ``detailed`` says
-    street: Street
+    street: Static
     points: FloatArray
     _panoramas: dict[bytes, list[Panorama]] = field(default_factory=dict, repr=False)
 
@@ -110,7 +110,7 @@ class LidarObjects(Objects):
     street: LidarSurface
 
     @classmethod
-    def among(cls, street: Street, points: FloatArray, boxes: FloatArray) -> LidarObjects:
+    def among(cls, street: Static, points: FloatArray, boxes: FloatArray) -> LidarObjects:
         """Boxes (B, 7) among points (P, 3)."""
         return cls(LidarSurface(street, points[~within_boxes(boxes, points, BOX_AIR_M)]), boxes)
 

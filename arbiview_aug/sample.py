@@ -139,6 +139,16 @@ def _points_of_frames(
     return [np.concatenate(part) for part in parts]
 
 
+def names_of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[object]:
+    """What an entry of the sample calls each frame, hashable: a name, or in a batch a list or tensor of names."""
+    values = [value]
+    if lead:
+        values = list(value.reshape(count, -1)) if isinstance(value, torch.Tensor) and value.ndim else value
+        if not isinstance(values, list | tuple) or len(values) != count:
+            raise SampleError(f"{key}: expected a name for each of {count} frames, got {type(value).__name__}")
+    return [str(v.tolist()) if isinstance(v, torch.Tensor) else str(v) for v in values]
+
+
 def _of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[np.ndarray]:
     """Numbers of each frame: a tensor with the images' leading dimensions, or a list with an entry for each frame."""
     if not lead:
