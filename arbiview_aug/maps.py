@@ -138,7 +138,7 @@ class PairMap:
         self._whole: BoolArray | None = None
         self._fine: tuple[Slot, npt.NDArray[np.float32]] | None = None
         self._near_shadow: BoolArray | None = None
-        if self.solids is not None:
+        if self.solids is not None and not isinstance(self.surface, Static):
             self._from_source_q = (q / np.maximum(np.sqrt((points * points).sum(-1)), 1e-300)).astype(np.float32)
         if rays.grid.step == 1:
             self.nodes = _bounds(self.valid & source.contains(self.uv), 0)
@@ -294,7 +294,8 @@ class PairMap:
         camera = _halved_camera(self.source, level)
         shadows = self.whole_surface.shadows(camera)
         pixel, inside = _nearest_pixel(shadows.beyond, _at_level(self.uv, level))
-        free = self.valid & ~(inside & (shadows.beyond[pixel] > self._from_source_q))
+        beyond = 0 if isinstance(self.surface, Static) else self._from_source_q
+        free = self.valid & ~(inside & (shadows.beyond[pixel] > beyond))
         on_solid = self.rays.at_nodes(255 - self.rays.solids(self.whole_surface).free) > 0
         seen = np.zeros(self.rays.camera.size, bool)
         px, py = self.solids.pixels.T
@@ -356,7 +357,8 @@ class PairMap:
             here = slice(t - y0, b - y0), slice(le - x0, r - x0)
             local = at[here] - np.array([slot.x, slot.y], np.float32)
             first: Any = cv2.remap(shadows.beyond, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
-            visible[here] &= cv2.compare(first, grid.upsample(self._from_source_q, part), cv2.CMP_LE).astype(np.uint8)
+            beyond: Any = 0 if isinstance(self.surface, Static) else grid.upsample(self._from_source_q, part)
+            visible[here] &= cv2.compare(first, beyond, cv2.CMP_LE).astype(np.uint8)
         visible &= self.rays.solids(self.whole_surface).free[y0:y1, x0:x1]
         solids = self.solids
         strip = slice(*np.searchsorted(solids.pixels[:, 1], [y0, y1]).tolist())
