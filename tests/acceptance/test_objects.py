@@ -174,7 +174,9 @@ def found() -> dict[tuple[str, str, str], Found]:
     out: dict[tuple[str, str, str], Found] = defaultdict(Found)
     for seed in SEEDS:
         measure(seed, out)
-    print("\nvehicles' edges: median over objects (their 90 % quantile), px | colour > 2 px outside box, outside shape, %")
+    print(
+        "\nvehicles' edges: median over objects (their 90 % quantile), px | colour > 2 px outside box, outside shape, %"
+    )
     print("holes on road and objects: precision, recall; anywhere: precision, recall (2 px of tolerance)")
     for (world, move, surface), f in sorted(out.items()):
         tops = [f"{f.median(e):.2f} ({np.quantile(f.edges[e], 0.9):.1f})" for e in ("top", "bottom")]
