@@ -138,6 +138,7 @@ class PairMap:
         self._whole: BoolArray | None = None
         self._fine: tuple[Slot, npt.NDArray[np.float32]] | None = None
         self._near_shadow: BoolArray | None = None
+        self._shadows_by_level: dict[int, Shadows] = {}
         if self.solids is not None and not isinstance(self.surface, Static):
             self._from_source_q = (q / np.maximum(np.sqrt((points * points).sum(-1)), 1e-300)).astype(np.float32)
         if rays.grid.step == 1:
@@ -291,8 +292,7 @@ class PairMap:
         """Nodes (ny, nx) whose scene point the source sees when its image is halved ``level`` times."""
         if self.solids is None or not isinstance(self.whole_surface, Layered):
             return self.valid
-        camera = _halved_camera(self.source, level)
-        shadows = self.whole_surface.shadows(camera)
+        shadows = self._shadows(level)
         pixel, inside = _nearest_pixel(shadows.beyond, _at_level(self.uv, level))
         beyond = 0 if isinstance(self.surface, Static) else self._from_source_q
         free = self.valid & ~(inside & (shadows.beyond[pixel] > beyond))
@@ -301,6 +301,12 @@ class PairMap:
         px, py = self.solids.pixels.T
         seen[py, px] = self.solids.lit(shadows, _at_level(self.solids.uv, level), slice(None))
         return np.where(on_solid, self.rays.at_nodes(seen), free)
+
+    def _shadows(self, level: int) -> Shadows:
+        if level not in self._shadows_by_level:
+            assert isinstance(self.whole_surface, Layered)
+            self._shadows_by_level[level] = self.whole_surface.shadows(_halved_camera(self.source, level))
+        return self._shadows_by_level[level]
 
     def full_resolution(
         self, slot: Slot, rows: tuple[int, int]
@@ -351,7 +357,7 @@ class PairMap:
         assert self.solids is not None and isinstance(self.whole_surface, Layered)
         grid = self.rays.grid
         y0, y1, x0, x1 = grid.pixels(nodes)
-        shadows = self.whole_surface.shadows(_halved_camera(self.source, slot.level))
+        shadows = self._shadows(slot.level)
         for part in self._parts_near_shadow(shadows.beyond, nodes, slot.level):
             t, b, le, r = grid.pixels(part)
             here = slice(t - y0, b - y0), slice(le - x0, r - x0)
