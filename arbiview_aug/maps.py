@@ -138,7 +138,7 @@ class PairMap:
         self._whole: BoolArray | None = None
         self._fine: tuple[Slot, npt.NDArray[np.float32]] | None = None
         self._near_shadow: BoolArray | None = None
-        self._shadows_by_level: dict[int, Shadows] = {}
+        self._light: dict[int, tuple[Shadows, BoolArray]] = {}
         if self.solids is not None and not isinstance(self.surface, Static):
             self._from_source_q = (q / np.maximum(np.sqrt((points * points).sum(-1)), 1e-300)).astype(np.float32)
         if rays.grid.step == 1:
@@ -292,21 +292,23 @@ class PairMap:
         """Nodes (ny, nx) whose scene point the source sees when its image is halved ``level`` times."""
         if self.solids is None or not isinstance(self.whole_surface, Layered):
             return self.valid
-        shadows = self._shadows(level)
+        shadows, lit = self._in_light(level)
         pixel, inside = _nearest_pixel(shadows.beyond, _at_level(self.uv, level))
         beyond = 0 if isinstance(self.surface, Static) else self._from_source_q
         free = self.valid & ~(inside & (shadows.beyond[pixel] > beyond))
         on_solid = self.rays.at_nodes(255 - self.rays.solids(self.whole_surface).free) > 0
         seen = np.zeros(self.rays.camera.size, bool)
         px, py = self.solids.pixels.T
-        seen[py, px] = self.solids.lit(shadows, _at_level(self.solids.uv, level), slice(None))
+        seen[py, px] = lit
         return np.where(on_solid, self.rays.at_nodes(seen), free)
 
-    def _shadows(self, level: int) -> Shadows:
-        if level not in self._shadows_by_level:
-            assert isinstance(self.whole_surface, Layered)
-            self._shadows_by_level[level] = self.whole_surface.shadows(_halved_camera(self.source, level))
-        return self._shadows_by_level[level]
+    def _in_light(self, level: int) -> tuple[Shadows, BoolArray]:
+        """The source's shadow images when it is halved ``level`` times, and which of ``solids`` (n,) it sees."""
+        if level not in self._light:
+            assert self.solids is not None and isinstance(self.whole_surface, Layered)
+            shadows = self.whole_surface.shadows(_halved_camera(self.source, level))
+            self._light[level] = shadows, self.solids.lit(shadows, _at_level(self.solids.uv, level))
+        return self._light[level]
 
     def full_resolution(
         self, slot: Slot, rows: tuple[int, int]
@@ -357,7 +359,7 @@ class PairMap:
         assert self.solids is not None and isinstance(self.whole_surface, Layered)
         grid = self.rays.grid
         y0, y1, x0, x1 = grid.pixels(nodes)
-        shadows = self._shadows(slot.level)
+        shadows, lit = self._in_light(slot.level)
         for part in self._parts_near_shadow(shadows.beyond, nodes, slot.level):
             t, b, le, r = grid.pixels(part)
             here = slice(t - y0, b - y0), slice(le - x0, r - x0)
@@ -371,7 +373,7 @@ class PairMap:
         px, py = solids.pixels[strip].T
         exact: Any = slot.from_source(solids.uv[strip])
         at[py - y0, px - x0] = exact
-        visible[py - y0, px - x0] = solids.lit(shadows, exact - (slot.x, slot.y), strip) * np.uint8(255)
+        visible[py - y0, px - x0] = lit[strip] * np.uint8(255)
 
     def _parts_near_shadow(self, shadow: npt.NDArray[np.float32], nodes: Box, level: int) -> Iterator[Box]:
         """The parts of a strip, between its rows of nodes, whose background may be read in a shadow."""
@@ -453,11 +455,11 @@ class _SeenSolids(NamedTuple):
         inside = np.flatnonzero(valid & source.contains(uv) & (before_m * q >= _LEAST_INCIDENCE))
         return cls(pixels[inside], uv[inside], q[inside], solid[inside])
 
-    def lit(self, shadows: Shadows, at: FloatArray, part: slice) -> BoolArray:
-        """Which of a part of them no other solid hides, by their positions (n, 2) in the shadow images."""
+    def lit(self, shadows: Shadows, at: FloatArray) -> BoolArray:
+        """Which of them no other solid hides, by their positions (n, 2) in the shadow images."""
         pixel, inside = _nearest_pixel(shadows.beyond, at)
-        nearer = shadows.beyond[pixel] > self.inverse_distance[part]
-        return ~(inside & nearer & (shadows.solid[pixel] != self.solid[part]))
+        nearer = shadows.beyond[pixel] > self.inverse_distance
+        return ~(inside & nearer & (shadows.solid[pixel] != self.solid))
 
     def nodes(self, grid: Grid) -> Box | None:
         """The nodes around all of them."""
