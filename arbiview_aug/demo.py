@@ -39,7 +39,7 @@ from arbiview_aug.evaluate.pictures import contact_sheet, outline_coverage, save
 from arbiview_aug.evaluate.scores import mean_of
 from arbiview_aug.evaluate.sparse import ColouredPoints, coloured_points, equalised, sparse_metrics
 from arbiview_aug.evaluate.truth import truth_metrics
-from arbiview_aug.favs.config import PlanQuality
+from arbiview_aug.favs.config import Quality
 from arbiview_aug.rig import Rig, load_rig, shipped_rigs
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.transforms import RigRetarget
@@ -88,18 +88,20 @@ class _Rendered:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Retarget, explain, compare, and write the contact sheet."""
-    arguments = _parser().parse_args(argv)
+    parser = _parser()
+    arguments = parser.parse_args(argv)
+    if arguments.quality == "paper" and arguments.surface not in ("auto", "far"):
+        parser.error(f"argument --surface: quality paper knows the far surface alone, got {arguments.surface}")
     picture_path = _picture_path(arguments.output)
     data = _load(arguments)
     count = min(arguments.frames, len(data.samples))
-    surfaces = list(dict.fromkeys((arguments.surface, *_COMPARED)))
-    rows: dict[str, list[dict[str, float]]] = {surface: [] for surface in surfaces}
+    compared = _compared(data.target, arguments.quality, arguments.surface)
+    rows: dict[str, list[dict[str, float]]] = {name: [] for name in compared}
     plan_ms: list[float] = []
     frame_ms: list[float] = []
     first: tuple[dict[str, Any], _Reference, _Rendered] | None = None
-    with _notes(), tqdm(total=count * (2 + len(surfaces)), unit="step", leave=False) as progress:
-        transforms = {s: RigRetarget(data.target, quality=arguments.quality, surface=s) for s in surfaces}
-        chosen = transforms[arguments.surface]
+    with _notes(), tqdm(total=count * (2 + len(compared)), unit="step", leave=False) as progress:
+        chosen = next(iter(compared.values()))
         for index in range(count):
             progress.set_description(f"frame {index + 1}/{count}: source views")
             sample = data.samples[index]
@@ -109,21 +111,23 @@ def main(argv: Sequence[str] | None = None) -> int:
             progress.update()
             for times, ms in zip((frame_ms, plan_ms), _timings(chosen, sample), strict=True):
                 times.append(ms)
-            for surface, retarget in transforms.items():
-                progress.set_description(f"frame {index + 1}/{count}: target views, surface {surface}")
-                rows[surface].extend(_rows(reference, retarget, sample))
+            for name, retarget in compared.items():
+                progress.set_description(f"frame {index + 1}/{count}: target views, {name}")
+                rows[name].extend(_rows(reference, retarget, sample))
                 progress.update()
             first = first or (sample, reference, _render(chosen, sample))
     assert first is not None
     sample, reference, rendered = first
     print(f"{sample['rig']!r}\n\n{data.target!r}\n\n{chosen.explain(sample)}\n")
-    means = {surface: mean_of(found) for surface, found in rows.items()}
+    means = {name: mean_of(found) for name, found in rows.items()}
     print(_table(means, reference, f"{len(data.target)} cameras, {count} frame{'s' if count > 1 else ''}"))
     size = "x".join(map(str, rendered.rig.sizes[0][::-1]))
+    planned = f"a new plan, for another calibration or other boxes, takes {statistics.median(plan_ms):.0f} ms more."
+    if arguments.quality == "paper":
+        planned = "nothing can be planned ahead."
     print(
         f"\n{statistics.median(frame_ms):.1f} ms a frame: {len(sample['rig'])} source images to {len(data.target)} "
-        f"views of {size}, quality {arguments.quality}, {cv2.getNumThreads()} threads; a new plan, for another "
-        f"calibration or other boxes, takes {statistics.median(plan_ms):.0f} ms more."
+        f"views of {size}, quality {arguments.quality}, {cv2.getNumThreads()} threads; {planned}"
     )
     sheet = _sheet(sample, reference, rendered, arguments.width)
     print(f"picture: {save_picture(picture_path, sheet)}")
@@ -154,7 +158,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help=f"folder for {PICTURE_FILE}, or a picture file ending in .png or .jpg (default: %(default)s)",
     )
-    parser.add_argument("--quality", choices=get_args(PlanQuality), default="fast", help="(default: %(default)s)")
+    parser.add_argument(
+        "--quality",
+        choices=get_args(Quality),
+        default="fast",
+        help="(default: %(default)s); paper: the published method, beside fast on the other surfaces, without lenses",
+    )
     parser.add_argument("--surface", choices=get_args(SurfaceName), default="auto", help="(default: %(default)s)")
     parser.add_argument("--frames", type=_count, default=1, metavar="N", help="how many (default: %(default)s)")
     parser.add_argument("--seed", type=_seed, default=0, help="of the synthetic streets (default: %(default)s)")
@@ -205,15 +214,27 @@ def _picture_path(output: str) -> Path:
 
 
 def _load(arguments: argparse.Namespace) -> _Data:
-    target = None if arguments.target is None else load_rig(arguments.target)
+    name = arguments.target or (_REAL_TARGET if arguments.data else None)
+    target = None if name is None else load_rig(name)
+    if target is not None and arguments.quality == "paper":  # homographies know no lens
+        target = target.undistorted()
     if arguments.data is not None:
-        target = target or load_rig(_REAL_TARGET)
+        assert target is not None
         return _Data(open_data(arguments.data), _resized(target, arguments.size), None)
     size = {} if arguments.size is None else {"size": arguments.size}
     source = demo_source_rig(**size)
     target = demo_target_rig(**size) if target is None else _resized(target, arguments.size or source.sizes[0])
     drive = SyntheticDrive(source, num_frames=arguments.frames, seed=arguments.seed, lidar=False)
     return _Data(drive, target, lambda index: drive.render(index, target))
+
+
+def _compared(target: Rig, quality: Quality, surface: SurfaceName) -> dict[str, RigRetarget]:
+    """What was asked for, and the surfaces that it is compared with, by name."""
+    if quality == "paper":
+        asked, quality = {"paper": RigRetarget(target, quality="paper", surface=surface)}, "fast"
+    else:
+        asked = {surface: RigRetarget(target, quality=quality, surface=surface)}
+    return asked | {s: RigRetarget(target, quality=quality, surface=s) for s in _COMPARED if s not in asked}
 
 
 def _resized(rig: Rig, size: tuple[int, int] | None) -> Rig:

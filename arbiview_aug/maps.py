@@ -61,6 +61,7 @@ class TargetRays:
         self.nodes = self.grid.nodes()
         self.directions, self.valid = ego_rays(camera, self.nodes)
         self._inverse: dict[Surface, FloatArray] = {}
+        self._uncertainty: dict[Surface, FloatArray] = {}
         self._solids: dict[Layered, SolidPixels] = {}
         ny, nx = self.grid.shape
         self.sparse_index = np.ix_(np.unique(np.r_[0:ny:4, ny - 1]), np.unique(np.r_[0:nx:4, nx - 1]))
@@ -78,6 +79,13 @@ class TargetRays:
             self._inverse[surface] = self._evaluated(surface)
             self.counters[f"surface_{type(surface).__name__.lower()}"] += 1
         return self._inverse[surface]
+
+    def uncertainty(self, surface: Surface) -> FloatArray:
+        """(ny, nx) of the inverse distances; evaluated once for each surface."""
+        if surface not in self._uncertainty:
+            q = self.inverse_distance(surface)
+            self._uncertainty[surface] = surface.uncertainty(self.camera.center_m, self.directions, q)
+        return self._uncertainty[surface]
 
     def _evaluated(self, surface: Surface) -> FloatArray:
         if not isinstance(surface, Layered):

@@ -6,6 +6,7 @@ import copy
 import os
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -13,10 +14,13 @@ import cv2
 import numpy as np
 import torch
 
+from arbiview_aug.confidence import confidence
+from arbiview_aug.detections import OfCameras, detections_of_frames
 from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError
 from arbiview_aug.explain import Explanation, PaperExplanation
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
+from arbiview_aug.favs.overlap_depth import OverlapDepth, RefinementCache, overlap_depth
 from arbiview_aug.favs.paper import PaperRendering, check_pinhole, check_settings, render_paper
 from arbiview_aug.favs.photometric import Harmonise, Harmoniser, PhotometricReport
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
@@ -24,7 +28,7 @@ from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_targ
 from arbiview_aug.plan import PlanCache, RenderPlan, baselines_m, build_plan, needs_geometry, plan_key
 from arbiview_aug.random_rig import RandomRig
 from arbiview_aug.rig import Rig, load_rig
-from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame, check_inputs, scenes_of_frames
+from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame, check_inputs, names_of_frames, scenes_of_frames
 from arbiview_aug.sampling import Scratch
 from arbiview_aug.scene import Scene
 from arbiview_aug.surface import SurfaceName
@@ -34,7 +38,7 @@ Execution = Literal["auto", "opencv", "torch"]
 View = RenderPlan | PaperRendering | tuple[int, int]
 """How a frame is made: by a plan, by the published stages (and then it is rendered already), or only resized."""
 
-_OUTPUTS = ("source_camera",)
+_OUTPUTS = ("source_camera", "confidence")
 _UNREACHABLE = 0.5  # a target camera of which less than this is covered is worth a warning
 _MOVED_M = 0.2
 """A target camera farther than this from every source is worth a warning where only the static street is known: what
@@ -64,8 +68,11 @@ class RigRetarget(torch.nn.Module):
         target_rig: A ``Rig``, the name of a shipped one, a rig file, or a ``RandomRig``.
         source_rig: The rig of every sample that carries none.
         path: ``favs``: stitching.
-        quality: ``draft``, ``fast``, or a ``FavsConfig``; ``paper`` or a ``PaperConfig``: stages 1 to 4 as published,
-            on the CPU, for pinhole cameras.
+        quality: ``draft``, ``fast``, ``accurate``, or a ``FavsConfig``; ``paper`` or a ``PaperConfig``: stages 1 to 4
+            as published, on the CPU, for pinhole cameras. Its objects take their types from the sample, where it has
+            ``detections`` (for each camera ``{"boxes": (n, 4), "labels": [n names]}`` in source pixels, as
+            torchvision's detectors return them) or else ``boxes_3d``, with ``box_names`` (a name each) where there are
+            any.
         surface: ``far``, ``ground``, ``street``; ``objects``: the sample's ``boxes_3d`` stand on the street, so that
             objects keep their height when cameras move; ``auto``: for each pair of cameras ``far`` where their centres
             coincide, else the best that the sample offers: ``objects`` with ``boxes_3d``, else ``street``, with a
@@ -73,6 +80,9 @@ class RigRetarget(torch.nn.Module):
         harmonise: Bring the sources to one exposure (``arbiview_aug.favs.photometric``): True or a ``HarmoniseConfig``
             estimates a gain for each camera in every frame; numbers are gains to use as they are. Off by default.
             Samples that ``p`` skips keep their colours.
+        refinement: For ``quality="accurate"``, whose depth from overlap depends on the images: None computes it, and
+            plans anew, for every frame; a ``RefinementCache`` reuses both where its key says that the scene is the
+            same.
         size: (h, w) of every output image; the target cameras are resized to it.
         p: Probability of retargeting. A skipped sample keeps its own cameras, resized to ``size``, with full coverage;
             so ``p < 1`` needs ``size`` and equal camera counts. The output then always has ``lens``, ``distortion``
@@ -83,7 +93,9 @@ class RigRetarget(torch.nn.Module):
         label_keys: Keys that hold label maps (..., N, H, W) or lists of them, besides ``tv_tensors.Mask``.
         label_fill: Value of label pixels that no source sees (False for bool maps).
         pass_keys: Keys to keep although they look bound to the source's pixels.
-        outputs: Further outputs: ``source_camera`` (..., M, h, w) int8, -1 where uncovered.
+        outputs: Further outputs: ``source_camera`` (..., M, h, w) int8, -1 where uncovered; ``confidence``
+            (..., M, h, w) float32 in [0, 1], exp(-e / 10) for an expected error of e grey levels of 255: 1 where
+            the source is exact, 0 where uncovered (``arbiview_aug.confidence``; not with ``paper``).
         execution: ``opencv`` (CPU), ``torch`` (any device, differentiable); ``auto`` takes OpenCV for CPU images that
             need no gradient.
         cache_bytes: Memory for plans; the least recently used go first.
@@ -102,6 +114,7 @@ class RigRetarget(torch.nn.Module):
         quality: Quality | FavsConfig = "fast",
         surface: SurfaceName = "auto",
         harmonise: Harmonise = None,
+        refinement: RefinementCache | None = None,
         size: tuple[int, int] | None = None,
         p: float = 1.0,
         rng: torch.Generator | None = None,
@@ -138,6 +151,13 @@ class RigRetarget(torch.nn.Module):
             check_pinhole(self.target if isinstance(self.target, Rig) else self.target.base)
             if harmonise is not None and harmonise is not False:
                 raise ValueError("harmonise: quality='paper' is as published: expected None, got " + repr(harmonise))
+            if "confidence" in outputs:
+                raise ValueError("outputs: quality='paper' has no 'confidence': it moves pixels by what it matches")
+        elif "confidence" in outputs:
+            self.config = replace(self.config, certainty=True)
+        if refinement is not None and not (isinstance(self.config, FavsConfig) and self.config.overlap_depth):
+            raise ValueError("refinement: expected quality='accurate' (or overlap_depth=True) with a RefinementCache")
+        self.refinement = refinement
         self.path, self.surface, self.p, self.rng = path, surface, float(p), rng
         self.size = None if size is None else _checked_size(size)
         self.label_frame, self.label_keys, self.label_fill = label_frame, tuple(label_keys), label_fill
@@ -176,8 +196,13 @@ class RigRetarget(torch.nn.Module):
         target, skip, drawn = self._draw(sample, frames, params)
         views: list[View] = []
         scenes = self._scenes(sample, len(frames), lead)
-        for frame, scene in zip(frames, scenes, strict=True):
-            views.append(self.size if skip and self.size else self._view(frame, target, scene))
+        names = self._refinement_names(sample, len(frames), lead)
+        found = self._detections(sample, frames, lead)
+        for frame, scene, name, detections in zip(frames, scenes, names, found, strict=True):
+            if skip and self.size:
+                views.append(self.size)
+            else:
+                views.append(self._view(frame, target, scene, self._depth(frame, target, name), detections))
         parts = self._rendered(frames, views)
         out = self._kept(sample, labels)
         out["images"] = rewrapped(gathered([part["images"] for part in parts], lead), sample["images"])
@@ -247,7 +272,9 @@ class RigRetarget(torch.nn.Module):
     def _rendered(self, frames: Sequence[SourceFrame], views: Sequence[View]) -> list[dict[str, Any]]:
         """Images, calibration and masks of each frame: rendered by its plan, or resized."""
         parts = []
-        for frame, view, images in zip(frames, views, self._images(frames, views), strict=True):
+        seams: dict[int, list[torch.Tensor]] | None = {} if "confidence" in self.outputs else None
+        rendered = self._images(frames, views, seams)
+        for b, (frame, view, images) in enumerate(zip(frames, views, rendered, strict=True)):
             device = frame.images[0].device
             rig = view.target if not isinstance(view, tuple) else frame.rig.resized(view)
             part = self._described(rig, device)
@@ -257,13 +284,23 @@ class RigRetarget(torch.nn.Module):
             else:
                 winners = [np.full(view, k, np.int8) for k in range(len(rig))]
             part["coverage"] = covered(winners, device)
+            if seams is not None:
+                part["confidence"] = stacked(_confidence(view, images, part["coverage"], seams.get(b, [])))
             if "source_camera" in self.outputs:
                 part["source_camera"] = stacked([torch.from_numpy(winner.copy()).to(device) for winner in winners])
             parts.append(part)
         return parts
 
-    def _images(self, frames: Sequence[SourceFrame], views: Sequence[View]) -> list[list[torch.Tensor]]:
-        """The target images of each frame; frames that share a plan go through torch together."""
+    def _images(
+        self,
+        frames: Sequence[SourceFrame],
+        views: Sequence[View],
+        seams: dict[int, list[torch.Tensor]] | None = None,
+    ) -> list[list[torch.Tensor]]:
+        """The target images of each frame; frames that share a plan go through torch together.
+
+        Into ``seams``, where given, go the changes along the seams (see ``render_opencv``) of each planned frame.
+        """
         done: dict[int, list[torch.Tensor]] = {}
         together: dict[int, list[int]] = {}
         for b, (frame, view) in enumerate(zip(frames, views, strict=True)):
@@ -275,15 +312,19 @@ class RigRetarget(torch.nn.Module):
                 together.setdefault(id(view), []).append(b)
             else:
                 curves = self.harmoniser.curves(frame.rig, frame.images)
-                done[b] = render_opencv(view, frame.images, self._scratch, curves)
+                changes = None if seams is None else seams.setdefault(b, [])
+                done[b] = render_opencv(view, frame.images, self._scratch, curves, changes)
         for members in together.values():
             plan = views[members[0]]
             assert isinstance(plan, RenderPlan)
             sources = zip(*(frames[b].images for b in members), strict=True)
             toned = [self.harmoniser.curves(frames[b].rig, frames[b].images) for b in members]
-            rendered = render_torch(plan, [torch.stack(images) for images in sources], toned)
+            batched: list[torch.Tensor] | None = None if seams is None else []
+            rendered = render_torch(plan, [torch.stack(images) for images in sources], toned, batched)
             for k, b in enumerate(members):
                 done[b] = [image[k] for image in rendered]
+                if seams is not None and batched is not None:
+                    seams[b] = [change[k] for change in batched]
         return [done[b] for b in range(len(frames))]
 
     def _described(self, rig: Rig, device: torch.device) -> dict[str, Any]:
@@ -309,13 +350,48 @@ class RigRetarget(torch.nn.Module):
             return [Scene()] * count
         return scenes_of_frames(sample, count, lead, self.surface)
 
-    def _view(self, frame: SourceFrame, target: Rig, scene: Scene) -> RenderPlan | PaperRendering:
+    def _detections(
+        self, sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...]
+    ) -> Sequence[OfCameras]:
+        """The objects that each frame's sample names, for the published stages."""
+        if isinstance(self.config, PaperConfig) and self.config.use_detections:
+            return detections_of_frames(sample, frames, lead)
+        return [{}] * len(frames)
+
+    def _view(
+        self, frame: SourceFrame, target: Rig, scene: Scene, depth: OverlapDepth | None, detections: OfCameras
+    ) -> RenderPlan | PaperRendering:
         """The plan of a frame, or the frame rendered by the published stages, for which nothing can be planned."""
         if not isinstance(self.config, PaperConfig):
-            return self.plan(frame.rig, target, scene)
-        rendering = render_paper(frame.rig, target.in_frame_of(frame.rig), frame.images, self.config)
+            known = scene if depth is None else replace(scene, corrections=depth.corrections)
+            return self.plan(frame.rig, target, known)
+        rendering = render_paper(frame.rig, target.in_frame_of(frame.rig), frame.images, self.config, detections)
         self._warn_unreachable(rendering)
         return rendering
+
+    def _refinement_names(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[object]:
+        """For each frame, what the sample calls its scene, where refinements are reused by name.
+
+        Raises:
+            SampleError: The sample lacks the name, or has another number of them than frames.
+        """
+        key = None if self.refinement is None else self.refinement.key
+        if key is None:
+            return [None] * count
+        if key not in sample:
+            raise SampleError(f"refinement: expected {key!r} in the sample, to tell which frames share a refinement")
+        return names_of_frames(key, sample[key], count, lead)
+
+    def _depth(self, frame: SourceFrame, target: Rig, name: object) -> OverlapDepth | None:
+        """Depth from overlap, where it is asked for and any pixel's place depends on it."""
+        config = self.config
+        if isinstance(config, PaperConfig) or not config.overlap_depth or self.surface in ("far", "ground"):
+            return None
+        if self.surface == "auto" and not needs_geometry(frame.rig, target, config):
+            return None
+        if self.refinement is None:
+            return overlap_depth(frame.rig, frame.images)
+        return self.refinement.get((frame.rig.content_key, name), lambda: overlap_depth(frame.rig, frame.images))
 
     def plan(self, source: Rig, target: Rig, scene: Scene | None = None) -> RenderPlan:
         """The cached render plan of a pair of rigs in a scene.
@@ -328,15 +404,17 @@ class RigRetarget(torch.nn.Module):
         config, known = self.config, scene or Scene()
         if self.surface == "auto" and not known.is_empty and not needs_geometry(source, target, config):
             known = Scene()
-        # A frame's geometry never comes back: its plan must not push out those that do.
-        cache = self.plans if known.is_empty else self._plan_of_frame
+        # A frame's geometry never comes back, unless it is a refinement that is reused: its plan must not push out
+        # those that do.
+        comes_back = known.is_empty or (self.refinement is not None and known.boxes is None)
+        cache = self.plans if comes_back else self._plan_of_frame
         key = plan_key(source, target, self.surface, config, known)
         return cache.get(key, lambda: self._built(source, target, config, known))
 
     def _built(self, source: Rig, target: Rig, config: FavsConfig, scene: Scene) -> RenderPlan:
         plan = build_plan(source, target, surface=self.surface, config=config, scene=scene)
         self._warn_unreachable(plan)
-        if self.surface == "auto" and scene.is_empty:
+        if self.surface == "auto" and scene.best == "street":
             self._warn_static(source, target)
         return plan
 
@@ -370,12 +448,15 @@ class RigRetarget(torch.nn.Module):
         """
         frames, lead = check_inputs(sample, self.source_rig), leading_shape(sample["images"])
         target, _, _ = self._draw(sample, frames[:1], None)
-        (scene,) = self._scenes(sample, len(frames), lead)[:1]
+        scene = self._scenes(sample, len(frames), lead)[0]
+        detections = self._detections(sample, frames, lead)[0]
         asked = self.harmoniser.estimates or self.harmoniser.gains is not None
-        view = self._view(frames[0], target, scene)
+        name = self._refinement_names(sample, len(frames), lead)[0]
+        depth = self._depth(frames[0], target, name)
+        view = self._view(frames[0], target, scene, depth, detections)
         if isinstance(view, PaperRendering):
             return PaperExplanation(view)
-        return Explanation(view, self.harmonisation(sample) if asked else None)
+        return Explanation(view, self.harmonisation(sample) if asked else None, depth)
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
         """The gains that a sample's source images would get, and why; of a batch, its first frame."""
@@ -428,6 +509,17 @@ class RigRetarget(torch.nn.Module):
 def _one_of(name: str, value: Any, choices: Sequence[str]) -> None:
     if value not in choices:
         raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+
+
+def _confidence(
+    view: View, images: Sequence[torch.Tensor], coverage: Sequence[torch.Tensor], seams: Sequence[torch.Tensor]
+) -> list[torch.Tensor]:
+    """Confidence (h, w) of each view; a frame that was only resized shows what its cameras saw."""
+    if not isinstance(view, RenderPlan):
+        return [seen.float() for seen in coverage]
+    certain = [target.certainty for target in view.targets]
+    parts = zip(images, certain, coverage, seams, strict=True)
+    return [confidence(image, c, seen, change) for image, c, seen, change in parts if c is not None]
 
 
 def _checked_size(size: Any) -> tuple[int, int]:

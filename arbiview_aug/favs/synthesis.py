@@ -11,7 +11,7 @@ import torch
 from arbiview_aug import sampling
 from arbiview_aug.plan import RenderPlan
 from arbiview_aug.sampling import Scratch
-from arbiview_aug.tone import ToneCurve
+from arbiview_aug.tone import STRIP_ROWS, ToneCurve
 
 
 def render_opencv(
@@ -19,6 +19,7 @@ def render_opencv(
     images: Sequence[torch.Tensor],
     scratch: Scratch | None = None,
     curves: Sequence[ToneCurve] | None = None,
+    seams: list[torch.Tensor] | None = None,
 ) -> list[torch.Tensor]:
     """Target views by OpenCV, for CPU images; not differentiable.
 
@@ -26,7 +27,9 @@ def render_opencv(
         plan: The plan for these images' rig.
         images: N images (3, H, W): uint8, or float in [0, 1].
         scratch: Buffers to reuse between calls.
-        curves: A tone curve for each image; the images themselves are not changed.
+        curves: A tone curve for each image, applied to what the target reads of it.
+        seams: A list to append, for each view, (h, w) float32 to: by how much blending a second source changed the
+            winner's colour, mean over the channels, in the images' unit.
 
     Returns:
         M views (3, h, w) of the images' type, black where no source sees; slices of one (M, 3, h, w) block where all
@@ -35,26 +38,43 @@ def render_opencv(
     scratch = scratch or Scratch()
     dtype = images[0].dtype
     work = torch.uint8 if dtype == torch.uint8 else torch.float32
-    atlas = sampling.fill_atlas(plan.layout, [image.detach().to(work) for image in images], scratch, curves)
+    atlas = sampling.fill_atlas(plan.layout, [image.detach().to(work) for image in images], scratch)
     views = _empty_views(plan, work)
     for k, (target, view) in enumerate(zip(plan.targets, views, strict=True)):
         h, w = target.source_camera.shape
+        change = np.zeros((h, w), np.float32) if seams is not None else None
+        if seams is not None:
+            seams.append(torch.from_numpy(change))
         if not target.pairs:
             view.zero_()
             continue
         buffer = scratch.get(f"view{h}x{w}", (h, w, 3), atlas.dtype)
-        rendered = sampling.remap(atlas, target.at, plan.interpolation, dst=buffer)
+        for y in range(0, h, STRIP_ROWS):
+            strip = buffer[y : y + STRIP_ROWS]
+            sampling.remap(atlas, target.at.rows(y, y + STRIP_ROWS), plan.interpolation, dst=strip)
+            # Not in the sources: a target has no more pixels, they are in the cache, and a source need not be copied.
+            if curves is not None:
+                for patch in target.patches[y // STRIP_ROWS]:
+                    curves[patch.source].apply(strip[:, patch.x], patch.mask)
         for band in target.bands:
             bh, bw = band.weight.shape
-            part = rendered[band.y : band.y + bh, band.x : band.x + bw]
+            part = buffer[band.y : band.y + bh, band.x : band.x + bw]
             second = sampling.remap(atlas, band.at, plan.interpolation)
+            if curves is not None:
+                curves[band.source].apply(second)
+            if change is not None:
+                apart = np.abs(part.astype(np.float32) - second).mean(-1)
+                change[band.y : band.y + bh, band.x : band.x + bw] += apart * band.weight
             part[...] = cv2.blendLinear(part, second, 1 - band.weight, band.weight)
-        cv2.split(rendered, list(views[k].numpy()))
+        cv2.split(buffer, list(views[k].numpy()))
     return [view.to(dtype) for view in views]
 
 
 def render_torch(
-    plan: RenderPlan, images: Sequence[torch.Tensor], curves: Sequence[Sequence[ToneCurve] | None] | None = None
+    plan: RenderPlan,
+    images: Sequence[torch.Tensor],
+    curves: Sequence[Sequence[ToneCurve] | None] | None = None,
+    seams: list[torch.Tensor] | None = None,
 ) -> list[torch.Tensor]:
     """Target views by ``grid_sample``: batches, any device, differentiable in the images.
 
@@ -62,29 +82,57 @@ def render_torch(
         plan: The plan for these images' rig, shared by the batch.
         images: N images (B, 3, H, W): uint8, or float in [0, 1]; sampled in float32.
         curves: For each frame of the batch nothing, or a tone curve for each image.
+        seams: A list to append, for each view, (B, h, w) float32 to: see ``render_opencv``.
 
     Returns:
         M views (B, 3, h, w) of the images' type.
     """
     dtype, device = images[0].dtype, images[0].device
-    atlas = sampling.torch_atlas(plan.layout, images, curves)
+    atlas = sampling.torch_atlas(plan.layout, images)
     views = []
     for target in plan.targets:
         coverage = torch.from_numpy(target.coverage).to(device)
         grid = sampling.torch_grid(target.at.to_float(), plan.layout.size, device)
         view = sampling.grid_sample(atlas, grid, plan.interpolation) * coverage
+        if curves is not None:
+            view = _toned(view, torch.from_numpy(target.source_camera).to(device), curves, dtype == torch.uint8)
+        if seams is not None:
+            seams.append(view.new_zeros(view.shape[0], *coverage.shape))
         for band in target.bands:
             bh, bw = band.weight.shape
             part = (slice(None), slice(None), slice(band.y, band.y + bh), slice(band.x, band.x + bw))
             second = sampling.grid_sample(
                 atlas, sampling.torch_grid(band.at.to_float(), plan.layout.size, device), plan.interpolation
             )
+            if curves is not None:
+                second = _toned(second, torch.tensor(band.source, device=device), curves, dtype == torch.uint8)
             weight = torch.from_numpy(band.weight).to(device)
+            if seams is not None:
+                seams[-1][(slice(None), *part[2:])] += (view[part] - second).detach().abs().mean(1) * weight
             blended = view.clone()
             blended[part] = torch.lerp(view[part], second, weight.expand_as(second))
             view = blended
         views.append(_rounded(view, dtype))
     return views
+
+
+def _toned(
+    views: torch.Tensor, source: torch.Tensor, curves: Sequence[Sequence[ToneCurve] | None], whole: bool
+) -> torch.Tensor:
+    """Views (B, 3, h, w) after the curves of the sources (h, w), or the one source (), that they are read from."""
+    frames = []
+    for view, of_sources in zip(views, curves, strict=True):
+        if of_sources is None:
+            frames.append(view)
+            continue
+        # Whole numbers as the OpenCV execution has them, which looks them up in a table.
+        read = torch.floor(view + 0.5) if whole else view
+        for k in source.unique().tolist():
+            if k >= 0 and of_sources[k].gain != 1:
+                toned = of_sources[k].of_tensor(read, 255.0 if whole else 1.0)
+                view = torch.where(source == k, torch.floor(toned + 0.5).clamp(0, 255) if whole else toned, view)
+        frames.append(view)
+    return torch.stack(frames)
 
 
 def render_labels(plan: RenderPlan, labels: Sequence[torch.Tensor], fill: float) -> list[torch.Tensor]:
