@@ -269,10 +269,14 @@ class PairMap:
         """
         if isinstance(self.surface, Static):
             return None
-        towards, _ = self._from_source(self.rays.directions, self.rays.inverse_distance(self.surface))
-        near = np.zeros(self.valid.shape, bool)
-        for origin, rays in ((self.rays.camera.center_m, self.rays.directions), (self.source.center_m, towards)):
-            near |= self.surface.detailed(origin, rays, self.rays.spacing_rad)
+        target = self.rays.camera.center_m
+        near = self.surface.detailed(target, self.rays.directions, self.rays.spacing_rad)
+        # What the source does not show need not be asked about: the nodes inside its image, and some around them.
+        shown = cv2.dilate(self.source.contains(self.uv).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+        j0, j1, i0, i1 = _bounds(shown, 1) or (0, *shown.shape[:1], 0, shown.shape[1])
+        part = slice(j0, j1), slice(i0, i1)
+        towards, _ = self._from_source(self.rays.directions[part], self.rays.inverse_distance(self.surface)[part])
+        near[part] |= self.surface.detailed(self.source.center_m, towards, self.rays.spacing_rad)
         return cv2.dilate(near.astype(np.uint8), np.ones((8, 8), np.uint8), anchor=(3, 3))[:-1, :-1] > 0
 
     def _evaluate(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -287,8 +291,12 @@ class PairMap:
         uv, _, valid = self.source.project_cam(points)
         if isinstance(self.surface, Static):
             return uv, valid
-        towards, from_source = self._from_source(directions, q)
-        return uv, valid & ~self.surface.hides(self.source.center_m, towards, from_source, 1 / self.source.K[0, 0])
+        shown = valid & self.source.contains(uv)  # what lies beside the image need not be asked about
+        if shown.any():
+            towards, from_source = self._from_source(directions[shown], q[shown])
+            pixel_rad = 1 / self.source.K[0, 0]
+            valid[shown] = ~self.surface.hides(self.source.center_m, towards, from_source, pixel_rad)
+        return uv, valid
 
     def _from_source(self, directions: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Unit rays (..., 3) from the source to scene points on target rays, and inverse distances along them."""

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 
-SurfaceName = Literal["auto", "far", "ground", "street", "objects"]
+SurfaceName = Literal["auto", "far", "ground", "street", "objects", "lidar"]
 """Surfaces a user can ask for. ``auto`` decides per pair of target and source camera (see ``plan``)."""
 
 MAX_INVERSE_DISTANCE = 100.0
@@ -108,7 +108,7 @@ class Layered(Surface):
 
     @property
     @abstractmethod
-    def background(self) -> Static:
+    def background(self) -> Surface:
         """What there is behind the solids."""
 
     @abstractmethod

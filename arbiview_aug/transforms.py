@@ -74,9 +74,11 @@ class RigRetarget(torch.nn.Module):
             torchvision's detectors return them) or else ``boxes_3d``, with ``box_names`` (a name each) where there are
             any.
         surface: ``far``, ``ground``, ``street``; ``objects``: the sample's ``boxes_3d`` stand on the street, so that
-            objects keep their height when cameras move; ``auto``: for each pair of cameras ``far`` where their centres
-            coincide, else the best that the sample offers: ``objects`` with ``boxes_3d``, else ``street``, with a
-            warning where cameras move (``paper``: always ``far``).
+            objects keep their height when cameras move; ``lidar``: its ``points`` (ego frame) or ``depth_m`` (..., N,
+            H, W; z-depth in metres, 0 or NaN where unknown), with ``boxes_3d`` before them where there are any;
+            ``auto``: for each pair of cameras ``far`` where their centres coincide, else the best that the sample
+            offers: ``objects`` with ``boxes_3d``, else ``street``, with a warning where cameras move (``paper``:
+            always ``far``).
         harmonise: Bring the sources to one exposure (``arbiview_aug.favs.photometric``): True or a ``HarmoniseConfig``
             estimates a gain for each camera in every frame; numbers are gains to use as they are. Off by default.
             Samples that ``p`` skips keep their colours.
@@ -195,7 +197,7 @@ class RigRetarget(torch.nn.Module):
         labels = check_other_keys(sample, list(sizes), self.label_keys, self.pass_keys)
         target, skip, drawn = self._draw(sample, frames, params)
         views: list[View] = []
-        scenes = self._scenes(sample, len(frames), lead)
+        scenes = self._scenes(sample, frames, lead)
         names = self._refinement_names(sample, len(frames), lead)
         found = self._detections(sample, frames, lead)
         for frame, scene, name, detections in zip(frames, scenes, names, found, strict=True):
@@ -344,11 +346,13 @@ class RigRetarget(torch.nn.Module):
             part["ignore"] = stacked([torch.from_numpy(~m).to(device) for m in masks])
         return part
 
-    def _scenes(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[Scene]:
+    def _scenes(
+        self, sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...]
+    ) -> Sequence[Scene]:
         """What each frame's sample says of the geometry, as far as the surface uses it."""
         if isinstance(self.config, PaperConfig):
-            return [Scene()] * count
-        return scenes_of_frames(sample, count, lead, self.surface)
+            return [Scene()] * len(frames)
+        return scenes_of_frames(sample, frames, lead, self.surface)
 
     def _detections(
         self, sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...]
@@ -406,7 +410,7 @@ class RigRetarget(torch.nn.Module):
             known = Scene()
         # A frame's geometry never comes back, unless it is a refinement that is reused: its plan must not push out
         # those that do.
-        comes_back = known.is_empty or (self.refinement is not None and known.boxes is None)
+        comes_back = known.is_empty or (self.refinement is not None and known.best == "street")
         cache = self.plans if comes_back else self._plan_of_frame
         key = plan_key(source, target, self.surface, config, known)
         return cache.get(key, lambda: self._built(source, target, config, known))
@@ -448,7 +452,7 @@ class RigRetarget(torch.nn.Module):
         """
         frames, lead = check_inputs(sample, self.source_rig), leading_shape(sample["images"])
         target, _, _ = self._draw(sample, frames[:1], None)
-        scene = self._scenes(sample, len(frames), lead)[0]
+        scene = self._scenes(sample, frames, lead)[0]
         detections = self._detections(sample, frames, lead)[0]
         asked = self.harmoniser.estimates or self.harmoniser.gains is not None
         name = self._refinement_names(sample, len(frames), lead)[0]
