@@ -102,7 +102,12 @@ def scenes_of_frames(
             "surface='objects': expected 'boxes_3d' (B, 7) in the sample, got none; an empty (0, 7) tensor says "
             "that nothing stands there"
         )
-    points = _points_of_frames(sample, frames, lead) if surface == "lidar" else None
+    points = _points_of_frames(sample, frames, lead) if surface in ("auto", "lidar") else None
+    if points is None and surface == "lidar":
+        raise SampleError(
+            "surface='lidar': expected 'points' (P, >= 3) in the ego frame, or 'depth_m' (N, H, W), z-depth of each "
+            "camera in metres, in the sample, got neither"
+        )
     if boxes is None and points is None:
         return [Scene()] * count
     solid: list[FloatArray | None] = [None] * count
@@ -114,14 +119,11 @@ def scenes_of_frames(
 
 def _points_of_frames(
     sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...]
-) -> list[FloatArray]:
-    """(P, 3) measured points of each frame: its ``points``, and those of its depth maps ``depth_m``."""
+) -> list[FloatArray] | None:
+    """(P, 3) measured points of each frame: its ``points``, and those of its depth maps ``depth_m``; None without."""
     points, depth_m = sample.get("points"), sample.get("depth_m")
     if points is None and depth_m is None:
-        raise SampleError(
-            "surface='lidar': expected 'points' (P, >= 3) in the ego frame, or 'depth_m' (N, H, W), z-depth of each "
-            "camera in metres, in the sample, got neither"
-        )
+        return None
     parts: list[list[FloatArray]] = [[] for _ in frames]
     if points is not None:
         for part, of_frame in zip(parts, _of_frames("points", points, len(frames), lead), strict=True):

@@ -34,6 +34,8 @@ class Scene:
     @property
     def best(self) -> SurfaceName:
         """The surface made of the best geometry that there is: what ``auto`` takes."""
+        if self.points is not None and len(self.points):
+            return "lidar"
         return "street" if self.boxes is None else "objects"
 
     @property
