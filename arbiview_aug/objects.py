@@ -19,7 +19,7 @@ from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.grid import Grid
 from arbiview_aug.solids import draw_boxes
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn, Layered, Shadows, Surface
+from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn, Layered, Shadows, Static, Surface
 
 _LENS_STEP_PX = 8  # cells in which rays of a lens are cast or not
 
