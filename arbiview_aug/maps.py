@@ -61,6 +61,7 @@ class TargetRays:
         self.nodes = self.grid.nodes()
         self.directions, self.valid = ego_rays(camera, self.nodes)
         self._inverse: dict[Surface, FloatArray] = {}
+        self._uncertainty: dict[Surface, FloatArray] = {}
         self._solids: dict[Layered, SolidPixels] = {}
         ny, nx = self.grid.shape
         self.sparse_index = np.ix_(np.unique(np.r_[0:ny:4, ny - 1]), np.unique(np.r_[0:nx:4, nx - 1]))
@@ -78,6 +79,13 @@ class TargetRays:
             self._inverse[surface] = self._evaluated(surface)
             self.counters[f"surface_{type(surface).__name__.lower()}"] += 1
         return self._inverse[surface]
+
+    def uncertainty(self, surface: Surface) -> FloatArray:
+        """(ny, nx) of the inverse distances; evaluated once for each surface."""
+        if surface not in self._uncertainty:
+            q = self.inverse_distance(surface)
+            self._uncertainty[surface] = surface.uncertainty(self.camera.center_m, self.directions, q)
+        return self._uncertainty[surface]
 
     def _evaluated(self, surface: Surface) -> FloatArray:
         if not isinstance(surface, Layered):
@@ -138,7 +146,8 @@ class PairMap:
         self._whole: BoolArray | None = None
         self._fine: tuple[Slot, npt.NDArray[np.float32]] | None = None
         self._near_shadow: BoolArray | None = None
-        if self.solids is not None:
+        self._light: dict[int, tuple[Shadows, BoolArray]] = {}
+        if self.solids is not None and not isinstance(self.surface, Static):
             self._from_source_q = (q / np.maximum(np.sqrt((points * points).sum(-1)), 1e-300)).astype(np.float32)
         if rays.grid.step == 1:
             self.nodes = _bounds(self.valid & source.contains(self.uv), 0)
@@ -260,10 +269,14 @@ class PairMap:
         """
         if isinstance(self.surface, Static):
             return None
-        towards, _ = self._from_source(self.rays.directions, self.rays.inverse_distance(self.surface))
-        near = np.zeros(self.valid.shape, bool)
-        for origin, rays in ((self.rays.camera.center_m, self.rays.directions), (self.source.center_m, towards)):
-            near |= self.surface.detailed(origin, rays, self.rays.spacing_rad)
+        target = self.rays.camera.center_m
+        near = self.surface.detailed(target, self.rays.directions, self.rays.spacing_rad)
+        # What the source does not show need not be asked about: the nodes inside its image, and some around them.
+        shown = cv2.dilate(self.source.contains(self.uv).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+        j0, j1, i0, i1 = _bounds(shown, 1) or (0, *shown.shape[:1], 0, shown.shape[1])
+        part = slice(j0, j1), slice(i0, i1)
+        towards, _ = self._from_source(self.rays.directions[part], self.rays.inverse_distance(self.surface)[part])
+        near[part] |= self.surface.detailed(self.source.center_m, towards, self.rays.spacing_rad)
         return cv2.dilate(near.astype(np.uint8), np.ones((8, 8), np.uint8), anchor=(3, 3))[:-1, :-1] > 0
 
     def _evaluate(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -278,8 +291,12 @@ class PairMap:
         uv, _, valid = self.source.project_cam(points)
         if isinstance(self.surface, Static):
             return uv, valid
-        towards, from_source = self._from_source(directions, q)
-        return uv, valid & ~self.surface.hides(self.source.center_m, towards, from_source, 1 / self.source.K[0, 0])
+        shown = valid & self.source.contains(uv)  # what lies beside the image need not be asked about
+        if shown.any():
+            towards, from_source = self._from_source(directions[shown], q[shown])
+            pixel_rad = 1 / self.source.K[0, 0]
+            valid[shown] = ~self.surface.hides(self.source.center_m, towards, from_source, pixel_rad)
+        return uv, valid
 
     def _from_source(self, directions: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Unit rays (..., 3) from the source to scene points on target rays, and inverse distances along them."""
@@ -291,15 +308,23 @@ class PairMap:
         """Nodes (ny, nx) whose scene point the source sees when its image is halved ``level`` times."""
         if self.solids is None or not isinstance(self.whole_surface, Layered):
             return self.valid
-        camera = _halved_camera(self.source, level)
-        shadows = self.whole_surface.shadows(camera)
+        shadows, lit = self._in_light(level)
         pixel, inside = _nearest_pixel(shadows.beyond, _at_level(self.uv, level))
-        free = self.valid & ~(inside & (shadows.beyond[pixel] > self._from_source_q))
+        beyond = 0 if isinstance(self.surface, Static) else self._from_source_q
+        free = self.valid & ~(inside & (shadows.beyond[pixel] > beyond))
         on_solid = self.rays.at_nodes(255 - self.rays.solids(self.whole_surface).free) > 0
         seen = np.zeros(self.rays.camera.size, bool)
         px, py = self.solids.pixels.T
-        seen[py, px] = self.solids.lit(shadows, _at_level(self.solids.uv, level), slice(None))
+        seen[py, px] = lit
         return np.where(on_solid, self.rays.at_nodes(seen), free)
+
+    def _in_light(self, level: int) -> tuple[Shadows, BoolArray]:
+        """The source's shadow images when it is halved ``level`` times, and which of ``solids`` (n,) it sees."""
+        if level not in self._light:
+            assert self.solids is not None and isinstance(self.whole_surface, Layered)
+            shadows = self.whole_surface.shadows(_halved_camera(self.source, level))
+            self._light[level] = shadows, self.solids.lit(shadows, _at_level(self.solids.uv, level))
+        return self._light[level]
 
     def full_resolution(
         self, slot: Slot, rows: tuple[int, int]
@@ -350,20 +375,21 @@ class PairMap:
         assert self.solids is not None and isinstance(self.whole_surface, Layered)
         grid = self.rays.grid
         y0, y1, x0, x1 = grid.pixels(nodes)
-        shadows = self.whole_surface.shadows(_halved_camera(self.source, slot.level))
+        shadows, lit = self._in_light(slot.level)
         for part in self._parts_near_shadow(shadows.beyond, nodes, slot.level):
             t, b, le, r = grid.pixels(part)
             here = slice(t - y0, b - y0), slice(le - x0, r - x0)
             local = at[here] - np.array([slot.x, slot.y], np.float32)
             first: Any = cv2.remap(shadows.beyond, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
-            visible[here] &= cv2.compare(first, grid.upsample(self._from_source_q, part), cv2.CMP_LE).astype(np.uint8)
+            beyond: Any = 0 if isinstance(self.surface, Static) else grid.upsample(self._from_source_q, part)
+            visible[here] &= cv2.compare(first, beyond, cv2.CMP_LE).astype(np.uint8)
         visible &= self.rays.solids(self.whole_surface).free[y0:y1, x0:x1]
         solids = self.solids
         strip = slice(*np.searchsorted(solids.pixels[:, 1], [y0, y1]).tolist())
         px, py = solids.pixels[strip].T
         exact: Any = slot.from_source(solids.uv[strip])
         at[py - y0, px - x0] = exact
-        visible[py - y0, px - x0] = solids.lit(shadows, exact - (slot.x, slot.y), strip) * np.uint8(255)
+        visible[py - y0, px - x0] = lit[strip] * np.uint8(255)
 
     def _parts_near_shadow(self, shadow: npt.NDArray[np.float32], nodes: Box, level: int) -> Iterator[Box]:
         """The parts of a strip, between its rows of nodes, whose background may be read in a shadow."""
@@ -445,11 +471,11 @@ class _SeenSolids(NamedTuple):
         inside = np.flatnonzero(valid & source.contains(uv) & (before_m * q >= _LEAST_INCIDENCE))
         return cls(pixels[inside], uv[inside], q[inside], solid[inside])
 
-    def lit(self, shadows: Shadows, at: FloatArray, part: slice) -> BoolArray:
-        """Which of a part of them no other solid hides, by their positions (n, 2) in the shadow images."""
+    def lit(self, shadows: Shadows, at: FloatArray) -> BoolArray:
+        """Which of them no other solid hides, by their positions (n, 2) in the shadow images."""
         pixel, inside = _nearest_pixel(shadows.beyond, at)
-        nearer = shadows.beyond[pixel] > self.inverse_distance[part]
-        return ~(inside & nearer & (shadows.solid[pixel] != self.solid[part]))
+        nearer = shadows.beyond[pixel] > self.inverse_distance
+        return ~(inside & nearer & (shadows.solid[pixel] != self.solid))
 
     def nodes(self, grid: Grid) -> Box | None:
         """The nodes around all of them."""

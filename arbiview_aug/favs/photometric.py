@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -24,6 +24,7 @@ import torch
 
 from arbiview_aug.camera import BoolArray
 from arbiview_aug.errors import SampleError
+from arbiview_aug.favs.config import check_ranges
 from arbiview_aug.maps import edge_distance, ego_rays, project_rays
 from arbiview_aug.neighbours import adjacent_pairs, half_way_view, odd_tiles
 from arbiview_aug.rig import Rig, content_order
@@ -73,10 +74,7 @@ class HarmoniseConfig:
     """If no gain changes more than this the cameras agree: half a grey level at mid-grey is not worth a copy."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value, (low, high) = getattr(self, field.name), _RANGES[field.name]
-            if not low <= value <= high:
-                raise ValueError(f"HarmoniseConfig.{field.name}: expected {low:g} to {high:g}, got {value!r}")
+        check_ranges(self, _RANGES)
 
 
 _RANGES: dict[str, tuple[float, float]] = {
