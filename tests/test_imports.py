@@ -37,6 +37,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("tensors", "random_rig", "explain"),
     ("sample",),
     ("labels", "detections"),
+    ("stitching",),
     ("datasets", "transforms"),
     ("evaluate",),
     ("bench", "convert", "demo", "inspect"),
