@@ -34,7 +34,9 @@ Execution = Literal["auto", "opencv", "torch"]
 View = RenderPlan | PaperRendering | tuple[int, int]
 """How a frame is made: by a plan, by the published stages (and then it is rendered already), or only resized."""
 
-_OUTPUTS = ("source_camera",)
+OUTPUTS = ("source_camera",)
+"""What a sample can hold besides, on request."""
+
 _UNREACHABLE = 0.5  # a target camera of which less than this is covered is worth a warning
 _MOVED_M = 0.2
 """A target camera farther than this from every source is worth a warning where only the static street is known: what
@@ -99,7 +101,7 @@ class RigRetarget(torch.nn.Module):
         *,
         source_rig: Rig | str | Path | None = None,
         path: Literal["favs"] = "favs",
-        quality: Quality | FavsConfig = "fast",
+        quality: Quality | FavsConfig | PaperConfig = "fast",
         surface: SurfaceName = "auto",
         harmonise: Harmonise = None,
         size: tuple[int, int] | None = None,
@@ -120,7 +122,7 @@ class RigRetarget(torch.nn.Module):
         _one_of("label_frame", label_frame, ("source", "target"))
         _one_of("execution", execution, get_args(Execution))
         for name in outputs:
-            _one_of("outputs", name, _OUTPUTS)
+            _one_of("outputs", name, OUTPUTS)
         if not 0 <= p <= 1:
             raise ValueError(f"p: expected a probability from 0 to 1, got {p!r}")
         if p < 1 and size is None:

@@ -11,15 +11,12 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
-from arbiview_aug.camera import BoolArray, FloatArray
+from arbiview_aug.camera import FloatArray
 from arbiview_aug.errors import SampleError
-from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
+from arbiview_aug.evaluate.images import Image, View, as_arrays, as_tensors, to_bytes
 from arbiview_aug.favs.synthesis import render_opencv
 from arbiview_aug.plan import build_plan
 from arbiview_aug.rig import Rig
-
-View = tuple[Image, BoolArray]
-"""A rendered view (h, w, 3), and where it is covered (h, w)."""
 
 Renderer = Callable[[Rig, Sequence[Image], Rig], list[View]]
 """Source rig, its images, target rig: one view for each target camera."""
@@ -29,17 +26,19 @@ SPLIT_DEPTH_M = 50.0
 
 
 def own_camera(source: Rig, images: Sequence[Image], target: Rig) -> list[View]:
-    """Each target camera sees the source camera of its own name alone (else of its own place), over the far surface.
+    """Each target camera sees one source camera, of its own name or else looking most nearly its way: far surface.
 
     This is "Geometric" of the paper's Table 2: projection by H = K' R' Rᵀ K⁻¹, without fusion.
     """
     views = []
-    for k, camera in enumerate(target):
-        index = source.names.index(camera.name) if camera.name in source.names else min(k, len(source) - 1)
+    axes = source.cam2ego[:, :3, 2]
+    for camera in target:
+        nearest = int(np.argmax(axes @ camera.cam2ego[:3, 2]))
+        index = source.names.index(camera.name) if camera.name in source.names else nearest
         alone = source.with_cameras([source[index]])
         plan = build_plan(alone, target.with_cameras([camera]), surface="far")
         (view,) = as_arrays(render_opencv(plan, as_tensors([images[index]])))
-        views.append((view, plan.coverage[0]))
+        views.append(View(view, plan.coverage[0]))
     return views
 
 
@@ -48,7 +47,8 @@ def crop_and_slide(source: Rig, images: Sequence[Image], target: Rig) -> list[Vi
 
     Each image is cropped to the columns half-way to its neighbours' azimuths, at a constant number of pixels a degree;
     the strips make a closed panorama, and a target camera sees the window around its azimuth, as wide as its
-    field of view. Rows, pitch and position stay as they were: no perspective is corrected. Everything is covered.
+    field of view. An image that does not reach half-way is stretched. Rows, pitch and position stay as they were: no
+    perspective is corrected. Everything is covered.
     """
     ring = sorted(range(len(source)), key=lambda k: -source[k].azimuth_deg)  # from left to right
     azimuth = np.array([source[k].azimuth_deg for k in ring])
@@ -59,7 +59,7 @@ def crop_and_slide(source: Rig, images: Sequence[Image], target: Rig) -> list[Vi
     strips, centre_px, x = [], [], 0.0
     per_degree = float(np.median([source[k].width_px / source[k].fov_deg[0] for k in ring]))
     for n, k in enumerate(ring):
-        camera, image = source[k], np.asarray(images[k])
+        camera, image = source[k], to_bytes(images[k])
         left, right = gap[n - 1] / 2, gap[n] / 2
         own = camera.width_px / camera.fov_deg[0]
         middle = float(camera.K[0, 2])
@@ -79,7 +79,7 @@ def crop_and_slide(source: Rig, images: Sequence[Image], target: Rig) -> list[Vi
         half = per_degree * camera.fov_deg[0] / 2
         columns = np.arange(round(middle - half), round(middle + half)) % panorama.shape[1]
         h, w = camera.size
-        views.append((np.asarray(cv2.resize(panorama[:, columns], (w, h))), np.ones((h, w), bool)))
+        views.append(View(np.asarray(cv2.resize(panorama[:, columns], (w, h)), np.uint8), np.ones((h, w), bool)))
     return views
 
 
@@ -109,7 +109,7 @@ def row_split(source: Rig, images: Sequence[Image], target: Rig) -> list[View]:
                 column, row = column[free], row[free]
             view[inside] = np.asarray(image)[row, column]
             seen |= inside
-        views.append((view, seen))
+        views.append(View(view, seen))
     return views
 
 

@@ -1,0 +1,102 @@
+"""Named methods: whatever renders a sample for a target rig, so that tables can compare them.
+
+A method gets the whole sample and may use what is in it; what it must not see is left out before (``frames``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+from arbiview_aug.evaluate.baselines import BASELINES, Renderer
+from arbiview_aug.evaluate.images import Image, View, as_arrays
+from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, paper
+from arbiview_aug.rig import Rig
+from arbiview_aug.surface import SurfaceName
+from arbiview_aug.transforms import OUTPUTS, RigRetarget
+
+Sample = Mapping[str, Any]
+
+READS_POINTS = ("auto", "lidar")
+"""Surfaces that may be made of a sample's ``points``."""
+
+_HELD_TRANSFORMS = 8  # as many as a set of targets has; full-size plans take 50 MB each
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of a table.
+
+    Attributes:
+        name: Shown in tables.
+        render: Sample with ``rig``, target rig (in its own ego frame): one view for each target camera.
+        reads_points: Whether it may use the sample's ``points``: then only a part of them can score it.
+    """
+
+    name: str
+    render: Callable[[Sample, Rig], list[View]]
+    reads_points: bool = False
+
+
+def retargeting(quality: Quality | FavsConfig | PaperConfig, surface: SurfaceName = "auto", name: str = "") -> Method:
+    """``RigRetarget`` as a method; a transform, with its last plan, for each of the last target rigs."""
+    outputs = tuple(key for key in ("confidence",) if key in OUTPUTS and not isinstance(quality, PaperConfig))
+
+    @lru_cache(_HELD_TRANSFORMS)
+    def transform(target: Rig) -> RigRetarget:
+        return RigRetarget(target, quality=quality, surface=surface, outputs=outputs, cache_bytes=0)
+
+    def render(sample: Sample, target: Rig) -> list[View]:
+        return views_of(transform(target)(sample))
+
+    published = quality == "paper" or isinstance(quality, PaperConfig)
+    label = name or (f"{quality}, {surface}" if isinstance(quality, str) else f"{type(quality).__name__}, {surface}")
+    return Method(label, render, reads_points=surface in READS_POINTS and not published)
+
+
+def views_of(out: Sample) -> list[View]:
+    """A retargeted sample's views."""
+    images, coverage = as_arrays(out["images"]), [mask.cpu().numpy() for mask in out["coverage"]]
+    confidence = [c.float().cpu().numpy() for c in out["confidence"]] if "confidence" in out else [None] * len(images)
+    return [View(*parts) for parts in zip(images, coverage, confidence, strict=True)]
+
+
+def baseline(name: str) -> Method:
+    """One of ``baselines.BASELINES``."""
+    renderer: Renderer = BASELINES[name]
+
+    def render(sample: Sample, target: Rig) -> list[View]:
+        rig: Rig = sample["rig"]
+        images: list[Image] = as_arrays(sample["images"])
+        return renderer(rig, images, target.in_frame_of(rig))
+
+    return Method(name, render)
+
+
+def paper_stages() -> dict[str, PaperConfig]:
+    """``paper`` whole, and with each stage switched off: what each is worth.
+
+    Without stage 4 the fused image is the plain mean of all sources that see a pixel.
+    """
+    whole = paper()
+    return {
+        "paper": whole,
+        "paper without stage 2": replace(whole, use_feature_matching=False),
+        "paper without stage 3": replace(whole, use_object_alignment=False),
+        "paper without stages 2, 3": replace(whole, use_feature_matching=False, use_object_alignment=False),
+        "paper without stage 4": replace(
+            whole,
+            use_distance_weight=False,
+            use_gradient_weight=False,
+            use_quality_weight=False,
+            use_primary_weight=False,
+        ),
+    }
+
+
+def study_methods() -> list[Method]:
+    """The rows of the paper's tables and ours, from images and poses alone: no LiDAR, no boxes."""
+    published = [retargeting(config, "auto", name) for name, config in paper_stages().items()]
+    return [*map(baseline, BASELINES), *published, *(retargeting(q, "street", q) for q in ("draft", "fast"))]
