@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -33,7 +34,9 @@ def source_overlap(
     def from_one(view: Camera, k: int) -> tuple[Image, BoolArray]:
         alone = {key: value for key, value in sample.items() if key not in ("K", "cam2ego")}
         alone |= {"images": [sample["images"][k]], "rig": rig.with_cameras([rig[k]])}
-        (rendered,) = render(alone, rig.with_cameras([view]))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of views that one camera cannot cover: it need not
+            (rendered,) = render(alone, rig.with_cameras([view]))
         return rendered.image, rendered.coverage
 
     return overlap_scores(rig, from_one, size=size)

@@ -56,7 +56,7 @@ def evaluate(
     frames: Iterable[tuple[str, Frame]],
     targets: Callable[[Rig], Mapping[str, Rig]],
     methods: Sequence[Method],
-    tick: Callable[[str], None] = lambda _: None,
+    tick: Callable[[str, int], None] = lambda _, __: None,
 ) -> Evaluation:
     """Run every method on every frame and target.
 
@@ -64,29 +64,36 @@ def evaluate(
         frames: Names and frames.
         targets: The rigs to render, by name, for a source rig.
         methods: What renders them.
-        tick: Told before each step what it is: once a frame and method, and once for each of its targets.
+        tick: Told before each step what it is, and how many steps the frame has.
     """
     done = Evaluation()
     for name, frame in frames:
         rigs = dict(targets(frame.sample["rig"]))
         if done.first is None:
             done.first, done.targets = frame, rigs
+        steps = len(methods) * (1 + len(rigs))
         for method in methods:
-            tick(f"{name}: {method.name}")
             try:
-                _one(done, name, frame, rigs, method, tick)
+                _one(done, name, frame, rigs, method, steps, tick)
             except (CalibrationError, SampleError) as error:  # lenses, for a method of pinhole cameras
                 done.declined[method.name] = str(error)
     return done
 
 
 def _one(
-    done: Evaluation, name: str, frame: Frame, rigs: Mapping[str, Rig], method: Method, tick: Callable[[str], None]
+    done: Evaluation,
+    name: str,
+    frame: Frame,
+    rigs: Mapping[str, Rig],
+    method: Method,
+    steps: int,
+    tick: Callable[[str, int], None],
 ) -> None:
+    tick(f"{name}: {method.name}, overlap", steps)
     for pair in source_overlap(frame.sample, method.render):
         done.pairs.append({"frame": name, "method": method.name, "kind": "overlap", **pair._asdict()})
     for target, rig in rigs.items():
-        tick(f"{name}: {method.name}, {target}")
+        tick(f"{name}: {method.name}, {target}", steps)
         views, rows = scores(frame, method.render, rig)
         if frame is done.first:
             done.pictures[target, method.name] = views
