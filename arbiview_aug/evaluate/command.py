@@ -97,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--quality", nargs="+", choices=get_args(Quality), default=["fast"], help="(default: fast)")
     parser.add_argument("--surface", nargs="+", choices=get_args(SurfaceName), default=["auto"], help="(default: auto)")
-    parser.add_argument("--frames", type=count, default=1, metavar="N", help="how many (default: %(default)s)")
+    parser.add_argument("--frames", type=count, metavar="N", help="how many (default: 1; --paper: 3 synthetic ones)")
     parser.add_argument("--seed", type=seed, default=0, help="of the synthetic streets (default: %(default)s)")
     parser.add_argument("--reduce", type=int, choices=(1, 2, 4), default=1, help="decode images at 1, 1/2 or 1/4 size")
     parser.add_argument("--size", type=size, metavar="HxW", help="of every view; of synthetic sources too (256x704)")
@@ -130,7 +130,7 @@ def _yaws(text: str) -> str | list[float]:
 def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> str:
     methods = [retargeting(quality, surface) for quality in arguments.quality for surface in arguments.surface]
     data, targets = _data(arguments), partial(_targets, arguments)
-    frames = min(arguments.frames, len(data))
+    frames = min(arguments.frames or 1, len(data))
     held_out = any(method.reads_points for method in methods)
     with gathered_warnings(notes), tqdm(unit="step", leave=False) as progress:
 
@@ -156,7 +156,7 @@ def _data(arguments: argparse.Namespace) -> Any:
     if arguments.data is not None:
         return open_data(arguments.data, reduce=arguments.reduce)
     source = demo_source_rig(**({} if arguments.size is None else {"size": arguments.size}))
-    return SyntheticDrive(source, num_frames=arguments.frames, seed=arguments.seed)
+    return SyntheticDrive(source, num_frames=arguments.frames or 1, seed=arguments.seed)
 
 
 def _targets(arguments: argparse.Namespace, source: Rig) -> dict[str, Rig]:

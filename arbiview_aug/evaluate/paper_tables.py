@@ -73,7 +73,7 @@ class Study:
 def measure_paper(
     data: str | Path | None = None,
     *,
-    frames: int = 1,
+    frames: int | None = None,
     size: tuple[int, int] | None = None,
     methods: Sequence[Method] | None = None,
     tick: Callable[[str, int], None] = lambda _, __: None,
@@ -82,7 +82,7 @@ def measure_paper(
 
     Args:
         data: A folder of real frames; by default ``REAL_FRAMES`` below ARBIVIEW_DATA, and the synthetic set.
-        frames: How many of each real data set.
+        frames: How many of each data set; by default 1 of real ones and ``SYNTHETIC_FRAMES``.
         size: (h, w) of the synthetic images, for a quick look.
         methods: By default ``study_methods``.
         tick: Told before each step what it is, and how many there are so far.
@@ -114,18 +114,18 @@ def measure_paper(
 
 
 def _data_sets(
-    data: str | Path | None, frames: int, size: tuple[int, int] | None
+    data: str | Path | None, frames: int | None, size: tuple[int, int] | None
 ) -> Iterator[tuple[str, Iterator[Frame]]]:
     root = os.environ.get("ARBIVIEW_DATA")
     folders = [Path(data)] if data is not None else [Path(root) / name for name in REAL_FRAMES] if root else []
     for folder in folders:
         if data is not None or folder.is_dir():
             samples = open_data(folder, reduce=2)
-            count = min(frames, len(samples))
+            count = min(frames or 1, len(samples))
             yield folder.resolve().name, (make_frame(samples[k]) for k in range(count))
     if data is None:
         drive = SyntheticDrive(
-            demo_source_rig(size or SYNTHETIC_SIZE), num_frames=SYNTHETIC_FRAMES, seed=SYNTHETIC_SEED
+            demo_source_rig(size or SYNTHETIC_SIZE), num_frames=frames or SYNTHETIC_FRAMES, seed=SYNTHETIC_SEED
         )
         yield (
             SYNTHETIC,

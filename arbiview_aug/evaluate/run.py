@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from arbiview_aug.errors import CalibrationError, SampleError
-from arbiview_aug.evaluate.agreement import source_overlap, summary, target_consistency
+from arbiview_aug.evaluate.consistency import source_overlap, summary, target_consistency
 from arbiview_aug.evaluate.frames import Frame, scores
 from arbiview_aug.evaluate.images import View
 from arbiview_aug.evaluate.methods import Method
