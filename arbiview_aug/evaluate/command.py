@@ -129,7 +129,8 @@ def _yaws(text: str) -> str | list[float]:
 # --- the work ---------------------------------------------------------------------------------------------------------
 def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> str:
     methods = [retargeting(quality, surface) for quality in arguments.quality for surface in arguments.surface]
-    data, targets = _data(arguments), partial(_targets, arguments)
+    asked = None if arguments.target is None else load_rig(arguments.target)
+    data, targets = _data(arguments), partial(_targets, arguments, asked)
     frames = min(arguments.frames or 1, len(data))
     held_out = any(method.reads_points for method in methods)
     with gathered_warnings(notes), tqdm(unit="step", leave=False) as progress:
@@ -159,11 +160,10 @@ def _data(arguments: argparse.Namespace) -> Any:
     return SyntheticDrive(source, num_frames=arguments.frames or 1, seed=arguments.seed)
 
 
-def _targets(arguments: argparse.Namespace, source: Rig) -> dict[str, Rig]:
+def _targets(arguments: argparse.Namespace, asked: Rig | None, source: Rig) -> dict[str, Rig]:
     """The rigs to render, by name."""
     if arguments.yaws is None:
-        default = load_rig(_REAL_TARGET) if arguments.data is not None else demo_target_rig(source.sizes[0])
-        rig = default if arguments.target is None else load_rig(arguments.target)
+        rig = asked or (load_rig(_REAL_TARGET) if arguments.data else demo_target_rig(source.sizes[0]))
         found = {rig.name or "target": rig}
     elif isinstance(arguments.yaws, str):
         found = named_targets(arguments.yaws, source)

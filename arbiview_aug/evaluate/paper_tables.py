@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from arbiview_aug.datasets import open_data
+from arbiview_aug.datasets.images import Reduce
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import CalibrationError, SampleError
 from arbiview_aug.evaluate.frames import Exposure, Frame, make_frame, scores
@@ -27,6 +28,9 @@ REAL_FRAMES = ("nuscenes-one", "ddad-one")
 SYNTHETIC = "synthetic"
 SYNTHETIC_FRAMES, SYNTHETIC_SEED, SYNTHETIC_SIZE = 3, 0, (256, 704)
 """The fixed synthetic set."""
+
+REDUCE: Reduce = 2
+"""Real images are decoded at half size, as accuracy is reported everywhere."""
 
 SETS = ("paper", "yaw", "vehicles", "truck")
 
@@ -120,7 +124,7 @@ def _data_sets(
     folders = [Path(data)] if data is not None else [Path(root) / name for name in REAL_FRAMES] if root else []
     for folder in folders:
         if data is not None or folder.is_dir():
-            samples = open_data(folder, reduce=2)
+            samples = open_data(folder, reduce=REDUCE)
             count = min(frames or 1, len(samples))
             yield folder.resolve().name, (make_frame(samples[k]) for k in range(count))
     if data is None:
