@@ -24,12 +24,12 @@ from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.evaluate.frames import Frame, make_frame, scores
 from arbiview_aug.evaluate.images import View, as_arrays
-from arbiview_aug.evaluate.methods import retargeting, views_of
+from arbiview_aug.evaluate.methods import Method, retargeting, views_of
 from arbiview_aug.evaluate.pictures import save_picture
 from arbiview_aug.evaluate.scores import mean_of
 from arbiview_aug.evaluate.sheet import frame_sheet
 from arbiview_aug.evaluate.tables import SEEN, SPARSE_COLUMNS, SPARSE_NOTES, TRUTH_COLUMNS, TRUTH_NOTES, text_table
-from arbiview_aug.favs.config import PlanQuality
+from arbiview_aug.favs.config import Quality
 from arbiview_aug.rig import Rig, load_rig, shipped_rigs
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.transforms import RigRetarget
@@ -51,19 +51,21 @@ class _Data:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Retarget, explain, compare, and write the contact sheet."""
-    arguments = _parser().parse_args(argv)
+    parser = _parser()
+    arguments = parser.parse_args(argv)
+    if arguments.quality == "paper" and arguments.surface not in ("auto", "far"):
+        parser.error(f"argument --surface: quality paper knows the far surface alone, got {arguments.surface}")
     picture_path = _picture_path(arguments.output)
     data = _load(arguments)
     frames = min(arguments.frames, len(data.samples))
-    surfaces = list(dict.fromkeys((arguments.surface, *_COMPARED)))
-    methods = {surface: retargeting(arguments.quality, surface) for surface in surfaces}
-    reads_points = any(method.reads_points for method in methods.values())
-    rows: dict[str, list[dict[str, float]]] = {surface: [] for surface in surfaces}
+    methods = _compared(arguments.quality, arguments.surface)
+    reads_points = any(method.reads_points for method in methods)
+    rows: dict[str, list[dict[str, float]]] = {method.name: [] for method in methods}
     plan_ms: list[float] = []
     frame_ms: list[float] = []
     first: tuple[dict[str, Any], Frame, list[View]] | None = None
     notes: list[str] = []
-    with gathered_warnings(notes), tqdm(total=frames * (2 + len(surfaces)), unit="step", leave=False) as progress:
+    with gathered_warnings(notes), tqdm(total=frames * (2 + len(methods)), unit="step", leave=False) as progress:
         chosen = RigRetarget(data.target, quality=arguments.quality, surface=arguments.surface)
         for index in range(frames):
             progress.set_description(f"frame {index + 1}/{frames}: source views")
@@ -75,9 +77,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             progress.update()
             for times, ms in zip((frame_ms, plan_ms), _timings(chosen, sample), strict=True):
                 times.append(ms)
-            for surface, method in methods.items():
-                progress.set_description(f"frame {index + 1}/{frames}: target views, surface {surface}")
-                rows[surface].extend(scores(frame, method.render, data.target)[1])
+            for method in methods:
+                progress.set_description(f"frame {index + 1}/{frames}: target views, {method.name}")
+                rows[method.name].extend(scores(frame, method.render, data.target)[1])
                 progress.update()
             first = first or (sample, frame, views_of(chosen(sample)))
     assert first is not None
@@ -85,13 +87,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     for note in notes:
         print(f"note: {note}\n")
     print(f"{sample['rig']!r}\n\n{data.target!r}\n\n{chosen.explain(sample)}\n")
-    means = {surface: mean_of(found) for surface, found in rows.items()}
+    means = {name: mean_of(found) for name, found in rows.items()}
     print(_table(means, frame, f"{len(data.target)} cameras, {frames} frame{'s' if frames > 1 else ''}"))
     width_height = "x".join(map(str, data.target.sizes[0][::-1]))
+    planned = f"a new plan, for another calibration or other boxes, takes {statistics.median(plan_ms):.0f} ms more."
+    if arguments.quality == "paper":
+        planned = "nothing can be planned ahead."
     print(
         f"\n{statistics.median(frame_ms):.1f} ms a frame: {len(sample['rig'])} source images to {len(data.target)} "
-        f"views of {width_height}, quality {arguments.quality}, {cv2.getNumThreads()} threads; a new plan, for another "
-        f"calibration or other boxes, takes {statistics.median(plan_ms):.0f} ms more."
+        f"views of {width_height}, quality {arguments.quality}, {cv2.getNumThreads()} threads; {planned}"
     )
     true = None if frame.truth is None else as_arrays(frame.truth(data.target).images)
     images = as_arrays(sample["images"])
@@ -124,7 +128,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help=f"folder for {PICTURE_FILE}, or a picture file ending in .png or .jpg (default: %(default)s)",
     )
-    parser.add_argument("--quality", choices=get_args(PlanQuality), default="fast", help="(default: %(default)s)")
+    parser.add_argument(
+        "--quality",
+        choices=get_args(Quality),
+        default="fast",
+        help="(default: %(default)s); paper: the published method, beside fast on the other surfaces, without lenses",
+    )
     parser.add_argument("--surface", choices=get_args(SurfaceName), default="auto", help="(default: %(default)s)")
     parser.add_argument("--frames", type=count, default=1, metavar="N", help="how many (default: %(default)s)")
     parser.add_argument("--seed", type=seed, default=0, help="of the synthetic streets (default: %(default)s)")
@@ -150,15 +159,25 @@ def _picture_path(output: str) -> Path:
 
 
 def _load(arguments: argparse.Namespace) -> _Data:
-    target = None if arguments.target is None else load_rig(arguments.target)
+    name = arguments.target or (_REAL_TARGET if arguments.data else None)
+    target = None if name is None else load_rig(name)
+    if target is not None and arguments.quality == "paper":  # homographies know no lens
+        target = target.undistorted()
     if arguments.data is not None:
-        target = target or load_rig(_REAL_TARGET)
+        assert target is not None
         return _Data(open_data(arguments.data), _resized(target, arguments.size), None)
     size_given = {} if arguments.size is None else {"size": arguments.size}
     source = demo_source_rig(**size_given)
     target = demo_target_rig(**size_given) if target is None else _resized(target, arguments.size or source.sizes[0])
     drive = SyntheticDrive(source, num_frames=arguments.frames, seed=arguments.seed, lidar=False)
     return _Data(drive, target, drive.render)
+
+
+def _compared(quality: Quality, surface: SurfaceName) -> list[Method]:
+    """What was asked for, and the surfaces that it is compared with."""
+    if quality == "paper":
+        return [retargeting("paper", surface, "paper"), *(retargeting("fast", s, s) for s in _COMPARED)]
+    return [retargeting(quality, s, s) for s in dict.fromkeys((surface, *_COMPARED))]
 
 
 def _resized(rig: Rig, to: tuple[int, int] | None) -> Rig:

@@ -1,9 +1,13 @@
-"""Checks of the Python environment."""
+"""Checks of the Python environment, and what in it must be switched off for results to repeat."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import metadata
+
+import cv2
 
 CV2_WHEELS = (
     "opencv-python",
@@ -43,3 +47,21 @@ def warn_about_cv2_wheels() -> None:
         RuntimeWarning,
         stacklevel=3,
     )
+
+
+@contextmanager
+def repeatable_opencv() -> Iterator[None]:
+    """OpenCV on one thread and without Intel's IPP, so that the same images give the same bits; as before afterwards.
+
+    The last bits of IPP's ``distanceTransform`` and ``magnitude`` depend on where in memory their buffers lie, and
+    SIFT's angles on those (OpenCV 5.0, IPP 2026.0). IPP can be switched off for the calling thread only, hence the one
+    thread; that number is the whole process's.
+    """
+    ipp, threads = cv2.ipp.useIPP(), cv2.getNumThreads()
+    cv2.ipp.setUseIPP(False)
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.ipp.setUseIPP(ipp)
+        cv2.setNumThreads(threads)

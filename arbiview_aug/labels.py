@@ -19,6 +19,7 @@ from arbiview_aug.tensors import gathered, nearest_resized, rewrapped, split, st
 PIXEL_BOUND_KEYS = (
     "boxes_2d",
     "labels_2d",
+    "detections",
     "centers_2d",
     "depths",
     "depth",

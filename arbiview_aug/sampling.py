@@ -20,8 +20,6 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from arbiview_aug.tone import ToneCurve
-
 OUTSIDE = -16
 """Whole-pixel coordinate of a map entry that reads nothing: far enough that no bilinear tap touches the atlas."""
 
@@ -43,6 +41,10 @@ class FixedMap:
     def fill_rows(self, y0: int, y1: int, uv: npt.NDArray[np.float32]) -> None:
         """Round a float map (y1 - y0, w, 2) into rows y0 to y1."""
         cv2.convertMaps(uv, None, cv2.CV_16SC2, self.xy[y0:y1], self.frac[y0:y1])  # type: ignore[call-overload]
+
+    def rows(self, y0: int, y1: int) -> FixedMap:
+        """Rows y0 to y1, the same memory."""
+        return FixedMap(self.xy[y0:y1], self.frac[y0:y1])
 
     def rounded(self) -> FixedMap:
         """The same map at the nearest whole pixels."""
@@ -153,14 +155,9 @@ def interleaved(image: torch.Tensor) -> np.ndarray | None:
     return array.numpy() if array.is_contiguous() else None
 
 
-def fill_atlas(
-    layout: AtlasLayout, images: Sequence[torch.Tensor], scratch: Scratch, curves: Sequence[ToneCurve] | None = None
-) -> np.ndarray:
-    """The atlas (rows, columns, 3) of (3, H, W) uint8 or float32 CPU images; channels-last stacks are not copied.
-
-    With tone curves, one for each image, everything is copied: the images themselves are the user's.
-    """
-    block = _stacked_block(layout, images) if curves is None else None
+def fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor], scratch: Scratch) -> np.ndarray:
+    """The atlas (rows, columns, 3) of (3, H, W) uint8 or float32 CPU images; channels-last stacks are not copied."""
+    block = _stacked_block(layout, images)
     if block is not None:
         return block
     dtype = np.uint8 if images[0].dtype == torch.uint8 else np.float32
@@ -170,14 +167,10 @@ def fill_atlas(
         place = atlas[slot.y : slot.y + h, slot.x : slot.x + w]
         image = interleaved(images[slot.source])
         if image is not None:
-            image = halved(image, slot.level)
+            halved(image, slot.level, dst=place)
         else:
             planes = images[slot.source].contiguous().numpy()
-            image = cv2.merge([halved(plane, slot.level) for plane in planes], dst=place)
-        if curves is not None and curves[slot.source].gain != 1:
-            curves[slot.source].write(image, place)
-        elif image is not place:
-            place[...] = image
+            cv2.merge([halved(plane, slot.level) for plane in planes], dst=place)
     return atlas
 
 
@@ -199,11 +192,14 @@ def _stacked_block(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> np.nd
     return stack.numpy()
 
 
-def halved(image: np.ndarray, level: int) -> np.ndarray:
-    """The image (H, W[, 3]) after ``level`` halvings by 2x2 means."""
-    for _ in range(level):
+def halved(image: np.ndarray, level: int, dst: np.ndarray | None = None) -> np.ndarray:
+    """The image (H, W[, 3]) after ``level`` halvings by 2x2 means; written into ``dst`` where that is given."""
+    for k in range(level):
         h, w = image.shape[0] // 2, image.shape[1] // 2
-        image = cv2.resize(image[: 2 * h, : 2 * w], (w, h), interpolation=cv2.INTER_AREA)
+        last = dst if k == level - 1 else None
+        image = cv2.resize(image[: 2 * h, : 2 * w], (w, h), dst=last, interpolation=cv2.INTER_AREA)
+    if dst is not None and level == 0:
+        dst[...] = image
     return image
 
 
@@ -215,13 +211,8 @@ def remap(atlas: np.ndarray, at: FixedMap, interpolation: str, dst: np.ndarray |
 
 
 # --- torch ------------------------------------------------------------------------------------------------------------
-def torch_atlas(
-    layout: AtlasLayout, images: Sequence[torch.Tensor], curves: Sequence[Sequence[ToneCurve] | None] | None = None
-) -> torch.Tensor:
-    """The atlas (B, 3, rows, columns) float32 of (B, 3, H, W) images in 0..255 or [0, 1]; differentiable.
-
-    Tone curves, where given, are one for each image, for each frame of the batch that has any.
-    """
+def torch_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Tensor:
+    """The atlas (B, 3, rows, columns) float32 of (B, 3, H, W) images in 0..255 or [0, 1]; differentiable."""
     whole = images[0].dtype == torch.uint8
     batch, device = images[0].shape[0], images[0].device
     atlas = torch.zeros((batch, 3, *layout.size), dtype=torch.float32, device=device)
@@ -232,18 +223,8 @@ def torch_atlas(
             image = torch.nn.functional.avg_pool2d(image, 2)
             if whole:
                 image = torch.floor(image + 0.5)  # as OpenCV rounds its halved uint8 images
-        if curves is not None:
-            frames = zip(image, curves, strict=True)
-            image = torch.stack([_toned(one, of[slot.source], whole) if of else one for one, of in frames])
         atlas[:, :, slot.y : slot.y + h, slot.x : slot.x + w] = image
     return atlas
-
-
-def _toned(image: torch.Tensor, curve: ToneCurve, whole: bool) -> torch.Tensor:
-    """An image after its curve; rounded where the OpenCV execution looks whole numbers up in a table."""
-    if curve.gain == 1:
-        return image
-    return torch.floor(curve.of_tensor(image, 255.0) + 0.5).clamp(0, 255) if whole else curve.of_tensor(image)
 
 
 def torch_grid(uv: npt.NDArray[np.floating], atlas_size: tuple[int, int], device: torch.device) -> torch.Tensor:

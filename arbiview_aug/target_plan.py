@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from arbiview_aug.maps import PairMap, TargetRays, edge_distance, resolution
 from arbiview_aug.rig import Rig
 from arbiview_aug.sampling import AtlasLayout, FixedMap, Scratch
 from arbiview_aug.surface import Surface, worst_parallax_px
+from arbiview_aug.tone import Patch, patches
 
 SAME_CENTER_M = 1e-6
 """Centres closer than this coincide: a homography is exact whatever the scene."""
@@ -90,6 +92,11 @@ class TargetPlan:
     def coverage(self) -> BoolArray:
         """(h, w) True where some source sees the pixel."""
         return self.source_camera >= 0
+
+    @cached_property
+    def patches(self) -> list[list[Patch]]:
+        """For each strip of rows, which source wins where, for tone curves; found when first asked for."""
+        return patches(self.source_camera, [pair.source for pair in self.pairs])
 
     @property
     def nbytes(self) -> int:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import torch
 
+from arbiview_aug.detections import OfCameras, detections_of_frames
 from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError
 from arbiview_aug.explain import Explanation, PaperExplanation
@@ -67,7 +68,9 @@ class RigRetarget(torch.nn.Module):
         source_rig: The rig of every sample that carries none.
         path: ``favs``: stitching.
         quality: ``draft``, ``fast``, or a ``FavsConfig``; ``paper`` or a ``PaperConfig``: stages 1 to 4 as published,
-            on the CPU, for pinhole cameras.
+            on the CPU, for pinhole cameras. Its objects take their types from the sample, where it has ``detections``
+            (for each camera ``{"boxes": (n, 4), "labels": [n names]}`` in source pixels, as torchvision's detectors
+            return them) or else ``boxes_3d``, with ``box_names`` (a name each) where there are any.
         surface: ``far``, ``ground``, ``street``; ``objects``: the sample's ``boxes_3d`` stand on the street, so that
             objects keep their height when cameras move; ``auto``: for each pair of cameras ``far`` where their centres
             coincide, else the best that the sample offers: ``objects`` with ``boxes_3d``, else ``street``, with a
@@ -178,8 +181,9 @@ class RigRetarget(torch.nn.Module):
         target, skip, drawn = self._draw(sample, frames, params)
         views: list[View] = []
         scenes = self._scenes(sample, len(frames), lead)
-        for frame, scene in zip(frames, scenes, strict=True):
-            views.append(self.size if skip and self.size else self._view(frame, target, scene))
+        found = self._detections(sample, frames, lead)
+        for frame, scene, detections in zip(frames, scenes, found, strict=True):
+            views.append(self.size if skip and self.size else self._view(frame, target, scene, detections))
         parts = self._rendered(frames, views)
         out = self._kept(sample, labels)
         out["images"] = rewrapped(gathered([part["images"] for part in parts], lead), sample["images"])
@@ -311,11 +315,21 @@ class RigRetarget(torch.nn.Module):
             return [Scene()] * count
         return scenes_of_frames(sample, count, lead, self.surface)
 
-    def _view(self, frame: SourceFrame, target: Rig, scene: Scene) -> RenderPlan | PaperRendering:
+    def _detections(
+        self, sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...]
+    ) -> Sequence[OfCameras]:
+        """The objects that each frame's sample names, for the published stages."""
+        if isinstance(self.config, PaperConfig) and self.config.use_detections:
+            return detections_of_frames(sample, frames, lead)
+        return [{}] * len(frames)
+
+    def _view(
+        self, frame: SourceFrame, target: Rig, scene: Scene, detections: OfCameras
+    ) -> RenderPlan | PaperRendering:
         """The plan of a frame, or the frame rendered by the published stages, for which nothing can be planned."""
         if not isinstance(self.config, PaperConfig):
             return self.plan(frame.rig, target, scene)
-        rendering = render_paper(frame.rig, target.in_frame_of(frame.rig), frame.images, self.config)
+        rendering = render_paper(frame.rig, target.in_frame_of(frame.rig), frame.images, self.config, detections)
         self._warn_unreachable(rendering)
         return rendering
 
@@ -372,9 +386,10 @@ class RigRetarget(torch.nn.Module):
         """
         frames, lead = check_inputs(sample, self.source_rig), leading_shape(sample["images"])
         target, _, _ = self._draw(sample, frames[:1], None)
-        (scene,) = self._scenes(sample, len(frames), lead)[:1]
+        scene = self._scenes(sample, len(frames), lead)[0]
+        detections = self._detections(sample, frames, lead)[0]
         asked = self.harmoniser.estimates or self.harmoniser.gains is not None
-        view = self._view(frames[0], target, scene)
+        view = self._view(frames[0], target, scene, detections)
         if isinstance(view, PaperRendering):
             return PaperExplanation(view)
         return Explanation(view, self.harmonisation(sample) if asked else None)

@@ -52,6 +52,20 @@ def test_real_keyframe(reader: str, nuscenes_root: Path, tmp_path: Path, capsys:
     assert cv2.imread(str(picture)) is not None
 
 
+def test_the_published_method_beside_fast(nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    options = ["--quality", "paper", "--output", str(tmp_path)]
+    assert main(["demo", *options, "--size", "64x112"]) == 0
+    printed = capsys.readouterr().out
+    assert "stages 1 to 4 as published" in printed and "nothing can be planned ahead" in printed
+    # 0.6 m higher, rotations alone miss the road.
+    assert numbers(printed, "street")[2] > numbers(printed, "paper")[2] + 3
+    assert main(["demo", *options, "--size", "64x112", "--data", str(nuscenes_root)]) == 0  # waymo's lenses undistorted
+    assert numbers(capsys.readouterr().out, "paper")[0] > 80
+    with pytest.raises(SystemExit, match="2"):
+        main(["demo", *options, "--surface", "street"])
+    assert "quality paper knows the far surface alone" in capsys.readouterr().err
+
+
 def test_lenses_without_points(fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--target", "ddad", "--size", "120x200", "--output", str(tmp_path), "--surface", "far"]
     assert main(["demo", "--data", str(fisheye_root), *arguments]) == 0

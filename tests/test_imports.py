@@ -34,7 +34,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("favs.synthesis",),
     ("tensors", "random_rig", "explain"),
     ("sample",),
-    ("labels",),
+    ("labels", "detections"),
     ("datasets", "transforms"),
     ("evaluate",),
     ("bench", "convert", "demo", "inspect"),

@@ -16,7 +16,8 @@ the median over the rounds; a ratio is the median over the rounds of candidate /
 ``frame`` is the cached plan executed: the sample's uint8 images in, one uint8 (M, 3, h, w) tensor out. ``interleaved``
 images lie channels-last in one block, as this package's readers give them, ``planar`` ones are contiguous. ``whole
 call`` is ``RigRetarget`` with its checks and the plan's lookup. ``plan`` builds the plan of a calibration that was not
-seen before; its ratio is to the frame, which it precedes where every frame has its own calibration.
+seen before; its ratio is to the frame, which it precedes where every frame has its own calibration. ``harmonised`` is
+the frame with known gains for all cameras.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ from arbiview_aug.favs.synthesis import render_opencv
 from arbiview_aug.plan import build_plan
 from arbiview_aug.rig import Rig, load_rig
 from arbiview_aug.sampling import Scratch
+from arbiview_aug.tone import ToneCurve
 from arbiview_aug.transforms import RigRetarget
 
 YAW_DEG = 22.0
@@ -57,6 +59,8 @@ _SMALL_ROUNDS = 3
 _NEW_CALIBRATION_M = 0.01
 _EGO_MOTION = (0.4, 0.07)
 """Largest movement (m) and turn (deg) of a camera between its own and the LiDAR's time on nuScenes."""
+_GAINS = (0.8, 1.1, 0.9, 1.25, 1.05, 0.95)
+"""Gains of every source, as far apart as a real frame's: none of them is free."""
 _DISTRIBUTIONS = ("arbiview_aug", "torch", "numpy")
 
 
@@ -193,6 +197,7 @@ def _full_size(rig: Rig, images: torch.Tensor) -> list[_Candidate]:
         _Candidate(floor, _floor(images, rig.sizes[0])),
         _Candidate(frame, _frame(rig, target, images), floor, 1.5),
         _Candidate(f"{label} frame, planar", _frame(rig, target, images.contiguous()), floor, 1.5),
+        _Candidate(f"{label} frame, harmonised", _frame(rig, target, images, _GAINS), frame),
         _Candidate(f"{label} whole call", _call(rig, target, images), floor),
         _Candidate(f"{label} plan", _plan(rig, target), frame, 1.5),
         _Candidate(f"{label} plan, ego motion", _plan_with_ego_motion(rig, target), frame),
@@ -206,7 +211,9 @@ def _small_size(rig: Rig, images: torch.Tensor, halves: torch.Tensor, size: tupl
     return [
         _Candidate(floor, _floor(images, size)),
         _Candidate(full, _frame(rig, target, images), floor, 2.2),
+        _Candidate(f"{full}, harmonised", _frame(rig, target, images, _GAINS), full),
         _Candidate(half, _frame(half_rig, target, halves), floor, 1.6),
+        _Candidate(f"{half}, harmonised", _frame(half_rig, target, halves, _GAINS), half),
         _Candidate(f"{label} whole call, from half size", _call(half_rig, target, halves), floor),
         _Candidate(f"{label} plan, from full size", _plan(rig, target), full, 1.5),
         _Candidate(f"{label} plan, from half size", _plan(half_rig, target), half, 1.5),
@@ -228,9 +235,10 @@ def _floor(images: torch.Tensor, size: tuple[int, int]) -> Callable[[], None]:
     return run
 
 
-def _frame(source: Rig, target: Rig, images: torch.Tensor) -> Callable[[], Any]:
+def _frame(source: Rig, target: Rig, images: torch.Tensor, gains: Sequence[float] = ()) -> Callable[[], Any]:
     plan, scratch, views = build_plan(source, target), Scratch(), list(images)
-    return lambda: render_opencv(plan, views, scratch)
+    curves = [ToneCurve(gains[k % len(gains)]) for k in range(len(source))] if gains else None
+    return lambda: render_opencv(plan, views, scratch, curves)
 
 
 def _call(source: Rig, target: Rig, images: torch.Tensor) -> Callable[[], Any]:

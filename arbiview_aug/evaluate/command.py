@@ -169,6 +169,8 @@ def _targets(arguments: argparse.Namespace, asked: Rig | None, source: Rig) -> d
         found = named_targets(arguments.yaws, source)
     else:
         found = {f"yaw {yaw:+g}": without_masks(source.turned(yaw_deg=yaw)) for yaw in arguments.yaws}
+    if "paper" in arguments.quality:  # homographies know no lens, and all rows are of one target
+        found = {name: rig.undistorted() for name, rig in found.items()}
     if arguments.size is None:
         return found
     return {name: rig.resized(arguments.size) for name, rig in found.items()}

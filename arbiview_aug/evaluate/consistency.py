@@ -32,7 +32,7 @@ def source_overlap(
     rig: Rig = sample["rig"]
 
     def from_one(view: Camera, k: int) -> tuple[Image, BoolArray]:
-        alone = {key: value for key, value in sample.items() if key not in ("K", "cam2ego")}
+        alone = {key: value for key, value in sample.items() if key not in ("K", "cam2ego", "detections")}
         alone |= {"images": [sample["images"][k]], "rig": rig.with_cameras([rig[k]])}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of views that one camera cannot cover: it need not

@@ -126,22 +126,20 @@ def _data_sets(
         if data is not None or folder.is_dir():
             samples = open_data(folder, reduce=REDUCE)
             count = min(frames or 1, len(samples))
-            yield folder.resolve().name, (make_frame(samples[k]) for k in range(count))
+            yield folder.resolve().name, (make_frame(_bare(samples[k])) for k in range(count))
     if data is None:
         drive = SyntheticDrive(
             demo_source_rig(size or SYNTHETIC_SIZE), num_frames=frames or SYNTHETIC_FRAMES, seed=SYNTHETIC_SEED
         )
-        yield (
-            SYNTHETIC,
-            (
-                make_frame(
-                    {key: value for key, value in drive[k].items() if key != "boxes_3d"},
-                    truth=partial(drive.render, k),
-                    exposures=("raw",),
-                )
-                for k in range(len(drive))
-            ),
+        streets = (
+            make_frame(_bare(drive[k]), truth=partial(drive.render, k), exposures=("raw",)) for k in range(len(drive))
         )
+        yield SYNTHETIC, streets
+
+
+def _bare(sample: Mapping[str, Any]) -> dict[str, Any]:
+    """Without labels; the points only score."""
+    return {key: value for key, value in sample.items() if key not in ("boxes_3d", "detections")}
 
 
 # --- the table --------------------------------------------------------------------------------------------------------

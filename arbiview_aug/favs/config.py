@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-PlanQuality = Literal["draft", "fast"]
 Quality = Literal["draft", "fast", "paper"]
 
 
@@ -72,6 +71,9 @@ class PaperConfig:
 
     use_object_alignment: bool = True
     """Stage 3: shift H_base by the objects' mean offset."""
+
+    use_detections: bool = True
+    """Stage 3: objects that a detection holds get its type, where the sample has any; off, all types are geometric."""
 
     use_distance_weight: bool = True
     """Stage 4: w_distance."""
@@ -175,8 +177,9 @@ class PaperConfig:
                 raise ValueError(f"PaperConfig.type_weights: {kind}: expected a number from 0 to 1e+06, got {weight!r}")
 
     def type_weight(self, kind: str) -> float:
-        """type_weight_j of a type."""
-        return dict(self.type_weights).get(kind, self.other_type_weight)
+        """type_weight_j of a type; of a name in parts such as ``vehicle.car``, that of the first part listed."""
+        weights = dict(self.type_weights)
+        return next((weights[name] for name in (kind, *kind.split(".")) if name in weights), self.other_type_weight)
 
 
 _PAPER_RANGES: dict[str, tuple[float, float]] = {

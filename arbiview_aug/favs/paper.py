@@ -20,6 +20,7 @@ import numpy.typing as npt
 import torch
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
+from arbiview_aug.environment import repeatable_opencv
 from arbiview_aug.errors import CalibrationError, SampleError
 from arbiview_aug.favs.adaptive_fusion import distance_weight, fuse, gradient_weight, primary_weight
 from arbiview_aug.favs.config import PaperConfig
@@ -114,8 +115,7 @@ def render_paper(
 ) -> PaperRendering:
     """Render a target rig by the published stages.
 
-    The same images give the same result, bit for bit: OpenCV's random generator is seeded before every use (and so
-    changed for the caller's thread).
+    The same images give the same result, bit for bit, in every process: meanwhile OpenCV has one thread.
 
     Args:
         source: Pinhole cameras; their masks are honoured: the own car's pixels are never read.
@@ -138,9 +138,10 @@ def render_paper(
     arrays = [_masked(camera, image) for camera, image in zip(source, images, strict=True)]
     order = content_order(source.cameras)
     views = []
-    for camera in target:
-        blended, winners, reports = _render_view(source, order, camera, arrays, config, detections or {})
-        views.append(PaperView(_as_tensor(blended, images[0].dtype), winners, reports))
+    with repeatable_opencv():
+        for camera in target:
+            blended, winners, reports = _render_view(source, order, camera, arrays, config, detections or {})
+            views.append(PaperView(_as_tensor(blended, images[0].dtype), winners, reports))
     return PaperRendering(source, target, tuple(views))
 
 

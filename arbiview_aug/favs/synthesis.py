@@ -11,7 +11,7 @@ import torch
 from arbiview_aug import sampling
 from arbiview_aug.plan import RenderPlan
 from arbiview_aug.sampling import Scratch
-from arbiview_aug.tone import ToneCurve
+from arbiview_aug.tone import STRIP_ROWS, ToneCurve
 
 
 def render_opencv(
@@ -26,7 +26,7 @@ def render_opencv(
         plan: The plan for these images' rig.
         images: N images (3, H, W): uint8, or float in [0, 1].
         scratch: Buffers to reuse between calls.
-        curves: A tone curve for each image; the images themselves are not changed.
+        curves: A tone curve for each image, applied to what the target reads of it.
 
     Returns:
         M views (3, h, w) of the images' type, black where no source sees; slices of one (M, 3, h, w) block where all
@@ -35,7 +35,7 @@ def render_opencv(
     scratch = scratch or Scratch()
     dtype = images[0].dtype
     work = torch.uint8 if dtype == torch.uint8 else torch.float32
-    atlas = sampling.fill_atlas(plan.layout, [image.detach().to(work) for image in images], scratch, curves)
+    atlas = sampling.fill_atlas(plan.layout, [image.detach().to(work) for image in images], scratch)
     views = _empty_views(plan, work)
     for k, (target, view) in enumerate(zip(plan.targets, views, strict=True)):
         h, w = target.source_camera.shape
@@ -43,13 +43,21 @@ def render_opencv(
             view.zero_()
             continue
         buffer = scratch.get(f"view{h}x{w}", (h, w, 3), atlas.dtype)
-        rendered = sampling.remap(atlas, target.at, plan.interpolation, dst=buffer)
+        for y in range(0, h, STRIP_ROWS):
+            strip = buffer[y : y + STRIP_ROWS]
+            sampling.remap(atlas, target.at.rows(y, y + STRIP_ROWS), plan.interpolation, dst=strip)
+            # Not in the sources: a target has no more pixels, they are in the cache, and a source need not be copied.
+            if curves is not None:
+                for patch in target.patches[y // STRIP_ROWS]:
+                    curves[patch.source].apply(strip[:, patch.x], patch.mask)
         for band in target.bands:
             bh, bw = band.weight.shape
-            part = rendered[band.y : band.y + bh, band.x : band.x + bw]
+            part = buffer[band.y : band.y + bh, band.x : band.x + bw]
             second = sampling.remap(atlas, band.at, plan.interpolation)
+            if curves is not None:
+                curves[band.source].apply(second)
             part[...] = cv2.blendLinear(part, second, 1 - band.weight, band.weight)
-        cv2.split(rendered, list(views[k].numpy()))
+        cv2.split(buffer, list(views[k].numpy()))
     return [view.to(dtype) for view in views]
 
 
@@ -67,24 +75,47 @@ def render_torch(
         M views (B, 3, h, w) of the images' type.
     """
     dtype, device = images[0].dtype, images[0].device
-    atlas = sampling.torch_atlas(plan.layout, images, curves)
+    atlas = sampling.torch_atlas(plan.layout, images)
     views = []
     for target in plan.targets:
         coverage = torch.from_numpy(target.coverage).to(device)
         grid = sampling.torch_grid(target.at.to_float(), plan.layout.size, device)
         view = sampling.grid_sample(atlas, grid, plan.interpolation) * coverage
+        if curves is not None:
+            view = _toned(view, torch.from_numpy(target.source_camera).to(device), curves, dtype == torch.uint8)
         for band in target.bands:
             bh, bw = band.weight.shape
             part = (slice(None), slice(None), slice(band.y, band.y + bh), slice(band.x, band.x + bw))
             second = sampling.grid_sample(
                 atlas, sampling.torch_grid(band.at.to_float(), plan.layout.size, device), plan.interpolation
             )
+            if curves is not None:
+                second = _toned(second, torch.tensor(band.source, device=device), curves, dtype == torch.uint8)
             weight = torch.from_numpy(band.weight).to(device)
             blended = view.clone()
             blended[part] = torch.lerp(view[part], second, weight.expand_as(second))
             view = blended
         views.append(_rounded(view, dtype))
     return views
+
+
+def _toned(
+    views: torch.Tensor, source: torch.Tensor, curves: Sequence[Sequence[ToneCurve] | None], whole: bool
+) -> torch.Tensor:
+    """Views (B, 3, h, w) after the curves of the sources (h, w), or the one source (), that they are read from."""
+    frames = []
+    for view, of_sources in zip(views, curves, strict=True):
+        if of_sources is None:
+            frames.append(view)
+            continue
+        # Whole numbers as the OpenCV execution has them, which looks them up in a table.
+        read = torch.floor(view + 0.5) if whole else view
+        for k in source.unique().tolist():
+            if k >= 0 and of_sources[k].gain != 1:
+                toned = of_sources[k].of_tensor(read, 255.0 if whole else 1.0)
+                view = torch.where(source == k, torch.floor(toned + 0.5).clamp(0, 255) if whole else toned, view)
+        frames.append(view)
+    return torch.stack(frames)
 
 
 def render_labels(plan: RenderPlan, labels: Sequence[torch.Tensor], fill: float) -> list[torch.Tensor]:

@@ -18,7 +18,7 @@ from arbiview_aug.favs.photometric import HarmoniseConfig, PhotometricReport, es
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
 from arbiview_aug.maps import ego_rays
 from arbiview_aug.plan import build_plan
-from arbiview_aug.tone import ToneCurve
+from arbiview_aug.tone import STRIP_ROWS, ToneCurve, patches
 
 SIZE = (180, 320)
 
@@ -168,8 +168,8 @@ def test_order_of_cameras_and_repetition_change_nothing(street) -> None:
 def test_tone_curves() -> None:
     values = np.arange(256, dtype=np.uint8).reshape(1, 256, 1).repeat(3, 2)
     for gain in (0.4, 0.7, 0.95, 1.0, 1.05, 1.3, 2.5):
-        curve, out = ToneCurve(gain), np.empty_like(values)
-        curve.write(values, out)
+        curve, out = ToneCurve(gain), values.copy()
+        curve.apply(out)
         line = out[0, :, 0].astype(int)
         assert line[0] == 0 and line[255] == 255 and (np.diff(line) >= 0).all(), "saturated stays saturated"
         knee = int(255 * curve.knee / max(gain, 1))
@@ -177,6 +177,23 @@ def test_tone_curves() -> None:
         x = np.linspace(0, 1, 101)
         np.testing.assert_allclose(ToneCurve(1 / gain).of_array(curve.of_array(x)), x, atol=1e-12)
         np.testing.assert_allclose(curve.of_tensor(torch.from_numpy(x)).numpy(), curve.of_array(x))
+
+
+def test_patches_hold_every_pixel_with_its_own_source() -> None:
+    """A slanted seam, a source within another, and a hole; 70 rows are three strips, the last one lower."""
+    winner = np.zeros((70, 90), np.int8)
+    winner[np.add.outer(np.arange(70), 2 * np.arange(90)) > 120] = 3
+    winner[20:30, 10:20] = 5
+    winner[60:, 50:] = -1
+    seen = np.full(winner.shape, -1, np.int8)
+    for k, strip in enumerate(patches(winner, [3, 0, 5])):
+        for patch in strip:
+            part = seen[STRIP_ROWS * k : STRIP_ROWS * (k + 1), patch.x]
+            own = np.ones(part.shape, bool) if patch.mask is None else patch.mask > 0
+            assert (part[own] == -1).all(), "no pixel gets two curves"
+            part[own] = patch.source
+    assert np.array_equal(seen[winner >= 0], winner[winner >= 0])
+    assert patches(np.full((40, 8), -1, np.int8), []) == [[], []]
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.45])
