@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -238,7 +239,7 @@ def _write(
     for (target, method), views in done.pictures.items():
         rig = done.targets[target]
         true = None if done.first.truth is None else as_arrays(done.first.truth(rig).images)
-        file = f"{target}-{method}.png".replace(", ", "-").replace(" ", "_")
+        file = re.sub(r"[^\w+-]+", "-", f"{target}-{method}") + ".png"
         save_picture(folder / file, frame_sheet(done.first.sample["rig"], images, rig, views, true))
     (folder / "report.html").write_text(html_report(title, done, names, tables, notes), encoding="utf-8")
     return text
