@@ -144,3 +144,10 @@ def _halved_spacing(part: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     fine[::2] = even
     fine[1::2] = cv2.filter2D(even, -1, _CUBIC.T, anchor=(0, 1), borderType=cv2.BORDER_REPLICATE)[:-1]
     return fine
+
+
+def runs(flags: BoolArray) -> Iterator[tuple[int, int]]:
+    """First and last index of each run of True."""
+    edges = np.flatnonzero(np.diff(np.r_[False, flags, False].astype(np.int8)))
+    for start, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        yield start, stop - 1

@@ -9,21 +9,44 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterator
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
-from arbiview_aug.grid import HALVINGS, Box, Grid
-from arbiview_aug.sampling import Slot, halved
-from arbiview_aug.surface import Static, Surface
+from arbiview_aug.grid import HALVINGS, Box, Grid, runs
+from arbiview_aug.sampling import Slot, halved, level_size
+from arbiview_aug.surface import Layered, Shadows, Static, Surface
 
 _SAFETY = 2.0  # curvature between the nodes may exceed what the nodes show
 _CORNERS = tuple((a, b) for a in (slice(None, -1), slice(1, None)) for b in (slice(None, -1), slice(1, None)))
+_SHADOW_TILE_PX = 8
+_LEAST_INCIDENCE = 0.05
+"""Sine of the flattest angle at which a source may look along a face: that of the road 30 m from a car's cameras."""
+
 _FAR_AWAY_PX = 1e5  # float32 maps stay precise and int16 conversion saturates harmlessly
+
+
+class SolidPixels(NamedTuple):
+    """The pixels of an image that show solids of a ``Layered`` surface, row by row.
+
+    Attributes:
+        free: (h, w) uint8, 255 at all other pixels.
+        pixels: (n, 2) int64.
+        directions: (n, 3) unit rays in the ego frame.
+        inverse_distance: (n,) 1/m.
+        face: (n,) as in ``Drawn``.
+    """
+
+    free: npt.NDArray[np.uint8]
+    pixels: npt.NDArray[np.int64]
+    directions: FloatArray
+    inverse_distance: FloatArray
+    face: npt.NDArray[np.int32]
 
 
 class TargetRays:
@@ -38,6 +61,7 @@ class TargetRays:
         self.nodes = self.grid.nodes()
         self.directions, self.valid = ego_rays(camera, self.nodes)
         self._inverse: dict[Surface, FloatArray] = {}
+        self._solids: dict[Layered, SolidPixels] = {}
         ny, nx = self.grid.shape
         self.sparse_index = np.ix_(np.unique(np.r_[0:ny:4, ny - 1]), np.unique(np.r_[0:nx:4, nx - 1]))
         planes = np.ascontiguousarray(np.moveaxis(self.directions[self.sparse_index], -1, 0))
@@ -51,9 +75,38 @@ class TargetRays:
     def inverse_distance(self, surface: Surface) -> FloatArray:
         """(ny, nx) on the nodes; evaluated once for each surface."""
         if surface not in self._inverse:
-            self._inverse[surface] = surface.inverse_distance(self.camera.center_m, self.directions)
+            self._inverse[surface] = self._evaluated(surface)
             self.counters[f"surface_{type(surface).__name__.lower()}"] += 1
         return self._inverse[surface]
+
+    def _evaluated(self, surface: Surface) -> FloatArray:
+        if not isinstance(surface, Layered):
+            return surface.inverse_distance(self.camera.center_m, self.directions)
+        # Solids are drawn at pixel centres; what a node between pixels shows is read at the one above and left of it.
+        background, solids = self.inverse_distance(surface.background), self.solids(surface)
+        near = np.zeros(self.camera.size)
+        near[solids.pixels[:, 1], solids.pixels[:, 0]] = solids.inverse_distance
+        return np.maximum(background, self.at_nodes(near))
+
+    def at_nodes(self, image: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Values (ny, nx) at the pixel nearest to each node, 0 outside the image."""
+        h, w = self.camera.size
+        x, y = (np.floor(self.nodes[..., k]).astype(np.int64) for k in (0, 1))
+        inside = (x >= 0) & (x < w) & (y >= 0) & (y < h)
+        return np.where(inside, image[y.clip(0, h - 1), x.clip(0, w - 1)], 0)
+
+    def solids(self, surface: Layered) -> SolidPixels:
+        """The target's pixels that show solids; drawn once for each surface."""
+        if surface not in self._solids:
+            index, inverse_distance, face = surface.drawn(self.camera)
+            y, x = np.divmod(index, self.camera.width_px)
+            pixels = np.stack([x, y], axis=-1)
+            directions, _ = ego_rays(self.camera, pixels.astype(np.float64))
+            free = np.full(self.camera.size, 255, np.uint8)
+            free.reshape(-1)[index] = 0
+            self._solids[surface] = SolidPixels(free, pixels, directions, inverse_distance, face)
+            self.counters["solid_pixels"] += len(pixels)
+        return self._solids[surface]
 
 
 class PairMap:
@@ -66,28 +119,42 @@ class PairMap:
     """
 
     def __init__(self, rays: TargetRays, source: Camera, surface: Surface) -> None:
-        self.rays, self.source, self.surface = rays, source, surface
+        self.rays, self.source, self.whole_surface = rays, source, surface
+        self.surface: Surface = surface.background if isinstance(surface, Layered) else surface
         self.offset_m = rays.camera.center_m - source.center_m
         self.nodes: Box | None = None
-        if self._look_apart() or (rays.grid.step > 1 and not self._glance()):
+        if self._look_apart():
             return
-        self.uv, self.valid = self._seen(rays.directions, rays.inverse_distance(surface))
+        self.solids = _SeenSolids.of(rays, source, surface) if isinstance(surface, Layered) else None
+        seen_solids = self.solids.nodes(rays.grid) if self.solids is not None else None
+        if rays.grid.step > 1 and seen_solids is None and not self._glance():
+            return
+        q = rays.inverse_distance(self.surface)
+        points = _source_points(source, rays.directions, q, self.offset_m)
+        self.uv, self.valid = self._seen(rays.directions, q, points)
         self.valid &= rays.valid
         self._exact = np.zeros((0, 0), bool)
         self._use: BoolArray | None = None
         self._whole: BoolArray | None = None
         self._fine: tuple[Slot, npt.NDArray[np.float32]] | None = None
+        self._near_shadow: BoolArray | None = None
+        if self.solids is not None:
+            self._from_source_q = (q / np.maximum(np.sqrt((points * points).sum(-1)), 1e-300)).astype(np.float32)
         if rays.grid.step == 1:
             self.nodes = _bounds(self.valid & source.contains(self.uv), 0)
         else:
-            self.nodes = self._classify()
+            self.nodes = self._classify(points)
+        self.nodes = _around(self.nodes, seen_solids)
 
     def _look_apart(self) -> bool:
         """Whether the two viewing cones, widened by the parallax of the nearest scene point, cannot meet."""
-        q = self.rays.inverse_distance(self.surface)
+        q = self.rays.inverse_distance(self.whole_surface)
         # Law of sines: a point at 1 / q is seen from the two centres in directions that differ by at most asin(b q);
         # by any angle where it is nearer than the baseline b.
-        nearness = float(np.linalg.norm(self.offset_m)) * float(q.max())
+        nearest = float(q.max())
+        if isinstance(self.whole_surface, Layered):
+            nearest = max(nearest, float(self.rays.solids(self.whole_surface).inverse_distance.max(initial=0.0)))
+        nearness = float(np.linalg.norm(self.offset_m)) * nearest
         if nearness >= 1:
             return False
         parallax = math.asin(nearness)
@@ -98,14 +165,14 @@ class PairMap:
         """Whether any cell four times as large may hold a pixel of the source."""
         directions, valid = self.rays.sparse
         q = self.rays.inverse_distance(self.surface)[self.rays.sparse_index]
-        uv, projected = project_rays(self.source, directions, q, self.offset_m)
-        whole, border = self._cells_that_may_see(directions, q, uv, projected & valid)
+        points = _source_points(self.source, directions, q, self.offset_m)
+        uv, _, projected = self.source.project_cam(points)
+        whole, border = self._cells_that_may_see(points, uv, projected & valid)
         return bool(whole.any() or border.any())
 
-    def _classify(self) -> Box | None:
+    def _classify(self, points: FloatArray) -> Box | None:
         """Sort the cells: seeing nothing, whole, on a border of validity. Returns the nodes around those in use."""
-        q = self.rays.inverse_distance(self.surface)
-        self._whole, border = self._cells_that_may_see(self.rays.directions, q, self.uv, self.valid, self._detailed)
+        self._whole, border = self._cells_that_may_see(points, self.uv, self.valid, self._detailed)
         use = self._whole | border
         # Invalid nodes hold placeholders that may lie inside the image.
         self._use = None if self.valid.all() else use
@@ -125,15 +192,10 @@ class PairMap:
         counters["cells_interpolated"] += int(np.count_nonzero(self._whole & ~self._exact))
 
     def _cells_that_may_see(
-        self,
-        directions: FloatArray,
-        q: FloatArray,
-        uv: FloatArray,
-        valid: BoolArray,
-        detailed: BoolArray | None = None,
+        self, points: FloatArray, uv: FloatArray, valid: BoolArray, detailed: BoolArray | None = None
     ) -> tuple[BoolArray, BoolArray]:
         """Cells whose corners are valid and not all beyond one side of the image; such cells with an invalid corner."""
-        beyond = beyond_image(self.source, directions, q, self.offset_m, uv, valid)
+        beyond = beyond_image(self.source, points, uv, valid)
         sides = [beyond[c] for c in _CORNERS]
         use = (sides[0] & sides[1] & sides[2] & sides[3]) == 0
         if valid.all():
@@ -143,14 +205,13 @@ class PairMap:
         touched = (corners[0] | corners[1] | corners[2] | corners[3]).astype(np.uint8)
         near = cv2.dilate(touched, np.ones((3, 3), np.uint8)) > 0
         if self.source.lens != "pinhole":
-            near |= self._cells_near_lens(directions, q)
+            near |= self._cells_near_lens(points)
         if detailed is not None:
             near |= detailed  # a gap between two objects may lie between hidden corners
         return use & all_valid, use & ~all_valid & near
 
-    def _cells_near_lens(self, directions: FloatArray, q: FloatArray) -> BoolArray:
+    def _cells_near_lens(self, points: FloatArray) -> BoolArray:
         """Cells that may reach into the cone of the lens's image, although no corner of theirs may lie in it."""
-        points = _source_points(self.source, directions, q, self.offset_m)
         unit = points / np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), 1e-300)
         off_axis = np.arccos(np.clip(unit[..., 2], -1, 1))
         nearest = np.minimum.reduce([off_axis[c] for c in _CORNERS])
@@ -209,12 +270,12 @@ class PairMap:
         """Source pixels of target pixels (..., 2) in float64, and where they are valid."""
         directions, ray_valid = ego_rays(self.rays.camera, pixels)
         q = self.surface.inverse_distance(self.rays.camera.center_m, directions)
-        uv, valid = self._seen(directions, q)
+        uv, valid = self._seen(directions, q, _source_points(self.source, directions, q, self.offset_m))
         return uv, valid & ray_valid
 
-    def _seen(self, directions: FloatArray, q: FloatArray) -> tuple[FloatArray, BoolArray]:
+    def _seen(self, directions: FloatArray, q: FloatArray, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Source pixels of scene points, valid where the scene does not hide them from the source."""
-        uv, valid = project_rays(self.source, directions, q, self.offset_m)
+        uv, _, valid = self.source.project_cam(points)
         if isinstance(self.surface, Static):
             return uv, valid
         towards, from_source = self._from_source(directions, q)
@@ -225,6 +286,20 @@ class PairMap:
         towards = directions + q[..., None] * self.offset_m  # scaled by q
         length = np.sqrt((towards * towards).sum(-1))
         return towards / length[..., None], q / length
+
+    def visible_nodes(self, level: int) -> BoolArray:
+        """Nodes (ny, nx) whose scene point the source sees when its image is halved ``level`` times."""
+        if self.solids is None or not isinstance(self.whole_surface, Layered):
+            return self.valid
+        camera = _halved_camera(self.source, level)
+        shadows = self.whole_surface.shadows(camera)
+        pixel, inside = _nearest_pixel(shadows.beyond, _at_level(self.uv, level))
+        free = self.valid & ~(inside & (shadows.beyond[pixel] > self._from_source_q))
+        on_solid = self.rays.at_nodes(255 - self.rays.solids(self.whole_surface).free) > 0
+        seen = np.zeros(self.rays.camera.size, bool)
+        px, py = self.solids.pixels.T
+        seen[py, px] = self.solids.lit(shadows, _at_level(self.solids.uv, level), slice(None))
+        return np.where(on_solid, self.rays.at_nodes(seen), free)
 
     def full_resolution(
         self, slot: Slot, rows: tuple[int, int]
@@ -260,6 +335,8 @@ class PairMap:
         visible: Any = cv2.inRange(at, tuple(low), tuple(high))
         if self._use is not None:
             visible &= grid.cells_to_pixels(self._use, nodes)
+        if self.solids is not None:
+            self._put_solids(at, visible, nodes, slot)
         if source.mask is not None:
             visible &= _mask_at(source, slot, at)
         if slot.level:
@@ -267,6 +344,41 @@ class PairMap:
             h, w = slot.size
             at = np.clip(at, (slot.x, slot.y), (slot.x + w - 1, slot.y + h - 1), dtype=np.float32)
         return at, visible
+
+    def _put_solids(self, at: npt.NDArray[np.float32], visible: npt.NDArray[np.uint8], nodes: Box, slot: Slot) -> None:
+        """What lies in the shadow of solids is not seen; then the pixels that show solids."""
+        assert self.solids is not None and isinstance(self.whole_surface, Layered)
+        grid = self.rays.grid
+        y0, y1, x0, x1 = grid.pixels(nodes)
+        shadows = self.whole_surface.shadows(_halved_camera(self.source, slot.level))
+        for part in self._parts_near_shadow(shadows.beyond, nodes, slot.level):
+            t, b, le, r = grid.pixels(part)
+            here = slice(t - y0, b - y0), slice(le - x0, r - x0)
+            local = at[here] - np.array([slot.x, slot.y], np.float32)
+            first: Any = cv2.remap(shadows.beyond, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
+            visible[here] &= cv2.compare(first, grid.upsample(self._from_source_q, part), cv2.CMP_LE).astype(np.uint8)
+        visible &= self.rays.solids(self.whole_surface).free[y0:y1, x0:x1]
+        solids = self.solids
+        strip = slice(*np.searchsorted(solids.pixels[:, 1], [y0, y1]).tolist())
+        px, py = solids.pixels[strip].T
+        exact: Any = slot.from_source(solids.uv[strip])
+        at[py - y0, px - x0] = exact
+        visible[py - y0, px - x0] = solids.lit(shadows, exact - (slot.x, slot.y), strip) * np.uint8(255)
+
+    def _parts_near_shadow(self, shadow: npt.NDArray[np.float32], nodes: Box, level: int) -> Iterator[Box]:
+        """The parts of a strip, between its rows of nodes, whose background may be read in a shadow."""
+        if self.rays.grid.step == 1:
+            yield nodes
+            return
+        if self._near_shadow is None:
+            self._near_shadow = _cells_near_shadow(shadow, _at_level(self.uv, level))
+        j0, j1, i0, i1 = nodes
+        near: BoolArray = np.logical_or.reduce(self._near_shadow[j0:j1, i0:i1])
+        for first, last in runs(near):
+            part = j0, j1, i0 + first, i0 + last + 1
+            _, _, x0, x1 = self.rays.grid.pixels(part)
+            if x1 > x0:  # nodes lie beyond the image too
+                yield part
 
     @cached_property
     def _exact_pixels(self) -> tuple[npt.NDArray[np.int64], FloatArray, BoolArray]:
@@ -296,6 +408,106 @@ class PairMap:
         exact = np.clip(slot.from_source(uv[start:stop][inside]), -_FAR_AWAY_PX, _FAR_AWAY_PX)
         exact = np.where(valid[start:stop][inside, None], exact, -_FAR_AWAY_PX)
         at[py[inside] - y0, px[inside] - x0] = exact
+
+
+class _SeenSolids(NamedTuple):
+    """The pixels showing faces that are turned to a source and project into its image, hidden by others or not.
+
+    Attributes:
+        pixels: (n, 2) target pixels, row by row.
+        uv: (n, 2) source pixels.
+        inverse_distance: (n,) from the source, 1/m.
+        solid: (n,) which one.
+    """
+
+    pixels: npt.NDArray[np.int64]
+    uv: FloatArray
+    inverse_distance: FloatArray
+    solid: npt.NDArray[np.int32]
+
+    @classmethod
+    def of(cls, rays: TargetRays, source: Camera, surface: Layered) -> _SeenSolids:
+        _, pixels, directions, q, face = rays.solids(surface)
+        offset_m = rays.camera.center_m - source.center_m
+        solid, before_m = surface.facing(source.center_m, face)
+        turned = before_m > 0
+        if source.lens == "pinhole":
+            # Most solids lie beside most sources: two half-spaces are cheaper than a projection.
+            K, to_source = source.K, source.cam2ego[:3, :3].T
+            sides = np.stack([K[0], (source.width_px - 1) * K[2] - K[0]]) @ to_source
+            left, right = sides @ directions.T + np.outer(sides @ offset_m, q)
+            turned &= (left >= -1e-6) & (right >= -1e-6)
+        some = np.flatnonzero(turned)
+        pixels, directions, q, solid, before_m = pixels[some], directions[some], q[some], solid[some], before_m[some]
+        points = _source_points(source, directions, q, offset_m)
+        uv, _, valid = source.project_cam(points)
+        q /= np.maximum(np.sqrt((points * points).sum(-1)), 1e-300)
+        inside = np.flatnonzero(valid & source.contains(uv) & (before_m * q >= _LEAST_INCIDENCE))
+        return cls(pixels[inside], uv[inside], q[inside], solid[inside])
+
+    def lit(self, shadows: Shadows, at: FloatArray, part: slice) -> BoolArray:
+        """Which of a part of them no other solid hides, by their positions (n, 2) in the shadow images."""
+        pixel, inside = _nearest_pixel(shadows.beyond, at)
+        nearer = shadows.beyond[pixel] > self.inverse_distance[part]
+        return ~(inside & nearer & (shadows.solid[pixel] != self.solid[part]))
+
+    def nodes(self, grid: Grid) -> Box | None:
+        """The nodes around all of them."""
+        if len(self.pixels) == 0:
+            return None
+        first = round(grid.offset + 0.5) if grid.step > 1 else 0
+        low = (self.pixels.min(axis=0) - first) // grid.step
+        high = (self.pixels.max(axis=0) - first) // grid.step + (grid.step > 1)
+        return int(low[1]), int(high[1]), int(low[0]), int(high[0])
+
+
+def _around(one: Box | None, two: Box | None) -> Box | None:
+    """The box around two boxes of nodes."""
+    if one is None or two is None:
+        return one or two
+    return min(one[0], two[0]), max(one[1], two[1]), min(one[2], two[2]), max(one[3], two[3])
+
+
+def _halved_camera(camera: Camera, level: int) -> Camera:
+    """The camera of an image that was halved ``level`` times."""
+    h, w = level_size(camera.size, level)
+    return camera.crop(0, 0, (h << level, w << level)).resize((h, w)) if level else camera
+
+
+def _at_level(uv: FloatArray, level: int) -> FloatArray:
+    """Pixels (..., 2) in an image that was halved ``level`` times."""
+    return (uv + 0.5) / 2**level - 0.5
+
+
+def _cells_near_shadow(shadow: npt.NDArray[np.float32], uv: FloatArray) -> BoolArray:
+    """Cells (ny - 1, nx - 1) whose corners (ny, nx, 2) span a part of a shadow image that is not free of shadow."""
+    tile = _SHADOW_TILE_PX
+    h, w = shadow.shape
+    rows, columns = -(-h // tile), -(-w // tile)
+    dark = np.zeros((rows * tile, columns * tile), np.uint8)
+    dark[:h, :w] = cv2.compare(shadow, 0, cv2.CMP_GT)  # type: ignore[call-overload]
+    count = cv2.integral((cv2.resize(dark, (columns, rows), interpolation=cv2.INTER_AREA) > 0).astype(np.uint8))
+    (x0, x1), (y0, y1) = (_tiles_between(uv[..., k], n) for k, n in enumerate((columns, rows)))
+    return np.asarray(count[y1, x1] - count[y0, x1] - count[y1, x0] + count[y0, x0] > 0)
+
+
+def _tiles_between(position: FloatArray, count: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """First and last (exclusive) tile along one axis that a cell's corners span, a pixel of slack included: maps bulge
+    between the corners, and positions are rounded."""
+    scaled = np.clip(position / _SHADOW_TILE_PX, -2, count + 2)
+    slack = 1 / _SHADOW_TILE_PX
+    corners = [scaled[c] for c in _CORNERS]
+    low, high = (f(f(corners[0], corners[1]), f(corners[2], corners[3])) for f in (np.minimum, np.maximum))
+    first, last = np.floor(low - slack), np.floor(high + slack) + 1
+    return first.clip(0, count).astype(np.int64), last.clip(0, count).astype(np.int64)
+
+
+def _nearest_pixel(image: npt.NDArray[Any], at: FloatArray) -> tuple[tuple[Any, Any], BoolArray]:
+    """Rows and columns (...,) nearest to positions (..., 2), and where those lie in the image; elsewhere they are 0."""
+    h, w = image.shape
+    u, v = np.rint(at[..., 0]), np.rint(at[..., 1])
+    inside = (u >= 0) & (u < w) & (v >= 0) & (v < h)
+    return (np.where(inside, v, 0).astype(np.int64), np.where(inside, u, 0).astype(np.int64)), inside
 
 
 def ego_rays(camera: Camera, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -335,9 +547,7 @@ def _source_points(
     return np.moveaxis(points.reshape(3, *directions.shape[:-1]), 0, -1)
 
 
-def beyond_image(
-    source: Camera, directions: FloatArray, q: FloatArray, offset_m: FloatArray, uv: FloatArray, valid: BoolArray
-) -> npt.NDArray[np.uint8]:
+def beyond_image(source: Camera, points: FloatArray, uv: FloatArray, valid: BoolArray) -> npt.NDArray[np.uint8]:
     """Outcodes (...,): which of the image's borders, or the camera's plane, a scene point lies beyond; 0 is unknown.
 
     For pinholes they are read off homogeneous coordinates, which know their side behind the camera too (clipping as
@@ -345,7 +555,6 @@ def beyond_image(
     """
     h, w = source.size
     if source.lens == "pinhole":
-        points = _source_points(source, directions, q, offset_m)
         K, z = source.K, points[..., 2]
         x = K[0, 0] * points[..., 0] + K[0, 1] * points[..., 1] + K[0, 2] * z
         y = K[1, 1] * points[..., 1] + K[1, 2] * z

@@ -7,29 +7,29 @@ read from that source: the object's own colours would be smeared behind it. Wher
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
-from arbiview_aug.camera import BoolArray, FloatArray
+from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Street, Surface
+from arbiview_aug.grid import Grid
+from arbiview_aug.solids import draw_boxes
+from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn, Layered, Shadows, Street
 
-_BLOCK = 512  # rays looked at together: eight coarse cells in a row
-
-AIR_M = 0.03
-"""Boxes are drawn this much too tight or too wide by labellers; for hiding they are enlarged by it, and by a pixel."""
-
-_LEAST_INCIDENCE = 0.2
-"""Sine of the flattest angle (12 degrees) at which a source may look along a face and still be read for it."""
+_LENS_STEP_PX = 8  # cells in which rays of a lens are cast or not
 
 
 @dataclass(frozen=True, eq=False)
-class Objects(Surface):
+class Objects(Layered):
     """Boxes standing on the street.
+
+    Plans are built from ``drawn`` and ``shadows``; ``inverse_distance`` and ``hides`` say the same of single rays, and
+    are their plain reference.
 
     Attributes:
         street: What there is without them.
@@ -39,7 +39,61 @@ class Objects(Surface):
     smooth: ClassVar[bool] = True  # away from the boxes; near them every pixel is ``detailed``
     street: Street
     boxes: FloatArray
+    _shadows: dict[Camera, Shadows] = field(default_factory=dict, repr=False)
 
+    @property
+    def background(self) -> Street:
+        """The street."""
+        return self.street
+
+    # --- images -------------------------------------------------------------------------------------------------------
+    def drawn(self, camera: Camera) -> Drawn:
+        """The pixels of a camera that show boxes."""
+        return self._drawn(camera, self.boxes)
+
+    def shadows(self, camera: Camera) -> Shadows:
+        """What boxes hide from a source, by ``hides``; kept for the next target."""
+        if camera not in self._shadows:
+            pixel_rad = float(1 / camera.K[0, 0])
+            index, first, face = self._drawn(camera, self._enlarged(camera.center_m, pixel_rad))
+            beyond, solid = np.zeros(camera.size, np.float32), np.full(camera.size, -1, np.int32)
+            beyond.reshape(-1)[index] = _with_slack(first, pixel_rad)
+            solid.reshape(-1)[index] = face // 6
+            self._shadows[camera] = Shadows(beyond, solid)
+        return self._shadows[camera]
+
+    def facing(self, origin: FloatArray, face: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int32], FloatArray]:
+        """The boxes of faces (n,), and by how many metres ``origin`` lies before the faces' planes; see ``solids``."""
+        before_m = np.empty((len(self.boxes), 6))
+        local, half = _in_box_frames(self.boxes, origin), self.boxes[:, 3:6] / 2
+        before_m[:, 0::2], before_m[:, 1::2] = -local - half, local - half
+        return face // 6, before_m.reshape(-1)[face]
+
+    def _enlarged(self, origin: FloatArray, pixel_rad: float) -> FloatArray:
+        """The boxes wider by a pixel on all sides."""
+        boxes = self.boxes.copy()
+        boxes[:, 3:6] += 2 * pixel_rad * np.linalg.norm(boxes[:, :3] - origin, axis=-1, keepdims=True)
+        return boxes
+
+    def _drawn(self, camera: Camera, boxes: FloatArray) -> Drawn:
+        """Rasterised, or for a lens by casting the rays near the boxes."""
+        if camera.lens == "pinhole":
+            return draw_boxes(camera, boxes)
+        scene = Objects(self.street, boxes)
+        grid = Grid(camera.size, _LENS_STEP_PX)
+        rays, valid = camera.unproject(grid.nodes())
+        spacing = np.where(valid[:, 1:] & valid[:, :-1], np.linalg.norm(np.diff(rays, axis=1), axis=-1), 0)
+        near = valid & scene.detailed(camera.center_m, rays, 2 * float(spacing.max(initial=0.0)))
+        cells = cv2.dilate(near.astype(np.uint8), np.ones((3, 3), np.uint8))[:-1, :-1] > 0
+        ny, nx = grid.shape
+        index = np.flatnonzero(grid.cells_to_pixels(cells, (0, ny - 1, 0, nx - 1)))
+        v, u = np.divmod(index, camera.width_px)
+        directions, known = camera.unproject(np.stack([u, v], -1))
+        nearest, face = scene._boxes_ahead(camera.center_m, directions)
+        shown = known & (nearest > 0)
+        return Drawn(index[shown], nearest[shown], face[shown])
+
+    # --- rays ---------------------------------------------------------------------------------------------------------
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """The nearer of street and boxes, 1/m (...,)."""
         return np.maximum(self.street.inverse_distance(origin, directions), self._boxes_ahead(origin, directions)[0])
@@ -49,12 +103,13 @@ class Objects(Surface):
     ) -> BoolArray:
         """Whether a box stands between ``origin`` and points at these inverse distances along unit rays.
 
-        Boxes are enlarged by ``AIR_M`` and by the angle of a pixel, so that no pixel mixed with an object's colour is
-        read for what lies behind it. A box's own face lies behind its enlarged one by little, unless it is seen at
-        less than 12 degrees: then it counts as hidden.
+        Boxes are enlarged by a pixel on all sides, so that no pixel mixed with an object's colour is read for what lies
+        behind it. What a box stands on begins before its enlarged bottom ends: nothing nearer behind the first face
+        than twice that margin is hidden. A margin in metres for loose labels (3 cm) is not worth it: on synthetic
+        streets moved sideways it took the share of marked pixels that are holes from 97 to 82 %.
         """
-        first, air_m = self._boxes_ahead(origin, directions, AIR_M, pixel_rad)
-        return first * (1 - air_m / _LEAST_INCIDENCE * inverse_distance) > inverse_distance
+        scene = Objects(self.street, self._enlarged(origin, pixel_rad))
+        return _with_slack(scene._boxes_ahead(origin, directions)[0], pixel_rad) > inverse_distance
 
     def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
         """Rays (...,) that pass a box within an angle, where nothing may be interpolated."""
@@ -63,61 +118,60 @@ class Objects(Surface):
             near |= directions @ towards >= np.cos(min(angle + margin_rad, np.pi))
         return near
 
-    def _outside(self, origin: FloatArray) -> Iterator[tuple[FloatArray, FloatArray, float]]:
+    def _outside(self, origin: FloatArray) -> Iterator[tuple[int, FloatArray, float]]:
         """Boxes that do not hold the origin (the vehicle with the camera does), towards which, within what angle."""
-        for box in self.boxes:
-            if np.all(np.abs(_in_box_frame(box, origin - box[:3])) <= box[3:6] / 2):
-                continue
+        holding = (np.abs(_in_box_frames(self.boxes, origin)) <= self.boxes[:, 3:6] / 2).all(axis=-1)
+        for row in np.flatnonzero(~holding).tolist():
+            box = self.boxes[row]
             towards = box[:3] - origin
             distance_m, radius_m = float(np.linalg.norm(towards)), float(np.linalg.norm(box[3:6])) / 2
             angle = float(np.arcsin(radius_m / distance_m)) if distance_m > radius_m else np.pi
-            yield box, towards / max(distance_m, 1e-9), angle
+            yield row, towards / max(distance_m, 1e-9), angle
 
-    def _boxes_ahead(
-        self, origin: FloatArray, directions: FloatArray, air_m: float = 0.0, air_rad: float = 0.0
-    ) -> tuple[FloatArray, FloatArray]:
-        """Inverse distance to the first box face along each ray, 0 where there is none (slab method).
-
-        Rays are handled in blocks, which are neighbours in the image: most boxes miss most blocks. Boxes may be
-        enlarged on all sides by a length and an angle; how much the first one was is returned too, in metres.
-        """
-        n = math.prod(directions.shape[:-1])
-        count = max(1, -(-n // _BLOCK))
-        rays = np.resize(directions.reshape(-1, 3), (count, _BLOCK, 3)) if n else np.zeros((count, _BLOCK, 3))
-        centre = rays.mean(axis=1)
-        centre /= np.maximum(np.linalg.norm(centre, axis=-1, keepdims=True), 1e-9)
-        spread = np.arccos(np.clip(np.einsum("bnk,bk->bn", rays, centre).min(axis=1), -1, 1))
-        q, air = np.zeros((count, _BLOCK)), np.zeros((count, _BLOCK))
-        for box, towards, angle in self._outside(origin):
-            more_m = air_m + air_rad * float(np.linalg.norm(box[:3] - origin))
-            widened = angle + 2 * more_m / max(float(np.linalg.norm(box[:3] - origin)), 1e-9)
-            passing = np.arccos(np.clip(centre @ towards, -1, 1)) <= widened + spread
-            if passing.any():
-                larger = box + np.array([0, 0, 0, 2 * more_m, 2 * more_m, 2 * more_m, 0])
-                face = _first_face(larger, origin, rays[passing])
-                air[passing] = np.where(face > q[passing], more_m, air[passing])
-                q[passing] = np.maximum(q[passing], face)
-        shape = directions.shape[:-1]
-        return q.reshape(-1)[:n].reshape(shape), air.reshape(-1)[:n].reshape(shape)
+    def _boxes_ahead(self, origin: FloatArray, directions: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int32]]:
+        """Inverse distance (...,) to the first box face along each ray, 0 where there is none; the face's number."""
+        rays = directions.reshape(-1, 3)
+        q, number = np.zeros(len(rays)), np.full(len(rays), -1, np.int32)
+        for row, towards, angle in self._outside(origin):
+            near = np.flatnonzero(rays @ towards >= np.cos(min(angle + 1e-6, np.pi)))
+            nearest, side = _first_face(self.boxes[row], origin, rays[near])
+            first = nearest > q[near]
+            q[near[first]], number[near[first]] = nearest[first], 6 * row + side[first]
+        return q.reshape(directions.shape[:-1]), number.reshape(directions.shape[:-1])
 
 
-def _first_face(box: FloatArray, origin: FloatArray, directions: FloatArray) -> FloatArray:
-    """Inverse distance to where rays enter a box, 0 where they miss it."""
+def _with_slack(first: FloatArray, pixel_rad: float) -> FloatArray:
+    """Inverse distances a little beyond the first faces; see ``hides``."""
+    return first / (1 + 2 * pixel_rad)
+
+
+def _first_face(
+    box: FloatArray, origin: FloatArray, directions: FloatArray
+) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Inverse distance to where rays (n, 3) enter a box, 0 where they miss it; which side they enter (slab method)."""
     rays = _in_box_frame(box, directions)
     rays = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
     start, half = _in_box_frame(box, origin - box[:3]), box[3:6] / 2
     one, two = (-half - start) / rays, (half - start) / rays
     near, far = np.minimum(one, two), np.maximum(one, two)
-    enter = np.maximum(np.maximum(near[..., 0], near[..., 1]), near[..., 2])
-    leave = np.minimum(np.minimum(far[..., 0], far[..., 1]), far[..., 2])
+    axis = near.argmax(axis=-1)
+    enter, leave = near.max(axis=-1), far.min(axis=-1)
     hit = (leave >= enter) & (enter > 0)
-    return np.where(hit, 1 / np.maximum(enter, 1 / MAX_INVERSE_DISTANCE), 0.0)
+    side = 2 * axis + (np.take_along_axis(rays, axis[:, None], axis=-1)[:, 0] < 0)
+    return np.where(hit, 1 / np.maximum(enter, 1 / MAX_INVERSE_DISTANCE), 0.0), side
 
 
 def _in_box_frame(box: FloatArray, vectors: FloatArray) -> FloatArray:
     """Ego-frame vectors (..., 3) along the box's length, width and height."""
     c, s = np.cos(box[6]), np.sin(box[6])
     return vectors @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _in_box_frames(boxes: FloatArray, origin: FloatArray) -> FloatArray:
+    """One point (B, 3) in the frames of all boxes."""
+    c, s = np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
+    x, y, z = (origin - boxes[:, :3]).T
+    return np.stack([c * x + s * y, c * y - s * x, z], axis=-1)
 
 
 def checked_boxes(boxes: Any) -> FloatArray:

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from arbiview_aug.camera import BoolArray, FloatArray
+from arbiview_aug.camera import BoolArray, Camera, FloatArray
 
 SurfaceName = Literal["auto", "far", "ground", "street", "objects"]
 """Surfaces a user can ask for. ``auto`` decides per pair of target and source camera (see ``plan``)."""
@@ -64,6 +65,62 @@ class Surface(ABC):
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Spread (...,) in 1/m of the true inverse distance around this surface's ``inverse_distance``."""
         return depth_uncertainty(inverse_distance)
+
+
+class Drawn(NamedTuple):
+    """The pixels of an image that show something.
+
+    Attributes:
+        pixel: (n,) into the flattened image, ascending.
+        inverse_distance: (n,) along the pixels' rays, 1/m.
+        face: (n,) which face of which solid, a number that the surface knows.
+    """
+
+    pixel: npt.NDArray[np.int64]
+    inverse_distance: FloatArray
+    face: npt.NDArray[np.int32]
+
+
+class Shadows(NamedTuple):
+    """What solids hide from a source, for each of its pixels.
+
+    Attributes:
+        beyond: (h, w) float32, 1/m: background at a smaller inverse distance along the pixel's ray is hidden.
+        solid: (h, w) int32, the solid that hides it, -1 for none.
+    """
+
+    beyond: npt.NDArray[np.float32]
+    solid: npt.NDArray[np.int32]
+
+
+class Layered(Surface):
+    """A smooth background with solids in front of it, which can be drawn into cameras.
+
+    Pixels that show a solid are mapped one by one; the others by the background, as if there were no solids. Both are
+    hidden where the source's shadow image says so.
+    """
+
+    @property
+    @abstractmethod
+    def background(self) -> Static:
+        """What there is behind the solids."""
+
+    @abstractmethod
+    def drawn(self, camera: Camera) -> Drawn:
+        """The pixels of a camera that show solids."""
+
+    @abstractmethod
+    def shadows(self, camera: Camera) -> Shadows:
+        """What solids hide from a source."""
+
+    @abstractmethod
+    def facing(self, origin: FloatArray, face: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int32], FloatArray]:
+        """The solids of faces (n,), and by how many metres a point lies before the faces' planes.
+
+        Args:
+            origin: (3,) the point in the ego frame.
+            face: As in ``Drawn``.
+        """
 
 
 class Static(Surface):

@@ -16,7 +16,7 @@ from arbiview_aug import sampling
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.favs.adaptive_fusion import distance_weight, primary_weight, quality_weight
 from arbiview_aug.favs.config import FavsConfig
-from arbiview_aug.grid import Box
+from arbiview_aug.grid import Box, runs
 from arbiview_aug.maps import PairMap, TargetRays, edge_distance, resolution
 from arbiview_aug.rig import Rig
 from arbiview_aug.sampling import AtlasLayout, FixedMap, Scratch
@@ -180,6 +180,7 @@ class TargetDraft:
         seen = pair.valid & (edge_px > 0)
         level = self._level(pixels_per_pixel[seen], source.size) if self.config.antialias else 0
         pair.set_tolerance(self.config.map_tolerance_px * 2**level)
+        seen = pair.visible_nodes(level) & (edge_px > 0)
         parallax = self._expected_parallax(offset_m, focal_px, surface)
         score = (
             distance_weight(edge_px, min(source.size) / 2, self.config.distance_gamma)
@@ -296,7 +297,7 @@ class TargetDraft:
         columns = np.logical_or.reduce(shared[max(rows[0] - 1, 0) : rows[1] + 2])
         columns[1:] |= columns[:-1].copy()
         columns[:-1] |= columns[1:].copy()
-        for i0, i1 in _runs(columns):
+        for i0, i1 in runs(columns):
             yield from self._bands_in(self.grid.pixels((*rows, i0, i1)), seen, winner)
 
     def _bands_in(self, box: Box, seen: list[_Visible], winner: npt.NDArray[np.int8]) -> Iterator[Band]:
@@ -351,13 +352,6 @@ class TargetDraft:
                 share=won_px[region.source] / winner.size,
                 level=region.level,
             )
-
-
-def _runs(flags: BoolArray) -> Iterator[tuple[int, int]]:
-    """First and last index of each run of True."""
-    edges = np.flatnonzero(np.diff(np.r_[False, flags, False].astype(np.int8)))
-    for start, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        yield start, stop - 1
 
 
 def _overlap(one: Box, two: Box) -> Box | None:

@@ -20,6 +20,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("camera",),
     ("rig",),
     ("surface", "grid", "neighbours", "tone"),
+    ("solids",),
     ("objects",),
     ("scene",),
     ("sampling",),

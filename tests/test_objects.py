@@ -51,7 +51,7 @@ def test_boxes_hide_what_is_behind_them_and_not_their_own_faces() -> None:
     scene = Objects(Street(), CAR)
     ray = np.broadcast_to(unit(8, 0, -0.5), (4, 3))
     face = np.linalg.norm([8, 0, -0.5])
-    distances = np.array([face - 1, face, face + 0.05, face + 1.0])
+    distances = np.array([face - 1, face, face + 0.005, face + 0.1])
     assert scene.hides(EYE, ray, 1 / distances, 0.001).tolist() == [False, False, False, True]
     assert scene.hides(EYE, ray[:1], np.zeros(1), 0.001).tolist() == [True]  # the sky behind a car is hidden too
 
@@ -60,15 +60,6 @@ def test_hiding_boxes_are_a_pixel_wider() -> None:
     scene, beside = Objects(Street(), CAR), unit(8, 1.05, -0.5)[None]  # 5 cm beside the front corner
     assert scene.hides(EYE, beside, np.zeros(1), 0.001).tolist() == [False]
     assert scene.hides(EYE, beside, np.zeros(1), 0.01).tolist() == [True]
-
-
-def test_a_face_seen_edge_on_is_not_read() -> None:
-    eye = np.array([0.0, 0.0, 1.6])  # 10 cm above the roof
-    roof = np.array([9.0, 0.0, 1.5]) - eye
-    scene = Objects(Street(), CAR)
-    assert scene.hides(eye, unit(*roof)[None], np.array([1 / np.linalg.norm(roof)]), 0.001).tolist() == [True]
-    steep = np.array([9.0, 0.0, 1.5]) - (above := np.array([5.0, 0.0, 4.0]))
-    assert scene.hides(above, unit(*steep)[None], np.array([1 / np.linalg.norm(steep)]), 0.001).tolist() == [False]
 
 
 def test_any_number_of_rays_gives_the_same_answers() -> None:
