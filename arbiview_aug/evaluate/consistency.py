@@ -45,8 +45,10 @@ def source_overlap(
 def target_consistency(rig: Rig, views: Sequence[View], *, size: tuple[int, int] = VIEW_SIZE) -> list[OverlapScore]:
     """Do neighbouring rendered views show the same scene? Overlap metrics of the rendered views themselves.
 
-    Each view, where it is covered, is resampled to the half-way view over the street surface; so what the street
-    cannot know of the scene lowers the figure of every method alike.
+    Each view, where it is covered, is resampled to the half-way view over the street surface. Views rendered over
+    that same surface agree even where it is wrong, and views that are right about objects disagree there: compare
+    methods of one surface. On nuScenes' frame 1 m higher, where LiDAR is 10 dB nearer to the points than the street,
+    its views score 9 dB lower here.
 
     Args:
         rig: The target rig, on its own road.

@@ -59,7 +59,8 @@ OVERLAP_COLUMNS = (
 OVERLAP_NOTES: tuple[str, ...] = (
     "Two neighbouring source cameras, each alone rendered to the view half-way between them: PSNR on odd tiles, raw",
     "and with a gain and an offset per channel fitted on the even ones. targets: neighbouring rendered views, brought",
-    "to their half-way view over the street's surface: do they show the same scene?",
+    "to their half-way view over the street's surface: do they show the same scene? Compare methods of one surface:",
+    "what is rendered over the street agrees there even where the street is wrong.",
 )
 
 
