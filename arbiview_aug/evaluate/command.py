@@ -44,6 +44,7 @@ from arbiview_aug.evaluate.targets import named_targets, without_masks
 from arbiview_aug.favs.config import Quality
 from arbiview_aug.rig import Rig, load_rig, shipped_rigs
 from arbiview_aug.surface import SurfaceName
+from arbiview_aug.transforms import OUTPUTS
 
 TARGET_SETS = ("paper", "yaw", "vehicles", "truck")
 _REAL_TARGET = "waymo"
@@ -129,7 +130,7 @@ def _yaws(text: str) -> str | list[float]:
 
 # --- the work ---------------------------------------------------------------------------------------------------------
 def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> str:
-    methods = [retargeting(quality, surface) for quality in arguments.quality for surface in arguments.surface]
+    methods = [_method(quality, surface) for quality in arguments.quality for surface in arguments.surface]
     asked = None if arguments.target is None else load_rig(arguments.target)
     data, targets = _data(arguments), partial(_targets, arguments, asked)
     frames = min(arguments.frames or 1, len(data))
@@ -152,6 +153,12 @@ def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> 
         return written
     text = "\n\n".join(text_table(*table) for table in tables)
     return f"{title}\n\n{text}\n\nreport: {folder / 'report.html'}\nnumbers: {folder / 'evaluate.json'}"
+
+
+def _method(quality: Quality, surface: SurfaceName) -> Method:
+    """With its confidence to show, where it has one."""
+    published = quality == "paper"
+    return retargeting(quality, surface, outputs=[o for o in OUTPUTS if o == "confidence" and not published])
 
 
 def _data(arguments: argparse.Namespace) -> Any:

@@ -24,6 +24,8 @@ def source_overlap(
 ) -> list[OverlapScore]:
     """Overlap metrics of a method: neighbouring source cameras, each alone rendered to their half-way view.
 
+    A method that learns from overlaps learns nothing here, where it sees one camera at a time.
+
     Args:
         sample: With ``rig`` and ``images``; the method gets it with one camera at a time.
         render: The method.

@@ -5,7 +5,7 @@ A method gets the whole sample and may use what is in it; what it must not see i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -15,7 +15,7 @@ from arbiview_aug.evaluate.images import Image, View, as_arrays
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, paper
 from arbiview_aug.rig import Rig
 from arbiview_aug.surface import SurfaceName
-from arbiview_aug.transforms import OUTPUTS, RigRetarget
+from arbiview_aug.transforms import RigRetarget
 
 Sample = Mapping[str, Any]
 
@@ -40,9 +40,21 @@ class Method:
     reads_points: bool = False
 
 
-def retargeting(quality: Quality | FavsConfig | PaperConfig, surface: SurfaceName = "auto", name: str = "") -> Method:
-    """``RigRetarget`` as a method; a transform, with its last plan, for each of the last target rigs."""
-    outputs = tuple(key for key in ("confidence",) if key in OUTPUTS and not isinstance(quality, PaperConfig))
+def retargeting(
+    quality: Quality | FavsConfig | PaperConfig,
+    surface: SurfaceName = "auto",
+    name: str = "",
+    *,
+    outputs: Sequence[str] = (),
+) -> Method:
+    """``RigRetarget`` as a method; a transform, with its last plan, for each of the last target rigs.
+
+    Args:
+        quality: As for ``RigRetarget``.
+        surface: As for ``RigRetarget``.
+        name: For tables; by default made of both.
+        outputs: Further outputs, ``confidence`` where there is to be one.
+    """
 
     @lru_cache(_HELD_TRANSFORMS)
     def transform(target: Rig) -> RigRetarget:
