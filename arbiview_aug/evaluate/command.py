@@ -48,6 +48,11 @@ from arbiview_aug.transforms import OUTPUTS
 
 TARGET_SETS = ("paper", "yaw", "vehicles", "truck")
 _REAL_TARGET = "waymo"
+_OWN = {
+    "paper": ("target", "yaws", "quality", "surface", "seed", "reduce"),
+    "figure": ("target", "yaws", "quality", "surface", "frames"),
+}
+"""What the two modes fix themselves."""
 
 Table = tuple[str, Mapping[str, Mapping[str, float]], Sequence[Column], Sequence[str]]
 
@@ -56,6 +61,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print the tables, write JSON, pictures and the report."""
     parser = _parser()
     arguments = parser.parse_args(argv)
+    for mode, own in _OWN.items():
+        for name in own:
+            if getattr(arguments, mode) and getattr(arguments, name) != parser.get_default(name):
+                parser.error(f"argument --{name}: --{mode} has its own; expected none")
     folder = writable_folder(Path(arguments.output), arguments.output)
     notes: list[str] = []
     if arguments.paper:

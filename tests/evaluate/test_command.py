@@ -151,7 +151,14 @@ def test_errors_are_one_line(
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--yaws", "left"], ["--target", "waymo", "--yaws", "paper"], ["--paper", "--figure"]]
+    "arguments",
+    [
+        ["--yaws", "left"],
+        ["--target", "waymo", "--yaws", "paper"],
+        ["--paper", "--figure"],
+        ["--paper", "--yaws", "yaw"],
+        ["--figure", "--surface", "far"],
+    ],
 )
 def test_wrong_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
