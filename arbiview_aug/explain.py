@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from arbiview_aug.camera import FloatArray
+from arbiview_aug.camera import BoolArray, Camera, FloatArray
+from arbiview_aug.favs.overlap_depth import OverlapDepth
 from arbiview_aug.favs.paper import PaperRendering, SourceReport
 from arbiview_aug.favs.photometric import PhotometricReport
 from arbiview_aug.plan import RenderPlan
+from arbiview_aug.target_plan import PairReport
 
 
 @dataclass(frozen=True)
@@ -20,36 +23,30 @@ class Explanation:
     Attributes:
         plan: The plan.
         harmonisation: The sources' gains and why, where harmonisation was asked for.
+        depth: What became of each pair of neighbours, where depth from overlap was asked for and matters.
     """
 
     plan: RenderPlan
     harmonisation: PhotometricReport | None = None
+    depth: OverlapDepth | None = None
 
     def as_dict(self) -> list[dict[str, Any]]:
         """One entry for each target camera: coverage, share to invent, and its sources with surface and reason."""
-        entries = []
-        for camera, target in zip(self.plan.target, self.plan.targets, strict=True):
-            coverage = float(target.coverage.mean())
-            entries.append(
-                {
-                    "camera": camera.name,
-                    "coverage": coverage,
-                    "to_invent": 1 - coverage,
-                    "sources": [
-                        {
-                            "camera": self.plan.source[pair.source].name,
-                            "share": pair.share,
-                            "surface": pair.surface,
-                            "reason": pair.reason,
-                            "baseline_m": pair.baseline_m,
-                            "parallax_px": pair.parallax_px,
-                            "halved": pair.level,
-                        }
-                        for pair in target.pairs
-                    ],
-                }
-            )
-        return entries
+        return [
+            _entry(camera, target.coverage, [self._source(pair) for pair in target.pairs])
+            for camera, target in zip(self.plan.target, self.plan.targets, strict=True)
+        ]
+
+    def _source(self, pair: PairReport) -> dict[str, Any]:
+        return {
+            "camera": self.plan.source[pair.source].name,
+            "share": pair.share,
+            "surface": pair.surface,
+            "reason": pair.reason,
+            "baseline_m": pair.baseline_m,
+            "parallax_px": pair.parallax_px,
+            "halved": pair.level,
+        }
 
     def __str__(self) -> str:
         lines = [
@@ -58,14 +55,9 @@ class Explanation:
         ]
         if self.harmonisation is not None:
             lines.append(f"  {self.harmonisation}")
-        for entry in self.as_dict():
-            to_invent = entry["to_invent"]
-            note = f", {to_invent:.1%} that no camera saw: masked, or for a generator to invent" if to_invent else ""
-            lines.append(f"  {entry['camera']}: {entry['coverage']:.1%} covered{note}")
-            if not entry["sources"]:
-                lines.append("    no source camera looks there")
-            lines.extend(f"    {_source_line(source)}" for source in entry["sources"])
-        return "\n".join(lines)
+        if self.depth is not None:
+            lines.extend(f"  {line}" for line in str(self.depth).splitlines())
+        return "\n".join([*lines, *_lines(self.as_dict(), _source_line)])
 
     __repr__ = __str__
 
@@ -82,18 +74,10 @@ class PaperExplanation:
 
     def as_dict(self) -> list[dict[str, Any]]:
         """One entry for each target camera: coverage, share to invent, and what each stage made of its sources."""
-        entries = []
-        for camera, view in zip(self.rendering.target, self.rendering.targets, strict=True):
-            coverage = float(view.coverage.mean())
-            entries.append(
-                {
-                    "camera": camera.name,
-                    "coverage": coverage,
-                    "to_invent": 1 - coverage,
-                    "sources": [self._source(report, camera.center_m) for report in view.reports],
-                }
-            )
-        return entries
+        return [
+            _entry(camera, view.coverage, [self._source(report, camera.center_m) for report in view.reports])
+            for camera, view in zip(self.rendering.target, self.rendering.targets, strict=True)
+        ]
 
     def _source(self, report: SourceReport, center_m: FloatArray) -> dict[str, Any]:
         camera = self.rendering.source[report.source]
@@ -118,21 +102,31 @@ class PaperExplanation:
             f"{rendering.source.name or 'source'} -> {rendering.target.name or 'target'}: {len(rendering.source)} "
             f"cameras to {len(rendering.target)}, stages 1 to 4 as published, far surface"
         ]
-        for entry in self.as_dict():
-            lines.append(f"  {entry['camera']}: {entry['coverage']:.1%} covered")
-            if not entry["sources"]:
-                lines.append("    no source camera looks there")
-            for source in entry["sources"]:
-                lines.append(f"    {source['share']:6.1%} from {source['camera']}: {_stages(source)}")
-        return "\n".join(lines)
+        return "\n".join([*lines, *_lines(self.as_dict(), _stages)])
 
     __repr__ = __str__
 
 
+def _entry(camera: Camera, coverage: BoolArray, sources: list[dict[str, Any]]) -> dict[str, Any]:
+    covered = float(coverage.mean())
+    return {"camera": camera.name, "coverage": covered, "to_invent": 1 - covered, "sources": sources}
+
+
+def _lines(entries: list[dict[str, Any]], words: Callable[[dict[str, Any]], str]) -> Iterator[str]:
+    for entry in entries:
+        to_invent = entry["to_invent"]
+        note = f", {to_invent:.1%} that no camera saw: masked, or for a generator to invent" if to_invent else ""
+        yield f"  {entry['camera']}: {entry['coverage']:.1%} covered{note}"
+        if not entry["sources"]:
+            yield "    no source camera looks there"
+        for source in entry["sources"]:
+            yield f"    {source['share']:6.1%} from {source['camera']}{words(source)}"
+
+
 def _stages(source: dict[str, Any]) -> str:
     if source["primary"]:
-        return "the primary camera, the reference of the others"
-    return f"features: {source['features']}; objects: {source['objects']}"
+        return ": the primary camera, the reference of the others"
+    return f": features: {source['features']}; objects: {source['objects']}"
 
 
 def _source_line(source: dict[str, Any]) -> str:
@@ -141,4 +135,4 @@ def _source_line(source: dict[str, Any]) -> str:
         why.append(f"about {source['parallax_px']:.1f} px of parallax where depth is unknown")
     if source["halved"]:
         why.append(f"read at 1/{2 ** source['halved']} size")
-    return f"{source['share']:6.1%} from {source['camera']} over the {source['surface']} surface ({', '.join(why)})"
+    return f" over the {source['surface']} surface ({', '.join(why)})"

@@ -19,7 +19,7 @@ from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.grid import Grid
 from arbiview_aug.solids import draw_boxes
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn, Layered, Shadows, Street
+from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn, Layered, Shadows, Static
 
 _LENS_STEP_PX = 8  # cells in which rays of a lens are cast or not
 
@@ -37,12 +37,12 @@ class Objects(Layered):
     """
 
     smooth: ClassVar[bool] = True  # away from the boxes; near them every pixel is ``detailed``
-    street: Street
+    street: Static
     boxes: FloatArray
     _shadows: dict[Camera, Shadows] = field(default_factory=dict, repr=False)
 
     @property
-    def background(self) -> Street:
+    def background(self) -> Static:
         """The street."""
         return self.street
 

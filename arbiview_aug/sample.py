@@ -103,6 +103,16 @@ def scenes_of_frames(sample: Mapping[str, Any], count: int, lead: tuple[int, ...
     return [Scene(boxes=checked_boxes(frame)) for frame in _of_frames("boxes_3d", boxes, count, lead)]
 
 
+def names_of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[object]:
+    """What an entry of the sample calls each frame, hashable: a name, or in a batch a list or tensor of names."""
+    values = [value]
+    if lead:
+        values = list(value.reshape(count, -1)) if isinstance(value, torch.Tensor) and value.ndim else value
+        if not isinstance(values, list | tuple) or len(values) != count:
+            raise SampleError(f"{key}: expected a name for each of {count} frames, got {type(value).__name__}")
+    return [str(v.tolist()) if isinstance(v, torch.Tensor) else str(v) for v in values]
+
+
 def _of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[np.ndarray]:
     """Numbers of each frame: a tensor with the images' leading dimensions, or a list with an entry for each frame."""
     if not lead:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from arbiview_aug.camera import FloatArray
 from arbiview_aug.objects import Objects
-from arbiview_aug.surface import Far, Ground, Street, Surface, SurfaceName
+from arbiview_aug.refined import Correction, Refined
+from arbiview_aug.surface import Far, Ground, Static, Street, Surface, SurfaceName
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,14 +17,16 @@ class Scene:
 
     Attributes:
         boxes: (B, 7) labelled objects: centre x, y, z, length, width, height (metres), yaw (radians).
+        corrections: What overlaps say of the street's distances.
     """
 
     boxes: FloatArray | None = None
+    corrections: tuple[Correction, ...] = ()
 
     @property
     def is_empty(self) -> bool:
         """Whether nothing is known but the road."""
-        return self.boxes is None
+        return self.boxes is None and not self.corrections
 
     @property
     def best(self) -> SurfaceName:
@@ -36,6 +39,8 @@ class Scene:
         digest = hashlib.sha256()
         for array in (self.boxes,):
             digest.update(b"none" if array is None else repr(array.shape).encode() + array.tobytes())
+        for correction in self.corrections:
+            digest.update(correction.key)
         return digest.digest()
 
     def surface(self, name: str, ground_z_m: float) -> Surface:
@@ -44,7 +49,9 @@ class Scene:
         Raises:
             ValueError: An unknown name, or geometry that the scene lacks.
         """
-        street = Street(ground_z_m=ground_z_m)
+        street: Static = Street(ground_z_m=ground_z_m)
+        if self.corrections:
+            street = Refined(street, self.corrections)
         if name == "far":
             return Far()
         if name == "ground":

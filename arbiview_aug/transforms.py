@@ -6,6 +6,7 @@ import copy
 import os
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -18,6 +19,7 @@ from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError
 from arbiview_aug.explain import Explanation, PaperExplanation
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
+from arbiview_aug.favs.overlap_depth import OverlapDepth, RefinementCache, overlap_depth
 from arbiview_aug.favs.paper import PaperRendering, check_pinhole, check_settings, render_paper
 from arbiview_aug.favs.photometric import Harmonise, Harmoniser, PhotometricReport
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
@@ -25,7 +27,7 @@ from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_targ
 from arbiview_aug.plan import PlanCache, RenderPlan, baselines_m, build_plan, needs_geometry, plan_key
 from arbiview_aug.random_rig import RandomRig
 from arbiview_aug.rig import Rig, load_rig
-from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame, check_inputs, scenes_of_frames
+from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame, check_inputs, names_of_frames, scenes_of_frames
 from arbiview_aug.sampling import Scratch
 from arbiview_aug.scene import Scene
 from arbiview_aug.surface import SurfaceName
@@ -67,10 +69,11 @@ class RigRetarget(torch.nn.Module):
         target_rig: A ``Rig``, the name of a shipped one, a rig file, or a ``RandomRig``.
         source_rig: The rig of every sample that carries none.
         path: ``favs``: stitching.
-        quality: ``draft``, ``fast``, or a ``FavsConfig``; ``paper`` or a ``PaperConfig``: stages 1 to 4 as published,
-            on the CPU, for pinhole cameras. Its objects take their types from the sample, where it has ``detections``
-            (for each camera ``{"boxes": (n, 4), "labels": [n names]}`` in source pixels, as torchvision's detectors
-            return them) or else ``boxes_3d``, with ``box_names`` (a name each) where there are any.
+        quality: ``draft``, ``fast``, ``accurate``, or a ``FavsConfig``; ``paper`` or a ``PaperConfig``: stages 1 to 4
+            as published, on the CPU, for pinhole cameras. Its objects take their types from the sample, where it has
+            ``detections`` (for each camera ``{"boxes": (n, 4), "labels": [n names]}`` in source pixels, as
+            torchvision's detectors return them) or else ``boxes_3d``, with ``box_names`` (a name each) where there are
+            any.
         surface: ``far``, ``ground``, ``street``; ``objects``: the sample's ``boxes_3d`` stand on the street, so that
             objects keep their height when cameras move; ``auto``: for each pair of cameras ``far`` where their centres
             coincide, else the best that the sample offers: ``objects`` with ``boxes_3d``, else ``street``, with a
@@ -78,6 +81,9 @@ class RigRetarget(torch.nn.Module):
         harmonise: Bring the sources to one exposure (``arbiview_aug.favs.photometric``): True or a ``HarmoniseConfig``
             estimates a gain for each camera in every frame; numbers are gains to use as they are. Off by default.
             Samples that ``p`` skips keep their colours.
+        refinement: For ``quality="accurate"``, whose depth from overlap depends on the images: None computes it, and
+            plans anew, for every frame; a ``RefinementCache`` reuses both where its key says that the scene is the
+            same.
         size: (h, w) of every output image; the target cameras are resized to it.
         p: Probability of retargeting. A skipped sample keeps its own cameras, resized to ``size``, with full coverage;
             so ``p < 1`` needs ``size`` and equal camera counts. The output then always has ``lens``, ``distortion``
@@ -107,6 +113,7 @@ class RigRetarget(torch.nn.Module):
         quality: Quality | FavsConfig | PaperConfig = "fast",
         surface: SurfaceName = "auto",
         harmonise: Harmonise = None,
+        refinement: RefinementCache | None = None,
         size: tuple[int, int] | None = None,
         p: float = 1.0,
         rng: torch.Generator | None = None,
@@ -143,6 +150,9 @@ class RigRetarget(torch.nn.Module):
             check_pinhole(self.target if isinstance(self.target, Rig) else self.target.base)
             if harmonise is not None and harmonise is not False:
                 raise ValueError("harmonise: quality='paper' is as published: expected None, got " + repr(harmonise))
+        if refinement is not None and not (isinstance(self.config, FavsConfig) and self.config.overlap_depth):
+            raise ValueError("refinement: expected quality='accurate' (or overlap_depth=True) with a RefinementCache")
+        self.refinement = refinement
         self.path, self.surface, self.p, self.rng = path, surface, float(p), rng
         self.size = None if size is None else _checked_size(size)
         self.label_frame, self.label_keys, self.label_fill = label_frame, tuple(label_keys), label_fill
@@ -181,9 +191,13 @@ class RigRetarget(torch.nn.Module):
         target, skip, drawn = self._draw(sample, frames, params)
         views: list[View] = []
         scenes = self._scenes(sample, len(frames), lead)
+        names = self._refinement_names(sample, len(frames), lead)
         found = self._detections(sample, frames, lead)
-        for frame, scene, detections in zip(frames, scenes, found, strict=True):
-            views.append(self.size if skip and self.size else self._view(frame, target, scene, detections))
+        for frame, scene, name, detections in zip(frames, scenes, names, found, strict=True):
+            if skip and self.size:
+                views.append(self.size)
+            else:
+                views.append(self._view(frame, target, scene, self._depth(frame, target, name), detections))
         parts = self._rendered(frames, views)
         out = self._kept(sample, labels)
         out["images"] = rewrapped(gathered([part["images"] for part in parts], lead), sample["images"])
@@ -324,14 +338,39 @@ class RigRetarget(torch.nn.Module):
         return [{}] * len(frames)
 
     def _view(
-        self, frame: SourceFrame, target: Rig, scene: Scene, detections: OfCameras
+        self, frame: SourceFrame, target: Rig, scene: Scene, depth: OverlapDepth | None, detections: OfCameras
     ) -> RenderPlan | PaperRendering:
         """The plan of a frame, or the frame rendered by the published stages, for which nothing can be planned."""
         if not isinstance(self.config, PaperConfig):
-            return self.plan(frame.rig, target, scene)
+            known = scene if depth is None else replace(scene, corrections=depth.corrections)
+            return self.plan(frame.rig, target, known)
         rendering = render_paper(frame.rig, target.in_frame_of(frame.rig), frame.images, self.config, detections)
         self._warn_unreachable(rendering)
         return rendering
+
+    def _refinement_names(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[object]:
+        """For each frame, what the sample calls its scene, where refinements are reused by name.
+
+        Raises:
+            SampleError: The sample lacks the name, or has another number of them than frames.
+        """
+        key = None if self.refinement is None else self.refinement.key
+        if key is None:
+            return [None] * count
+        if key not in sample:
+            raise SampleError(f"refinement: expected {key!r} in the sample, to tell which frames share a refinement")
+        return names_of_frames(key, sample[key], count, lead)
+
+    def _depth(self, frame: SourceFrame, target: Rig, name: object) -> OverlapDepth | None:
+        """Depth from overlap, where it is asked for and any pixel's place depends on it."""
+        config = self.config
+        if isinstance(config, PaperConfig) or not config.overlap_depth or self.surface in ("far", "ground"):
+            return None
+        if self.surface == "auto" and not needs_geometry(frame.rig, target, config):
+            return None
+        if self.refinement is None:
+            return overlap_depth(frame.rig, frame.images)
+        return self.refinement.get((frame.rig.content_key, name), lambda: overlap_depth(frame.rig, frame.images))
 
     def plan(self, source: Rig, target: Rig, scene: Scene | None = None) -> RenderPlan:
         """The cached render plan of a pair of rigs in a scene.
@@ -344,15 +383,17 @@ class RigRetarget(torch.nn.Module):
         config, known = self.config, scene or Scene()
         if self.surface == "auto" and not known.is_empty and not needs_geometry(source, target, config):
             known = Scene()
-        # A frame's geometry never comes back: its plan must not push out those that do.
-        cache = self.plans if known.is_empty else self._plan_of_frame
+        # A frame's geometry never comes back, unless it is a refinement that is reused: its plan must not push out
+        # those that do.
+        comes_back = known.is_empty or (self.refinement is not None and known.boxes is None)
+        cache = self.plans if comes_back else self._plan_of_frame
         key = plan_key(source, target, self.surface, config, known)
         return cache.get(key, lambda: self._built(source, target, config, known))
 
     def _built(self, source: Rig, target: Rig, config: FavsConfig, scene: Scene) -> RenderPlan:
         plan = build_plan(source, target, surface=self.surface, config=config, scene=scene)
         self._warn_unreachable(plan)
-        if self.surface == "auto" and scene.is_empty:
+        if self.surface == "auto" and scene.best == "street":
             self._warn_static(source, target)
         return plan
 
@@ -389,10 +430,12 @@ class RigRetarget(torch.nn.Module):
         scene = self._scenes(sample, len(frames), lead)[0]
         detections = self._detections(sample, frames, lead)[0]
         asked = self.harmoniser.estimates or self.harmoniser.gains is not None
-        view = self._view(frames[0], target, scene, detections)
+        name = self._refinement_names(sample, len(frames), lead)[0]
+        depth = self._depth(frames[0], target, name)
+        view = self._view(frames[0], target, scene, depth, detections)
         if isinstance(view, PaperRendering):
             return PaperExplanation(view)
-        return Explanation(view, self.harmonisation(sample) if asked else None)
+        return Explanation(view, self.harmonisation(sample) if asked else None, depth)
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
         """The gains that a sample's source images would get, and why; of a batch, its first frame."""

@@ -33,6 +33,7 @@ TINY = {
     "inspect nuscenes waymo": [],
     "bench speed --data FOLDER": ["--repeats", "1"],
     "bench speed": ["--repeats", "1"],
+    "bench ablation --data FOLDER": ["--reduce", "4", "--only", "far surface"],
 }
 """Every command of the README, and options that make it quick."""
 

@@ -1,14 +1,19 @@
 """``python -m arbiview_aug bench WHAT``: measurements that anyone can repeat, on their own data too.
 
-``speed``: milliseconds against bare ``cv2.remap`` calls (``bench.speed``).
+``speed``: milliseconds against bare ``cv2.remap`` calls (``bench.speed``). ``ablation``: each stage and setting on and
+off, dB and milliseconds (``bench.ablation``).
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from importlib import import_module
 
-BENCHMARKS = ("speed",)
+BENCHMARKS = {
+    "speed": "milliseconds against bare cv2.remap calls",
+    "ablation": "each stage and setting on and off: dB and milliseconds",
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -16,9 +21,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m arbiview_aug bench", description="Measurements, as tables and JSON."
     )
-    parser.add_argument("what", choices=BENCHMARKS, help="speed: milliseconds against bare cv2.remap calls")
+    words = "; ".join(f"{name}: {summary}" for name, summary in BENCHMARKS.items())
+    parser.add_argument("what", choices=BENCHMARKS, help=words)
     parser.add_argument("rest", nargs=argparse.REMAINDER, metavar="...", help="its options")
     arguments = parser.parse_args(argv)
-    from arbiview_aug.bench import speed
-
-    return speed.main(arguments.rest)
+    return int(import_module(f"arbiview_aug.bench.{arguments.what}").main(arguments.rest))

@@ -150,7 +150,7 @@ def measure(
     """
     rig, images, halves = _inputs(data, full_size)
     load_before = os.getloadavg()
-    with _one_thread():
+    with one_thread():
         measures = _run(_full_size(rig, images), repeats, "full size")
         measures += _run(_small_size(rig, images, halves, small_size), repeats * _SMALL_ROUNDS, "small")
     return {
@@ -161,7 +161,7 @@ def measure(
         "sources": [list(size) for size in rig.sizes],
         "rounds": {"full size": repeats, "small": repeats * _SMALL_ROUNDS},
         "machine": {
-            "cpu": _cpu_model(),
+            "cpu": cpu_model(),
             "cores": os.cpu_count(),
             "threads": 1,
             "load_before": load_before,
@@ -301,7 +301,7 @@ def _measure(candidate: _Candidate, times: dict[str, npt.NDArray[np.float64]]) -
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """OpenCV, torch and the linear algebra behind numpy on one thread; as before afterwards."""
     from threadpoolctl import threadpool_limits  # a dependency of scikit-learn
 
@@ -336,7 +336,7 @@ def _smooth_images(count: int, size: tuple[int, int]) -> torch.Tensor:
     return torch.from_numpy(block).permute(0, 3, 1, 2)
 
 
-def _cpu_model() -> str:
+def cpu_model() -> str:
     """As the kernel names it; platforms without /proc have at least the architecture."""
     try:
         text = Path("/proc/cpuinfo").read_text()

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -24,6 +24,7 @@ import torch
 
 from arbiview_aug.camera import BoolArray
 from arbiview_aug.errors import SampleError
+from arbiview_aug.favs.config import check_ranges
 from arbiview_aug.maps import edge_distance, ego_rays, project_rays
 from arbiview_aug.neighbours import adjacent_pairs, half_way_view, odd_tiles
 from arbiview_aug.rig import Rig, content_order
@@ -73,10 +74,7 @@ class HarmoniseConfig:
     """If no gain changes more than this the cameras agree: half a grey level at mid-grey is not worth a copy."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value, (low, high) = getattr(self, field.name), _RANGES[field.name]
-            if not low <= value <= high:
-                raise ValueError(f"HarmoniseConfig.{field.name}: expected {low:g} to {high:g}, got {value!r}")
+        check_ranges(self, _RANGES)
 
 
 _RANGES: dict[str, tuple[float, float]] = {
@@ -199,7 +197,7 @@ def estimate_gains(
     none = (1.0,) * len(rig)
     if not overlaps.pairs:
         return PhotometricReport(none, False, "no two cameras overlap enough")
-    small = [_reduced(images[k], level) for k, level in zip(overlaps.order, overlaps.levels, strict=True)]
+    small = [reduced(images[k], level) for k, level in zip(overlaps.order, overlaps.levels, strict=True)]
     seen = [(pair, _read(small[pair.a], pair.at[0]), _read(small[pair.b], pair.at[1])) for pair in overlaps.pairs]
     measured = [_log_ratio(one[: pair.fitted], two[: pair.fitted], config) for pair, one, two in seen]
     if all(ratio is None for ratio in measured):
@@ -222,7 +220,7 @@ def estimate_gains(
     return PhotometricReport(gains, True, words, before, after)
 
 
-def _reduced(image: torch.Tensor, level: int) -> _Pixels:
+def reduced(image: torch.Tensor, level: int) -> _Pixels:
     """The image (h, w, 3) float32 in [0, 1], halved ``level`` times."""
     image = image.detach()
     top = np.float32(255 if image.dtype == torch.uint8 else 1)
