@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.camera import BoolArray, Camera
-from arbiview_aug.evaluate.frames import Render
 from arbiview_aug.evaluate.images import Image, View, as_arrays, as_tensors
+from arbiview_aug.evaluate.methods import Method
 from arbiview_aug.evaluate.overlap import OverlapScore, overlap_scores
 from arbiview_aug.favs.synthesis import render_opencv
 from arbiview_aug.neighbours import VIEW_SIZE
@@ -20,26 +20,22 @@ from arbiview_aug.rig import Rig
 
 
 def source_overlap(
-    sample: Mapping[str, Any], render: Render, *, size: tuple[int, int] = VIEW_SIZE
+    sample: Mapping[str, Any], method: Method, *, size: tuple[int, int] = VIEW_SIZE
 ) -> list[OverlapScore]:
     """Overlap metrics of a method: neighbouring source cameras, each alone rendered to their half-way view.
 
-    A method that learns from overlaps learns nothing here, where it sees one camera at a time.
-
     Args:
-        sample: With ``rig`` and ``images``; the method gets it with one camera at a time.
-        render: The method.
+        sample: With ``rig`` and ``images``.
+        method: The method; what it knows of the scene from all cameras it keeps (``Method.alone``).
         size: (h, w) of the half-way views.
     """
     rig: Rig = sample["rig"]
 
     def from_one(view: Camera, k: int) -> tuple[Image, BoolArray]:
-        alone = {key: value for key, value in sample.items() if key not in ("K", "cam2ego", "detections")}
-        alone |= {"images": [sample["images"][k]], "rig": rig.with_cameras([rig[k]])}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of views that one camera cannot cover: it need not
-            (rendered,) = render(alone, rig.with_cameras([view]))
-        return rendered.image, rendered.coverage
+            image, coverage, _ = method.alone(sample, k, rig.with_cameras([view]))
+        return image, coverage
 
     return overlap_scores(rig, from_one, size=size)
 

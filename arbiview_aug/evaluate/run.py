@@ -90,7 +90,7 @@ def _one(
     tick: Callable[[str, int], None],
 ) -> None:
     tick(f"{name}: {method.name}, overlap", steps)
-    for pair in source_overlap(frame.sample, method.render):
+    for pair in source_overlap(frame.sample, method):
         done.pairs.append({"frame": name, "method": method.name, "kind": "overlap", **pair._asdict()})
     for target, rig in rigs.items():
         tick(f"{name}: {method.name}, {target}", steps)
