@@ -47,7 +47,7 @@ def detections_of_frames(
         return [_of_cameras(found, frame) for found, frame in zip(of_frames, frames, strict=True)]
     if sample.get("boxes_3d") is None:
         return [{} for _ in frames]
-    scenes, names = scenes_of_frames(sample, len(frames), lead, "objects"), sample.get("box_names")
+    scenes, names = scenes_of_frames(sample, frames, lead, "objects"), sample.get("box_names")
     names_of = [names] if not lead or names is None else _entries("box_names", names, len(frames), "frames")
     names_of = names_of * (len(frames) // len(names_of))
     found = []

@@ -23,6 +23,7 @@ PIXEL_BOUND_KEYS = (
     "centers_2d",
     "depths",
     "depth",
+    "depth_m",
     "keypoints_2d",
     "neighbours",
     "source_camera",

@@ -61,6 +61,7 @@ class TargetRays:
         self.nodes = self.grid.nodes()
         self.directions, self.valid = ego_rays(camera, self.nodes)
         self._inverse: dict[Surface, FloatArray] = {}
+        self._uncertainty: dict[Surface, FloatArray] = {}
         self._solids: dict[Layered, SolidPixels] = {}
         ny, nx = self.grid.shape
         self.sparse_index = np.ix_(np.unique(np.r_[0:ny:4, ny - 1]), np.unique(np.r_[0:nx:4, nx - 1]))
@@ -78,6 +79,13 @@ class TargetRays:
             self._inverse[surface] = self._evaluated(surface)
             self.counters[f"surface_{type(surface).__name__.lower()}"] += 1
         return self._inverse[surface]
+
+    def uncertainty(self, surface: Surface) -> FloatArray:
+        """(ny, nx) of the inverse distances; evaluated once for each surface."""
+        if surface not in self._uncertainty:
+            q = self.inverse_distance(surface)
+            self._uncertainty[surface] = surface.uncertainty(self.camera.center_m, self.directions, q)
+        return self._uncertainty[surface]
 
     def _evaluated(self, surface: Surface) -> FloatArray:
         if not isinstance(surface, Layered):
@@ -260,10 +268,14 @@ class PairMap:
         """
         if isinstance(self.surface, Static):
             return None
-        towards, _ = self._from_source(self.rays.directions, self.rays.inverse_distance(self.surface))
-        near = np.zeros(self.valid.shape, bool)
-        for origin, rays in ((self.rays.camera.center_m, self.rays.directions), (self.source.center_m, towards)):
-            near |= self.surface.detailed(origin, rays, self.rays.spacing_rad)
+        target = self.rays.camera.center_m
+        near = self.surface.detailed(target, self.rays.directions, self.rays.spacing_rad)
+        # What the source does not show need not be asked about: the nodes inside its image, and some around them.
+        shown = cv2.dilate(self.source.contains(self.uv).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+        j0, j1, i0, i1 = _bounds(shown, 1) or (0, *shown.shape[:1], 0, shown.shape[1])
+        part = slice(j0, j1), slice(i0, i1)
+        towards, _ = self._from_source(self.rays.directions[part], self.rays.inverse_distance(self.surface)[part])
+        near[part] |= self.surface.detailed(self.source.center_m, towards, self.rays.spacing_rad)
         return cv2.dilate(near.astype(np.uint8), np.ones((8, 8), np.uint8), anchor=(3, 3))[:-1, :-1] > 0
 
     def _evaluate(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -278,8 +290,12 @@ class PairMap:
         uv, _, valid = self.source.project_cam(points)
         if isinstance(self.surface, Static):
             return uv, valid
-        towards, from_source = self._from_source(directions, q)
-        return uv, valid & ~self.surface.hides(self.source.center_m, towards, from_source, 1 / self.source.K[0, 0])
+        shown = valid & self.source.contains(uv)  # what lies beside the image need not be asked about
+        if shown.any():
+            towards, from_source = self._from_source(directions[shown], q[shown])
+            pixel_rad = 1 / self.source.K[0, 0]
+            valid[shown] = ~self.surface.hides(self.source.center_m, towards, from_source, pixel_rad)
+        return uv, valid
 
     def _from_source(self, directions: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Unit rays (..., 3) from the source to scene points on target rays, and inverse distances along them."""

@@ -125,9 +125,9 @@ def build_plan(
     Args:
         source: The rig that recorded the images.
         target: The rig to render, in its own ego frame: the two roads are made to coincide.
-        surface: ``far``, ``ground``, ``street``, ``objects`` (needs boxes); or ``auto``: for each pair of target and
-            source camera, ``far`` where their centres coincide or the worst-case parallax is below
-            ``config.far_parallax_px``, else the scene's best.
+        surface: ``far``, ``ground``, ``street``, ``objects`` (needs boxes), ``lidar`` (needs points); or ``auto``: for
+            each pair of target and source camera, ``far`` where their centres coincide or the worst-case parallax is
+            below ``config.far_parallax_px``, else the scene's best.
         config: Settings; the ``fast`` preset by default.
         scene: What is known of the geometry, in the source's ego frame.
 

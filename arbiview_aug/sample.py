@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug.camera import BoolArray, Camera
+from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError, SampleTypeError
+from arbiview_aug.lidar import checked_points, points_of_depth
 from arbiview_aug.objects import checked_boxes
 from arbiview_aug.rig import Rig
 from arbiview_aug.scene import Scene
@@ -80,27 +81,64 @@ def check_inputs(sample: Any, source_rig: Rig | None) -> list[SourceFrame]:
     ]
 
 
-def scenes_of_frames(sample: Mapping[str, Any], count: int, lead: tuple[int, ...], surface: str) -> list[Scene]:
+def scenes_of_frames(
+    sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...], surface: str
+) -> list[Scene]:
     """What each frame of a sample says of the geometry, in the source's ego frame.
 
     Args:
-        sample: The sample dict, its images checked.
-        count: Number of frames.
+        sample: The sample dict.
+        frames: Its checked frames.
         lead: Leading dimensions of its images.
         surface: The surface asked for: what it does not use is not read.
 
     Raises:
         SampleError: Geometry that the surface needs is missing or impossible.
     """
-    boxes = sample.get("boxes_3d") if surface in ("auto", "objects") else None
-    if boxes is None:
-        if surface == "objects":
-            raise SampleError(
-                "surface='objects': expected 'boxes_3d' (B, 7) in the sample, got none; an empty (0, 7) tensor says "
-                "that nothing stands there"
-            )
+    count = len(frames)
+    boxes = sample.get("boxes_3d") if surface in ("auto", "objects", "lidar") else None
+    if boxes is None and surface == "objects":
+        raise SampleError(
+            "surface='objects': expected 'boxes_3d' (B, 7) in the sample, got none; an empty (0, 7) tensor says "
+            "that nothing stands there"
+        )
+    points = _points_of_frames(sample, frames, lead) if surface in ("auto", "lidar") else None
+    if points is None and surface == "lidar":
+        raise SampleError(
+            "surface='lidar': expected 'points' (P, >= 3) in the ego frame, or 'depth_m' (N, H, W), z-depth of each "
+            "camera in metres, in the sample, got neither"
+        )
+    if boxes is None and points is None:
         return [Scene()] * count
-    return [Scene(boxes=checked_boxes(frame)) for frame in _of_frames("boxes_3d", boxes, count, lead)]
+    solid: list[FloatArray | None] = [None] * count
+    if boxes is not None:
+        solid = [checked_boxes(of_frame) for of_frame in _of_frames("boxes_3d", boxes, count, lead)]
+    measured = [None] * count if points is None else points
+    return [Scene(b, p) for b, p in zip(solid, measured, strict=True)]
+
+
+def _points_of_frames(
+    sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...]
+) -> list[FloatArray] | None:
+    """(P, 3) measured points of each frame: its ``points``, and those of its depth maps ``depth_m``; None without."""
+    points, depth_m = sample.get("points"), sample.get("depth_m")
+    if points is None and depth_m is None:
+        return None
+    parts: list[list[FloatArray]] = [[] for _ in frames]
+    if points is not None:
+        for part, of_frame in zip(parts, _of_frames("points", points, len(frames), lead), strict=True):
+            part.append(checked_points(of_frame))
+    if depth_m is not None:
+        try:
+            maps = split(depth_m, lead)
+        except (AttributeError, ValueError) as error:
+            raise SampleError(f"depth_m: expected one map (H, W) for each image ({error})") from None
+        for part, frame, of_cameras in zip(parts, frames, maps, strict=True):
+            if not hasattr(of_cameras, "__len__") or len(of_cameras) != len(frame.rig):
+                raise SampleError(f"depth_m: expected {len(frame.rig)} maps (H, W), one for each image")
+            for camera, depth in zip(frame.rig, of_cameras, strict=True):
+                part.append(points_of_depth(camera, _numbers("depth_m", depth, ())))
+    return [np.concatenate(part) for part in parts]
 
 
 def names_of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[object]:

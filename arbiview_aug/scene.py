@@ -6,6 +6,7 @@ import hashlib
 from dataclasses import dataclass
 
 from arbiview_aug.camera import FloatArray
+from arbiview_aug.lidar import LidarObjects, LidarSurface
 from arbiview_aug.objects import Objects
 from arbiview_aug.refined import Correction, Refined
 from arbiview_aug.surface import Far, Ground, Static, Street, Surface, SurfaceName
@@ -17,27 +18,31 @@ class Scene:
 
     Attributes:
         boxes: (B, 7) labelled objects: centre x, y, z, length, width, height (metres), yaw (radians).
+        points: (P, 3) measured points, metres.
         corrections: What overlaps say of the street's distances.
     """
 
     boxes: FloatArray | None = None
+    points: FloatArray | None = None
     corrections: tuple[Correction, ...] = ()
 
     @property
     def is_empty(self) -> bool:
         """Whether nothing is known but the road."""
-        return self.boxes is None and not self.corrections
+        return self.boxes is None and self.points is None and not self.corrections
 
     @property
     def best(self) -> SurfaceName:
         """The surface made of the best geometry that there is: what ``auto`` takes."""
+        if self.points is not None and len(self.points):
+            return "lidar"
         return "street" if self.boxes is None else "objects"
 
     @property
     def key(self) -> bytes:
         """Content hash: scenes with equal keys are the same."""
         digest = hashlib.sha256()
-        for array in (self.boxes,):
+        for array in (self.boxes, self.points):
             digest.update(b"none" if array is None else repr(array.shape).encode() + array.tobytes())
         for correction in self.corrections:
             digest.update(correction.key)
@@ -60,4 +65,8 @@ class Scene:
             return street
         if name == "objects" and self.boxes is not None:
             return Objects(street, self.boxes)
+        if name == "lidar" and self.points is not None:
+            if self.boxes is not None and len(self.boxes):
+                return LidarObjects.among(street, self.points, self.boxes)
+            return LidarSurface(street, self.points)
         raise ValueError(f"surface: {name!r} is unknown, or the scene has no geometry for it")

@@ -15,11 +15,13 @@ import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 
-SurfaceName = Literal["auto", "far", "ground", "street", "objects"]
+SurfaceName = Literal["auto", "far", "ground", "street", "objects", "lidar"]
 """Surfaces a user can ask for. ``auto`` decides per pair of target and source camera (see ``plan``)."""
 
 MAX_INVERSE_DISTANCE = 100.0
 """Nothing is nearer to a camera than 1 cm: keeps points finite when a camera touches a surface."""
+
+_TYPICAL_OBJECT_M = 20.0
 
 WALL_CENTER_M = (1.0, 0.0)
 """Centre of the far wall in the ego frame: the middle of a car's cameras when the origin is its rear axle.
@@ -63,8 +65,11 @@ class Surface(ABC):
         """Rays (...,) that pass some detail within an angle, where nothing may be interpolated."""
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
-        """Spread (...,) in 1/m of the true inverse distance around this surface's ``inverse_distance``."""
-        return depth_uncertainty(inverse_distance)
+        """Mean error (...,) in 1/m to expect of this surface's ``inverse_distance``.
+
+        Where a surface does not know better: 1/20, that of the nearest objects of a street.
+        """
+        return np.full(inverse_distance.shape, 1 / _TYPICAL_OBJECT_M)
 
 
 class Drawn(NamedTuple):
@@ -102,7 +107,7 @@ class Layered(Surface):
 
     @property
     @abstractmethod
-    def background(self) -> Static:
+    def background(self) -> Surface:
         """What there is behind the solids."""
 
     @abstractmethod
@@ -166,6 +171,10 @@ class Ground(Static):
         wall = wall_inverse_distance(origin, directions, self.radius_m, self.radius_m)
         return np.maximum(plane_inverse_distance(origin, directions, self.ground_z_m), wall)
 
+    def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
+        """What objects on a street make of it, 1/m (...,)."""
+        return street_uncertainty(origin, directions, inverse_distance)
+
 
 @dataclass(frozen=True)
 class Street(Static):
@@ -209,6 +218,10 @@ class Street(Static):
         joined = near * (1 + ratio**self.sharpness) ** (1 / self.sharpness)
         return np.minimum(joined, MAX_INVERSE_DISTANCE)
 
+    def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
+        """What objects on the street make of it, 1/m (...,)."""
+        return street_uncertainty(origin, directions, inverse_distance)
+
 
 def plane_inverse_distance(origin: FloatArray, directions: FloatArray, ground_z_m: float) -> FloatArray:
     """Inverse distance to the horizontal plane z = ground_z_m; 0 for rays that do not descend to it.
@@ -241,16 +254,28 @@ def wall_inverse_distance(
     return np.clip(q, 0.0, MAX_INVERSE_DISTANCE)
 
 
-def depth_uncertainty(inverse_distance: FloatArray) -> FloatArray:
-    """Spread (1/m) of the true inverse distance around a static surface's.
+def street_uncertainty(origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
+    """Mean error (...,) in 1/m of a street without objects: they stand in front of it, and nobody said where.
 
-    Objects stand in front of the surface, anywhere down to the camera: half the surface's own inverse distance, and
-    never less than 1/``_TYPICAL_OBJECT_M``, which is where the nearest objects of a street are.
+    A ray meets them anywhere between ``_FREE`` of the way to the wall and the surface, at ``_DENSITY`` for each such
+    way: the integral of (1/t - 1/t_surface) over t. The near road is certain, the wall and what is above it are not.
+    Measured on six synthetic streets, tenths of the rays ordered by this, it is within a quarter of the mean error
+    for eight of them (0.041 to 0.129; of the others, 0.035 for 0.044 and 0.054 for 0.040).
+
+    Args:
+        origin: (3,) the rays' start in the ego frame, metres.
+        directions: (..., 3) unit directions.
+        inverse_distance: (...,) of the surface along them, 1/m.
     """
-    return np.maximum(0.5 * inverse_distance, 1 / _TYPICAL_OBJECT_M)
+    wall = wall_inverse_distance(origin, directions, Street.half_length_m, Street.half_width_m)
+    t = np.clip(wall / np.maximum(inverse_distance, 1e-9), _FREE, 1.0)
+    return np.asarray(_DENSITY * wall * (np.log(t / _FREE) - 1 + _FREE / t))
 
 
-_TYPICAL_OBJECT_M = 20.0
+_FREE = 0.1
+"""Nothing stands nearer than a tenth of the way to the wall, 4 m ahead and 2 m aside: 0.15 fits as well."""
+_DENSITY = 1.33
+"""Fitted on synthetic streets, seeds 100 to 105."""
 
 NEAREST_SCENE_M = 2.0
 """Nearest scene point assumed for worst-case parallax: what stands closer fills a camera's view."""

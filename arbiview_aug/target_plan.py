@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from arbiview_aug import sampling
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
+from arbiview_aug.confidence import certainty
 from arbiview_aug.favs.adaptive_fusion import distance_weight, primary_weight, quality_weight
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.grid import Box, runs
@@ -81,12 +82,14 @@ class TargetPlan:
         source_camera: (h, w) int8 index of the winning source, -1 where no source sees the pixel.
         bands: Blended rectangles along the seams.
         pairs: One report for each source that wins any pixel.
+        certainty: (h, w) ``confidence.certainty`` of the winning source in 255ths, 0 where uncovered; if asked for.
     """
 
     at: FixedMap
     source_camera: npt.NDArray[np.int8]
     bands: tuple[Band, ...]
     pairs: tuple[PairReport, ...]
+    certainty: npt.NDArray[np.uint8] | None = None
 
     @property
     def coverage(self) -> BoolArray:
@@ -102,7 +105,8 @@ class TargetPlan:
     def nbytes(self) -> int:
         """Memory held."""
         bands = sum(b.at.nbytes + b.weight.nbytes for b in self.bands)
-        return self.at.nbytes + self.source_camera.nbytes + bands
+        certainty = 0 if self.certainty is None else self.certainty.nbytes
+        return self.at.nbytes + self.source_camera.nbytes + bands + certainty
 
 
 @dataclass
@@ -118,6 +122,7 @@ class _Region:
     score: npt.NDArray[np.float32]  # [ny, nx] stage-4 weight on the nodes, 0 where not visible
     parallax: npt.NDArray[np.float32]  # [ny, nx] expected displacement, target pixels
     border_px: npt.NDArray[np.float32]  # [ny, nx] distance to the border of what the source sees, target pixels
+    certainty: npt.NDArray[np.float32] | None  # [ny, nx] in 255ths, if asked for
 
 
 @dataclass(frozen=True)
@@ -129,6 +134,7 @@ class _Visible:
     at: npt.NDArray[np.float32]  # [box h, box w, 2] atlas positions
     visible: npt.NDArray[np.uint8]  # [box h, box w] 255 where the source sees the pixel
     weight: npt.NDArray[np.float32]  # [box h, box w] seam weight
+    certainty: npt.NDArray[np.uint8] | None  # [box h, box w]
 
 
 class TargetDraft:
@@ -197,14 +203,25 @@ class TargetDraft:
             score=self.grid.extended(np.where(seen, score, 0).astype(np.float32)),
             parallax=parallax.astype(np.float32),
             border_px=(edge_px / np.maximum(pixels_per_pixel, 1e-3)).astype(np.float32),
+            certainty=self._certainty(pair, parallax / focal_px, pixels_per_pixel) if self.config.certainty else None,
         )
+
+    def _certainty(
+        self, pair: PairMap, parallax_rad: FloatArray, pixels_per_pixel: FloatArray
+    ) -> npt.NDArray[np.float32]:
+        """Certainty on the nodes in 255ths; nodes that the source cannot see take the mean of those around them."""
+        valid = pair.valid.astype(np.float32)
+        known = np.where(pair.valid, 255 * certainty(parallax_rad, pixels_per_pixel), 0).astype(np.float32)
+        if pair.valid.all():
+            return self.grid.extended(known)
+        total, count = (cv2.blur(part, (5, 5), borderType=cv2.BORDER_REPLICATE) for part in (known, valid))
+        return self.grid.extended(np.where(pair.valid, known, total / np.maximum(count, 1e-6)))
 
     def _expected_parallax(self, offset_m: FloatArray, focal_px: float, surface: Surface) -> FloatArray:
         """Displacement (target px) that unknown depth around a surface may cause: offset across the ray x spread."""
-        q = self.rays.inverse_distance(surface)
         along_m = self.rays.directions @ offset_m
         across_m = np.sqrt(np.maximum(offset_m @ offset_m - along_m**2, 0))
-        return focal_px * across_m * surface.uncertainty(self.camera.center_m, self.rays.directions, q)
+        return focal_px * across_m * self.rays.uncertainty(surface)
 
     @staticmethod
     def _level(resolution: FloatArray, size: tuple[int, int]) -> int:
@@ -223,6 +240,7 @@ class TargetDraft:
         h, w = self.camera.size
         fixed = FixedMap(np.empty((h, w, 2), np.int16), np.empty((h, w), np.uint16))
         winner = np.full((h, w), -1, np.int8)
+        certain = np.zeros((h, w), np.uint8) if self.config.certainty else None
         weights = self._seam_weights()
         shared = np.count_nonzero([weight > 0 for weight in weights], axis=0) > 1
         bands: list[Band] = []
@@ -246,6 +264,8 @@ class TargetDraft:
                 cv2.copyTo(part.at, wins, at[top - y0 : bottom - y0, left:right])
                 own = np.full(wins.shape, region.source, np.int8)
                 cv2.copyTo(own, wins, winner[top:bottom, left:right])
+                if certain is not None and part.certainty is not None:
+                    cv2.copyTo(part.certainty, wins, certain[top:bottom, left:right])
             fixed.fill_rows(y0, y1, at)
             for part in seen:
                 won = cv2.inRange(winner[y0:y1], part.source, part.source)  # type: ignore[call-overload]
@@ -254,7 +274,7 @@ class TargetDraft:
                 bands.extend(self._bands(seen, winner, shared, rows))
         if self.config.interpolation == "nearest":
             fixed = fixed.rounded()
-        return TargetPlan(fixed, winner, tuple(bands), tuple(self._reports(winner, won_px)))
+        return TargetPlan(fixed, winner, tuple(bands), tuple(self._reports(winner, won_px)), certain)
 
     def _visible(
         self, region: _Region, weight: npt.NDArray[np.float32], rows: tuple[int, int], layout: AtlasLayout
@@ -267,7 +287,10 @@ class TargetDraft:
         if box[1] <= box[0] or box[3] <= box[2]:
             return None
         at, visible = region.pair.full_resolution(layout.slot(region.source, region.level), nodes[:2])
-        return _Visible(region.source, box, at, visible, self.grid.upsample(weight, nodes))
+        certain = None
+        if region.certainty is not None:
+            certain = np.round(self.grid.upsample(region.certainty, nodes)).astype(np.uint8)
+        return _Visible(region.source, box, at, visible, self.grid.upsample(weight, nodes), certain)
 
     def _seam_weights(self) -> list[npt.NDArray[np.float32]]:
         """Weights on the nodes: each source's winning area, softened over the seam width, fading at its own border."""

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import torch
 
+from arbiview_aug.confidence import confidence
 from arbiview_aug.detections import OfCameras, detections_of_frames
 from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError
@@ -37,7 +38,7 @@ Execution = Literal["auto", "opencv", "torch"]
 View = RenderPlan | PaperRendering | tuple[int, int]
 """How a frame is made: by a plan, by the published stages (and then it is rendered already), or only resized."""
 
-OUTPUTS = ("source_camera",)
+OUTPUTS = ("source_camera", "confidence")
 """What a sample can hold besides, on request."""
 
 _UNREACHABLE = 0.5  # a target camera of which less than this is covered is worth a warning
@@ -75,9 +76,11 @@ class RigRetarget(torch.nn.Module):
             torchvision's detectors return them) or else ``boxes_3d``, with ``box_names`` (a name each) where there are
             any.
         surface: ``far``, ``ground``, ``street``; ``objects``: the sample's ``boxes_3d`` stand on the street, so that
-            objects keep their height when cameras move; ``auto``: for each pair of cameras ``far`` where their centres
-            coincide, else the best that the sample offers: ``objects`` with ``boxes_3d``, else ``street``, with a
-            warning where cameras move (``paper``: always ``far``).
+            objects keep their height when cameras move; ``lidar``: its ``points`` (ego frame) or ``depth_m`` (..., N,
+            H, W; z-depth in metres, 0 or NaN where unknown), with ``boxes_3d`` before them where there are any;
+            ``auto``: for each pair of cameras ``far`` where their centres coincide, else the best that the sample
+            offers: ``objects`` with ``boxes_3d``, else ``street``, with a warning where cameras move (``paper``:
+            always ``far``).
         harmonise: Bring the sources to one exposure (``arbiview_aug.favs.photometric``): True or a ``HarmoniseConfig``
             estimates a gain for each camera in every frame; numbers are gains to use as they are. Off by default.
             Samples that ``p`` skips keep their colours.
@@ -94,7 +97,9 @@ class RigRetarget(torch.nn.Module):
         label_keys: Keys that hold label maps (..., N, H, W) or lists of them, besides ``tv_tensors.Mask``.
         label_fill: Value of label pixels that no source sees (False for bool maps).
         pass_keys: Keys to keep although they look bound to the source's pixels.
-        outputs: Further outputs: ``source_camera`` (..., M, h, w) int8, -1 where uncovered.
+        outputs: Further outputs: ``source_camera`` (..., M, h, w) int8, -1 where uncovered; ``confidence``
+            (..., M, h, w) float32 in [0, 1], exp(-e / 10) for an expected error of e grey levels of 255: 1 where
+            the source is exact, 0 where uncovered (``arbiview_aug.confidence``; not with ``paper``).
         execution: ``opencv`` (CPU), ``torch`` (any device, differentiable); ``auto`` takes OpenCV for CPU images that
             need no gradient.
         cache_bytes: Memory for plans; the least recently used go first.
@@ -150,6 +155,10 @@ class RigRetarget(torch.nn.Module):
             check_pinhole(self.target if isinstance(self.target, Rig) else self.target.base)
             if harmonise is not None and harmonise is not False:
                 raise ValueError("harmonise: quality='paper' is as published: expected None, got " + repr(harmonise))
+            if "confidence" in outputs:
+                raise ValueError("outputs: quality='paper' has no 'confidence': it moves pixels by what it matches")
+        elif "confidence" in outputs:
+            self.config = replace(self.config, certainty=True)
         if refinement is not None and not (isinstance(self.config, FavsConfig) and self.config.overlap_depth):
             raise ValueError("refinement: expected quality='accurate' (or overlap_depth=True) with a RefinementCache")
         self.refinement = refinement
@@ -190,7 +199,7 @@ class RigRetarget(torch.nn.Module):
         labels = check_other_keys(sample, list(sizes), self.label_keys, self.pass_keys)
         target, skip, drawn = self._draw(sample, frames, params)
         views: list[View] = []
-        scenes = self._scenes(sample, len(frames), lead)
+        scenes = self._scenes(sample, frames, lead)
         names = self._refinement_names(sample, len(frames), lead)
         found = self._detections(sample, frames, lead)
         for frame, scene, name, detections in zip(frames, scenes, names, found, strict=True):
@@ -267,7 +276,9 @@ class RigRetarget(torch.nn.Module):
     def _rendered(self, frames: Sequence[SourceFrame], views: Sequence[View]) -> list[dict[str, Any]]:
         """Images, calibration and masks of each frame: rendered by its plan, or resized."""
         parts = []
-        for frame, view, images in zip(frames, views, self._images(frames, views), strict=True):
+        seams: dict[int, list[torch.Tensor]] | None = {} if "confidence" in self.outputs else None
+        rendered = self._images(frames, views, seams)
+        for b, (frame, view, images) in enumerate(zip(frames, views, rendered, strict=True)):
             device = frame.images[0].device
             rig = view.target if not isinstance(view, tuple) else frame.rig.resized(view)
             part = self._described(rig, device)
@@ -277,13 +288,23 @@ class RigRetarget(torch.nn.Module):
             else:
                 winners = [np.full(view, k, np.int8) for k in range(len(rig))]
             part["coverage"] = covered(winners, device)
+            if seams is not None:
+                part["confidence"] = stacked(_confidence(view, images, part["coverage"], seams.get(b, [])))
             if "source_camera" in self.outputs:
                 part["source_camera"] = stacked([torch.from_numpy(winner.copy()).to(device) for winner in winners])
             parts.append(part)
         return parts
 
-    def _images(self, frames: Sequence[SourceFrame], views: Sequence[View]) -> list[list[torch.Tensor]]:
-        """The target images of each frame; frames that share a plan go through torch together."""
+    def _images(
+        self,
+        frames: Sequence[SourceFrame],
+        views: Sequence[View],
+        seams: dict[int, list[torch.Tensor]] | None = None,
+    ) -> list[list[torch.Tensor]]:
+        """The target images of each frame; frames that share a plan go through torch together.
+
+        Into ``seams``, where given, go the changes along the seams (see ``render_opencv``) of each planned frame.
+        """
         done: dict[int, list[torch.Tensor]] = {}
         together: dict[int, list[int]] = {}
         for b, (frame, view) in enumerate(zip(frames, views, strict=True)):
@@ -295,15 +316,19 @@ class RigRetarget(torch.nn.Module):
                 together.setdefault(id(view), []).append(b)
             else:
                 curves = self.harmoniser.curves(frame.rig, frame.images)
-                done[b] = render_opencv(view, frame.images, self._scratch, curves)
+                changes = None if seams is None else seams.setdefault(b, [])
+                done[b] = render_opencv(view, frame.images, self._scratch, curves, changes)
         for members in together.values():
             plan = views[members[0]]
             assert isinstance(plan, RenderPlan)
             sources = zip(*(frames[b].images for b in members), strict=True)
             toned = [self.harmoniser.curves(frames[b].rig, frames[b].images) for b in members]
-            rendered = render_torch(plan, [torch.stack(images) for images in sources], toned)
+            batched: list[torch.Tensor] | None = None if seams is None else []
+            rendered = render_torch(plan, [torch.stack(images) for images in sources], toned, batched)
             for k, b in enumerate(members):
                 done[b] = [image[k] for image in rendered]
+                if seams is not None and batched is not None:
+                    seams[b] = [change[k] for change in batched]
         return [done[b] for b in range(len(frames))]
 
     def _described(self, rig: Rig, device: torch.device) -> dict[str, Any]:
@@ -323,11 +348,13 @@ class RigRetarget(torch.nn.Module):
             part["ignore"] = stacked([torch.from_numpy(~m).to(device) for m in masks])
         return part
 
-    def _scenes(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[Scene]:
+    def _scenes(
+        self, sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...]
+    ) -> Sequence[Scene]:
         """What each frame's sample says of the geometry, as far as the surface uses it."""
         if isinstance(self.config, PaperConfig):
-            return [Scene()] * count
-        return scenes_of_frames(sample, count, lead, self.surface)
+            return [Scene()] * len(frames)
+        return scenes_of_frames(sample, frames, lead, self.surface)
 
     def _detections(
         self, sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...]
@@ -385,7 +412,7 @@ class RigRetarget(torch.nn.Module):
             known = Scene()
         # A frame's geometry never comes back, unless it is a refinement that is reused: its plan must not push out
         # those that do.
-        comes_back = known.is_empty or (self.refinement is not None and known.boxes is None)
+        comes_back = known.is_empty or (self.refinement is not None and known.best == "street")
         cache = self.plans if comes_back else self._plan_of_frame
         key = plan_key(source, target, self.surface, config, known)
         return cache.get(key, lambda: self._built(source, target, config, known))
@@ -427,7 +454,7 @@ class RigRetarget(torch.nn.Module):
         """
         frames, lead = check_inputs(sample, self.source_rig), leading_shape(sample["images"])
         target, _, _ = self._draw(sample, frames[:1], None)
-        scene = self._scenes(sample, len(frames), lead)[0]
+        scene = self._scenes(sample, frames, lead)[0]
         detections = self._detections(sample, frames, lead)[0]
         asked = self.harmoniser.estimates or self.harmoniser.gains is not None
         name = self._refinement_names(sample, len(frames), lead)[0]
@@ -488,6 +515,17 @@ class RigRetarget(torch.nn.Module):
 def _one_of(name: str, value: Any, choices: Sequence[str]) -> None:
     if value not in choices:
         raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+
+
+def _confidence(
+    view: View, images: Sequence[torch.Tensor], coverage: Sequence[torch.Tensor], seams: Sequence[torch.Tensor]
+) -> list[torch.Tensor]:
+    """Confidence (h, w) of each view; a frame that was only resized shows what its cameras saw."""
+    if not isinstance(view, RenderPlan):
+        return [seen.float() for seen in coverage]
+    certain = [target.certainty for target in view.targets]
+    parts = zip(images, certain, coverage, seams, strict=True)
+    return [confidence(image, c, seen, change) for image, c, seen, change in parts if c is not None]
 
 
 def _checked_size(size: Any) -> tuple[int, int]:

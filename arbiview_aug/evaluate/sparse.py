@@ -24,10 +24,8 @@ from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.images import Image
 from arbiview_aug.evaluate.scores import Errors, errors, flat, mean_of, ssim
+from arbiview_aug.lidar import own_car
 from arbiview_aug.rig import Rig
-
-OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
-"""(x, y) ranges in the ego frame whose LiDAR returns are the own car's."""
 
 NEAREST_M = 1.0
 """Points closer to the camera are not used: they lie on the own car."""
@@ -142,7 +140,8 @@ def coloured_points(
 ) -> ColouredPoints:
     """LiDAR points coloured by the camera that sees each closest to its axis.
 
-    Returns of the own car (``OWN_CAR_M``) and points that no camera sees, or only on a car-body mask, are dropped.
+    Returns of the own car (``lidar.OWN_CAR_M``) and points that no camera sees, or only on a car-body mask, are
+    dropped.
 
     Args:
         rig: The source rig.
@@ -151,9 +150,7 @@ def coloured_points(
         ground_band_m: Distance from the road plane that still counts as ground.
     """
     _check_images(rig, images)
-    (x0, x1), (y0, y1) = OWN_CAR_M
-    x, y = points[:, 0], points[:, 1]
-    points = points[~((x > x0) & (x < x1) & (y > y0) & (y < y1)), :3].astype(np.float64)
+    points = points[~own_car(points), :3].astype(np.float64)
     colours, best_cosine = np.zeros((len(points), 3)), np.full(len(points), -1.0)
     for camera, image in zip(rig, images, strict=True):
         index, uv, _ = _unmasked(camera, visible_points(camera, points))

@@ -45,6 +45,10 @@ class FavsConfig:
     overlap_depth: bool = False
     """Correct the street's distances by what overlapping cameras see of them, frame by frame."""
 
+    certainty: bool = False
+    """Plans hold how far the geometry of each pixel can be trusted, one byte a pixel: ``outputs=("confidence",)`` sets
+    it."""
+
     def __post_init__(self) -> None:
         check_ranges(self, _RANGES)
         if self.grid_step_px not in (1, 4, 8, 16, 32):

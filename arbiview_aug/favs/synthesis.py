@@ -19,6 +19,7 @@ def render_opencv(
     images: Sequence[torch.Tensor],
     scratch: Scratch | None = None,
     curves: Sequence[ToneCurve] | None = None,
+    seams: list[torch.Tensor] | None = None,
 ) -> list[torch.Tensor]:
     """Target views by OpenCV, for CPU images; not differentiable.
 
@@ -27,6 +28,8 @@ def render_opencv(
         images: N images (3, H, W): uint8, or float in [0, 1].
         scratch: Buffers to reuse between calls.
         curves: A tone curve for each image, applied to what the target reads of it.
+        seams: A list to append, for each view, (h, w) float32 to: by how much blending a second source changed the
+            winner's colour, mean over the channels, in the images' unit.
 
     Returns:
         M views (3, h, w) of the images' type, black where no source sees; slices of one (M, 3, h, w) block where all
@@ -39,6 +42,9 @@ def render_opencv(
     views = _empty_views(plan, work)
     for k, (target, view) in enumerate(zip(plan.targets, views, strict=True)):
         h, w = target.source_camera.shape
+        change = np.zeros((h, w), np.float32) if seams is not None else None
+        if seams is not None:
+            seams.append(torch.from_numpy(change))
         if not target.pairs:
             view.zero_()
             continue
@@ -56,13 +62,19 @@ def render_opencv(
             second = sampling.remap(atlas, band.at, plan.interpolation)
             if curves is not None:
                 curves[band.source].apply(second)
+            if change is not None:
+                apart = np.abs(part.astype(np.float32) - second).mean(-1)
+                change[band.y : band.y + bh, band.x : band.x + bw] += apart * band.weight
             part[...] = cv2.blendLinear(part, second, 1 - band.weight, band.weight)
         cv2.split(buffer, list(views[k].numpy()))
     return [view.to(dtype) for view in views]
 
 
 def render_torch(
-    plan: RenderPlan, images: Sequence[torch.Tensor], curves: Sequence[Sequence[ToneCurve] | None] | None = None
+    plan: RenderPlan,
+    images: Sequence[torch.Tensor],
+    curves: Sequence[Sequence[ToneCurve] | None] | None = None,
+    seams: list[torch.Tensor] | None = None,
 ) -> list[torch.Tensor]:
     """Target views by ``grid_sample``: batches, any device, differentiable in the images.
 
@@ -70,6 +82,7 @@ def render_torch(
         plan: The plan for these images' rig, shared by the batch.
         images: N images (B, 3, H, W): uint8, or float in [0, 1]; sampled in float32.
         curves: For each frame of the batch nothing, or a tone curve for each image.
+        seams: A list to append, for each view, (B, h, w) float32 to: see ``render_opencv``.
 
     Returns:
         M views (B, 3, h, w) of the images' type.
@@ -83,6 +96,8 @@ def render_torch(
         view = sampling.grid_sample(atlas, grid, plan.interpolation) * coverage
         if curves is not None:
             view = _toned(view, torch.from_numpy(target.source_camera).to(device), curves, dtype == torch.uint8)
+        if seams is not None:
+            seams.append(view.new_zeros(view.shape[0], *coverage.shape))
         for band in target.bands:
             bh, bw = band.weight.shape
             part = (slice(None), slice(None), slice(band.y, band.y + bh), slice(band.x, band.x + bw))
@@ -92,6 +107,8 @@ def render_torch(
             if curves is not None:
                 second = _toned(second, torch.tensor(band.source, device=device), curves, dtype == torch.uint8)
             weight = torch.from_numpy(band.weight).to(device)
+            if seams is not None:
+                seams[-1][(slice(None), *part[2:])] += (view[part] - second).detach().abs().mean(1) * weight
             blended = view.clone()
             blended[part] = torch.lerp(view[part], second, weight.expand_as(second))
             view = blended

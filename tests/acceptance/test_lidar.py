@@ -1,0 +1,120 @@
+"""What measured points are worth: on real frames against the protocol's ``ground`` renderer, and on synthetic streets.
+
+Real frames: half resolution, exposures made even, quality ``fast``; the surface is made of the points of every other
+degree of azimuth, the others score it. Synthetic streets: how far the outlines of vehicles are from the truth.
+Run with ``-s`` for the tables.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug.camera import Camera
+from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig
+from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
+from arbiview_aug.favs.synthesis import render_labels
+from arbiview_aug.lidar import checked_points
+from arbiview_aug.objects import checked_boxes
+from arbiview_aug.plan import build_plan
+from arbiview_aug.rig import Rig
+from arbiview_aug.scene import Scene
+from arbiview_aug.transforms import RigRetarget
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+MOVES = {"up 0.6 m": (0.0, (0.0, 0.0, 0.6)), "11° and moved": (11.0, (0.5, 0.3, 0.7)), "22°": (22.0, (0.0, 0.0, 0.0))}
+GAINS_DB = {"nuscenes-one": (8.0, 9.0, 3.0), "ddad-one": (7.0, 7.0, 3.5)}
+"""Over ``ground``, by move: what naive linear interpolation of inverse depth reaches."""
+
+SEEDS = range(4)
+STREET_MOVES = {"0.7 m higher": {"z_m": 0.7}, "1 m sideways": {"y_m": 1.0}}
+LARGEST_SHIFT_PX = 1.5
+
+
+def as_camera(name: str, K: Any, cam2ego: Any, size: tuple[int, int], mask: Any = None) -> Camera:
+    return Camera(name=name, width_px=size[1], height_px=size[0], K=K, cam2ego=cam2ego, mask=mask)
+
+
+@pytest.mark.parametrize("frame", GAINS_DB)
+def test_gain_over_ground(frame: str, referee: ModuleType, data_root: Path) -> None:
+    if not (data_root / frame).is_dir():
+        pytest.skip(f"no frame {frame} in {data_root}")
+    cameras, lidar, calibration = referee.load_frame(str(data_root / frame), 0.5)
+    cameras, ground_z_m = referee.equalised(cameras, lidar), float(calibration["ground_z_m"])
+    fit, test = referee.lidar_split(lidar)
+    rig = Rig(
+        [as_camera(n, c["K"], c["cam2ego"], c["image"].shape[:2], c["mask"] > 0) for n, c in cameras.items()],
+        ground_z_m=ground_z_m,
+    )
+    sample = {"images": as_tensors([c["image"] for c in cameras.values()]), "points": torch.from_numpy(lidar[fit])}
+
+    def ours(targets: list[Any]) -> list[Image]:
+        target = Rig([as_camera(*view) for view in targets], ground_z_m=ground_z_m)
+        return as_arrays(RigRetarget(target, source_rig=rig, surface="lidar")(sample)["images"])
+
+    reference = referee.reference_renderer(cameras, "ground", ground_z=ground_z_m)
+    rows = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of targets that are half outside
+        for name, (yaw_deg, shift_m) in MOVES.items():
+            targets = [referee.rotated_targets(cameras, yaw_deg, shift_m)]
+            psnr = [referee.score(r, cameras, lidar[test], targets)["psnr"] for r in (ours, reference)]
+            rows.append((name, *psnr, psnr[0] - psnr[1]))
+    print(f"\n{frame}, PSNR in dB: lidar, ground, gain")
+    print("\n".join(f"  {name:<16}{a:8.2f}{b:8.2f}{gain:+8.2f}" for name, a, b, gain in rows))
+    for (name, *_, gain), least in zip(rows, GAINS_DB[frame], strict=True):
+        assert gain >= least, name
+
+
+def edge_shifts(rendered: np.ndarray, truth: np.ndarray, covered: np.ndarray) -> Iterator[float]:
+    """Pixels between top and bottom edges of a mask (h, w) and the true ones, column by column.
+
+    Where nothing covers the true edge it is a hole, not displaced; columns at the image's border are cut off.
+    """
+    h = len(truth)
+    for x in np.flatnonzero(rendered.any(0) & truth.any(0)):
+        (ours,), (true,) = np.nonzero(rendered[:, x]), np.nonzero(truth[:, x])
+        for edge in (0, -1):
+            if 0 < true[edge] < h - 1 and covered[true[edge], x]:
+                yield abs(int(ours[edge]) - int(true[edge]))
+
+
+@pytest.fixture(scope="module")
+def shifts() -> dict[tuple[str, str], np.ndarray]:
+    """Displacements of vehicles' outlines, by (move, surface)."""
+    rig = demo_source_rig((256, 704))
+    found: dict[tuple[str, str], list[float]] = {}
+    for seed in SEEDS:
+        drive = SyntheticDrive(rig, num_frames=1, seed=seed)
+        sample, source = drive[0], drive.render(0)
+        scene = Scene(checked_boxes(sample["boxes_3d"]), checked_points(sample["points"].double().numpy()))
+        for move, by in STREET_MOVES.items():
+            truth = drive.render(0, rig.shifted(**by))
+            for surface in ("lidar", "street"):
+                plan = build_plan(rig, rig.shifted(**by), surface=surface, scene=scene)
+                views = render_labels(plan, list(source.instances), -2)
+                for view, true, classes in zip(views, truth.instances, truth.classes, strict=True):
+                    vehicles = np.unique(true[classes == SceneClass.VEHICLE].numpy())
+                    for k in vehicles[vehicles >= 0]:
+                        mask = (true == k).numpy()
+                        if mask.sum() >= 200:  # smaller ones are a few pixels high
+                            rows = edge_shifts((view == k).numpy(), mask, (view != -2).numpy())
+                            found.setdefault((move, surface), []).extend(rows)
+    for (move, surface), values in found.items():
+        half, more, most = np.percentile(values, [50, 75, 90])
+        print(f"\n{surface:<8}{move:<14}{len(values):>6} edges, 50/75/90 %: {half:.1f}/{more:.1f}/{most:.1f} px")
+    return {key: np.array(values) for key, values in found.items()}
+
+
+@pytest.mark.parametrize("move", STREET_MOVES)
+def test_vehicles_keep_their_outlines(shifts: dict[tuple[str, str], np.ndarray], move: str) -> None:
+    assert np.median(shifts[move, "lidar"]) <= LARGEST_SHIFT_PX
+    assert shifts[move, "lidar"].mean() < shifts[move, "street"].mean()

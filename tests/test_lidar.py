@@ -1,0 +1,251 @@
+"""Measured points as a surface: planes and boxes with known answers, outlines, hiding, and points of every bad kind."""
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import RigRetarget, SampleError
+from arbiview_aug.camera import Camera
+from arbiview_aug.datasets.synthetic import demo_source_rig
+from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.lidar import LidarObjects, LidarSurface, checked_points, points_of_depth
+from arbiview_aug.panorama import REACH_RAD
+from arbiview_aug.plan import build_plan
+from arbiview_aug.scene import Scene
+from arbiview_aug.surface import Street
+
+EYE = np.array([2.0, 0.0, 1.5])
+PIXEL_RAD = 0.002
+
+
+def wall(x_m: float, y_m: tuple[float, float], z_m: tuple[float, float], spacing_rad: float = 0.004) -> np.ndarray:
+    """Points on the plane x = x_m, ``spacing_rad`` apart as seen from the eye."""
+    step = spacing_rad * abs(x_m - EYE[0])
+    y, z = np.meshgrid(np.arange(*y_m, step), np.arange(*z_m, step))
+    return np.stack([np.full(y.size, x_m), y.ravel(), z.ravel()], -1)
+
+
+def towards(points: np.ndarray, eye: np.ndarray = EYE) -> tuple[np.ndarray, np.ndarray]:
+    """Unit rays and inverse distances of points."""
+    away = points - eye
+    length = np.linalg.norm(away, axis=-1)
+    return away / length[..., None], 1 / length
+
+
+NEAR, FAR = wall(12.0, (-2, 2), (0.0, 2.0)), wall(32.0, (-20, 20), (-1.0, 8.0))
+
+
+def test_a_wall_is_where_its_points_are() -> None:
+    rays, q = towards(np.array([[12.0, y, z] for y in (-1.33, 0.01, 1.47) for z in (0.6, 1.02, 1.63)]))
+    assert np.allclose(LidarSurface(Street(), NEAR).inverse_distance(EYE, rays), q, rtol=0.02)
+
+
+@pytest.mark.parametrize("eye", [EYE, EYE + np.array([0.5, 0.3, 0.7]), np.array([-2.0, 0.0, 1.5])])
+def test_any_centre_sees_the_same_wall(eye: np.ndarray) -> None:
+    rays, q = towards(np.array([[12.0, y, 1.02] for y in (-1.33, 0.01, 1.47)]), eye)
+    assert np.allclose(LidarSurface(Street(), NEAR).inverse_distance(eye, rays), q, rtol=0.02)
+
+
+def test_walls_behind_are_as_good_as_walls_ahead() -> None:
+    """Azimuth wraps there."""
+    mirrored = NEAR * np.array([-1.0, 1.0, 1.0])
+    rays, q = towards(np.array([[-12.0, y, 1.02] for y in (-1.33, -0.01, 0.01, 1.47)]))
+    assert np.allclose(LidarSurface(Street(), mirrored).inverse_distance(EYE, rays), q, rtol=0.02)
+
+
+def test_a_road_stays_a_plane_between_scan_lines() -> None:
+    azimuth, radius = np.meshgrid(np.radians(np.arange(0, 360, 0.5)), [6.0, 8.0, 12.0, 20.0])
+    rings = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.zeros_like(radius)], -1).reshape(-1, 3)
+    street = Street(half_length_m=500, half_width_m=500)
+    rays, q = towards(np.array([[EYE[0] + d, y, 0.0] for d in (7.3, 9.7, 15.1) for y in (-1.0, 0.4)]))
+    assert np.allclose(LidarSurface(street, rings).inverse_distance(EYE, rays), q, rtol=2e-3)
+
+
+def test_outlines_do_not_melt() -> None:
+    """Across the edge of a wall before a wall every ray meets one of the two, and the edge is where it was."""
+    surface = LidarSurface(Street(), np.concatenate([NEAR, FAR]))
+    y = np.linspace(0.5, 3.5, 301)
+    rays, q = towards(np.stack([np.full_like(y, 12.0), y, np.full_like(y, 1.5)], -1))
+    got = surface.inverse_distance(EYE, rays)
+    on_near, on_far = np.abs(got / q - 1) < 0.02, np.abs(got / (q / 3) - 1) < 0.02
+    assert (on_near ^ on_far).all()
+    edge = y[on_near].max()
+    assert np.array_equal(on_near, y <= edge)  # one edge
+    assert abs(edge - 2.0) / 10 < np.radians(0.4)
+
+
+def test_what_shines_through_gaps_is_dropped() -> None:
+    """Scan lines 1.3 degrees apart on a near wall, and points of a far one between them."""
+    lines = np.concatenate([wall(12.0, (-2, 2), (z, z + 0.01)) for z in np.arange(0.0, 2.5, 0.227)])
+    rays, q = towards(wall(12.0, (-1.5, 1.5), (0.4, 1.8)))
+    got = LidarSurface(Street(), np.concatenate([lines, FAR])).inverse_distance(EYE, rays)
+    assert np.allclose(got, q, rtol=0.04)
+
+
+def test_silence_is_the_street() -> None:
+    surface, street = LidarSurface(Street(), NEAR), Street()
+    beyond = 2 / 10 + np.tan(REACH_RAD) + 0.1
+    rays, _ = towards(EYE + np.array([[1.0, beyond, 0.2], [1.0, -beyond, -0.3], [-1.0, 0.0, -0.1]]))
+    assert np.allclose(surface.inverse_distance(EYE, rays), street.inverse_distance(EYE, rays), rtol=1e-6)
+    empty = LidarSurface(street, np.zeros((0, 3)))
+    assert np.allclose(empty.inverse_distance(EYE, rays), street.inverse_distance(EYE, rays), rtol=1e-6)
+    assert not empty.hides(EYE, rays, np.zeros(3), PIXEL_RAD).any()
+    assert not empty.detailed(EYE, rays, 0.01).any()
+
+
+def test_measured_rays_are_more_certain() -> None:
+    rays, q = towards(np.array([[12.0, 0.0, 1.0], [12.0, 12.0, 1.0]]))
+    on_wall, beside = LidarSurface(Street(), NEAR).uncertainty(EYE, rays, q)
+    assert on_wall < 0.01 < beside
+
+
+def test_a_wall_hides_what_is_behind_it() -> None:
+    surface = LidarSurface(Street(), NEAR)
+    rays, q = towards(np.array([[12.0, 0.3, 1.1]] * 4))
+    distance = 1 / q[0]
+    at = np.array([distance - 2, distance, distance + 0.5, distance + 3.0])
+    assert surface.hides(EYE, rays, 1 / at, PIXEL_RAD).tolist() == [False, False, False, True]
+    assert surface.hides(EYE, rays[:1], np.zeros(1), PIXEL_RAD).tolist() == [True]
+    beside, _ = towards(np.array([[12.0, 3.0, 1.1], [12.0, 0.0, 3.0]]))
+    assert surface.hides(EYE, beside, np.zeros(2), PIXEL_RAD).tolist() == [False, False]  # silent: nothing hides
+
+
+def test_outlines_are_detail_and_flat_parts_are_not() -> None:
+    surface = LidarSurface(Street(), np.concatenate([NEAR, FAR]))
+    rays, _ = towards(np.array([[12.0, 1.98, 1.2], [32.0, 12.0, 2.0]]))
+    assert surface.detailed(EYE, rays, 0.005).tolist() == [True, False]
+
+
+def test_the_own_car_is_no_obstacle() -> None:
+    bonnet = np.array([[x, y, 1.0] for x in np.arange(2.5, 3.9, 0.05) for y in np.arange(-0.8, 0.8, 0.05)])
+    rays, _ = towards(np.array([[12.0, 0.0, 1.0], [6.0, 0.3, 0.0]]))
+    got = LidarSurface(Street(), np.concatenate([bonnet, NEAR])).inverse_distance(EYE, rays)
+    assert np.allclose(got, LidarSurface(Street(), NEAR).inverse_distance(EYE, rays))
+
+
+def test_a_box_decides_within_its_silhouette_and_its_points_not_beyond() -> None:
+    box = np.array([[13.0, 0.0, 1.0, 2.0, 3.0, 2.0, 0.0]])  # its back is x = 12, y within 1.5, the top at 2
+    mirror = wall(12.1, (1.5, 1.65), (1.0, 1.4))
+    own = wall(12.0, (-1.5, 1.5), (0.0, 2.0))
+    surface = LidarObjects.among(Street(), np.concatenate([own, mirror, FAR]), box)
+    inside, q = towards(np.array([[12.0, y, z] for y in (-1.49, 1.49) for z in (0.3, 1.99)]))
+    assert np.allclose(surface.inverse_distance(EYE, inside), q, rtol=1e-6)
+    outside, q = towards(np.array([[12.0, y, z] for y, z in ((-1.51, 1.5), (1.51, 1.5), (0.0, 2.01))]))
+    assert np.allclose(surface.inverse_distance(EYE, outside), q / 3, rtol=0.02)
+    assert surface.hides(EYE, inside, np.full(4, 1 / 30), PIXEL_RAD).all()
+    assert surface.detailed(EYE, inside, 0.01).all()
+
+
+# --- extremes ---------------------------------------------------------------------------------------------------------
+def test_points_of_every_bad_kind() -> None:
+    rays = np.random.default_rng(0).normal(size=(40, 50, 3))
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    bad = {
+        "one": np.array([[12.0, 0.0, 1.0]]),
+        "at the centre": np.array([EYE, EYE + 1e-9, EYE + 1e-3]),
+        "duplicates": np.repeat(NEAR[:5], 1000, axis=0),
+        "very far": np.array([[1e8, 0.0, 0.0], [0.0, 1e30, 0.0]]),
+        "straight above and below": EYE + np.array([[0.0, 0.0, 3.0], [0.0, 0.0, -1.4]]),
+        "everywhere": np.random.default_rng(1).normal(size=(5000, 3)) * 20,
+    }
+    for name, points in bad.items():
+        surface = LidarSurface(Street(), points)
+        q = surface.inverse_distance(EYE, rays)
+        assert np.isfinite(q).all() and (q >= 0).all() and (q <= 100).all(), name
+        assert surface.hides(EYE, rays, q, PIXEL_RAD).shape == surface.detailed(EYE, rays, 0.01).shape == (40, 50)
+        assert np.isfinite(surface.uncertainty(EYE, rays, q)).all(), name
+    assert surface.inverse_distance(EYE, np.zeros((0, 3))).shape == (0,)
+
+
+def test_duplicates_and_order_change_nothing() -> None:
+    rng, rays = np.random.default_rng(0), towards(wall(12.0, (-3, 3), (0.0, 3.0), 0.02))[0]
+    points = np.concatenate([NEAR, FAR])
+    once = LidarSurface(Street(), points).inverse_distance(EYE, rays)
+    shuffled = rng.permutation(np.concatenate([points, points]))
+    assert np.allclose(LidarSurface(Street(), shuffled).inverse_distance(EYE, rays), once, atol=1e-6)
+
+
+def test_parts_of_a_view_agree_with_the_whole() -> None:
+    surface = LidarSurface(Street(), np.concatenate([NEAR, FAR]))
+    rays = towards(wall(12.0, (-3, 3), (0.0, 3.0), 0.08))[0]
+    parts = np.concatenate([LidarSurface(Street(), surface.points).inverse_distance(EYE, r) for r in rays[:, None]])
+    around = np.random.default_rng(0).normal(size=(500, 3))
+    around /= np.linalg.norm(around, axis=-1, keepdims=True)
+    whole = surface.inverse_distance(EYE, np.concatenate([around, rays]))[500:]
+    assert np.allclose(parts, whole, rtol=0.02)
+
+
+def test_millions_of_points() -> None:
+    points = np.random.default_rng(0).uniform((-60, -60, 0), (60, 60, 5), (2_000_000, 3))
+    rays, _ = towards(wall(12.0, (-3, 3), (0.0, 3.0), 0.02))
+    assert np.isfinite(LidarSurface(Street(), points).inverse_distance(EYE, rays)).all()
+
+
+def test_points_are_checked() -> None:
+    assert len(checked_points(np.array([[1.0, 2, 3, 9], [np.nan, 0, 0, 9], [0, np.inf, 0, 9], [1, 1, 1, np.nan]]))) == 2
+    assert checked_points(np.zeros(0)).shape == (0, 3)
+    with pytest.raises(SampleError, match=r"points: expected shape \(P, >= 3\), x y z in the ego frame, got \(4, 2\)"):
+        checked_points(np.zeros((4, 2)))
+
+
+# --- depth maps and samples -------------------------------------------------------------------------------------------
+def camera(size: tuple[int, int] = (192, 320)) -> Camera:
+    return Camera.looking(
+        name="front", azimuth_deg=0, position_m=tuple(EYE), width_px=size[1], height_px=size[0], horizontal_fov_deg=70
+    )
+
+
+def test_depth_is_along_the_axis() -> None:
+    view = camera()
+    depth = np.full(view.size, 10.0)
+    depth[:20], depth[20:40], depth[40:60] = 0.0, np.nan, np.inf
+    points = points_of_depth(view, depth)
+    assert np.allclose(points[:, 0], EYE[0] + 10) and len(points) == 320 * 132
+    with pytest.raises(SampleError, match=r"depth_m: camera 'front': expected a map of \(192, 320\), got \(3, 4\)"):
+        points_of_depth(view, np.zeros((3, 4)))
+
+
+def test_coarse_grid_equals_pixel_by_pixel_evaluation() -> None:
+    rig = demo_source_rig((128, 352))
+    scene = Scene(points=np.concatenate([NEAR, FAR]))
+    plans = [
+        build_plan(rig, rig.shifted(z_m=0.7), surface="lidar", scene=scene, config=FavsConfig(grid_step_px=step))
+        for step in (8, 1)
+    ]
+    for a, b in zip(*(plan.coverage for plan in plans), strict=True):
+        assert (a != b).mean() < 0.003
+
+
+def test_in_a_sample() -> None:
+    rig = demo_source_rig((64, 176))
+    images = torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8)
+    sample = {"images": images, "rig": rig}
+    retarget = RigRetarget(rig.shifted(z_m=0.5), surface="lidar")
+    street = RigRetarget(rig.shifted(z_m=0.5), surface="street")(sample)
+    nothing = torch.full((3, 4), float("nan"))
+    assert torch.equal(retarget(sample | {"points": nothing})["images"], street["images"])
+    points = torch.from_numpy(NEAR).float()
+    seen = retarget(sample | {"points": points})
+    assert seen["points"] is points and not torch.equal(seen["images"], street["images"])
+    assert "lidar surface" in str(retarget.explain(sample | {"points": points}))
+    batch = {"images": images.expand(2, 6, 3, 64, 176), "rig": rig, "points": [points, points]}
+    assert torch.equal(retarget(batch)["images"][1], seen["images"])
+    with pytest.raises(SampleError, match=r"surface='lidar': expected 'points' \(P, >= 3\)"):
+        retarget(sample)
+    with pytest.raises(SampleError, match=r"points: expected shape"):
+        retarget(sample | {"points": torch.zeros(5, 2)})
+
+
+def test_depth_maps_in_a_sample() -> None:
+    rig = demo_source_rig((64, 176))
+    sample = {"images": torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8), "rig": rig}
+    retarget = RigRetarget(rig.shifted(z_m=0.5), surface="lidar")
+    depth = torch.zeros(6, 64, 176)
+    depth[0] = 9.0
+    with pytest.warns(UserWarning, match="depth_m"):
+        mapped = retarget(sample | {"depth_m": depth})
+    assert "depth_m" not in mapped  # it would be the source's
+    points = torch.from_numpy(points_of_depth(rig[0], np.full((64, 176), 9.0)))
+    assert torch.equal(mapped["images"], retarget(sample | {"points": points})["images"])
+    with pytest.raises(SampleError, match=r"depth_m: expected 6 maps"):
+        retarget(sample | {"depth_m": depth[:2]})
