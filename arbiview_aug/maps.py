@@ -146,7 +146,8 @@ class PairMap:
         self._whole: BoolArray | None = None
         self._fine: tuple[Slot, npt.NDArray[np.float32]] | None = None
         self._near_shadow: BoolArray | None = None
-        if self.solids is not None:
+        self._light: dict[int, tuple[Shadows, BoolArray]] = {}
+        if self.solids is not None and not isinstance(self.surface, Static):
             self._from_source_q = (q / np.maximum(np.sqrt((points * points).sum(-1)), 1e-300)).astype(np.float32)
         if rays.grid.step == 1:
             self.nodes = _bounds(self.valid & source.contains(self.uv), 0)
@@ -307,15 +308,23 @@ class PairMap:
         """Nodes (ny, nx) whose scene point the source sees when its image is halved ``level`` times."""
         if self.solids is None or not isinstance(self.whole_surface, Layered):
             return self.valid
-        camera = _halved_camera(self.source, level)
-        shadows = self.whole_surface.shadows(camera)
+        shadows, lit = self._in_light(level)
         pixel, inside = _nearest_pixel(shadows.beyond, _at_level(self.uv, level))
-        free = self.valid & ~(inside & (shadows.beyond[pixel] > self._from_source_q))
+        beyond = 0 if isinstance(self.surface, Static) else self._from_source_q
+        free = self.valid & ~(inside & (shadows.beyond[pixel] > beyond))
         on_solid = self.rays.at_nodes(255 - self.rays.solids(self.whole_surface).free) > 0
         seen = np.zeros(self.rays.camera.size, bool)
         px, py = self.solids.pixels.T
-        seen[py, px] = self.solids.lit(shadows, _at_level(self.solids.uv, level), slice(None))
+        seen[py, px] = lit
         return np.where(on_solid, self.rays.at_nodes(seen), free)
+
+    def _in_light(self, level: int) -> tuple[Shadows, BoolArray]:
+        """The source's shadow images when it is halved ``level`` times, and which of ``solids`` (n,) it sees."""
+        if level not in self._light:
+            assert self.solids is not None and isinstance(self.whole_surface, Layered)
+            shadows = self.whole_surface.shadows(_halved_camera(self.source, level))
+            self._light[level] = shadows, self.solids.lit(shadows, _at_level(self.solids.uv, level))
+        return self._light[level]
 
     def full_resolution(
         self, slot: Slot, rows: tuple[int, int]
@@ -366,20 +375,21 @@ class PairMap:
         assert self.solids is not None and isinstance(self.whole_surface, Layered)
         grid = self.rays.grid
         y0, y1, x0, x1 = grid.pixels(nodes)
-        shadows = self.whole_surface.shadows(_halved_camera(self.source, slot.level))
+        shadows, lit = self._in_light(slot.level)
         for part in self._parts_near_shadow(shadows.beyond, nodes, slot.level):
             t, b, le, r = grid.pixels(part)
             here = slice(t - y0, b - y0), slice(le - x0, r - x0)
             local = at[here] - np.array([slot.x, slot.y], np.float32)
             first: Any = cv2.remap(shadows.beyond, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
-            visible[here] &= cv2.compare(first, grid.upsample(self._from_source_q, part), cv2.CMP_LE).astype(np.uint8)
+            beyond: Any = 0 if isinstance(self.surface, Static) else grid.upsample(self._from_source_q, part)
+            visible[here] &= cv2.compare(first, beyond, cv2.CMP_LE).astype(np.uint8)
         visible &= self.rays.solids(self.whole_surface).free[y0:y1, x0:x1]
         solids = self.solids
         strip = slice(*np.searchsorted(solids.pixels[:, 1], [y0, y1]).tolist())
         px, py = solids.pixels[strip].T
         exact: Any = slot.from_source(solids.uv[strip])
         at[py - y0, px - x0] = exact
-        visible[py - y0, px - x0] = solids.lit(shadows, exact - (slot.x, slot.y), strip) * np.uint8(255)
+        visible[py - y0, px - x0] = lit[strip] * np.uint8(255)
 
     def _parts_near_shadow(self, shadow: npt.NDArray[np.float32], nodes: Box, level: int) -> Iterator[Box]:
         """The parts of a strip, between its rows of nodes, whose background may be read in a shadow."""
@@ -461,11 +471,11 @@ class _SeenSolids(NamedTuple):
         inside = np.flatnonzero(valid & source.contains(uv) & (before_m * q >= _LEAST_INCIDENCE))
         return cls(pixels[inside], uv[inside], q[inside], solid[inside])
 
-    def lit(self, shadows: Shadows, at: FloatArray, part: slice) -> BoolArray:
-        """Which of a part of them no other solid hides, by their positions (n, 2) in the shadow images."""
+    def lit(self, shadows: Shadows, at: FloatArray) -> BoolArray:
+        """Which of them no other solid hides, by their positions (n, 2) in the shadow images."""
         pixel, inside = _nearest_pixel(shadows.beyond, at)
-        nearer = shadows.beyond[pixel] > self.inverse_distance[part]
-        return ~(inside & nearer & (shadows.solid[pixel] != self.solid[part]))
+        nearer = shadows.beyond[pixel] > self.inverse_distance
+        return ~(inside & nearer & (shadows.solid[pixel] != self.solid))
 
     def nodes(self, grid: Grid) -> Box | None:
         """The nodes around all of them."""

@@ -19,7 +19,7 @@ from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.grid import Grid
 from arbiview_aug.solids import draw_boxes
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn, Layered, Shadows, Surface
+from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn, Layered, Shadows, Static, Surface
 
 _LENS_STEP_PX = 8  # cells in which rays of a lens are cast or not
 
@@ -64,7 +64,7 @@ class Objects(Layered):
             pixel_rad = float(1 / camera.K[0, 0])
             index, first, face = self._drawn(camera, self._enlarged(camera.center_m, pixel_rad))
             beyond, solid = np.zeros(camera.size, np.float32), np.full(camera.size, -1, np.int32)
-            beyond.reshape(-1)[index] = _with_slack(first, pixel_rad)
+            beyond.reshape(-1)[index] = first / (1 + 2 * pixel_rad)  # a lookup at the nearest pixel
             solid.reshape(-1)[index] = face // 6
             self._shadows[camera] = Shadows(beyond, solid)
         return self._shadows[camera]
@@ -77,9 +77,16 @@ class Objects(Layered):
         return face // 6, before_m.reshape(-1)[face]
 
     def _enlarged(self, origin: FloatArray, pixel_rad: float) -> FloatArray:
-        """The boxes wider by a pixel on all sides."""
+        """The boxes wider by half a pixel: what pixels that touch them show is mixed with their colours.
+
+        Not below, where what they stand on is seen before them: they are lifted instead. A margin in metres for loose
+        labels (3 cm) is not worth it: on synthetic streets moved sideways it took the share of marked pixels that are
+        holes from 97 to 82 %.
+        """
         boxes = self.boxes.copy()
-        boxes[:, 3:6] += 2 * pixel_rad * np.linalg.norm(boxes[:, :3] - origin, axis=-1, keepdims=True)
+        more_m = pixel_rad / 2 * np.linalg.norm(boxes[:, :3] - origin, axis=-1)
+        boxes[:, 2] += more_m
+        boxes[:, 3:5] += 2 * more_m[:, None]
         return boxes
 
     def _drawn(self, camera: Camera, boxes: FloatArray) -> Drawn:
@@ -116,13 +123,10 @@ class Objects(Layered):
     ) -> BoolArray:
         """Whether a box stands between ``origin`` and points at these inverse distances along unit rays.
 
-        Boxes are enlarged by a pixel on all sides, so that no pixel mixed with an object's colour is read for what lies
-        behind it. What a box stands on begins before its enlarged bottom ends: nothing nearer behind the first face
-        than twice that margin is hidden. A margin in metres for loose labels (3 cm) is not worth it: on synthetic
-        streets moved sideways it took the share of marked pixels that are holes from 97 to 82 %.
+        A static street is a guess, a box a label: what such a street says lies before a box lies behind it in truth.
         """
-        scene = Objects(self.street, self._enlarged(origin, pixel_rad))
-        return _with_slack(scene._boxes_ahead(origin, directions)[0], pixel_rad) > inverse_distance
+        first = Objects(self.street, self._enlarged(origin, pixel_rad))._boxes_ahead(origin, directions)[0]
+        return first > (0 if isinstance(self.street, Static) else inverse_distance * (1 + 2 * pixel_rad))
 
     def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
         """Rays (...,) that pass a box within an angle, where nothing may be interpolated."""
@@ -151,11 +155,6 @@ class Objects(Layered):
             first = nearest > q[near]
             q[near[first]], number[near[first]] = nearest[first], 6 * row + side[first]
         return q.reshape(directions.shape[:-1]), number.reshape(directions.shape[:-1])
-
-
-def _with_slack(first: FloatArray, pixel_rad: float) -> FloatArray:
-    """Inverse distances a little beyond the first faces; see ``hides``."""
-    return first / (1 + 2 * pixel_rad)
 
 
 def _first_face(

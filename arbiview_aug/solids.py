@@ -17,6 +17,8 @@ from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn
 _TOUCHES_M = 1e-9
 """A camera this close to a face's plane does not see the face."""
 
+_ROUNDING_PX = 1e-6
+
 _SIGNS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
 
 
@@ -101,7 +103,9 @@ def _faces(camera: Camera, boxes: FloatArray) -> _Faces:
         e = across[:, k]
         sides[:, 2 * k] = (half[b, e] - start[b, e])[:, None] * plane - rays[b, e]
         sides[:, 2 * k + 1] = (half[b, e] + start[b, e])[:, None] * plane + rays[b, e]
-    return _Faces(plane, sides, _pixel_bounds(pixels, camera.size), 6 * b + 2 * axis + (side > 0))
+    bounds = _pixel_bounds(pixels, camera.size)
+    some = (bounds[:, 1] > bounds[:, 0]) & (bounds[:, 3] > bounds[:, 2])  # others lie between pixel centres
+    return _Faces(plane[some], sides[some], bounds[some], (6 * b + 2 * axis + (side > 0))[some])
 
 
 def _pixel_bounds(corners: FloatArray, size: tuple[int, int]) -> npt.NDArray[np.int64]:
@@ -110,6 +114,6 @@ def _pixel_bounds(corners: FloatArray, size: tuple[int, int]) -> npt.NDArray[np.
     ahead = (z > 0).all(axis=1)  # [F, 1]
     uv = corners[..., :2] / np.where(z > 0, z, 1.0)
     limit = np.array(size[::-1])
-    low = np.where(ahead, np.floor(uv.min(axis=1).clip(0, limit - 1)), 0)
-    high = np.where(ahead, np.ceil(uv.max(axis=1).clip(0, limit - 1)) + 1, limit)
+    low = np.where(ahead, np.ceil(uv.min(axis=1).clip(0, limit) - _ROUNDING_PX), 0)
+    high = np.where(ahead, np.floor(uv.max(axis=1).clip(-1, limit - 1) + _ROUNDING_PX) + 1, limit)
     return np.stack([low, high], axis=-1).reshape(-1, 4).astype(np.int64)

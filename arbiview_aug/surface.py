@@ -87,11 +87,12 @@ class Drawn(NamedTuple):
 
 
 class Shadows(NamedTuple):
-    """What solids hide from a source, for each of its pixels.
+    """The images of solids in a source, a little enlarged: what is behind them is not read there.
 
     Attributes:
-        beyond: (h, w) float32, 1/m: background at a smaller inverse distance along the pixel's ray is hidden.
-        solid: (h, w) int32, the solid that hides it, -1 for none.
+        beyond: (h, w) float32, 1/m: what has a smaller inverse distance is hidden; a ``Static`` background always,
+            because it is a guess. 0 where there is no solid.
+        solid: (h, w) int32, which one, -1 for none.
     """
 
     beyond: npt.NDArray[np.float32]

@@ -110,7 +110,9 @@ def shifts() -> dict[tuple[str, str], np.ndarray]:
                             found.setdefault((move, surface), []).extend(rows)
     for (move, surface), values in found.items():
         half, more, most = np.percentile(values, [50, 75, 90])
-        print(f"\n{surface:<8}{move:<14}{len(values):>6} edges, 50/75/90 %: {half:.1f}/{more:.1f}/{most:.1f} px")
+        print(
+            f"\n{surface:<8}{move:<14}{len(values):>6} edges, 50/75/90 %: {half:.1f}/{more:.1f}/{most:.1f} px", end=""
+        )
     return {key: np.array(values) for key, values in found.items()}
 
 
