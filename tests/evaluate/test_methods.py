@@ -71,6 +71,7 @@ def test_one_camera_keeps_what_the_ego_frame_holds(sample: dict) -> None:
     assert alone["boxes_3d"] is sample["boxes_3d"] and not {"K", "cam2ego", "detections"} & set(alone)
 
 
+@pytest.mark.filterwarnings("ignore:the target rig")
 def test_depth_from_overlap_reaches_a_camera_alone() -> None:
     """``accurate`` finds depth where two cameras overlap; the view from one of them then knows it."""
     sample = SyntheticDrive(demo_source_rig((128, 352)), num_frames=1)[0]

@@ -31,6 +31,7 @@ def test_published_numbers() -> None:
     assert "55.14 is 13.30 dB" in PROTOCOL
 
 
+@pytest.mark.filterwarnings("ignore:the target rig")
 def test_synthetic_streets(no_real_frames: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(paper_tables, "SETS", ("paper", "truck"))
     told = []
