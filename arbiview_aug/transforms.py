@@ -33,7 +33,8 @@ from arbiview_aug.tensors import covered, gathered, leading_shape, lens_names, l
 Made = RenderPlan | PaperRendering | tuple[int, int]
 """What a frame's views are made by: a plan, the published stages; or it is only resized, to this size."""
 
-_OUTPUTS = ("source_camera", "confidence")
+OUTPUTS = ("source_camera", "confidence")
+"""What a sample can hold besides, on request."""
 
 
 class RigRetarget(torch.nn.Module):
@@ -104,7 +105,7 @@ class RigRetarget(torch.nn.Module):
         *,
         source_rig: Rig | str | Path | None = None,
         path: Literal["favs"] = "favs",
-        quality: Quality | FavsConfig = "fast",
+        quality: Quality | FavsConfig | PaperConfig = "fast",
         surface: SurfaceName = "auto",
         harmonise: Harmonise = None,
         refinement: RefinementCache | None = None,
@@ -126,7 +127,7 @@ class RigRetarget(torch.nn.Module):
         _one_of("label_frame", label_frame, ("source", "target"))
         _one_of("execution", execution, get_args(Execution))
         for name in outputs:
-            _one_of("outputs", name, _OUTPUTS)
+            _one_of("outputs", name, OUTPUTS)
         if not 0 <= p <= 1:
             raise ValueError(f"p: expected a probability from 0 to 1, got {p!r}")
         if p < 1 and size is None:

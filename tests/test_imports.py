@@ -14,6 +14,7 @@ PACKAGE = Path(__file__).parents[1] / "arbiview_aug"
 
 LAYERS: list[tuple[str, ...]] = [
     ("errors", "environment"),
+    ("command_line",),
     ("lens",),
     ("rotations",),
     ("camera",),
