@@ -14,6 +14,7 @@ import hashlib
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from numbers import Real
 from typing import Any, NamedTuple, get_args
 
 import cv2
@@ -124,7 +125,7 @@ class Camera:
     def _checked_array(self, field: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
         try:
             array = np.array(value, dtype=np.float64)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise self._error(field, f"numbers of shape {shape}", f"{type(value).__name__} ({error})") from None
         if array.shape != shape:
             raise self._error(field, f"shape {shape}", f"shape {array.shape}")
@@ -147,6 +148,10 @@ class Camera:
             fix = "pass cam2ego.T" if np.any(cam2ego[3, :3]) and not np.any(cam2ego[:3, 3]) else ""
             raise self._error("cam2ego", "last row (0, 0, 0, 1)", f"{cam2ego[3].tolist()}", fix)
         R = cam2ego[:3, :3]
+        largest = float(np.abs(R).max())
+        if largest > 2:  # near 1e308 the products below overflow
+            fix = f"the nearest rotation is {nearest_rotation(R / largest).round(9).tolist()}"
+            raise self._error("cam2ego", "a rotation, with entries from -1 to 1", f"{R.tolist()}", fix)
         deviation = float(np.abs(R @ R.T - np.eye(3)).max())
         determinant = float(np.linalg.det(R))
         if deviation > ROTATION_TOLERANCE or determinant < 0:
@@ -166,7 +171,7 @@ class Camera:
     def _checked_distortion(self, distortion: Any) -> tuple[float, ...]:
         try:
             coefficients = tuple(float(k) + 0.0 for k in distortion)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise self._error("distortion", "a sequence of numbers", repr(distortion)) from None
         counts = COEFFICIENT_COUNTS[self.lens]
         if len(coefficients) not in counts:
@@ -233,26 +238,34 @@ class Camera:
         """
         if (K is None) == (horizontal_fov_deg is None):
             raise CalibrationError(f"camera {name!r}: expected either K or horizontal_fov_deg, got both or none")
-        if horizontal_fov_deg is not None:
-            K = intrinsics_for_fov(name, horizontal_fov_deg, width_px, height_px, lens, distortion)
         angles = (azimuth_deg, elevation_deg, roll_deg)
-        if not all(map(math.isfinite, angles)):
+        if not all(isinstance(angle, Real) and math.isfinite(angle) for angle in angles):
             raise CalibrationError(f"camera {name!r}: expected finite angles, got {angles}")
+        try:
+            position = np.array(position_m, dtype=np.float64)
+        except (TypeError, ValueError):
+            position = np.zeros(0)
+        if position.shape != (3,):
+            raise CalibrationError(f"camera {name!r}: position_m: expected (x, y, z) in metres, got {position_m!r}")
         cam2ego = np.eye(4)
         cam2ego[:3, :3] = (
             rotation_z(azimuth_deg) @ CAMERA_AXES_IN_EGO @ rotation_x(elevation_deg) @ rotation_z(roll_deg)
         )
-        cam2ego[:3, 3] = position_m
-        return cls(
+        cam2ego[:3, 3] = position
+        camera = cls(
             name=name,
             width_px=width_px,
             height_px=height_px,
-            K=K,
+            K=np.eye(3) if K is None else K,
             cam2ego=cam2ego,
             lens=lens,
             distortion=distortion,
             mask=mask,
         )
+        if horizontal_fov_deg is None:
+            return camera
+        size = camera.width_px, camera.height_px
+        return replace(camera, K=intrinsics_for_fov(name, horizontal_fov_deg, *size, camera.lens, camera.distortion))
 
     # --- derived ----------------------------------------------------------------------------------------------------
     @property
@@ -411,7 +424,10 @@ class Camera:
 
     def moved(self, ego2ego: Any) -> Camera:
         """The same camera in another ego frame: ``cam2ego`` becomes ``ego2ego @ cam2ego``."""
-        return replace(self, cam2ego=np.asarray(ego2ego, dtype=np.float64) @ self.cam2ego)
+        move = self._checked_array("ego2ego", ego2ego, (4, 4))
+        with np.errstate(over="ignore", invalid="ignore"):  # refused as a pose
+            cam2ego = move @ self.cam2ego
+        return replace(self, cam2ego=cam2ego)
 
     def turned(self, *, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Camera:
         """Turned about its own centre: yaw about the ego's z (left), pitch about its own x (up), roll about its z."""

@@ -11,7 +11,7 @@ import numpy as np
 from arbiview_aug.camera import Camera, FloatArray
 from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.favs.object_alignment import Detection
-from arbiview_aug.sample import SourceFrame, scenes_of_frames
+from arbiview_aug.sample import SourceFrame, numbers, scenes_of_frames
 
 UNNAMED_TYPE = "upright"
 """Type of labelled boxes without names: they stand on the road, which is all that stage 3 asks for."""
@@ -66,8 +66,7 @@ def _of_cameras(given: Any, frame: SourceFrame) -> OfCameras:
         if not isinstance(entry, Mapping) or not {"boxes", "labels"} <= entry.keys():
             got = ", ".join(map(str, entry)) if isinstance(entry, Mapping) else type(entry).__name__
             raise SampleTypeError(f"{where}: expected a dict with 'boxes' (n, 4) and 'labels', got {got}")
-        boxes = entry["boxes"]
-        array = np.asarray(boxes.detach().cpu() if hasattr(boxes, "detach") else boxes, np.float64)
+        array = numbers(f"{where}['boxes']", entry["boxes"])
         array = array.reshape(0, 4) if array.size == 0 else array
         if array.ndim != 2 or array.shape[1] != 4:
             raise SampleError(f"{where}: expected boxes (n, 4): x0 y0 x1 y1 in source pixels, got {array.shape}")

@@ -14,7 +14,7 @@ from arbiview_aug.favs.paper import PaperRendering, paper_labels
 from arbiview_aug.favs.synthesis import render_labels
 from arbiview_aug.plan import RenderPlan
 from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame
-from arbiview_aug.tensors import gathered, nearest_resized, rewrapped, split, stacked
+from arbiview_aug.tensors import gathered, is_readable, nearest_resized, rewrapped, split, stacked
 
 PIXEL_BOUND_KEYS = (
     "boxes_2d",
@@ -122,8 +122,10 @@ def target_labels(
         SampleError: Maps that do not belong to the images, or a fill that their type cannot hold.
         SampleTypeError: Maps that are no tensors.
     """
-    if not all(isinstance(v, torch.Tensor) for v in (value if isinstance(value, list | tuple) else [value])):
-        raise SampleTypeError(f"{key}: expected label maps as tensors, got {type(value).__name__}; use torch.as_tensor")
+    maps_given = value if isinstance(value, list | tuple) else [value]
+    if not all(map(is_readable, maps_given)):
+        got = type(value).__name__
+        raise SampleTypeError(f"{key}: expected label maps as tensors, got {got}; use torch.as_tensor")
     if isinstance(value, torch.Tensor) and value.ndim < len(lead) + 3:
         raise SampleError(f"{key}: expected label maps of shape (..., N, H, W), got {tuple(value.shape)}")
     try:
@@ -178,6 +180,9 @@ def move_to_target(out: dict[str, Any], ego2ego: torch.Tensor, lead: tuple[int, 
             out[key] = _translated(key, out[key], ego2ego[..., :3, 3], lead)
     if out.get("ego2world") is not None:
         pose = out["ego2world"]
+        if tuple(getattr(pose, "shape", ()))[-2:] != (4, 4):
+            got = getattr(pose, "shape", type(pose).__name__)
+            raise SampleError(f"ego2world: label_frame='target': expected shape (..., 4, 4), got {got}")
         inverse = torch.linalg.inv(ego2ego)
         if isinstance(pose, np.ndarray):
             out["ego2world"] = pose @ inverse.numpy()
@@ -195,9 +200,9 @@ def _translated(key: str, value: Any, offset_m: torch.Tensor, lead: tuple[int, .
         if len(offsets) != len(value):
             raise SampleError(f"{key}: expected {len(offsets)} entries, one a frame, got {len(value)}")
         return [_translated(key, v, o, ()) for v, o in zip(value, offsets, strict=True)]
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray) and value.dtype.kind == "f":
         return _translated(key, torch.tensor(value), offset_m, lead).numpy()
-    if not isinstance(value, torch.Tensor) or not value.is_floating_point():
+    if not is_readable(value) or not value.is_floating_point():
         kind = value.dtype if isinstance(value, torch.Tensor) else type(value).__name__
         raise SampleTypeError(f"{key}: label_frame='target': expected a float tensor, got {kind}")
     if value.ndim < len(lead) + 1 or value.shape[-1] < 3 or tuple(value.shape[: len(lead)]) != lead:

@@ -7,6 +7,7 @@ with OpenCV's k1..k4.
 from __future__ import annotations
 
 import math
+from numbers import Real
 from typing import Literal
 
 import numpy as np
@@ -167,10 +168,10 @@ def intrinsics_for_fov(
 ) -> FloatArray:
     """Square-pixel K with a central principal point whose outer image edges span ``fov_deg``."""
     largest = 360.0 if lens == "fisheye" else 180.0
-    if not 0 < fov_deg < largest:
+    if not isinstance(fov_deg, Real) or not 0 < fov_deg < largest:
         raise CalibrationError(
             f"camera {name!r}: horizontal_fov_deg: expected between 0 and {largest:g} for a {lens} lens, "
-            f"got {fov_deg:g}"
+            f"got {fov_deg!r}"
         )
     half = np.array(math.radians(fov_deg) / 2)
     x, _, valid = distort(lens, distortion, fold_limit(lens, distortion), np.sin(half), np.array(0.0), np.cos(half))

@@ -59,7 +59,7 @@ class Rig:
             raise CalibrationError(f"{where}: expected different camera names, got {', '.join(twice)} more than once")
         try:
             ground = float(ground_z_m)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: tensors of several heights
             ground = math.nan
         if not math.isfinite(ground):
             raise CalibrationError(f"{where}: ground_z_m: expected a finite height in metres, got {ground_z_m!r}")
@@ -306,7 +306,10 @@ def read_mask(file: Any, folder: Path | None, label: str) -> np.ndarray:
     if not isinstance(file, str) or folder is None:
         raise CalibrationError(f"{label}: mask: expected a file name beside the rig file, got {file!r}")
     path = folder / file
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    try:
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    except (OSError, ValueError):  # a name that no file can have
+        image = None
     if image is None:
         raise CalibrationError(f"{label}: mask: expected an image file {path}, found none that can be read")
     return np.asarray(image > 0)

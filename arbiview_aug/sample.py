@@ -33,6 +33,7 @@ CALIBRATION_KEYS = (
 """Keys that describe the source's images; they are replaced by the target's or consumed."""
 
 MAX_CAMERAS = 128  # winning sources are int8
+_IMAGE_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)  # torch cannot compare 8 bit floats
 _OFF_CENTER = 0.2  # share of the image's size by which both coordinates of a principal point never lie off its centre
 
 
@@ -131,10 +132,12 @@ def _points_of_frames(
     if depth_m is not None:
         try:
             maps = split(depth_m, lead)
-        except (AttributeError, ValueError) as error:
+        except (AttributeError, TypeError, ValueError, RuntimeError) as error:
             raise SampleError(f"depth_m: expected one map (H, W) for each image ({error})") from None
         for part, frame, of_cameras in zip(parts, frames, maps, strict=True):
-            if not hasattr(of_cameras, "__len__") or len(of_cameras) != len(frame.rig):
+            if isinstance(of_cameras, torch.Tensor | np.ndarray):
+                of_cameras = list(numbers("depth_m", of_cameras)) if of_cameras.ndim else ()
+            if not isinstance(of_cameras, list | tuple) or len(of_cameras) != len(frame.rig):
                 raise SampleError(f"depth_m: expected {len(frame.rig)} maps (H, W), one for each image")
             for camera, depth in zip(frame.rig, of_cameras, strict=True):
                 part.append(points_of_depth(camera, _numbers("depth_m", depth, ())))
@@ -148,6 +151,8 @@ def names_of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> 
         values = list(value.reshape(count, -1)) if isinstance(value, torch.Tensor) and value.ndim else value
         if not isinstance(values, list | tuple) or len(values) != count:
             raise SampleError(f"{key}: expected a name for each of {count} frames, got {type(value).__name__}")
+    if any(isinstance(v, torch.Tensor) and (v.device.type == "meta" or v.layout != torch.strided) for v in values):
+        raise SampleTypeError(f"{key}: expected names, got tensors without values")
     return [str(v.tolist()) if isinstance(v, torch.Tensor) else str(v) for v in values]
 
 
@@ -157,7 +162,7 @@ def _of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[
         return [_numbers(key, value, ())]
     try:
         frames = value if isinstance(value, list | tuple) else split(value, lead)
-    except (AttributeError, ValueError):
+    except (AttributeError, TypeError, ValueError, RuntimeError):
         frames = ()
     if len(frames) != count:
         got = f"shape {tuple(value.shape)}" if hasattr(value, "shape") else type(value).__name__
@@ -212,9 +217,14 @@ def _check_image(k: int, image: torch.Tensor) -> None:
         raise SampleError(f"images[{k}]: expected an RGB image (3, H, W), got shape {shape}{fix}")
     if 0 in shape:
         raise SampleError(f"images[{k}]: expected pixels, got shape {shape}")
+    if image.layout != torch.strided or image.device.type == "meta":
+        kind = image.layout if image.layout != torch.strided else "a meta tensor, which holds no pixels"
+        raise SampleTypeError(f"images[{k}]: expected a dense tensor with pixels, got {kind}; use .to_dense()")
     if image.dtype == torch.uint8:
         return
-    if not image.dtype.is_floating_point:
+    if image.dtype not in _IMAGE_FLOATS:
+        if image.dtype.is_floating_point:
+            raise SampleTypeError(f"images[{k}]: expected uint8 or float, got {image.dtype}; convert with .float()")
         raise SampleTypeError(f"images[{k}]: expected uint8 or float, got {image.dtype}; convert with .to(torch.uint8)")
     low, high = (float(x) for x in image.detach().aminmax())  # NaN wherever the image has one
     if not (low >= -1e-3 and high <= 1 + 1e-3):
@@ -275,8 +285,11 @@ def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any
             Camera(name=name, width_px=w, height_px=h, K=K[k], cam2ego=cam2ego[k], lens=lens, distortion=distortion)
         )
     ground_z_m = sample.get("ground_z_m", 0.0)
-    of_frame = _numbers("ground_z_m", ground_z_m, index if np.ndim(ground_z_m) else ())
-    return Rig(cameras, ground_z_m=float(of_frame))
+    heights = numbers("ground_z_m", ground_z_m)
+    of_frame = _numbers("ground_z_m", heights, index) if heights.ndim else heights
+    if of_frame.size != 1:
+        raise SampleError(f"ground_z_m: expected one height for each frame, got shape {heights.shape}")
+    return Rig(cameras, ground_z_m=float(of_frame.item()))
 
 
 def _check_principal_point(k: int, K: np.ndarray, size: tuple[int, int]) -> None:
@@ -308,6 +321,8 @@ def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> li
     if not isinstance(names, list | tuple) or len(names) != count:
         raise SampleError(f"lens: expected a list of {count} names, one a camera, got {names!r}")
     lenses = [_entry(name, index) for name in names]
+    if not all(isinstance(lens, str) for lens in lenses):
+        raise SampleTypeError(f"lens: expected names, one a camera, got {lenses!r}")
     if all(lens == "pinhole" for lens in lenses):
         return [("pinhole", ())] * count
     if coefficients is None or coefficients.ndim != 2 or len(coefficients) != count:
@@ -325,6 +340,8 @@ def _entry(name: Any, index: tuple[int, ...]) -> Any:
     for i in index:
         if isinstance(name, str):
             break
+        if not isinstance(name, list | tuple) or not i < len(name):
+            raise SampleError(f"lens: expected a name for each frame of the batch, got {name!r}")
         name = name[i]
     return name
 
@@ -345,7 +362,7 @@ def _without_hidden_pixels(rig: Rig, sample: Mapping[str, Any], lead: tuple[int,
                     seen = ~pixels.cpu().numpy()
                     held = masks[k]
                     masks[k] = seen if held is None else held & seen
-        except (TypeError, ValueError, AttributeError) as error:
+        except (TypeError, ValueError, AttributeError, RuntimeError) as error:  # RuntimeError: meta, sparse
             raise SampleError(
                 f"{key}: expected a bool map of the size of each image, as an earlier retargeting gives it ({error}); "
                 "rename the key if it is something else"
@@ -355,13 +372,30 @@ def _without_hidden_pixels(rig: Rig, sample: Mapping[str, Any], lead: tuple[int,
     return rig.with_cameras([replace(camera, mask=mask) for camera, mask in zip(rig, masks, strict=True)])
 
 
+def numbers(key: str, value: Any) -> FloatArray:
+    """An entry of a sample as a float64 array.
+
+    Raises:
+        SampleTypeError: It holds no real numbers.
+    """
+    try:
+        if isinstance(value, torch.Tensor):
+            if value.layout != torch.strided or value.device.type == "meta":
+                raise TypeError(f"{value.layout} on {value.device}")
+            if value.is_complex():
+                raise TypeError("complex numbers")
+            return value.detach().cpu().double().numpy()
+        if np.iscomplexobj(value):
+            raise TypeError("complex numbers")
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # RuntimeError: quantised tensors
+        why = " ".join(str(error).split())[:120]
+        raise SampleTypeError(f"{key}: expected a tensor of numbers, got {type(value).__name__} ({why})") from None
+
+
 def _numbers(key: str, value: Any, index: tuple[int, ...]) -> np.ndarray:
     """An entry of the calibration for one frame, float64."""
-    try:
-        plain = value.detach().cpu().double().numpy() if isinstance(value, torch.Tensor) else value
-        array = np.asarray(plain, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise SampleTypeError(f"{key}: expected a tensor of numbers, got {type(value).__name__} ({error})") from None
+    array = numbers(key, value)
     try:
         return np.asarray(array[index])
     except IndexError:

@@ -34,6 +34,14 @@ def split(value: Any, lead: tuple[int, ...]) -> list[Any]:
     return list(value.reshape(math.prod(lead), *value.shape[len(lead) :]).unbind(0))
 
 
+def is_readable(value: Any) -> bool:
+    """Whether a value is a tensor whose entries can be computed with: dense, real, not on ``meta``, no 8 bit floats."""
+    if not isinstance(value, torch.Tensor) or value.layout != torch.strided or value.device.type == "meta":
+        return False
+    tiny_float = value.is_floating_point() and value.dtype.itemsize == 1  # torch has no arithmetic for them
+    return not (value.is_complex() or value.is_quantized or tiny_float)
+
+
 def stacked(views: list[torch.Tensor]) -> torch.Tensor | list[torch.Tensor]:
     """One tensor where all sizes agree, without copying the slices of one block; a list otherwise."""
     if len({view.shape for view in views}) > 1:

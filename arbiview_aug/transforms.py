@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import operator
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -12,6 +14,7 @@ import cv2
 import numpy as np
 import torch
 
+from arbiview_aug.camera import MAX_SIZE_PX
 from arbiview_aug.confidence import confidence
 from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError
@@ -126,12 +129,20 @@ class RigRetarget(torch.nn.Module):
         _one_of("surface", surface, get_args(SurfaceName))
         _one_of("label_frame", label_frame, ("source", "target"))
         _one_of("execution", execution, get_args(Execution))
-        for name in outputs:
+        for name in _checked_names("outputs", outputs):
             _one_of("outputs", name, OUTPUTS)
-        if not 0 <= p <= 1:
+        if not _is_number(p) or not 0 <= p <= 1:
             raise ValueError(f"p: expected a probability from 0 to 1, got {p!r}")
         if p < 1 and size is None:
             raise ValueError("p < 1: expected size=(h, w), so that skipped samples collate with retargeted ones")
+        if not _is_number(label_fill):
+            raise ValueError(f"label_fill: expected a number, got {label_fill!r}")
+        if not _is_number(cache_bytes) or not cache_bytes >= 0:
+            raise ValueError(f"cache_bytes: expected a number of bytes from 0, got {cache_bytes!r}")
+        if rng is not None and not isinstance(rng, torch.Generator):
+            raise ValueError(f"rng: expected a torch.Generator or None, got {type(rng).__name__}")
+        if refinement is not None and not isinstance(refinement, RefinementCache):
+            raise ValueError(f"refinement: expected a RefinementCache or None, got {type(refinement).__name__}")
         self.target: Rig | RandomRig
         if isinstance(target_rig, Rig | RandomRig):
             self.target = target_rig
@@ -147,8 +158,9 @@ class RigRetarget(torch.nn.Module):
             self.config = replace(self.config, certainty=True)
         self.path, self.p, self.rng = path, float(p), rng
         self.size = None if size is None else _checked_size(size)
-        self.label_frame, self.label_keys, self.label_fill = label_frame, tuple(label_keys), label_fill
-        self.pass_keys, self.outputs = tuple(pass_keys), tuple(outputs)
+        self.label_frame, self.label_fill = label_frame, label_fill
+        self.label_keys = _checked_names("label_keys", label_keys)
+        self.pass_keys, self.outputs = _checked_names("pass_keys", pass_keys), tuple(outputs)
         self._warn = WarnOnce()
         # Rigs drawn for each sample never come back: only the last plan is kept.
         once = isinstance(self.target, RandomRig) and self.target.per == "sample"
@@ -217,7 +229,7 @@ class RigRetarget(torch.nn.Module):
         """All randomness of a call: the target rig, whether to skip, and the parameters that say so."""
         if self.rng is not None and torch.utils.data.get_worker_info() is not None:
             raise SampleError("rng: a generator repeats itself in every DataLoader worker; leave rng=None there")
-        given = None if params is None else {name: float(value) for name, value in params.items()}
+        given = None if params is None else _checked_params(params)
         drawn: dict[str, float] = {}
         if self.p < 1:
             if given is None:
@@ -368,15 +380,31 @@ class RigRetarget(torch.nn.Module):
 
 
 def _one_of(name: str, value: Any, choices: Sequence[str]) -> None:
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+
+
+def _checked_names(name: str, value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list | tuple) or not all(isinstance(entry, str) for entry in value):
+        raise ValueError(f"{name}: expected names in a list or tuple, got {value!r}")
+    return tuple(value)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def _checked_params(params: Any) -> dict[str, float]:
+    if not isinstance(params, Mapping) or not all(_is_number(value) for value in params.values()):
+        raise SampleError(f"params: expected the 'retarget_params' of an output, names and numbers, got {params!r}")
+    return {name: float(value) for name, value in params.items()}
 
 
 def _checked_size(size: Any) -> tuple[int, int]:
     try:
-        h, w = (int(side) for side in size)
+        h, w = (operator.index(side) for side in size)  # 10.5 is refused, not cut
     except (TypeError, ValueError):
         h, w = 0, 0
-    if min(h, w) < 1:
-        raise ValueError(f"size: expected (h, w) in pixels, got {size!r}")
+    if not 1 <= min(h, w) <= max(h, w) <= MAX_SIZE_PX:
+        raise ValueError(f"size: expected (h, w) in whole pixels, from 1 to {MAX_SIZE_PX}, got {size!r}")
     return h, w

@@ -198,7 +198,11 @@ def _read_points(calib: Mapping[str, Any], folder: Path, where: str) -> torch.Te
     if named is not None and not isinstance(named, str):
         raise DataError(f"{where}: lidar: expected {{'file': name}}, got {entry!r}")
     path = folder / (named or POINTS_FILE)
-    if not path.is_file():
+    try:
+        found = path.is_file()
+    except (OSError, ValueError):  # a name that no file can have
+        found = False
+    if not found:
         if named is None:
             return None
         raise DataError(
@@ -231,8 +235,9 @@ def checked_points(array: Any, where: str) -> torch.Tensor:
 def _boxes(rows: Any, where: str) -> torch.Tensor:
     expected = "rows of x y z length width height yaw (at least 7 finite numbers, sizes above 0)"
     try:
-        array = np.array(rows, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+        with np.errstate(over="ignore"):  # beyond float32 is not finite either
+            array = np.array(rows, dtype=np.float64).astype(np.float32)
+    except (TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{where}: boxes_3d: expected {expected}, got {error}") from None
     if array.size == 0:
         array = array.reshape(0, 7)
@@ -241,13 +246,13 @@ def _boxes(rows: Any, where: str) -> torch.Tensor:
     bad = np.flatnonzero(~np.isfinite(array[:, :7]).all(axis=1) | (array[:, 3:6] <= 0).any(axis=1))
     if len(bad):
         raise DataError(f"{where}: boxes_3d: expected {expected}, got row {bad[0]}: {array[bad[0]].tolist()}")
-    return torch.from_numpy(array.astype(np.float32))
+    return torch.from_numpy(array)
 
 
 def _pose(value: Any, where: str) -> torch.Tensor:
     try:
         pose = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pose = np.zeros(0)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise DataError(f"{where}: ego2world: expected 4x4 finite numbers, got {value!r}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, Literal
 
 Quality = Literal["draft", "fast", "accurate", "paper"]
@@ -182,7 +183,7 @@ class PaperConfig:
                 f"got {self.consistent_px!r}"
             )
         for kind, weight in self.type_weights:
-            if not 0 <= weight <= 1e6:
+            if not isinstance(weight, Real) or not 0 <= weight <= 1e6:
                 raise ValueError(f"PaperConfig.type_weights: {kind}: expected a number from 0 to 1e+06, got {weight!r}")
 
     def type_weight(self, kind: str) -> float:
@@ -219,11 +220,11 @@ def check_ranges(config: Any, ranges: dict[str, tuple[float, float]]) -> None:
     """Refuse fields of a config outside their (lowest, highest) value.
 
     Raises:
-        ValueError: With the config's and the field's name.
+        ValueError: With the config's and the field's name; what is no number too.
     """
     for name, (low, high) in ranges.items():
         value = getattr(config, name)
-        if not low <= value <= high:
+        if not isinstance(value, Real) or not low <= float(value) <= high:
             raise ValueError(f"{type(config).__name__}.{name}: expected {low:g} to {high:g}, got {value!r}")
 
 
@@ -263,7 +264,7 @@ def favs_config(quality: Any) -> FavsConfig | PaperConfig:
         "accurate": accurate,
         "paper": paper,
     }
-    if quality not in presets:
+    if not isinstance(quality, str) or quality not in presets:
         raise ValueError(
             f"quality: expected one of {', '.join(presets)}, a FavsConfig or a PaperConfig, got {quality!r}"
         )

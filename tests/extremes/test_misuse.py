@@ -1,0 +1,194 @@
+"""Whatever a user passes by mistake works or is refused by name: no foreign exception, no hang, bounded memory."""
+
+from __future__ import annotations
+
+import random
+import resource
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import ArbiviewError, Camera, FavsConfig, PaperConfig, RandomRig, Rig, RigRetarget, load_rig
+from arbiview_aug.datasets import FrameFolder
+from arbiview_aug.errors import CalibrationError, SampleError, SampleTypeError
+from arbiview_aug.tensors import is_readable
+from tests.extremes import misuse
+
+TARGET = misuse.rig(spread_deg=30.0).shifted(z_m=0.3)
+HANG_S = 20  # CPU seconds; the slowest input takes about one
+GROWTH_KB = 1024**2  # of the process's peak memory: 1 GiB beyond what the tests before it needed
+
+
+@contextmanager
+def bounded() -> Iterator[None]:
+    """Fails on inputs that together need a GiB more memory than the process had."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    yield
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < GROWTH_KB
+
+
+def works_or_refuses(call: Callable[[], Any], seed: int, allowed: tuple[type[Exception], ...]) -> bool:
+    """Whether the call worked; any exception but the allowed ones, which need a message, fails the test."""
+    started = time.thread_time()
+    try:
+        call()
+    except allowed as error:
+        assert str(error), f"seed {seed}: no message"
+        return False
+    except Exception as error:
+        raise AssertionError(f"seed {seed}: {type(error).__name__}: {error}") from error
+    finally:
+        assert time.thread_time() - started < HANG_S, f"seed {seed}"
+    return True
+
+
+def try_sample(seed: int) -> bool:
+    rng = random.Random(seed)
+    sample = misuse.sample(rng)
+    settings_too = rng.random() < 0.25
+    chosen = misuse.mutated_settings(rng, sample) if settings_too else misuse.settings(rng, sample)
+    made: list[RigRetarget] = []
+    if not works_or_refuses(lambda: made.append(RigRetarget(TARGET, **chosen)), seed, (ArbiviewError, ValueError)):
+        return False
+    if not settings_too:
+        for _ in range(rng.choice((1, 1, 2))):
+            sample = misuse.mutated(sample, rng)
+
+    def render() -> None:
+        out = made[0](sample)
+        images = out["images"] if isinstance(out["images"], list) else [out["images"]]
+        assert all(is_readable(image) and bool(image.isfinite().all()) for image in images)
+
+    return works_or_refuses(render, seed, (ArbiviewError,))
+
+
+def try_files(seed: int, folder: Path) -> bool:
+    text = misuse.mutated_text(random.Random(seed))
+    for name in ("calib.json", "rig.yaml"):
+        (folder / name).write_bytes(text)
+    works = works_or_refuses(lambda: FrameFolder(folder)[0], seed, (ArbiviewError,))
+    readable = "rig.yaml" if seed % 8 == 0 else "calib.json"  # YAML's reader is slow
+    return works_or_refuses(lambda: repr(load_rig(folder / readable)), seed, (ArbiviewError,)) and works
+
+
+@pytest.fixture
+def frame_folder(tmp_path: Path) -> Path:
+    for name in ("left", "right"):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((*misuse.SIZE, 3), 100, np.uint8))
+    cv2.imwrite(str(tmp_path / "mask.png"), np.full(misuse.SIZE, 255, np.uint8))
+    np.save(tmp_path / "lidar.npy", np.zeros((4, 3), np.float32))
+    return tmp_path
+
+
+def check(samples: range, files: range, folder: Path) -> None:
+    with bounded(), warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        worked = sum(try_sample(seed) for seed in samples)
+        opened = sum(try_files(seed, folder) for seed in files)
+    assert 0.2 < worked / len(samples) < 0.8, "the mutations reach what is behind the first check"
+    assert 0.1 < opened / len(files) < 0.8
+
+
+def test_mutated_inputs(frame_folder: Path) -> None:
+    check(range(300), range(200), frame_folder)
+
+
+@pytest.mark.slow
+def test_ten_thousand_mutated_inputs(frame_folder: Path) -> None:
+    check(range(300, 5800), range(200, 4700), frame_folder)
+
+
+@pytest.mark.parametrize(
+    ("values", "match"),
+    [
+        ({"azimuth_deg": "x"}, "finite angles"),
+        ({"azimuth_deg": None}, "finite angles"),
+        ({"position_m": (1.0, 2.0)}, "position_m"),
+        ({"position_m": "front"}, "position_m"),
+        ({"horizontal_fov_deg": "wide"}, "horizontal_fov_deg"),
+        ({"width_px": "x"}, "width_px"),
+        ({"height_px": 0}, "height_px"),
+        ({"lens": "wide"}, "lens"),
+        ({"distortion": "x"}, "distortion"),
+    ],
+)
+def test_cameras_refuse_by_name(values: dict[str, Any], match: str) -> None:
+    right: dict[str, Any] = {"name": "c", "azimuth_deg": 0.0, "width_px": 9, "height_px": 7, "horizontal_fov_deg": 60.0}
+    with pytest.raises(CalibrationError, match=match):
+        Camera.looking(**(right | values))
+
+
+@pytest.mark.parametrize("value", [np.eye(3), "x", np.full((4, 4), np.nan), np.full((4, 4), 1e308), None])
+def test_moves_refuse_what_is_no_pose(value: Any) -> None:
+    with pytest.raises(CalibrationError, match="'left'"):
+        misuse.rig()[0].moved(value)
+
+
+def test_huge_entries_are_no_rotation() -> None:
+    pose = np.eye(4)
+    pose[:3, :3] = [[1e308, -1e308, 0], [1e308, 1e308, 0], [0, 0, 1e308]]
+    with pytest.raises(CalibrationError, match="nearest rotation"):
+        Camera(name="c", width_px=9, height_px=7, K=np.eye(3), cam2ego=pose)
+
+
+@pytest.mark.parametrize(
+    ("values", "match"),
+    [
+        ({"p": "x"}, "p: expected"),
+        ({"p": [0.5]}, "p: expected"),
+        ({"quality": ["fast"]}, "quality: expected"),
+        ({"surface": ["far"]}, "surface: expected"),
+        ({"size": (10.5, 20)}, "size: expected"),
+        ({"size": (40_000, 20)}, "size: expected"),
+        ({"outputs": "confidence"}, "outputs: expected names"),
+        ({"label_keys": "labels"}, "label_keys: expected names"),
+        ({"pass_keys": 3}, "pass_keys: expected names"),
+        ({"label_fill": "x"}, "label_fill"),
+        ({"cache_bytes": None}, "cache_bytes"),
+        ({"rng": 7}, "rng"),
+        ({"refinement": "scene", "quality": "accurate"}, "refinement"),
+        ({"harmonise": torch.zeros(0)}, "harmonise"),
+    ],
+)
+def test_settings_refuse_by_name(values: dict[str, Any], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        RigRetarget(TARGET, **values)
+
+
+def test_configs_refuse_by_name() -> None:
+    with pytest.raises(ValueError, match=r"FavsConfig\.seam_width"):
+        FavsConfig(seam_width="a")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"PaperConfig\.beta"):
+        PaperConfig(beta=None)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="yaw_deg"):
+        RandomRig(TARGET, yaw_deg="x")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("params", [{"yaw_deg": "x"}, {"skipped": None}, 3, ["yaw_deg"]])
+def test_params_refuse_what_is_no_number(params: Any) -> None:
+    with pytest.raises(ArbiviewError, match="params"):
+        RigRetarget(RandomRig(TARGET, yaw_deg=5.0))({"images": torch.zeros(2, 3, *misuse.SIZE), "rig": TARGET}, params)
+
+
+@pytest.mark.parametrize(
+    "change", [lambda t: t.to("meta"), lambda t: t.to(torch.float8_e4m3fn), lambda t: t.to_sparse()]
+)
+def test_tensors_that_cannot_be_read(change: Callable[[torch.Tensor], torch.Tensor]) -> None:
+    cameras: Rig = misuse.rig()
+    right = torch.zeros(2, 3, *misuse.SIZE)
+    with pytest.raises(SampleTypeError, match=r"images\[0\]"):
+        RigRetarget(TARGET)({"images": change(right), "rig": cameras})
+    sample = {"images": right, "rig": cameras, "points": change(torch.rand(20, 3)), "boxes_3d": torch.zeros(0, 7)}
+    retarget = RigRetarget(TARGET, surface="lidar")
+    with suppress(SampleTypeError):  # 8 bit floats can be read as numbers
+        assert retarget(sample)["images"].isfinite().all()
+    with pytest.raises(SampleError, match="points"):
+        retarget({**sample, "points": torch.rand(20, 2)})
