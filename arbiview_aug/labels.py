@@ -180,9 +180,8 @@ def move_to_target(out: dict[str, Any], ego2ego: torch.Tensor, lead: tuple[int, 
             out[key] = _translated(key, out[key], ego2ego[..., :3, 3], lead)
     if out.get("ego2world") is not None:
         pose = out["ego2world"]
-        if tuple(getattr(pose, "shape", ()))[-2:] != (4, 4):
-            got = getattr(pose, "shape", type(pose).__name__)
-            raise SampleError(f"ego2world: label_frame='target': expected shape (..., 4, 4), got {got}")
+        if tuple(getattr(pose, "shape", (4, 4)))[-2:] != (4, 4):
+            raise SampleError(f"ego2world: label_frame='target': expected shape (..., 4, 4), got {pose.shape}")
         inverse = torch.linalg.inv(ego2ego)
         if isinstance(pose, np.ndarray):
             out["ego2world"] = pose @ inverse.numpy()

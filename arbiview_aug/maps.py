@@ -382,7 +382,7 @@ class PairMap:
             local = at[here] - np.array([slot.x, slot.y], np.float32)
             first: Any = cv2.remap(shadows.beyond, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
             beyond: Any = 0 if isinstance(self.surface, Static) else grid.upsample(self._from_source_q, part)
-            visible[here] &= cv2.compare(first, beyond, cv2.CMP_LE).astype(np.uint8)
+            visible[here] *= first <= beyond  # not cv2.compare: to it a part of one or four pixels is a scalar
         visible &= self.rays.solids(self.whole_surface).free[y0:y1, x0:x1]
         solids = self.solids
         strip = slice(*np.searchsorted(solids.pixels[:, 1], [y0, y1]).tolist())
@@ -511,7 +511,7 @@ def _cells_near_shadow(shadow: npt.NDArray[np.float32], uv: FloatArray) -> BoolA
     h, w = shadow.shape
     rows, columns = -(-h // tile), -(-w // tile)
     dark = np.zeros((rows * tile, columns * tile), np.uint8)
-    dark[:h, :w] = cv2.compare(shadow, 0, cv2.CMP_GT)  # type: ignore[call-overload]
+    dark[:h, :w] = np.uint8(255) * (shadow > 0)
     count = cv2.integral((cv2.resize(dark, (columns, rows), interpolation=cv2.INTER_AREA) > 0).astype(np.uint8))
     (x0, x1), (y0, y1) = (_tiles_between(uv[..., k], n) for k, n in enumerate((columns, rows)))
     return np.asarray(count[y1, x1] - count[y0, x1] - count[y1, x0] + count[y0, x0] > 0)

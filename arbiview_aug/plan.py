@@ -10,6 +10,7 @@ and pixel by pixel elsewhere (``arbiview_aug.maps``).
 from __future__ import annotations
 
 import hashlib
+import threading
 from collections import Counter, OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
@@ -58,31 +59,38 @@ class RenderPlan:
 
 
 class PlanCache:
-    """Plans by content key, the least recently used dropped once ``max_bytes`` are held. Pickles as empty."""
+    """Plans by content key, the least recently used dropped once ``max_bytes`` are held. Pickles as empty.
+
+    Threads may share it: two that miss the same plan at once both build it, so that none waits for another's.
+    """
 
     def __init__(self, max_bytes: int = 512 * 2**20) -> None:
         self.max_bytes = max_bytes
         self.hits = self.misses = 0
         self._plans: OrderedDict[bytes, RenderPlan] = OrderedDict()
+        self._lock = threading.Lock()
 
     def get(self, key: bytes, build: Callable[[], RenderPlan]) -> RenderPlan:
         """The plan of this key, built if it is not held."""
-        if key in self._plans:
-            self.hits += 1
-            self._plans.move_to_end(key)
-            return self._plans[key]
-        self.misses += 1
+        with self._lock:
+            if key in self._plans:
+                self.hits += 1
+                self._plans.move_to_end(key)
+                return self._plans[key]
+            self.misses += 1
         plan = build()
-        self._plans[key] = plan
-        held = self.nbytes
-        while held > self.max_bytes and len(self._plans) > 1:
-            held -= self._plans.popitem(last=False)[1].nbytes
+        with self._lock:
+            self._plans[key] = plan
+            held = sum(p.nbytes for p in self._plans.values())
+            while held > self.max_bytes and len(self._plans) > 1:
+                held -= self._plans.popitem(last=False)[1].nbytes
         return plan
 
     @property
     def nbytes(self) -> int:
         """Memory held by all plans."""
-        return sum(plan.nbytes for plan in self._plans.values())
+        with self._lock:
+            return sum(plan.nbytes for plan in self._plans.values())
 
     def __len__(self) -> int:
         return len(self._plans)

@@ -395,9 +395,11 @@ def _is_number(value: Any) -> bool:
 
 
 def _checked_params(params: Any) -> dict[str, float]:
-    if not isinstance(params, Mapping) or not all(_is_number(value) for value in params.values()):
-        raise SampleError(f"params: expected the 'retarget_params' of an output, names and numbers, got {params!r}")
-    return {name: float(value) for name, value in params.items()}
+    try:
+        return {name: float(value) for name, value in params.items()}  # of a collated batch: tensors
+    except (AttributeError, TypeError, ValueError, RuntimeError):
+        got = repr(params)
+    raise SampleError(f"params: expected the 'retarget_params' of an output, names and numbers, got {got}")
 
 
 def _checked_size(size: Any) -> tuple[int, int]:
@@ -406,5 +408,5 @@ def _checked_size(size: Any) -> tuple[int, int]:
     except (TypeError, ValueError):
         h, w = 0, 0
     if not 1 <= min(h, w) <= max(h, w) <= MAX_SIZE_PX:
-        raise ValueError(f"size: expected (h, w) in whole pixels, from 1 to {MAX_SIZE_PX}, got {size!r}")
+        raise ValueError(f"size: expected (h, w) in pixels, got {size!r}; whole numbers from 1 to {MAX_SIZE_PX}")
     return h, w

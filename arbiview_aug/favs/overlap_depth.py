@@ -14,6 +14,7 @@ even tile's border it looks into its neighbours. Wherever a pair declines, the s
 from __future__ import annotations
 
 import math
+import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -437,18 +438,22 @@ class RefinementCache:
         self.key, self.max_bytes = key, max_bytes
         self.hits = self.misses = 0
         self._held: OrderedDict[tuple[bytes, object], OverlapDepth] = OrderedDict()
+        self._lock = threading.Lock()
 
     def get(self, name: tuple[bytes, object], compute: Callable[[], OverlapDepth]) -> OverlapDepth:
         """The refinement of a calibration's content key and the sample's own, computed if it is not held."""
-        if name in self._held:
-            self.hits += 1
-            self._held.move_to_end(name)
-            return self._held[name]
-        self.misses += 1
-        self._held[name] = found = compute()
-        held = sum(depth.nbytes for depth in self._held.values())
-        while held > self.max_bytes and len(self._held) > 1:
-            held -= self._held.popitem(last=False)[1].nbytes
+        with self._lock:
+            if name in self._held:
+                self.hits += 1
+                self._held.move_to_end(name)
+                return self._held[name]
+            self.misses += 1
+        found = compute()
+        with self._lock:
+            found = self._held.setdefault(name, found)  # another thread's came first: all share the first
+            held = sum(depth.nbytes for depth in self._held.values())
+            while held > self.max_bytes and len(self._held) > 1:
+                held -= self._held.popitem(last=False)[1].nbytes
         return found
 
     def __repr__(self) -> str:

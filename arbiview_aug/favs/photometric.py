@@ -12,6 +12,7 @@ chessboard) is fitted to, the other half decides whether the gains are accepted.
 from __future__ import annotations
 
 import math
+import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -318,6 +319,7 @@ class Harmoniser:
         self.estimates = choice is True or isinstance(choice, HarmoniseConfig)
         self.gains = None if self.estimates or choice is None or choice is False else _checked_gains(choice)
         self._overlaps: OrderedDict[bytes, Overlaps] = OrderedDict()
+        self._lock = threading.Lock()
 
     @property
     def is_on(self) -> bool:
@@ -355,12 +357,16 @@ class Harmoniser:
 
     def _overlaps_of(self, rig: Rig) -> Overlaps:
         key = rig.content_key
-        if key not in self._overlaps:
-            self._overlaps[key] = find_overlaps(rig, self.config)
+        with self._lock:
+            if key in self._overlaps:
+                self._overlaps.move_to_end(key)
+                return self._overlaps[key]
+        found = find_overlaps(rig, self.config)
+        with self._lock:
+            self._overlaps[key] = found
             while len(self._overlaps) > _HELD_RIGS:
                 self._overlaps.popitem(last=False)
-        self._overlaps.move_to_end(key)
-        return self._overlaps[key]
+        return found
 
 
 _HELD_RIGS = 8  # about 0.2 MB each; every frame of a drive may have a calibration of its own

@@ -153,8 +153,9 @@ def mutated(value: Any, rng: random.Random) -> Any:
         else:
             value[k] = mutated(value[k], rng)
         return value
-    if isinstance(value, torch.Tensor) and rng.random() < 0.75:
-        if rng.random() < 0.3 and value.numel() and value.device.type == "cpu" and value.layout == torch.strided:
+    readable = isinstance(value, torch.Tensor) and value.device.type == "cpu" and value.layout == torch.strided
+    if readable and "float8" not in str(value.dtype) and rng.random() < 0.75:
+        if rng.random() < 0.3 and value.numel():
             changed = value.clone().double()
             changed.view(-1)[rng.randrange(value.numel())] = rng.choice(NUMBERS)
             return changed if rng.random() < 0.5 else changed.to(value.dtype)

@@ -1,0 +1,64 @@
+"""One ``RigRetarget`` in several threads gives what it gives in one."""
+
+from __future__ import annotations
+
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from arbiview_aug import RigRetarget
+from arbiview_aug.favs.overlap_depth import RefinementCache
+from arbiview_aug.plan import PlanCache
+from tests.extremes import misuse
+
+
+@pytest.fixture(autouse=True)
+def switches_often() -> Any:
+    """Threads take turns a thousand times as often as they would."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(5e-6)
+    yield
+    sys.setswitchinterval(before)
+
+
+def sample(k: int) -> dict[str, Any]:
+    """One of several calibrations, so that plans are built, found and dropped."""
+    generator = torch.Generator().manual_seed(k)
+    images = torch.randint(0, 256, (2, 3, *misuse.SIZE), generator=generator, dtype=torch.uint8)
+    return {"images": images, "rig": misuse.rig(spread_deg=30.0 + k % 7), "scene": f"s{k}"}
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"cache_bytes": 2**30},
+        {"cache_bytes": 20_000},  # plans are dropped all the time
+        {"harmonise": True, "quality": "accurate", "refinement": RefinementCache(key="scene", max_bytes=1)},
+    ],
+)
+def test_threads_do_not_disturb_each_other(settings: dict[str, Any]) -> None:
+    retarget = RigRetarget(misuse.rig().shifted(z_m=0.2), surface="street", **settings)
+    count = 70 if "quality" not in settings else 20
+    fresh = RigRetarget(misuse.rig().shifted(z_m=0.2), surface="street", **{**settings, "refinement": None})
+    with ThreadPoolExecutor(4) as threads:
+        rendered = list(threads.map(lambda k: retarget(sample(k % 35))["images"], range(count)))
+    for k, images in enumerate(rendered):
+        assert torch.equal(images, fresh(sample(k % 35))["images"])
+    assert retarget.plans.hits + retarget.plans.misses == count
+    assert retarget.plans.nbytes <= settings.get("cache_bytes", 2**30) or len(retarget.plans) == 1
+
+
+@pytest.mark.parametrize("cache", [PlanCache(20), RefinementCache(max_bytes=20)])
+def test_caches_keep_count(cache: Any) -> None:
+    def get(k: int) -> int:
+        key = bytes([k * k % 7])
+        name = key if isinstance(cache, PlanCache) else (key, None)
+        return int(cache.get(name, lambda: SimpleNamespace(nbytes=5, key=key)).key == key)
+
+    with ThreadPoolExecutor(4) as threads:
+        assert sum(threads.map(get, range(5000))) == 5000
+    assert cache.hits + cache.misses == 5000
