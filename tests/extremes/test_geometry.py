@@ -1,0 +1,168 @@
+"""Cameras at the edges of what calibrations can say: finite maps, no warnings, covered only where a source sees."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import Camera, Rig, RigRetarget
+from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.maps import ego_rays, project_rays
+from arbiview_aug.plan import RenderPlan, build_plan
+from arbiview_aug.scene import Scene
+
+MAP_TOLERANCE_PX = 1 / 32
+BOXES = np.array([[12.0, 1.0, 0.8, 4.5, 1.9, 1.6, 0.3], [-8.0, -3.0, 1.0, 4.0, 2.0, 2.0, 1.5]])
+POINTS = np.random.default_rng(0).normal(size=(2000, 3)) * (20, 20, 1) + (0, 0, 1)
+SCENES = {
+    "far": Scene(),
+    "ground": Scene(),
+    "street": Scene(),
+    "objects": Scene(boxes=BOXES),
+    "lidar": Scene(points=POINTS),
+}
+
+
+def camera(name: str = "c", **values: Any) -> Camera:
+    lens = values.get("lens", "pinhole")
+    usual: dict[str, Any] = {"azimuth_deg": 0.0, "width_px": 64, "height_px": 48, "position_m": (1.5, 0.0, 1.5)}
+    if "K" not in values:
+        usual["horizontal_fov_deg"] = 80.0
+    return Camera.looking(name=name, **(usual | {"distortion": (0.0,) * 4 if lens == "fisheye" else ()} | values))
+
+
+def ring(count: int = 6, **values: Any) -> Rig:
+    """Cameras all around, half a metre from the middle."""
+    angles = [360.0 * k / count for k in range(count)]
+    places = [(0.5 * np.cos(np.radians(a)), 0.5 * np.sin(np.radians(a)), 1.5) for a in angles]
+    return Rig(
+        [
+            camera(f"c{k}", **({"azimuth_deg": a, "position_m": p} | values))
+            for k, (a, p) in enumerate(zip(angles, places, strict=True))
+        ]
+    )
+
+
+def focal(f_px: float) -> list[list[float]]:
+    return [[f_px, 0, 31.5], [0, f_px, 23.5], [0, 0, 1]]
+
+
+TARGETS: dict[str, Callable[[], Camera]] = {
+    **{f"focal {f:g} px": (lambda f=f: camera(K=focal(f))) for f in (1e-2, 1.0, 1e3, 1e5)},
+    **{f"field of view {a:g}": (lambda a=a: camera(horizontal_fov_deg=a)) for a in (1.0, 150.0, 179.0)},
+    "fisheye 220": lambda: camera(lens="fisheye", horizontal_fov_deg=220.0),
+    **{f"yaw {a:g}": (lambda a=a: camera(azimuth_deg=a)) for a in (-180.0, -179.9999999, 90.0, 180.0)},
+    "pitch 90": lambda: camera(elevation_deg=90.0),
+    "pitch -90": lambda: camera(elevation_deg=-90.0),
+    "roll 180": lambda: camera(roll_deg=180.0),
+    "a centre of a source": lambda: camera(position_m=tuple(ring()[0].center_m)),
+    "1e-7 m from a source": lambda: camera(position_m=tuple(ring()[0].center_m + 1e-7)),
+    "1e-7 deg from a source": lambda: camera(azimuth_deg=1e-7, position_m=tuple(ring()[0].center_m)),
+    "at the cylinder": lambda: camera(position_m=(40.0, 0.0, 1.5)),
+    "on the road": lambda: camera(position_m=(1.5, 0.0, 0.0)),
+    "below the road": lambda: camera(position_m=(1.5, 0.0, -2.0)),
+    "1 km away": lambda: camera(position_m=(1000.0, 0.0, 1.5)),
+    "1 km away, looking back": lambda: camera(position_m=(1000.0, 0.0, 1.5), azimuth_deg=180.0),
+    "1 km above": lambda: camera(position_m=(0.0, 0.0, 1000.0), elevation_deg=-90.0),
+    "in a box": lambda: camera(position_m=(12.0, 1.0, 0.8)),
+    "principal point outside": lambda: camera(K=[[60.0, 0, -200.0], [0, 60.0, 300.0], [0, 0, 1]]),
+    "skewed": lambda: camera(K=[[60.0, 30.0, 31.5], [0, 20.0, 23.5], [0, 0, 1]]),
+    "1x1": lambda: camera(width_px=1, height_px=1),
+    "1x64": lambda: camera(width_px=64, height_px=1),
+    "48x1": lambda: camera(width_px=1, height_px=48),
+    "odd": lambda: camera(width_px=61, height_px=37),
+    "horizon on a row": lambda: camera(K=[[40.0, 0, 31.0], [0, 40.0, 24.0], [0, 0, 1]]),
+}
+
+
+def check(plan: RenderPlan, surface: str, scene: Scene) -> None:
+    """Every covered pixel is read where float64 geometry puts it, inside its source, in front of it."""
+    for view, target in zip(plan.targets, plan.target, strict=True):
+        names = {pair.source: pair.surface for pair in view.pairs}
+        directions, ray_valid = ego_rays(target, target.pixel_grid())
+        for index, name in names.items():
+            source = plan.source[index]
+            won = view.source_camera == index
+            assert ray_valid[won].all()
+            q = scene.surface(name, plan.source.ground_z_m).inverse_distance(target.center_m, directions[won])
+            uv, valid = project_rays(source, directions[won], q, target.center_m - source.center_m)
+            assert valid.all(), f"{source.name} over {name}: read behind the camera"
+            outside = np.maximum(-uv, uv - (source.width_px - 1, source.height_px - 1)).max()
+            assert outside <= MAP_TOLERANCE_PX, f"{source.name} over {name}: read {outside:.3g} px outside"
+
+
+@pytest.mark.parametrize("surface", SCENES)
+@pytest.mark.parametrize("name", TARGETS)
+def test_targets_at_the_edges(name: str, surface: str) -> None:
+    source, target, scene = ring(), TARGETS[name](), SCENES[surface]
+    with warnings.catch_warnings(), np.errstate(over="raise", divide="raise", invalid="raise"):
+        warnings.simplefilter("error")
+        plan = build_plan(source, Rig([target]), surface=surface, scene=scene, config=FavsConfig(certainty=True))
+    check(plan, surface, scene)
+
+
+SOURCES: dict[str, Callable[[], Rig]] = {
+    "one camera": lambda: ring(1),
+    "twelve cameras": lambda: ring(12),
+    "one centre": lambda: ring(position_m=(0.0, 0.0, 1.5)),
+    "1x1": lambda: ring(width_px=1, height_px=1),
+    "1x64": lambda: ring(width_px=64, height_px=1),
+    "2x1": lambda: ring(width_px=1, height_px=2),
+    "odd": lambda: ring(width_px=61, height_px=37),
+    "179 degrees": lambda: ring(horizontal_fov_deg=179.0),
+    "1 degree": lambda: ring(horizontal_fov_deg=1.0),
+    "fisheye 220": lambda: ring(lens="fisheye", horizontal_fov_deg=220.0),
+    "focal 1e-2 px": lambda: ring(K=focal(1e-2)),
+    "focal 1e5 px": lambda: ring(K=focal(1e5)),
+    "below the road": lambda: ring(position_m=(0.0, 0.0, -2.0)),
+    "1 km away": lambda: ring(position_m=(1000.0, 0.0, 1.5)),
+    "looking up": lambda: ring(elevation_deg=90.0),
+    "upside down": lambda: ring(roll_deg=180.0),
+}
+
+
+@pytest.mark.parametrize("surface", SCENES)
+@pytest.mark.parametrize("name", SOURCES)
+def test_sources_at_the_edges(name: str, surface: str) -> None:
+    scene, target = SCENES[surface], Rig([camera("t0"), camera("t1", azimuth_deg=70.0, position_m=(0.0, 0.6, 1.9))])
+    with warnings.catch_warnings(), np.errstate(over="raise", divide="raise", invalid="raise"):
+        warnings.simplefilter("error")
+        plan = build_plan(SOURCES[name](), target, surface=surface, scene=scene)
+    check(plan, surface, scene)
+
+
+@pytest.mark.parametrize("quality", ["draft", "fast", "accurate"])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float16, torch.bfloat16, torch.float64])
+@pytest.mark.parametrize("name", ["one camera", "1x1", "2x1", "odd", "fisheye 220", "below the road"])
+def test_pixels_are_finite_and_in_range(name: str, dtype: torch.dtype, quality: str) -> None:
+    source = SOURCES[name]()
+    shape = (len(source), 3, *source[0].size)
+    images = torch.rand(shape, generator=torch.Generator().manual_seed(0))
+    images = (images * 255).to(dtype) if dtype == torch.uint8 else images.to(dtype)
+    retarget = RigRetarget(Rig([camera("t")]), quality=quality, surface="street", outputs=("confidence",))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        warnings.filterwarnings("ignore", message="the target rig")
+        out = retarget({"images": images, "rig": source})
+    assert out["images"].dtype == dtype and out["confidence"].isfinite().all()
+    if dtype != torch.uint8:
+        assert out["images"].isfinite().all() and 0 <= out["images"].min() <= out["images"].max() <= 1
+
+
+def test_twelve_8k_cameras_with_one_centre_in_any_order() -> None:
+    """Their atlas at full size would be 51,840 rows; the plan must not depend on their order either."""
+    angles = range(0, 360, 30)
+    size = {"width_px": 7680, "height_px": 4320, "position_m": (0.0, 0.0, 1.5)}
+    cameras = [camera(f"c{a}", azimuth_deg=float(a), **size) for a in angles]
+    target = Rig([camera("t", azimuth_deg=17.0, width_px=704, height_px=256)])
+    order = np.random.default_rng(0).permutation(len(cameras))
+    one, two = (build_plan(Rig(rig), target) for rig in (cameras, [cameras[k] for k in order]))
+    winner = two.targets[0].source_camera
+    assert np.array_equal(one.targets[0].source_camera, np.where(winner >= 0, order[winner], -1))
+    assert one.targets[0].coverage.any()
+    check(one, "far", Scene())
