@@ -91,6 +91,8 @@ def check(plan: RenderPlan, surface: str, scene: Scene) -> None:
             assert ray_valid[won].all()
             q = scene.surface(name, plan.source.ground_z_m).inverse_distance(target.center_m, directions[won])
             uv, valid = project_rays(source, directions[won], q, target.center_m - source.center_m)
+            ahead = (directions[won] + q[:, None] * (target.center_m - source.center_m)) @ source.cam2ego[:3, 2] > 0
+            assert source.lens == "fisheye" or ahead.all(), f"{source.name} over {name}: what is read lies behind it"
             assert valid.all(), f"{source.name} over {name}: read behind the camera"
             outside = np.maximum(-uv, uv - (source.width_px - 1, source.height_px - 1)).max()
             assert outside <= MAP_TOLERANCE_PX, f"{source.name} over {name}: read {outside:.3g} px outside"
