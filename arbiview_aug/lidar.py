@@ -7,8 +7,9 @@ No sensor's place is assumed: points are z-buffered and made dense anew for each
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -16,7 +17,7 @@ from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.objects import Objects, within_boxes
 from arbiview_aug.panorama import CELL_RAD, Layer, Panorama, Window, angles, panorama
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn, Shadows, Static, Surface
+from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Dense, Drawn, Shadows, Static
 
 OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
 """(x, y) ranges in the ego frame whose returns are the own car's: a car's about the middle of its rear axle."""
@@ -27,6 +28,9 @@ NEAREST_M = 0.5
 BOX_AIR_M = 0.2
 """Points this far outside a box are its object's too: mirrors, and the noise of points and labels."""
 
+_STEEP = 0.9
+"""Sine of the elevation up to which azimuths are interpolated over 0.2 degrees: 64 degrees, a hundredth of a cell."""
+
 _NO_BOX = -2  # in shadows: a point's, no box's
 
 _MEASURED_SPREAD = 0.05
@@ -34,7 +38,7 @@ _MEASURED_SPREAD = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class LidarSurface(Surface):
+class LidarSurface(Dense):
     """Points made dense over the street. Points of the own car are left out.
 
     Attributes:
@@ -46,6 +50,7 @@ class LidarSurface(Surface):
     street: Static
     points: FloatArray
     _panoramas: dict[bytes, list[Panorama]] = field(default_factory=dict, repr=False)
+    _shadows: dict[Camera, Shadows] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", self.points[~own_car(self.points)])
@@ -54,7 +59,25 @@ class LidarSurface(Surface):
         """The points' dense surface, 1/m (...,)."""
         view, row, column = self._view(origin, directions)
         known = self.street.inverse_distance(origin, directions) + view.residual(row, column)
-        return np.clip(known, 0.0, MAX_INVERSE_DISTANCE)
+        return np.asarray(np.clip(known, 0.0, MAX_INVERSE_DISTANCE), np.float64)
+
+    def image(self, camera: Camera) -> Layer:
+        """The points' dense surface at all pixels, 1/m (h, w); the street between nodes a panorama's cell apart."""
+        nodes, view, row, column = self._on_image(camera)
+        known = nodes.upsampled(self.street.inverse_distance(camera.center_m, nodes.directions).astype(np.float32))
+        return np.clip(known + view.residual(row, column), 0, np.float32(MAX_INVERSE_DISTANCE))
+
+    def shadows(self, camera: Camera) -> Shadows:
+        """What is hidden from a source, by ``hides`` at its pixel centres; kept for the next target."""
+        if camera not in self._shadows:
+            beyond = self.before_image(camera)
+            self._shadows[camera] = Shadows(beyond, np.full(camera.size, -1, np.int32))
+        return self._shadows[camera]
+
+    def before_image(self, camera: Camera) -> Layer:
+        """``before`` at all pixels of a camera (h, w)."""
+        _, view, row, column = self._on_image(camera)
+        return view.before(row, column)
 
     def hides(
         self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
@@ -70,7 +93,7 @@ class LidarSurface(Surface):
     def before(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """Inverse distances (...,) beyond which ``hides`` says that points are hidden, 1/m."""
         view, row, column = self._view(origin, directions)
-        return view.before(row, column)
+        return view.before(row, column).astype(np.float64)
 
     def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
         """Rays (...,) near an outline or a slope against the street."""
@@ -83,6 +106,15 @@ class LidarSurface(Surface):
         unknown = self.street.uncertainty(origin, directions, inverse_distance)
         return np.where(view.is_measured(row, column), _MEASURED_SPREAD * inverse_distance, unknown)
 
+    def _on_image(self, camera: Camera) -> tuple[_Nodes, Panorama, Layer, Layer]:
+        """Rays to interpolate between, a panorama, and in it the rows and columns (h, w) of a camera's pixels."""
+        nodes = _Nodes.of(camera)
+        view, row, column = self._view(camera.center_m, nodes.directions)
+        if nodes.step > 1 and view.window.is_whole:  # columns jump
+            nodes = _Nodes.of(camera, 1)
+            view, row, column = self._view(camera.center_m, nodes.directions)
+        return nodes, view, nodes.upsampled(row), nodes.upsampled(column)
+
     def _view(self, origin: FloatArray, directions: FloatArray) -> tuple[Panorama, Layer, Layer]:
         """The panorama around a centre that holds the rays, and their rows and columns in it."""
         azimuth, elevation = angles(directions)
@@ -94,6 +126,39 @@ class LidarSurface(Surface):
             view = panorama(asked.widened(), origin, self.points[~near], self.street)
             held.append(view)
         return view, *view.window.cells(azimuth, elevation)
+
+
+@dataclass(frozen=True)
+class _Nodes:
+    """Rays of a camera about as far apart as a panorama's cells, for what bends little from one to the next.
+
+    Attributes:
+        size: (h, w) of the image.
+        step: Their spacing, pixels.
+        directions: (ny, nx, 3) unit rays in the ego frame; the first node lies one step before the image's first block.
+    """
+
+    size: tuple[int, int]
+    step: int
+    directions: FloatArray
+
+    @classmethod
+    def of(cls, camera: Camera, step: int | None = None) -> _Nodes:
+        """Of a camera; all pixels where azimuths bend, and of lenses, which may have no rays next to their images."""
+        if step is None:
+            step = max(1, round(CELL_RAD * float(camera.K[0, 0]))) if camera.lens == "pinhole" else 1
+        v, u = (step * np.arange(-1.0, -(-n // step) + 1) + (step - 1) / 2 for n in camera.size)
+        directions, valid = camera.unproject(np.stack(np.meshgrid(u, v), -1))
+        if step > 1 and float(np.abs(directions[..., 2]).max()) > _STEEP:
+            return cls.of(camera, 1)
+        return cls(camera.size, step, np.where(valid[..., None], directions, camera.cam2ego[:3, 2]))
+
+    def upsampled(self, values: Layer) -> Any:
+        """Bilinear interpolation (ny, nx) to all pixels (h, w)."""
+        s, (h, w) = self.step, self.size
+        if s > 1:
+            values = cv2.resize(values, None, fx=s, fy=s, interpolation=cv2.INTER_LINEAR)  # type: ignore[assignment]
+        return values[s : s + h, s : s + w]
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,19 +182,18 @@ class LidarObjects(Objects):
     def drawn(self, camera: Camera) -> Drawn:
         """The pixels of a camera that show boxes with nothing measured before them."""
         pixel, first, face = super().drawn(camera)
-        shown = first >= self._measured_before(camera, pixel)
+        shown = first >= self.street.before_image(camera).reshape(-1)[pixel]
         return Drawn(pixel[shown], first[shown], face[shown])
 
     def shadows(self, camera: Camera) -> Shadows:
-        """What boxes hide from a source; and what was measured before boxes hides them."""
+        """What boxes hide from a source, and what was measured."""
         new = camera not in self._shadows
         shadows = super().shadows(camera)
         if new:
-            pixel = np.flatnonzero(shadows.solid.reshape(-1) >= 0)
-            before = self._measured_before(camera, pixel)
-            nearer = before > shadows.beyond.reshape(-1)[pixel]
-            shadows.beyond.reshape(-1)[pixel[nearer]] = before[nearer]
-            shadows.solid.reshape(-1)[pixel[nearer]] = _NO_BOX
+            measured = self.street.shadows(camera).beyond
+            nearer = measured > shadows.beyond
+            np.copyto(shadows.beyond, measured, where=nearer)
+            np.copyto(shadows.solid, _NO_BOX, where=nearer)
         return shadows
 
     def hides(
@@ -147,12 +211,6 @@ class LidarObjects(Objects):
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Small where a point is near, the street's elsewhere: 1/m (...,)."""
         return self.street.uncertainty(origin, directions, inverse_distance)
-
-    def _measured_before(self, camera: Camera, pixel: npt.NDArray[np.int64]) -> FloatArray:
-        """Inverse distances (n,) beyond which pixels of a camera (n,) are hidden by what was measured."""
-        v, u = np.divmod(pixel, camera.width_px)
-        directions, _ = camera.unproject(np.stack([u, v], -1).astype(np.float64))
-        return self.street.before(camera.center_m, directions)
 
 
 def own_car(points: FloatArray) -> BoolArray:

@@ -1,8 +1,9 @@
 """Where a target camera's pixels lie in a source image, over a surface: cheaply, and to a stated precision.
 
 Maps are evaluated in float64 on the nodes of a coarse grid and interpolated (``arbiview_aug.grid``). Cells whose error
-bound exceeds the tolerance, and cells on the border of what can be projected, are evaluated pixel by pixel. Directions
-are held plane by plane, (3, ny, nx) in memory: three times faster.
+bound exceeds the tolerance, and cells on the border of what can be projected, are evaluated pixel by pixel. Surfaces
+that step anywhere (``Dense``) are evaluated once at every pixel of a target, and every pixel is projected, in float32
+(positions are precise to 1/1000 px). Directions are held plane by plane, (3, ny, nx) in memory: three times faster.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy.typing as npt
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.grid import HALVINGS, Box, Grid, runs
 from arbiview_aug.sampling import Slot, halved, level_size
-from arbiview_aug.surface import Layered, Shadows, Static, Surface
+from arbiview_aug.surface import Dense, Layered, Shadows, Static, Surface
 
 _SAFETY = 2.0  # curvature between the nodes may exceed what the nodes show
 _CORNERS = tuple((a, b) for a in (slice(None, -1), slice(1, None)) for b in (slice(None, -1), slice(1, None)))
@@ -28,7 +29,14 @@ _SHADOW_TILE_PX = 8
 _LEAST_INCIDENCE = 0.05
 """Sine of the flattest angle at which a source may look along a face: that of the road 30 m from a car's cameras."""
 
+_MORE_NODES = 2
+"""An object 5 m away before a house at 20 m is displaced by 0.15 rad for a metre of baseline, but so are its nodes; what
+is narrower than the spacing of nodes (a post) may lie outside the box around those that see the source."""
+
 _FAR_AWAY_PX = 1e5  # float32 maps stay precise and int16 conversion saturates harmlessly
+
+
+Layer = npt.NDArray[np.float32]
 
 
 class SolidPixels(NamedTuple):
@@ -63,6 +71,7 @@ class TargetRays:
         self._inverse: dict[Surface, FloatArray] = {}
         self._uncertainty: dict[Surface, FloatArray] = {}
         self._solids: dict[Layered, SolidPixels] = {}
+        self._dense: dict[Dense, Layer] = {}
         ny, nx = self.grid.shape
         self.sparse_index = np.ix_(np.unique(np.r_[0:ny:4, ny - 1]), np.unique(np.r_[0:nx:4, nx - 1]))
         planes = np.ascontiguousarray(np.moveaxis(self.directions[self.sparse_index], -1, 0))
@@ -117,6 +126,35 @@ class TargetRays:
         return self._solids[surface]
 
 
+    @cached_property
+    def planes(self) -> tuple[Layer, Layer, Layer]:
+        """x, y and z of all pixels' rays in the camera's frame, float32; those of a pinhole broadcast to (h, w).
+
+        A pinhole's have z = 1, those of lenses unit length; all are 0 where there is no ray.
+        """
+        h, w = self.camera.size
+        if self.camera.lens != "pinhole":
+            rays, valid = self.camera.unproject_cam(self.camera.pixel_grid())
+            x, y, z = (np.where(valid, rays[..., k], 0).astype(np.float32) for k in range(3))
+            return x, y, z
+        K = self.camera.K
+        v = ((np.arange(h) - K[1, 2]) / K[1, 1])[:, None]
+        u = ((np.arange(w) - K[0, 2]) / K[0, 0])[None]
+        x = u - K[0, 1] / K[0, 0] * v if K[0, 1] else u
+        return x.astype(np.float32), v.astype(np.float32), np.ones((1, 1), np.float32)
+
+    def dense(self, surface: Dense) -> Layer:
+        """Inverse distances (h, w) along ``planes``, in their lengths; evaluated once for each surface."""
+        if surface not in self._dense:
+            q = surface.image(self.camera)
+            if self.camera.lens == "pinhole":
+                x, y, z = self.planes
+                q = q * np.sqrt(x * x + (y * y + z * z))
+            self._dense[surface] = q
+            self.counters["dense_pixels"] += q.size
+        return self._dense[surface]
+
+
 class PairMap:
     """Where one source sees one target.
 
@@ -141,18 +179,21 @@ class PairMap:
         points = _source_points(source, rays.directions, q, self.offset_m)
         self.uv, self.valid = self._seen(rays.directions, q, points)
         self.valid &= rays.valid
+        self._shaded = isinstance(self.surface, Dense) or self.solids is not None
         self._exact = np.zeros((0, 0), bool)
         self._use: BoolArray | None = None
         self._whole: BoolArray | None = None
         self._fine: tuple[Slot, npt.NDArray[np.float32]] | None = None
         self._near_shadow: BoolArray | None = None
         self._light: dict[int, tuple[Shadows, BoolArray]] = {}
-        if self.solids is not None and not isinstance(self.surface, Static):
+        if self._shaded and not isinstance(self.surface, Static):
             self._from_source_q = (q / np.maximum(np.sqrt((points * points).sum(-1)), 1e-300)).astype(np.float32)
         if rays.grid.step == 1:
             self.nodes = _bounds(self.valid & source.contains(self.uv), 0)
         else:
             self.nodes = self._classify(points)
+            if isinstance(self.surface, Dense):
+                self._every_pixel()
         self.nodes = _around(self.nodes, seen_solids)
 
     def _look_apart(self) -> bool:
@@ -187,6 +228,14 @@ class PairMap:
         self._use = None if self.valid.all() else use
         self._exact = border
         return _bounds(use, 1)
+
+    def _every_pixel(self) -> None:
+        """Interpolate nothing; look a little farther: between nodes the surface may come nearer than it is on them."""
+        self._whole = self._use = None
+        self._exact = np.zeros_like(self._exact)
+        if self.nodes is not None:
+            (j0, j1, i0, i1), (ny, nx), more = self.nodes, self.rays.grid.shape, _MORE_NODES
+            self.nodes = max(j0 - more, 0), min(j1 + more, ny - 1), max(i0 - more, 0), min(i1 + more, nx - 1)
 
     def set_tolerance(self, tolerance_px: float) -> None:
         """Mark the cells whose interpolation may be off by more than this, in source pixels, for exact evaluation."""
@@ -267,7 +316,7 @@ class PairMap:
 
         They include those whose cubic neighbours could: a node reaches three cells away through two halvings.
         """
-        if isinstance(self.surface, Static):
+        if isinstance(self.surface, Static | Dense):
             return None
         target = self.rays.camera.center_m
         near = self.surface.detailed(target, self.rays.directions, self.rays.spacing_rad)
@@ -289,7 +338,7 @@ class PairMap:
     def _seen(self, directions: FloatArray, q: FloatArray, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Source pixels of scene points, valid where the scene does not hide them from the source."""
         uv, _, valid = self.source.project_cam(points)
-        if isinstance(self.surface, Static):
+        if isinstance(self.surface, Static | Dense):  # what those hide is known by their shadows
             return uv, valid
         shown = valid & self.source.contains(uv)  # what lies beside the image need not be asked about
         if shown.any():
@@ -306,12 +355,14 @@ class PairMap:
 
     def visible_nodes(self, level: int) -> BoolArray:
         """Nodes (ny, nx) whose scene point the source sees when its image is halved ``level`` times."""
-        if self.solids is None or not isinstance(self.whole_surface, Layered):
+        if not self._shaded:
             return self.valid
         shadows, lit = self._in_light(level)
         pixel, inside = _nearest_pixel(shadows.beyond, _at_level(self.uv, level))
         beyond = 0 if isinstance(self.surface, Static) else self._from_source_q
         free = self.valid & ~(inside & (shadows.beyond[pixel] > beyond))
+        if self.solids is None or not isinstance(self.whole_surface, Layered):
+            return free
         on_solid = self.rays.at_nodes(255 - self.rays.solids(self.whole_surface).free) > 0
         seen = np.zeros(self.rays.camera.size, bool)
         px, py = self.solids.pixels.T
@@ -321,9 +372,12 @@ class PairMap:
     def _in_light(self, level: int) -> tuple[Shadows, BoolArray]:
         """The source's shadow images when it is halved ``level`` times, and which of ``solids`` (n,) it sees."""
         if level not in self._light:
-            assert self.solids is not None and isinstance(self.whole_surface, Layered)
+            assert isinstance(self.whole_surface, Layered | Dense)
             shadows = self.whole_surface.shadows(_halved_camera(self.source, level))
-            self._light[level] = shadows, self.solids.lit(shadows, _at_level(self.solids.uv, level))
+            lit = np.zeros(0, bool)
+            if self.solids is not None:
+                lit = self.solids.lit(shadows, _at_level(self.solids.uv, level))
+            self._light[level] = shadows, lit
         return self._light[level]
 
     def full_resolution(
@@ -346,7 +400,11 @@ class PairMap:
             y0, y1, x0, x1 = grid.pixels(nodes)
             at = slot.from_source(self.uv[y0:y1, x0:x1]).astype(np.float32)
             at[~self.valid[y0:y1, x0:x1]] = -_FAR_AWAY_PX
+            q = self._from_source_q[y0:y1, x0:x1] if isinstance(self.surface, Dense) else None
+        elif isinstance(self.surface, Dense):
+            at, q = self._projected(self.surface, grid.pixels(nodes), slot)
         else:
+            q = None
             if self._fine is None or self._fine[0] != slot:
                 self._fine = slot, grid.refined(slot.from_source(self.uv).astype(np.float32), self.nodes)
             at = grid.upsample_refined(self._fine[1], self.nodes, rows)
@@ -360,6 +418,9 @@ class PairMap:
         visible: Any = cv2.inRange(at, tuple(low), tuple(high))
         if self._use is not None:
             visible &= grid.cells_to_pixels(self._use, nodes)
+        if q is not None:
+            beyond = self._in_light(slot.level)[0].beyond
+            visible &= cv2.compare(_read_nearest(beyond, at, slot), q, cv2.CMP_LE).astype(np.uint8)
         if self.solids is not None:
             self._put_solids(at, visible, nodes, slot)
         if source.mask is not None:
@@ -370,6 +431,31 @@ class PairMap:
             at = np.clip(at, (slot.x, slot.y), (slot.x + w - 1, slot.y + h - 1), dtype=np.float32)
         return at, visible
 
+    def _projected(self, surface: Dense, box: Box, slot: Slot) -> tuple[Layer, Layer]:
+        """Atlas positions (h, w, 2) of a box of pixels, and inverse distances (h, w) from the source, 1/m."""
+        y0, y1, x0, x1 = box
+        camera, source = self.rays.camera, self.source
+        rays = [p[y0 if len(p) > 1 else 0 :][: y1 - y0, x0 if p.shape[1] > 1 else 0 :][:, : x1 - x0] for p in self.rays.planes]
+        q = self.rays.dense(surface)[y0:y1, x0:x1]
+        to_source = source.cam2ego[:3, :3].T
+        turn, offset = (to_source @ camera.cam2ego[:3, :3]).astype(np.float32), (to_source @ self.offset_m).astype(np.float32)
+        x, y, z = (turn[k, 0] * rays[0] + (turn[k, 1] * rays[1] + turn[k, 2] * rays[2]) + offset[k] * q for k in range(3))
+        from_source = q / np.maximum(np.sqrt(x * x + y * y + z * z), np.float32(1e-30))
+        at = np.empty((*q.shape, 2), np.float32)
+        if source.lens == "pinhole":
+            ahead = z > 1e-6
+            shrink, K = 2.0**-slot.level, source.K
+            first = slot.from_source(np.zeros(2))
+            inverse = np.float32(shrink) / np.where(ahead, z, np.float32(np.inf))
+            for k, along in enumerate((np.float32(K[0, 0]) * x + np.float32(K[0, 1]) * y, np.float32(K[1, 1]) * y)):
+                at[..., k] = along * inverse + np.float32(first[k] + shrink * K[k, 2])
+        else:
+            uv, _, ahead = source.project_cam(np.stack([x, y, z], -1).astype(np.float64))
+            at[:] = slot.from_source(uv)
+        np.clip(at, -_FAR_AWAY_PX, _FAR_AWAY_PX, out=at)
+        at[~ahead] = -_FAR_AWAY_PX
+        return at, from_source
+
     def _put_solids(self, at: npt.NDArray[np.float32], visible: npt.NDArray[np.uint8], nodes: Box, slot: Slot) -> None:
         """What lies in the shadow of solids is not seen; then the pixels that show solids."""
         assert self.solids is not None and isinstance(self.whole_surface, Layered)
@@ -379,8 +465,7 @@ class PairMap:
         for part in self._parts_near_shadow(shadows.beyond, nodes, slot.level):
             t, b, le, r = grid.pixels(part)
             here = slice(t - y0, b - y0), slice(le - x0, r - x0)
-            local = at[here] - np.array([slot.x, slot.y], np.float32)
-            first: Any = cv2.remap(shadows.beyond, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
+            first = _read_nearest(shadows.beyond, at[here], slot)
             beyond: Any = 0 if isinstance(self.surface, Static) else grid.upsample(self._from_source_q, part)
             visible[here] &= cv2.compare(first, beyond, cv2.CMP_LE).astype(np.uint8)
         visible &= self.rays.solids(self.whole_surface).free[y0:y1, x0:x1]
@@ -393,6 +478,8 @@ class PairMap:
 
     def _parts_near_shadow(self, shadow: npt.NDArray[np.float32], nodes: Box, level: int) -> Iterator[Box]:
         """The parts of a strip, between its rows of nodes, whose background may be read in a shadow."""
+        if isinstance(self.surface, Dense):
+            return  # shaded already
         if self.rays.grid.step == 1:
             yield nodes
             return
@@ -526,6 +613,12 @@ def _tiles_between(position: FloatArray, count: int) -> tuple[npt.NDArray[np.int
     low, high = (f(f(corners[0], corners[1]), f(corners[2], corners[3])) for f in (np.minimum, np.maximum))
     first, last = np.floor(low - slack), np.floor(high + slack) + 1
     return first.clip(0, count).astype(np.int64), last.clip(0, count).astype(np.int64)
+
+
+def _read_nearest(image: Layer, at: Layer, slot: Slot) -> Any:
+    """Values (h, w) of a source's image at the pixels nearest to atlas positions (h, w, 2), 0 outside it."""
+    local = at - np.array([slot.x, slot.y], np.float32)
+    return cv2.remap(image, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
 
 
 def _nearest_pixel(image: npt.NDArray[Any], at: FloatArray) -> tuple[tuple[Any, Any], BoolArray]:

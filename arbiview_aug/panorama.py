@@ -55,6 +55,7 @@ SHRINK_RAD = math.radians(0.4)
 ``SUPPORT_RAD``. With 0.2 degrees false holes cost 0.1 to 1 dB on nuScenes and DDAD."""
 
 _ROOM_RAD = math.radians(5.0)  # panoramas are this much wider than what is asked first: later questions fit in
+_REMAP_LIMIT = 16384  # cv2.remap wants sizes below 32767
 _HALO_RAD = math.radians(4.0)  # points around a window that its filters need
 
 
@@ -141,18 +142,18 @@ class Panorama:
     measured: Layer
     _detail: dict[int, Layer] = field(default_factory=dict)
 
-    def residual(self, row: Layer, column: Layer) -> FloatArray:
+    def residual(self, row: Layer, column: Layer) -> Layer:
         """Inverse distance minus the static surface's (...,)."""
         near, far, share = (_at(layer, row, column) for layer in (self.near, self.far, self.share))
-        return np.where(share > 0.5, near, far).astype(np.float64)
+        return np.where(share > 0.5, near, far)
 
     def hides(self, row: Layer, column: Layer, inverse_distance: FloatArray) -> BoolArray:
         """Whether something stands before points (...,): nearer than them by a tenth of its distance and 0.3 m."""
         return np.asarray(inverse_distance < self.before(row, column))
 
-    def before(self, row: Layer, column: Layer) -> FloatArray:
+    def before(self, row: Layer, column: Layer) -> Layer:
         """The inverse distance (...,) at which ``hides`` begins, 1/m; 0 where nothing hides."""
-        return np.asarray(_hidden_below(_at(self.hiding, row, column)), np.float64)
+        return np.asarray(_hidden_below(_at(self.hiding, row, column)), np.float32)
 
     def is_measured(self, row: Layer, column: Layer) -> BoolArray:
         """Whether a point lies within ``SUPPORT_RAD`` (...,)."""
@@ -285,9 +286,11 @@ def _at(layer: Layer, row: Layer, column: Layer) -> Layer:
     n = row.size
     if n == 0:
         return np.zeros(row.shape, np.float32)
-    width = max(1, min(n, 16384))  # remap wants sizes below 32767
-    x, y = (np.zeros((-(-n // width), width), np.float32) for _ in range(2))
-    x.reshape(-1)[:n], y.reshape(-1)[:n] = column.reshape(-1), row.reshape(-1)
+    x, y = column, row
+    if row.ndim != 2 or max(row.shape) > _REMAP_LIMIT:
+        width = min(n, _REMAP_LIMIT)
+        x, y = (np.zeros((-(-n // width), width), np.float32) for _ in range(2))
+        x.reshape(-1)[:n], y.reshape(-1)[:n] = column.reshape(-1), row.reshape(-1)
     values: Any = cv2.remap(layer, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values.reshape(-1)[:n].reshape(row.shape))
 

@@ -129,6 +129,18 @@ class Layered(Surface):
         """
 
 
+class Dense(Surface):
+    """A surface that may step anywhere: it is evaluated at every pixel, and never interpolated between coarse nodes."""
+
+    @abstractmethod
+    def image(self, camera: Camera) -> npt.NDArray[np.float32]:
+        """Inverse distances (h, w) along the rays of a camera's pixel centres, 1/m."""
+
+    @abstractmethod
+    def shadows(self, camera: Camera) -> Shadows:
+        """What the surface hides from a source."""
+
+
 class Static(Surface):
     """A surface without objects: it hides nothing from any camera, and has no detail; equal for the same scene."""
 
