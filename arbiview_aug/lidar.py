@@ -6,12 +6,12 @@ No sensor's place is assumed: points are z-buffered and made dense anew for each
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError
@@ -46,11 +46,12 @@ class LidarSurface(Dense):
         points: (P, 3) in the ego frame, finite, metres.
     """
 
-    smooth: ClassVar[bool] = True  # away from what ``detailed`` says
+    smooth: ClassVar[bool] = False
     street: Static
     points: FloatArray
     _panoramas: dict[bytes, list[Panorama]] = field(default_factory=dict, repr=False)
     _shadows: dict[Camera, Shadows] = field(default_factory=dict, repr=False)
+    _rays: dict[Camera, _Located] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", self.points[~own_car(self.points)])
@@ -62,10 +63,11 @@ class LidarSurface(Dense):
         return np.asarray(np.clip(known, 0.0, MAX_INVERSE_DISTANCE), np.float64)
 
     def image(self, camera: Camera) -> Layer:
-        """The points' dense surface at all pixels, 1/m (h, w); the street between nodes a panorama's cell apart."""
-        nodes, view, row, column = self._on_image(camera)
-        known = nodes.upsampled(self.street.inverse_distance(camera.center_m, nodes.directions).astype(np.float32))
-        return np.clip(known + view.residual(row, column), 0, np.float32(MAX_INVERSE_DISTANCE))
+        """The points' dense surface at all pixels, 1/m (h, w); the street between rays a panorama's cell apart."""
+        rays = self._located(camera)
+        street = self.street.inverse_distance(camera.center_m, rays.directions).astype(np.float32)
+        known = rays.to_pixels(street) + rays.view.residual(rays.to_pixels(rays.row), rays.to_pixels(rays.column))
+        return np.clip(known, 0, np.float32(MAX_INVERSE_DISTANCE), out=known)
 
     def shadows(self, camera: Camera) -> Shadows:
         """What is hidden from a source, by ``hides`` at its pixel centres; kept for the next target."""
@@ -76,8 +78,8 @@ class LidarSurface(Dense):
 
     def before_image(self, camera: Camera) -> Layer:
         """``before`` at all pixels of a camera (h, w)."""
-        _, view, row, column = self._on_image(camera)
-        return view.before(row, column)
+        rays = self._located(camera)
+        return rays.view.before(rays.to_pixels(rays.row), rays.to_pixels(rays.column))
 
     def hides(
         self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
@@ -95,25 +97,23 @@ class LidarSurface(Dense):
         view, row, column = self._view(origin, directions)
         return view.before(row, column).astype(np.float64)
 
-    def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
-        """Rays (...,) near an outline or a slope against the street."""
-        view, row, column = self._view(origin, directions)
-        return view.is_detailed(row, column, margin_rad)
-
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Small where a point is near, the street's elsewhere: 1/m (...,)."""
         view, row, column = self._view(origin, directions)
         unknown = self.street.uncertainty(origin, directions, inverse_distance)
         return np.where(view.is_measured(row, column), _MEASURED_SPREAD * inverse_distance, unknown)
 
-    def _on_image(self, camera: Camera) -> tuple[_Nodes, Panorama, Layer, Layer]:
-        """Rays to interpolate between, a panorama, and in it the rows and columns (h, w) of a camera's pixels."""
-        nodes = _Nodes.of(camera)
-        view, row, column = self._view(camera.center_m, nodes.directions)
-        if nodes.step > 1 and view.window.is_whole:  # columns jump
-            nodes = _Nodes.of(camera, 1)
-            view, row, column = self._view(camera.center_m, nodes.directions)
-        return nodes, view, nodes.upsampled(row), nodes.upsampled(column)
+    def _located(self, camera: Camera) -> _Located:
+        """Rays to interpolate a camera's pixels between; kept for the next question."""
+        if camera not in self._rays:
+            rays = _Located.of(camera, self._view, max(1, round(CELL_RAD * float(camera.K[0, 0]))))
+            # Columns jump somewhere in a panorama that goes all around; azimuths bend near the zenith, and a lens may
+            # have no rays next to its image.
+            steep = float(np.abs(rays.directions[..., 2]).max()) > _STEEP
+            if rays.step > 1 and (camera.lens != "pinhole" or steep or rays.view.window.is_whole):
+                rays = _Located.of(camera, self._view, 1)
+            self._rays[camera] = rays
+        return self._rays[camera]
 
     def _view(self, origin: FloatArray, directions: FloatArray) -> tuple[Panorama, Layer, Layer]:
         """The panorama around a centre that holds the rays, and their rows and columns in it."""
@@ -128,37 +128,41 @@ class LidarSurface(Dense):
         return view, *view.window.cells(azimuth, elevation)
 
 
-@dataclass(frozen=True)
-class _Nodes:
-    """Rays of a camera about as far apart as a panorama's cells, for what bends little from one to the next.
+class _Located(NamedTuple):
+    """Rays of a camera about as far apart as a panorama's cells, and where they lie in one.
 
     Attributes:
         size: (h, w) of the image.
-        step: Their spacing, pixels.
-        directions: (ny, nx, 3) unit rays in the ego frame; the first node lies one step before the image's first block.
+        step: Their spacing in pixels; they start one step before the centre of the image's first block.
+        directions: (ny, nx, 3) unit rays in the ego frame.
+        view: The panorama.
+        row: (ny, nx) in it.
+        column: (ny, nx).
     """
 
     size: tuple[int, int]
     step: int
     directions: FloatArray
+    view: Panorama
+    row: Layer
+    column: Layer
 
     @classmethod
-    def of(cls, camera: Camera, step: int | None = None) -> _Nodes:
-        """Of a camera; all pixels where azimuths bend, and of lenses, which may have no rays next to their images."""
-        if step is None:
-            step = max(1, round(CELL_RAD * float(camera.K[0, 0]))) if camera.lens == "pinhole" else 1
+    def of(
+        cls, camera: Camera, view: Callable[[FloatArray, FloatArray], tuple[Panorama, Layer, Layer]], step: int
+    ) -> _Located:
         v, u = (step * np.arange(-1.0, -(-n // step) + 1) + (step - 1) / 2 for n in camera.size)
         directions, valid = camera.unproject(np.stack(np.meshgrid(u, v), -1))
-        if step > 1 and float(np.abs(directions[..., 2]).max()) > _STEEP:
-            return cls.of(camera, 1)
-        return cls(camera.size, step, np.where(valid[..., None], directions, camera.cam2ego[:3, 2]))
+        directions = np.where(valid[..., None], directions, camera.cam2ego[:3, 2])
+        return cls(camera.size, step, directions, *view(camera.center_m, directions))
 
-    def upsampled(self, values: Layer) -> Any:
+    def to_pixels(self, values: Layer) -> Any:
         """Bilinear interpolation (ny, nx) to all pixels (h, w)."""
         s, (h, w) = self.step, self.size
+        enlarged: Any = values
         if s > 1:
-            values = cv2.resize(values, None, fx=s, fy=s, interpolation=cv2.INTER_LINEAR)  # type: ignore[assignment]
-        return values[s : s + h, s : s + w]
+            enlarged = cv2.resize(values, None, fx=s, fy=s, interpolation=cv2.INTER_LINEAR)
+        return enlarged[s : s + h, s : s + w]
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,11 +206,6 @@ class LidarObjects(Objects):
         """Whether a box, or what was measured, stands before points (...,)."""
         by_box = super().hides(origin, directions, inverse_distance, pixel_rad)
         return by_box | self.street.hides(origin, directions, inverse_distance, pixel_rad)
-
-    def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
-        """Rays (...,) near a box, an outline or a slope against the street."""
-        near_box = super().detailed(origin, directions, margin_rad)
-        return near_box | self.street.detailed(origin, directions, margin_rad)
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Small where a point is near, the street's elsewhere: 1/m (...,)."""

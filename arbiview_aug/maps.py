@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
+from arbiview_aug.dense import FAR_AWAY_PX, Layer, Planes, cropped, pixel_rays, project_pixels
 from arbiview_aug.grid import HALVINGS, Box, Grid, runs
 from arbiview_aug.sampling import Slot, halved, level_size
 from arbiview_aug.surface import Dense, Layered, Shadows, Static, Surface
@@ -30,13 +31,8 @@ _LEAST_INCIDENCE = 0.05
 """Sine of the flattest angle at which a source may look along a face: that of the road 30 m from a car's cameras."""
 
 _MORE_NODES = 2
-"""An object 5 m away before a house at 20 m is displaced by 0.15 rad for a metre of baseline, but so are its nodes; what
-is narrower than the spacing of nodes (a post) may lie outside the box around those that see the source."""
-
-_FAR_AWAY_PX = 1e5  # float32 maps stay precise and int16 conversion saturates harmlessly
-
-
-Layer = npt.NDArray[np.float32]
+"""Between nodes a dense surface may be nearer than on any of them: a source may see a post, and nothing of what is around
+it. 16 px are the parallax for a metre between 20 and 50 m at a focal length of 530."""
 
 
 class SolidPixels(NamedTuple):
@@ -76,11 +72,6 @@ class TargetRays:
         self.sparse_index = np.ix_(np.unique(np.r_[0:ny:4, ny - 1]), np.unique(np.r_[0:nx:4, nx - 1]))
         planes = np.ascontiguousarray(np.moveaxis(self.directions[self.sparse_index], -1, 0))
         self.sparse = np.moveaxis(planes, 0, -1), self.valid[self.sparse_index]
-
-    @cached_property
-    def spacing_rad(self) -> float:
-        """Largest angle between neighbouring nodes' rays."""
-        return float(np.sqrt((np.diff(self.directions, axis=1) ** 2).sum(-1)).max(initial=0.0))
 
     def inverse_distance(self, surface: Surface) -> FloatArray:
         """(ny, nx) on the nodes; evaluated once for each surface."""
@@ -125,31 +116,16 @@ class TargetRays:
             self.counters["solid_pixels"] += len(pixels)
         return self._solids[surface]
 
-
     @cached_property
-    def planes(self) -> tuple[Layer, Layer, Layer]:
-        """x, y and z of all pixels' rays in the camera's frame, float32; those of a pinhole broadcast to (h, w).
-
-        A pinhole's have z = 1, those of lenses unit length; all are 0 where there is no ray.
-        """
-        h, w = self.camera.size
-        if self.camera.lens != "pinhole":
-            rays, valid = self.camera.unproject_cam(self.camera.pixel_grid())
-            x, y, z = (np.where(valid, rays[..., k], 0).astype(np.float32) for k in range(3))
-            return x, y, z
-        K = self.camera.K
-        v = ((np.arange(h) - K[1, 2]) / K[1, 1])[:, None]
-        u = ((np.arange(w) - K[0, 2]) / K[0, 0])[None]
-        x = u - K[0, 1] / K[0, 0] * v if K[0, 1] else u
-        return x.astype(np.float32), v.astype(np.float32), np.ones((1, 1), np.float32)
+    def planes(self) -> Planes:
+        """Rays of all pixels."""
+        return pixel_rays(self.camera)
 
     def dense(self, surface: Dense) -> Layer:
         """Inverse distances (h, w) along ``planes``, in their lengths; evaluated once for each surface."""
         if surface not in self._dense:
-            q = surface.image(self.camera)
-            if self.camera.lens == "pinhole":
-                x, y, z = self.planes
-                q = q * np.sqrt(x * x + (y * y + z * z))
+            x, y, z = self.planes
+            q = surface.image(self.camera) * np.sqrt(x * x + (y * y + z * z))
             self._dense[surface] = q
             self.counters["dense_pixels"] += q.size
         return self._dense[surface]
@@ -177,7 +153,7 @@ class PairMap:
             return
         q = rays.inverse_distance(self.surface)
         points = _source_points(source, rays.directions, q, self.offset_m)
-        self.uv, self.valid = self._seen(rays.directions, q, points)
+        self.uv, _, self.valid = source.project_cam(points)
         self.valid &= rays.valid
         self._shaded = isinstance(self.surface, Dense) or self.solids is not None
         self._exact = np.zeros((0, 0), bool)
@@ -222,7 +198,7 @@ class PairMap:
 
     def _classify(self, points: FloatArray) -> Box | None:
         """Sort the cells: seeing nothing, whole, on a border of validity. Returns the nodes around those in use."""
-        self._whole, border = self._cells_that_may_see(points, self.uv, self.valid, self._detailed)
+        self._whole, border = self._cells_that_may_see(points, self.uv, self.valid)
         use = self._whole | border
         # Invalid nodes hold placeholders that may lie inside the image.
         self._use = None if self.valid.all() else use
@@ -249,9 +225,7 @@ class PairMap:
         counters["cells_exact"] += exact
         counters["cells_interpolated"] += int(np.count_nonzero(self._whole & ~self._exact))
 
-    def _cells_that_may_see(
-        self, points: FloatArray, uv: FloatArray, valid: BoolArray, detailed: BoolArray | None = None
-    ) -> tuple[BoolArray, BoolArray]:
+    def _cells_that_may_see(self, points: FloatArray, uv: FloatArray, valid: BoolArray) -> tuple[BoolArray, BoolArray]:
         """Cells whose corners are valid and not all beyond one side of the image; such cells with an invalid corner."""
         beyond = beyond_image(self.source, points, uv, valid)
         sides = [beyond[c] for c in _CORNERS]
@@ -264,8 +238,6 @@ class PairMap:
         near = cv2.dilate(touched, np.ones((3, 3), np.uint8)) > 0
         if self.source.lens != "pinhole":
             near |= self._cells_near_lens(points)
-        if detailed is not None:
-            near |= detailed  # a gap between two objects may lie between hidden corners
         return use & all_valid, use & ~all_valid & near
 
     def _cells_near_lens(self, points: FloatArray) -> BoolArray:
@@ -307,51 +279,14 @@ class PairMap:
             mean = sum(uv[c] for c in _CORNERS) / 4
             cell = np.maximum(cell, 4 * _larger(mean - centre))
         bound[j0:j1, i0:i1] = cell
-        too_curved = bound > tolerance_px
-        return too_curved if self._detailed is None else too_curved | self._detailed
-
-    @cached_property
-    def _detailed(self) -> BoolArray | None:
-        """Cells (ny - 1, nx - 1) so near to the surface's detail, as target or source see it, that they could miss it.
-
-        They include those whose cubic neighbours could: a node reaches three cells away through two halvings.
-        """
-        if isinstance(self.surface, Static | Dense):
-            return None
-        target = self.rays.camera.center_m
-        near = self.surface.detailed(target, self.rays.directions, self.rays.spacing_rad)
-        # What the source does not show need not be asked about: the nodes inside its image, and some around them.
-        shown = cv2.dilate(self.source.contains(self.uv).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-        j0, j1, i0, i1 = _bounds(shown, 1) or (0, *shown.shape[:1], 0, shown.shape[1])
-        part = slice(j0, j1), slice(i0, i1)
-        towards, _ = self._from_source(self.rays.directions[part], self.rays.inverse_distance(self.surface)[part])
-        near[part] |= self.surface.detailed(self.source.center_m, towards, self.rays.spacing_rad)
-        return cv2.dilate(near.astype(np.uint8), np.ones((8, 8), np.uint8), anchor=(3, 3))[:-1, :-1] > 0
+        return np.asarray(bound > tolerance_px)
 
     def _evaluate(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Source pixels of target pixels (..., 2) in float64, and where they are valid."""
         directions, ray_valid = ego_rays(self.rays.camera, pixels)
         q = self.surface.inverse_distance(self.rays.camera.center_m, directions)
-        uv, valid = self._seen(directions, q, _source_points(self.source, directions, q, self.offset_m))
+        uv, valid = project_rays(self.source, directions, q, self.offset_m)
         return uv, valid & ray_valid
-
-    def _seen(self, directions: FloatArray, q: FloatArray, points: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Source pixels of scene points, valid where the scene does not hide them from the source."""
-        uv, _, valid = self.source.project_cam(points)
-        if isinstance(self.surface, Static | Dense):  # what those hide is known by their shadows
-            return uv, valid
-        shown = valid & self.source.contains(uv)  # what lies beside the image need not be asked about
-        if shown.any():
-            towards, from_source = self._from_source(directions[shown], q[shown])
-            pixel_rad = 1 / self.source.K[0, 0]
-            valid[shown] = ~self.surface.hides(self.source.center_m, towards, from_source, pixel_rad)
-        return uv, valid
-
-    def _from_source(self, directions: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Unit rays (..., 3) from the source to scene points on target rays, and inverse distances along them."""
-        towards = directions + q[..., None] * self.offset_m  # scaled by q
-        length = np.sqrt((towards * towards).sum(-1))
-        return towards / length[..., None], q / length
 
     def visible_nodes(self, level: int) -> BoolArray:
         """Nodes (ny, nx) whose scene point the source sees when its image is halved ``level`` times."""
@@ -399,10 +334,12 @@ class PairMap:
         if grid.step == 1:
             y0, y1, x0, x1 = grid.pixels(nodes)
             at = slot.from_source(self.uv[y0:y1, x0:x1]).astype(np.float32)
-            at[~self.valid[y0:y1, x0:x1]] = -_FAR_AWAY_PX
+            at[~self.valid[y0:y1, x0:x1]] = -FAR_AWAY_PX
             q = self._from_source_q[y0:y1, x0:x1] if isinstance(self.surface, Dense) else None
         elif isinstance(self.surface, Dense):
-            at, q = self._projected(self.surface, grid.pixels(nodes), slot)
+            box = grid.pixels(nodes)
+            known = self.rays.dense(self.surface)[box[0] : box[1], box[2] : box[3]]
+            at, q = project_pixels(cropped(self.rays.planes, box), known, self.rays.camera, source, slot)
         else:
             q = None
             if self._fine is None or self._fine[0] != slot:
@@ -430,31 +367,6 @@ class PairMap:
             h, w = slot.size
             at = np.clip(at, (slot.x, slot.y), (slot.x + w - 1, slot.y + h - 1), dtype=np.float32)
         return at, visible
-
-    def _projected(self, surface: Dense, box: Box, slot: Slot) -> tuple[Layer, Layer]:
-        """Atlas positions (h, w, 2) of a box of pixels, and inverse distances (h, w) from the source, 1/m."""
-        y0, y1, x0, x1 = box
-        camera, source = self.rays.camera, self.source
-        rays = [p[y0 if len(p) > 1 else 0 :][: y1 - y0, x0 if p.shape[1] > 1 else 0 :][:, : x1 - x0] for p in self.rays.planes]
-        q = self.rays.dense(surface)[y0:y1, x0:x1]
-        to_source = source.cam2ego[:3, :3].T
-        turn, offset = (to_source @ camera.cam2ego[:3, :3]).astype(np.float32), (to_source @ self.offset_m).astype(np.float32)
-        x, y, z = (turn[k, 0] * rays[0] + (turn[k, 1] * rays[1] + turn[k, 2] * rays[2]) + offset[k] * q for k in range(3))
-        from_source = q / np.maximum(np.sqrt(x * x + y * y + z * z), np.float32(1e-30))
-        at = np.empty((*q.shape, 2), np.float32)
-        if source.lens == "pinhole":
-            ahead = z > 1e-6
-            shrink, K = 2.0**-slot.level, source.K
-            first = slot.from_source(np.zeros(2))
-            inverse = np.float32(shrink) / np.where(ahead, z, np.float32(np.inf))
-            for k, along in enumerate((np.float32(K[0, 0]) * x + np.float32(K[0, 1]) * y, np.float32(K[1, 1]) * y)):
-                at[..., k] = along * inverse + np.float32(first[k] + shrink * K[k, 2])
-        else:
-            uv, _, ahead = source.project_cam(np.stack([x, y, z], -1).astype(np.float64))
-            at[:] = slot.from_source(uv)
-        np.clip(at, -_FAR_AWAY_PX, _FAR_AWAY_PX, out=at)
-        at[~ahead] = -_FAR_AWAY_PX
-        return at, from_source
 
     def _put_solids(self, at: npt.NDArray[np.float32], visible: npt.NDArray[np.uint8], nodes: Box, slot: Slot) -> None:
         """What lies in the shadow of solids is not seen; then the pixels that show solids."""
@@ -518,8 +430,8 @@ class PairMap:
         start, stop = np.searchsorted(pixels[:: step**2, 1], [first + step * j0, first + step * j1]) * step**2
         px, py = pixels[start:stop].T
         inside = (py >= y0) & (py < y1) & (px >= x0) & (px < x1)
-        exact = np.clip(slot.from_source(uv[start:stop][inside]), -_FAR_AWAY_PX, _FAR_AWAY_PX)
-        exact = np.where(valid[start:stop][inside, None], exact, -_FAR_AWAY_PX)
+        exact = np.clip(slot.from_source(uv[start:stop][inside]), -FAR_AWAY_PX, FAR_AWAY_PX)
+        exact = np.where(valid[start:stop][inside, None], exact, -FAR_AWAY_PX)
         at[py[inside] - y0, px[inside] - x0] = exact
 
 
@@ -724,7 +636,7 @@ def edge_distance(source: Camera, uv: FloatArray) -> FloatArray:
     free = np.pad((coarse >= 1).astype(np.uint8), 1, constant_values=1)
     distance = cv2.distanceTransform(free, cv2.DIST_L2, 3)[1:-1, 1:-1]
     distance = np.minimum(distance, 1e6) * 8  # it is the largest float where nothing is masked
-    index = np.clip(np.clip(uv, -8, _FAR_AWAY_PX) / 8, 0, (coarse.shape[1] - 1, coarse.shape[0] - 1)).astype(np.int64)
+    index = np.clip(np.clip(uv, -8, FAR_AWAY_PX) / 8, 0, (coarse.shape[1] - 1, coarse.shape[0] - 1)).astype(np.int64)
     return np.where(edge >= 0, np.minimum(edge, distance[index[..., 1], index[..., 0]]), edge)
 
 
