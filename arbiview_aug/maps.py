@@ -31,8 +31,8 @@ _LEAST_INCIDENCE = 0.05
 """Sine of the flattest angle at which a source may look along a face: that of the road 30 m from a car's cameras."""
 
 _MORE_NODES = 2
-"""Between nodes a dense surface may be nearer than on any of them: a source may see a post, and nothing of what is around
-it. 16 px are the parallax for a metre between 20 and 50 m at a focal length of 530."""
+"""Between nodes a dense surface may be nearer than on any: a source may see a post, and nothing of what is around it.
+16 px are the parallax for a metre between 20 and 50 m at a focal length of 530."""
 
 
 class SolidPixels(NamedTuple):
