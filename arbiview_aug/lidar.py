@@ -29,7 +29,7 @@ BOX_AIR_M = 0.2
 """Points this far outside a box are its object's too: mirrors, and the noise of points and labels."""
 
 _STEEP = 0.9
-"""Sine of the elevation up to which azimuths are interpolated over 0.2 degrees: 64 degrees, a hundredth of a cell."""
+"""Sine of the elevation up to which azimuths are interpolated over 0.2 degrees: 64 degrees."""
 
 _NO_BOX = -2  # in shadows: a point's, no box's
 
@@ -63,23 +63,26 @@ class LidarSurface(Dense):
         return np.asarray(np.clip(known, 0.0, MAX_INVERSE_DISTANCE), np.float64)
 
     def image(self, camera: Camera) -> Layer:
-        """The points' dense surface at all pixels, 1/m (h, w); the street between rays a panorama's cell apart."""
+        """The points' dense surface at all pixels, 1/m (h, w).
+
+        The street is interpolated between rays a panorama's cell apart: to 0.02 px for a metre of parallax.
+        """
         rays = self._located(camera)
         street = self.street.inverse_distance(camera.center_m, rays.directions).astype(np.float32)
         known = rays.to_pixels(street) + rays.view.residual(rays.to_pixels(rays.row), rays.to_pixels(rays.column))
         return np.clip(known, 0, np.float32(MAX_INVERSE_DISTANCE), out=known)
 
     def shadows(self, camera: Camera) -> Shadows:
-        """What is hidden from a source, by ``hides`` at its pixel centres; kept for the next target."""
+        """What is hidden from a source, by ``hides``; kept for the next target."""
         if camera not in self._shadows:
-            beyond = self.before_image(camera)
-            self._shadows[camera] = Shadows(beyond, np.full(camera.size, -1, np.int32))
+            none = np.broadcast_to(np.int32(-1), camera.size)
+            self._shadows[camera] = Shadows(self.before_image(camera), none)
         return self._shadows[camera]
 
     def before_image(self, camera: Camera) -> Layer:
-        """``before`` at all pixels of a camera (h, w)."""
+        """``before`` at all pixels of a camera (h, w), interpolated between rays a panorama's cell apart."""
         rays = self._located(camera)
-        return rays.view.before(rays.to_pixels(rays.row), rays.to_pixels(rays.column))
+        return np.asarray(rays.to_pixels(rays.view.before(rays.row, rays.column)))
 
     def hides(
         self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
@@ -194,7 +197,7 @@ class LidarObjects(Objects):
         new = camera not in self._shadows
         shadows = super().shadows(camera)
         if new:
-            measured = self.street.shadows(camera).beyond
+            measured = self.street.before_image(camera)
             nearer = measured > shadows.beyond
             np.copyto(shadows.beyond, measured, where=nearer)
             np.copyto(shadows.solid, _NO_BOX, where=nearer)

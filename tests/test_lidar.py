@@ -223,9 +223,11 @@ def test_images_say_what_single_rays_say(name: str, all_around: bool) -> None:
     rays, valid = view.unproject(view.pixel_grid())
     q, before = surface.inverse_distance(EYE, rays[valid]), surface.before(EYE, rays[valid])
     # Rounding decides on which side of an outline a pixel lies.
-    for got, expected in ((surface.image(view)[valid], q), (surface.shadows(view).beyond[valid], before)):
-        off = np.abs(got - expected)
-        assert np.quantile(off, 0.99) < 2e-5 and (off > 1e-3).mean() < 0.003
+    off = np.abs(surface.image(view)[valid] - q)
+    assert np.quantile(off, 0.99) < 2e-5 and (off > 1e-3).mean() < 0.003
+    # Shadows are interpolated over a panorama's cell: their outlines are half a cell wider or narrower.
+    off = np.abs(surface.shadows(view).beyond[valid] - before)
+    assert np.median(off) < 1e-5 and (off > 1e-3).mean() < 0.03
 
 
 def test_coarse_grid_equals_pixel_by_pixel_evaluation() -> None:
