@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import copy
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,34 +13,28 @@ import numpy as np
 import torch
 
 from arbiview_aug.confidence import confidence
-from arbiview_aug.detections import OfCameras, detections_of_frames
 from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError
 from arbiview_aug.explain import Explanation, PaperExplanation
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
-from arbiview_aug.favs.overlap_depth import OverlapDepth, RefinementCache, overlap_depth
-from arbiview_aug.favs.paper import PaperRendering, check_pinhole, check_settings, render_paper
+from arbiview_aug.favs.overlap_depth import RefinementCache
+from arbiview_aug.favs.paper import PaperRendering, check_pinhole
 from arbiview_aug.favs.photometric import Harmonise, Harmoniser, PhotometricReport
-from arbiview_aug.favs.synthesis import render_opencv, render_torch
 from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_target, target_labels
-from arbiview_aug.plan import PlanCache, RenderPlan, baselines_m, build_plan, needs_geometry, plan_key
+from arbiview_aug.plan import PlanCache, RenderPlan
 from arbiview_aug.random_rig import RandomRig
 from arbiview_aug.rig import Rig, load_rig
-from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame, check_inputs, names_of_frames, scenes_of_frames
-from arbiview_aug.sampling import Scratch
+from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame, check_inputs
 from arbiview_aug.scene import Scene
+from arbiview_aug.stitching import Execution, Stitcher, WarnOnce
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.tensors import covered, gathered, leading_shape, lens_names, like, resized, rewrapped, stacked
 
-Execution = Literal["auto", "opencv", "torch"]
-View = RenderPlan | PaperRendering | tuple[int, int]
-"""How a frame is made: by a plan, by the published stages (and then it is rendered already), or only resized."""
+Made = RenderPlan | PaperRendering | tuple[int, int]
+"""What a frame's views are made by: a plan, the published stages; or it is only resized, to this size."""
 
-_OUTPUTS = ("source_camera", "confidence")
-_UNREACHABLE = 0.5  # a target camera of which less than this is covered is worth a warning
-_MOVED_M = 0.2
-"""A target camera farther than this from every source is worth a warning where only the static street is known: what
-stands 10 m away shifts by more than a degree, and the street does not know that it stands there."""
+OUTPUTS = ("source_camera", "confidence")
+"""What a sample can hold besides, on request."""
 
 
 class RigRetarget(torch.nn.Module):
@@ -77,8 +69,8 @@ class RigRetarget(torch.nn.Module):
             objects keep their height when cameras move; ``lidar``: its ``points`` (ego frame) or ``depth_m`` (..., N,
             H, W; z-depth in metres, 0 or NaN where unknown), with ``boxes_3d`` before them where there are any;
             ``auto``: for each pair of cameras ``far`` where their centres coincide, else the best that the sample
-            offers: ``objects`` with ``boxes_3d``, else ``street``, with a warning where cameras move (``paper``:
-            always ``far``).
+            offers: ``lidar``, else ``objects``, else ``street``, with a warning where cameras move (``paper``: always
+            ``far``). Plans over points and boxes are made anew for every frame.
         harmonise: Bring the sources to one exposure (``arbiview_aug.favs.photometric``): True or a ``HarmoniseConfig``
             estimates a gain for each camera in every frame; numbers are gains to use as they are. Off by default.
             Samples that ``p`` skips keep their colours.
@@ -113,7 +105,7 @@ class RigRetarget(torch.nn.Module):
         *,
         source_rig: Rig | str | Path | None = None,
         path: Literal["favs"] = "favs",
-        quality: Quality | FavsConfig = "fast",
+        quality: Quality | FavsConfig | PaperConfig = "fast",
         surface: SurfaceName = "auto",
         harmonise: Harmonise = None,
         refinement: RefinementCache | None = None,
@@ -135,7 +127,7 @@ class RigRetarget(torch.nn.Module):
         _one_of("label_frame", label_frame, ("source", "target"))
         _one_of("execution", execution, get_args(Execution))
         for name in outputs:
-            _one_of("outputs", name, _OUTPUTS)
+            _one_of("outputs", name, OUTPUTS)
         if not 0 <= p <= 1:
             raise ValueError(f"p: expected a probability from 0 to 1, got {p!r}")
         if p < 1 and size is None:
@@ -147,36 +139,37 @@ class RigRetarget(torch.nn.Module):
             self.target = load_rig(target_rig)
         self.source_rig = source_rig if isinstance(source_rig, Rig) or source_rig is None else load_rig(source_rig)
         self.config = favs_config(quality)
-        self.harmoniser = Harmoniser(harmonise)
         if isinstance(self.config, PaperConfig):
-            check_settings(surface, execution)
             check_pinhole(self.target if isinstance(self.target, Rig) else self.target.base)
-            if harmonise is not None and harmonise is not False:
-                raise ValueError("harmonise: quality='paper' is as published: expected None, got " + repr(harmonise))
             if "confidence" in outputs:
                 raise ValueError("outputs: quality='paper' has no 'confidence': it moves pixels by what it matches")
         elif "confidence" in outputs:
             self.config = replace(self.config, certainty=True)
-        if refinement is not None and not (isinstance(self.config, FavsConfig) and self.config.overlap_depth):
-            raise ValueError("refinement: expected quality='accurate' (or overlap_depth=True) with a RefinementCache")
-        self.refinement = refinement
-        self.path, self.surface, self.p, self.rng = path, surface, float(p), rng
+        self.path, self.p, self.rng = path, float(p), rng
         self.size = None if size is None else _checked_size(size)
         self.label_frame, self.label_keys, self.label_fill = label_frame, tuple(label_keys), label_fill
-        self.pass_keys, self.outputs, self.execution = tuple(pass_keys), tuple(outputs), execution
+        self.pass_keys, self.outputs = tuple(pass_keys), tuple(outputs)
+        self._warn = WarnOnce()
         # Rigs drawn for each sample never come back: only the last plan is kept.
         once = isinstance(self.target, RandomRig) and self.target.per == "sample"
-        self.plans = PlanCache(0 if once else cache_bytes)
-        self._plan_of_frame = PlanCache(0)  # holds one
+        self.stitcher = Stitcher(
+            self.config,
+            surface,
+            Harmoniser(harmonise),
+            refinement,
+            execution,
+            cache_bytes=0 if once else cache_bytes,
+            warn=self._warn,
+        )
         self._fixed_target = self._sized(self.target) if isinstance(self.target, Rig) else None
-        self._scratch = Scratch()
-        self._warned: set[str] = set()
         self._limited_process: int | None = None
 
     def extra_repr(self) -> str:
         """Target and settings, for ``repr``."""
         target = self.target if isinstance(self.target, RandomRig) else (self.target.name or "unnamed rig")
-        settings = f"surface={self.surface}, harmonise={self.harmoniser}, size={self.size}, p={self.p:g}"
+        settings = (
+            f"surface={self.stitcher.surface}, harmonise={self.stitcher.harmoniser}, size={self.size}, p={self.p:g}"
+        )
         return f"target={target}, {settings}, {self.config}"
 
     # --- the transform --------------------------------------------------------------------------------------------
@@ -196,16 +189,7 @@ class RigRetarget(torch.nn.Module):
         sizes = {tuple(image.shape[-2:]) for frame in frames for image in frame.images}
         labels = check_other_keys(sample, list(sizes), self.label_keys, self.pass_keys)
         target, skip, drawn = self._draw(sample, frames, params)
-        views: list[View] = []
-        scenes = self._scenes(sample, frames, lead)
-        names = self._refinement_names(sample, len(frames), lead)
-        found = self._detections(sample, frames, lead)
-        for frame, scene, name, detections in zip(frames, scenes, names, found, strict=True):
-            if skip and self.size:
-                views.append(self.size)
-            else:
-                views.append(self._view(frame, target, scene, self._depth(frame, target, name), detections))
-        parts = self._rendered(frames, views)
+        parts, made = self._parts(sample, frames, lead, target, skip)
         out = self._kept(sample, labels)
         out["images"] = rewrapped(gathered([part["images"] for part in parts], lead), sample["images"])
         for key in ("K", "cam2ego"):
@@ -218,7 +202,7 @@ class RigRetarget(torch.nn.Module):
         if "lens" in parts[0]:
             out["lens"] = lens_names([part["lens"] for part in parts], lead)
         for key in labels:
-            out[key] = target_labels(key, sample[key], frames, lead, views, self.label_fill)
+            out[key] = target_labels(key, sample[key], frames, lead, made, self.label_fill)
         if drawn:
             out["retarget_params"] = drawn
         if self.label_frame == "target":
@@ -266,68 +250,48 @@ class RigRetarget(torch.nn.Module):
         stale = [key for key in sample if key in PIXEL_BOUND_KEYS and key not in kept]
         dropped = [key for key in stale if key not in self.outputs]
         if dropped:
-            self._warn_once("dropped", f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels")
+            self._warn("dropped", f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels")
         rendered = ("images", "K", "cam2ego")  # their places in the dict are kept
         return {k: v for k, v in sample.items() if k in rendered or k not in (*CALIBRATION_KEYS, *stale)}
 
     # --- images ---------------------------------------------------------------------------------------------------
-    def _rendered(self, frames: Sequence[SourceFrame], views: Sequence[View]) -> list[dict[str, Any]]:
-        """Images, calibration and masks of each frame: rendered by its plan, or resized."""
+    def _parts(
+        self, sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...], target: Rig, skip: bool
+    ) -> tuple[list[dict[str, Any]], list[Made]]:
+        """Images, calibration and masks of each frame, rendered or resized; and what they were made by."""
+        if skip and self.size:
+            return [self._resized(frame, self.size) for frame in frames], [self.size] * len(frames)
+        views = self.stitcher.views(sample, frames, lead, target)
+        seams: list[list[torch.Tensor]] | None = [] if "confidence" in self.outputs else None
         parts = []
-        seams: dict[int, list[torch.Tensor]] | None = {} if "confidence" in self.outputs else None
-        rendered = self._images(frames, views, seams)
-        for b, (frame, view, images) in enumerate(zip(frames, views, rendered, strict=True)):
-            device = frame.images[0].device
-            rig = view.target if not isinstance(view, tuple) else frame.rig.resized(view)
-            part = self._described(rig, device)
+        for b, images in enumerate(self.stitcher.render(frames, views, seams)):
+            made, device = views[b].made, images[0].device
+            part = self._described(made.target, device)
             part["images"] = stacked(images)
-            if not isinstance(view, tuple):
-                winners = [target.source_camera for target in view.targets]
-            else:
-                winners = [np.full(view, k, np.int8) for k in range(len(rig))]
+            winners = [view.source_camera for view in made.targets]
             part["coverage"] = covered(winners, device)
-            if seams is not None:
-                part["confidence"] = stacked(_confidence(view, images, part["coverage"], seams.get(b, [])))
+            if seams is not None and isinstance(made, RenderPlan):
+                certain = [view.certainty for view in made.targets if view.certainty is not None]
+                of_views = zip(images, certain, part["coverage"], seams[b], strict=True)
+                part["confidence"] = stacked([confidence(*of_view) for of_view in of_views])
             if "source_camera" in self.outputs:
                 part["source_camera"] = stacked([torch.from_numpy(winner.copy()).to(device) for winner in winners])
             parts.append(part)
-        return parts
+        return parts, [view.made for view in views]
 
-    def _images(
-        self,
-        frames: Sequence[SourceFrame],
-        views: Sequence[View],
-        seams: dict[int, list[torch.Tensor]] | None = None,
-    ) -> list[list[torch.Tensor]]:
-        """The target images of each frame; frames that share a plan go through torch together.
-
-        Into ``seams``, where given, go the changes along the seams (see ``render_opencv``) of each planned frame.
-        """
-        done: dict[int, list[torch.Tensor]] = {}
-        together: dict[int, list[int]] = {}
-        for b, (frame, view) in enumerate(zip(frames, views, strict=True)):
-            if isinstance(view, PaperRendering):
-                done[b] = [target.image for target in view.targets]
-            elif isinstance(view, tuple):
-                done[b] = [resized(image, view) for image in frame.images]
-            elif self._uses_torch(frame):
-                together.setdefault(id(view), []).append(b)
-            else:
-                curves = self.harmoniser.curves(frame.rig, frame.images)
-                changes = None if seams is None else seams.setdefault(b, [])
-                done[b] = render_opencv(view, frame.images, self._scratch, curves, changes)
-        for members in together.values():
-            plan = views[members[0]]
-            assert isinstance(plan, RenderPlan)
-            sources = zip(*(frames[b].images for b in members), strict=True)
-            toned = [self.harmoniser.curves(frames[b].rig, frames[b].images) for b in members]
-            batched: list[torch.Tensor] | None = None if seams is None else []
-            rendered = render_torch(plan, [torch.stack(images) for images in sources], toned, batched)
-            for k, b in enumerate(members):
-                done[b] = [image[k] for image in rendered]
-                if seams is not None and batched is not None:
-                    seams[b] = [change[k] for change in batched]
-        return [done[b] for b in range(len(frames))]
+    def _resized(self, frame: SourceFrame, size: tuple[int, int]) -> dict[str, Any]:
+        """A frame that keeps its cameras: they saw all of it."""
+        device = frame.images[0].device
+        part = self._described(frame.rig.resized(size), device)
+        part["images"] = stacked([resized(image, size) for image in frame.images])
+        part["coverage"] = covered([np.zeros(size, np.int8)] * len(frame.rig), device)
+        if "confidence" in self.outputs:
+            part["confidence"] = part["coverage"].float()
+        if "source_camera" in self.outputs:
+            part["source_camera"] = stacked(
+                [torch.full(size, k, dtype=torch.int8, device=device) for k in range(len(frame.rig))]
+            )
+        return part
 
     def _described(self, rig: Rig, device: torch.device) -> dict[str, Any]:
         """The calibration that goes with a frame's images; which keys there are depends on the settings alone."""
@@ -346,56 +310,10 @@ class RigRetarget(torch.nn.Module):
             part["ignore"] = stacked([torch.from_numpy(~m).to(device) for m in masks])
         return part
 
-    def _scenes(
-        self, sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...]
-    ) -> Sequence[Scene]:
-        """What each frame's sample says of the geometry, as far as the surface uses it."""
-        if isinstance(self.config, PaperConfig):
-            return [Scene()] * len(frames)
-        return scenes_of_frames(sample, frames, lead, self.surface)
-
-    def _detections(
-        self, sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...]
-    ) -> Sequence[OfCameras]:
-        """The objects that each frame's sample names, for the published stages."""
-        if isinstance(self.config, PaperConfig) and self.config.use_detections:
-            return detections_of_frames(sample, frames, lead)
-        return [{}] * len(frames)
-
-    def _view(
-        self, frame: SourceFrame, target: Rig, scene: Scene, depth: OverlapDepth | None, detections: OfCameras
-    ) -> RenderPlan | PaperRendering:
-        """The plan of a frame, or the frame rendered by the published stages, for which nothing can be planned."""
-        if not isinstance(self.config, PaperConfig):
-            known = scene if depth is None else replace(scene, corrections=depth.corrections)
-            return self.plan(frame.rig, target, known)
-        rendering = render_paper(frame.rig, target.in_frame_of(frame.rig), frame.images, self.config, detections)
-        self._warn_unreachable(rendering)
-        return rendering
-
-    def _refinement_names(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[object]:
-        """For each frame, what the sample calls its scene, where refinements are reused by name.
-
-        Raises:
-            SampleError: The sample lacks the name, or has another number of them than frames.
-        """
-        key = None if self.refinement is None else self.refinement.key
-        if key is None:
-            return [None] * count
-        if key not in sample:
-            raise SampleError(f"refinement: expected {key!r} in the sample, to tell which frames share a refinement")
-        return names_of_frames(key, sample[key], count, lead)
-
-    def _depth(self, frame: SourceFrame, target: Rig, name: object) -> OverlapDepth | None:
-        """Depth from overlap, where it is asked for and any pixel's place depends on it."""
-        config = self.config
-        if isinstance(config, PaperConfig) or not config.overlap_depth or self.surface in ("far", "ground"):
-            return None
-        if self.surface == "auto" and not needs_geometry(frame.rig, target, config):
-            return None
-        if self.refinement is None:
-            return overlap_depth(frame.rig, frame.images)
-        return self.refinement.get((frame.rig.content_key, name), lambda: overlap_depth(frame.rig, frame.images))
+    @property
+    def plans(self) -> PlanCache:
+        """The plans that are held for calibrations that come back."""
+        return self.stitcher.plans
 
     def plan(self, source: Rig, target: Rig, scene: Scene | None = None) -> RenderPlan:
         """The cached render plan of a pair of rigs in a scene.
@@ -403,24 +321,7 @@ class RigRetarget(torch.nn.Module):
         Raises:
             ValueError: With ``quality="paper"``.
         """
-        if isinstance(self.config, PaperConfig):
-            raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
-        config, known = self.config, scene or Scene()
-        if self.surface == "auto" and not known.is_empty and not needs_geometry(source, target, config):
-            known = Scene()
-        # A frame's geometry never comes back, unless it is a refinement that is reused: its plan must not push out
-        # those that do.
-        comes_back = known.is_empty or (self.refinement is not None and known.best == "street")
-        cache = self.plans if comes_back else self._plan_of_frame
-        key = plan_key(source, target, self.surface, config, known)
-        return cache.get(key, lambda: self._built(source, target, config, known))
-
-    def _built(self, source: Rig, target: Rig, config: FavsConfig, scene: Scene) -> RenderPlan:
-        plan = build_plan(source, target, surface=self.surface, config=config, scene=scene)
-        self._warn_unreachable(plan)
-        if self.surface == "auto" and scene.best == "street":
-            self._warn_static(source, target)
-        return plan
+        return self.stitcher.plan(source, target, scene)
 
     def prepare(self, source: Rig | None = None) -> RenderPlan:
         """Build the plan for a source rig before DataLoader workers fork: they share its memory.
@@ -436,12 +337,6 @@ class RigRetarget(torch.nn.Module):
             raise ValueError("prepare: expected a source rig and a fixed target rig")
         return self.plan(source, self._fixed_target)
 
-    def _uses_torch(self, frame: SourceFrame) -> bool:
-        wanted = any(image.device.type != "cpu" or image.requires_grad for image in frame.images)
-        if self.execution == "opencv" and wanted:
-            raise SampleError("execution='opencv': expected CPU images without gradients; use execution='torch'")
-        return self.execution == "torch" or (self.execution == "auto" and wanted)
-
     # --- words ------------------------------------------------------------------------------------------------------
     def explain(self, sample: Mapping[str, Any]) -> Explanation | PaperExplanation:
         """How a sample would be rendered: sources, surfaces and why, coverage, expected parallax; print it.
@@ -452,47 +347,17 @@ class RigRetarget(torch.nn.Module):
         """
         frames, lead = check_inputs(sample, self.source_rig), leading_shape(sample["images"])
         target, _, _ = self._draw(sample, frames[:1], None)
-        scene = self._scenes(sample, frames, lead)[0]
-        detections = self._detections(sample, frames, lead)[0]
-        asked = self.harmoniser.estimates or self.harmoniser.gains is not None
-        name = self._refinement_names(sample, len(frames), lead)[0]
-        depth = self._depth(frames[0], target, name)
-        view = self._view(frames[0], target, scene, depth, detections)
-        if isinstance(view, PaperRendering):
-            return PaperExplanation(view)
-        return Explanation(view, self.harmonisation(sample) if asked else None, depth)
+        view = self.stitcher.views(sample, frames, lead, target)[0]
+        if isinstance(view.made, PaperRendering):
+            return PaperExplanation(view.made)
+        return Explanation(
+            view.made, self.harmonisation(sample) if self.stitcher.harmoniser.is_on else None, view.depth
+        )
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
         """The gains that a sample's source images would get, and why; of a batch, its first frame."""
         frame = check_inputs(sample, self.source_rig)[0]
-        return self.harmoniser.report(frame.rig, frame.images)
-
-    def _warn_once(self, topic: str, message: str) -> None:
-        if topic not in self._warned:
-            self._warned.add(topic)
-            warnings.warn(message, stacklevel=4)
-
-    def _warn_unreachable(self, plan: RenderPlan | PaperRendering) -> None:
-        if "unreachable" in self._warned:
-            return
-        shares = [float(coverage.mean()) for coverage in plan.coverage]
-        poor = [f"{c.name} {share:.0%}" for c, share in zip(plan.target, shares, strict=True) if share < _UNREACHABLE]
-        if poor:
-            self._warn_once(
-                "unreachable",
-                f"the target rig {plan.target.name!r} cannot be reached from this data: covered are "
-                f"{', '.join(poor)}; train with the coverage mask, or choose another target",
-            )
-
-    def _warn_static(self, source: Rig, target: Rig) -> None:
-        moved_m = float(baselines_m(source, target).min(axis=1).max())
-        if moved_m > _MOVED_M:
-            self._warn_once(
-                "static",
-                f"target cameras stand up to {moved_m:.2f} m from the nearest source camera, and the sample does not "
-                "say what stands on the street: objects will lean and stretch, which can harm a detector. Pass "
-                "'boxes_3d' in the samples, mix with untouched ones (p=0.5), or accept it with surface='street'",
-            )
+        return self.stitcher.harmoniser.report(frame.rig, frame.images)
 
     # --- processes --------------------------------------------------------------------------------------------------
     def _limit_threads(self) -> None:
@@ -501,29 +366,10 @@ class RigRetarget(torch.nn.Module):
             cv2.setNumThreads(0)
             self._limited_process = os.getpid()
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> RigRetarget:
-        clone = self.__class__.__new__(self.__class__)
-        memo[id(self)] = clone
-        state = {k: v for k, v in self.__dict__.items() if k not in ("plans", "_plan_of_frame", "_scratch")}
-        clone.__dict__.update(copy.deepcopy(state, memo))
-        clone.plans, clone._plan_of_frame, clone._scratch = PlanCache(self.plans.max_bytes), PlanCache(0), Scratch()
-        return clone
-
 
 def _one_of(name: str, value: Any, choices: Sequence[str]) -> None:
     if value not in choices:
         raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
-
-
-def _confidence(
-    view: View, images: Sequence[torch.Tensor], coverage: Sequence[torch.Tensor], seams: Sequence[torch.Tensor]
-) -> list[torch.Tensor]:
-    """Confidence (h, w) of each view; a frame that was only resized shows what its cameras saw."""
-    if not isinstance(view, RenderPlan):
-        return [seen.float() for seen in coverage]
-    certain = [target.certainty for target in view.targets]
-    parts = zip(images, certain, coverage, seams, strict=True)
-    return [confidence(image, c, seen, change) for image, c, seen, change in parts if c is not None]
 
 
 def _checked_size(size: Any) -> tuple[int, int]:

@@ -14,6 +14,7 @@ PACKAGE = Path(__file__).parents[1] / "arbiview_aug"
 
 LAYERS: list[tuple[str, ...]] = [
     ("errors", "environment"),
+    ("command_line",),
     ("lens",),
     ("rotations",),
     ("camera",),
@@ -38,6 +39,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("tensors", "random_rig", "explain"),
     ("sample",),
     ("labels", "detections"),
+    ("stitching",),
     ("datasets", "transforms"),
     ("evaluate",),
     ("bench", "convert", "demo", "inspect"),

@@ -592,6 +592,9 @@ def test_labels_that_cannot_move() -> None:
     retarget = RigRetarget(ring(ground_z_m=-0.5), label_frame="target")
     with pytest.raises(SampleTypeError, match="boxes_3d: expected a tensor of numbers, got str"):
         retarget(sample_of(ring(), boxes_3d="none"))
+    retarget = RigRetarget(ring(ground_z_m=-0.5), label_frame="target", surface="street")
+    with pytest.raises(SampleTypeError, match="boxes_3d: label_frame='target': expected a float tensor, got str"):
+        retarget(sample_of(ring(), boxes_3d="none"))
     with pytest.raises(SampleTypeError, match=r"points: .*expected a float tensor, got torch.int64"):
         retarget(sample_of(ring(), points=torch.zeros(3, 3, dtype=torch.int64)))
     with pytest.raises(SampleTypeError, match="ego2world: label_frame='target': expected a float tensor, got list"):
@@ -644,7 +647,7 @@ def test_prepare_builds_the_plan_that_samples_use() -> None:
         ({"surface": "sphere"}, "surface: expected one of .*far.* got 'sphere'"),
         ({"label_frame": "world"}, "label_frame: expected one of source, target, got 'world'"),
         ({"execution": "jax"}, "execution: expected one of auto, opencv, torch, got 'jax'"),
-        ({"outputs": ["depth"]}, "outputs: expected one of source_camera, got 'depth'"),
+        ({"outputs": ["depth"]}, "outputs: expected one of source_camera, confidence, got 'depth'"),
         ({"p": 1.5}, "p: expected a probability from 0 to 1, got 1.5"),
         ({"p": float("nan")}, "p: expected a probability"),
         ({"size": 256}, r"size: expected \(h, w\) in pixels, got 256"),

@@ -30,12 +30,15 @@ from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
+from arbiview_aug.evaluate.methods import paper_stages
 from arbiview_aug.evaluate.overlap import overlap_scores
+from arbiview_aug.evaluate.paper_tables import PUBLISHED
 from arbiview_aug.evaluate.scores import mean_of
 from arbiview_aug.evaluate.sparse import coloured_points, equalised, sparse_metrics
 from arbiview_aug.evaluate.targets import UP_M, paper_targets, shifted_target
 from arbiview_aug.evaluate.truth import truth_metrics
 from arbiview_aug.favs.config import FavsConfig, PaperConfig
+from arbiview_aug.favs.overlap_depth import RefinementCache
 from arbiview_aug.rig import Rig
 from arbiview_aug.transforms import RigRetarget
 
@@ -50,10 +53,7 @@ def _without_weight(name: str) -> PaperConfig:
 
 
 ROWS: dict[str, dict[str, Any]] = {
-    "paper: stages 1 to 4": {"quality": "paper"},
-    "paper without stage 2, matching": {"quality": PaperConfig(use_feature_matching=False)},
-    "paper without stage 3, objects": {"quality": PaperConfig(use_object_alignment=False)},
-    "paper without stages 2 and 3": {"quality": PaperConfig(**_NO_STAGES_2_3)},
+    **{name: {"quality": config} for name, config in paper_stages().items()},
     **{f"... and without w_{w}": {"quality": _without_weight(w)} for w in _WEIGHTS},
     "paper, stage 1 alone": {"quality": PaperConfig(**_NO_STAGES_2_3, **_NO_WEIGHTS)},
     "draft": {"quality": "draft"},
@@ -63,19 +63,16 @@ ROWS: dict[str, dict[str, Any]] = {
     "fast on the street surface": {"quality": "fast", "surface": "street"},
     "fast without blended seams": {"quality": FavsConfig(seam_width=0.0)},
     "fast, harmonised": {"quality": "fast", "harmonise": True},
+    "accurate": {"quality": "accurate"},
+    "accurate, depth held": {"quality": "accurate", "refinement": True},
 }
-"""Settings of ``RigRetarget`` by name."""
+"""Settings of ``RigRetarget`` by name; ``refinement``: with a cache of its own."""
 
 OWN_CAMERA = "own camera only, far surface"
 """A row of its own: each target view from the source camera that it was made of."""
 
-PUBLISHED: dict[str, dict[str, float]] = {
-    "published: DriveSuprim": {"psnr_db": 9.5647, "ssim": 0.8542, "mae": 72.4672, "rmse": 87.5129},
-    "published: Geometric": {"psnr_db": 9.3167, "ssim": 0.8339, "mae": 74.1309, "rmse": 88.7707},
-    "published: FAVS": {"psnr_db": 11.8707, "ssim": 0.8813, "mae": 42.4985, "rmse": 55.1446},
-    "published: full model": {"psnr_db": 14.2335, "ssim": 0.9691, "mae": 38.2820, "rmse": 49.5294},
-}
-"""The paper's Tables 1 and 2. The RMSE of its FAVS row belongs to 13.30 dB."""
+_PUBLISHED = {f"published: {row.name.split(',')[0]}": row._asdict() for row in PUBLISHED.values()}
+"""The paper's Tables 1 and 2."""
 
 _COLUMNS = (
     ("PSNR dB", "psnr_db", 2),
@@ -173,7 +170,7 @@ def measure(
         "cpu": cpu_model(),
         "rows": rows,
         "raw_overlap_db": overlap,
-        "published": PUBLISHED,
+        "published": _PUBLISHED,
     }
 
 
@@ -243,7 +240,10 @@ def _row(name: str, work: _Work) -> dict[str, float]:
 
 
 def _rendered(name: str, work: _Work, target: Rig) -> tuple[list[Image], list[BoolArray], float]:
-    retarget = RigRetarget(target, **ROWS[name])
+    settings = ROWS[name]
+    if "refinement" in settings:
+        settings = {**settings, "refinement": RefinementCache()}
+    retarget = RigRetarget(target, **settings)
     if not isinstance(retarget.config, PaperConfig):  # which plans nothing
         retarget(work.sample)
     start = time.process_time()

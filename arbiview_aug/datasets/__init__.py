@@ -3,6 +3,7 @@
 from arbiview_aug.datasets.frame_folder import FrameFolder
 from arbiview_aug.datasets.images import decode_images, reduced_camera, reduced_rig
 from arbiview_aug.datasets.nuscenes import NuScenesDataset
+from arbiview_aug.datasets.opening import open_data
 from arbiview_aug.datasets.wrappers import RetargetedDataset, RetargetedIterable
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "RetargetedDataset",
     "RetargetedIterable",
     "decode_images",
+    "open_data",
     "reduced_camera",
     "reduced_rig",
 ]

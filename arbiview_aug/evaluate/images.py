@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from arbiview_aug.camera import BoolArray
 from arbiview_aug.errors import SampleError
 
 if TYPE_CHECKING:
@@ -15,6 +16,20 @@ if TYPE_CHECKING:
 
 Image = npt.NDArray[np.uint8] | npt.NDArray[np.floating[Any]]
 """(h, w, 3) RGB on the scale 0-255: uint8, or float where a renderer kept fractions."""
+
+
+class View(NamedTuple):
+    """A rendered view.
+
+    Attributes:
+        image: (h, w, 3), black where nothing covers it.
+        coverage: (h, w) bool, where some source saw it.
+        confidence: (h, w) in [0, 1], where the renderer tells it.
+    """
+
+    image: Image
+    coverage: BoolArray
+    confidence: npt.NDArray[np.float32] | None = None
 
 
 def as_arrays(images: torch.Tensor | Sequence[torch.Tensor]) -> list[Image]:

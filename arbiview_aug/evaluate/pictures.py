@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -131,6 +131,19 @@ def outline_coverage(image: Image, coverage: BoolArray, *, colour: Colour = HOLE
     contours = cv2.findContours(hole.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)[0]
     cv2.drawContours(picture, contours, -1, colour, max(1, h // 200), cv2.LINE_AA)
     return picture
+
+
+def overlay_confidence(image: Image, confidence: npt.NDArray[np.floating[Any]]) -> Picture:
+    """The image in grey under colours from red (0) over yellow to green (1).
+
+    Args:
+        image: (h, w, 3) on the scale 0-255.
+        confidence: (h, w) in [0, 1].
+    """
+    sure = np.clip(confidence.astype(np.float32), 0, 1)[..., None]
+    colour = 255 * np.concatenate([np.minimum(1, 2 - 2 * sure), np.minimum(1, 2 * sure), 0 * sure], axis=-1)
+    grey = to_bytes(image).mean(axis=-1, keepdims=True)
+    return to_bytes(0.5 * grey + 0.5 * colour)
 
 
 def save_picture(path: str | Path, picture: Picture) -> Path:

@@ -12,7 +12,7 @@ import numpy as np
 
 from arbiview_aug.camera import FloatArray
 from arbiview_aug.datasets.nuscenes import CAMERA_RING
-from arbiview_aug.rig import Rig
+from arbiview_aug.rig import Rig, load_rig
 
 PAPER_SHARES = (0.2, -0.2, 0.4, -0.4, 0.5, -0.25)
 """The paper's configurations: each camera yawed by this share of the azimuth spacing to its neighbour.
@@ -70,6 +70,40 @@ def shifted_target(rig: Rig, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.
 def standard_targets(rig: Rig) -> dict[str, list[Rig]]:
     """What accuracy is reported on: ``yaw`` (±11, ±22, 35 degrees), ``up`` (0.6 m) and ``paper`` (six)."""
     return {"yaw": yawed_targets(rig), "up": [shifted_target(rig, z_m=UP_M)], "paper": paper_targets(rig)}
+
+
+VEHICLES = ("waymo", "argoverse2", "lyft_l5", "nuplan")
+"""Shipped rigs that stand for changes of vehicle."""
+
+TRUCK_UP_M = 1.0
+"""From a sedan to a truck: the same cameras, so much higher."""
+
+
+def vehicle_targets(rig: Rig) -> dict[str, Rig]:
+    """``VEHICLES`` as pinhole rigs whose images are as wide as the source's, by name."""
+    width = float(np.median([camera.width_px for camera in rig]))
+    found = {}
+    for name in VEHICLES:
+        vehicle = load_rig(name).undistorted()
+        scaled = [c.resize((max(1, round(c.height_px * width / c.width_px)), round(width))) for c in vehicle]
+        found[name] = without_masks(vehicle.with_cameras(scaled))
+    return found
+
+
+def named_targets(kind: str, rig: Rig) -> dict[str, Rig]:
+    """A set of targets by name.
+
+    Args:
+        kind: ``paper`` (six configurations), ``yaw`` (``YAWS_DEG``), ``vehicles`` (``VEHICLES``), ``truck``.
+        rig: The source rig.
+    """
+    if kind == "paper":
+        return {f"paper {share:+g}": target for share, target in zip(PAPER_SHARES, paper_targets(rig), strict=True)}
+    if kind == "yaw":
+        return {f"yaw {yaw:+g}": target for yaw, target in zip(YAWS_DEG, yawed_targets(rig), strict=True)}
+    if kind == "vehicles":
+        return vehicle_targets(rig)
+    return {"truck": shifted_target(rig, z_m=TRUCK_UP_M)}
 
 
 def without_masks(rig: Rig) -> Rig:

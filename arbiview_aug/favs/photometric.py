@@ -319,6 +319,11 @@ class Harmoniser:
         self.gains = None if self.estimates or choice is None or choice is False else _checked_gains(choice)
         self._overlaps: OrderedDict[bytes, Overlaps] = OrderedDict()
 
+    @property
+    def is_on(self) -> bool:
+        """Whether anything was asked for."""
+        return self.estimates or self.gains is not None
+
     def __repr__(self) -> str:
         if self.gains is not None:
             return f"({', '.join(f'{gain:g}' for gain in self.gains)})"
@@ -343,7 +348,7 @@ class Harmoniser:
 
     def curves(self, rig: Rig, images: Sequence[torch.Tensor]) -> tuple[ToneCurve, ...] | None:
         """A tone curve for each camera, or None where the images stay as they are."""
-        if self.gains is None and not self.estimates:
+        if not self.is_on:
             return None
         gains = self.report(rig, images).gains
         return None if all(g == 1 for g in gains) else tuple(ToneCurve(g, self.config.knee) for g in gains)

@@ -8,6 +8,8 @@ import pytest
 from arbiview_aug.camera import Camera
 from arbiview_aug.evaluate.targets import (
     PAPER_SHARES,
+    VEHICLES,
+    named_targets,
     paper_target,
     paper_targets,
     shifted_target,
@@ -68,3 +70,24 @@ def test_targets_carry_no_masks() -> None:
     rig = Rig([camera], ground_z_m=0.1, name="masked")
     for target in (paper_target(rig, 0.2), *yawed_targets(rig, [5.0]), shifted_target(rig, z_m=1.0)):
         assert target[0].mask is None and target.name == "masked"
+
+
+def test_named_sets() -> None:
+    rig = load_rig("nuscenes").resized((225, 400))
+    assert list(named_targets("paper", rig)) == [f"paper {share:+g}" for share in PAPER_SHARES]
+    assert named_targets("paper", rig)["paper +0.2"] == paper_target(rig, 0.2)
+    assert list(named_targets("yaw", rig)) == ["yaw +11", "yaw -11", "yaw +22", "yaw -22", "yaw +35"]
+    (truck,) = named_targets("truck", rig).values()
+    np.testing.assert_allclose(truck.cam2ego[:, 2, 3] - rig.cam2ego[:, 2, 3], 1.0)
+    assert truck.ground_z_m == rig.ground_z_m
+
+
+def test_vehicles_are_as_wide_as_the_source_and_without_lenses() -> None:
+    rig = load_rig("nuscenes").resized((225, 400))
+    vehicles = named_targets("vehicles", rig)
+    assert list(vehicles) == list(VEHICLES)
+    for name, vehicle in vehicles.items():
+        for camera, shipped in zip(vehicle, load_rig(name), strict=True):
+            assert camera.width_px == 400 and camera.lens == "pinhole" and camera.mask is None
+            assert camera.fov_deg[0] == pytest.approx(shipped.undistorted().fov_deg[0], rel=0.01)
+            np.testing.assert_array_equal(camera.cam2ego, shipped.cam2ego)

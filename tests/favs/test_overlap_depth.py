@@ -155,7 +155,7 @@ def test_not_where_every_pixel_is_exact(monkeypatch: pytest.MonkeyPatch) -> None
     def refuse(*_: object) -> None:
         raise AssertionError("matched without need")
 
-    monkeypatch.setattr("arbiview_aug.transforms.overlap_depth", refuse)
+    monkeypatch.setattr("arbiview_aug.stitching.overlap_depth", refuse)
     one = Rig([camera("left", 25, 0), camera("right", -25, 0)])
     sample = {"images": noise(0)}
     RigRetarget(one.turned(yaw_deg=5), source_rig=one, quality="accurate")(sample)

@@ -1,0 +1,57 @@
+"""What the commands' parsers and outputs share."""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from arbiview_aug.errors import DataError
+
+
+def count(text: str) -> int:
+    """A whole number above 0."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number above 0, got {text!r}")
+    return value
+
+
+def seed(text: str) -> int:
+    """A whole number from 0."""
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 0, got {text!r}")
+    return value
+
+
+def size(text: str) -> tuple[int, int]:
+    """``256x704``: height and width."""
+    height, _, width = text.partition("x")
+    if not (height.isdecimal() and width.isdecimal() and int(height) and int(width)):
+        raise argparse.ArgumentTypeError(f"expected HEIGHTxWIDTH such as 256x704, got {text!r}")
+    return int(height), int(width)
+
+
+def writable_folder(path: Path, asked: str) -> Path:
+    """Make a folder before any work, so that one that cannot be made costs nothing.
+
+    Raises:
+        DataError: It cannot be made; ``asked`` is what ``--output`` said.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"--output {asked}: expected a folder that can be written to, got {error.strerror}") from None
+    return path
+
+
+@contextmanager
+def gathered_warnings(lines: list[str]) -> Iterator[None]:
+    """Warnings go into ``lines``, each once, out of a progress bar's way."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield
+    lines.extend(dict.fromkeys(str(warning.message) for warning in caught))

@@ -1,0 +1,37 @@
+"""The reader that fits a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, FrameFolder
+from arbiview_aug.datasets.images import Reduce
+from arbiview_aug.datasets.nuscenes import NuScenesDataset
+from arbiview_aug.errors import DataError
+
+_NUSCENES_VERSIONS = ("v1.0-mini", "v1.0-trainval")  # the first of these that is there, else whichever v1.0-*
+
+
+def open_data(folder: str | Path, *, reduce: Reduce = 1) -> FrameFolder | NuScenesDataset:
+    """Frame folders (also where there are nuScenes tables beside), else nuScenes.
+
+    Args:
+        folder: A frame folder, a folder of such folders, or a nuScenes root.
+        reduce: Decode the images at 1, 1/2 or 1/4 of their size.
+
+    Raises:
+        DataError: Neither.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise DataError(f"data {root}: expected a folder, found none")
+    if (root / CALIBRATION_FILE).is_file() or any(root.glob(f"*/{CALIBRATION_FILE}")):
+        return FrameFolder(root, reduce=reduce)
+    versions = sorted(path.name for path in root.glob("v1.0-*") if path.is_dir())
+    if not versions:
+        raise DataError(
+            f"data {root}: expected a frame folder ({CALIBRATION_FILE} in it or in its folders) or a nuScenes root "
+            "(with a folder of tables such as v1.0-mini), found neither"
+        )
+    version = next((v for v in _NUSCENES_VERSIONS if v in versions), versions[0])
+    return NuScenesDataset(root, version, reduce=reduce)

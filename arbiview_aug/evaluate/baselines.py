@@ -1,0 +1,128 @@
+"""What others do instead: baselines of known origin, on the same work as our own renderers.
+
+All take (source rig, its images, target rig in the source's ego frame) and give the views and where they are covered.
+Images are (h, w, 3) RGB on the scale 0-255. They are written to be read, not to be fast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import cv2
+import numpy as np
+
+from arbiview_aug.camera import FloatArray
+from arbiview_aug.errors import SampleError
+from arbiview_aug.evaluate.images import Image, View, as_arrays, as_tensors, to_bytes
+from arbiview_aug.favs.synthesis import render_opencv
+from arbiview_aug.plan import build_plan
+from arbiview_aug.rig import Rig
+
+Renderer = Callable[[Rig, Sequence[Image], Rig], list[View]]
+"""Source rig, its images, target rig: one view for each target camera."""
+
+SPLIT_DEPTH_M = 50.0
+"""Depth of everything above the horizon row in ``row_split``: UniDrive's value."""
+
+
+def own_camera(source: Rig, images: Sequence[Image], target: Rig) -> list[View]:
+    """Each target camera sees one source camera, of its own name or else looking most nearly its way: far surface.
+
+    This is "Geometric" of the paper's Table 2: projection by H = K' R' Rᵀ K⁻¹, without fusion.
+    """
+    views = []
+    axes = source.cam2ego[:, :3, 2]
+    for camera in target:
+        nearest = int(np.argmax(axes @ camera.cam2ego[:3, 2]))
+        index = source.names.index(camera.name) if camera.name in source.names else nearest
+        alone = source.with_cameras([source[index]])
+        plan = build_plan(alone, target.with_cameras([camera]), surface="far")
+        (view,) = as_arrays(render_opencv(plan, as_tensors([images[index]])))
+        views.append(View(view, plan.coverage[0]))
+    return views
+
+
+def crop_and_slide(source: Rig, images: Sequence[Image], target: Rig) -> list[View]:
+    """DriveSuprim's augmentation by rotation: a window slid over the side-cropped images in ring order.
+
+    Each image is cropped to the columns half-way to its neighbours' azimuths, at a constant number of pixels a degree;
+    the strips make a closed panorama, and a target camera sees the window around its azimuth, as wide as its
+    field of view. An image that does not reach half-way is stretched. Rows, pitch and position stay as they were: no
+    perspective is corrected. Everything is covered.
+    """
+    ring = sorted(range(len(source)), key=lambda k: -source[k].azimuth_deg)  # from left to right
+    azimuth = np.array([source[k].azimuth_deg for k in ring])
+    gap = (azimuth - np.roll(azimuth, -1)) % 360  # to the next on the right
+    if len(ring) == 1:
+        gap = np.array([source[0].fov_deg[0]])
+    height = max(h for h, _ in source.sizes)
+    strips, centre_px, x = [], [], 0.0
+    per_degree = float(np.median([source[k].width_px / source[k].fov_deg[0] for k in ring]))
+    for n, k in enumerate(ring):
+        camera, image = source[k], to_bytes(images[k])
+        left, right = gap[n - 1] / 2, gap[n] / 2
+        own = camera.width_px / camera.fov_deg[0]
+        middle = float(camera.K[0, 2]) + 0.5  # counted from the image's edge
+        a = int(np.clip(round(middle - left * own), 0, camera.width_px - 1))
+        b = int(np.clip(round(middle + right * own), a + 1, camera.width_px))
+        wide = max(1, round((left + right) * per_degree))
+        strips.append(cv2.resize(image[:, a:b], (wide, height), interpolation=cv2.INTER_LINEAR))
+        centre_px.append(x + left * per_degree)
+        x += wide
+    panorama = np.concatenate(strips, axis=1)
+    views: list[View] = []
+    for camera in target:
+        # The window's centre: the nearest strip's, moved by the turn from it.
+        turn = (azimuth - camera.azimuth_deg + 180) % 360 - 180
+        n = int(np.abs(turn).argmin())
+        middle = centre_px[n] + turn[n] * per_degree
+        half = per_degree * camera.fov_deg[0] / 2
+        columns = np.arange(round(middle - half), round(middle + half)) % panorama.shape[1]
+        h, w = camera.size
+        views.append(View(np.asarray(cv2.resize(panorama[:, columns], (w, h)), np.uint8), np.ones((h, w), bool)))
+    return views
+
+
+def row_split(source: Rig, images: Sequence[Image], target: Rig) -> list[View]:
+    """UniDrive's projection: below the camera's horizon row the road's plane, above it a plane 50 m ahead.
+
+    Nearest neighbour; where several sources see a pixel, the last one in the rig's order wins.
+
+    Raises:
+        SampleError: Lenses other than pinhole.
+    """
+    if any(camera.lens != "pinhole" for camera in (*source, *target)):
+        raise SampleError("row_split: expected pinhole cameras; use Rig.undistorted()")
+    views: list[View] = []
+    for camera in target:
+        points = _split_points(camera.K, camera.cam2ego, camera.size, source.ground_z_m).reshape(-1, 3)
+        view, seen = np.zeros((len(points), 3), np.float32), np.zeros(len(points), bool)
+        for at, image in zip(source, images, strict=True):
+            ahead = np.flatnonzero((points - at.center_m) @ at.cam2ego[:3, 2] > 0)  # half of them: the cheap test
+            uv, _, valid = at.project(points[ahead])
+            pixel = np.floor(uv + 0.5)
+            inside = valid & (pixel >= 0).all(-1) & (pixel < (at.width_px, at.height_px)).all(-1)
+            index, (column, row) = ahead[inside], pixel[inside].astype(np.int64).T
+            if at.mask is not None:
+                free = at.mask[row, column]
+                index, column, row = index[free], column[free], row[free]
+            view[index] = np.asarray(image)[row, column]
+            seen[index] = True
+        views.append(View(view.reshape(*camera.size, 3), seen.reshape(camera.size)))
+    return views
+
+
+def _split_points(K: FloatArray, cam2ego: FloatArray, size: tuple[int, int], ground_z_m: float) -> FloatArray:
+    """Scene points (h, w, 3) of ``row_split`` in the ego frame."""
+    v, u = np.indices(size, dtype=np.float64)
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(size)], -1)
+    down = rays @ cam2ego[2, :3]  # the ego's z along a ray of unit depth
+    with np.errstate(divide="ignore"):
+        road_m = (ground_z_m - cam2ego[2, 3]) / down
+    below = (v > K[1, 2]) & (road_m > 0)
+    depth = np.where(below, np.minimum(road_m, 1e4), SPLIT_DEPTH_M)
+    return (rays * depth[..., None]) @ cam2ego[:3, :3].T + cam2ego[:3, 3]
+
+
+BASELINES: dict[str, Renderer] = {"own camera": own_camera, "crop and slide": crop_and_slide, "row split": row_split}
+"""By name."""

@@ -1,0 +1,159 @@
+"""Named methods: whatever renders a sample for a target rig, so that tables can compare them.
+
+A method gets the whole sample and may use what is in it; what it must not see is left out before (``frames``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+from arbiview_aug.evaluate.baselines import BASELINES, Renderer
+from arbiview_aug.evaluate.images import Image, View, as_arrays
+from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config, paper
+from arbiview_aug.favs.overlap_depth import OverlapDepth, RefinementCache, overlap_depth
+from arbiview_aug.rig import Rig
+from arbiview_aug.surface import SurfaceName
+from arbiview_aug.transforms import RigRetarget
+
+Sample = Mapping[str, Any]
+
+READS_POINTS = ("auto", "lidar")
+"""Surfaces that may be made of a sample's ``points``."""
+
+_HELD_TRANSFORMS = 8  # as many as a set of targets has; full-size plans take 50 MB each
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of a table.
+
+    Attributes:
+        name: Shown in tables.
+        render: Sample with ``rig``, target rig (in its own ego frame): one view for each target camera.
+        reads_points: Whether it may use the sample's ``points``: then only a part of them can score it.
+        render_alone: Sample, index of a source camera, one-camera target rig: the view from that source alone, but
+            with what the method knows of the scene from all; None where it knows nothing but what each camera shows.
+    """
+
+    name: str
+    render: Callable[[Sample, Rig], list[View]]
+    reads_points: bool = False
+    render_alone: Callable[[Sample, int, Rig], View] | None = None
+
+    def alone(self, sample: Sample, camera: int, target: Rig) -> View:
+        """A one-camera target from one source camera alone."""
+        if self.render_alone is not None:
+            return self.render_alone(sample, camera, target)
+        (view,) = self.render(one_camera(sample, camera), target)
+        return view
+
+
+def retargeting(
+    quality: Quality | FavsConfig | PaperConfig,
+    surface: SurfaceName = "auto",
+    name: str = "",
+    *,
+    outputs: Sequence[str] = (),
+) -> Method:
+    """``RigRetarget`` as a method; a transform, with its last plan, for each of the last target rigs.
+
+    Args:
+        quality: As for ``RigRetarget``.
+        surface: As for ``RigRetarget``.
+        name: For tables; by default made of both.
+        outputs: Further outputs, ``confidence`` where there is to be one.
+    """
+
+    @lru_cache(_HELD_TRANSFORMS)
+    def transform(target: Rig) -> RigRetarget:
+        return RigRetarget(target, quality=quality, surface=surface, outputs=outputs, cache_bytes=0)
+
+    def render(sample: Sample, target: Rig) -> list[View]:
+        return views_of(transform(target)(sample))
+
+    def render_alone(sample: Sample, camera: int, target: Rig) -> View:
+        """The depth that all cameras' overlaps gave, as if it had been found before."""
+        given = one_camera(sample, camera)
+        depth = RefinementCache()
+        depth.get((given["rig"].content_key, None), lambda: whole.get(sample))
+        retarget = RigRetarget(target, quality=quality, surface=surface, refinement=depth, cache_bytes=0)
+        (view,) = views_of(retarget(given))
+        return view
+
+    config, whole = favs_config(quality), _LastDepth()
+    label = name or (f"{quality}, {surface}" if isinstance(quality, str) else f"{type(quality).__name__}, {surface}")
+    learns = isinstance(config, FavsConfig) and config.overlap_depth
+    reads_points = surface in READS_POINTS and not isinstance(config, PaperConfig)
+    return Method(label, render, reads_points, render_alone if learns else None)
+
+
+class _LastDepth:
+    """Depth from overlap of the last sample: a dozen views of it are rendered in a row."""
+
+    def __init__(self) -> None:
+        self._last: tuple[Sample, OverlapDepth] | None = None
+
+    def get(self, sample: Sample) -> OverlapDepth:
+        if self._last is None or self._last[0] is not sample:
+            self._last = sample, overlap_depth(sample["rig"], list(sample["images"]))
+        return self._last[1]
+
+
+def one_camera(sample: Sample, camera: int) -> dict[str, Any]:
+    """A sample as if it had one camera; what its ego frame holds stays."""
+    rig: Rig = sample["rig"]
+    given = {key: value for key, value in sample.items() if key not in ("K", "cam2ego", "detections")}
+    return {**given, "images": [sample["images"][camera]], "rig": rig.with_cameras([rig[camera]])}
+
+
+def views_of(out: Sample) -> list[View]:
+    """A retargeted sample's views."""
+    images, coverage = as_arrays(out["images"]), [mask.cpu().numpy() for mask in out["coverage"]]
+    confidence = [c.float().cpu().numpy() for c in out["confidence"]] if "confidence" in out else [None] * len(images)
+    return [View(*parts) for parts in zip(images, coverage, confidence, strict=True)]
+
+
+def baseline(name: str) -> Method:
+    """One of ``baselines.BASELINES``."""
+    renderer: Renderer = BASELINES[name]
+
+    def render(sample: Sample, target: Rig) -> list[View]:
+        rig: Rig = sample["rig"]
+        images: list[Image] = as_arrays(sample["images"])
+        return renderer(rig, images, target.in_frame_of(rig))
+
+    return Method(name, render)
+
+
+def paper_stages() -> dict[str, PaperConfig]:
+    """``paper`` whole, and with each stage switched off: what each is worth.
+
+    Without stage 4 the fused image is the plain mean of all sources that see a pixel.
+    """
+    whole = paper()
+    return {
+        "paper": whole,
+        "paper without stage 2, matching": replace(whole, use_feature_matching=False),
+        "paper without stage 3, objects": replace(whole, use_object_alignment=False),
+        "paper without stages 2 and 3": replace(whole, use_feature_matching=False, use_object_alignment=False),
+        "paper without stage 4, weights": replace(
+            whole,
+            use_distance_weight=False,
+            use_gradient_weight=False,
+            use_quality_weight=False,
+            use_primary_weight=False,
+        ),
+    }
+
+
+def study_methods() -> list[Method]:
+    """The rows of the paper's tables and ours, from images and poses alone: no LiDAR, no boxes."""
+    published = [retargeting(config, "auto", name) for name, config in paper_stages().items()]
+    return [
+        *map(baseline, BASELINES),
+        *published,
+        *(retargeting(q, "street", q) for q in ("draft", "fast", "accurate")),
+    ]

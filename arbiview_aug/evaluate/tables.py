@@ -1,0 +1,87 @@
+"""Metrics as text: the columns of each table, and how they are laid out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+
+class Column(NamedTuple):
+    """Heading, the metric below it, and how many digits follow the point; ``%`` for shares."""
+
+    heading: str
+    metric: str
+    digits: int | str = 2
+
+
+SEEN = Column("seen", "seen", "%")
+
+TRUTH_COLUMNS = (
+    SEEN,
+    Column("PSNR dB", "true_covered_psnr_db"),
+    Column("ground", "true_covered_ground_psnr_db"),
+    Column("objects", "true_covered_object_psnr_db"),
+    Column("sky", "true_covered_sky_psnr_db"),
+    Column("MAE", "true_covered_mae"),
+    Column("SSIM", "true_covered_ssim", 4),
+    Column("holes", "true_hole_psnr_db"),
+    Column("whole view", "true_psnr_db"),
+)
+TRUTH_NOTES: tuple[str, ...] = (
+    "seen: share of the target's pixels. ground, objects, sky: PSNR there. MAE in grey levels of 255.",
+    "holes: PSNR where no source saw. whole view: PSNR with the holes as they are, black.",
+)
+SPARSE_COLUMNS = (
+    SEEN,
+    Column("raw dB", "raw_psnr_db"),
+    Column("even dB", "even_psnr_db"),
+    Column("covered", "even_covered_psnr_db"),
+    Column("ground", "even_ground_psnr_db"),
+    Column("other", "even_other_psnr_db"),
+    Column("MAE", "even_mae"),
+    Column("RMSE", "even_rmse"),
+    Column("SSIM", "even_ssim", 4),
+    Column("points", "even_coverage", "%"),
+)
+SPARSE_NOTES: tuple[str, ...] = (
+    "seen: share of the target's pixels; points: of the LiDAR points. raw: PSNR of all points, those on unseen pixels",
+    "against black. even and all between: the cameras' exposures are made even first, since exposure is not geometry;",
+    "covered: on seen pixels; ground: on the road; other: all but the road.",
+)
+OVERLAP_COLUMNS = (
+    Column("raw dB", "overlap_raw_psnr_db"),
+    Column("fitted dB", "overlap_fitted_psnr_db"),
+    Column("worst pair", "overlap_worst_fitted_psnr_db"),
+    Column("targets raw", "consistency_raw_psnr_db"),
+    Column("fitted", "consistency_fitted_psnr_db"),
+    Column("worst", "consistency_worst_fitted_psnr_db"),
+)
+OVERLAP_NOTES: tuple[str, ...] = (
+    "Two neighbouring source cameras, each alone rendered to the view half-way between them: PSNR on odd tiles, raw",
+    "and with a gain and an offset per channel fitted on the even ones. targets: neighbouring rendered views, brought",
+    "to their half-way view over the street's surface: do they show the same scene? Compare methods of one surface:",
+    "what is rendered over the street agrees there even where the street is wrong.",
+)
+
+
+def text_table(
+    title: str, rows: Mapping[str, Mapping[str, float]], columns: Sequence[Column], notes: Sequence[str] = ()
+) -> str:
+    """A table with named rows; a metric that a row lacks is a dash."""
+    name_width = max(7, *(len(name) for name in rows)) if rows else 7
+    lines = [f"{title}:", f"  {'':<{name_width}}" + "".join(f"{c.heading:>{_width(c)}}" for c in columns)]
+    for name, row in rows.items():
+        lines.append(f"  {name:<{name_width}}" + "".join(f"{cell(row, c):>{_width(c)}}" for c in columns))
+    return "\n".join([*lines, *(f"  {note}" for note in notes)])
+
+
+def cell(row: Mapping[str, float], column: Column) -> str:
+    """One number as it is printed."""
+    value = row.get(column.metric)
+    if value is None:
+        return "-"
+    return f"{value:.1%}" if column.digits == "%" else f"{value:.{column.digits}f}"
+
+
+def _width(column: Column) -> int:
+    return max(7, len(column.heading)) + 2

@@ -1,0 +1,250 @@
+"""The FAVS path of a transform: checked frames in, target views out, with plans and refinements held between frames."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+
+from arbiview_aug.detections import OfCameras, detections_of_frames
+from arbiview_aug.errors import SampleError
+from arbiview_aug.favs.config import FavsConfig, PaperConfig
+from arbiview_aug.favs.overlap_depth import OverlapDepth, RefinementCache, overlap_depth
+from arbiview_aug.favs.paper import PaperRendering, check_settings, render_paper
+from arbiview_aug.favs.photometric import Harmoniser
+from arbiview_aug.favs.synthesis import render_opencv, render_torch
+from arbiview_aug.plan import PlanCache, RenderPlan, baselines_m, build_plan, needs_geometry, plan_key
+from arbiview_aug.rig import Rig
+from arbiview_aug.sample import SourceFrame, names_of_frames, scenes_of_frames
+from arbiview_aug.sampling import Scratch
+from arbiview_aug.scene import Scene
+from arbiview_aug.surface import SurfaceName
+
+Execution = Literal["auto", "opencv", "torch"]
+
+_UNREACHABLE = 0.5  # a target camera of which less than this is covered is worth a warning
+_MOVED_M = 0.2
+"""A target camera farther than this from every source is worth a warning where only the static street is known: what
+stands 10 m away shifts by more than a degree, and the street does not know that it stands there."""
+
+
+class WarnOnce:
+    """Warnings that are said once for each topic."""
+
+    def __init__(self) -> None:
+        self._said: set[str] = set()
+
+    def __call__(self, topic: str, message: str) -> None:
+        """Say it, if nothing was said on this topic before."""
+        if topic not in self._said:
+            self._said.add(topic)
+            warnings.warn(message, stacklevel=5)
+
+
+@dataclass(frozen=True)
+class View:
+    """How a frame is seen by the target.
+
+    Attributes:
+        made: Its plan; or the frame rendered by the published stages, for which nothing can be planned.
+        depth: What became of its overlaps, where depth from overlap was asked for and matters.
+    """
+
+    made: RenderPlan | PaperRendering
+    depth: OverlapDepth | None = None
+
+
+class Stitcher:
+    """Plans and renders frames by FAVS.
+
+    Args:
+        config: Settings.
+        surface: As in ``RigRetarget``.
+        harmoniser: Tone curves for every frame.
+        refinement: Where refinements are held, for settings with depth from overlap.
+        execution: ``opencv``, ``torch`` or ``auto``.
+        cache_bytes: Memory for plans that may come back.
+        warn: Says what a user should know.
+
+    Raises:
+        ValueError: Settings that contradict each other.
+    """
+
+    def __init__(
+        self,
+        config: FavsConfig | PaperConfig,
+        surface: SurfaceName,
+        harmoniser: Harmoniser,
+        refinement: RefinementCache | None,
+        execution: Execution,
+        cache_bytes: int,
+        warn: WarnOnce,
+    ) -> None:
+        if isinstance(config, PaperConfig):
+            check_settings(surface, execution)
+            if harmoniser.is_on:
+                raise ValueError(f"harmonise: quality='paper' is as published: expected None, got {harmoniser!r}")
+        if refinement is not None and not (isinstance(config, FavsConfig) and config.overlap_depth):
+            raise ValueError("refinement: expected quality='accurate' (or overlap_depth=True) with a RefinementCache")
+        self.config, self.surface, self.harmoniser = config, surface, harmoniser
+        self.refinement, self.execution, self.warn = refinement, execution, warn
+        self.plans = PlanCache(cache_bytes)
+        self._plan_of_frame = PlanCache(0)  # holds one
+        self._scratch = Scratch()
+
+    # --- what a frame is made by --------------------------------------------------------------------------------------
+    def views(
+        self, sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...], target: Rig
+    ) -> list[View]:
+        """How each frame of a sample is seen by the target.
+
+        Raises:
+            SampleError: What the settings need of the sample is missing or impossible.
+        """
+        if isinstance(self.config, PaperConfig):
+            return [View(rendering) for rendering in self._published(self.config, sample, frames, lead, target)]
+        scenes = scenes_of_frames(sample, frames, lead, self.surface)
+        views = []
+        for frame, scene, name in zip(frames, scenes, self._names(sample, len(frames), lead), strict=True):
+            depth = self._depth(self.config, frame, target, scene, name)
+            known = scene if depth is None else replace(scene, corrections=depth.corrections)
+            views.append(View(self.plan(frame.rig, target, known), depth))
+        return views
+
+    def _published(
+        self,
+        config: PaperConfig,
+        sample: Mapping[str, Any],
+        frames: Sequence[SourceFrame],
+        lead: tuple[int, ...],
+        target: Rig,
+    ) -> list[PaperRendering]:
+        """The frames rendered by the published stages."""
+        named: Sequence[OfCameras] = [{}] * len(frames)
+        if config.use_detections:
+            named = detections_of_frames(sample, frames, lead)
+        renderings = []
+        for frame, detections in zip(frames, named, strict=True):
+            renderings.append(render_paper(frame.rig, target.in_frame_of(frame.rig), frame.images, config, detections))
+            self._warn_unreachable(renderings[-1])
+        return renderings
+
+    def plan(self, source: Rig, target: Rig, scene: Scene | None = None) -> RenderPlan:
+        """The cached render plan of a pair of rigs in a scene.
+
+        Raises:
+            ValueError: With ``quality="paper"``.
+        """
+        if isinstance(self.config, PaperConfig):
+            raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
+        config, known = self.config, scene or Scene()
+        if self.surface == "auto" and not known.is_empty and not needs_geometry(source, target, config):
+            known = Scene()
+        # A frame's geometry never comes back, unless it is a refinement that is reused: its plan must not push out
+        # those that do.
+        comes_back = known.is_empty or (self.refinement is not None and known.best == "street")
+        cache = self.plans if comes_back else self._plan_of_frame
+        key = plan_key(source, target, self.surface, config, known)
+        return cache.get(key, lambda: self._built(source, target, config, known))
+
+    def _built(self, source: Rig, target: Rig, config: FavsConfig, scene: Scene) -> RenderPlan:
+        plan = build_plan(source, target, surface=self.surface, config=config, scene=scene)
+        self._warn_unreachable(plan)
+        if self.surface == "auto" and scene.best == "street":
+            self._warn_static(source, target)
+        return plan
+
+    # --- depth from overlap -------------------------------------------------------------------------------------------
+    def _names(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[object]:
+        """For each frame, what the sample calls its scene, where refinements are reused by name.
+
+        Raises:
+            SampleError: The sample lacks the name, or has another number of them than frames.
+        """
+        key = None if self.refinement is None else self.refinement.key
+        if key is None:
+            return [None] * count
+        if key not in sample:
+            raise SampleError(f"refinement: expected {key!r} in the sample, to tell which frames share a refinement")
+        return names_of_frames(key, sample[key], count, lead)
+
+    def _depth(
+        self, config: FavsConfig, frame: SourceFrame, target: Rig, scene: Scene, name: object
+    ) -> OverlapDepth | None:
+        """Depth from overlap, where it is asked for and any pixel's place depends on it: not where it was measured."""
+        surface = scene.best if self.surface == "auto" else self.surface
+        if not config.overlap_depth or surface in ("far", "ground", "lidar"):
+            return None
+        if self.surface == "auto" and not needs_geometry(frame.rig, target, config):
+            return None
+        if self.refinement is None:
+            return overlap_depth(frame.rig, frame.images)
+        return self.refinement.get((frame.rig.content_key, name), lambda: overlap_depth(frame.rig, frame.images))
+
+    # --- images -------------------------------------------------------------------------------------------------------
+    def render(
+        self,
+        frames: Sequence[SourceFrame],
+        views: Sequence[View],
+        seams: list[list[torch.Tensor]] | None = None,
+    ) -> list[list[torch.Tensor]]:
+        """The target images of each frame; frames that share a plan go through torch together.
+
+        Into ``seams``, where given, go the changes along the seams (see ``render_opencv``) of each frame.
+        """
+        done: dict[int, list[torch.Tensor]] = {}
+        changes: dict[int, list[torch.Tensor]] = {b: [] for b in range(len(frames))}
+        together: dict[int, list[int]] = {}
+        for b, (frame, view) in enumerate(zip(frames, views, strict=True)):
+            if isinstance(view.made, PaperRendering):
+                done[b] = [target.image for target in view.made.targets]
+            elif self._uses_torch(frame):
+                together.setdefault(id(view.made), []).append(b)
+            else:
+                curves = self.harmoniser.curves(frame.rig, frame.images)
+                wanted = None if seams is None else changes[b]
+                done[b] = render_opencv(view.made, frame.images, self._scratch, curves, wanted)
+        for members in together.values():
+            plan = views[members[0]].made
+            assert isinstance(plan, RenderPlan)
+            sources = zip(*(frames[b].images for b in members), strict=True)
+            toned = [self.harmoniser.curves(frames[b].rig, frames[b].images) for b in members]
+            batched: list[torch.Tensor] | None = None if seams is None else []
+            rendered = render_torch(plan, [torch.stack(images) for images in sources], toned, batched)
+            for k, b in enumerate(members):
+                done[b] = [image[k] for image in rendered]
+                changes[b] = [change[k] for change in batched or ()]
+        if seams is not None:
+            seams.extend(changes[b] for b in range(len(frames)))
+        return [done[b] for b in range(len(frames))]
+
+    def _uses_torch(self, frame: SourceFrame) -> bool:
+        wanted = any(image.device.type != "cpu" or image.requires_grad for image in frame.images)
+        if self.execution == "opencv" and wanted:
+            raise SampleError("execution='opencv': expected CPU images without gradients; use execution='torch'")
+        return self.execution == "torch" or (self.execution == "auto" and wanted)
+
+    # --- words --------------------------------------------------------------------------------------------------------
+    def _warn_unreachable(self, plan: RenderPlan | PaperRendering) -> None:
+        shares = [float(coverage.mean()) for coverage in plan.coverage]
+        poor = [f"{c.name} {share:.0%}" for c, share in zip(plan.target, shares, strict=True) if share < _UNREACHABLE]
+        if poor:
+            self.warn(
+                "unreachable",
+                f"the target rig {plan.target.name!r} cannot be reached from this data: covered are "
+                f"{', '.join(poor)}; train with the coverage mask, or choose another target",
+            )
+
+    def _warn_static(self, source: Rig, target: Rig) -> None:
+        moved_m = float(baselines_m(source, target).min(axis=1).max())
+        if moved_m > _MOVED_M:
+            self.warn(
+                "static",
+                f"target cameras stand up to {moved_m:.2f} m from the nearest source camera, and the sample does not "
+                "say what stands on the street: objects will lean and stretch, which can harm a detector. Pass "
+                "'points' or 'boxes_3d' in the samples, mix with untouched ones (p=0.5), or accept it with "
+                "surface='street'",
+            )

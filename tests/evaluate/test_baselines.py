@@ -1,0 +1,120 @@
+"""What others do, on cases worked out by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from arbiview_aug.camera import Camera
+from arbiview_aug.errors import SampleError
+from arbiview_aug.evaluate.baselines import BASELINES, SPLIT_DEPTH_M, crop_and_slide, own_camera, row_split
+from arbiview_aug.rig import Rig
+
+COLOURS = ((200, 30, 30), (30, 200, 30), (30, 30, 200), (200, 200, 30))
+
+
+def camera(azimuth_deg: float = 0.0, name: str = "front", x: float = 0.0, y: float = 0.0, z: float = 1.5) -> Camera:
+    return Camera.looking(
+        name=name,
+        azimuth_deg=azimuth_deg,
+        position_m=(x, y, z),
+        width_px=181,
+        height_px=91,
+        horizontal_fov_deg=90.0,
+    )
+
+
+def ring() -> Rig:
+    """Four cameras that see a quarter each: ahead, left, back, right."""
+    return Rig([camera(90.0 * k, f"at {90 * k}") for k in range(4)])
+
+
+def plain(colour: tuple[int, int, int]) -> np.ndarray:
+    return np.full((91, 181, 3), colour, np.uint8)
+
+
+def noise(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(1, 255, (91, 181, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_the_source_rig_comes_back(name: str) -> None:
+    rig = ring()
+    images = [noise(k) for k in range(4)]
+    for image, view in zip(images, BASELINES[name](rig, images, rig), strict=True):
+        assert view.image.shape == image.shape and view.coverage.dtype == bool
+        if name != "crop and slide":  # which knows degrees only to a pixel
+            inside = view.coverage.copy()
+            inside[:, :2] = inside[:, -2:] = False  # edge columns belong to two cameras
+            assert inside.mean() > 0.97
+            np.testing.assert_array_equal(view.image[inside], image[inside])
+
+
+def test_own_camera_is_alone() -> None:
+    rig = ring()
+    images = [plain(colour) for colour in COLOURS]
+    (view,) = own_camera(rig, images, rig.with_cameras([camera(45.0, "at 0")]))
+    # 45 degrees to the left, the image's right half of the angle is what the own camera saw; none else helps.
+    columns = view.coverage.mean(0)
+    assert columns[:88].max() == 0 and columns[93:].min() > 0.6
+    assert set(map(tuple, view.image[view.coverage].tolist())) == {COLOURS[0]}
+    assert not view.image[~view.coverage].any()
+    (other,) = own_camera(rig, images, rig.with_cameras([camera(80.0, "of another rig")]))
+    assert tuple(other.image[45, 90]) == COLOURS[1], "without its name, the camera that looks most nearly its way"
+
+
+def test_crop_and_slide_is_a_window_over_strips() -> None:
+    rig = ring()
+    images = [plain(colour) for colour in COLOURS]
+    (view,) = crop_and_slide(rig, images, rig.with_cameras([camera(30.0, "any", x=5.0, z=3.0)]))
+    assert view.coverage.all(), "position and coverage play no part"
+    # 30 of 90 degrees to the left: a third of the width, from the left, is the left neighbour's.
+    row = view.image[45]
+    np.testing.assert_array_equal(row[:58], np.broadcast_to(COLOURS[1], (58, 3)))
+    np.testing.assert_array_equal(row[63:], np.broadcast_to(COLOURS[0], (118, 3)))
+    (back,) = crop_and_slide(rig, images, rig.with_cameras([camera(180.0, "any")]))
+    assert tuple(back.image[45, 90]) == COLOURS[2], "the panorama is closed"
+
+
+def test_crop_and_slide_of_one_camera() -> None:
+    image = noise()
+    (view,) = crop_and_slide(Rig([camera()]), [image], Rig([camera()]))
+    np.testing.assert_allclose(view.image.astype(int), image, atol=1)
+
+
+def test_row_split_below_the_horizon_is_the_road() -> None:
+    source, target = camera(z=1.5), camera(z=3.0)
+    row = np.broadcast_to(np.arange(91, dtype=np.uint8)[:, None, None], (91, 181, 3)).copy()
+    (view,) = row_split(Rig([source]), [row], Rig([target]))
+    # f = 90.5 px, the horizon at row 45. A road point at row 45 + v is at 90.5 · 3 / v m, and there at half of v.
+    assert view.image[45 + 40, 90, 0] == 45 + 20 and view.image[45 + 20, 90, 0] == 45 + 10
+    # Above: 50 m ahead, 1.5 m are 2.7 px.
+    f = source.K[1, 1]
+    assert view.image[20, 90, 0] == round(20 - f * 1.5 / SPLIT_DEPTH_M)
+
+
+def test_row_split_above_the_horizon_is_a_plane() -> None:
+    column = np.broadcast_to(np.arange(181, dtype=np.uint8)[None, :, None], (91, 181, 3)).copy()
+    (view,) = row_split(Rig([camera()]), [column], Rig([camera(y=2.0)]))
+    shift = round(float(camera().K[0, 0]) * 2.0 / SPLIT_DEPTH_M)
+    assert shift == 4
+    assert view.image[10, 90, 0] == 90 - shift, "from 2 m to the left, what is 50 m ahead was further left"
+
+
+def test_row_split_the_last_camera_wins_and_masks_hold() -> None:
+    mask = np.ones((91, 181), bool)
+    mask[:, :60] = False
+    masked = Camera(**{**_fields(camera(name="second")), "mask": mask})
+    (view,) = row_split(Rig([camera(), masked]), [plain(COLOURS[0]), plain(COLOURS[1])], Rig([camera()]))
+    assert tuple(view.image[45, 30]) == COLOURS[0] and tuple(view.image[45, 100]) == COLOURS[1]
+    assert view.coverage.all()
+
+
+def test_row_split_refuses_lenses() -> None:
+    lens = Camera(**{**_fields(camera()), "lens": "fisheye", "distortion": (0.0, 0.0, 0.0, 0.0)})
+    with pytest.raises(SampleError, match="row_split: expected pinhole cameras"):
+        row_split(Rig([lens]), [noise()], Rig([camera()]))
+
+
+def _fields(c: Camera) -> dict:
+    return {name: getattr(c, name) for name in ("name", "width_px", "height_px", "K", "cam2ego")}

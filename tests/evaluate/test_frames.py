@@ -1,0 +1,114 @@
+"""What methods get and what scores them; named methods; agreement of neighbours."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.evaluate.frames import make_frame, regions, scores
+from arbiview_aug.evaluate.images import View, as_arrays
+from arbiview_aug.evaluate.sparse import coloured_points, lidar_split
+from arbiview_aug.rig import Rig
+
+SIZE = (64, 176)
+
+
+@pytest.fixture(scope="module")
+def drive() -> SyntheticDrive:
+    return SyntheticDrive(demo_source_rig(SIZE), num_frames=1)
+
+
+@pytest.fixture(scope="module")
+def sample(drive: SyntheticDrive) -> dict:
+    return drive[0]
+
+
+def untouched(sample: dict, target: Rig) -> list[View]:
+    """For a target that is the source."""
+    return [View(image, np.ones(image.shape[:2], bool)) for image in as_arrays(sample["images"])]
+
+
+def test_points_are_split_between_method_and_score(sample: dict) -> None:
+    frame = make_frame(sample, hand_over_points=True)
+    everything = sample["points"].numpy()
+    fit, test = lidar_split(everything)
+    assert frame.held_out
+    np.testing.assert_array_equal(frame.sample["points"].numpy(), everything[fit])
+    for exposure in ("raw", "even"):
+        reference = frame.lidar[exposure]
+        assert reference.sample["points"] is frame.sample["points"]
+        assert lidar_split(reference.points.points)[1].all(), "no point that a method has seen scores"
+        assert 1000 < len(reference.points) <= test.sum()
+    whole = coloured_points(sample["rig"], as_arrays(sample["images"]), everything.astype(np.float64))
+    assert len(frame.lidar["raw"].points) == lidar_split(whole.points)[1].sum()
+
+
+def test_methods_that_read_no_points_get_none_and_all_score(sample: dict) -> None:
+    frame = make_frame(sample)
+    assert "points" not in frame.sample and not frame.held_out
+    whole = coloured_points(sample["rig"], as_arrays(sample["images"]), sample["points"].numpy().astype(np.float64))
+    np.testing.assert_array_equal(frame.lidar["raw"].points.points, whole.points)
+    assert "points" in sample, "the sample itself stays"
+
+
+def test_where_points_do_not_score_they_are_handed_over_whole(sample: dict) -> None:
+    frame = make_frame(sample, exposures=(), hand_over_points=True)
+    assert frame.sample["points"] is sample["points"] and not frame.lidar and not frame.held_out
+    assert "points" not in make_frame(sample, exposures=()).sample
+    bare = {key: value for key, value in sample.items() if key != "points"}
+    assert not make_frame(bare).lidar
+
+
+def test_even_exposures_reach_the_method(sample: dict) -> None:
+    dim = sample["images"].clone()
+    dim[0] = (dim[0].float() * 0.6).to(torch.uint8)
+    frame = make_frame({**sample, "images": dim})
+    even = as_arrays(frame.lidar["even"].sample["images"])
+    ratio = even[0].mean() / as_arrays(dim)[0].mean()
+    assert ratio > 1.2, "the dark camera is brightened"
+    assert frame.lidar["raw"].sample["images"][0].float().mean() == pytest.approx(dim[0].float().mean())
+
+
+def test_scores_of_the_source_itself(drive: SyntheticDrive, sample: dict) -> None:
+    calls = []
+
+    def render(given: dict, target: Rig) -> list[View]:
+        calls.append(given)
+        return untouched(given, target)
+
+    frame = make_frame(sample, truth=lambda rig: drive.render(0, rig))
+    views, rows = scores(frame, render, drive.rig)
+    assert len(views) == len(rows) == 6 and len(calls) == 2
+    assert views[0].image is not None and all(row["seen"] == 1 for row in rows)
+    for row in rows:
+        assert row["true_psnr_db"] > 100 and row["true_hole_share"] == 0
+        share = sum(row[f"true_{name}_share"] for name in ("ground", "object", "sky"))
+        assert share == pytest.approx(1)
+        assert row["raw_coverage"] == 1 and row["raw_psnr_db"] > 20
+    calls.clear()
+    _, rows = scores(frame, render, drive.rig, ("even",))
+    assert len(calls) == 1 and "even_psnr_db" in rows[0] and "raw_psnr_db" not in rows[0]
+
+
+def test_scores_without_any_reference(sample: dict) -> None:
+    bare = {key: value for key, value in sample.items() if key != "points"}
+    _, rows = scores(make_frame(bare), untouched, sample["rig"])
+    assert rows == [{"seen": 1.0}] * 6
+
+
+def test_targets_of_another_road(sample: dict) -> None:
+    """LiDAR points are where the source's road is: a target in its own frame is mounted there first."""
+    rig: Rig = sample["rig"]
+    raised = Rig([c.shifted(z_m=0.4) for c in rig], ground_z_m=rig.ground_z_m + 0.4)
+    frame = make_frame(sample)
+    for raised_row, row in zip(scores(frame, untouched, raised)[1], scores(frame, untouched, rig)[1], strict=True):
+        assert raised_row == pytest.approx(row)
+
+
+def test_regions_are_apart(drive: SyntheticDrive) -> None:
+    for classes in drive.render(0).classes:
+        found = regions(classes.numpy())
+        assert np.array_equal(sum(mask.astype(int) for mask in found.values()), np.ones(SIZE, int))
+        assert not found["sky"][-1].any(), "no sky at the bottom"

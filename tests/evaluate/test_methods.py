@@ -1,0 +1,98 @@
+"""Named methods: the rows of the tables."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.evaluate.baselines import BASELINES, row_split
+from arbiview_aug.evaluate.images import as_arrays
+from arbiview_aug.evaluate.methods import baseline, one_camera, paper_stages, retargeting, study_methods, views_of
+from arbiview_aug.favs.config import PaperConfig
+from arbiview_aug.favs.overlap_depth import overlap_depth
+from arbiview_aug.neighbours import half_way_view
+from arbiview_aug.rig import Rig
+from arbiview_aug.transforms import RigRetarget
+
+
+@pytest.fixture(scope="module")
+def sample() -> dict:
+    return SyntheticDrive(demo_source_rig((48, 132)), num_frames=1)[0]
+
+
+def test_retargeting_is_the_transform(sample: dict) -> None:
+    target = sample["rig"].turned(yaw_deg=10)
+    views = retargeting("fast", "street").render(sample, target)
+    out = RigRetarget(target, surface="street")(sample)
+    for view, image, coverage in zip(views, as_arrays(out["images"]), out["coverage"], strict=True):
+        np.testing.assert_array_equal(view.image, image)
+        np.testing.assert_array_equal(view.coverage, coverage)
+        assert not view.image[~view.coverage].any()
+
+
+def test_names_and_points() -> None:
+    assert retargeting("draft", "ground").name == "draft, ground"
+    assert retargeting(PaperConfig(), name="mine").name == "mine"
+    assert retargeting("fast", "auto").reads_points and not retargeting("fast", "street").reads_points
+    assert not retargeting("paper", "auto").reads_points, "the published stages know rotations only"
+    assert not any(method.reads_points for method in study_methods())
+
+
+def test_rows_of_the_study() -> None:
+    names = [method.name for method in study_methods()]
+    assert names[:3] == list(BASELINES) and {"paper", "draft", "fast", "accurate"} <= set(names)
+    assert len(set(names)) == len(names)
+
+
+def test_stages_are_off_one_at_a_time() -> None:
+    whole = PaperConfig()
+    stages = paper_stages()
+    assert stages["paper"] == whole
+    off = {name: [k for k, v in vars(config).items() if v != getattr(whole, k)] for name, config in stages.items()}
+    assert off["paper without stage 2, matching"] == ["use_feature_matching"]
+    assert off["paper without stage 3, objects"] == ["use_object_alignment"]
+    weights = off["paper without stage 4, weights"]
+    assert len(weights) == 4 and all("weight" in key for key in weights)
+
+
+def test_baselines_take_targets_in_their_own_frame(sample: dict) -> None:
+    rig: Rig = sample["rig"]
+    target = Rig([c.shifted(z_m=0.3) for c in rig], ground_z_m=rig.ground_z_m + 0.3)  # the same place over the road
+    views = baseline("row split").render(sample, target)
+    for view, want in zip(views, row_split(rig, as_arrays(sample["images"]), rig), strict=True):
+        np.testing.assert_array_equal(view.image, want.image)
+
+
+def test_one_camera_keeps_what_the_ego_frame_holds(sample: dict) -> None:
+    alone = one_camera({**sample, "detections": []}, 2)
+    assert alone["rig"].names == [sample["rig"].names[2]] and len(alone["images"]) == 1
+    assert alone["boxes_3d"] is sample["boxes_3d"] and not {"K", "cam2ego", "detections"} & set(alone)
+
+
+@pytest.mark.filterwarnings("ignore:the target rig")
+def test_depth_from_overlap_reaches_a_camera_alone() -> None:
+    """``accurate`` finds depth where two cameras overlap; the view from one of them then knows it."""
+    sample = SyntheticDrive(demo_source_rig((128, 352)), num_frames=1)[0]
+    rig: Rig = sample["rig"]
+    view = rig.with_cameras([half_way_view(rig[0], rig[1], (112, 200))])
+    fast, accurate = retargeting("fast", "street"), retargeting("accurate", "street")
+    assert fast.render_alone is None and accurate.render_alone is not None
+    without = fast.alone(sample, 0, view)
+    (same,) = accurate.render(one_camera(sample, 0), view)
+    np.testing.assert_array_equal(same.image, without.image)
+    corrections = overlap_depth(rig, list(sample["images"])).corrections
+    assert corrections, "some pair is refined"
+    changed = [
+        (accurate.alone(sample, k, view).image != fast.alone(sample, k, view).image).any() for k in range(len(rig))
+    ]
+    assert any(changed)
+
+
+def test_confidence_comes_along() -> None:
+    out = {"images": torch.zeros(1, 3, 4, 5), "coverage": torch.ones(1, 4, 5, dtype=torch.bool)}
+    assert views_of(out)[0].confidence is None
+    (view,) = views_of({**out, "confidence": torch.full((1, 4, 5), 0.25, dtype=torch.float16)})
+    assert view.confidence is not None and view.confidence.dtype == np.float32
+    np.testing.assert_array_equal(view.confidence, 0.25)

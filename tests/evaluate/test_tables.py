@@ -1,0 +1,76 @@
+"""Text tables: what a reader sees of the metrics; sheets."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from arbiview_aug.camera import Camera
+from arbiview_aug.evaluate.images import View
+from arbiview_aug.evaluate.pictures import HOLE
+from arbiview_aug.evaluate.sheet import frame_sheet, hatched_view, left_to_right, shrunk
+from arbiview_aug.evaluate.tables import (
+    OVERLAP_COLUMNS,
+    SEEN,
+    SPARSE_COLUMNS,
+    TRUTH_COLUMNS,
+    Column,
+    cell,
+    text_table,
+)
+from arbiview_aug.rig import Rig
+
+
+def test_cells() -> None:
+    row = {"seen": 0.5, "psnr": 20.126, "ssim": 0.98765}
+    assert cell(row, SEEN) == "50.0%"
+    assert cell(row, Column("PSNR", "psnr")) == "20.13" and cell(row, Column("SSIM", "ssim", 4)) == "0.9877"
+    assert cell(row, Column("absent", "absent")) == "-", "what a row lacks is no zero"
+
+
+def test_layout() -> None:
+    rows = {"a method of some length": {"seen": 1.0}, "b": {"seen": 0.25, "x": 3.0}}
+    table = text_table("Title", rows, [SEEN, Column("a wide heading", "x")], ["a note"])
+    title, head, first, second, note = table.splitlines()
+    assert title == "Title:" and note == "  a note"
+    assert len(head) == len(first) == len(second), "columns line up"
+    assert first.split()[-2:] == ["100.0%", "-"] and second.split() == ["b", "25.0%", "3.00"]
+    assert text_table("Nothing", {}, [SEEN]).count("\n") == 1
+
+
+def test_metrics_are_named_once() -> None:
+    for columns in (TRUTH_COLUMNS, SPARSE_COLUMNS, OVERLAP_COLUMNS):
+        assert len({c.metric for c in columns}) == len(columns)
+
+
+def camera(azimuth_deg: float) -> Camera:
+    return Camera.looking(
+        name=f"at {azimuth_deg:g}",
+        azimuth_deg=azimuth_deg,
+        position_m=(0, 0, 1.5),
+        width_px=60,
+        height_px=40,
+        horizontal_fov_deg=60,
+    )
+
+
+def test_cameras_stand_as_in_a_panorama() -> None:
+    rig = Rig([camera(0), camera(-60), camera(60), camera(180)])
+    assert [rig.names[k] for k in left_to_right(rig)] == ["at 60", "at 0", "at -60", "at 180"]
+
+
+def test_sheets_hatch_only_what_is_unseen() -> None:
+    rig = Rig([camera(0), camera(60)])
+    images = [np.full((40, 60, 3), 90, np.uint8)] * 2
+    seen, half = np.ones((40, 60), bool), np.ones((40, 60), bool)
+    half[:, :30] = False
+    whole = frame_sheet(rig, images, rig, [View(images[0], seen)] * 2, width_px=400)
+    holed = frame_sheet(rig, images, rig, [View(images[0], seen), View(images[0], half)], images, width_px=400)
+    assert not (whole == HOLE).all(-1).any() and (holed == HOLE).all(-1).any()
+    assert holed.shape[0] > 1.7 * whole.shape[0], "two rows more: hatched, and the truth"
+    hatched = (hatched_view(View(images[0], half), 40) == HOLE).all(-1)
+    assert hatched[:, :25].any() and not hatched[:, 35:].any()
+
+
+def test_shrinking_never_enlarges() -> None:
+    assert shrunk(np.zeros((40, 60, 3), np.uint8), 20).shape == (20, 30, 3)
+    assert shrunk(np.zeros((40, 60, 3), np.uint8), 400).shape == (40, 60, 3)
