@@ -92,8 +92,7 @@ class LidarSurface(Dense):
         What is nearer by a tenth of its distance and 0.3 m, as in the evaluation's visibility; and only within
         measured outlines: where the LiDAR is silent nothing hides.
         """
-        view, row, column = self._view(origin, directions)
-        return view.hides(row, column, inverse_distance)
+        return np.asarray(inverse_distance < self.before(origin, directions))
 
     def before(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """Inverse distances (...,) beyond which ``hides`` says that points are hidden, 1/m."""
@@ -107,16 +106,18 @@ class LidarSurface(Dense):
         return np.where(view.is_measured(row, column), _MEASURED_SPREAD * inverse_distance, unknown)
 
     def _located(self, camera: Camera) -> _Located:
-        """Rays to interpolate a camera's pixels between; kept for the next question."""
-        if camera not in self._rays:
-            rays = _Located.of(camera, self._view, max(1, round(CELL_RAD * float(camera.K[0, 0]))))
-            # Columns jump somewhere in a panorama that goes all around; azimuths bend near the zenith, and a lens may
-            # have no rays next to its image.
-            steep = float(np.abs(rays.directions[..., 2]).max()) > _STEEP
-            if rays.step > 1 and (camera.lens != "pinhole" or steep or rays.view.window.is_whole):
-                rays = _Located.of(camera, self._view, 1)
-            self._rays[camera] = rays
-        return self._rays[camera]
+        """Rays to interpolate a camera's pixels between; kept for the next question unless they are all pixels'."""
+        if camera in self._rays:
+            return self._rays[camera]
+        step = max(1, round(CELL_RAD * float(camera.K[0, 0])))
+        # A lens may have no rays next to its image.
+        if step > 1 and camera.lens == "pinhole":
+            rays = _Located.of(camera, self._view, step)
+            # Azimuths bend near the zenith, and columns jump somewhere in a panorama that goes all around.
+            if float(np.abs(rays.directions[..., 2]).max()) <= _STEEP and not rays.view.window.is_whole:
+                self._rays[camera] = rays
+                return rays
+        return _Located.of(camera, self._view, 1)
 
     def _view(self, origin: FloatArray, directions: FloatArray) -> tuple[Panorama, Layer, Layer]:
         """The panorama around a centre that holds the rays, and their rows and columns in it."""

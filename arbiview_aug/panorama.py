@@ -145,12 +145,8 @@ class Panorama:
         near, far, share = (_at(layer, row, column) for layer in (self.near, self.far, self.share))
         return np.where(share > 0.5, near, far)
 
-    def hides(self, row: Layer, column: Layer, inverse_distance: FloatArray) -> BoolArray:
-        """Whether something stands before points (...,): nearer than them by a tenth of its distance and 0.3 m."""
-        return np.asarray(inverse_distance < self.before(row, column))
-
     def before(self, row: Layer, column: Layer) -> Layer:
-        """The inverse distance (...,) at which ``hides`` begins, 1/m; 0 where nothing hides."""
+        """Points of a smaller inverse distance (...,) are hidden, 1/m; 0 where nothing hides."""
         return _at(self.hidden_below, row, column)
 
     def is_measured(self, row: Layer, column: Layer) -> BoolArray:
