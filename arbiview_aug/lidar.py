@@ -6,17 +6,18 @@ No sensor's place is assumed: points are z-buffered and made dense anew for each
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
+import cv2
 import numpy as np
-import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.objects import Objects, within_boxes
 from arbiview_aug.panorama import CELL_RAD, Layer, Panorama, Window, angles, panorama
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn, Shadows, Static, Surface
+from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Dense, Drawn, Shadows, Static
 
 OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
 """(x, y) ranges in the ego frame whose returns are the own car's: a car's about the middle of its rear axle."""
@@ -27,6 +28,9 @@ NEAREST_M = 0.5
 BOX_AIR_M = 0.2
 """Points this far outside a box are its object's too: mirrors, and the noise of points and labels."""
 
+_STEEP = 0.9
+"""Sine of the elevation up to which azimuths are interpolated over 0.2 degrees: 64 degrees."""
+
 _NO_BOX = -2  # in shadows: a point's, no box's
 
 _MEASURED_SPREAD = 0.05
@@ -34,7 +38,7 @@ _MEASURED_SPREAD = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class LidarSurface(Surface):
+class LidarSurface(Dense):
     """Points made dense over the street. Points of the own car are left out.
 
     Attributes:
@@ -42,10 +46,12 @@ class LidarSurface(Surface):
         points: (P, 3) in the ego frame, finite, metres.
     """
 
-    smooth: ClassVar[bool] = True  # away from what ``detailed`` says
+    smooth: ClassVar[bool] = False
     street: Static
     points: FloatArray
     _panoramas: dict[bytes, list[Panorama]] = field(default_factory=dict, repr=False)
+    _shadows: dict[Camera, Shadows] = field(default_factory=dict, repr=False)
+    _rays: dict[Camera, _Located] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", self.points[~own_car(self.points)])
@@ -54,7 +60,29 @@ class LidarSurface(Surface):
         """The points' dense surface, 1/m (...,)."""
         view, row, column = self._view(origin, directions)
         known = self.street.inverse_distance(origin, directions) + view.residual(row, column)
-        return np.clip(known, 0.0, MAX_INVERSE_DISTANCE)
+        return np.asarray(np.clip(known, 0.0, MAX_INVERSE_DISTANCE), np.float64)
+
+    def image(self, camera: Camera) -> Layer:
+        """The points' dense surface at all pixels, 1/m (h, w).
+
+        The street is interpolated between rays a panorama's cell apart: to 0.02 px for a metre of parallax.
+        """
+        rays = self._located(camera)
+        street = self.street.inverse_distance(camera.center_m, rays.directions).astype(np.float32)
+        known = rays.to_pixels(street) + rays.view.residual(rays.to_pixels(rays.row), rays.to_pixels(rays.column))
+        return np.clip(known, 0, np.float32(MAX_INVERSE_DISTANCE), out=known)
+
+    def shadows(self, camera: Camera) -> Shadows:
+        """What is hidden from a source, by ``hides``; kept for the next target."""
+        if camera not in self._shadows:
+            none = np.broadcast_to(np.int32(-1), camera.size)
+            self._shadows[camera] = Shadows(self.before_image(camera), none)
+        return self._shadows[camera]
+
+    def before_image(self, camera: Camera) -> Layer:
+        """``before`` at all pixels of a camera (h, w), interpolated between rays a panorama's cell apart."""
+        rays = self._located(camera)
+        return np.asarray(rays.to_pixels(rays.view.before(rays.row, rays.column)))
 
     def hides(
         self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
@@ -64,24 +92,32 @@ class LidarSurface(Surface):
         What is nearer by a tenth of its distance and 0.3 m, as in the evaluation's visibility; and only within
         measured outlines: where the LiDAR is silent nothing hides.
         """
-        view, row, column = self._view(origin, directions)
-        return view.hides(row, column, inverse_distance)
+        return np.asarray(inverse_distance < self.before(origin, directions))
 
     def before(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """Inverse distances (...,) beyond which ``hides`` says that points are hidden, 1/m."""
         view, row, column = self._view(origin, directions)
-        return view.before(row, column)
-
-    def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
-        """Rays (...,) near an outline or a slope against the street."""
-        view, row, column = self._view(origin, directions)
-        return view.is_detailed(row, column, margin_rad)
+        return view.before(row, column).astype(np.float64)
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Small where a point is near, the street's elsewhere: 1/m (...,)."""
         view, row, column = self._view(origin, directions)
         unknown = self.street.uncertainty(origin, directions, inverse_distance)
         return np.where(view.is_measured(row, column), _MEASURED_SPREAD * inverse_distance, unknown)
+
+    def _located(self, camera: Camera) -> _Located:
+        """Rays to interpolate a camera's pixels between; kept for the next question unless they are all pixels'."""
+        if camera in self._rays:
+            return self._rays[camera]
+        step = max(1, round(CELL_RAD * float(camera.K[0, 0])))
+        # A lens may have no rays next to its image.
+        if step > 1 and camera.lens == "pinhole":
+            rays = _Located.of(camera, self._view, step)
+            # Azimuths bend near the zenith, and columns jump somewhere in a panorama that goes all around.
+            if float(np.abs(rays.directions[..., 2]).max()) <= _STEEP and not rays.view.window.is_whole:
+                self._rays[camera] = rays
+                return rays
+        return _Located.of(camera, self._view, 1)
 
     def _view(self, origin: FloatArray, directions: FloatArray) -> tuple[Panorama, Layer, Layer]:
         """The panorama around a centre that holds the rays, and their rows and columns in it."""
@@ -94,6 +130,43 @@ class LidarSurface(Surface):
             view = panorama(asked.widened(), origin, self.points[~near], self.street)
             held.append(view)
         return view, *view.window.cells(azimuth, elevation)
+
+
+class _Located(NamedTuple):
+    """Rays of a camera about as far apart as a panorama's cells, and where they lie in one.
+
+    Attributes:
+        size: (h, w) of the image.
+        step: Their spacing in pixels; they start one step before the centre of the image's first block.
+        directions: (ny, nx, 3) unit rays in the ego frame.
+        view: The panorama.
+        row: (ny, nx) in it.
+        column: (ny, nx).
+    """
+
+    size: tuple[int, int]
+    step: int
+    directions: FloatArray
+    view: Panorama
+    row: Layer
+    column: Layer
+
+    @classmethod
+    def of(
+        cls, camera: Camera, view: Callable[[FloatArray, FloatArray], tuple[Panorama, Layer, Layer]], step: int
+    ) -> _Located:
+        v, u = (step * np.arange(-1.0, -(-n // step) + 1) + (step - 1) / 2 for n in camera.size)
+        directions, valid = camera.unproject(np.stack(np.meshgrid(u, v), -1))
+        directions = np.where(valid[..., None], directions, camera.cam2ego[:3, 2])
+        return cls(camera.size, step, directions, *view(camera.center_m, directions))
+
+    def to_pixels(self, values: Layer) -> Any:
+        """Bilinear interpolation (ny, nx) to all pixels (h, w)."""
+        s, (h, w) = self.step, self.size
+        enlarged: Any = values
+        if s > 1:
+            enlarged = cv2.resize(values, None, fx=s, fy=s, interpolation=cv2.INTER_LINEAR)
+        return enlarged[s : s + h, s : s + w]
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,19 +190,18 @@ class LidarObjects(Objects):
     def drawn(self, camera: Camera) -> Drawn:
         """The pixels of a camera that show boxes with nothing measured before them."""
         pixel, first, face = super().drawn(camera)
-        shown = first >= self._measured_before(camera, pixel)
+        shown = first >= self.street.before_image(camera).reshape(-1)[pixel]
         return Drawn(pixel[shown], first[shown], face[shown])
 
     def shadows(self, camera: Camera) -> Shadows:
-        """What boxes hide from a source; and what was measured before boxes hides them."""
+        """What boxes hide from a source, and what was measured."""
         new = camera not in self._shadows
         shadows = super().shadows(camera)
         if new:
-            pixel = np.flatnonzero(shadows.solid.reshape(-1) >= 0)
-            before = self._measured_before(camera, pixel)
-            nearer = before > shadows.beyond.reshape(-1)[pixel]
-            shadows.beyond.reshape(-1)[pixel[nearer]] = before[nearer]
-            shadows.solid.reshape(-1)[pixel[nearer]] = _NO_BOX
+            measured = self.street.before_image(camera)
+            nearer = measured > shadows.beyond
+            np.copyto(shadows.beyond, measured, where=nearer)
+            np.copyto(shadows.solid, _NO_BOX, where=nearer)
         return shadows
 
     def hides(
@@ -139,20 +211,9 @@ class LidarObjects(Objects):
         by_box = super().hides(origin, directions, inverse_distance, pixel_rad)
         return by_box | self.street.hides(origin, directions, inverse_distance, pixel_rad)
 
-    def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
-        """Rays (...,) near a box, an outline or a slope against the street."""
-        near_box = super().detailed(origin, directions, margin_rad)
-        return near_box | self.street.detailed(origin, directions, margin_rad)
-
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Small where a point is near, the street's elsewhere: 1/m (...,)."""
         return self.street.uncertainty(origin, directions, inverse_distance)
-
-    def _measured_before(self, camera: Camera, pixel: npt.NDArray[np.int64]) -> FloatArray:
-        """Inverse distances (n,) beyond which pixels of a camera (n,) are hidden by what was measured."""
-        v, u = np.divmod(pixel, camera.width_px)
-        directions, _ = camera.unproject(np.stack([u, v], -1).astype(np.float64))
-        return self.street.before(camera.center_m, directions)
 
 
 def own_car(points: FloatArray) -> BoolArray:

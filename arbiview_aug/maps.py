@@ -1,8 +1,9 @@
 """Where a target camera's pixels lie in a source image, over a surface: cheaply, and to a stated precision.
 
 Maps are evaluated in float64 on the nodes of a coarse grid and interpolated (``arbiview_aug.grid``). Cells whose error
-bound exceeds the tolerance, and cells on the border of what can be projected, are evaluated pixel by pixel. Directions
-are held plane by plane, (3, ny, nx) in memory: three times faster.
+bound exceeds the tolerance, and cells on the border of what can be projected, are evaluated pixel by pixel. Surfaces
+that step anywhere (``Dense``) are evaluated once at every pixel of a target, and every pixel is projected, in float32
+(positions are precise to 1/1000 px). Directions are held plane by plane, (3, ny, nx) in memory: three times faster.
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
+from arbiview_aug.dense import FAR_AWAY_PX, Layer, Planes, cropped, pixel_rays, project_pixels
 from arbiview_aug.grid import HALVINGS, Box, Grid, runs
 from arbiview_aug.sampling import Slot, halved, level_size
-from arbiview_aug.surface import Layered, Shadows, Static, Surface
+from arbiview_aug.surface import Dense, Layered, Shadows, Static, Surface
 
 _SAFETY = 2.0  # curvature between the nodes may exceed what the nodes show
 _CORNERS = tuple((a, b) for a in (slice(None, -1), slice(1, None)) for b in (slice(None, -1), slice(1, None)))
@@ -28,7 +30,9 @@ _SHADOW_TILE_PX = 8
 _LEAST_INCIDENCE = 0.05
 """Sine of the flattest angle at which a source may look along a face: that of the road 30 m from a car's cameras."""
 
-_FAR_AWAY_PX = 1e5  # float32 maps stay precise and int16 conversion saturates harmlessly
+_MORE_NODES = 2
+"""Between nodes a dense surface may be nearer than on any: a source may see a post, and nothing of what is around it.
+16 px are the parallax for a metre between 20 and 50 m at a focal length of 530."""
 
 
 class SolidPixels(NamedTuple):
@@ -63,15 +67,11 @@ class TargetRays:
         self._inverse: dict[Surface, FloatArray] = {}
         self._uncertainty: dict[Surface, FloatArray] = {}
         self._solids: dict[Layered, SolidPixels] = {}
+        self._dense: dict[Dense, Layer] = {}
         ny, nx = self.grid.shape
         self.sparse_index = np.ix_(np.unique(np.r_[0:ny:4, ny - 1]), np.unique(np.r_[0:nx:4, nx - 1]))
         planes = np.ascontiguousarray(np.moveaxis(self.directions[self.sparse_index], -1, 0))
         self.sparse = np.moveaxis(planes, 0, -1), self.valid[self.sparse_index]
-
-    @cached_property
-    def spacing_rad(self) -> float:
-        """Largest angle between neighbouring nodes' rays."""
-        return float(np.sqrt((np.diff(self.directions, axis=1) ** 2).sum(-1)).max(initial=0.0))
 
     def inverse_distance(self, surface: Surface) -> FloatArray:
         """(ny, nx) on the nodes; evaluated once for each surface."""
@@ -116,6 +116,20 @@ class TargetRays:
             self.counters["solid_pixels"] += len(pixels)
         return self._solids[surface]
 
+    @cached_property
+    def planes(self) -> Planes:
+        """Rays of all pixels."""
+        return pixel_rays(self.camera)
+
+    def dense(self, surface: Dense) -> Layer:
+        """Inverse distances (h, w) along ``planes``, in their lengths; evaluated once for each surface."""
+        if surface not in self._dense:
+            x, y, z = self.planes
+            q = surface.image(self.camera) * np.sqrt(x * x + (y * y + z * z))
+            self._dense[surface] = q
+            self.counters["dense_pixels"] += q.size
+        return self._dense[surface]
+
 
 class PairMap:
     """Where one source sees one target.
@@ -139,20 +153,23 @@ class PairMap:
             return
         q = rays.inverse_distance(self.surface)
         points = _source_points(source, rays.directions, q, self.offset_m)
-        self.uv, self.valid = self._seen(rays.directions, q, points)
+        self.uv, _, self.valid = source.project_cam(points)
         self.valid &= rays.valid
+        self._shaded = isinstance(self.surface, Dense) or self.solids is not None
         self._exact = np.zeros((0, 0), bool)
         self._use: BoolArray | None = None
         self._whole: BoolArray | None = None
         self._fine: tuple[Slot, npt.NDArray[np.float32]] | None = None
         self._near_shadow: BoolArray | None = None
         self._light: dict[int, tuple[Shadows, BoolArray]] = {}
-        if self.solids is not None and not isinstance(self.surface, Static):
+        if self._shaded and not isinstance(self.surface, Static):
             self._from_source_q = (q / np.maximum(np.sqrt((points * points).sum(-1)), 1e-300)).astype(np.float32)
         if rays.grid.step == 1:
             self.nodes = _bounds(self.valid & source.contains(self.uv), 0)
         else:
             self.nodes = self._classify(points)
+            if isinstance(self.surface, Dense):
+                self._every_pixel()
         self.nodes = _around(self.nodes, seen_solids)
 
     def _look_apart(self) -> bool:
@@ -181,12 +198,20 @@ class PairMap:
 
     def _classify(self, points: FloatArray) -> Box | None:
         """Sort the cells: seeing nothing, whole, on a border of validity. Returns the nodes around those in use."""
-        self._whole, border = self._cells_that_may_see(points, self.uv, self.valid, self._detailed)
+        self._whole, border = self._cells_that_may_see(points, self.uv, self.valid)
         use = self._whole | border
         # Invalid nodes hold placeholders that may lie inside the image.
         self._use = None if self.valid.all() else use
         self._exact = border
         return _bounds(use, 1)
+
+    def _every_pixel(self) -> None:
+        """Interpolate nothing; look a little farther: between nodes the surface may come nearer than it is on them."""
+        self._whole = self._use = None
+        self._exact = np.zeros_like(self._exact)
+        if self.nodes is not None:
+            (j0, j1, i0, i1), (ny, nx), more = self.nodes, self.rays.grid.shape, _MORE_NODES
+            self.nodes = max(j0 - more, 0), min(j1 + more, ny - 1), max(i0 - more, 0), min(i1 + more, nx - 1)
 
     def set_tolerance(self, tolerance_px: float) -> None:
         """Mark the cells whose interpolation may be off by more than this, in source pixels, for exact evaluation."""
@@ -200,9 +225,7 @@ class PairMap:
         counters["cells_exact"] += exact
         counters["cells_interpolated"] += int(np.count_nonzero(self._whole & ~self._exact))
 
-    def _cells_that_may_see(
-        self, points: FloatArray, uv: FloatArray, valid: BoolArray, detailed: BoolArray | None = None
-    ) -> tuple[BoolArray, BoolArray]:
+    def _cells_that_may_see(self, points: FloatArray, uv: FloatArray, valid: BoolArray) -> tuple[BoolArray, BoolArray]:
         """Cells whose corners are valid and not all beyond one side of the image; such cells with an invalid corner."""
         beyond = beyond_image(self.source, points, uv, valid)
         sides = [beyond[c] for c in _CORNERS]
@@ -215,8 +238,6 @@ class PairMap:
         near = cv2.dilate(touched, np.ones((3, 3), np.uint8)) > 0
         if self.source.lens != "pinhole":
             near |= self._cells_near_lens(points)
-        if detailed is not None:
-            near |= detailed  # a gap between two objects may lie between hidden corners
         return use & all_valid, use & ~all_valid & near
 
     def _cells_near_lens(self, points: FloatArray) -> BoolArray:
@@ -258,60 +279,25 @@ class PairMap:
             mean = sum(uv[c] for c in _CORNERS) / 4
             cell = np.maximum(cell, 4 * _larger(mean - centre))
         bound[j0:j1, i0:i1] = cell
-        too_curved = bound > tolerance_px
-        return too_curved if self._detailed is None else too_curved | self._detailed
-
-    @cached_property
-    def _detailed(self) -> BoolArray | None:
-        """Cells (ny - 1, nx - 1) so near to the surface's detail, as target or source see it, that they could miss it.
-
-        They include those whose cubic neighbours could: a node reaches three cells away through two halvings.
-        """
-        if isinstance(self.surface, Static):
-            return None
-        target = self.rays.camera.center_m
-        near = self.surface.detailed(target, self.rays.directions, self.rays.spacing_rad)
-        # What the source does not show need not be asked about: the nodes inside its image, and some around them.
-        shown = cv2.dilate(self.source.contains(self.uv).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-        j0, j1, i0, i1 = _bounds(shown, 1) or (0, *shown.shape[:1], 0, shown.shape[1])
-        part = slice(j0, j1), slice(i0, i1)
-        towards, _ = self._from_source(self.rays.directions[part], self.rays.inverse_distance(self.surface)[part])
-        near[part] |= self.surface.detailed(self.source.center_m, towards, self.rays.spacing_rad)
-        return cv2.dilate(near.astype(np.uint8), np.ones((8, 8), np.uint8), anchor=(3, 3))[:-1, :-1] > 0
+        return np.asarray(bound > tolerance_px)
 
     def _evaluate(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Source pixels of target pixels (..., 2) in float64, and where they are valid."""
         directions, ray_valid = ego_rays(self.rays.camera, pixels)
         q = self.surface.inverse_distance(self.rays.camera.center_m, directions)
-        uv, valid = self._seen(directions, q, _source_points(self.source, directions, q, self.offset_m))
+        uv, valid = project_rays(self.source, directions, q, self.offset_m)
         return uv, valid & ray_valid
-
-    def _seen(self, directions: FloatArray, q: FloatArray, points: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Source pixels of scene points, valid where the scene does not hide them from the source."""
-        uv, _, valid = self.source.project_cam(points)
-        if isinstance(self.surface, Static):
-            return uv, valid
-        shown = valid & self.source.contains(uv)  # what lies beside the image need not be asked about
-        if shown.any():
-            towards, from_source = self._from_source(directions[shown], q[shown])
-            pixel_rad = 1 / self.source.K[0, 0]
-            valid[shown] = ~self.surface.hides(self.source.center_m, towards, from_source, pixel_rad)
-        return uv, valid
-
-    def _from_source(self, directions: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Unit rays (..., 3) from the source to scene points on target rays, and inverse distances along them."""
-        towards = directions + q[..., None] * self.offset_m  # scaled by q
-        length = np.sqrt((towards * towards).sum(-1))
-        return towards / length[..., None], q / length
 
     def visible_nodes(self, level: int) -> BoolArray:
         """Nodes (ny, nx) whose scene point the source sees when its image is halved ``level`` times."""
-        if self.solids is None or not isinstance(self.whole_surface, Layered):
+        if not self._shaded:
             return self.valid
         shadows, lit = self._in_light(level)
         pixel, inside = _nearest_pixel(shadows.beyond, _at_level(self.uv, level))
         beyond = 0 if isinstance(self.surface, Static) else self._from_source_q
         free = self.valid & ~(inside & (shadows.beyond[pixel] > beyond))
+        if self.solids is None or not isinstance(self.whole_surface, Layered):
+            return free
         on_solid = self.rays.at_nodes(255 - self.rays.solids(self.whole_surface).free) > 0
         seen = np.zeros(self.rays.camera.size, bool)
         px, py = self.solids.pixels.T
@@ -321,9 +307,12 @@ class PairMap:
     def _in_light(self, level: int) -> tuple[Shadows, BoolArray]:
         """The source's shadow images when it is halved ``level`` times, and which of ``solids`` (n,) it sees."""
         if level not in self._light:
-            assert self.solids is not None and isinstance(self.whole_surface, Layered)
+            assert isinstance(self.whole_surface, Layered | Dense)
             shadows = self.whole_surface.shadows(_halved_camera(self.source, level))
-            self._light[level] = shadows, self.solids.lit(shadows, _at_level(self.solids.uv, level))
+            lit = np.zeros(0, bool)
+            if self.solids is not None:
+                lit = self.solids.lit(shadows, _at_level(self.solids.uv, level))
+            self._light[level] = shadows, lit
         return self._light[level]
 
     def full_resolution(
@@ -345,8 +334,14 @@ class PairMap:
         if grid.step == 1:
             y0, y1, x0, x1 = grid.pixels(nodes)
             at = slot.from_source(self.uv[y0:y1, x0:x1]).astype(np.float32)
-            at[~self.valid[y0:y1, x0:x1]] = -_FAR_AWAY_PX
+            at[~self.valid[y0:y1, x0:x1]] = -FAR_AWAY_PX
+            q = self._from_source_q[y0:y1, x0:x1] if isinstance(self.surface, Dense) else None
+        elif isinstance(self.surface, Dense):
+            box = grid.pixels(nodes)
+            known = self.rays.dense(self.surface)[box[0] : box[1], box[2] : box[3]]
+            at, q = project_pixels(cropped(self.rays.planes, box), known, self.rays.camera, source, slot)
         else:
+            q = None
             if self._fine is None or self._fine[0] != slot:
                 self._fine = slot, grid.refined(slot.from_source(self.uv).astype(np.float32), self.nodes)
             at = grid.upsample_refined(self._fine[1], self.nodes, rows)
@@ -360,6 +355,9 @@ class PairMap:
         visible: Any = cv2.inRange(at, tuple(low), tuple(high))
         if self._use is not None:
             visible &= grid.cells_to_pixels(self._use, nodes)
+        if q is not None:
+            beyond = self._in_light(slot.level)[0].beyond
+            visible &= cv2.compare(_read_nearest(beyond, at, slot), q, cv2.CMP_LE).astype(np.uint8)
         if self.solids is not None:
             self._put_solids(at, visible, nodes, slot)
         if source.mask is not None:
@@ -379,8 +377,7 @@ class PairMap:
         for part in self._parts_near_shadow(shadows.beyond, nodes, slot.level):
             t, b, le, r = grid.pixels(part)
             here = slice(t - y0, b - y0), slice(le - x0, r - x0)
-            local = at[here] - np.array([slot.x, slot.y], np.float32)
-            first: Any = cv2.remap(shadows.beyond, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
+            first = _read_nearest(shadows.beyond, at[here], slot)
             beyond: Any = 0 if isinstance(self.surface, Static) else grid.upsample(self._from_source_q, part)
             visible[here] *= first <= beyond  # not cv2.compare: to it a part of one or four pixels is a scalar
         visible &= self.rays.solids(self.whole_surface).free[y0:y1, x0:x1]
@@ -393,6 +390,8 @@ class PairMap:
 
     def _parts_near_shadow(self, shadow: npt.NDArray[np.float32], nodes: Box, level: int) -> Iterator[Box]:
         """The parts of a strip, between its rows of nodes, whose background may be read in a shadow."""
+        if isinstance(self.surface, Dense):
+            return  # shaded already
         if self.rays.grid.step == 1:
             yield nodes
             return
@@ -431,8 +430,8 @@ class PairMap:
         start, stop = np.searchsorted(pixels[:: step**2, 1], [first + step * j0, first + step * j1]) * step**2
         px, py = pixels[start:stop].T
         inside = (py >= y0) & (py < y1) & (px >= x0) & (px < x1)
-        exact = np.clip(slot.from_source(uv[start:stop][inside]), -_FAR_AWAY_PX, _FAR_AWAY_PX)
-        exact = np.where(valid[start:stop][inside, None], exact, -_FAR_AWAY_PX)
+        exact = np.clip(slot.from_source(uv[start:stop][inside]), -FAR_AWAY_PX, FAR_AWAY_PX)
+        exact = np.where(valid[start:stop][inside, None], exact, -FAR_AWAY_PX)
         at[py[inside] - y0, px[inside] - x0] = exact
 
 
@@ -526,6 +525,12 @@ def _tiles_between(position: FloatArray, count: int) -> tuple[npt.NDArray[np.int
     low, high = (f(f(corners[0], corners[1]), f(corners[2], corners[3])) for f in (np.minimum, np.maximum))
     first, last = np.floor(low - slack), np.floor(high + slack) + 1
     return first.clip(0, count).astype(np.int64), last.clip(0, count).astype(np.int64)
+
+
+def _read_nearest(image: Layer, at: Layer, slot: Slot) -> Any:
+    """Values (h, w) of a source's image at the pixels nearest to atlas positions (h, w, 2), 0 outside it."""
+    local = at - np.array([slot.x, slot.y], np.float32)
+    return cv2.remap(image, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
 
 
 def _nearest_pixel(image: npt.NDArray[Any], at: FloatArray) -> tuple[tuple[Any, Any], BoolArray]:
@@ -631,7 +636,7 @@ def edge_distance(source: Camera, uv: FloatArray) -> FloatArray:
     free = np.pad((coarse >= 1).astype(np.uint8), 1, constant_values=1)
     distance = cv2.distanceTransform(free, cv2.DIST_L2, 3)[1:-1, 1:-1]
     distance = np.minimum(distance, 1e6) * 8  # it is the largest float where nothing is masked
-    index = np.clip(np.clip(uv, -8, _FAR_AWAY_PX) / 8, 0, (coarse.shape[1] - 1, coarse.shape[0] - 1)).astype(np.int64)
+    index = np.clip(np.clip(uv, -8, FAR_AWAY_PX) / 8, 0, (coarse.shape[1] - 1, coarse.shape[0] - 1)).astype(np.int64)
     return np.where(edge >= 0, np.minimum(edge, distance[index[..., 1], index[..., 0]]), edge)
 
 

@@ -176,8 +176,10 @@ def _first_face(
 def within_boxes(boxes: FloatArray, points: FloatArray, air_m: float = 0.0) -> BoolArray:
     """(P,) points that lie in any box (B, 7), or no farther than ``air_m`` beside its faces."""
     within = np.zeros(len(points), bool)
+    x, y = np.ascontiguousarray(points[:, :2].T)
     for box in boxes:
-        near = np.flatnonzero(np.abs(points - box[:3]).max(1) <= np.linalg.norm(box[3:6]) / 2 + 2 * air_m)
+        reach_m = float(np.hypot(box[3], box[4])) / 2 + 2 * air_m
+        near = np.flatnonzero((np.abs(x - box[0]) <= reach_m) & (np.abs(y - box[1]) <= reach_m))
         within[near] |= np.all(np.abs(_in_box_frame(box, points[near] - box[:3])) <= box[3:6] / 2 + air_m, axis=1)
     return within
 

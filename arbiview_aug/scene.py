@@ -66,7 +66,10 @@ class Scene:
         if name == "objects" and self.boxes is not None:
             return Objects(street, self.boxes)
         if name == "lidar" and self.points is not None:
-            if self.boxes is not None and len(self.boxes):
+            some_boxes = self.boxes is not None and len(self.boxes) > 0
+            if len(self.points) == 0:
+                return self.surface("objects" if some_boxes else "street", ground_z_m)
+            if self.boxes is not None and some_boxes:
                 return LidarObjects.among(street, self.points, self.boxes)
             return LidarSurface(street, self.points)
         raise ValueError(f"surface: {name!r} is unknown, or the scene has no geometry for it")

@@ -32,8 +32,7 @@ class Surface(ABC):
     """What a ray meets, seen from any centre; hashable.
 
     Attributes:
-        smooth: Without creases (away from ``detailed`` rays): a map over it may be interpolated by what its values on
-            a grid show.
+        smooth: Without creases: a map over it may be interpolated by what its values on a grid show.
     """
 
     smooth: ClassVar[bool]
@@ -59,10 +58,6 @@ class Surface(ABC):
             inverse_distance: (...,) of the points along them, 1/m.
             pixel_rad: Angle of one of the source's pixels.
         """
-
-    @abstractmethod
-    def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
-        """Rays (...,) that pass some detail within an angle, where nothing may be interpolated."""
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Mean error (...,) in 1/m to expect of this surface's ``inverse_distance``.
@@ -129,18 +124,26 @@ class Layered(Surface):
         """
 
 
+class Dense(Surface):
+    """A surface that may step anywhere: it is evaluated at every pixel, and never interpolated between coarse nodes."""
+
+    @abstractmethod
+    def image(self, camera: Camera) -> npt.NDArray[np.float32]:
+        """Inverse distances (h, w) along the rays of a camera's pixel centres, 1/m."""
+
+    @abstractmethod
+    def shadows(self, camera: Camera) -> Shadows:
+        """What the surface hides from a source."""
+
+
 class Static(Surface):
-    """A surface without objects: it hides nothing from any camera, and has no detail; equal for the same scene."""
+    """A surface without objects: it hides nothing from any camera; equal for the same scene."""
 
     def hides(
         self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
     ) -> BoolArray:
         """Nothing (...,)."""
         return np.zeros(inverse_distance.shape, bool)
-
-    def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
-        """Nowhere (...,)."""
-        return np.zeros(directions.shape[:-1], bool)
 
 
 @dataclass(frozen=True)

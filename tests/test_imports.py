@@ -29,6 +29,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("favs.feature_matching",),
     ("favs.object_alignment",),
     ("favs.paper",),
+    ("dense",),
     ("maps",),
     ("favs.photometric", "confidence"),
     ("favs.overlap_depth",),

@@ -38,6 +38,7 @@ from arbiview_aug.evaluate.sparse import coloured_points, equalised, sparse_metr
 from arbiview_aug.evaluate.targets import UP_M, paper_targets, shifted_target
 from arbiview_aug.evaluate.truth import truth_metrics
 from arbiview_aug.favs.config import FavsConfig, PaperConfig
+from arbiview_aug.favs.overlap_depth import RefinementCache
 from arbiview_aug.rig import Rig
 from arbiview_aug.transforms import RigRetarget
 
@@ -62,8 +63,10 @@ ROWS: dict[str, dict[str, Any]] = {
     "fast on the street surface": {"quality": "fast", "surface": "street"},
     "fast without blended seams": {"quality": FavsConfig(seam_width=0.0)},
     "fast, harmonised": {"quality": "fast", "harmonise": True},
+    "accurate": {"quality": "accurate"},
+    "accurate, depth held": {"quality": "accurate", "refinement": True},
 }
-"""Settings of ``RigRetarget`` by name."""
+"""Settings of ``RigRetarget`` by name; ``refinement``: with a cache of its own."""
 
 OWN_CAMERA = "own camera only, far surface"
 """A row of its own: each target view from the source camera that it was made of."""
@@ -237,7 +240,10 @@ def _row(name: str, work: _Work) -> dict[str, float]:
 
 
 def _rendered(name: str, work: _Work, target: Rig) -> tuple[list[Image], list[BoolArray], float]:
-    retarget = RigRetarget(target, **ROWS[name])
+    settings = ROWS[name]
+    if "refinement" in settings:
+        settings = {**settings, "refinement": RefinementCache()}
+    retarget = RigRetarget(target, **settings)
     if not isinstance(retarget.config, PaperConfig):  # which plans nothing
         retarget(work.sample)
     start = time.process_time()

@@ -32,7 +32,7 @@ from arbiview_aug.scene import Scene
 from arbiview_aug.surface import Surface
 from arbiview_aug.transforms import RigRetarget
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.acceptance, pytest.mark.timeout(900)]
 
 FRAMES = ("nuscenes-one", "ddad-one")
 QUALITIES: tuple[Quality, ...] = ("fast", "accurate")

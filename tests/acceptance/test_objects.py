@@ -33,7 +33,7 @@ from arbiview_aug.plan import build_plan
 from arbiview_aug.scene import Scene as Geometry
 from arbiview_aug.surface import Street
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.acceptance, pytest.mark.timeout(900)]
 
 SEEDS = range(20)
 SIZE = (256, 704)

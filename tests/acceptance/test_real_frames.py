@@ -28,7 +28,7 @@ from arbiview_aug.rig import Rig
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.transforms import RigRetarget
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.acceptance, pytest.mark.timeout(600)]
 
 FRAMES = ("nuscenes-one", "ddad-one")
 SCALE = 0.5

@@ -1,0 +1,87 @@
+"""Scene points of all pixels of a target, projected into a source: in float32, three planes of numbers at a time.
+
+For surfaces that step anywhere nothing can be interpolated between coarse nodes, so every pixel is projected. A
+pinhole's rays need no memory: their planes are a row and a column that broadcast. Positions in images of 1600 px are
+within 1/500 px of float64.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from arbiview_aug.camera import Camera
+from arbiview_aug.grid import Box
+from arbiview_aug.sampling import Slot
+
+Layer = npt.NDArray[np.float32]
+
+Planes = tuple[Layer, Layer, Layer]
+"""x, y and z (h, w) in a camera's frame, or what broadcasts to (h, w)."""
+
+FAR_AWAY_PX = 1e5  # float32 maps stay precise and int16 conversion saturates harmlessly
+
+
+def pixel_rays(camera: Camera) -> Planes:
+    """Rays of all pixels: a pinhole's have z = 1, those of lenses unit length; 0 where there is none."""
+    h, w = camera.size
+    if camera.lens != "pinhole":
+        rays, valid = camera.unproject_cam(camera.pixel_grid())
+        x, y, z = (np.where(valid, rays[..., k], 0).astype(np.float32) for k in range(3))
+        return x, y, z
+    K = camera.K
+    v = ((np.arange(h) - K[1, 2]) / K[1, 1])[:, None]
+    u = ((np.arange(w) - K[0, 2]) / K[0, 0])[None]
+    x = u - K[0, 1] / K[0, 0] * v if K[0, 1] else u
+    return x.astype(np.float32), v.astype(np.float32), np.ones((1, 1), np.float32)
+
+
+def cropped(planes: Planes, box: Box) -> Planes:
+    """The planes of a box of pixels."""
+    y0, y1, x0, x1 = box
+
+    def part(p: Layer) -> Layer:
+        rows = slice(y0, y1) if len(p) > 1 else slice(None)
+        return p[rows, x0:x1] if p.shape[1] > 1 else p[rows]
+
+    x, y, z = map(part, planes)
+    return x, y, z
+
+
+def project_pixels(
+    planes: Planes, inverse_distance: Layer, target: Camera, source: Camera, slot: Slot
+) -> tuple[Layer, Layer]:
+    """Where a source sees scene points.
+
+    Args:
+        planes: Rays of the target's pixels, (h, w).
+        inverse_distance: (h, w) along them, in their lengths per metre: infinity is 0.
+        target: The camera whose pixels they are.
+        source: The camera that recorded the image.
+        slot: Where its image lies in the atlas.
+
+    Returns:
+        Atlas positions (h, w, 2), far away where the source cannot project a point, and inverse distances (h, w) of the
+        points from the source, 1/m.
+    """
+    q = inverse_distance
+    to_source = source.cam2ego[:3, :3].T
+    turn = (to_source @ target.cam2ego[:3, :3]).astype(np.float32)
+    offset = (to_source @ (target.center_m - source.center_m)).astype(np.float32)
+    a, b, c = planes
+    # The points times q.
+    x, y, z = (turn[k, 0] * a + (turn[k, 1] * b + turn[k, 2] * c) + offset[k] * q for k in range(3))
+    from_source = q / np.maximum(np.sqrt(x * x + y * y + z * z), np.float32(1e-30))
+    at = np.empty((*q.shape, 2), np.float32)
+    if source.lens == "pinhole":
+        valid = z > 1e-6
+        K, shrink, first = source.K.astype(np.float32), 2.0**-slot.level, slot.from_source(source.K[:2, 2])
+        scale = np.float32(shrink) / np.where(valid, z, np.float32(1))
+        at[..., 0] = (K[0, 0] * x + K[0, 1] * y if K[0, 1] else K[0, 0] * x) * scale + np.float32(first[0])
+        at[..., 1] = K[1, 1] * y * scale + np.float32(first[1])
+    else:
+        uv, _, valid = source.project_cam(np.stack([x, y, z], -1).astype(np.float64))
+        at[:] = slot.from_source(uv)
+    np.clip(at, -FAR_AWAY_PX, FAR_AWAY_PX, out=at)
+    at[~valid] = -FAR_AWAY_PX
+    return at, from_source
