@@ -182,7 +182,8 @@ class RigRetarget(torch.nn.Module):
         settings = (
             f"surface={self.stitcher.surface}, harmonise={self.stitcher.harmoniser}, size={self.size}, p={self.p:g}"
         )
-        return f"target={target}, {settings}, {self.config}"
+        held = "" if how.refinement is None else f"refinement={how.refinement!r}, "
+        return f"target={target}, {settings}, {held}{self.config}"
 
     # --- the transform --------------------------------------------------------------------------------------------
     def forward(self, sample: Mapping[str, Any], params: Mapping[str, float] | None = None) -> dict[str, Any]:

@@ -68,6 +68,13 @@ ROWS: dict[str, dict[str, Any]] = {
 }
 """Settings of ``RigRetarget`` by name; ``refinement``: with a cache of its own."""
 
+
+def settings_of(name: str) -> dict[str, Any]:
+    """A row's arguments of ``RigRetarget``."""
+    settings = ROWS[name]
+    return {**settings, "refinement": RefinementCache()} if "refinement" in settings else settings
+
+
 OWN_CAMERA = "own camera only, far surface"
 """A row of its own: each target view from the source camera that it was made of."""
 
@@ -240,10 +247,7 @@ def _row(name: str, work: _Work) -> dict[str, float]:
 
 
 def _rendered(name: str, work: _Work, target: Rig) -> tuple[list[Image], list[BoolArray], float]:
-    settings = ROWS[name]
-    if "refinement" in settings:
-        settings = {**settings, "refinement": RefinementCache()}
-    retarget = RigRetarget(target, **settings)
+    retarget = RigRetarget(target, **settings_of(name))
     if not isinstance(retarget.config, PaperConfig):  # which plans nothing
         retarget(work.sample)
     start = time.process_time()

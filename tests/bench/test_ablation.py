@@ -9,13 +9,13 @@ import pytest
 
 from arbiview_aug import RigRetarget
 from arbiview_aug.__main__ import main
-from arbiview_aug.bench.ablation import OWN_CAMERA, ROWS, measure, table
+from arbiview_aug.bench.ablation import OWN_CAMERA, ROWS, measure, settings_of, table
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.favs.config import PaperConfig
 
 
 def test_rows_are_settings_and_no_two_are_alike() -> None:
-    built = [RigRetarget(demo_source_rig((32, 88)), **settings) for settings in ROWS.values()]
+    built = [RigRetarget(demo_source_rig((32, 88)), **settings_of(name)) for name in ROWS]
     assert len({repr(retarget) for retarget in built}) == len(ROWS)
     switched = {name for name in PaperConfig.__dataclass_fields__ if name.startswith("use_")}
     off = {
