@@ -179,9 +179,8 @@ class RigRetarget(torch.nn.Module):
     def extra_repr(self) -> str:
         """Target and settings, for ``repr``."""
         target = self.target if isinstance(self.target, RandomRig) else (self.target.name or "unnamed rig")
-        settings = (
-            f"surface={self.stitcher.surface}, harmonise={self.stitcher.harmoniser}, size={self.size}, p={self.p:g}"
-        )
+        how = self.stitcher
+        settings = f"surface={how.surface}, harmonise={how.harmoniser}, size={self.size}, p={self.p:g}"
         held = "" if how.refinement is None else f"refinement={how.refinement!r}, "
         return f"target={target}, {settings}, {held}{self.config}"
 
