@@ -180,9 +180,10 @@ class Stitcher:
             return None
         if self.surface == "auto" and not needs_geometry(frame.rig, target, config):
             return None
+        boxes = scene.boxes if surface == "objects" else None
         if self.refinement is None:
-            return overlap_depth(frame.rig, frame.images)
-        return self.refinement.get((frame.rig.content_key, name), lambda: overlap_depth(frame.rig, frame.images))
+            return overlap_depth(frame.rig, frame.images, boxes)
+        return self.refinement.get((frame.rig.content_key, name), lambda: overlap_depth(frame.rig, frame.images, boxes))
 
     # --- images -------------------------------------------------------------------------------------------------------
     def render(

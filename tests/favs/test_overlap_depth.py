@@ -17,6 +17,7 @@ from arbiview_aug.neighbours import half_way_view
 from arbiview_aug.refined import Correction, Refined
 from arbiview_aug.rig import Rig
 from arbiview_aug.scene import Scene
+from arbiview_aug.solids import draw_boxes
 from arbiview_aug.surface import Static, Street
 from arbiview_aug.transforms import RigRetarget
 
@@ -174,6 +175,30 @@ def test_floats_say_the_same(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
     images, depth = nearer
     floats = overlap_depth(RIG, images.float() / 255)
     assert np.abs(floats.corrections[0].change - depth.corrections[0].change).max() < 0.05
+
+
+def test_labelled_objects_are_not_measured(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
+    """One that fills the overlap leaves nothing to measure."""
+    images, depth = nearer
+    view = half_way_view(RIG[0], RIG[1], SIZE)
+    box = np.array([[15.0, 0.0, 1.0, 4, 1.5, 2, 0]])
+    shown = draw_boxes(view, box).pixel
+    assert len(shown) > 200
+    (correction,) = overlap_depth(RIG, images, box).corrections
+    assert correction.key != depth.corrections[0].key
+    full = np.array([[12.0, 0.0, 0.0, 1, 40, 40, 0]])
+    (report,) = overlap_depth(RIG, images, full).reports
+    assert not report.accepted and "too little" in report.reason
+    none = overlap_depth(RIG, images, np.zeros((0, 7)))
+    assert none.corrections[0].key == depth.corrections[0].key
+
+
+def test_boxes_matter_where_they_are_solids(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
+    images, _ = nearer
+    sample = {"images": images, "boxes_3d": np.array([[12.0, 0.0, 0.0, 1, 40, 40, 0]])}
+    for surface, accepted in (("objects", False), ("auto", False), ("street", True)):
+        depth = RigRetarget(TARGET, source_rig=RIG, quality="accurate", surface=surface).explain(sample).depth  # type: ignore[arg-type]
+        assert depth is not None and depth.reports[0].accepted is accepted
 
 
 # --- the surface ------------------------------------------------------------------------------------------------------
