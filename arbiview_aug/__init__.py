@@ -4,6 +4,7 @@ from arbiview_aug.camera import Camera
 from arbiview_aug.datasets.wrappers import RetargetedDataset, RetargetedIterable
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, SampleTypeError
 from arbiview_aug.favs.config import FavsConfig, PaperConfig
+from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.random_rig import RandomRig
 from arbiview_aug.rig import Rig, load_rig, shipped_rigs
 from arbiview_aug.transforms import RigRetarget
@@ -16,6 +17,7 @@ __all__ = [
     "FavsConfig",
     "PaperConfig",
     "RandomRig",
+    "RefinementCache",
     "RetargetedDataset",
     "RetargetedIterable",
     "Rig",

@@ -9,126 +9,28 @@ that step anywhere (``Dense``) are evaluated once at every pixel of a target, an
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
-from arbiview_aug.dense import FAR_AWAY_PX, Layer, Planes, cropped, pixel_rays, project_pixels
-from arbiview_aug.grid import HALVINGS, Box, Grid, runs
-from arbiview_aug.sampling import Slot, halved, level_size
+from arbiview_aug.dense import FAR_AWAY_PX, cropped, project_pixels
+from arbiview_aug.grid import HALVINGS, Box, runs
+from arbiview_aug.projection import CORNERS, beyond_image, ego_rays, larger, mask_at, project_rays, source_points
+from arbiview_aug.sampling import Slot
+from arbiview_aug.shadowing import SeenSolids, at_level, cells_near_shadow, halved_camera, nearest_pixel, read_nearest
 from arbiview_aug.surface import Dense, Layered, Shadows, Static, Surface
+from arbiview_aug.target_rays import TargetRays
 
 _SAFETY = 2.0  # curvature between the nodes may exceed what the nodes show
-_CORNERS = tuple((a, b) for a in (slice(None, -1), slice(1, None)) for b in (slice(None, -1), slice(1, None)))
-_SHADOW_TILE_PX = 8
-_LEAST_INCIDENCE = 0.05
-"""Sine of the flattest angle at which a source may look along a face: that of the road 30 m from a car's cameras."""
 
 _MORE_NODES = 2
 """Between nodes a dense surface may be nearer than on any: a source may see a post, and nothing of what is around it.
 16 px are the parallax for a metre between 20 and 50 m at a focal length of 530."""
-
-
-class SolidPixels(NamedTuple):
-    """The pixels of an image that show solids of a ``Layered`` surface, row by row.
-
-    Attributes:
-        free: (h, w) uint8, 255 at all other pixels.
-        pixels: (n, 2) int64.
-        directions: (n, 3) unit rays in the ego frame.
-        inverse_distance: (n,) 1/m.
-        face: (n,) as in ``Drawn``.
-    """
-
-    free: npt.NDArray[np.uint8]
-    pixels: npt.NDArray[np.int64]
-    directions: FloatArray
-    inverse_distance: FloatArray
-    face: npt.NDArray[np.int32]
-
-
-class TargetRays:
-    """A target camera's viewing rays on the nodes of its grid, and where they meet each surface asked for.
-
-    ``sparse`` holds every fourth node, for a first glance at each source.
-    """
-
-    def __init__(self, camera: Camera, step: int, counters: Counter[str]) -> None:
-        self.camera, self.counters = camera, counters
-        self.grid = Grid.for_size(camera.size, step)
-        self.nodes = self.grid.nodes()
-        self.directions, self.valid = ego_rays(camera, self.nodes)
-        self._inverse: dict[Surface, FloatArray] = {}
-        self._uncertainty: dict[Surface, FloatArray] = {}
-        self._solids: dict[Layered, SolidPixels] = {}
-        self._dense: dict[Dense, Layer] = {}
-        ny, nx = self.grid.shape
-        self.sparse_index = np.ix_(np.unique(np.r_[0:ny:4, ny - 1]), np.unique(np.r_[0:nx:4, nx - 1]))
-        planes = np.ascontiguousarray(np.moveaxis(self.directions[self.sparse_index], -1, 0))
-        self.sparse = np.moveaxis(planes, 0, -1), self.valid[self.sparse_index]
-
-    def inverse_distance(self, surface: Surface) -> FloatArray:
-        """(ny, nx) on the nodes; evaluated once for each surface."""
-        if surface not in self._inverse:
-            self._inverse[surface] = self._evaluated(surface)
-            self.counters[f"surface_{type(surface).__name__.lower()}"] += 1
-        return self._inverse[surface]
-
-    def uncertainty(self, surface: Surface) -> FloatArray:
-        """(ny, nx) of the inverse distances; evaluated once for each surface."""
-        if surface not in self._uncertainty:
-            q = self.inverse_distance(surface)
-            self._uncertainty[surface] = surface.uncertainty(self.camera.center_m, self.directions, q)
-        return self._uncertainty[surface]
-
-    def _evaluated(self, surface: Surface) -> FloatArray:
-        if not isinstance(surface, Layered):
-            return surface.inverse_distance(self.camera.center_m, self.directions)
-        # Solids are drawn at pixel centres; what a node between pixels shows is read at the one above and left of it.
-        background, solids = self.inverse_distance(surface.background), self.solids(surface)
-        near = np.zeros(self.camera.size)
-        near[solids.pixels[:, 1], solids.pixels[:, 0]] = solids.inverse_distance
-        return np.maximum(background, self.at_nodes(near))
-
-    def at_nodes(self, image: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Values (ny, nx) at the pixel nearest to each node, 0 outside the image."""
-        h, w = self.camera.size
-        x, y = (np.floor(self.nodes[..., k]).astype(np.int64) for k in (0, 1))
-        inside = (x >= 0) & (x < w) & (y >= 0) & (y < h)
-        return np.where(inside, image[y.clip(0, h - 1), x.clip(0, w - 1)], 0)
-
-    def solids(self, surface: Layered) -> SolidPixels:
-        """The target's pixels that show solids; drawn once for each surface."""
-        if surface not in self._solids:
-            index, inverse_distance, face = surface.drawn(self.camera)
-            y, x = np.divmod(index, self.camera.width_px)
-            pixels = np.stack([x, y], axis=-1)
-            directions, _ = ego_rays(self.camera, pixels.astype(np.float64))
-            free = np.full(self.camera.size, 255, np.uint8)
-            free.reshape(-1)[index] = 0
-            self._solids[surface] = SolidPixels(free, pixels, directions, inverse_distance, face)
-            self.counters["solid_pixels"] += len(pixels)
-        return self._solids[surface]
-
-    @cached_property
-    def planes(self) -> Planes:
-        """Rays of all pixels."""
-        return pixel_rays(self.camera)
-
-    def dense(self, surface: Dense) -> Layer:
-        """Inverse distances (h, w) along ``planes``, in their lengths; evaluated once for each surface."""
-        if surface not in self._dense:
-            x, y, z = self.planes
-            q = surface.image(self.camera) * np.sqrt(x * x + (y * y + z * z))
-            self._dense[surface] = q
-            self.counters["dense_pixels"] += q.size
-        return self._dense[surface]
 
 
 class PairMap:
@@ -147,12 +49,12 @@ class PairMap:
         self.nodes: Box | None = None
         if self._look_apart():
             return
-        self.solids = _SeenSolids.of(rays, source, surface) if isinstance(surface, Layered) else None
+        self.solids = SeenSolids.of(rays, source, surface) if isinstance(surface, Layered) else None
         seen_solids = self.solids.nodes(rays.grid) if self.solids is not None else None
         if rays.grid.step > 1 and seen_solids is None and not self._glance():
             return
         q = rays.inverse_distance(self.surface)
-        points = _source_points(source, rays.directions, q, self.offset_m)
+        points = source_points(source, rays.directions, q, self.offset_m)
         self.uv, _, self.valid = source.project_cam(points)
         self.valid &= rays.valid
         self._shaded = isinstance(self.surface, Dense) or self.solids is not None
@@ -191,7 +93,7 @@ class PairMap:
         """Whether any cell four times as large may hold a pixel of the source."""
         directions, valid = self.rays.sparse
         q = self.rays.inverse_distance(self.surface)[self.rays.sparse_index]
-        points = _source_points(self.source, directions, q, self.offset_m)
+        points = source_points(self.source, directions, q, self.offset_m)
         uv, _, projected = self.source.project_cam(points)
         whole, border = self._cells_that_may_see(points, uv, projected & valid)
         return bool(whole.any() or border.any())
@@ -228,11 +130,11 @@ class PairMap:
     def _cells_that_may_see(self, points: FloatArray, uv: FloatArray, valid: BoolArray) -> tuple[BoolArray, BoolArray]:
         """Cells whose corners are valid and not all beyond one side of the image; such cells with an invalid corner."""
         beyond = beyond_image(self.source, points, uv, valid)
-        sides = [beyond[c] for c in _CORNERS]
+        sides = [beyond[c] for c in CORNERS]
         use = (sides[0] & sides[1] & sides[2] & sides[3]) == 0
         if valid.all():
             return use, np.zeros(use.shape, bool)
-        corners = [valid[c] for c in _CORNERS]
+        corners = [valid[c] for c in CORNERS]
         all_valid = corners[0] & corners[1] & corners[2] & corners[3]
         touched = (corners[0] | corners[1] | corners[2] | corners[3]).astype(np.uint8)
         near = cv2.dilate(touched, np.ones((3, 3), np.uint8)) > 0
@@ -244,8 +146,8 @@ class PairMap:
         """Cells that may reach into the cone of the lens's image, although no corner of theirs may lie in it."""
         unit = points / np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), 1e-300)
         off_axis = np.arccos(np.clip(unit[..., 2], -1, 1))
-        nearest = np.minimum.reduce([off_axis[c] for c in _CORNERS])
-        first, second, third, fourth = (unit[c] for c in _CORNERS)
+        nearest = np.minimum.reduce([off_axis[c] for c in CORNERS])
+        first, second, third, fourth = (unit[c] for c in CORNERS)
         widest = np.minimum((first * fourth).sum(-1), (second * third).sum(-1))
         return np.asarray(nearest <= self.source.cone_rad + np.arccos(np.clip(widest, -1, 1)))
 
@@ -263,8 +165,8 @@ class PairMap:
         around = self.uv[m0 : j1 + 3, n0 : i1 + 3]
         error = np.zeros(around.shape[:2])
         for axis in (0, 1):
-            second = _larger(np.diff(around, 2, axis=axis))
-            fourth = _larger(np.diff(around, 4, axis=axis)) if around.shape[axis] > 4 else None
+            second = larger(np.diff(around, 2, axis=axis))
+            fourth = larger(np.diff(around, 4, axis=axis)) if around.shape[axis] > 4 else None
             pad = [(0, 0), (0, 0)]
             pad[axis] = (1, 1)
             error += np.pad(second, pad, mode="edge") * (_SAFETY / 8 / (4**HALVINGS if self.surface.smooth else 1))
@@ -276,8 +178,8 @@ class PairMap:
             half = self.rays.grid.step / 2
             centre, _ = self._evaluate(self.rays.nodes[j0:j1, i0:i1] + half)
             uv = self.uv[j0 : j1 + 1, i0 : i1 + 1]
-            mean = sum(uv[c] for c in _CORNERS) / 4
-            cell = np.maximum(cell, 4 * _larger(mean - centre))
+            mean = sum(uv[c] for c in CORNERS) / 4
+            cell = np.maximum(cell, 4 * larger(mean - centre))
         bound[j0:j1, i0:i1] = cell
         return np.asarray(bound > tolerance_px)
 
@@ -293,7 +195,7 @@ class PairMap:
         if not self._shaded:
             return self.valid
         shadows, lit = self._in_light(level)
-        pixel, inside = _nearest_pixel(shadows.beyond, _at_level(self.uv, level))
+        pixel, inside = nearest_pixel(shadows.beyond, at_level(self.uv, level))
         beyond = 0 if isinstance(self.surface, Static) else self._from_source_q
         free = self.valid & ~(inside & (shadows.beyond[pixel] > beyond))
         if self.solids is None or not isinstance(self.whole_surface, Layered):
@@ -308,10 +210,10 @@ class PairMap:
         """The source's shadow images when it is halved ``level`` times, and which of ``solids`` (n,) it sees."""
         if level not in self._light:
             assert isinstance(self.whole_surface, Layered | Dense)
-            shadows = self.whole_surface.shadows(_halved_camera(self.source, level))
+            shadows = self.whole_surface.shadows(halved_camera(self.source, level))
             lit = np.zeros(0, bool)
             if self.solids is not None:
-                lit = self.solids.lit(shadows, _at_level(self.solids.uv, level))
+                lit = self.solids.lit(shadows, at_level(self.solids.uv, level))
             self._light[level] = shadows, lit
         return self._light[level]
 
@@ -357,11 +259,11 @@ class PairMap:
             visible &= grid.cells_to_pixels(self._use, nodes)
         if q is not None:
             beyond = self._in_light(slot.level)[0].beyond
-            visible &= cv2.compare(_read_nearest(beyond, at, slot), q, cv2.CMP_LE).astype(np.uint8)
+            visible &= cv2.compare(read_nearest(beyond, at, slot), q, cv2.CMP_LE).astype(np.uint8)
         if self.solids is not None:
             self._put_solids(at, visible, nodes, slot)
         if source.mask is not None:
-            visible &= _mask_at(source, slot, at)
+            visible &= mask_at(source, slot, at)
         if slot.level:
             # The outer half pixel of the full image lies outside the halved one: read its border pixel.
             h, w = slot.size
@@ -377,7 +279,7 @@ class PairMap:
         for part in self._parts_near_shadow(shadows.beyond, nodes, slot.level):
             t, b, le, r = grid.pixels(part)
             here = slice(t - y0, b - y0), slice(le - x0, r - x0)
-            first = _read_nearest(shadows.beyond, at[here], slot)
+            first = read_nearest(shadows.beyond, at[here], slot)
             beyond: Any = 0 if isinstance(self.surface, Static) else grid.upsample(self._from_source_q, part)
             visible[here] *= first <= beyond  # not cv2.compare: to it a part of one or four pixels is a scalar
         visible &= self.rays.solids(self.whole_surface).free[y0:y1, x0:x1]
@@ -396,7 +298,7 @@ class PairMap:
             yield nodes
             return
         if self._near_shadow is None:
-            self._near_shadow = _cells_near_shadow(shadow, _at_level(self.uv, level))
+            self._near_shadow = cells_near_shadow(shadow, at_level(self.uv, level))
         j0, j1, i0, i1 = nodes
         near: BoolArray = np.logical_or.reduce(self._near_shadow[j0:j1, i0:i1])
         for first, last in runs(near):
@@ -435,168 +337,11 @@ class PairMap:
         at[py[inside] - y0, px[inside] - x0] = exact
 
 
-class _SeenSolids(NamedTuple):
-    """The pixels showing faces that are turned to a source and project into its image, hidden by others or not.
-
-    Attributes:
-        pixels: (n, 2) target pixels, row by row.
-        uv: (n, 2) source pixels.
-        inverse_distance: (n,) from the source, 1/m.
-        solid: (n,) which one.
-    """
-
-    pixels: npt.NDArray[np.int64]
-    uv: FloatArray
-    inverse_distance: FloatArray
-    solid: npt.NDArray[np.int32]
-
-    @classmethod
-    def of(cls, rays: TargetRays, source: Camera, surface: Layered) -> _SeenSolids:
-        _, pixels, directions, q, face = rays.solids(surface)
-        offset_m = rays.camera.center_m - source.center_m
-        solid, before_m = surface.facing(source.center_m, face)
-        turned = before_m > 0
-        if source.lens == "pinhole":
-            # Most solids lie beside most sources: two half-spaces are cheaper than a projection.
-            K, to_source = source.K, source.cam2ego[:3, :3].T
-            sides = np.stack([K[0], (source.width_px - 1) * K[2] - K[0]]) @ to_source
-            left, right = sides @ directions.T + np.outer(sides @ offset_m, q)
-            turned &= (left >= -1e-6) & (right >= -1e-6)
-        some = np.flatnonzero(turned)
-        pixels, directions, q, solid, before_m = pixels[some], directions[some], q[some], solid[some], before_m[some]
-        points = _source_points(source, directions, q, offset_m)
-        uv, _, valid = source.project_cam(points)
-        q /= np.maximum(np.sqrt((points * points).sum(-1)), 1e-300)
-        inside = np.flatnonzero(valid & source.contains(uv) & (before_m * q >= _LEAST_INCIDENCE))
-        return cls(pixels[inside], uv[inside], q[inside], solid[inside])
-
-    def lit(self, shadows: Shadows, at: FloatArray) -> BoolArray:
-        """Which of them no other solid hides, by their positions (n, 2) in the shadow images."""
-        pixel, inside = _nearest_pixel(shadows.beyond, at)
-        nearer = shadows.beyond[pixel] > self.inverse_distance
-        return ~(inside & nearer & (shadows.solid[pixel] != self.solid))
-
-    def nodes(self, grid: Grid) -> Box | None:
-        """The nodes around all of them."""
-        if len(self.pixels) == 0:
-            return None
-        first = round(grid.offset + 0.5) if grid.step > 1 else 0
-        low = (self.pixels.min(axis=0) - first) // grid.step
-        high = (self.pixels.max(axis=0) - first) // grid.step + (grid.step > 1)
-        return int(low[1]), int(high[1]), int(low[0]), int(high[0])
-
-
 def _around(one: Box | None, two: Box | None) -> Box | None:
     """The box around two boxes of nodes."""
     if one is None or two is None:
         return one or two
     return min(one[0], two[0]), max(one[1], two[1]), min(one[2], two[2]), max(one[3], two[3])
-
-
-def _halved_camera(camera: Camera, level: int) -> Camera:
-    """The camera of an image that was halved ``level`` times."""
-    h, w = level_size(camera.size, level)
-    return camera.crop(0, 0, (h << level, w << level)).resize((h, w)) if level else camera
-
-
-def _at_level(uv: FloatArray, level: int) -> FloatArray:
-    """Pixels (..., 2) in an image that was halved ``level`` times."""
-    return (uv + 0.5) / 2**level - 0.5
-
-
-def _cells_near_shadow(shadow: npt.NDArray[np.float32], uv: FloatArray) -> BoolArray:
-    """Cells (ny - 1, nx - 1) whose corners (ny, nx, 2) span a part of a shadow image that is not free of shadow."""
-    tile = _SHADOW_TILE_PX
-    h, w = shadow.shape
-    rows, columns = -(-h // tile), -(-w // tile)
-    dark = np.zeros((rows * tile, columns * tile), np.uint8)
-    dark[:h, :w] = np.uint8(255) * (shadow > 0)
-    count = cv2.integral((cv2.resize(dark, (columns, rows), interpolation=cv2.INTER_AREA) > 0).astype(np.uint8))
-    (x0, x1), (y0, y1) = (_tiles_between(uv[..., k], n) for k, n in enumerate((columns, rows)))
-    return np.asarray(count[y1, x1] - count[y0, x1] - count[y1, x0] + count[y0, x0] > 0)
-
-
-def _tiles_between(position: FloatArray, count: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """First and last (exclusive) tile along one axis that a cell's corners span, a pixel of slack included: maps bulge
-    between the corners, and positions are rounded."""
-    scaled = np.clip(position / _SHADOW_TILE_PX, -2, count + 2)
-    slack = 1 / _SHADOW_TILE_PX
-    corners = [scaled[c] for c in _CORNERS]
-    low, high = (f(f(corners[0], corners[1]), f(corners[2], corners[3])) for f in (np.minimum, np.maximum))
-    first, last = np.floor(low - slack), np.floor(high + slack) + 1
-    return first.clip(0, count).astype(np.int64), last.clip(0, count).astype(np.int64)
-
-
-def _read_nearest(image: Layer, at: Layer, slot: Slot) -> Any:
-    """Values (h, w) of a source's image at the pixels nearest to atlas positions (h, w, 2), 0 outside it."""
-    local = at - np.array([slot.x, slot.y], np.float32)
-    return cv2.remap(image, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
-
-
-def _nearest_pixel(image: npt.NDArray[Any], at: FloatArray) -> tuple[tuple[Any, Any], BoolArray]:
-    """Rows and columns (...,) nearest to positions (..., 2), and where those lie in the image; elsewhere they are 0."""
-    h, w = image.shape
-    u, v = np.rint(at[..., 0]), np.rint(at[..., 1])
-    inside = (u >= 0) & (u < w) & (v >= 0) & (v < h)
-    return (np.where(inside, v, 0).astype(np.int64), np.where(inside, u, 0).astype(np.int64)), inside
-
-
-def ego_rays(camera: Camera, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Unit ego-frame rays of pixels (..., 2), as a (..., 3) view of plane-major memory, and their validity."""
-    directions, valid = camera.unproject_cam(pixels)
-    planes = np.ascontiguousarray(np.moveaxis(directions, -1, 0)).reshape(3, -1)
-    turned = (camera.cam2ego[:3, :3] @ planes).reshape(3, *pixels.shape[:-1])
-    return np.moveaxis(turned, 0, -1), valid
-
-
-def project_rays(
-    source: Camera, directions: FloatArray, inverse_distance: FloatArray, offset_m: FloatArray
-) -> tuple[FloatArray, BoolArray]:
-    """Source pixels of scene points on target rays, homogeneously: infinity is inverse distance 0.
-
-    Args:
-        source: The camera that recorded the image.
-        directions: (..., 3) unit rays of the target in the ego frame.
-        inverse_distance: (...,) along them, 1/m.
-        offset_m: (3,) the target's centre minus the source's, metres.
-
-    Returns:
-        Pixels (..., 2) and validity (...,).
-    """
-    uv, _, valid = source.project_cam(_source_points(source, directions, inverse_distance, offset_m))
-    return uv, valid
-
-
-def _source_points(
-    source: Camera, directions: FloatArray, inverse_distance: FloatArray, offset_m: FloatArray
-) -> FloatArray:
-    """The scene points in the source's frame (..., 3), up to a positive scale; plane by plane in memory."""
-    R = source.cam2ego[:3, :3].T
-    points = R @ np.moveaxis(directions, -1, 0).reshape(3, -1)
-    if np.any(offset_m):
-        points += (R @ offset_m)[:, None] * inverse_distance.reshape(1, -1)
-    return np.moveaxis(points.reshape(3, *directions.shape[:-1]), 0, -1)
-
-
-def beyond_image(source: Camera, points: FloatArray, uv: FloatArray, valid: BoolArray) -> npt.NDArray[np.uint8]:
-    """Outcodes (...,): which of the image's borders, or the camera's plane, a scene point lies beyond; 0 is unknown.
-
-    For pinholes they are read off homogeneous coordinates, which know their side behind the camera too (clipping as
-    in computer graphics): a cell with one bit in common holds no pixel of the image.
-    """
-    h, w = source.size
-    if source.lens == "pinhole":
-        K, z = source.K, points[..., 2]
-        x = K[0, 0] * points[..., 0] + K[0, 1] * points[..., 1] + K[0, 2] * z
-        y = K[1, 1] * points[..., 1] + K[1, 2] * z
-        tests = [x < 0, x > (w - 1) * z, y < 0, y > (h - 1) * z, z < 0]
-    else:
-        u, v = uv[..., 0], uv[..., 1]
-        tests = [valid & (u < 0), valid & (u > w - 1), valid & (v < 0), valid & (v > h - 1)]
-    code = np.zeros(valid.shape, np.uint8)
-    for bit, test in enumerate(tests):
-        code |= test.view(np.uint8) << bit
-    return code
 
 
 def _bounds(use: BoolArray, extra: int) -> Box | None:
@@ -605,54 +350,3 @@ def _bounds(use: BoolArray, extra: int) -> Box | None:
     if len(rows) == 0:
         return None
     return int(rows[0]), int(rows[-1]) + extra, int(columns[0]), int(columns[-1]) + extra
-
-
-def _larger(vectors: FloatArray) -> FloatArray:
-    """The larger absolute component of (..., 2); a reduction over so short an axis would be ten times slower."""
-    return np.maximum(np.abs(vectors[..., 0]), np.abs(vectors[..., 1]))
-
-
-def _mask_at(source: Camera, slot: Slot, at: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-    """255 where every bilinear tap with a weight at atlas positions (h, w, 2) lies on the scene, not on the own car."""
-    assert source.mask is not None
-    clean: Any = source.mask.astype(np.uint8) * 255
-    if slot.level:
-        clean = cv2.inRange(halved(clean, slot.level), 255, 255)  # a halved pixel is clean where all in it are
-    local = at - np.array([slot.x, slot.y], np.float32) if slot.x or slot.y else at
-    share = cv2.remap(clean, local, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-    return np.asarray(cv2.inRange(share, 255, 255), np.uint8)  # cv2.compare refuses a single pixel
-
-
-def edge_distance(source: Camera, uv: FloatArray) -> FloatArray:
-    """Distance (px) of source pixels (..., 2) to the border of what the source sees: the outermost centres are 0.5
-    inside it; negative outside the image."""
-    u, v = uv[..., 0], uv[..., 1]
-    edge = np.minimum(np.minimum(u, source.width_px - 1 - u), np.minimum(v, source.height_px - 1 - v)) + 0.5
-    if source.mask is None:
-        return edge
-    h, w = source.size
-    whole = cv2.copyMakeBorder(source.mask.astype(np.float32), 0, -h % 8, 0, -w % 8, cv2.BORDER_REPLICATE)
-    coarse = cv2.resize(whole, (-(-w // 8), -(-h // 8)), interpolation=cv2.INTER_AREA)
-    free = np.pad((coarse >= 1).astype(np.uint8), 1, constant_values=1)
-    distance = cv2.distanceTransform(free, cv2.DIST_L2, 3)[1:-1, 1:-1]
-    distance = np.minimum(distance, 1e6) * 8  # it is the largest float where nothing is masked
-    index = np.clip(np.clip(uv, -8, FAR_AWAY_PX) / 8, 0, (coarse.shape[1] - 1, coarse.shape[0] - 1)).astype(np.int64)
-    return np.where(edge >= 0, np.minimum(edge, distance[index[..., 1], index[..., 0]]), edge)
-
-
-def resolution(uv: FloatArray, step: int) -> FloatArray:
-    """Source pixels per target pixel along the worse axis (ny, nx): the smaller singular value of the Jacobian."""
-    if min(uv.shape[:2]) < 2:
-        return np.ones(uv.shape[:2])
-    (a, c), (b, d) = (_derivative(uv, axis, step) for axis in (1, 0))
-    half_sum, determinant = (a * a + b * b + c * c + d * d) / 2, a * d - b * c
-    return np.sqrt(np.maximum(half_sum - np.sqrt(np.maximum(half_sum**2 - determinant**2, 0)), 0))
-
-
-def _derivative(uv: FloatArray, axis: int, step: int) -> tuple[FloatArray, FloatArray]:
-    """Forward differences of u and v (ny, nx) along an axis, the last one repeated."""
-    last = [slice(None), slice(None)]
-    last[axis] = slice(-1, None)
-    difference = np.diff(uv, axis=axis) / step
-    difference = np.concatenate([difference, difference[tuple(last)]], axis=axis)
-    return difference[..., 0], difference[..., 1]

@@ -12,9 +12,10 @@ import torch
 from arbiview_aug.detections import OfCameras, detections_of_frames
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import FavsConfig, PaperConfig
-from arbiview_aug.favs.overlap_depth import OverlapDepth, RefinementCache, overlap_depth
+from arbiview_aug.favs.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.favs.paper import PaperRendering, check_settings, render_paper
 from arbiview_aug.favs.photometric import Harmoniser
+from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
 from arbiview_aug.plan import PlanCache, RenderPlan, baselines_m, build_plan, needs_geometry, plan_key
 from arbiview_aug.rig import Rig

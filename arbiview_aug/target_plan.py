@@ -18,10 +18,12 @@ from arbiview_aug.confidence import certainty
 from arbiview_aug.favs.adaptive_fusion import distance_weight, primary_weight, quality_weight
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.grid import Box, runs
-from arbiview_aug.maps import PairMap, TargetRays, edge_distance, resolution
+from arbiview_aug.maps import PairMap
+from arbiview_aug.projection import edge_distance, resolution
 from arbiview_aug.rig import Rig
 from arbiview_aug.sampling import AtlasLayout, FixedMap, Scratch
 from arbiview_aug.surface import Surface, worst_parallax_px
+from arbiview_aug.target_rays import TargetRays
 from arbiview_aug.tone import Patch, patches
 
 SAME_CENTER_M = 1e-6

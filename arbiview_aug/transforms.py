@@ -20,9 +20,9 @@ from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError
 from arbiview_aug.explain import Explanation, PaperExplanation
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
-from arbiview_aug.favs.overlap_depth import RefinementCache
 from arbiview_aug.favs.paper import PaperRendering, check_pinhole
 from arbiview_aug.favs.photometric import Harmonise, Harmoniser, PhotometricReport
+from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_target, target_labels
 from arbiview_aug.plan import PlanCache, RenderPlan
 from arbiview_aug.random_rig import RandomRig

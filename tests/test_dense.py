@@ -7,7 +7,7 @@ import pytest
 
 from arbiview_aug.camera import Camera
 from arbiview_aug.dense import FAR_AWAY_PX, cropped, pixel_rays, project_pixels
-from arbiview_aug.maps import ego_rays, project_rays
+from arbiview_aug.projection import ego_rays, project_rays
 from arbiview_aug.sampling import Slot
 
 PINHOLE = Camera.looking(

@@ -8,8 +8,8 @@ import pytest
 
 from arbiview_aug.camera import Camera
 from arbiview_aug.favs.config import FavsConfig
-from arbiview_aug.maps import ego_rays, project_rays
 from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
+from arbiview_aug.projection import ego_rays, project_rays
 from arbiview_aug.rig import Rig, load_rig
 from arbiview_aug.scene import Scene
 

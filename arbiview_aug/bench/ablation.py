@@ -38,7 +38,7 @@ from arbiview_aug.evaluate.sparse import coloured_points, equalised, sparse_metr
 from arbiview_aug.evaluate.targets import UP_M, paper_targets, shifted_target
 from arbiview_aug.evaluate.truth import truth_metrics
 from arbiview_aug.favs.config import FavsConfig, PaperConfig
-from arbiview_aug.favs.overlap_depth import RefinementCache
+from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.rig import Rig
 from arbiview_aug.transforms import RigRetarget
 

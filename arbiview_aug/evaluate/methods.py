@@ -13,7 +13,8 @@ from typing import Any
 from arbiview_aug.evaluate.baselines import BASELINES, Renderer
 from arbiview_aug.evaluate.images import Image, View, as_arrays
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config, paper
-from arbiview_aug.favs.overlap_depth import OverlapDepth, RefinementCache, overlap_depth
+from arbiview_aug.favs.overlap_depth import OverlapDepth, overlap_depth
+from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.rig import Rig
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.transforms import RigRetarget

@@ -24,7 +24,8 @@ from arbiview_aug.evaluate.scores import psnr_db
 from arbiview_aug.evaluate.sparse import coloured_points, equalised, sparse_metrics
 from arbiview_aug.evaluate.targets import UP_M, YAWS_DEG
 from arbiview_aug.favs.config import Quality
-from arbiview_aug.favs.overlap_depth import RefinementCache, overlap_depth
+from arbiview_aug.favs.overlap_depth import overlap_depth
+from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.favs.synthesis import render_opencv
 from arbiview_aug.plan import build_plan
 from arbiview_aug.rig import Rig

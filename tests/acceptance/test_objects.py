@@ -27,9 +27,9 @@ from arbiview_aug import Rig
 from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig
 from arbiview_aug.datasets.synthetic.scene import BoxClass, Material, Scene, SceneBuilder
 from arbiview_aug.favs.synthesis import render_labels
-from arbiview_aug.maps import project_rays
 from arbiview_aug.objects import Objects, checked_boxes
 from arbiview_aug.plan import build_plan
+from arbiview_aug.projection import project_rays
 from arbiview_aug.scene import Scene as Geometry
 from arbiview_aug.surface import Street
 

@@ -14,7 +14,8 @@ import pytest
 import torch
 
 from arbiview_aug.datasets import FrameFolder
-from arbiview_aug.favs.overlap_depth import RefinementCache, overlap_depth
+from arbiview_aug.favs.overlap_depth import overlap_depth
+from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.transforms import RigRetarget
 
 pytestmark = [

@@ -12,8 +12,8 @@ import torch
 
 from arbiview_aug import Camera, Rig, RigRetarget
 from arbiview_aug.favs.config import FavsConfig
-from arbiview_aug.maps import ego_rays, project_rays
 from arbiview_aug.plan import RenderPlan, build_plan
+from arbiview_aug.projection import ego_rays, project_rays
 from arbiview_aug.scene import Scene
 
 MAP_TOLERANCE_PX = 1 / 32

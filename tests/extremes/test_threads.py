@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from arbiview_aug import RigRetarget
-from arbiview_aug.favs.overlap_depth import RefinementCache
+from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.plan import PlanCache
 from tests.extremes import misuse
 

@@ -16,8 +16,8 @@ from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.overlap import overlap_scores
 from arbiview_aug.favs.photometric import HarmoniseConfig, PhotometricReport, estimate_gains, find_overlaps
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
-from arbiview_aug.maps import ego_rays
 from arbiview_aug.plan import build_plan
+from arbiview_aug.projection import ego_rays
 from arbiview_aug.tone import STRIP_ROWS, ToneCurve, patches
 
 SIZE = (180, 320)
