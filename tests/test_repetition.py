@@ -22,13 +22,14 @@ from arbiview_aug.environment import repeatable_opencv
 SETTINGS: dict[str, dict[str, Any]] = {
     "fast": {},
     "harmonised": {"harmonise": True},
+    "accurate": {"quality": "accurate", "surface": "street", "outputs": ("confidence",)},
     "paper": {"quality": "paper", "outputs": ("source_camera",)},
 }
 
 
 def digest(out: Mapping[str, Any]) -> str:
     """Of all tensors of an output, bit for bit."""
-    tensors = [out["images"], out["coverage"], *([out["source_camera"]] if "source_camera" in out else [])]
+    tensors = [out[key] for key in ("images", "coverage", "source_camera", "confidence") if key in out]
     return hashlib.sha256(b"".join(tensor.numpy().tobytes() for tensor in tensors)).hexdigest()
 
 
