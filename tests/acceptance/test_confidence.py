@@ -19,7 +19,7 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.transforms import RigRetarget
 
-pytestmark = [pytest.mark.acceptance, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.truth, pytest.mark.timeout(900)]
 
 SEEDS = range(int(os.environ.get("ARBIVIEW_STREETS", "5")))
 SIZE = (256, 704)

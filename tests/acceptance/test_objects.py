@@ -33,7 +33,7 @@ from arbiview_aug.projection import project_rays
 from arbiview_aug.scene import Scene as Geometry
 from arbiview_aug.surface import Street
 
-pytestmark = [pytest.mark.acceptance, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.truth, pytest.mark.timeout(900)]
 
 SEEDS = range(20)
 SIZE = (256, 704)
