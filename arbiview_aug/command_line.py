@@ -9,6 +9,30 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from arbiview_aug.errors import DataError
+from arbiview_aug.rig import shipped_rigs
+
+REAL_TARGET = "waymo"
+"""The rig that real frames are rendered for, where none is named."""
+
+
+def add_data(parser: argparse.ArgumentParser, default: str) -> None:
+    """``--data``; ``default`` is what there is without it."""
+    parser.add_argument(
+        "--data",
+        metavar="FOLDER",
+        help="real frames: a frame folder (calib.json and images), a folder of such folders, or a nuScenes root "
+        f"(default: {default})",
+    )
+
+
+def add_target(group: argparse._ActionsContainer) -> None:
+    """``--target``, in a parser or one of its groups."""
+    group.add_argument(
+        "--target",
+        metavar="RIG",
+        help=f"the rig to render: a shipped one ({', '.join(shipped_rigs())}), or a rig file (default: a higher "
+        f"five-camera rig; with --data, {REAL_TARGET})",
+    )
 
 
 def count(text: str) -> int:

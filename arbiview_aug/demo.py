@@ -19,7 +19,16 @@ from typing import Any, get_args
 import cv2
 from tqdm import tqdm
 
-from arbiview_aug.command_line import count, gathered_warnings, seed, size, writable_folder
+from arbiview_aug.command_line import (
+    REAL_TARGET,
+    add_data,
+    add_target,
+    count,
+    gathered_warnings,
+    seed,
+    size,
+    writable_folder,
+)
 from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.evaluate.frames import Frame, make_frame, scores
@@ -30,12 +39,11 @@ from arbiview_aug.evaluate.scores import mean_of
 from arbiview_aug.evaluate.sheet import frame_sheet
 from arbiview_aug.evaluate.tables import SEEN, SPARSE_COLUMNS, SPARSE_NOTES, TRUTH_COLUMNS, TRUTH_NOTES, text_table
 from arbiview_aug.favs.config import Quality
-from arbiview_aug.rig import Rig, load_rig, shipped_rigs
+from arbiview_aug.rig import Rig, load_rig
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.transforms import RigRetarget
 
 PICTURE_FILE = "demo.png"
-_REAL_TARGET = "waymo"
 _COMPARED: tuple[SurfaceName, ...] = ("street", "ground", "far")
 _TIMED_CALLS = 5
 
@@ -110,18 +118,8 @@ def _parser() -> argparse.ArgumentParser:
         description="Retarget a synthetic street, or real frames, to another vehicle's cameras: the plan in words, "
         "metrics, time, and one contact sheet.",
     )
-    parser.add_argument(
-        "--data",
-        metavar="FOLDER",
-        help="real frames: a frame folder (calib.json and images), a folder of such folders, or a nuScenes root "
-        "(default: a synthetic street)",
-    )
-    parser.add_argument(
-        "--target",
-        metavar="RIG",
-        help=f"the rig to render: a shipped one ({', '.join(shipped_rigs())}), or a rig file (default: a higher "
-        f"five-camera rig; with --data, {_REAL_TARGET})",
-    )
+    add_data(parser, "a synthetic street")
+    add_target(parser)
     parser.add_argument(
         "--output",
         default="output",
@@ -159,7 +157,7 @@ def _picture_path(output: str) -> Path:
 
 
 def _load(arguments: argparse.Namespace) -> _Data:
-    name = arguments.target or (_REAL_TARGET if arguments.data else None)
+    name = arguments.target or (REAL_TARGET if arguments.data else None)
     target = None if name is None else load_rig(name)
     if target is not None and arguments.quality == "paper":  # homographies know no lens
         target = target.undistorted()

@@ -10,9 +10,7 @@ and pixel by pixel elsewhere (``arbiview_aug.maps``).
 from __future__ import annotations
 
 import hashlib
-import threading
-from collections import Counter, OrderedDict
-from collections.abc import Callable
+from collections import Counter
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
 
@@ -20,6 +18,7 @@ import numpy as np
 
 from arbiview_aug.camera import BoolArray, FloatArray
 from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.held import Held
 from arbiview_aug.rig import Rig, content_order
 from arbiview_aug.sampling import AtlasLayout, Scratch
 from arbiview_aug.scene import Scene
@@ -58,42 +57,21 @@ class RenderPlan:
         return [t.coverage for t in self.targets]
 
 
-class PlanCache:
-    """Plans by content key, the least recently used dropped once ``max_bytes`` are held. Pickles as empty.
-
-    Threads may share it: two that miss the same plan at once both build it, so that none waits for another's.
-    """
+class PlanCache(Held[bytes, RenderPlan]):
+    """Plans by content key, the least recently used dropped once ``max_bytes`` are held. Pickles as empty."""
 
     def __init__(self, max_bytes: int = 512 * 2**20) -> None:
-        self.max_bytes = max_bytes
-        self.hits = self.misses = 0
-        self._plans: OrderedDict[bytes, RenderPlan] = OrderedDict()
-        self._lock = threading.Lock()
+        super().__init__(max_bytes, lambda plan: plan.nbytes)
 
-    def get(self, key: bytes, build: Callable[[], RenderPlan]) -> RenderPlan:
-        """The plan of this key, built if it is not held."""
-        with self._lock:
-            if key in self._plans:
-                self.hits += 1
-                self._plans.move_to_end(key)
-                return self._plans[key]
-            self.misses += 1
-        plan = build()
-        with self._lock:
-            self._plans[key] = plan
-            held = sum(p.nbytes for p in self._plans.values())
-            while held > self.max_bytes and len(self._plans) > 1:
-                held -= self._plans.popitem(last=False)[1].nbytes
-        return plan
+    @property
+    def max_bytes(self) -> int:
+        """Memory for plans."""
+        return self.limit
 
     @property
     def nbytes(self) -> int:
         """Memory held by all plans."""
-        with self._lock:
-            return sum(plan.nbytes for plan in self._plans.values())
-
-    def __len__(self) -> int:
-        return len(self._plans)
+        return self.size
 
     def __reduce__(self) -> tuple[type[PlanCache], tuple[int]]:
         return PlanCache, (self.max_bytes,)

@@ -13,13 +13,12 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "arbiview_aug"
 
 LAYERS: list[tuple[str, ...]] = [
-    ("errors", "environment"),
-    ("command_line",),
+    ("errors", "environment", "held"),
     ("lens",),
     ("rotations",),
     ("camera",),
     ("rig",),
-    ("surface", "grid", "neighbours", "tone"),
+    ("surface", "grid", "neighbours", "tone", "command_line"),
     ("solids", "refined", "panorama"),
     ("objects",),
     ("lidar",),

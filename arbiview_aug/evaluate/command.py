@@ -16,7 +16,16 @@ from typing import Any, get_args
 
 from tqdm import tqdm
 
-from arbiview_aug.command_line import count, gathered_warnings, seed, size, writable_folder
+from arbiview_aug.command_line import (
+    REAL_TARGET,
+    add_data,
+    add_target,
+    count,
+    gathered_warnings,
+    seed,
+    size,
+    writable_folder,
+)
 from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.errors import DataError
@@ -42,12 +51,11 @@ from arbiview_aug.evaluate.tables import (
 )
 from arbiview_aug.evaluate.targets import named_targets, without_masks
 from arbiview_aug.favs.config import Quality
-from arbiview_aug.rig import Rig, load_rig, shipped_rigs
+from arbiview_aug.rig import Rig, load_rig
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.transforms import OUTPUTS
 
 TARGET_SETS = ("paper", "yaw", "vehicles", "truck")
-_REAL_TARGET = "waymo"
 _OWN = {
     "paper": ("target", "yaws", "quality", "surface", "seed", "reduce"),
     "figure": ("target", "yaws", "quality", "surface", "frames"),
@@ -86,19 +94,9 @@ def _parser() -> argparse.ArgumentParser:
         description="How good are the views? Sparse LiDAR metrics, overlap and consistency on real frames, the truth "
         "on synthetic streets: tables, evaluate.json, pictures, and report.html, which needs no other file.",
     )
-    parser.add_argument(
-        "--data",
-        metavar="FOLDER",
-        help="real frames: a frame folder (calib.json and images), a folder of such folders, or a nuScenes root "
-        "(default: synthetic streets)",
-    )
+    add_data(parser, "synthetic streets")
     target = parser.add_mutually_exclusive_group()
-    target.add_argument(
-        "--target",
-        metavar="RIG",
-        help=f"the rig to render: a shipped one ({', '.join(shipped_rigs())}), or a rig file (default: a higher "
-        f"five-camera rig; with --data, {_REAL_TARGET})",
-    )
+    add_target(target)
     target.add_argument(
         "--yaws",
         metavar="SET",
@@ -180,7 +178,7 @@ def _data(arguments: argparse.Namespace) -> Any:
 def _targets(arguments: argparse.Namespace, asked: Rig | None, source: Rig) -> dict[str, Rig]:
     """The rigs to render, by name."""
     if arguments.yaws is None:
-        rig = asked or (load_rig(_REAL_TARGET) if arguments.data else demo_target_rig(source.sizes[0]))
+        rig = asked or (load_rig(REAL_TARGET) if arguments.data else demo_target_rig(source.sizes[0]))
         found = {rig.name or "target": rig}
     elif isinstance(arguments.yaws, str):
         found = named_targets(arguments.yaws, source)

@@ -12,8 +12,6 @@ chessboard) is fitted to, the other half decides whether the gains are accepted.
 from __future__ import annotations
 
 import math
-import threading
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -26,6 +24,7 @@ import torch
 from arbiview_aug.camera import BoolArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import check_ranges
+from arbiview_aug.held import Held
 from arbiview_aug.neighbours import adjacent_pairs, half_way_view, odd_tiles
 from arbiview_aug.projection import edge_distance, ego_rays, project_rays
 from arbiview_aug.rig import Rig, content_order
@@ -318,8 +317,7 @@ class Harmoniser:
         self.config = choice if isinstance(choice, HarmoniseConfig) else HarmoniseConfig()
         self.estimates = choice is True or isinstance(choice, HarmoniseConfig)
         self.gains = None if self.estimates or choice is None or choice is False else _checked_gains(choice)
-        self._overlaps: OrderedDict[bytes, Overlaps] = OrderedDict()
-        self._lock = threading.Lock()
+        self._overlaps: Held[bytes, Overlaps] = Held(_HELD_RIGS, lambda _: 1)
 
     @property
     def is_on(self) -> bool:
@@ -346,7 +344,8 @@ class Harmoniser:
             return PhotometricReport(self.gains, True, "given")
         if not self.estimates:
             return PhotometricReport((1.0,) * len(rig), False, "harmonise is off")
-        return estimate_gains(rig, images, self.config, overlaps=self._overlaps_of(rig))
+        overlaps = self._overlaps.get(rig.content_key, lambda: find_overlaps(rig, self.config))
+        return estimate_gains(rig, images, self.config, overlaps=overlaps)
 
     def curves(self, rig: Rig, images: Sequence[torch.Tensor]) -> tuple[ToneCurve, ...] | None:
         """A tone curve for each camera, or None where the images stay as they are."""
@@ -354,19 +353,6 @@ class Harmoniser:
             return None
         gains = self.report(rig, images).gains
         return None if all(g == 1 for g in gains) else tuple(ToneCurve(g, self.config.knee) for g in gains)
-
-    def _overlaps_of(self, rig: Rig) -> Overlaps:
-        key = rig.content_key
-        with self._lock:
-            if key in self._overlaps:
-                self._overlaps.move_to_end(key)
-                return self._overlaps[key]
-        found = find_overlaps(rig, self.config)
-        with self._lock:
-            self._overlaps[key] = found
-            while len(self._overlaps) > _HELD_RIGS:
-                self._overlaps.popitem(last=False)
-        return found
 
 
 _HELD_RIGS = 8  # about 0.2 MB each; every frame of a drive may have a calibration of its own
