@@ -9,7 +9,8 @@ import re
 import numpy as np
 import pytest
 
-from arbiview_aug.camera import MAX_SIZE_PX, Camera
+from arbiview_aug.calibration import MAX_SIZE_PX
+from arbiview_aug.camera import Camera
 from arbiview_aug.errors import ArbiviewError, CalibrationError
 from arbiview_aug.rotations import nearest_rotation
 

@@ -16,6 +16,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("errors", "environment", "held"),
     ("lens",),
     ("rotations",),
+    ("calibration",),
     ("camera",),
     ("rig",),
     ("surface", "grid", "neighbours", "tone", "command_line"),
