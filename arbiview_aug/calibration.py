@@ -5,7 +5,8 @@ All functions take the camera's name first and raise ``CalibrationError``; what 
 
 from __future__ import annotations
 
-from typing import Any, get_args
+import math
+from typing import Any, cast, get_args
 
 import numpy as np
 
@@ -29,21 +30,45 @@ def checked_name(name: Any) -> str:
     return name
 
 
-def checked_size(name: str, field: str, value: Any) -> int:
-    """A side of an image in pixels, from 1 to ``MAX_SIZE_PX``."""
+def checked_pixels(name: str, field: str, value: Any, least: int = 1) -> int:
+    """A whole number of pixels up to ``MAX_SIZE_PX``: an image's side, or a place with ``least`` below 1."""
     try:
-        size = int(value)
-        whole = size == value
+        pixels = int(value)
+        whole = pixels == value
     except (TypeError, ValueError, OverflowError):
-        size, whole = 0, False
-    if not whole or not 1 <= size <= MAX_SIZE_PX:
-        raise _error(name, field, f"a whole number of pixels from 1 to {MAX_SIZE_PX}", repr(value))
-    return size
+        pixels, whole = 0, False
+    if not whole or not least <= pixels <= MAX_SIZE_PX:
+        raise _error(name, field, f"a whole number of pixels from {least} to {MAX_SIZE_PX}", repr(value))
+    return pixels
+
+
+def checked_size(name: str, value: Any) -> tuple[int, int]:
+    """A size (h, w)."""
+    try:
+        h, w = value
+    except (TypeError, ValueError):
+        raise _error(name, "size", "(h, w) in pixels", repr(value)) from None
+    return checked_pixels(name, "height_px", h), checked_pixels(name, "width_px", w)
+
+
+def checked_numbers(name: str, field: str, values: Any, count: int, expected: str) -> tuple[float, ...]:
+    """Finite numbers; ``expected`` says in the error which."""
+    try:
+        numbers = tuple(float(v) for v in values)
+        good = len(numbers) == count and all(map(math.isfinite, numbers))
+        good = good and not any(isinstance(v, str | bytes) for v in values)  # float reads words too
+    except (TypeError, ValueError, OverflowError):
+        good = False
+    if not good:
+        raise _error(name, field, expected, repr(values))
+    return numbers
 
 
 def checked_array(name: str, field: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
     """Finite float64 numbers of a shape, copied."""
     try:
+        if np.iscomplexobj(value):
+            raise TypeError("complex numbers")
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise _error(name, field, f"numbers of shape {shape}", f"{type(value).__name__} ({error})") from None
@@ -98,9 +123,9 @@ def checked_pose(name: str, value: Any) -> FloatArray:
 
 def checked_lens(name: str, value: Any) -> Lens:
     """The name of a lens model."""
-    if value not in get_args(Lens):
+    if not isinstance(value, str) or value not in get_args(Lens):
         raise _error(name, "lens", f"one of {', '.join(get_args(Lens))}", repr(value))
-    return value
+    return cast(Lens, value)
 
 
 def checked_distortion(name: str, lens: Lens, value: Any) -> tuple[float, ...]:

@@ -14,19 +14,21 @@ import hashlib
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from numbers import Real
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
 from arbiview_aug.calibration import (
+    MAX_SIZE_PX,
     checked_array,
     checked_distortion,
     checked_intrinsics,
     checked_lens,
     checked_mask,
     checked_name,
+    checked_numbers,
+    checked_pixels,
     checked_pose,
     checked_size,
 )
@@ -36,6 +38,8 @@ from arbiview_aug.rotations import CAMERA_AXES_IN_EGO, rotation_x, rotation_z
 
 UNPROJECT_TOLERANCE_PX = 1e-6
 """A ray counts as found when projecting it again lands this close to its pixel."""
+
+_ANGLES, _METRES = "finite angles in degrees", "finite (x, y, z) in metres"
 
 
 class Projection(NamedTuple):
@@ -91,7 +95,7 @@ class Camera:
         put = lambda field, value: object.__setattr__(self, field, value)  # noqa: E731 - frozen dataclass
         name = checked_name(self.name)
         for field in ("width_px", "height_px"):
-            put(field, checked_size(name, field, getattr(self, field)))
+            put(field, checked_pixels(name, field, getattr(self, field)))
         put("K", checked_intrinsics(name, self.K))
         put("cam2ego", checked_pose(name, self.cam2ego))
         put("lens", checked_lens(name, self.lens))
@@ -144,19 +148,11 @@ class Camera:
         """
         if (K is None) == (horizontal_fov_deg is None):
             raise CalibrationError(f"camera {name!r}: expected either K or horizontal_fov_deg, got both or none")
-        angles = (azimuth_deg, elevation_deg, roll_deg)
-        if not all(isinstance(angle, Real) and math.isfinite(angle) for angle in angles):
-            raise CalibrationError(f"camera {name!r}: expected finite angles, got {angles}")
-        try:
-            position = np.array(position_m, dtype=np.float64)
-        except (TypeError, ValueError):
-            position = np.zeros(0)
-        if position.shape != (3,):
-            raise CalibrationError(f"camera {name!r}: position_m: expected (x, y, z) in metres, got {position_m!r}")
+        angles = azimuth_deg, elevation_deg, roll_deg
+        azimuth, elevation, roll = checked_numbers(name, "azimuth, elevation, roll", angles, 3, _ANGLES)
+        position = checked_numbers(name, "position_m", position_m, 3, _METRES)
         cam2ego = np.eye(4)
-        cam2ego[:3, :3] = (
-            rotation_z(azimuth_deg) @ CAMERA_AXES_IN_EGO @ rotation_x(elevation_deg) @ rotation_z(roll_deg)
-        )
+        cam2ego[:3, :3] = rotation_z(azimuth) @ CAMERA_AXES_IN_EGO @ rotation_x(elevation) @ rotation_z(roll)
         cam2ego[:3, 3] = position
         camera = cls(
             name=name,
@@ -301,8 +297,8 @@ class Camera:
     # --- changed copies -------------------------------------------------------------------------------------------
     def resize(self, size: tuple[int, int]) -> Camera:
         """The camera of the image resized to (h, w): outer edges stay, so centres move by half pixels."""
-        h, w = size
-        A = resize_matrix(self.size, size)
+        h, w = checked_size(self.name, size)
+        A = resize_matrix(self.size, (h, w))
         camera = replace(self, width_px=w, height_px=h, K=A @ self.K, mask=None)
         if self.mask is None:
             return camera
@@ -314,10 +310,10 @@ class Camera:
 
         Outside the image a mask is False: nothing was recorded there.
         """
-        h, w = size
+        h, w = checked_size(self.name, size)
         K = self.K.copy()
-        K[0, 2] -= left
-        K[1, 2] -= top
+        top, left = (checked_pixels(self.name, f, n, -MAX_SIZE_PX) for f, n in (("top", top), ("left", left)))
+        K[:2, 2] -= left, top
         camera = replace(self, width_px=w, height_px=h, K=K, mask=None)
         if self.mask is None:
             return camera
@@ -337,14 +333,15 @@ class Camera:
 
     def turned(self, *, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Camera:
         """Turned about its own centre: yaw about the ego's z (left), pitch about its own x (up), roll about its z."""
+        yaw, pitch, roll = checked_numbers(self.name, "yaw, pitch, roll", (yaw_deg, pitch_deg, roll_deg), 3, _ANGLES)
         cam2ego = self.cam2ego.copy()
-        cam2ego[:3, :3] = rotation_z(yaw_deg) @ cam2ego[:3, :3] @ rotation_x(pitch_deg) @ rotation_z(roll_deg)
+        cam2ego[:3, :3] = rotation_z(yaw) @ cam2ego[:3, :3] @ rotation_x(pitch) @ rotation_z(roll)
         return replace(self, cam2ego=cam2ego)
 
     def shifted(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Camera:
         """Moved along the ego's axes."""
         cam2ego = self.cam2ego.copy()
-        cam2ego[:3, 3] += (x_m, y_m, z_m)
+        cam2ego[:3, 3] += checked_numbers(self.name, "shift", (x_m, y_m, z_m), 3, _METRES)
         return replace(self, cam2ego=cam2ego)
 
     def undistorted(self) -> Camera:
