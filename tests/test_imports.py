@@ -25,7 +25,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("lidar",),
     ("scene",),
     ("sampling",),
-    ("favs.config", "favs.geometric_transformation", "favs.adaptive_fusion"),
+    ("favs.config", "favs.geometric_transformation", "favs.adaptive_fusion", "favs.dense_flow"),
     ("favs.feature_matching",),
     ("favs.object_alignment",),
     ("favs.paper",),
