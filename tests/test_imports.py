@@ -40,7 +40,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("target_plan",),
     ("plan",),
     ("favs.synthesis",),
-    ("tensors", "random_rig", "explain"),
+    ("tensors", "sample_images", "random_rig", "explain"),
     ("sample",),
     ("labels", "detections"),
     ("stitching",),
