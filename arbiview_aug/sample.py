@@ -16,6 +16,7 @@ from arbiview_aug.objects import checked_boxes
 from arbiview_aug.rig import Rig
 from arbiview_aug.sample_images import check_container, checked_images
 from arbiview_aug.scene import Scene
+from arbiview_aug.surface import Points
 from arbiview_aug.tensors import leading_shape, split
 
 CALIBRATION_KEYS = (
@@ -113,18 +114,18 @@ def scenes_of_frames(
     solid: list[FloatArray | None] = [None] * count
     if boxes is not None:
         solid = [checked_boxes(of_frame) for of_frame in _of_frames("boxes_3d", boxes, count, lead)]
-    measured = [None] * count if points is None else points
+    measured: Sequence[Points | None] = [None] * count if points is None else points
     return [Scene(b, p) for b, p in zip(solid, measured, strict=True)]
 
 
 def _points_of_frames(
     sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...]
-) -> list[FloatArray] | None:
+) -> list[Points] | None:
     """(P, 3) measured points of each frame: its ``points``, and those of its depth maps ``depth_m``; None without."""
     points, depth_m = sample.get("points"), sample.get("depth_m")
     if points is None and depth_m is None:
         return None
-    parts: list[list[FloatArray]] = [[] for _ in frames]
+    parts: list[list[np.ndarray]] = [[] for _ in frames]
     if points is not None:
         for part, of_frame in zip(parts, _of_frames("points", points, len(frames), lead), strict=True):
             part.append(checked_points(of_frame))
@@ -140,7 +141,7 @@ def _points_of_frames(
                 raise SampleError(f"depth_m: expected {len(frame.rig)} maps (H, W), one for each image")
             for camera, depth in zip(frame.rig, of_cameras, strict=True):
                 part.append(points_of_depth(camera, _numbers("depth_m", depth, ())))
-    return [np.concatenate(part) for part in parts]
+    return [part[0] if len(part) == 1 else np.concatenate(part) for part in parts]
 
 
 def names_of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[object]:
@@ -155,10 +156,10 @@ def names_of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> 
     return [str(v.tolist()) if isinstance(v, torch.Tensor) else str(v) for v in values]
 
 
-def _of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[np.ndarray]:
+def _of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[Points]:
     """Numbers of each frame: a tensor with the images' leading dimensions, or a list with an entry for each frame."""
     if not lead:
-        return [_numbers(key, value, ())]
+        return [_recorded(key, value)]
     try:
         frames = value if isinstance(value, list | tuple) else split(value, lead)
     except (AttributeError, TypeError, ValueError, RuntimeError):
@@ -166,7 +167,7 @@ def _of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[
     if len(frames) != count:
         got = f"shape {tuple(value.shape)}" if hasattr(value, "shape") else type(value).__name__
         raise SampleError(f"{key}: expected a tensor {lead} + (n, ...), or a list of {count} of them, got {got}")
-    return [_numbers(key, frame, ()) for frame in frames]
+    return [_recorded(key, frame) for frame in frames]
 
 
 # --- calibration ------------------------------------------------------------------------------------------------------
@@ -313,16 +314,27 @@ def numbers(key: str, value: Any) -> FloatArray:
     Raises:
         SampleTypeError: It holds no real numbers.
     """
+    return np.asarray(_recorded(key, value), np.float64)
+
+
+def _recorded(key: str, value: Any) -> Points:
+    """An entry of a sample as an array: float32 as it is, the same memory, anything else as float64.
+
+    Raises:
+        SampleTypeError: It holds no real numbers.
+    """
     try:
         if isinstance(value, torch.Tensor):
             if value.layout != torch.strided or value.device.type == "meta":
                 raise TypeError(f"{value.layout} on {value.device}")
             if value.is_complex():
                 raise TypeError("complex numbers")
-            return value.detach().cpu().double().numpy()
+            value = value.detach().cpu()
+            return (value if value.dtype == torch.float32 else value.double()).numpy()
         if np.iscomplexobj(value):
             raise TypeError("complex numbers")
-        return np.asarray(value, dtype=np.float64)
+        array = np.asarray(value)
+        return array if array.dtype == np.float32 else np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # RuntimeError: quantised tensors
         why = " ".join(str(error).split())[:120]
         raise SampleTypeError(f"{key}: expected a tensor of numbers, got {type(value).__name__} ({why})") from None
