@@ -41,8 +41,9 @@ _UNRESOLVED = 8 * 5 / 1024
 """Weight of sixth differences in the error of interpolation, eight times their own term. What is as narrow as the
 nodes' spacing, like the street's join of road and wall in small images, makes all differences alike, and where they
 change sign a bound by the fourth alone is too low: by three times in 1 cell of 6000 at 12 % of the shipped rigs' sizes.
-Over all pairs of them, street, at 5, 8, 12, 20 and 30 %, no cell is missed with 6 times or more and this safety; and
-with these two weights about as many cells are evaluated as with the fourth differences alone, taken twice."""
+Over all pairs of them, street and far, at 5, 8, 12 and 30 %, no cell is missed with this and the safety above; with 6
+times, three are at 5 %. Against the fourth alone, taken twice, a fifth more cells are evaluated pixel by pixel over the
+street and two fifths fewer over the far surface: plans take 3 % longer in the mean of eight pairs, 17 % at worst."""
 
 _MORE_NODES = 2
 """Between nodes a dense surface may be nearer than on any: a source may see a post, and nothing of what is around it.
