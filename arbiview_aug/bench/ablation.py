@@ -12,7 +12,6 @@ needs once. The paper's own numbers are printed beside: of nuScenes, raw exposur
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import time
 import warnings
@@ -24,7 +23,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from arbiview_aug.bench.speed import cpu_model, one_thread
+from arbiview_aug.bench.timing import cpu_model, one_thread, write_json
 from arbiview_aug.camera import BoolArray, Camera
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
@@ -134,14 +133,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     with one_thread(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of targets that are half outside: the paper's are
         report = measure(arguments.data, names, reduce=arguments.reduce, seed=arguments.seed)
-    text = json.dumps(report, indent=1)
-    print(text if arguments.json else table(report))
     path = Path(arguments.output)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text + "\n")
-    except OSError as error:
-        raise DataError(f"--output {path}: expected a file that can be written to, got {error.strerror}") from None
+    text = write_json(report, path)
+    print(text if arguments.json else table(report))
     if not arguments.json:
         print(f"report: {path}")
     return 0
