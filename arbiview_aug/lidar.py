@@ -110,11 +110,12 @@ class LidarSurface(Dense):
         if camera in self._rays:
             return self._rays[camera]
         step = max(1, round(CELL_RAD * float(camera.K[0, 0])))
-        # A lens may have no rays next to its image.
-        if step > 1 and camera.lens == "pinhole":
+        if step > 1:
             rays = _Located.of(camera, self._view, step)
-            # Azimuths bend near the zenith, and columns jump somewhere in a panorama that goes all around.
-            if float(np.abs(rays.directions[..., 2]).max()) <= _STEEP and not rays.view.window.is_whole:
+            # Azimuths bend near the zenith, and columns jump somewhere in a panorama that goes all around; a lens may
+            # have no rays next to its image.
+            steep = float(np.abs(rays.directions[..., 2]).max()) > _STEEP
+            if rays.are_rays and not steep and not rays.view.window.is_whole:
                 self._rays[camera] = rays
                 return rays
         return _Located.of(camera, self._view, 1)
@@ -138,7 +139,8 @@ class _Located(NamedTuple):
     Attributes:
         size: (h, w) of the image.
         step: Their spacing in pixels; they start one step before the centre of the image's first block.
-        directions: (ny, nx, 3) unit rays in the ego frame.
+        directions: (ny, nx, 3) unit rays in the ego frame; the optical axis where there is none.
+        are_rays: Whether there are all.
         view: The panorama.
         row: (ny, nx) in it.
         column: (ny, nx).
@@ -147,6 +149,7 @@ class _Located(NamedTuple):
     size: tuple[int, int]
     step: int
     directions: FloatArray
+    are_rays: bool
     view: Panorama
     row: Layer
     column: Layer
@@ -158,7 +161,7 @@ class _Located(NamedTuple):
         v, u = (step * np.arange(-1.0, -(-n // step) + 1) + (step - 1) / 2 for n in camera.size)
         directions, valid = camera.unproject(np.stack(np.meshgrid(u, v), -1))
         directions = np.where(valid[..., None], directions, camera.cam2ego[:3, 2])
-        return cls(camera.size, step, directions, *view(camera.center_m, directions))
+        return cls(camera.size, step, directions, bool(valid.all()), *view(camera.center_m, directions))
 
     def to_pixels(self, values: Layer) -> Any:
         """Bilinear interpolation (ny, nx) to all pixels (h, w)."""
