@@ -17,13 +17,10 @@ from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.objects import Objects, within_boxes
 from arbiview_aug.panorama import CELL_RAD, Layer, Panorama, Window, angles, panorama
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Dense, Drawn, Shadows, Static
+from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Dense, Drawn, Points, Shadows, Static
 
 OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
 """(x, y) ranges in the ego frame whose returns are the own car's: a car's about the middle of its rear axle."""
-
-NEAREST_M = 0.5
-"""Nearer to a camera than this nothing of the scene stands: such points are the vehicle's, or the camera itself."""
 
 BOX_AIR_M = 0.2
 """Points this far outside a box are its object's too: mirrors, and the noise of points and labels."""
@@ -48,7 +45,7 @@ class LidarSurface(Dense):
 
     smooth: ClassVar[bool] = False
     street: Static
-    points: FloatArray
+    points: Points
     _panoramas: dict[bytes, list[Panorama]] = field(default_factory=dict, repr=False)
     _shadows: dict[Camera, Shadows] = field(default_factory=dict, repr=False)
     _rays: dict[Camera, _Located] = field(default_factory=dict, repr=False)
@@ -126,8 +123,7 @@ class LidarSurface(Dense):
         held = self._panoramas.setdefault(np.asarray(origin, np.float64).tobytes(), [])
         view = next((p for p in held if p.window.holds(asked)), None)
         if view is None:
-            near = ((self.points - origin) ** 2).sum(1) < NEAREST_M**2
-            view = panorama(asked.widened(), origin, self.points[~near], self.street)
+            view = panorama(asked.widened(), origin, self.points, self.street)
             held.append(view)
         return view, *view.window.cells(azimuth, elevation)
 
@@ -183,7 +179,7 @@ class LidarObjects(Objects):
     street: LidarSurface
 
     @classmethod
-    def among(cls, street: Static, points: FloatArray, boxes: FloatArray) -> LidarObjects:
+    def among(cls, street: Static, points: Points, boxes: FloatArray) -> LidarObjects:
         """Boxes (B, 7) among points (P, 3)."""
         return cls(LidarSurface(street, points[~within_boxes(boxes, points, BOX_AIR_M)]), boxes)
 
@@ -216,15 +212,16 @@ class LidarObjects(Objects):
         return self.street.uncertainty(origin, directions, inverse_distance)
 
 
-def own_car(points: FloatArray) -> BoolArray:
+def own_car(points: Points) -> BoolArray:
     """(P,) points within ``OWN_CAR_M``."""
     (x0, x1), (y0, y1) = OWN_CAR_M
     x, y = points[:, 0], points[:, 1]
     return np.asarray((x > x0) & (x < x1) & (y > y0) & (y < y1))
 
 
-def checked_points(points: FloatArray, key: str = "points") -> FloatArray:
-    """(P, 3) finite points of a sample's (P, >= 3); rows that are not finite are dropped.
+def checked_points(points: Points, key: str = "points") -> Points:
+    """(P, 3) finite points of a sample's (P, >= 3); rows that are not finite are dropped, and nothing is copied if all
+    are.
 
     Raises:
         SampleError: Another shape.
@@ -234,7 +231,8 @@ def checked_points(points: FloatArray, key: str = "points") -> FloatArray:
     if points.ndim != 2 or points.shape[1] < 3:
         raise SampleError(f"{key}: expected shape (P, >= 3), x y z in the ego frame, got {points.shape}")
     xyz = points[:, :3]
-    return xyz[np.isfinite(xyz).all(axis=1)]
+    finite = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
+    return xyz if finite.all() else xyz[finite]
 
 
 def points_of_depth(camera: Camera, depth_m: FloatArray) -> FloatArray:
