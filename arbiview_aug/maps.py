@@ -8,7 +8,6 @@ that step anywhere (``Dense``) are evaluated once at every pixel of a target, an
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
@@ -20,7 +19,16 @@ import numpy.typing as npt
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.dense import FAR_AWAY_PX, cropped, project_pixels
 from arbiview_aug.grid import HALVINGS, Box, runs
-from arbiview_aug.projection import CORNERS, beyond_image, ego_rays, larger, mask_at, project_rays, source_points
+from arbiview_aug.projection import (
+    CORNERS,
+    beyond_image,
+    ego_rays,
+    larger,
+    look_apart,
+    mask_at,
+    project_rays,
+    source_points,
+)
 from arbiview_aug.sampling import Slot
 from arbiview_aug.shadowing import SeenSolids, at_level, cells_near_shadow, halved_camera, nearest_pixel, read_nearest
 from arbiview_aug.surface import Dense, Layered, Shadows, Static, Surface
@@ -75,19 +83,11 @@ class PairMap:
         self.nodes = _around(self.nodes, seen_solids)
 
     def _look_apart(self) -> bool:
-        """Whether the two viewing cones, widened by the parallax of the nearest scene point, cannot meet."""
-        q = self.rays.inverse_distance(self.whole_surface)
-        # Law of sines: a point at 1 / q is seen from the two centres in directions that differ by at most asin(b q);
-        # by any angle where it is nearer than the baseline b.
-        nearest = float(q.max())
+        """Whether the two cameras certainly have nothing in common."""
+        nearest = float(self.rays.inverse_distance(self.whole_surface).max())
         if isinstance(self.whole_surface, Layered):
             nearest = max(nearest, float(self.rays.solids(self.whole_surface).inverse_distance.max(initial=0.0)))
-        nearness = float(np.linalg.norm(self.offset_m)) * nearest
-        if nearness >= 1:
-            return False
-        parallax = math.asin(nearness)
-        apart = math.acos(float(np.clip(self.rays.camera.cam2ego[:3, 2] @ self.source.cam2ego[:3, 2], -1, 1)))
-        return apart > self.rays.camera.half_angle_rad + self.source.half_angle_rad + parallax + 0.01
+        return look_apart(self.rays.camera, self.source, nearest)
 
     def _glance(self) -> bool:
         """Whether any cell four times as large may hold a pixel of the source."""

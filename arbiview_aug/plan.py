@@ -14,15 +14,12 @@ from collections import Counter
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
 
-import numpy as np
-
-from arbiview_aug.camera import BoolArray, FloatArray
+from arbiview_aug.camera import BoolArray
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.held import Held
 from arbiview_aug.rig import Rig, content_order
 from arbiview_aug.sampling import AtlasLayout, Scratch
 from arbiview_aug.scene import Scene
-from arbiview_aug.surface import worst_parallax_px
 from arbiview_aug.target_plan import TargetDraft, TargetPlan
 
 
@@ -82,20 +79,6 @@ def plan_key(source: Rig, target: Rig, surface: str, config: FavsConfig, scene: 
     settings = tuple(getattr(config, f.name) for f in fields(config))
     geometry = (scene or Scene()).key
     return hashlib.sha256(repr((source.content_key, target.content_key, surface, settings, geometry)).encode()).digest()
-
-
-def baselines_m(source: Rig, target: Rig) -> FloatArray:
-    """(M, N) distances between the target's and the source's optical centres, roads and origins made to coincide."""
-    target = target.in_frame_of(source)
-    return np.asarray(np.linalg.norm(target.cam2ego[:, None, :3, 3] - source.cam2ego[None, :, :3, 3], axis=-1))
-
-
-def needs_geometry(source: Rig, target: Rig, config: FavsConfig) -> bool:
-    """Whether ``auto`` asks for a surface nearer than ``far`` for any pair of cameras."""
-    return any(
-        worst_parallax_px(float(row.max()), float(camera.K[0, 0])) >= config.far_parallax_px
-        for row, camera in zip(baselines_m(source, target), target, strict=True)
-    )
 
 
 def build_plan(

@@ -31,6 +31,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("favs.paper",),
     ("dense",),
     ("projection",),
+    ("required",),
     ("target_rays",),
     ("shadowing",),
     ("maps",),
