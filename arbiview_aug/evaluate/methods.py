@@ -14,8 +14,10 @@ from arbiview_aug.evaluate.baselines import BASELINES, Renderer
 from arbiview_aug.evaluate.images import Image, View, as_arrays
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config, paper
 from arbiview_aug.favs.overlap_depth import OverlapDepth, overlap_depth
+from arbiview_aug.favs.photometric import Harmonise
 from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.rig import Rig
+from arbiview_aug.sample import check_inputs, scenes_of_frames
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.transforms import RigRetarget
 
@@ -58,6 +60,8 @@ def retargeting(
     name: str = "",
     *,
     outputs: Sequence[str] = (),
+    harmonise: Harmonise = None,
+    refinement: RefinementCache | None = None,
 ) -> Method:
     """``RigRetarget`` as a method; a transform, with its last plan, for each of the last target rigs.
 
@@ -66,25 +70,34 @@ def retargeting(
         surface: As for ``RigRetarget``.
         name: For tables; by default made of both.
         outputs: Further outputs, ``confidence`` where there is to be one.
+        harmonise: As for ``RigRetarget``.
+        refinement: As for ``RigRetarget``.
     """
 
     @lru_cache(_HELD_TRANSFORMS)
     def transform(target: Rig) -> RigRetarget:
-        return RigRetarget(target, quality=quality, surface=surface, outputs=outputs, cache_bytes=0)
+        return RigRetarget(
+            target,
+            quality=quality,
+            surface=surface,
+            outputs=outputs,
+            harmonise=harmonise,
+            refinement=refinement,
+            cache_bytes=0,
+        )
 
     def render(sample: Sample, target: Rig) -> list[View]:
         return views_of(transform(target)(sample))
 
     def render_alone(sample: Sample, camera: int, target: Rig) -> View:
         """The depth that all cameras' overlaps gave, as if it had been found before."""
-        given = one_camera(sample, camera)
-        depth = RefinementCache()
+        given, depth = one_camera(sample, camera), RefinementCache()
         depth.get((given["rig"].content_key, None), lambda: whole.get(sample))
         retarget = RigRetarget(target, quality=quality, surface=surface, refinement=depth, cache_bytes=0)
         (view,) = views_of(retarget(given))
         return view
 
-    config, whole = favs_config(quality), _LastDepth()
+    config, whole = favs_config(quality), _LastDepth(surface)
     label = name or (f"{quality}, {surface}" if isinstance(quality, str) else f"{type(quality).__name__}, {surface}")
     learns = isinstance(config, FavsConfig) and config.overlap_depth
     reads_points = surface in READS_POINTS and not isinstance(config, PaperConfig)
@@ -94,12 +107,16 @@ def retargeting(
 class _LastDepth:
     """Depth from overlap of the last sample: a dozen views of it are rendered in a row."""
 
-    def __init__(self) -> None:
+    def __init__(self, surface: SurfaceName) -> None:
+        self._surface = surface
         self._last: tuple[Sample, OverlapDepth] | None = None
 
     def get(self, sample: Sample) -> OverlapDepth:
         if self._last is None or self._last[0] is not sample:
-            self._last = sample, overlap_depth(sample["rig"], list(sample["images"]))
+            (scene,) = scenes_of_frames(sample, check_inputs(sample, None), (), self._surface)
+            surface = scene.best if self._surface == "auto" else self._surface
+            boxes = scene.boxes if surface == "objects" else None  # as ``Stitcher`` measures it
+            self._last = sample, overlap_depth(sample["rig"], list(sample["images"]), boxes)
         return self._last[1]
 
 
