@@ -136,7 +136,7 @@ class _Located(NamedTuple):
     Attributes:
         size: (h, w) of the image.
         step: Their spacing in pixels; they start one step before the centre of the image's first block.
-        directions: (ny, nx, 3) unit rays in the ego frame.
+        directions: (ny, nx, 3) unit rays in the ego frame; the optical axis where there is none.
         view: The panorama.
         row: (ny, nx) in it.
         column: (ny, nx).

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.dense import FAR_AWAY_PX, cropped, project_pixels
-from arbiview_aug.grid import HALVINGS, Box, runs
+from arbiview_aug.grid import HALVINGS, Box, around, runs
 from arbiview_aug.projection import (
     CORNERS,
     beyond_image,
@@ -82,7 +82,10 @@ class PairMap:
             self.nodes = self._classify(points)
             if isinstance(self.surface, Dense):
                 self._every_pixel()
-        self.nodes = _around(self.nodes, seen_solids)
+        if seen_solids is not None:
+            self.nodes = seen_solids if self.nodes is None else around(self.nodes, seen_solids)
+        if isinstance(self.surface, Dense) and self.nodes is not None:
+            rays.ask(self.surface, self.nodes)
 
     def _look_apart(self) -> bool:
         """Whether the two cameras certainly have nothing in common."""
@@ -339,13 +342,6 @@ class PairMap:
         exact = np.clip(slot.from_source(uv[start:stop][inside]), -FAR_AWAY_PX, FAR_AWAY_PX)
         exact = np.where(valid[start:stop][inside, None], exact, -FAR_AWAY_PX)
         at[py[inside] - y0, px[inside] - x0] = exact
-
-
-def _around(one: Box | None, two: Box | None) -> Box | None:
-    """The box around two boxes of nodes."""
-    if one is None or two is None:
-        return one or two
-    return min(one[0], two[0]), max(one[1], two[1]), min(one[2], two[2]), max(one[3], two[3])
 
 
 def _bounds(use: BoolArray, extra: int) -> Box | None:
