@@ -8,6 +8,8 @@ interpolated rays within 1/200.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -100,19 +102,33 @@ def project_pixels(
     turn = (to_source @ target.cam2ego[:3, :3]).astype(np.float32)
     offset = (to_source @ (target.center_m - source.center_m)).astype(np.float32)
     a, b, c = planes
+    work = np.empty_like(q)  # one plane of scratch memory: fresh ones cost as much as the arithmetic
     # The points times q.
-    x, y, z = (turn[k, 0] * a + (turn[k, 1] * b + turn[k, 2] * c) + offset[k] * q for k in range(3))
-    from_source = q / np.maximum(np.sqrt(x * x + y * y + z * z), np.float32(1e-30))
-    at = np.empty((*q.shape, 2), np.float32)
+    x, y, z = (turn[k, 0] * a + (turn[k, 1] * b + turn[k, 2] * c) for k in range(3))
+    for axis, shift in zip((x, y, z), offset, strict=True):
+        axis += np.multiply(shift, q, out=work)
+    from_source = x * x
+    from_source += np.multiply(y, y, out=work)
+    from_source += np.multiply(z, z, out=work)
+    np.maximum(np.sqrt(from_source, out=from_source), np.float32(1e-30), out=from_source)
+    np.divide(q, from_source, out=from_source)
     if source.lens == "pinhole":
-        valid = z > 1e-6
+        invalid = z <= 1e-6
         K, shrink, first = source.K.astype(np.float32), 2.0**-slot.level, slot.from_source(source.K[:2, 2])
-        scale = np.float32(shrink) / np.where(valid, z, np.float32(1))
-        at[..., 0] = (K[0, 0] * x + K[0, 1] * y if K[0, 1] else K[0, 0] * x) * scale + np.float32(first[0])
-        at[..., 1] = K[1, 1] * y * scale + np.float32(first[1])
+        np.copyto(z, np.float32(1), where=invalid)
+        scale = np.divide(np.float32(shrink), z, out=z)
+        x *= K[0, 0]
+        if K[0, 1]:
+            x += np.multiply(K[0, 1], y, out=work)
+        y *= K[1, 1]
+        for axis, centre in ((x, first[0]), (y, first[1])):
+            axis *= scale
+            axis += np.float32(centre)
+            np.clip(axis, -FAR_AWAY_PX, FAR_AWAY_PX, out=axis)
+            np.copyto(axis, np.float32(-FAR_AWAY_PX), where=invalid)
     else:
         uv, _, valid = source.project_cam(np.stack([x, y, z], -1).astype(np.float64))
-        at[:] = slot.from_source(uv)
-    np.clip(at, -FAR_AWAY_PX, FAR_AWAY_PX, out=at)
-    at[~valid] = -FAR_AWAY_PX
+        positions = np.clip(slot.from_source(uv), -FAR_AWAY_PX, FAR_AWAY_PX)
+        x, y = (np.where(valid, positions[..., k], -FAR_AWAY_PX).astype(np.float32) for k in range(2))
+    at: Any = cv2.merge([x, y])
     return at, from_source

@@ -22,6 +22,7 @@ from arbiview_aug.grid import HALVINGS, Box, around, runs
 from arbiview_aug.projection import (
     CORNERS,
     beyond_image,
+    clean_pixels,
     ego_rays,
     larger,
     look_apart,
@@ -71,6 +72,7 @@ class PairMap:
         self._whole: BoolArray | None = None
         self._fine: tuple[Slot, npt.NDArray[np.float32]] | None = None
         self._near_shadow: BoolArray | None = None
+        self._clean: dict[int, npt.NDArray[np.uint8]] = {}
         self._light: dict[int, tuple[Shadows, BoolArray]] = {}
         if self._shaded and not isinstance(self.surface, Static):
             self._from_source_q = (q / np.maximum(np.sqrt((points * points).sum(-1)), 1e-300)).astype(np.float32)
@@ -265,8 +267,10 @@ class PairMap:
             visible &= cv2.compare(read_nearest(beyond, at, slot), q, cv2.CMP_LE).astype(np.uint8)
         if self.solids is not None:
             self._put_solids(at, visible, nodes, slot)
-        if source.mask is not None:
-            visible &= mask_at(source, slot, at)
+        if source.mask is not None and not source.mask.all():
+            if slot.level not in self._clean:
+                self._clean[slot.level] = clean_pixels(source, slot.level)
+            visible &= mask_at(self._clean[slot.level], slot, at)
         if slot.level:
             # The outer half pixel of the full image lies outside the halved one: read its border pixel.
             h, w = slot.size

@@ -99,15 +99,25 @@ def larger(vectors: FloatArray) -> FloatArray:
     return np.maximum(np.abs(vectors[..., 0]), np.abs(vectors[..., 1]))
 
 
-def mask_at(source: Camera, slot: Slot, at: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-    """255 where every bilinear tap with a weight at atlas positions (h, w, 2) lies on the scene, not on the own car."""
+def clean_pixels(source: Camera, level: int) -> npt.NDArray[np.uint8]:
+    """255 (h, w) where a source that is halved ``level`` times shows the scene alone, 0 where some of its own car."""
     assert source.mask is not None
-    clean: Any = source.mask.astype(np.uint8) * 255
-    if slot.level:
-        clean = cv2.inRange(halved(clean, slot.level), 255, 255)  # a halved pixel is clean where all in it are
-    local = at - np.array([slot.x, slot.y], np.float32) if slot.x or slot.y else at
-    share = cv2.remap(clean, local, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+    clean: Any = source.mask.view(np.uint8) * np.uint8(255)
+    return cv2.inRange(halved(clean, level), 255, 255) if level else clean  # type: ignore[call-overload,return-value]
+
+
+def mask_at(clean: npt.NDArray[np.uint8], slot: Slot, at: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+    """255 where every bilinear tap with a weight at atlas positions (h, w, 2) lies on ``clean_pixels``."""
+    share: Any = cv2.remap(clean, in_slot(at, slot), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
     return np.asarray(cv2.inRange(share, 255, 255), np.uint8)  # cv2.compare refuses a single pixel
+
+
+def in_slot(at: npt.NDArray[np.float32], slot: Slot) -> npt.NDArray[np.float32]:
+    """Atlas positions (h, w, 2) as positions in one of its images."""
+    if not (slot.x or slot.y):
+        return at
+    moved: Any = cv2.subtract(at, (slot.x, slot.y, 0, 0))  # type: ignore[call-overload]  # numpy takes ten times as long
+    return moved
 
 
 def edge_distance(source: Camera, uv: FloatArray) -> FloatArray:
@@ -115,7 +125,7 @@ def edge_distance(source: Camera, uv: FloatArray) -> FloatArray:
     inside it; negative outside the image."""
     u, v = uv[..., 0], uv[..., 1]
     edge = np.minimum(np.minimum(u, source.width_px - 1 - u), np.minimum(v, source.height_px - 1 - v)) + 0.5
-    if source.mask is None:
+    if source.mask is None or source.mask.all():
         return edge
     h, w = source.size
     whole = cv2.copyMakeBorder(source.mask.astype(np.float32), 0, -h % 8, 0, -w % 8, cv2.BORDER_REPLICATE)

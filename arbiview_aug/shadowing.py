@@ -11,7 +11,7 @@ import numpy.typing as npt
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.dense import Layer
 from arbiview_aug.grid import Box, Grid
-from arbiview_aug.projection import CORNERS, source_points
+from arbiview_aug.projection import CORNERS, in_slot, source_points
 from arbiview_aug.sampling import Slot, level_size
 from arbiview_aug.surface import Layered, Shadows
 from arbiview_aug.target_rays import TargetRays
@@ -109,8 +109,7 @@ def _tiles_between(position: FloatArray, count: int) -> tuple[npt.NDArray[np.int
 
 def read_nearest(image: Layer, at: Layer, slot: Slot) -> Any:
     """Values (h, w) of a source's image at the pixels nearest to atlas positions (h, w, 2), 0 outside it."""
-    local = at - np.array([slot.x, slot.y], np.float32)
-    return cv2.remap(image, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
+    return cv2.remap(image, in_slot(at, slot), None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
 
 
 def nearest_pixel(image: npt.NDArray[Any], at: FloatArray) -> tuple[tuple[Any, Any], BoolArray]:

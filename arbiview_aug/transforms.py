@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import torch
 
-from arbiview_aug.camera import MAX_SIZE_PX
+from arbiview_aug.calibration import MAX_SIZE_PX
 from arbiview_aug.confidence import confidence
 from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError

@@ -174,7 +174,7 @@ def _full_size(rig: Rig, images: torch.Tensor) -> list[_Candidate]:
     label = "{1}x{0}".format(*rig.sizes[0])
     floor, frame = f"{label} floor", f"{label} frame, interleaved"
     return [
-        _Candidate(floor, _floor(images, rig.sizes[0])),
+        _Candidate(floor, remap_floor(images, rig.sizes[0])),
         _Candidate(frame, _frame(rig, target, images), floor, 1.5),
         _Candidate(f"{label} frame, planar", _frame(rig, target, images.contiguous()), floor, 1.5),
         _Candidate(f"{label} frame, harmonised", _frame(rig, target, images, _GAINS), frame),
@@ -189,7 +189,7 @@ def _small_size(rig: Rig, images: torch.Tensor, halves: torch.Tensor, size: tupl
     label = "{1}x{0}".format(*size)
     floor, full, half = f"{label} floor", f"{label} frame, from full size", f"{label} frame, from half size"
     return [
-        _Candidate(floor, _floor(images, size)),
+        _Candidate(floor, remap_floor(images, size)),
         _Candidate(full, _frame(rig, target, images), floor, 2.2),
         _Candidate(f"{full}, harmonised", _frame(rig, target, images, _GAINS), full),
         _Candidate(half, _frame(half_rig, target, halves), floor, 1.6),
@@ -201,7 +201,8 @@ def _small_size(rig: Rig, images: torch.Tensor, halves: torch.Tensor, size: tupl
     ]
 
 
-def _floor(images: torch.Tensor, size: tuple[int, int]) -> Callable[[], None]:
+def remap_floor(images: torch.Tensor, size: tuple[int, int]) -> Callable[[], None]:
+    """The floor: bare remaps of as many views of ``size`` (h, w) as there are images (N, 3, >=h, >=w) uint8."""
     h, w = size
     sources = [np.ascontiguousarray(image.permute(1, 2, 0).numpy()[:h, :w]) for image in images]
     y, x = np.indices((h, w), dtype=np.float32)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import json
+import math
 import os
 import platform
 import re
@@ -30,6 +31,7 @@ from arbiview_aug.errors import DataError
 
 _DISTRIBUTIONS = ("arbiview_aug", "torch", "numpy", "kornia")
 _MIB = 2**20
+_LEAST_ROUNDS = 3  # a median of fewer is a single time
 
 
 class Quartiles(NamedTuple):
@@ -47,17 +49,27 @@ def quartiles(times_ms: npt.NDArray[np.float64]) -> Quartiles:
 
 
 def timed_rounds(
-    candidates: Mapping[str, Callable[[], Any]], rounds: int, label: str
+    candidates: Mapping[str, Callable[[], Any]], rounds: int, label: str, *, enough_ms: float = math.inf
 ) -> dict[str, npt.NDArray[np.float64]]:
-    """(rounds,) CPU milliseconds of each candidate; ``label`` names the progress bar."""
-    times = {name: np.empty(rounds) for name in candidates}
-    for k in tqdm(range(rounds), desc=label, unit="round", leave=False):
+    """CPU milliseconds of each candidate, in every round.
+
+    Args:
+        candidates: What to run, by name.
+        rounds: At most so many.
+        label: Names the progress bar.
+        enough_ms: A candidate that has taken as much in ``_LEAST_ROUNDS`` or more sits the others out: long times
+            vary less.
+    """
+    times: dict[str, list[float]] = {name: [] for name in candidates}
+    for _ in tqdm(range(rounds), desc=label, unit="round", leave=False):
         for name, run in candidates.items():
+            if len(times[name]) >= _LEAST_ROUNDS and sum(times[name]) >= enough_ms:
+                continue
             run()
             start = time.process_time()
             run()
-            times[name][k] = 1e3 * (time.process_time() - start)
-    return times
+            times[name].append(1e3 * (time.process_time() - start))
+    return {name: np.array(taken) for name, taken in times.items()}
 
 
 @contextmanager
