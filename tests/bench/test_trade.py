@@ -14,6 +14,7 @@ from arbiview_aug.__main__ import main
 from arbiview_aug.bench.data import recorded
 from arbiview_aug.bench.others import OURS, ROW_SPLIT, STITCHING, every_move, lost_moves, same_rotation
 from arbiview_aug.bench.sweep import Setting, settings
+from arbiview_aug.bench.trade import _moves, table
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.rig import load_rig
@@ -58,6 +59,10 @@ def test_the_sweep(report: dict[str, Any]) -> None:
     assert best["front"] and report["steps"] and set(report["steps"]) <= {n for n, row in rows.items() if row["front"]}
     assert report["advice"]["setting"] == best["name"] and report["advice"]["again"]["median_ms"] < 1000
     assert report["moves"] is None
+    printed = table(report)
+    assert all(f"| {name}" in printed for name, row in rows.items() if row["front"])
+    assert f"Recommended, the most accurate within 1000 ms a frame: {best['name']}" in printed
+    assert "kornia's warp_perspective" in printed and "more settings, none of them on the front" in printed
 
 
 def test_what_nothing_keeps_to_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -65,7 +70,7 @@ def test_what_nothing_keeps_to_is_said(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["bench", "trade", *only, "--repeats", "1", "--min-psnr", "90", "--output", str(tmp_path)]) == 1
     printed = capsys.readouterr().out
     assert "No recommendation: nothing reaches 90 dB: the best has" in printed
-    assert "** draft, far, 1/1, opencv" in printed
+    assert "| draft, far, 1/1, opencv | step |" in printed
 
 
 def test_real_frames_need_points(fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -105,4 +110,6 @@ def test_rivals_at_every_move(moves: dict[str, dict[str, Any]]) -> None:
     assert lost_moves(moves, "common_psnr_db", OURS, ROW_SPLIT) == []
     assert lost_moves(moves, "common_psnr_db", OURS, STITCHING) == []
     first = {name: {"psnr_db": 20.0 + k} for k, name in enumerate((OURS, ROW_SPLIT))}
+    printed = _moves(moves)
+    assert f"{OURS} against {ROW_SPLIT}, common pixels: better at 6 of 6 moves\n" in printed
     assert lost_moves({"turned": first}, "psnr_db") == ["turned 20.00 against 21.00 dB"]
