@@ -33,6 +33,8 @@ from arbiview_aug.rig import Rig, load_rig
 from arbiview_aug.surface import SurfaceName
 
 SIZE = (256, 704)
+MOVES = ("paper", "yaw", "vehicles", "truck")
+"""Sets of targets (``evaluate.targets.named_targets``) for ``--moves``."""
 _SOURCES_OVER_VIEWS = 2
 """Synthetic images are as much larger than the views: so decoding at half size has something to save."""
 
@@ -125,7 +127,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
         "steps": [point.name for point in distinct_steps(points)],
         "advice": None if advice is None else _advice(advice),
         "same_rotation": _rotations(data, source, arguments),
-        "moves": every_move(data, arguments.frames, REFERENCE) if arguments.moves else None,
+        "moves": every_move(data, arguments.frames, REFERENCE, MOVES) if arguments.moves else None,
         "machine": machine(load_before),
         "versions": versions(),
     }
@@ -160,7 +162,7 @@ def _rotations(data: Recorded, source: Rig, arguments: argparse.Namespace) -> li
 
 
 # --- the tables -------------------------------------------------------------------------------------------------------
-_COLUMNS = (
+COLUMNS = (
     ("ms", "{median_ms:.1f}"),
     ("quartiles", "{q1_ms:.1f} to {q3_ms:.1f}"),
     ("x floor", "{floor_ratio:.2f}"),
@@ -170,7 +172,7 @@ _COLUMNS = (
     ("seen", "{seen:.1%}"),
     ("whole dB", "{whole_psnr_db:.2f}"),
 )
-_NOTES = (
+NOTES = (
     "CPU ms a frame on one thread, with the plan where every frame needs its own; x floor: bare cv2.remap of the same "
     "views; x decode: reading the images that the setting reads (1/2: at half size); MiB: growth over the first call; "
     "dB: of the pixels that some source sees; whole dB: of all, the others black. *Front*: nothing is both faster and "
@@ -191,12 +193,12 @@ def table(report: Mapping[str, Any]) -> str:
     for row in shown:
         mark = "step" if row["name"] in steps else "front" if row["front"] else ""
         known = {**row, "peak_mib": math.nan if row["peak_mib"] is None else row["peak_mib"]}
-        cells.append([row["name"], mark, *(form.format(**known) for _, form in _COLUMNS)])
+        cells.append([row["name"], mark, *(form.format(**known) for _, form in COLUMNS)])
     lines = [
         f"{report['data']} to {report['target']}, views of {w}x{h}, against {report['against']}; "
-        f"{machine_line(report)}. {_NOTES}",
+        f"{machine_line(report)}. {NOTES}",
         "",
-        markdown_table(["", "", *(heading for heading, _ in _COLUMNS)], cells, left=2),
+        markdown_table(["", "", *(heading for heading, _ in COLUMNS)], cells, left=2),
     ]
     if len(rows) > len(shown):
         lines += ["", f"{len(rows) - len(shown)} more settings, none of them on the front, are in the JSON."]
