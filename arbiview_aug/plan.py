@@ -116,5 +116,12 @@ def build_plan(
     layout = AtlasLayout.for_sources(source.sizes, used)
     scratch = Scratch()
     targets = tuple(draft.finish(layout, scratch) for draft in drafts)
+    read = {
+        (region.source, region.level)
+        for draft, target in zip(drafts, targets, strict=True)
+        for region in draft.regions
+        if region.source in target.sources
+    }
+    layout = layout.without_others(read)
     counters["bands"] = sum(len(t.bands) for t in targets)
     return RenderPlan(source, target, layout, targets, config.interpolation, dict(counters))

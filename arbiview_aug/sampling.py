@@ -12,8 +12,8 @@ An atlas holds the source images that a plan reads, below and beside each other,
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -163,6 +163,10 @@ class AtlasLayout:
                 "them, and their cameras by Rig.resized"
             )
         return cls(tuple(slots), (max(rows, 1), max(columns, 1)), False)
+
+    def without_others(self, read: Collection[tuple[int, int]]) -> AtlasLayout:
+        """The same places for the (source, level) pairs that are read: images that win no pixel are not copied."""
+        return replace(self, slots=tuple(slot for slot in self.slots if (slot.source, slot.level) in read))
 
     def slot(self, source: int, level: int) -> Slot:
         """The place of one source at one level."""

@@ -97,6 +97,11 @@ class TargetPlan:
         """(h, w) True where some source sees the pixel."""
         return self.source_camera >= 0
 
+    @property
+    def sources(self) -> set[int]:
+        """Indices of the source cameras that are read."""
+        return {pair.source for pair in self.pairs} | {band.source for band in self.bands}
+
     @cached_property
     def patches(self) -> list[list[Patch]]:
         """For each strip of rows, which source wins where, for tone curves; found when first asked for."""
