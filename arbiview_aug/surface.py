@@ -261,6 +261,13 @@ def wall_inverse_distance(
     return np.clip(q, 0.0, MAX_INVERSE_DISTANCE)
 
 
+def is_within_wall(origin: FloatArray) -> bool:
+    """Whether a centre (3,) stands within the street's far wall, the smaller of the two: from outside it has edges."""
+    ox = (origin[0] - WALL_CENTER_M[0]) / Street.half_length_m
+    oy = (origin[1] - WALL_CENTER_M[1]) / Street.half_width_m
+    return bool(ox * ox + oy * oy < 1)
+
+
 def street_uncertainty(origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
     """Mean error (...,) in 1/m of a street without objects: they stand in front of it, and nobody said where.
 

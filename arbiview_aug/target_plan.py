@@ -24,7 +24,7 @@ from arbiview_aug.projection import edge_distance, resolution
 from arbiview_aug.required import SAME_CENTER_M, serves_alone
 from arbiview_aug.rig import Rig
 from arbiview_aug.sampling import AtlasLayout, FixedMap, Scratch
-from arbiview_aug.surface import Surface, worst_parallax_px
+from arbiview_aug.surface import Surface, is_within_wall, worst_parallax_px
 from arbiview_aug.target_rays import TargetRays
 from arbiview_aug.tone import Patch, patches
 
@@ -160,7 +160,9 @@ class TargetDraft:
         self.source, self.camera, self.surface, self.config = source, camera, surface, config
         self.best, self.surface_by_name = best, surface_by_name
         self.counters = counters
-        self.rays = TargetRays(camera, config.grid_step_px, counters)
+        # From outside, the far wall is a narrow strip with edges, which a coarse grid could step over.
+        step = config.grid_step_px if is_within_wall(camera.center_m) else 1
+        self.rays = TargetRays(camera, step, counters)
         self.grid = self.rays.grid
         # In content order, so that ties never depend on the order of the source list.
         self.regions = [region for k in self._required(order) if (region := self._region(k)) is not None]

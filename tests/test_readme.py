@@ -12,7 +12,9 @@ from typing import get_args
 import pytest
 
 from arbiview_aug.__main__ import main
+from arbiview_aug.bench import trade
 from arbiview_aug.bench.ablation import NOTES, ROWS, STEPS, markdown
+from arbiview_aug.bench.sweep import settings
 from arbiview_aug.evaluate import paper_tables
 from arbiview_aug.evaluate.frames import Frame
 from arbiview_aug.evaluate.methods import study_methods
@@ -35,6 +37,12 @@ TINY = {
     "evaluate --paper": ["--size", "16x44", "--frames", "1"],
     "evaluate --figure --data FOLDER": ["--reduce", "4"],
     "inspect nuscenes waymo": [],
+    "bench --data FOLDER --budget-ms 20": [
+        *("--quality", "draft", "--surface", "far", "street", "--reduce", "4", "--size", "40x72", "--repeats", "1")
+    ],
+    "bench --data FOLDER --budget-ms 20 --moves": [
+        *("--quality", "draft", "--surface", "far", "--reduce", "4", "--size", "40x72", "--repeats", "1")
+    ],
     "bench speed --data FOLDER": ["--repeats", "1"],
     "bench speed": ["--repeats", "1"],
     "bench ablation --data FOLDER": ["--reduce", "4", "--only", "street, not far"],
@@ -92,6 +100,7 @@ def test_the_commands_run(
     if "--paper" in arguments:  # whole, it takes long
         monkeypatch.delenv("ARBIVIEW_DATA", raising=False)
         monkeypatch.setattr(paper_tables, "SETS", ("truck",))
+    monkeypatch.setattr(trade, "MOVES", ("truck",))
     monkeypatch.chdir(tmp_path)
     assert main([*arguments, *TINY[command]]) == 0
     assert any(path.is_file() for path in tmp_path.rglob("*"))
@@ -108,6 +117,17 @@ def test_the_ablation_is_the_commands() -> None:
     assert shown[0] == printed[0] and [row[:2] for row in shown] == [row[:2] for row in printed]
     assert all(re.fullmatch(r"\d\d\.\d\d \([+-]\d\.\d\d\)", row[k]) for row in shown[2:] for k in (2, 3, 6, 7))
     assert NOTES in words(measured("ablation"))
+
+
+def test_the_trade_is_the_commands() -> None:
+    (block,) = re.findall(r"<!-- trade -->\n(.*?)<!-- /trade -->", README, re.DOTALL)
+    (table,) = re.findall(r"((?:^\|.*\n)+)", block, re.MULTILINE)
+    head, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+    assert head == ["", "", *(heading for heading, _ in trade.COLUMNS)]
+    known = {setting.name for setting in settings(["far", "ground", "street", "lidar"])}
+    assert {name for name, *_ in rows} <= known and sum(mark == "step" for _, mark, *_ in rows) >= 4
+    assert trade.NOTES in block and block.count("kornia's warp_perspective") == 2
+    assert re.search(r"^Recommended, the most accurate within 20 ms a frame: ", block, re.MULTILINE)
 
 
 def test_the_papers_tables_are_the_commands() -> None:
@@ -137,8 +157,9 @@ def test_measurements_name_tests_that_are_there() -> None:
 
 
 def test_pictures_and_files_exist() -> None:
-    (picture,) = re.findall(r"!\[[^]]*\]\(([^)]+)\)", README)
-    assert 0 < (ROOT / picture).stat().st_size <= LARGEST_PICTURE_BYTES
+    pictures = re.findall(r"!\[[^]]*\]\(([^)]+)\)", README)
+    assert len(pictures) == 2
+    assert all(0 < (ROOT / picture).stat().st_size <= LARGEST_PICTURE_BYTES for picture in pictures)
     for path in re.findall(r"`((?:arbiview_aug|tests|\.ci)/[^`\s]+)`", README):
         assert (ROOT / path).exists(), path
 

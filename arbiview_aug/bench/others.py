@@ -29,7 +29,6 @@ from arbiview_aug.rig import Rig
 from arbiview_aug.sampling import Scratch
 
 YAW_DEG = 22.0
-MOVES = ("paper", "yaw", "vehicles", "truck")
 OURS, ROW_SPLIT, STITCHING = "fast, street", "row split (UniDrive)", "OpenCV stitching"
 
 
@@ -113,7 +112,7 @@ def _renderer(name: str, renderer: Renderer) -> Method:
     return Method(name, render)
 
 
-def every_move(data: Recorded, frames: int, reduce: Reduce, moves: Sequence[str] = MOVES) -> dict[str, dict[str, Any]]:
+def every_move(data: Recorded, frames: int, reduce: Reduce, moves: Sequence[str]) -> dict[str, dict[str, Any]]:
     """PSNR of each rival for each frame and move: over all pixels (unseen ones black), and over common ones.
 
     Common are the pixels that both ``OURS`` and ``ROW_SPLIT`` cover: what each leaves black is not compared there.

@@ -52,7 +52,7 @@ def save_plot(rows: Sequence[Mapping[str, Any]], steps: Sequence[str], title: st
         axes.annotate(
             row["name"],
             (row["median_ms"], row["psnr_db"]),
-            xytext=(-8 if right else 8, -14 if k % 2 else 8),
+            xytext=(-8 if right else 8, 8 if k % 2 else -14),
             textcoords="offset points",
             fontsize=8,
             ha="right" if right else "left",

@@ -8,6 +8,7 @@ before it is named.
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
@@ -17,7 +18,7 @@ from typing import Any, get_args
 import torch
 
 from arbiview_aug.bench.data import REDUCES, Recorded, recorded
-from arbiview_aug.bench.front import Advice, Point, at_least, distinct_steps, pareto_front, within_budget
+from arbiview_aug.bench.front import LEAST_GAIN_DB, Advice, Point, at_least, distinct_steps, pareto_front, within_budget
 from arbiview_aug.bench.others import OURS, ROW_SPLIT, STITCHING, every_move, lost_moves, same_rotation
 from arbiview_aug.bench.plot import save_plot
 from arbiview_aug.bench.sweep import REFERENCE, REPEATS, Execution, Sweep, settings
@@ -25,12 +26,15 @@ from arbiview_aug.bench.timing import Quartiles, machine, machine_line, one_thre
 from arbiview_aug.command_line import REAL_TARGET, add_data, add_target, count, size, writable_folder
 from arbiview_aug.datasets.synthetic import demo_target_rig
 from arbiview_aug.errors import SampleError
+from arbiview_aug.evaluate.tables import markdown_table
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.favs.config import Quality
 from arbiview_aug.rig import Rig, load_rig
 from arbiview_aug.surface import SurfaceName
 
 SIZE = (256, 704)
+MOVES = ("paper", "yaw", "vehicles", "truck")
+"""Sets of targets (``evaluate.targets.named_targets``) for ``--moves``."""
 _SOURCES_OVER_VIEWS = 2
 """Synthetic images are as much larger than the views: so decoding at half size has something to save."""
 
@@ -123,7 +127,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
         "steps": [point.name for point in distinct_steps(points)],
         "advice": None if advice is None else _advice(advice),
         "same_rotation": _rotations(data, source, arguments),
-        "moves": every_move(data, arguments.frames, REFERENCE) if arguments.moves else None,
+        "moves": every_move(data, arguments.frames, REFERENCE, MOVES) if arguments.moves else None,
         "machine": machine(load_before),
         "versions": versions(),
     }
@@ -158,68 +162,77 @@ def _rotations(data: Recorded, source: Rig, arguments: argparse.Namespace) -> li
 
 
 # --- the tables -------------------------------------------------------------------------------------------------------
-_COLUMNS = (
+COLUMNS = (
     ("ms", "{median_ms:.1f}"),
-    ("quartiles", "{q1_ms:.1f} .. {q3_ms:.1f}"),
+    ("quartiles", "{q1_ms:.1f} to {q3_ms:.1f}"),
     ("x floor", "{floor_ratio:.2f}"),
     ("x decode", "{decode_ratio:.2f}"),
     ("MiB", "{peak_mib:.0f}"),
     ("dB", "{psnr_db:.2f}"),
-    ("seen", "{seen:.0%}"),
+    ("seen", "{seen:.1%}"),
     ("whole dB", "{whole_psnr_db:.2f}"),
+)
+NOTES = (
+    "CPU ms a frame on one thread, with the plan where every frame needs its own; x floor: bare cv2.remap of the same "
+    "views; x decode: reading the images that the setting reads (1/2: at half size); MiB: growth over the first call; "
+    "dB: of the pixels that some source sees; whole dB: of all, the others black. *Front*: nothing is both faster and "
+    f"better; *step*: by {LEAST_GAIN_DB} dB and more than the spread of times."
 )
 
 
 def table(report: Mapping[str, Any]) -> str:
-    """The report to read: settings from fast to slow, the front marked, then others, then the recommendation."""
+    """The report to read, in Markdown: settings from fast to slow, then others, then the recommendation.
+
+    Shown are the front, and of the rest what OpenCV makes of images decoded as the first shown on the front are.
+    """
     h, w = report["size"]
-    rows = sorted(report["settings"], key=lambda row: row["median_ms"])
-    width = max(len(row["name"]) for row in rows) + 4
+    steps, rows = report["steps"], sorted(report["settings"], key=lambda row: row["median_ms"])
+    usual = next(row["reduce"] for row in rows if row["name"] in steps)
+    shown = [r for r in rows if r["front"] or (r["reduce"] == usual and r["execution"] == "opencv")]
+    cells = []
+    for row in shown:
+        mark = "step" if row["name"] in steps else "front" if row["front"] else ""
+        known = {**row, "peak_mib": math.nan if row["peak_mib"] is None else row["peak_mib"]}
+        cells.append([row["name"], mark, *(form.format(**known) for _, form in COLUMNS)])
     lines = [
-        f"{report['data']} to {report['target']}, views of {w}x{h}, against {report['against']}",
-        machine_line(report),
+        f"{report['data']} to {report['target']}, views of {w}x{h}, against {report['against']}; "
+        f"{machine_line(report)}. {NOTES}",
         "",
-        f"{'':<{width}}" + "".join(f"{heading:>16}" for heading, _ in _COLUMNS),
+        markdown_table(["", "", *(heading for heading, _ in COLUMNS)], cells, left=2),
     ]
-    for row in rows:
-        mark = "**" if row["name"] in report["steps"] else "*" if row["front"] else ""
-        known = {**row, "peak_mib": float("nan") if row["peak_mib"] is None else row["peak_mib"]}
-        cells = [f"{form.format(**known):>16}" for _, form in _COLUMNS]
-        lines.append(f"{mark:<3}{row['name']:<{width - 3}}" + "".join(cells))
-    lines += [
-        "",
-        "* on the front: nothing is both faster and better; ** by more than 0.2 dB and the spread of times.",
-        "x floor: bare cv2.remap of the same views; x decode: reading the images that the setting reads.",
-        "dB: of the pixels that some source sees; whole dB: of all, the others black.",
-    ]
-    for rotation in report["same_rotation"]:
-        ms = {name: f"{time['median_ms']:.1f} ms" for name, time in rotation["times"].items()}
-        ours = ", ".join(f"{name} {ms[name]} ({ratio:.3f} of it)" for name, ratio in rotation["ratio"].items())
-        lines.append(
-            f"Turned by {rotation['yaw_deg']:g} degrees, {rotation['size'][1]}x{rotation['size'][0]}: kornia "
-            f"{ms['kornia warp_perspective']}; ours, {ours}; mean difference {rotation['mean_difference']:.2f} grey "
-            "levels."
-        )
+    if len(rows) > len(shown):
+        lines += ["", f"{len(rows) - len(shown)} more settings, none of them on the front, are in the JSON."]
+    if report["same_rotation"]:
+        lines += ["", " ".join(map(_rotation, report["same_rotation"]))]
     if report["moves"]:
-        lines += ["", *_moves(report["moves"])]
+        lines += ["", _moves(report["moves"])]
     if report["advice"]:
         lines += ["", advice_line(report["advice"])]
     return "\n".join(lines)
 
 
-def _moves(moves: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def _rotation(found: Mapping[str, Any]) -> str:
+    ms = {name: f"{time['median_ms']:.1f} ms" for name, time in found["times"].items()}
+    ours = ", ".join(f"{name} {ms[name]} ({ratio:.2f} of it)" for name, ratio in found["ratio"].items())
+    return (
+        f"Turned by {found['yaw_deg']:g} degrees at {found['size'][1]}x{found['size'][0]}: kornia's warp_perspective "
+        f"{ms['kornia warp_perspective']}; ours, {ours}; mean difference {found['mean_difference']:.2f} grey levels."
+    )
+
+
+def _moves(moves: Mapping[str, Mapping[str, Any]]) -> str:
     names = list(next(iter(moves.values())))
-    lines = [f"{'dB: all pixels / common ones':<36}" + "".join(f"{name:>24}" for name in names)]
-    for move, row in moves.items():
-        cells = [f"{row[name]['psnr_db']:.2f} / {row[name]['common_psnr_db']:.2f}" for name in names]
-        lines.append(f"{move:<36}" + "".join(f"{cell:>24}" for cell in cells))
+    rows = [
+        [move, *(f"{row[name]['psnr_db']:.2f} / {row[name]['common_psnr_db']:.2f}" for name in names)]
+        for move, row in moves.items()
+    ]
+    lines = ["dB: all pixels / those that ours and row split cover", "", markdown_table(["", *names], rows), ""]
     for other in (ROW_SPLIT, STITCHING):
         for metric, what in (("psnr_db", "all pixels"), ("common_psnr_db", "common pixels")):
             lost = lost_moves(moves, metric, OURS, other)
-            lines.append(
-                f"{OURS} loses to {other} on {what} at {len(lost)} of {len(moves)}: {'; '.join(lost) or 'none'}"
-            )
-    return lines
+            better = f"{OURS} against {other}, {what}: better at {len(moves) - len(lost)} of {len(moves)} moves"
+            lines.append(f"{better}; not at {'; '.join(lost)}" if lost else better)
+    return "\n".join(lines)
 
 
 def advice_line(advice: Mapping[str, Any]) -> str:

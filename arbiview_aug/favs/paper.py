@@ -279,7 +279,8 @@ def fusion_weight(
         weight = weight * (config.unmatched_quality + (1 - config.unmatched_quality) * quality)
     if config.use_primary_weight:
         weight = weight * primary_weight(primary, config.primary_bonus)
-    return weight.astype(np.float32)
+    # In float32 small weights may vanish, but what a source sees is covered however little it counts.
+    return np.where(coverage, np.maximum(weight, np.finfo(np.float32).tiny), 0).astype(np.float32)
 
 
 def _gradient_magnitude(image: Float32Image) -> FloatArray:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from arbiview_aug.__main__ import main
 from arbiview_aug.bench.data import recorded
 from arbiview_aug.bench.others import OURS, ROW_SPLIT, STITCHING, every_move, lost_moves, same_rotation
 from arbiview_aug.bench.sweep import Setting, settings
+from arbiview_aug.bench.trade import _moves, table
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.rig import load_rig
@@ -58,6 +61,10 @@ def test_the_sweep(report: dict[str, Any]) -> None:
     assert best["front"] and report["steps"] and set(report["steps"]) <= {n for n, row in rows.items() if row["front"]}
     assert report["advice"]["setting"] == best["name"] and report["advice"]["again"]["median_ms"] < 1000
     assert report["moves"] is None
+    printed = table(report)
+    assert all(f"| {name}" in printed for name, row in rows.items() if row["front"])
+    assert f"Recommended, the most accurate within 1000 ms a frame: {best['name']}" in printed
+    assert "kornia's warp_perspective" in printed and "more settings, none of them on the front" in printed
 
 
 def test_what_nothing_keeps_to_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -65,7 +72,7 @@ def test_what_nothing_keeps_to_is_said(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["bench", "trade", *only, "--repeats", "1", "--min-psnr", "90", "--output", str(tmp_path)]) == 1
     printed = capsys.readouterr().out
     assert "No recommendation: nothing reaches 90 dB: the best has" in printed
-    assert "** draft, far, 1/1, opencv" in printed
+    assert "| draft, far, 1/1, opencv | step |" in printed
 
 
 def test_real_frames_need_points(fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -105,4 +112,26 @@ def test_rivals_at_every_move(moves: dict[str, dict[str, Any]]) -> None:
     assert lost_moves(moves, "common_psnr_db", OURS, ROW_SPLIT) == []
     assert lost_moves(moves, "common_psnr_db", OURS, STITCHING) == []
     first = {name: {"psnr_db": 20.0 + k} for k, name in enumerate((OURS, ROW_SPLIT))}
+    printed = _moves(moves)
+    assert f"{OURS} against {ROW_SPLIT}, common pixels: better at 6 of 6 moves\n" in printed
     assert lost_moves({"turned": first}, "psnr_db") == ["turned 20.00 against 21.00 dB"]
+
+
+@pytest.mark.bench
+@pytest.mark.xfail("CI" in os.environ, reason="on shared machines times are reported, not asserted", strict=False)
+def test_the_trade_on_a_real_frame(nuscenes_root: Path, tmp_path: Path) -> None:
+    """Steps to choose from, a budget that is kept, kornia slower, decoding dearer, row split worse at each move."""
+    only = ["--reduce", "2", "--execution", "opencv", "--budget-ms", "20", "--output", str(tmp_path), "--moves"]
+    assert main(["bench", "--data", str(nuscenes_root), *only]) == 0
+    report = json.loads((tmp_path / "trade.json").read_text())
+    rows = {row["name"]: row for row in report["settings"]}
+    print(table(report))
+    assert len(rows) >= 8 and len(report["steps"]) >= 4
+    steps = [rows[name] for name in report["steps"]]
+    for one, two in itertools.pairwise(steps):
+        assert two["psnr_db"] >= one["psnr_db"] + 0.2 and two["q1_ms"] > one["q3_ms"]
+    assert report["advice"]["again"]["median_ms"] <= 20
+    assert rows["fast, street, 1/2, opencv"]["decode_ratio"] < 1
+    assert all(ratio < 1 for rotation in report["same_rotation"] for ratio in rotation["ratio"].values())
+    for metric in ("psnr_db", "common_psnr_db"):
+        assert len(report["moves"]) == 16 and lost_moves(report["moves"], metric) == []
