@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from arbiview_aug.bench.data import REDUCES, as_of_another_frame, recorded
 from arbiview_aug.bench.timing import machine, machine_line, one_thread, quartiles, timed_rounds, versions, write_json
@@ -192,9 +191,9 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
 # --- situations -------------------------------------------------------------------------------------------------------
 def situations(sample: Mapping[str, Any]) -> list[Situation]:
     """The situations that a frame can be brought into: those about LiDAR where it has points."""
-    bare = {key: value for key, value in sample.items() if key not in _GEOMETRY}
-    rig = sample["rig"]
-    turned, cut = without_masks(rig).turned(yaw_deg=YAW_DEG), zoomed(rig, ZOOM)
+    rig = without_masks(sample["rig"])  # of what the own car hides no source sees all
+    bare = {key: value for key, value in sample.items() if key not in _GEOMETRY} | {"rig": rig}
+    turned, cut = rig.turned(yaw_deg=YAW_DEG), zoomed(rig, ZOOM)
 
     def over(name: str, target: Rig, frame: Mapping[str, Any], **settings: Any) -> Case:
         return Case(frame, nearly(target), {"surface": name, **settings})
@@ -209,8 +208,8 @@ def situations(sample: Mapping[str, Any]) -> list[Situation]:
         Situation(
             "target = source",
             "no neighbour is looked at, no seam is blended",
-            Case(bare, without_masks(rig)),
-            over("street", without_masks(rig), bare),
+            Case(bare, rig),
+            over("street", rig, bare),
         ),
         Situation(
             f"one source sees all (zoom {ZOOM:g})",
@@ -244,8 +243,8 @@ def situations(sample: Mapping[str, Any]) -> list[Situation]:
             Situation(
                 f"LiDAR, all cameras at one centre, turned by {YAW_DEG:g} deg",
                 "no point is read, the plan is held",
-                Case(shared, without_masks(shared["rig"]).turned(yaw_deg=YAW_DEG)),
-                over("lidar", without_masks(shared["rig"]).turned(yaw_deg=YAW_DEG), shared),
+                Case(shared, shared["rig"].turned(yaw_deg=YAW_DEG)),
+                over("lidar", shared["rig"].turned(yaw_deg=YAW_DEG), shared),
             ),
         ]
     apart, together = subsets(rig)
@@ -281,7 +280,7 @@ def zoomed(rig: Rig, factor: float) -> Rig:
     """The middle of every camera's view, at the same size: each sees all of its own."""
     scale = np.diag([factor, factor, 1.0])
     cameras = []
-    for camera in without_masks(rig):
+    for camera in rig:
         h, w = camera.size
         middle = np.array([[1, 0, (w - 1) / 2], [0, 1, (h - 1) / 2], [0, 0, 1]])
         cameras.append(replace(camera, K=middle @ scale @ np.linalg.inv(middle) @ camera.K))
@@ -313,7 +312,7 @@ def _only(sample: Mapping[str, Any], cameras: Sequence[int], settings: Mapping[s
     """The frame of some cameras, raised."""
     rig = sample["rig"].with_cameras([sample["rig"][k] for k in cameras])
     images = [sample["images"][k] for k in cameras]
-    return Case({"images": images, "rig": rig}, without_masks(rig).shifted(z_m=UP_M), settings)
+    return Case({"images": images, "rig": rig}, rig.shifted(z_m=UP_M), settings)
 
 
 # --- measuring --------------------------------------------------------------------------------------------------------
@@ -331,17 +330,8 @@ def done(cases: Sequence[Case], repeats: int, label: str) -> list[Done]:
 def _frame(case: Case) -> Callable[[], Any]:
     """Every other frame is new to the transform."""
     retarget = case.retarget()
-    frames = itertools.cycle([case.sample, another(case.sample)])
+    frames = itertools.cycle([case.sample, as_of_another_frame(case.sample)])
     return lambda: retarget(next(frames))
-
-
-def another(sample: Mapping[str, Any]) -> dict[str, Any]:
-    """The same frame with all that was measured a little aside, images too; memory lies as it did."""
-    images = sample["images"]
-    moved: Any = images.clone() if isinstance(images, torch.Tensor) else [image.clone() for image in images]
-    for to, image in zip(moved, images, strict=True):
-        to[..., 1:] = image[..., :-1]
-    return as_of_another_frame(sample) | {"images": moved}
 
 
 def _plan(case: Case) -> Callable[[], Any]:
@@ -358,7 +348,7 @@ def _done(case: Case, plan_ms: float | None, frame_ms: float) -> Done:
     if plan_ms is None:
         return Done(None, frame_ms, False, {}, (0, 0), 0, 0, 0, 0)
     retarget = case.retarget()
-    first, second = (retarget.explain(frame) for frame in (case.sample, another(case.sample)))
+    first, second = (retarget.explain(frame) for frame in (case.sample, as_of_another_frame(case.sample)))
     assert isinstance(first, Explanation) and isinstance(second, Explanation)
     counters, depth = first.plan.counters, first.depth
     return Done(
