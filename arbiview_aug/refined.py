@@ -24,8 +24,8 @@ _STEPS = 2
 again. A third one moves nothing by more than 0.02 dB on two real frames."""
 
 _SLACK = 8.0
-"""Maps may err by 1/8 px: distances are measured to a pixel of a view 400 px wide. Against every bend to 1/64 px, on
-nuScenes at half resolution, raised: 99 % of the positions within 1/16 px, views 61 dB alike, and a third of the time."""
+"""Maps may err by 1/8 px: distances are measured to a pixel of a view 400 px wide. Against 1/64 px on nuScenes at half
+resolution, raised: 99 % of the positions within 1/16 px, views 61 dB alike, and a third of the time."""
 
 _ROW = 4096  # remap's sizes must stay below 32767
 
