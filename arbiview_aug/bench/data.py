@@ -83,8 +83,13 @@ def recorded(data: str | Path | None, *, frames: int = 1, size: tuple[int, int] 
 
 
 def as_of_another_frame(sample: Mapping[str, Any]) -> dict[str, Any]:
-    """The same sample with its points and boxes a millimetre away: nothing that was planned for the one fits it."""
-    moved = dict(sample)
+    """The same sample with its images a pixel aside and its points and boxes a millimetre: nothing that was planned or
+    estimated for the one fits the other. Memory lies as it did."""
+    images = sample["images"]
+    aside: Any = images.clone() if isinstance(images, torch.Tensor) else [image.clone() for image in images]
+    for to, image in zip(aside, images, strict=True):
+        to[..., 1:] = image[..., :-1]
+    moved = dict(sample) | {"images": aside}
     for key in ("points", "boxes_3d"):
         if key in sample:
             shift = torch.zeros(sample[key].shape[-1])
