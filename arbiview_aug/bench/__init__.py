@@ -2,7 +2,7 @@
 
 ``trade``, the default: speed against accuracy of all settings (``bench.trade``). ``speed``: milliseconds against bare
 ``cv2.remap`` calls (``bench.speed``). ``ablation``: each stage and setting on and off, dB and milliseconds
-(``bench.ablation``). ``scene``: what is not done where a scene does not require it (``bench.scene``).
+(``bench.ablation``). ``device``: batches by torch, on a GPU where there is one (``bench.device``). ``scene``: what is not done where a scene does not require it (``bench.scene``).
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from importlib import import_module
 BENCHMARKS = {
     "trade": "speed against accuracy of all settings, and which to use (the default)",
     "speed": "milliseconds against bare cv2.remap calls",
+    "device": "batches by torch, on a GPU where there is one",
     "ablation": "each stage and setting on and off: dB and milliseconds",
     "scene": "only what a scene requires is done: counters and milliseconds",
 }

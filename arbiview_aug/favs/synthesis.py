@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
 
 from arbiview_aug import sampling
+from arbiview_aug.held import Held
 from arbiview_aug.plan import RenderPlan
-from arbiview_aug.sampling import Scratch
+from arbiview_aug.sampling import FixedMap, Scratch
+from arbiview_aug.target_plan import Band
 from arbiview_aug.tone import STRIP_ROWS, ToneCurve
+
+_ON_DEVICE_BYTES = 256 * 2**20  # three full-size plans of six cameras, or thirty of 256x704
 
 
 def render_opencv(
@@ -70,8 +76,102 @@ def render_opencv(
     return [view.to(dtype) for view in views]
 
 
+class TorchBand(NamedTuple):
+    """A blended band of a target on a device.
+
+    Attributes:
+        part: The band's rows and columns in a view (B, 3, h, w).
+        source: Which source is blended in, ().
+        grid: (bh, bw, 2) where to read it.
+        weight: (bh, bw) its share.
+    """
+
+    part: tuple[slice, ...]
+    source: torch.Tensor
+    grid: torch.Tensor
+    weight: torch.Tensor
+
+
+class TorchTarget(NamedTuple):
+    """A target on a device.
+
+    Attributes:
+        grid: (h, w, 2) float32, where to read the atlas.
+        coverage: (h, w) bool.
+        source: (h, w) int8, the winner.
+        bands: What is blended in.
+    """
+
+    grid: torch.Tensor
+    coverage: torch.Tensor
+    source: torch.Tensor
+    bands: tuple[TorchBand, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class TorchPlan:
+    """A plan with all that ``render_torch`` needs on its device: nothing is moved there frame by frame.
+
+    Attributes:
+        plan: The plan.
+        targets: One for each of its targets.
+    """
+
+    plan: RenderPlan
+    targets: tuple[TorchTarget, ...]
+
+    @classmethod
+    def of(cls, plan: RenderPlan, device: torch.device) -> TorchPlan:
+        """Move a plan to a device."""
+
+        def grid(at: FixedMap) -> torch.Tensor:
+            return sampling.torch_grid(at.to_float(), plan.layout.size, device)
+
+        def band(b: Band) -> TorchBand:
+            bh, bw = b.weight.shape
+            part = (slice(None), slice(None), slice(b.y, b.y + bh), slice(b.x, b.x + bw))
+            weight = torch.from_numpy(b.weight).to(device)
+            return TorchBand(part, torch.tensor(b.source, device=device), grid(b.at), weight)
+
+        return cls(
+            plan,
+            tuple(
+                TorchTarget(
+                    grid(target.at),
+                    torch.from_numpy(target.coverage).to(device),
+                    torch.from_numpy(target.source_camera).to(device),
+                    tuple(map(band, target.bands)),
+                )
+                for target in plan.targets
+            ),
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Memory on the device."""
+        tensors = [t for target in self.targets for t in (*target[:3], *(x for b in target.bands for x in b[1:]))]
+        return sum(t.numel() * t.element_size() for t in tensors)
+
+
+class TorchPlans(Held[tuple[int, str], TorchPlan]):
+    """Plans on devices, the least recently used dropped. Pickles as empty.
+
+    The key is a plan's ``id`` and a device: what is held keeps its plan alive, so that no other can get its id.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(_ON_DEVICE_BYTES, lambda moved: moved.nbytes)
+
+    def of(self, plan: RenderPlan, device: torch.device) -> TorchPlan:
+        """A plan on a device."""
+        return self.get((id(plan), str(device)), lambda: TorchPlan.of(plan, device))
+
+    def __reduce__(self) -> tuple[type[TorchPlans], tuple[()]]:
+        return TorchPlans, ()
+
+
 def render_torch(
-    plan: RenderPlan,
+    plan: RenderPlan | TorchPlan,
     images: Sequence[torch.Tensor],
     curves: Sequence[Sequence[ToneCurve] | None] | None = None,
     seams: list[torch.Tensor] | None = None,
@@ -79,8 +179,8 @@ def render_torch(
     """Target views by ``grid_sample``: batches, any device, differentiable in the images.
 
     Args:
-        plan: The plan for these images' rig, shared by the batch.
-        images: N images (B, 3, H, W): uint8, or float in [0, 1]; sampled in float32.
+        plan: The plan for these images' rig, shared by the batch; a ``TorchPlan`` must be on their device.
+        images: N images (B, 3, H, W): uint8, or float in [0, 1]; sampled in float32 at float32 positions.
         curves: For each frame of the batch nothing, or a tone curve for each image.
         seams: A list to append, for each view, (B, h, w) float32 to: see ``render_opencv``.
 
@@ -88,30 +188,24 @@ def render_torch(
         M views (B, 3, h, w) of the images' type.
     """
     dtype, device = images[0].dtype, images[0].device
-    atlas = sampling.torch_atlas(plan.layout, images)
+    here = TorchPlan.of(plan, device) if isinstance(plan, RenderPlan) else plan
+    interpolation = here.plan.interpolation
+    atlas = sampling.torch_atlas(here.plan.layout, images)
     views = []
-    for target in plan.targets:
-        coverage = torch.from_numpy(target.coverage).to(device)
-        grid = sampling.torch_grid(target.at.to_float(), plan.layout.size, device)
-        view = sampling.grid_sample(atlas, grid, plan.interpolation) * coverage
+    for target in here.targets:
+        view = sampling.grid_sample(atlas, target.grid, interpolation) * target.coverage
         if curves is not None:
-            view = _toned(view, torch.from_numpy(target.source_camera).to(device), curves, dtype == torch.uint8)
+            view = _toned(view, target.source, curves, dtype == torch.uint8)
         if seams is not None:
-            seams.append(view.new_zeros(view.shape[0], *coverage.shape))
+            seams.append(view.new_zeros(view.shape[0], *target.coverage.shape))
         for band in target.bands:
-            bh, bw = band.weight.shape
-            part = (slice(None), slice(None), slice(band.y, band.y + bh), slice(band.x, band.x + bw))
-            second = sampling.grid_sample(
-                atlas, sampling.torch_grid(band.at.to_float(), plan.layout.size, device), plan.interpolation
-            )
+            second = sampling.grid_sample(atlas, band.grid, interpolation)
             if curves is not None:
-                second = _toned(second, torch.tensor(band.source, device=device), curves, dtype == torch.uint8)
-            weight = torch.from_numpy(band.weight).to(device)
+                second = _toned(second, band.source, curves, dtype == torch.uint8)
             if seams is not None:
-                seams[-1][(slice(None), *part[2:])] += (view[part] - second).detach().abs().mean(1) * weight
-            blended = view.clone()
-            blended[part] = torch.lerp(view[part], second, weight.expand_as(second))
-            view = blended
+                change = (view[band.part] - second).detach().abs().mean(1) * band.weight
+                seams[-1][(slice(None), *band.part[2:])] += change
+            view[band.part] = torch.lerp(view[band.part], second, band.weight.expand_as(second))
         views.append(_rounded(view, dtype))
     return views
 
