@@ -2,7 +2,8 @@
 
 ``trade``, the default: speed against accuracy of all settings (``bench.trade``). ``speed``: milliseconds against bare
 ``cv2.remap`` calls (``bench.speed``). ``ablation``: each stage and setting on and off, dB and milliseconds
-(``bench.ablation``). ``device``: batches by torch, on a GPU where there is one (``bench.device``). ``scene``: what is not done where a scene does not require it (``bench.scene``).
+(``bench.ablation``). ``device``: batches by torch, on a GPU where there is one (``bench.device``). ``scene``: what is
+not done where a scene does not require it (``bench.scene``).
 """
 
 from __future__ import annotations

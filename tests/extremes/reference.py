@@ -54,7 +54,7 @@ def fold(camera: Camera) -> float:
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (..., 2) of camera-frame points or directions (..., 3), NaN where the camera has none, and where it has."""
+    """Pixels (..., 2) of camera-frame points or directions (..., 3), NaN where there is none, and where there is."""
     x, y, z = np.moveaxis(points / np.linalg.norm(points, axis=-1, keepdims=True), -1, 0)
     with np.errstate(all="ignore"):
         if camera.lens == "fisheye":
