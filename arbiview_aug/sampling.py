@@ -266,12 +266,14 @@ def torch_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Te
     atlas = torch.zeros((batch, 3, *layout.size), dtype=torch.float32, device=device)
     for slot in layout.slots:
         h, w = slot.size
-        image = images[slot.source].float()
+        image = images[slot.source]
+        if slot.level:
+            image = image.float()
         for _ in range(slot.level):
             image = torch.nn.functional.avg_pool2d(image, 2)
             if whole:
                 image = torch.floor(image + 0.5)  # as OpenCV rounds its halved uint8 images
-        atlas[:, :, slot.y : slot.y + h, slot.x : slot.x + w] = image
+        atlas[:, :, slot.y : slot.y + h, slot.x : slot.x + w] = image  # converts as it copies
     return atlas
 
 

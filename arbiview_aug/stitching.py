@@ -16,7 +16,7 @@ from arbiview_aug.favs.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.favs.paper import PaperRendering, check_settings, render_paper
 from arbiview_aug.favs.photometric import Harmoniser
 from arbiview_aug.favs.refinement import RefinementCache
-from arbiview_aug.favs.synthesis import TorchPlans, render_opencv, render_torch
+from arbiview_aug.favs.synthesis import render_opencv, render_torch
 from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
 from arbiview_aug.required import baselines_m, needs_geometry
 from arbiview_aug.rig import Rig
@@ -98,7 +98,6 @@ class Stitcher:
         self.refinement, self.execution, self.warn = refinement, execution, warn
         self.plans = PlanCache(cache_bytes)
         self._plan_of_frame = PlanCache(0)  # holds one
-        self._on_device = TorchPlans()
         self._scratch = Scratch()
 
     # --- what a frame is made by --------------------------------------------------------------------------------------
@@ -221,10 +220,7 @@ class Stitcher:
             sources = zip(*(frames[b].images for b in members), strict=True)
             toned = [self.harmoniser.curves(frames[b].rig, frames[b].images) for b in members]
             batched: list[torch.Tensor] | None = None if seams is None else []
-            device = frames[members[0]].images[0].device
-            rendered = render_torch(
-                self._on_device.of(plan, device), [torch.stack(images) for images in sources], toned, batched
-            )
+            rendered = render_torch(plan, [torch.stack(images) for images in sources], toned, batched)
             for k, b in enumerate(members):
                 done[b] = [image[k] for image in rendered]
                 changes[b] = [change[k] for change in batched or ()]

@@ -203,7 +203,7 @@ class TargetDraft:
         edge_px = edge_distance(source, pair.uv)
         seen = pair.valid & (edge_px > 0)
         level = self._level(pixels_per_pixel[seen], source.size) if self.config.antialias else 0
-        pair.set_tolerance(self.config.map_tolerance_px * 2**level)
+        pair.set_tolerance(self.config.map_tolerance_px * 2**level * pair.surface.slack)
         seen = pair.visible_nodes(level) & (edge_px > 0)
         parallax = self._expected_parallax(offset_m, focal_px, surface)
         score = (

@@ -26,7 +26,7 @@ from arbiview_aug.bench.timing import machine, machine_line, one_thread, quartil
 from arbiview_aug.command_line import count
 from arbiview_aug.evaluate.tables import markdown_table
 from arbiview_aug.evaluate.targets import without_masks
-from arbiview_aug.favs.synthesis import TorchPlan, render_torch
+from arbiview_aug.favs.synthesis import render_torch
 from arbiview_aug.plan import RenderPlan, build_plan
 from arbiview_aug.rig import load_rig
 
@@ -83,7 +83,6 @@ def measure(
     for source_size, size in sizes:
         source = without_masks(load_rig("nuscenes")).resized(source_size)
         plan = build_plan(source, source.turned(yaw_deg=YAW_DEG).resized(size))
-        moved = TorchPlan.of(plan, on)
         for dtype in tqdm(DTYPES, desc="{1}x{0}".format(*size), leave=False):
             generator = torch.Generator(on).manual_seed(0)
             shape = (batch, 3, *source_size)
@@ -92,7 +91,7 @@ def measure(
             if compiled:
                 runs[", compiled"] = torch.compile(render_torch)
             for how, run in runs.items():
-                times = _times_ms(lambda run=run, moved=moved, images=images: run(moved, images), on, repeats)  # type: ignore[misc]
+                times = _times_ms(lambda run=run, plan=plan, images=images: run(plan, images), on, repeats)  # type: ignore[misc]
                 least = least_bytes(plan, batch, dtype.itemsize)
                 found = quartiles(times)
                 rows.append(

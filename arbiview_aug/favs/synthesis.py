@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -11,13 +10,10 @@ import numpy as np
 import torch
 
 from arbiview_aug import sampling
-from arbiview_aug.held import Held
+from arbiview_aug.device_maps import Blend, maps_on
 from arbiview_aug.plan import RenderPlan
-from arbiview_aug.sampling import FixedMap, Scratch
-from arbiview_aug.target_plan import Band
+from arbiview_aug.sampling import Scratch
 from arbiview_aug.tone import STRIP_ROWS, ToneCurve
-
-_ON_DEVICE_BYTES = 256 * 2**20  # three full-size plans of six cameras, or thirty of 256x704
 
 
 def render_opencv(
@@ -76,102 +72,8 @@ def render_opencv(
     return [view.to(dtype) for view in views]
 
 
-class TorchBand(NamedTuple):
-    """A blended band of a target on a device.
-
-    Attributes:
-        part: The band's rows and columns in a view (B, 3, h, w).
-        source: Which source is blended in, ().
-        grid: (bh, bw, 2) where to read it.
-        weight: (bh, bw) its share.
-    """
-
-    part: tuple[slice, ...]
-    source: torch.Tensor
-    grid: torch.Tensor
-    weight: torch.Tensor
-
-
-class TorchTarget(NamedTuple):
-    """A target on a device.
-
-    Attributes:
-        grid: (h, w, 2) float32, where to read the atlas.
-        coverage: (h, w) bool.
-        source: (h, w) int8, the winner.
-        bands: What is blended in.
-    """
-
-    grid: torch.Tensor
-    coverage: torch.Tensor
-    source: torch.Tensor
-    bands: tuple[TorchBand, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class TorchPlan:
-    """A plan with all that ``render_torch`` needs on its device: nothing is moved there frame by frame.
-
-    Attributes:
-        plan: The plan.
-        targets: One for each of its targets.
-    """
-
-    plan: RenderPlan
-    targets: tuple[TorchTarget, ...]
-
-    @classmethod
-    def of(cls, plan: RenderPlan, device: torch.device) -> TorchPlan:
-        """Move a plan to a device."""
-
-        def grid(at: FixedMap) -> torch.Tensor:
-            return sampling.torch_grid(at.to_float(), plan.layout.size, device)
-
-        def band(b: Band) -> TorchBand:
-            bh, bw = b.weight.shape
-            part = (slice(None), slice(None), slice(b.y, b.y + bh), slice(b.x, b.x + bw))
-            weight = torch.from_numpy(b.weight).to(device)
-            return TorchBand(part, torch.tensor(b.source, device=device), grid(b.at), weight)
-
-        return cls(
-            plan,
-            tuple(
-                TorchTarget(
-                    grid(target.at),
-                    torch.from_numpy(target.coverage).to(device),
-                    torch.from_numpy(target.source_camera).to(device),
-                    tuple(map(band, target.bands)),
-                )
-                for target in plan.targets
-            ),
-        )
-
-    @property
-    def nbytes(self) -> int:
-        """Memory on the device."""
-        tensors = [t for target in self.targets for t in (*target[:3], *(x for b in target.bands for x in b[1:]))]
-        return sum(t.numel() * t.element_size() for t in tensors)
-
-
-class TorchPlans(Held[tuple[int, str], TorchPlan]):
-    """Plans on devices, the least recently used dropped. Pickles as empty.
-
-    The key is a plan's ``id`` and a device: what is held keeps its plan alive, so that no other can get its id.
-    """
-
-    def __init__(self) -> None:
-        super().__init__(_ON_DEVICE_BYTES, lambda moved: moved.nbytes)
-
-    def of(self, plan: RenderPlan, device: torch.device) -> TorchPlan:
-        """A plan on a device."""
-        return self.get((id(plan), str(device)), lambda: TorchPlan.of(plan, device))
-
-    def __reduce__(self) -> tuple[type[TorchPlans], tuple[()]]:
-        return TorchPlans, ()
-
-
 def render_torch(
-    plan: RenderPlan | TorchPlan,
+    plan: RenderPlan,
     images: Sequence[torch.Tensor],
     curves: Sequence[Sequence[ToneCurve] | None] | None = None,
     seams: list[torch.Tensor] | None = None,
@@ -179,8 +81,8 @@ def render_torch(
     """Target views by ``grid_sample``: batches, any device, differentiable in the images.
 
     Args:
-        plan: The plan for these images' rig, shared by the batch; a ``TorchPlan`` must be on their device.
-        images: N images (B, 3, H, W): uint8, or float in [0, 1]; sampled in float32 at float32 positions.
+        plan: The plan for these images' rig, shared by the batch.
+        images: N images (B, 3, H, W): uint8, or float in [0, 1]; sampled in float32.
         curves: For each frame of the batch nothing, or a tone curve for each image.
         seams: A list to append, for each view, (B, h, w) float32 to: see ``render_opencv``.
 
@@ -188,45 +90,73 @@ def render_torch(
         M views (B, 3, h, w) of the images' type.
     """
     dtype, device = images[0].dtype, images[0].device
-    here = TorchPlan.of(plan, device) if isinstance(plan, RenderPlan) else plan
-    interpolation = here.plan.interpolation
-    atlas = sampling.torch_atlas(here.plan.layout, images)
+    whole = dtype == torch.uint8
+    atlas = sampling.torch_atlas(plan.layout, images)
+    tones = None if curves is None else _Tones.of(curves, len(images), device, 255.0 if whole else 1.0)
     views = []
-    for target in here.targets:
-        view = sampling.grid_sample(atlas, target.grid, interpolation) * target.coverage
-        if curves is not None:
-            view = _toned(view, target.source, curves, dtype == torch.uint8)
-        if seams is not None:
-            seams.append(view.new_zeros(view.shape[0], *target.coverage.shape))
-        for band in target.bands:
-            second = sampling.grid_sample(atlas, band.grid, interpolation)
-            if curves is not None:
-                second = _toned(second, band.source, curves, dtype == torch.uint8)
-            if seams is not None:
-                change = (view[band.part] - second).detach().abs().mean(1) * band.weight
-                seams[-1][(slice(None), *band.part[2:])] += change
-            view[band.part] = torch.lerp(view[band.part], second, band.weight.expand_as(second))
+    for maps in maps_on(plan, device):
+        view = sampling.grid_sample(atlas, maps.grid, plan.interpolation)
+        if tones is not None:
+            view = tones.applied(view, maps.source.long(), whole)
+        change = None if seams is None else view.new_zeros(view.shape[0], *view.shape[2:])
+        if maps.blend is not None:
+            view = _blended(view, atlas, maps.blend, plan.interpolation, tones, whole, change)
+        if seams is not None and change is not None:
+            seams.append(change)
         views.append(_rounded(view, dtype))
     return views
 
 
-def _toned(
-    views: torch.Tensor, source: torch.Tensor, curves: Sequence[Sequence[ToneCurve] | None], whole: bool
+def _blended(
+    view: torch.Tensor,
+    atlas: torch.Tensor,
+    blend: Blend,
+    interpolation: str,
+    tones: _Tones | None,
+    whole: bool,
+    change: torch.Tensor | None,
 ) -> torch.Tensor:
-    """Views (B, 3, h, w) after the curves of the sources (h, w), or the one source (), that they are read from."""
-    frames = []
-    for view, of_sources in zip(views, curves, strict=True):
-        if of_sources is None:
-            frames.append(view)
-            continue
+    """A view (B, 3, h, w) with its second sources; into ``change`` (B, h, w) goes what they changed."""
+    second = sampling.grid_sample(atlas, blend.grid, interpolation)[:, :, 0]  # [B, 3, n]
+    if tones is not None:
+        second = tones.applied(second, blend.source, whole)
+    first = view.flatten(2)[:, :, blend.pixel]
+    if change is not None:
+        change.flatten(1)[:, blend.pixel] = (first - second).detach().abs().mean(1) * blend.weight
+    mixed = torch.lerp(first, second, blend.weight.expand_as(second))
+    return view.flatten(2).index_copy(2, blend.pixel, mixed).view_as(view)
+
+
+class _Tones(NamedTuple):
+    """The curves of all frames and sources as tensors: two straight lines each (see ``ToneCurve``).
+
+    Attributes:
+        gain: (B, N) slope of the lower line; 1 where nothing changes.
+        slope: (B, N) of the upper line.
+        offset: (B, N) its value at 0.
+    """
+
+    gain: torch.Tensor
+    slope: torch.Tensor
+    offset: torch.Tensor
+
+    @classmethod
+    def of(cls, curves: Sequence[Sequence[ToneCurve] | None], sources: int, device: torch.device, top: float) -> _Tones:
+        none = [ToneCurve(1.0)] * sources
+        frames = [none if of_frame is None else of_frame for of_frame in curves]
+        lines = [[(c.gain, c.upper_slope, top * (1 - c.upper_slope)) for c in of_frame] for of_frame in frames]
+        return cls(*torch.tensor(lines, dtype=torch.float32).to(device).unbind(-1))
+
+    def applied(self, view: torch.Tensor, source: torch.Tensor, whole: bool) -> torch.Tensor:
+        """Views (B, 3, ...) read from sources (...,), -1 for none, after their curves."""
+        gain, slope, offset = (lines[:, source][:, None] for lines in self)  # [B, 1, ...]
         # Whole numbers as the OpenCV execution has them, which looks them up in a table.
         read = torch.floor(view + 0.5) if whole else view
-        for k in source.unique().tolist():
-            if k >= 0 and of_sources[k].gain != 1:
-                toned = of_sources[k].of_tensor(read, 255.0 if whole else 1.0)
-                view = torch.where(source == k, torch.floor(toned + 0.5).clamp(0, 255) if whole else toned, view)
-        frames.append(view)
-    return torch.stack(frames)
+        lower, upper = read * gain, read * slope + offset
+        toned = torch.where(gain > 1, torch.minimum(lower, upper), torch.maximum(lower, upper))
+        if whole:
+            toned = torch.floor(toned + 0.5).clamp(0, 255)
+        return torch.where((gain != 1) & (source >= 0), toned, view)
 
 
 def render_labels(plan: RenderPlan, labels: Sequence[torch.Tensor], fill: float) -> list[torch.Tensor]:

@@ -12,7 +12,7 @@ from arbiview_aug.__main__ import main
 from arbiview_aug.bench import device
 from arbiview_aug.bench.device import least_bytes, measure, table
 from arbiview_aug.datasets.synthetic import demo_source_rig
-from arbiview_aug.favs.synthesis import TorchPlan, TorchPlans, render_torch
+from arbiview_aug.favs.synthesis import render_torch
 from arbiview_aug.plan import build_plan
 
 TINY = (((45, 80), (45, 80)), ((45, 80), (24, 64)))
@@ -58,15 +58,3 @@ def test_positions_stay_float32_for_half_precision_images() -> None:
     for a, b in zip(exact, half, strict=True):
         assert b.dtype == torch.bfloat16
         assert (a - b.float()).abs().max() < 2 * 2**-8  # two roundings to 8 bits of mantissa
-
-
-def test_a_plan_moves_to_its_device_once() -> None:
-    rig = demo_source_rig((32, 88))
-    plan, other = build_plan(rig, rig.turned(yaw_deg=5)), build_plan(rig, rig.turned(yaw_deg=9))
-    plans, here = TorchPlans(), torch.device("cpu")
-    moved = plans.of(plan, here)
-    assert plans.of(plan, here) is moved and moved.plan is plan and plans.of(other, here).plan is other
-    assert moved.nbytes > sum(8 * target.source_camera.size for target in plan.targets)
-    images = [torch.rand(2, 3, 32, 88) for _ in rig]
-    for a, b in zip(render_torch(moved, images), render_torch(TorchPlan.of(plan, here), images), strict=True):
-        assert torch.equal(a, b)
