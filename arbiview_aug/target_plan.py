@@ -161,7 +161,7 @@ class TargetDraft:
         self.best, self.surface_by_name = best, surface_by_name
         self.counters = counters
         # From outside, the far wall is a narrow strip with edges, which a coarse grid could step over.
-        step = config.grid_step_px if is_within_wall(camera.center_m) else 1
+        step = config.grid_step_px if surface == "far" or is_within_wall(camera.center_m) else 1
         self.rays = TargetRays(camera, step, counters)
         self.grid = self.rays.grid
         # In content order, so that ties never depend on the order of the source list.

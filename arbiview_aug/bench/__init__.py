@@ -2,8 +2,8 @@
 
 ``trade``, the default: speed against accuracy of all settings (``bench.trade``). ``speed``: milliseconds against bare
 ``cv2.remap`` calls (``bench.speed``). ``ablation``: each stage and setting on and off, dB and milliseconds
-(``bench.ablation``). ``loader``: frames per second of a ``DataLoader`` (``bench.loader``). ``device``: the torch
-execution against copy bandwidth (``bench.device``). ``scene``: what is not done where a scene does not require it
+(``bench.ablation``). ``device``: batches by torch, on a GPU where there is one (``bench.device``). ``loader``: frames
+per second out of a ``DataLoader`` (``bench.loader``). ``scene``: what is not done where a scene does not require it
 (``bench.scene``).
 """
 
@@ -16,9 +16,9 @@ from importlib import import_module
 BENCHMARKS = {
     "trade": "speed against accuracy of all settings, and which to use (the default)",
     "speed": "milliseconds against bare cv2.remap calls",
+    "device": "batches by torch, on a GPU where there is one",
     "ablation": "each stage and setting on and off: dB and milliseconds",
     "loader": "frames per second of a DataLoader, memory per worker",
-    "device": "rendering by torch on a device: milliseconds, bytes, share of copy bandwidth",
     "scene": "only what a scene requires is done: counters and milliseconds",
 }
 
