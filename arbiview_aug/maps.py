@@ -35,6 +35,7 @@ from arbiview_aug.shadowing import SeenSolids, at_level, cells_near_shadow, halv
 from arbiview_aug.surface import Dense, Layered, Shadows, Static, Surface
 from arbiview_aug.target_rays import TargetRays
 
+_SLACK_PX = 1e-3  # a pixel on the very border must not drop out by a rounding, of float32 at most
 _SAFETY = 1.25  # curvature between the nodes may exceed what the nodes show
 
 _UNRESOLVED = 8 * 5 / 1024
@@ -84,7 +85,7 @@ class PairMap:
         if self._shaded and not isinstance(self.surface, Static):
             self._from_source_q = (q / np.maximum(np.sqrt((points * points).sum(-1)), 1e-300)).astype(np.float32)
         if rays.grid.step == 1:
-            self.nodes = _bounds(self.valid & source.contains(self.uv), 0)
+            self.nodes = _bounds(self.valid & source.contains(self.uv, _SLACK_PX), 0)
         else:
             self.nodes = self._classify(points)
             if isinstance(self.surface, Dense):
@@ -260,10 +261,8 @@ class PairMap:
                 self._fine = slot, grid.refined(slot.from_source(self.uv).astype(np.float32), self.nodes)
             at = grid.upsample_refined(self._fine[1], self.nodes, rows)
             self._patch_exact(at, nodes, slot)
-        # Slack: a pixel on the very border must not drop out by a rounding of float32.
-        slack = 1e-3
-        low = slot.from_source(np.array([-slack, -slack]))
-        high = slot.from_source(np.array([source.width_px - 1 + slack, source.height_px - 1 + slack]))
+        low = slot.from_source(np.array([-_SLACK_PX, -_SLACK_PX]))
+        high = slot.from_source(np.array([source.width_px - 1 + _SLACK_PX, source.height_px - 1 + _SLACK_PX]))
         # Halving leaves out the last row or column of an odd size: nothing is known there.
         high = np.minimum(high, np.array([slot.x + slot.size[1], slot.y + slot.size[0]]) - 0.5)
         visible: Any = cv2.inRange(at, tuple(low), tuple(high))
