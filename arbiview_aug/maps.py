@@ -170,7 +170,8 @@ class PairMap:
         Bilinear interpolation over a spacing s errs by at most (|f_xx| + |f_yy|) s² / 8; the cubic mid-point by
         3/128 of the fourth difference, less 5/1024 of the sixth, and so on: all are read off the nodes. Where the
         surface has creases the refinement earns nothing, and the cells' centres are evaluated too: a crease shows
-        there with at least half its largest error, which the cubic may double.
+        there with at least half its largest error, which the cubic may double. What reaches an invalid node, which
+        holds a placeholder, cannot be interpolated at all.
         """
         bound = np.zeros(tuple(n - 1 for n in self.uv.shape[:2]))
         j0, j1, i0, i1 = box
@@ -194,7 +195,12 @@ class PairMap:
             mean = sum(uv[c] for c in CORNERS) / 4
             cell = np.maximum(cell, 4 * larger(mean - centre))
         bound[j0:j1, i0:i1] = cell
-        return np.asarray(bound > tolerance_px)
+        curved = bound > tolerance_px
+        if not self.valid.all():
+            side = 2 * HALVINGS + 2
+            unknown = cv2.dilate((~self.valid).view(np.uint8), np.ones((side, side), np.uint8), anchor=(HALVINGS,) * 2)
+            curved |= unknown[:-1, :-1] > 0
+        return np.asarray(curved)
 
     def _evaluate(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Source pixels of target pixels (..., 2) in float64, and where they are valid."""
