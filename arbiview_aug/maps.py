@@ -35,6 +35,7 @@ from arbiview_aug.shadowing import SeenSolids, at_level, cells_near_shadow, halv
 from arbiview_aug.surface import Dense, Layered, Shadows, Static, Surface
 from arbiview_aug.target_rays import TargetRays
 
+_SLACK_PX = 1e-3  # a pixel on the very border must not drop out by a rounding, of float32 at most
 _SAFETY = 1.25  # curvature between the nodes may exceed what the nodes show
 
 _UNRESOLVED = 8 * 5 / 1024
@@ -84,7 +85,7 @@ class PairMap:
         if self._shaded and not isinstance(self.surface, Static):
             self._from_source_q = (q / np.maximum(np.sqrt((points * points).sum(-1)), 1e-300)).astype(np.float32)
         if rays.grid.step == 1:
-            self.nodes = _bounds(self.valid & source.contains(self.uv), 0)
+            self.nodes = _bounds(self.valid & source.contains(self.uv, _SLACK_PX), 0)
         else:
             self.nodes = self._classify(points)
             if isinstance(self.surface, Dense):
@@ -169,7 +170,8 @@ class PairMap:
         Bilinear interpolation over a spacing s errs by at most (|f_xx| + |f_yy|) s² / 8; the cubic mid-point by
         3/128 of the fourth difference, less 5/1024 of the sixth, and so on: all are read off the nodes. Where the
         surface has creases the refinement earns nothing, and the cells' centres are evaluated too: a crease shows
-        there with at least half its largest error, which the cubic may double.
+        there with at least half its largest error, which the cubic may double. What reaches an invalid node, which
+        holds a placeholder, cannot be interpolated at all.
         """
         bound = np.zeros(tuple(n - 1 for n in self.uv.shape[:2]))
         j0, j1, i0, i1 = box
@@ -193,7 +195,12 @@ class PairMap:
             mean = sum(uv[c] for c in CORNERS) / 4
             cell = np.maximum(cell, 4 * larger(mean - centre))
         bound[j0:j1, i0:i1] = cell
-        return np.asarray(bound > tolerance_px)
+        curved = bound > tolerance_px
+        if not self.valid.all():
+            side = 2 * HALVINGS + 2
+            unknown = cv2.dilate((~self.valid).view(np.uint8), np.ones((side, side), np.uint8), anchor=(HALVINGS,) * 2)
+            curved |= unknown[:-1, :-1] > 0
+        return np.asarray(curved)
 
     def _evaluate(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Source pixels of target pixels (..., 2) in float64, and where they are valid."""
@@ -260,10 +267,8 @@ class PairMap:
                 self._fine = slot, grid.refined(slot.from_source(self.uv).astype(np.float32), self.nodes)
             at = grid.upsample_refined(self._fine[1], self.nodes, rows)
             self._patch_exact(at, nodes, slot)
-        # Slack: a pixel on the very border must not drop out by a rounding of float32.
-        slack = 1e-3
-        low = slot.from_source(np.array([-slack, -slack]))
-        high = slot.from_source(np.array([source.width_px - 1 + slack, source.height_px - 1 + slack]))
+        low = slot.from_source(np.array([-_SLACK_PX, -_SLACK_PX]))
+        high = slot.from_source(np.array([source.width_px - 1 + _SLACK_PX, source.height_px - 1 + _SLACK_PX]))
         # Halving leaves out the last row or column of an odd size: nothing is known there.
         high = np.minimum(high, np.array([slot.x + slot.size[1], slot.y + slot.size[0]]) - 0.5)
         visible: Any = cv2.inRange(at, tuple(low), tuple(high))

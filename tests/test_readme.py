@@ -43,7 +43,7 @@ TINY = {
     "bench --data FOLDER --budget-ms 20 --moves": [
         *("--quality", "draft", "--surface", "far", "--reduce", "4", "--size", "40x72", "--repeats", "1")
     ],
-    "bench device": ["--device", "cpu", "--batch", "1", "--repeats", "1"],
+    "bench device": ["--device", "cpu", "--sizes", "32x88", "--repeats", "1"],
     "bench speed --data FOLDER": ["--repeats", "1"],
     "bench speed": ["--repeats", "1"],
     "bench ablation --data FOLDER": ["--reduce", "4", "--only", "street, not far"],

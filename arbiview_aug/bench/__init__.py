@@ -16,7 +16,7 @@ from importlib import import_module
 BENCHMARKS = {
     "trade": "speed against accuracy of all settings, and which to use (the default)",
     "speed": "milliseconds against bare cv2.remap calls",
-    "device": "batches by torch, on a GPU where there is one",
+    "device": "batches by torch, on a GPU where there is one: milliseconds, share of copy bandwidth",
     "ablation": "each stage and setting on and off: dB and milliseconds",
     "loader": "frames per second of a DataLoader, memory per worker",
     "scene": "only what a scene requires is done: counters and milliseconds",

@@ -1,166 +1,218 @@
-"""``python -m arbiview_aug bench device``: batches by torch, on a GPU where there is one.
+"""``python -m arbiview_aug bench device``: how near the torch execution comes to moving its bytes once.
 
-Six nuScenes cameras turned by 22°, at 1600x900 and at 704x256 from images of half size. Images are float32 or
-bfloat16, positions always float32. ``MB moved`` is the least that the work must move: every image read once, every
-position read once (8 bytes a pixel), every view written once; ``of copying`` is how near moving that comes to the
-bandwidth of a plain copy on the same device, measured in the same run. What is moved besides, the float32 atlas above
-all, shows as distance from 100 %.
+A batch of frames of the data's cameras, brought to a size, is rendered for the same cameras turned by ``YAW_DEG`` at
+that size, from images that lie on the device already: uint8, bfloat16 and float32, always with float32 grids.
 
-On a GPU the clock is the time on the wall between two synchronisations, else CPU time on one thread.
+*Bytes* are the least that must move: each source image that is read, once; each map position, once for the whole batch;
+each view, once; all in their own types. *Share* is bytes / time, over the bandwidth of a copy within the device of as
+many bytes, measured in the same rounds (a copy moves its bytes twice: read and written). A share of 1 is the limit.
+
+Times are CUDA events', or on the CPU the process's CPU time on one thread; a call warms up before each.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from tqdm import tqdm
 
-from arbiview_aug.bench.timing import machine, machine_line, one_thread, quartiles, versions, write_json
-from arbiview_aug.command_line import count
-from arbiview_aug.evaluate.tables import markdown_table
+from arbiview_aug.bench.data import recorded
+from arbiview_aug.bench.timing import (
+    cuda_ms,
+    machine,
+    machine_line,
+    one_thread,
+    process_ms,
+    quartiles,
+    timed_rounds,
+    versions,
+    write_json,
+)
+from arbiview_aug.command_line import add_data, count, size
+from arbiview_aug.device_maps import maps_on
+from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.favs.synthesis import render_torch
 from arbiview_aug.plan import RenderPlan, build_plan
-from arbiview_aug.rig import load_rig
+from arbiview_aug.rig import Rig
+from arbiview_aug.tensors import resized
 
 YAW_DEG = 22.0
-BATCH = 8
-SIZES = (((900, 1600), (900, 1600)), ((450, 800), (256, 704)))
-"""(h, w) of sources and views."""
-DTYPES = (torch.float32, torch.bfloat16)
-REPEATS = 9
-_COPIED_BYTES = 2**28  # large against every cache
+SIZES = ((900, 1600), (256, 704))
+DTYPES = {"uint8": torch.uint8, "bf16": torch.bfloat16, "fp32": torch.float32}
+BATCH = {"cuda": 8, "cpu": 1}
+REPEATS = 15
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print the table, write the JSON."""
     parser = argparse.ArgumentParser(
         prog="python -m arbiview_aug bench device",
-        description="Milliseconds of batches by torch, and the share of the device's copy bandwidth.",
+        description="Rendering by torch on a device: milliseconds, bytes moved, and their share of copy bandwidth.",
     )
-    here = "cuda" if torch.cuda.is_available() else "cpu"
-    parser.add_argument("--device", default=here, choices=sorted({here, "cpu"}), help="(default: %(default)s)")
-    parser.add_argument("--batch", type=count, default=BATCH, metavar="N", help="frames (default: %(default)s)")
-    parser.add_argument("--compile", action="store_true", help="also through torch.compile")
-    parser.add_argument("--repeats", type=count, default=REPEATS, metavar="N", help="(default: %(default)s)")
+    add_data(parser, "a synthetic street")
+    parser.add_argument(
+        "--device", default=None, metavar="NAME", help="cpu, cuda, cuda:1, ... (default: cuda where there is one)"
+    )
+    parser.add_argument("--batch", type=count, metavar="N", help="frames at once (default: 8; on the cpu 1)")
+    parser.add_argument("--sizes", type=size, nargs="+", default=list(SIZES), metavar="HxW", help="of images and views")
+    parser.add_argument(
+        "--compile",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="measure torch.compile beside it (default: not on the cpu)",
+    )
+    parser.add_argument("--repeats", type=count, default=REPEATS, metavar="N", help="rounds (default: %(default)s)")
     parser.add_argument("--output", default="output/device.json", metavar="FILE", help="(default: %(default)s)")
     arguments = parser.parse_args(argv)
-    with one_thread():
-        report = measure(arguments.device, arguments.batch, arguments.repeats, compiled=arguments.compile)
-    write_json(report, Path(arguments.output))
-    print(f"{table(report)}\n\nreport: {arguments.output}")
+    device = _device(arguments.device)
+    with one_thread(), recorded(arguments.data) as data:
+        report = measure(
+            data.sample(0),
+            data.name,
+            device=device,
+            batch=arguments.batch or BATCH.get(device.type, 1),
+            sizes=arguments.sizes,
+            compiled=device.type != "cpu" if arguments.compile is None else arguments.compile,
+            repeats=arguments.repeats,
+        )
+    print(table(report))
+    path = Path(arguments.output)
+    write_json(report, path)
+    print(f"report: {path}")
     return 0
 
 
 def measure(
-    device: str,
-    batch: int,
-    repeats: int,
+    sample: Mapping[str, Any],
+    name: str,
     *,
+    device: torch.device,
+    batch: int,
+    sizes: Sequence[tuple[int, int]] = SIZES,
     compiled: bool = False,
-    sizes: Sequence[tuple[tuple[int, int], tuple[int, int]]] = SIZES,
+    repeats: int = REPEATS,
 ) -> dict[str, Any]:
-    """All figures, as plain data for JSON.
+    """All sizes and types, as plain data for JSON.
 
     Args:
-        device: ``cpu`` or ``cuda``.
-        batch: Frames rendered together.
-        repeats: How often each is timed.
-        compiled: Also through ``torch.compile``.
-        sizes: (h, w) of sources and views.
+        sample: A frame, as a reader gives it.
+        name: Of the data.
+        device: Where to render.
+        batch: Frames at once.
+        sizes: (h, w) of images and views.
+        compiled: Measure ``torch.compile`` too.
+        repeats: Rounds.
     """
     load_before = os.getloadavg()
-    on = torch.device(device)
-    copy_gb_s = _copy_bandwidth(on, repeats)
-    rows = []
-    for source_size, size in sizes:
-        source = without_masks(load_rig("nuscenes")).resized(source_size)
-        plan = build_plan(source, source.turned(yaw_deg=YAW_DEG).resized(size))
-        for dtype in tqdm(DTYPES, desc="{1}x{0}".format(*size), leave=False):
-            generator = torch.Generator(on).manual_seed(0)
-            shape = (batch, 3, *source_size)
-            images = [torch.rand(shape, generator=generator, device=on).to(dtype) for _ in source]
-            runs: dict[str, Callable[..., Any]] = {"": render_torch}
-            if compiled:
-                runs[", compiled"] = torch.compile(render_torch)
-            for how, run in runs.items():
-                times = _times_ms(lambda run=run, plan=plan, images=images: run(plan, images), on, repeats)  # type: ignore[misc]
-                least = least_bytes(plan, batch, dtype.itemsize)
-                found = quartiles(times)
-                rows.append(
-                    {
-                        "name": f"{size[1]}x{size[0]}, {str(dtype).removeprefix('torch.')}{how}",
-                        **found._asdict(),
-                        "ms_a_frame": found.median_ms / batch,
-                        "least_bytes": least,
-                        "copy_share": least / (found.median_ms * 1e6) / copy_gb_s,
-                    }
-                )
+    rows = [row for to in sizes for row in _of_size(sample, to, device, batch, compiled, repeats)]
     return {
         "benchmark": "device",
-        "device": torch.cuda.get_device_name(on) if on.type == "cuda" else "cpu, one thread",
+        "data": name,
+        "cameras": len(sample["rig"]),
         "batch": batch,
-        "copy_gb_s": copy_gb_s,
-        "rows": rows,
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
+        "clock": "CUDA events" if device.type == "cuda" else "CPU time of the process",
+        "rounds": repeats,
         "machine": machine(load_before),
         "versions": versions(),
+        "rows": rows,
     }
 
 
-def least_bytes(plan: RenderPlan, batch: int, itemsize: int) -> int:
-    """Every image that is read, once; every position (two float32), once; every view, once."""
-    read = {pair.source for target in plan.targets for pair in target.pairs}
-    sources = sum(h * w for k, (h, w) in enumerate(plan.source.sizes) if k in read)
-    views = sum(target.source_camera.size for target in plan.targets)
-    return batch * 3 * itemsize * (sources + views) + 8 * views
-
-
-def table(report: dict[str, Any]) -> str:
-    """The report to read, in Markdown."""
-    rows = [
-        [
-            row["name"],
-            f"{row['median_ms']:.1f}",
-            f"{row['q1_ms']:.1f} to {row['q3_ms']:.1f}",
-            f"{row['ms_a_frame']:.2f}",
-            f"{row['least_bytes'] / 1e6:.0f}",
-            f"{row['copy_share']:.0%}",
-        ]
-        for row in report["rows"]
+def table(report: Mapping[str, Any]) -> str:
+    """The report to read."""
+    lines = [
+        machine_line(report),
+        f"{report['data']}, {report['cameras']} cameras turned by {YAW_DEG:g} degrees, batches of {report['batch']} on "
+        f"{report['device']}",
+        f"{'':<28}{'ms':>9}{'quartiles':>18}{'MB moved':>10}{'GB/s':>8}{'copy GB/s':>11}{'share':>8}",
     ]
-    head = ["", "ms a batch", "quartiles", "ms a frame", "MB moved", "of copying"]
-    return (
-        f"{report['device']}: batches of {report['batch']} frames of six cameras, images and views in its memory; a "
-        f"plain copy moves {report['copy_gb_s']:.1f} GB/s. {machine_line(report)}\n\n{markdown_table(head, rows)}"
-    )
+    for row in report["rows"]:
+        spread = f"{row['q1_ms']:.2f} .. {row['q3_ms']:.2f}"
+        h, w = row["size"]
+        label = f"{w}x{h} {row['dtype']}{', compiled' if row['compiled'] else ''}"
+        lines.append(
+            f"{label:<28}{row['median_ms']:>9.2f}{spread:>18}{row['bytes'] / 1e6:>10.1f}"
+            f"{row['gb_per_s']:>8.1f}{row['copy_gb_per_s']:>11.1f}{row['share']:>8.1%}"
+        )
+    return "\n".join(lines)
 
 
-def _copy_bandwidth(device: torch.device, repeats: int) -> float:
-    """GB/s read and written together."""
-    source = torch.zeros(_COPIED_BYTES // 4, device=device)
-    into = torch.empty_like(source)
-    times = _times_ms(lambda: into.copy_(source), device, repeats)
-    return 2 * _COPIED_BYTES / (float(np.median(times)) * 1e6)
+def bytes_moved(plan: RenderPlan, images: Sequence[torch.Tensor]) -> int:
+    """The least that rendering images (B, 3, H, W) moves: see the module."""
+    read = sum(images[k].nbytes for k in {slot.source for slot in plan.layout.slots})
+    maps = maps_on(plan, images[0].device)
+    grids = sum(view.grid.nbytes + (0 if view.blend is None else view.blend.grid.nbytes) for view in maps)
+    pixels = sum(view.source.numel() for view in maps)
+    return read + grids + pixels * 3 * images[0].shape[0] * images[0].element_size()
 
 
-def _times_ms(run: Callable[[], Any], device: torch.device, repeats: int) -> np.ndarray:
-    cuda = device.type == "cuda"
-    clock = time.perf_counter if cuda else time.process_time
-    times = []
-    for k in range(repeats + 2):  # the first two warm up, and compile
-        if cuda:
-            torch.cuda.synchronize(device)
-        start = clock()
-        run()
-        if cuda:
-            torch.cuda.synchronize(device)
-        if k >= 2:
-            times.append(1e3 * (clock() - start))
-    return np.array(times)
+def _of_size(
+    sample: Mapping[str, Any], to: tuple[int, int], device: torch.device, batch: int, compiled: bool, repeats: int
+) -> list[dict[str, Any]]:
+    rig: Rig = without_masks(sample["rig"]).resized(to)
+    plan = build_plan(rig, rig.turned(yaw_deg=YAW_DEG))
+    runs: dict[tuple[str, bool], Callable[[], Any]] = {}
+    moved: dict[str, int] = {}
+    for name, dtype in DTYPES.items():
+        images = [_of_type(resized(image, to), dtype).to(device).repeat(batch, 1, 1, 1) for image in sample["images"]]
+        moved[name] = bytes_moved(plan, images)
+        for by_compiler in (False, True)[: 1 + compiled]:
+            runs[name, by_compiler] = _renders(plan, images, by_compiler)
+    # One copy for each number of bytes: it must not fit a cache that the frame does not fit.
+    copies = {name: _copies(count_of // 2, device) for name, count_of in moved.items()}
+    label = "{1}x{0}".format(*to)
+    clock = cuda_ms(device) if device.type == "cuda" else process_ms
+    named = {f"{name} {flag}": run for (name, flag), run in runs.items()} | {
+        f"{k} copy": run for k, run in copies.items()
+    }
+    times = timed_rounds(named, repeats, label, clock=clock)
+    rows = []
+    for name, flag in runs:
+        found = quartiles(times[f"{name} {flag}"])
+        rate, copied = (moved[name] / quartiles(times[f"{name} {of}"]).median_ms / 1e6 for of in (flag, "copy"))
+        rows.append(
+            {"size": list(to), "dtype": name, "compiled": flag, **found._asdict(), "bytes": moved[name]}
+            | {"gb_per_s": rate, "copy_gb_per_s": copied, "share": rate / copied}
+        )
+    return rows
+
+
+def _of_type(image: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
+    return image if dtype == torch.uint8 else (image.float() / 255).to(dtype)
+
+
+def _renders(plan: RenderPlan, images: list[torch.Tensor], compiled: bool) -> Callable[[], Any]:
+    def render(images: list[torch.Tensor]) -> list[torch.Tensor]:
+        return render_torch(plan, images)
+
+    chosen: Callable[[list[torch.Tensor]], Any] = torch.compile(render, dynamic=False) if compiled else render
+
+    def run() -> None:
+        with torch.no_grad():
+            chosen(images)
+
+    return run
+
+
+def _copies(half: int, device: torch.device) -> Callable[[], Any]:
+    """A copy that reads ``half`` bytes and writes as many."""
+    source, target = (torch.zeros(half, dtype=torch.uint8, device=device) for _ in range(2))
+    return lambda: target.copy_(source)
+
+
+def _device(name: str | None) -> torch.device:
+    if name is None:
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise DataError(f"--device: expected cpu, cuda, cuda:1, ..., got {name!r}") from None
+    if device.type not in BATCH or (device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count()):
+        raise DataError(f"--device: expected cpu or a CUDA device that is there, got {name!r}")
+    return device
