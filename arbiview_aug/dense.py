@@ -1,8 +1,9 @@
 """Scene points of all pixels of a target, projected into a source: in float32, three planes of numbers at a time.
 
 For surfaces that step anywhere nothing can be interpolated between coarse nodes, so every pixel is projected. A
-pinhole's rays need no memory: their planes are a row and a column that broadcast. Positions in images of 1600 px are
-within 1/500 px of float64.
+pinhole's rays need no memory: their planes are a row and a column that broadcast. Those of a lens are inverted on a
+coarse grid and interpolated, where that is precise. Positions in images of 1600 px are within 1/500 px of float64, with
+interpolated rays within 1/200.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.camera import Camera
-from arbiview_aug.grid import Box
+from arbiview_aug.grid import Box, Grid
 from arbiview_aug.sampling import Slot
 
 Layer = npt.NDArray[np.float32]
@@ -29,14 +30,43 @@ def pixel_rays(camera: Camera) -> Planes:
     """Rays of all pixels: a pinhole's have z = 1, those of lenses unit length; 0 where there is none."""
     h, w = camera.size
     if camera.lens != "pinhole":
-        rays, valid = camera.unproject_cam(camera.pixel_grid())
-        x, y, z = (np.where(valid, rays[..., k], 0).astype(np.float32) for k in range(3))
+        planes = _interpolated_rays(camera)
+        if planes is None:
+            rays, valid = camera.unproject_cam(camera.pixel_grid())
+            planes = tuple(np.where(valid, rays[..., k], 0).astype(np.float32) for k in range(3))
+        x, y, z = planes
         return x, y, z
     K = camera.K
     v = ((np.arange(h) - K[1, 2]) / K[1, 1])[:, None]
     u = ((np.arange(w) - K[0, 2]) / K[0, 0])[None]
     x = u - K[0, 1] / K[0, 0] * v if K[0, 1] else u
     return x.astype(np.float32), v.astype(np.float32), np.ones((1, 1), np.float32)
+
+
+def _interpolated_rays(camera: Camera) -> tuple[Layer, ...] | None:
+    """Unit rays of all pixels from those on coarse nodes; None where a lens bends too much for that, or has no rays."""
+    grid = Grid(camera.size, _STEP_PX)
+    rays, valid = camera.unproject_cam(grid.nodes())
+    # What Grid leaves: cubic between the nodes, bilinear over a quarter of their spacing.
+    error = 0.0
+    for axis in (0, 1):
+        for order, share in ((2, 1 / 8 / 16), (4, 3 / 128)):
+            error += share * float(np.abs(np.diff(rays, order, axis=axis)).max(initial=0.0))
+    if not valid.all() or not error * float(camera.K[0, 0]) <= _RAY_PX:
+        return None
+    ny, nx = grid.shape
+    nodes = 0, ny - 1, 0, nx - 1
+    pairs = [np.ascontiguousarray(rays[..., pair], np.float32) for pair in ([0, 1], [2, 2])]
+    (x, y), (z, _) = (cv2.split(grid.upsample_refined(grid.refined(pair, nodes), nodes, (0, ny - 1))) for pair in pairs)
+    return x, y, z
+
+
+_STEP_PX = 8
+"""As plans: 25 times as fast as every pixel."""
+
+_RAY_PX = 1 / 128
+"""Half of what plans may interpolate by, as a bound; radial lenses of vehicles stay below 1/300 px, fisheyes near
+their fold do not."""
 
 
 def cropped(planes: Planes, box: Box) -> Planes:

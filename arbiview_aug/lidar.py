@@ -6,14 +6,13 @@ No sensor's place is assumed: points are z-buffered and made dense anew for each
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import cv2
 import numpy as np
 
-from arbiview_aug.camera import BoolArray, Camera, FloatArray
+from arbiview_aug.camera import BoolArray, Camera, FloatArray, Rays
 from arbiview_aug.errors import SampleError
 from arbiview_aug.objects import Objects, within_boxes
 from arbiview_aug.panorama import CELL_RAD, Layer, Panorama, Window, angles, panorama
@@ -107,14 +106,17 @@ class LidarSurface(Dense):
         if camera in self._rays:
             return self._rays[camera]
         step = max(1, round(CELL_RAD * float(camera.K[0, 0])))
-        # A lens may have no rays next to its image.
-        if step > 1 and camera.lens == "pinhole":
-            rays = _Located.of(camera, self._view, step)
-            # Azimuths bend near the zenith, and columns jump somewhere in a panorama that goes all around.
-            if float(np.abs(rays.directions[..., 2]).max()) <= _STEEP and not rays.view.window.is_whole:
-                self._rays[camera] = rays
-                return rays
-        return _Located.of(camera, self._view, 1)
+        if step > 1:
+            directions, valid = _spaced_rays(camera, step)
+            # A lens may have no rays next to its image; azimuths bend near the zenith.
+            if valid.all() and float(np.abs(directions[..., 2]).max()) <= _STEEP:
+                rays = _Located(camera.size, step, directions, *self._view(camera.center_m, directions))
+                if not rays.view.window.is_whole:  # columns jump somewhere in a panorama that goes all around
+                    self._rays[camera] = rays
+                    return rays
+        directions, valid = _spaced_rays(camera, 1)
+        directions = np.where(valid[..., None], directions, camera.cam2ego[:3, 2])
+        return _Located(camera.size, 1, directions, *self._view(camera.center_m, directions))
 
     def _view(self, origin: FloatArray, directions: FloatArray) -> tuple[Panorama, Layer, Layer]:
         """The panorama around a centre that holds the rays, and their rows and columns in it."""
@@ -134,7 +136,7 @@ class _Located(NamedTuple):
     Attributes:
         size: (h, w) of the image.
         step: Their spacing in pixels; they start one step before the centre of the image's first block.
-        directions: (ny, nx, 3) unit rays in the ego frame.
+        directions: (ny, nx, 3) unit rays in the ego frame; the optical axis where there is none.
         view: The panorama.
         row: (ny, nx) in it.
         column: (ny, nx).
@@ -147,15 +149,6 @@ class _Located(NamedTuple):
     row: Layer
     column: Layer
 
-    @classmethod
-    def of(
-        cls, camera: Camera, view: Callable[[FloatArray, FloatArray], tuple[Panorama, Layer, Layer]], step: int
-    ) -> _Located:
-        v, u = (step * np.arange(-1.0, -(-n // step) + 1) + (step - 1) / 2 for n in camera.size)
-        directions, valid = camera.unproject(np.stack(np.meshgrid(u, v), -1))
-        directions = np.where(valid[..., None], directions, camera.cam2ego[:3, 2])
-        return cls(camera.size, step, directions, *view(camera.center_m, directions))
-
     def to_pixels(self, values: Layer) -> Any:
         """Bilinear interpolation (ny, nx) to all pixels (h, w)."""
         s, (h, w) = self.step, self.size
@@ -163,6 +156,12 @@ class _Located(NamedTuple):
         if s > 1:
             enlarged = cv2.resize(values, None, fx=s, fy=s, interpolation=cv2.INTER_LINEAR)
         return enlarged[s : s + h, s : s + w]
+
+
+def _spaced_rays(camera: Camera, step: int) -> Rays:
+    """Rays in the ego frame, from one step before the centre of the image's first block to one behind the last's."""
+    v, u = (step * np.arange(-1.0, -(-n // step) + 1) + (step - 1) / 2 for n in camera.size)
+    return camera.unproject(np.stack(np.meshgrid(u, v), -1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,6 @@ that step anywhere (``Dense``) are evaluated once at every pixel of a target, an
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
@@ -19,13 +18,14 @@ import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.dense import FAR_AWAY_PX, cropped, project_pixels
-from arbiview_aug.grid import HALVINGS, Box, runs
+from arbiview_aug.grid import HALVINGS, Box, around, runs
 from arbiview_aug.projection import (
     CORNERS,
     beyond_image,
     clean_pixels,
     ego_rays,
     larger,
+    look_apart,
     mask_at,
     project_rays,
     source_points,
@@ -35,6 +35,7 @@ from arbiview_aug.shadowing import SeenSolids, at_level, cells_near_shadow, halv
 from arbiview_aug.surface import Dense, Layered, Shadows, Static, Surface
 from arbiview_aug.target_rays import TargetRays
 
+_SLACK_PX = 1e-3  # a pixel on the very border must not drop out by a rounding, of float32 at most
 _SAFETY = 1.25  # curvature between the nodes may exceed what the nodes show
 
 _UNRESOLVED = 8 * 5 / 1024
@@ -85,27 +86,22 @@ class PairMap:
         if self._shaded and not isinstance(self.surface, Static):
             self._from_source_q = (q / np.maximum(np.sqrt((points * points).sum(-1)), 1e-300)).astype(np.float32)
         if rays.grid.step == 1:
-            self.nodes = _bounds(self.valid & source.contains(self.uv), 0)
+            self.nodes = _bounds(self.valid & source.contains(self.uv, _SLACK_PX), 0)
         else:
             self.nodes = self._classify(points)
             if isinstance(self.surface, Dense):
                 self._every_pixel()
-        self.nodes = _around(self.nodes, seen_solids)
+        if seen_solids is not None:
+            self.nodes = seen_solids if self.nodes is None else around(self.nodes, seen_solids)
+        if isinstance(self.surface, Dense) and self.nodes is not None:
+            rays.ask(self.surface, self.nodes)
 
     def _look_apart(self) -> bool:
-        """Whether the two viewing cones, widened by the parallax of the nearest scene point, cannot meet."""
-        q = self.rays.inverse_distance(self.whole_surface)
-        # Law of sines: a point at 1 / q is seen from the two centres in directions that differ by at most asin(b q);
-        # by any angle where it is nearer than the baseline b.
-        nearest = float(q.max())
+        """Whether the two cameras certainly have nothing in common."""
+        nearest = float(self.rays.inverse_distance(self.whole_surface).max())
         if isinstance(self.whole_surface, Layered):
             nearest = max(nearest, float(self.rays.solids(self.whole_surface).inverse_distance.max(initial=0.0)))
-        nearness = float(np.linalg.norm(self.offset_m)) * nearest
-        if nearness >= 1:
-            return False
-        parallax = math.asin(nearness)
-        apart = math.acos(float(np.clip(self.rays.camera.cam2ego[:3, 2] @ self.source.cam2ego[:3, 2], -1, 1)))
-        return apart > self.rays.camera.half_angle_rad + self.source.half_angle_rad + parallax + 0.01
+        return look_apart(self.rays.camera, self.source, nearest)
 
     def _glance(self) -> bool:
         """Whether any cell four times as large may hold a pixel of the source."""
@@ -272,10 +268,8 @@ class PairMap:
                 self._fine = slot, grid.refined(slot.from_source(self.uv).astype(np.float32), self.nodes)
             at = grid.upsample_refined(self._fine[1], self.nodes, rows)
             self._patch_exact(at, nodes, slot)
-        # Slack: a pixel on the very border must not drop out by a rounding of float32.
-        slack = 1e-3
-        low = slot.from_source(np.array([-slack, -slack]))
-        high = slot.from_source(np.array([source.width_px - 1 + slack, source.height_px - 1 + slack]))
+        low = slot.from_source(np.array([-_SLACK_PX, -_SLACK_PX]))
+        high = slot.from_source(np.array([source.width_px - 1 + _SLACK_PX, source.height_px - 1 + _SLACK_PX]))
         # Halving leaves out the last row or column of an odd size: nothing is known there.
         high = np.minimum(high, np.array([slot.x + slot.size[1], slot.y + slot.size[0]]) - 0.5)
         visible: Any = cv2.inRange(at, tuple(low), tuple(high))
@@ -361,13 +355,6 @@ class PairMap:
         exact = np.clip(slot.from_source(uv[start:stop][inside]), -FAR_AWAY_PX, FAR_AWAY_PX)
         exact = np.where(valid[start:stop][inside, None], exact, -FAR_AWAY_PX)
         at[py[inside] - y0, px[inside] - x0] = exact
-
-
-def _around(one: Box | None, two: Box | None) -> Box | None:
-    """The box around two boxes of nodes."""
-    if one is None or two is None:
-        return one or two
-    return min(one[0], two[0]), max(one[1], two[1]), min(one[2], two[2]), max(one[3], two[3])
 
 
 def _bounds(use: BoolArray, extra: int) -> Box | None:

@@ -5,6 +5,7 @@ Directions are held plane by plane, (3, ny, nx) in memory: three times faster.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import cv2
@@ -53,6 +54,23 @@ def source_points(
     if np.any(offset_m):
         points += (R @ offset_m)[:, None] * inverse_distance.reshape(1, -1)
     return np.moveaxis(points.reshape(3, *directions.shape[:-1]), 0, -1)
+
+
+def look_apart(one: Camera, two: Camera, nearest: float) -> bool:
+    """Whether the viewing cones of two cameras, widened by the parallax of the nearest scene point, cannot meet.
+
+    Args:
+        one: A camera.
+        two: Another one, in the same ego frame.
+        nearest: The point's inverse distance from either of them, 1/m.
+    """
+    # Law of sines: a point at 1 / q is seen from the two centres in directions that differ by at most asin(b q); by
+    # any angle where it is nearer than the baseline b.
+    nearness = float(np.linalg.norm(one.center_m - two.center_m)) * nearest
+    if nearness >= 1:
+        return False
+    apart = math.acos(float(np.clip(one.cam2ego[:3, 2] @ two.cam2ego[:3, 2], -1, 1)))
+    return apart > one.half_angle_rad + two.half_angle_rad + math.asin(nearness) + 0.01
 
 
 def beyond_image(source: Camera, points: FloatArray, uv: FloatArray, valid: BoolArray) -> npt.NDArray[np.uint8]:

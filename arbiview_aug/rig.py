@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -219,9 +220,11 @@ class Rig:
         """Write the rig to a .yaml, .yml or .json file; masks become PNGs beside it. Returns the path."""
         path = Path(path)
         data = self.to_dict()
-        for entry, camera in zip(data["cameras"], self.cameras, strict=True):
+        for k, (entry, camera) in enumerate(zip(data["cameras"], self.cameras, strict=True)):
             if camera.mask is not None:
-                file = path.with_name(f"{path.stem}.{camera.name}.mask.png")
+                # Names such as /camera/front are no file names; with a space, the other cannot be a camera's own name.
+                name = camera.name if re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", camera.name) else f"camera {k}"
+                file = path.with_name(f"{path.stem}.{name}.mask.png")
                 cv2.imwrite(str(file), camera.mask.astype(np.uint8) * 255)
                 entry["mask"] = file.name
         if path.suffix == ".json":

@@ -11,14 +11,18 @@ An atlas holds the source images that a plan reads, below and beside each other,
 
 from __future__ import annotations
 
+import math
 import threading
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
+
+from arbiview_aug.camera import MAX_SIZE_PX
+from arbiview_aug.errors import CalibrationError
 
 OUTSIDE = -16
 """Whole-pixel coordinate of a map entry that reads nothing: far enough that no bilinear tap touches the atlas."""
@@ -38,9 +42,35 @@ class FixedMap:
         """Round a float map (h, w, 2) to 32nds of a pixel."""
         return cls(*cv2.convertMaps(uv, None, cv2.CV_16SC2))  # type: ignore[call-overload]
 
-    def fill_rows(self, y0: int, y1: int, uv: npt.NDArray[np.float32]) -> None:
-        """Round a float map (y1 - y0, w, 2) into rows y0 to y1."""
-        cv2.convertMaps(uv, None, cv2.CV_16SC2, self.xy[y0:y1], self.frac[y0:y1])  # type: ignore[call-overload]
+    @classmethod
+    def in_slot(cls, uv: npt.NDArray[np.float32], slot: Slot) -> FixedMap:
+        """A float map (h, w, 2) in the image of a slot, as positions in the atlas.
+
+        Rounded first: float32 has 1/512 px left in an atlas's last rows, whole pixels are added exactly.
+        """
+        fixed = cls.from_float(uv)
+        for axis, first in enumerate((slot.x, slot.y)):
+            if first:
+                fixed.xy[..., axis] += np.int16(first)
+        return fixed
+
+    @classmethod
+    def outside(cls, size: tuple[int, int]) -> FixedMap:
+        """A map (h, w) that reads nothing."""
+        return cls(np.full((*size, 2), OUTSIDE, np.int16), np.zeros(size, np.uint16))
+
+    def put(self, part: FixedMap, where: npt.NDArray[np.uint8]) -> None:
+        """Take another map's positions where ``where`` (h, w) is not 0."""
+        cv2.copyTo(part.xy, where, self.xy)
+        cv2.copyTo(part.frac, where, self.frac)
+
+    def part(self, rows: slice, columns: slice) -> FixedMap:
+        """A rectangle of it, the same memory."""
+        return FixedMap(self.xy[rows, columns], self.frac[rows, columns])
+
+    def copy(self) -> FixedMap:
+        """The same map in memory of its own."""
+        return FixedMap(self.xy.copy(), self.frac.copy())
 
     def rows(self, y0: int, y1: int) -> FixedMap:
         """Rows y0 to y1, the same memory."""
@@ -81,6 +111,10 @@ class Slot:
         """The inverse of ``from_source``."""
         return (at - (self.x, self.y) + 0.5) * 2**self.level - 0.5
 
+    def alone(self) -> Slot:
+        """The same image in an atlas of its own: what it sees must not depend on the images above it."""
+        return Slot(self.source, self.level, 0, 0, self.size)
+
 
 @dataclass(frozen=True)
 class AtlasLayout:
@@ -98,7 +132,11 @@ class AtlasLayout:
 
     @classmethod
     def for_sources(cls, sizes: Sequence[tuple[int, int]], used: Sequence[tuple[int, int]]) -> AtlasLayout:
-        """Lay out the used (source, level) pairs: below each other, in further columns where rows run out."""
+        """Lay out the used (source, level) pairs: below each other, in further columns where rows run out.
+
+        Raises:
+            CalibrationError: There are no more columns: 29 images of 7680x4320 px, read at their full size.
+        """
         used = sorted(set(used))
         is_stack = (
             len(set(sizes)) == 1
@@ -118,7 +156,18 @@ class AtlasLayout:
             slots.append(Slot(source, level, y, x, (h, w)))
             y, column_width = y + h, max(column_width, w)
             rows = max(rows, y)
-        return cls(tuple(slots), (max(rows, 1), max(x + column_width, 1)), False)
+        columns = x + column_width
+        if columns > MAX_SIZE_PX:
+            raise CalibrationError(
+                f"rig: expected source images that fit {_MAX_ROWS} rows and {MAX_SIZE_PX} columns together, got "
+                f"{len(slots)} to read at once, up to {max(h for h, _ in sizes)}x{max(w for _, w in sizes)}; resize "
+                "them, and their cameras by Rig.resized"
+            )
+        return cls(tuple(slots), (max(rows, 1), max(columns, 1)), False)
+
+    def without_others(self, read: Collection[tuple[int, int]]) -> AtlasLayout:
+        """The same places for the (source, level) pairs that are read: images that win no pixel are not copied."""
+        return replace(self, slots=tuple(slot for slot in self.slots if (slot.source, slot.level) in read))
 
     def slot(self, source: int, level: int) -> Slot:
         """The place of one source at one level."""
@@ -215,15 +264,19 @@ def torch_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Te
     """The atlas (B, 3, rows, columns) float32 of (B, 3, H, W) images in 0..255 or [0, 1]; differentiable."""
     whole = images[0].dtype == torch.uint8
     batch, device = images[0].shape[0], images[0].device
-    atlas = torch.zeros((batch, 3, *layout.size), dtype=torch.float32, device=device)
+    # What no slot fills must be finite: bilinear taps of weight 0 read it.
+    is_full = sum(math.prod(slot.size) for slot in layout.slots) == math.prod(layout.size)
+    atlas = (torch.empty if is_full else torch.zeros)((batch, 3, *layout.size), dtype=torch.float32, device=device)
     for slot in layout.slots:
         h, w = slot.size
-        image = images[slot.source].float()
+        image = images[slot.source]
+        if slot.level:
+            image = image.float()
         for _ in range(slot.level):
             image = torch.nn.functional.avg_pool2d(image, 2)
             if whole:
                 image = torch.floor(image + 0.5)  # as OpenCV rounds its halved uint8 images
-        atlas[:, :, slot.y : slot.y + h, slot.x : slot.x + w] = image
+        atlas[:, :, slot.y : slot.y + h, slot.x : slot.x + w] = image  # converts as it copies
     return atlas
 
 

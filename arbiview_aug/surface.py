@@ -36,9 +36,12 @@ class Surface(ABC):
 
     Attributes:
         smooth: Without creases: a map over it may be interpolated by what its values on a grid show.
+        slack: By how much more than settings say maps over it may err where they are interpolated: more than 1 where
+            the surface itself is not known that well.
     """
 
     smooth: ClassVar[bool]
+    slack: ClassVar[float] = 1.0
 
     @abstractmethod
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
@@ -259,6 +262,13 @@ def wall_inverse_distance(
     else:
         q = np.where((b < 0) & (b * b >= a * c), towards, 0.0)
     return np.clip(q, 0.0, MAX_INVERSE_DISTANCE)
+
+
+def is_within_wall(origin: FloatArray) -> bool:
+    """Whether a centre (3,) stands within the street's far wall, the smaller of the two: from outside it has edges."""
+    ox = (origin[0] - WALL_CENTER_M[0]) / Street.half_length_m
+    oy = (origin[1] - WALL_CENTER_M[1]) / Street.half_width_m
+    return bool(ox * ox + oy * oy < 1)
 
 
 def street_uncertainty(origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:

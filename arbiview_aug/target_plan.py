@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,14 +21,12 @@ from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.grid import Box, runs
 from arbiview_aug.maps import PairMap
 from arbiview_aug.projection import edge_distance, resolution
+from arbiview_aug.required import SAME_CENTER_M, serves_alone
 from arbiview_aug.rig import Rig
 from arbiview_aug.sampling import AtlasLayout, FixedMap, Scratch
-from arbiview_aug.surface import Surface, worst_parallax_px
+from arbiview_aug.surface import Surface, is_within_wall, worst_parallax_px
 from arbiview_aug.target_rays import TargetRays
 from arbiview_aug.tone import Patch, patches
-
-SAME_CENTER_M = 1e-6
-"""Centres closer than this coincide: a homography is exact whatever the scene."""
 
 _STRIP_PX = 128  # rows worked on at once: they fit a cache, and slanted seams make narrow rectangles
 _LEAST_SHARE = 1 / 256  # a source that adds less than this to a pixel cannot change a grey level
@@ -98,6 +97,11 @@ class TargetPlan:
         """(h, w) True where some source sees the pixel."""
         return self.source_camera >= 0
 
+    @property
+    def sources(self) -> set[int]:
+        """Indices of the source cameras that are read."""
+        return {pair.source for pair in self.pairs} | {band.source for band in self.bands}
+
     @cached_property
     def patches(self) -> list[list[Patch]]:
         """For each strip of rows, which source wins where, for tone curves; found when first asked for."""
@@ -133,7 +137,7 @@ class _Visible:
 
     source: int
     box: Box  # y0, y1, x0, x1
-    at: npt.NDArray[np.float32]  # [box h, box w, 2] atlas positions
+    at: FixedMap  # [box h, box w] atlas positions
     visible: npt.NDArray[np.uint8]  # [box h, box w] 255 where the source sees the pixel
     weight: npt.NDArray[np.float32]  # [box h, box w] seam weight
     certainty: npt.NDArray[np.uint8] | None  # [box h, box w]
@@ -156,12 +160,24 @@ class TargetDraft:
         self.source, self.camera, self.surface, self.config = source, camera, surface, config
         self.best, self.surface_by_name = best, surface_by_name
         self.counters = counters
-        self.rays = TargetRays(camera, config.grid_step_px, counters)
+        # From outside, the far wall is a narrow strip with edges, which a coarse grid could step over.
+        step = config.grid_step_px if surface == "far" or is_within_wall(camera.center_m) else 1
+        self.rays = TargetRays(camera, step, counters)
         self.grid = self.rays.grid
         # In content order, so that ties never depend on the order of the source list.
-        self.regions = [region for k in order if (region := self._region(k)) is not None]
+        self.regions = [region for k in self._required(order) if (region := self._region(k)) is not None]
 
     # --- what a source sees -------------------------------------------------------------------------------------------
+    def _required(self, order: list[int]) -> list[int]:
+        """The sources that can win a pixel: where one serves the target alone, those at its centre."""
+        if not any(serves_alone(self.source[k], self.camera, self.config) for k in order):
+            return order
+        self.counters["served_alone"] += 1
+        return [k for k in order if self._baseline_m(k) < SAME_CENTER_M]
+
+    def _baseline_m(self, index: int) -> float:
+        return float(np.linalg.norm(self.camera.center_m - self.source[index].center_m))
+
     def _choose_surface(self, baseline_m: float, focal_px: float) -> tuple[str, str]:
         if baseline_m < SAME_CENTER_M:
             return "far", "centres coincide: exact"
@@ -175,7 +191,7 @@ class TargetDraft:
     def _region(self, index: int) -> _Region | None:
         source = self.source[index]
         offset_m = self.camera.center_m - source.center_m
-        baseline_m = float(np.linalg.norm(offset_m))
+        baseline_m = self._baseline_m(index)
         focal_px = float(self.camera.K[0, 0])
         name, reason = self._choose_surface(baseline_m, focal_px)
         surface = self.surface_by_name(name)
@@ -187,7 +203,7 @@ class TargetDraft:
         edge_px = edge_distance(source, pair.uv)
         seen = pair.valid & (edge_px > 0)
         level = self._level(pixels_per_pixel[seen], source.size) if self.config.antialias else 0
-        pair.set_tolerance(self.config.map_tolerance_px * 2**level)
+        pair.set_tolerance(self.config.map_tolerance_px * 2**level * pair.surface.slack)
         seen = pair.visible_nodes(level) & (edge_px > 0)
         parallax = self._expected_parallax(offset_m, focal_px, surface)
         score = (
@@ -240,7 +256,7 @@ class TargetDraft:
     def finish(self, layout: AtlasLayout, scratch: Scratch) -> TargetPlan:
         """Winners, maps into the atlas, and blended bands; strip by strip, so that the work stays in the cache."""
         h, w = self.camera.size
-        fixed = FixedMap(np.empty((h, w, 2), np.int16), np.empty((h, w), np.uint16))
+        fixed = FixedMap.outside((h, w))
         winner = np.full((h, w), -1, np.int8)
         certain = np.zeros((h, w), np.uint8) if self.config.certainty else None
         weights = self._seam_weights()
@@ -249,8 +265,6 @@ class TargetDraft:
         won_px: Counter[int] = Counter()
         for rows in self.grid.strips(_STRIP_PX):
             y0, y1, _, _ = self.grid.pixels((*rows, 0, 0))
-            at = scratch.get("at", (y1 - y0, w, 2), np.float32)
-            at.fill(sampling.OUTSIDE)
             best = scratch.get("best", (y1 - y0, w), np.float32)
             best.fill(-1)  # a source that sees a pixel beats none, even with a weight of 0
             seen = []
@@ -261,14 +275,13 @@ class TargetDraft:
                 seen.append(part)
                 top, bottom, left, right = part.box
                 held = best[top - y0 : bottom - y0, left:right]
-                wins = cv2.bitwise_and(part.visible, cv2.compare(part.weight, held, cv2.CMP_GT))
+                wins: Any = cv2.bitwise_and(part.visible, cv2.compare(part.weight, held, cv2.CMP_GT))
                 cv2.copyTo(part.weight, wins, held)
-                cv2.copyTo(part.at, wins, at[top - y0 : bottom - y0, left:right])
+                fixed.part(slice(top, bottom), slice(left, right)).put(part.at, wins)
                 own = np.full(wins.shape, region.source, np.int8)
                 cv2.copyTo(own, wins, winner[top:bottom, left:right])
                 if certain is not None and part.certainty is not None:
                     cv2.copyTo(part.certainty, wins, certain[top:bottom, left:right])
-            fixed.fill_rows(y0, y1, at)
             for part in seen:
                 won = cv2.inRange(winner[y0:y1], part.source, part.source)  # type: ignore[call-overload]
                 won_px[part.source] += cv2.countNonZero(won)
@@ -288,11 +301,13 @@ class TargetDraft:
         box = self.grid.pixels(nodes)
         if box[1] <= box[0] or box[3] <= box[2]:
             return None
-        at, visible = region.pair.full_resolution(layout.slot(region.source, region.level), nodes[:2])
+        slot = layout.slot(region.source, region.level)
+        at, visible = region.pair.full_resolution(slot.alone(), nodes[:2])
         certain = None
         if region.certainty is not None:
             certain = np.round(self.grid.upsample(region.certainty, nodes)).astype(np.uint8)
-        return _Visible(region.source, box, at, visible, self.grid.upsample(weight, nodes), certain)
+        fixed = FixedMap.in_slot(at, slot)
+        return _Visible(region.source, box, fixed, visible, self.grid.upsample(weight, nodes), certain)
 
     def _seam_weights(self) -> list[npt.NDArray[np.float32]]:
         """Weights on the nodes: each source's winning area, softened over the seam width, fading at its own border."""
@@ -332,31 +347,27 @@ class TargetDraft:
         if y1 <= y0 or x1 <= x0 or len(local) < 2:
             return
         weight = np.zeros((len(local), y1 - y0, x1 - x0), np.float32)
-        at = np.full((*weight.shape, 2), sampling.OUTSIDE, np.float32)
         for k, (s, common) in enumerate(local):
-            b0, _, c0, _ = s.box
-            t, b, le, r = common
-            mine = slice(t - b0, b - b0), slice(le - c0, r - c0)
-            here = slice(t - y0, b - y0), slice(le - x0, r - x0)
+            mine, here = _within(s.box, common), _within(box, common)
             weight[k][here] = np.where(s.visible[mine] > 0, s.weight[mine], 0)
-            at[k][here] = s.at[mine]
         index = np.array([s.source for s, _ in local])
         is_winner = winner[None, y0:y1, x0:x1] == index[:, None, None]
         first = np.where(is_winner, weight, 0).max(axis=0)
         others = np.where(is_winner, 0, weight)
         second, second_weight = others.argmax(axis=0), others.max(axis=0)
         share = second_weight / np.maximum(first + second_weight, 1e-30)
-        for k, source in enumerate(index.tolist()):
+        for k, (s, common) in enumerate(local):
             adds = (second == k) & (share >= _LEAST_SHARE)
             if not adds.any():
                 continue
             ys, xs = np.flatnonzero(adds.any(axis=1)), np.flatnonzero(adds.any(axis=0))
             tight = (slice(ys[0], ys[-1] + 1), slice(xs[0], xs[-1] + 1))
             # Where this source adds nothing its positions may lie in a neighbour in the atlas: read nothing there.
-            positions = np.where(adds[..., None], at[k], np.float32(sampling.OUTSIDE))[tight]
+            positions = FixedMap.outside(adds.shape)
+            here = _within(box, common)
+            positions.part(*here).put(s.at.part(*_within(s.box, common)), adds[here].view(np.uint8))
             part = np.where(adds, share, 0).astype(np.float32)[tight]
-            fixed = FixedMap.from_float(np.ascontiguousarray(positions))
-            yield Band(y0 + int(ys[0]), x0 + int(xs[0]), source, fixed, part)
+            yield Band(y0 + int(ys[0]), x0 + int(xs[0]), s.source, positions.part(*tight).copy(), part)
 
     def _reports(self, winner: npt.NDArray[np.int8], won_px: Counter[int]) -> Iterator[PairReport]:
         """What each source that wins any pixel does, largest share first."""
@@ -377,6 +388,11 @@ class TargetDraft:
                 share=won_px[region.source] / winner.size,
                 level=region.level,
             )
+
+
+def _within(box: Box, part: Box) -> tuple[slice, slice]:
+    """Rows and columns of a part of a pixel box, counted in the box."""
+    return slice(part[0] - box[0], part[1] - box[0]), slice(part[2] - box[2], part[3] - box[2])
 
 
 def _overlap(one: Box, two: Box) -> Box | None:

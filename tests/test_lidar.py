@@ -3,6 +3,7 @@
 import time
 import tracemalloc
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from arbiview_aug.panorama import REACH_RAD
 from arbiview_aug.plan import build_plan
 from arbiview_aug.scene import Scene
 from arbiview_aug.surface import Street
+from arbiview_aug.target_rays import TargetRays
 
 EYE = np.array([2.0, 0.0, 1.5])
 PIXEL_RAD = 0.002
@@ -260,6 +262,7 @@ VIEWS = {
     ),
     "steep": camera().turned(pitch_deg=60.0),
     "behind": camera().turned(yaw_deg=175.0, roll_deg=20.0),
+    "radtan": replace(camera((480, 800)), lens="radtan", distortion=(-0.1, 0.02, 1e-3, -1e-3)),
     "fisheye": Camera.looking(
         name="wide", azimuth_deg=0, position_m=tuple(EYE), width_px=160, height_px=120, horizontal_fov_deg=170,
         lens="fisheye", distortion=(0.02, -0.01, 0.0, 0.0),
@@ -297,6 +300,26 @@ def test_coarse_grid_equals_pixel_by_pixel_evaluation() -> None:
         same = (a.source_camera == b.source_camera) & a.coverage
         assert same.mean() > 0.98 * a.coverage.mean()
         assert np.quantile(np.abs(a.at.xy[same].astype(int) - b.at.xy[same]), 0.99) <= 1
+
+
+def test_only_pixels_that_a_pair_may_read_are_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Turned cameras are exact over most of the view: points matter where neighbours see the rest."""
+    rig, scene = demo_source_rig((128, 352)), Scene(points=np.concatenate([NEAR, FAR]))
+    target = rig.turned(yaw_deg=15)
+    part = build_plan(rig, target, surface="lidar", scene=scene)
+    ask = TargetRays.ask
+    monkeypatch.setattr(TargetRays, "ask", lambda self, surface, nodes: ask(self, surface, whole(self)))
+    every = build_plan(rig, target, surface="lidar", scene=scene)
+    pixels = len(rig) * 128 * 352
+    assert 0 < part.counters["dense_pixels"] < 0.6 * pixels and every.counters["dense_pixels"] == pixels
+    for a, b in zip(part.targets, every.targets, strict=True):
+        assert (a.source_camera != b.source_camera).mean() < 1e-3
+        assert (a.at.xy != b.at.xy).mean() < 1e-3
+
+
+def whole(rays: TargetRays) -> tuple[int, int, int, int]:
+    ny, nx = rays.grid.shape
+    return 0, ny - 1, 0, nx - 1
 
 
 def test_in_a_sample() -> None:

@@ -310,7 +310,7 @@ class Harmoniser:
             numbers: gains, one for each source camera, used as they are.
 
     Raises:
-        ValueError: Anything else, or gains that are not positive numbers.
+        ValueError: Anything else, or gains that are no positive numbers up to a thousand.
     """
 
     def __init__(self, choice: Harmonise = None) -> None:
@@ -355,6 +355,7 @@ class Harmoniser:
         return None if all(g == 1 for g in gains) else tuple(ToneCurve(g, self.config.knee) for g in gains)
 
 
+_MAX_GIVEN_GAIN = 1e3  # ten stops: two cameras never differ more, and near 1e38 pixels of 0 would become NaN
 _HELD_RIGS = 8  # about 0.2 MB each; every frame of a drive may have a calibration of its own
 
 
@@ -363,8 +364,9 @@ def _checked_gains(choice: object) -> tuple[float, ...]:
         gains = tuple(float(gain) for gain in choice)  # type: ignore[attr-defined]
     except (TypeError, ValueError):
         gains = ()
-    if not gains or not all(math.isfinite(gain) and gain > 0 for gain in gains):
+    if not gains or not all(1 / _MAX_GIVEN_GAIN <= gain <= _MAX_GIVEN_GAIN for gain in gains):  # NaN fails too
         raise ValueError(
-            f"harmonise: expected None, a bool, a HarmoniseConfig or a positive gain for each camera, got {choice!r}"
+            "harmonise: expected None, a bool, a HarmoniseConfig or for each camera a gain from "
+            f"{1 / _MAX_GIVEN_GAIN:g} to {_MAX_GIVEN_GAIN:g}, got {choice!r}"
         )
     return gains
