@@ -69,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     change.add_argument("--test-frames", type=int, metavar="N")
     change.add_argument("--steps", type=int, metavar="N")
     change.add_argument("--precision", choices=("bf16", "fp32"))
-    change.add_argument("--device", help="of the trainings: cpu, cuda; with cuda take --workers 1")
+    change.add_argument("--device", help="of the trainings, cpu or cuda")
     return parser
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from integrations.cross_rig.views import Arm
+from integrations.cross_rig.views import Arm, Geometry
 
-_ALL = ("points", "boxes_3d")
+_ALL: tuple[Geometry, ...] = ("points", "boxes_3d")
 ARMS: dict[str, Arm] = {
     arm.name: arm
     for arm in (

@@ -58,7 +58,7 @@ def _source(name: str) -> Path | None:
 
 
 def _imported(tree: ast.AST) -> set[str]:
-    found = set()
+    found: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found.update(alias.name for alias in node.names)

@@ -171,7 +171,7 @@ def run(setup: Run, workers: int, log: Log) -> Iterator[int]:
                 log(f"{what}: {todo} chunks" if not done else f"{what}: made in {time.monotonic() - start:.0f} s")
     missing = setup.missing()
     yield len(missing)
-    if workers == 1:
+    if workers == 1 or setup.settings.schedule.device != "cpu":  # one training at a time fills a GPU
         for done, job in enumerate(missing, 1):
             log(setup.do(job))
             yield len(missing) - done

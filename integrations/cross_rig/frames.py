@@ -23,6 +23,8 @@ from integrations.cross_rig.labels import Grid, box_cells, visible_objects
 from integrations.cross_rig.views import ViewMaker
 from integrations.cross_rig.worlds import CHANGES, STREET_SEEDS, Size, Split, source_rig
 
+_FORMAT = 1
+"""Part of every set's name: raise it when this file stores something else."""
 _MAX_FRAMES = 1 << 20
 """Length of the streets' datasets: a set of frames grows without becoming another."""
 
@@ -53,6 +55,7 @@ class Source:
     def store(self) -> FrameStore:
         """Where they lie."""
         spec: dict[str, Any] = {
+            "format": _FORMAT,
             "rig": self.rig.content_key.hex(),
             "streets": STREET_SEEDS[self.split],
             "grid": vars(Grid()),
@@ -130,7 +133,7 @@ class _TrueFrames:
             depth = views.depth_m.numpy()
             # Half precision: 6 cm at 100 m. The sky becomes 0: unknown.
             arrays["depth_m"] = np.where(np.isfinite(depth), depth, 0).astype(np.float16)
-        return {**arrays, "cpu_s": np.float32(time.process_time() - start)}
+        return {**arrays, "cpu_s": np.array(time.process_time() - start, np.float32)}
 
 
 class _ArmFrames:

@@ -20,7 +20,7 @@ FREE, VEHICLE, HIDDEN = 0, 1, 2
 VEHICLES = (BoxClass.CAR, BoxClass.VAN, BoxClass.TRUCK, BoxClass.BUS)
 
 VISIBLE_SHARE = 16 / (96 * 256)
-"""Pixels that make an object visible, as a share of an image: 16 at 96×256, the patch of one of the model's features."""
+"""Pixels that make an object visible, as a share of an image: 16 at 96×256, the patch of one feature of the model."""
 
 _COVER_HEIGHT_M = 0.8
 """A cell is covered where a camera sees this height over its centre: half a car's."""

@@ -1,4 +1,4 @@
-"""A small camera-only detector that uses calibration: image features, sampled at voxels, then a bird's-eye-view network.
+"""A small camera-only detector that uses calibration: image features, sampled at voxels, and a bird's-eye-view network.
 
 After SimpleBEV (Harley et al., ICRA 2023): each voxel averages the features that it projects to, without a depth
 distribution. Whatever no source saw takes no part: such pixels hold the mean colour on the way in, and features are

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +72,8 @@ def markdown(report: Mapping[str, Any]) -> str:
         "tests done. IoU of vehicle cells in %, [95 % interval] over seeds and frames; recovered: (arm − raw) / "
         "(oracle − raw), where oracle − raw is at least 5 points; loading: CPU ms that the arm adds to a frame.",
     ]
-    distances = [f"{a:g}–{b:g} m" for a, b in zip(DISTANCES_M, DISTANCES_M[1:], strict=False)]
-    heights = [f"{a:g}–{b:g} m high" for a, b in zip(HEIGHTS_M, HEIGHTS_M[1:], strict=False)]
+    distances = [f"{a:g}–{b:g} m" for a, b in pairwise(DISTANCES_M)]
+    heights = [f"{a:g}–{b:g} m high" for a, b in pairwise(HEIGHTS_M)]
     head = ["arm", "IoU", "over raw", "recovered %", *(f"IoU {d}" for d in distances)]
     head += [*(f"recall {h}" for h in heights), "loading"]
     for name, change in report["changes"].items():
@@ -125,5 +126,3 @@ def save_plot(report: Mapping[str, Any], path: Path) -> None:
     panels[0].set_yticks(range(len(names)), [ARMS[name].title for name in names])
     panels[0].invert_yaxis()
     figure.savefig(path)
-
-

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from integrations.cross_rig.arms import ARMS, named_arms
 from integrations.cross_rig.training import Schedule
@@ -33,7 +33,7 @@ class Settings:
     seeds: tuple[int, ...] = (0, 1, 2)
     changes: tuple[str, ...] = tuple(CHANGES)
     arms: tuple[str, ...] = tuple(ARMS)
-    schedule: Schedule = Schedule(steps=900)
+    schedule: Schedule = field(default_factory=lambda: Schedule(steps=900))
 
     def __post_init__(self) -> None:
         named_arms(self.arms)

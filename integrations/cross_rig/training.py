@@ -145,7 +145,7 @@ def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[BevDetector, lis
     """A trained detector and its mean loss over each tenth of the steps."""
     torch.manual_seed(seed)
     device = torch.device(schedule.device)
-    model = BevDetector(Grid(), schedule.backbone).to(device, memory_format=torch.channels_last)
+    model = BevDetector(Grid(), schedule.backbone).to(device).to(memory_format=torch.channels_last)
     optimizer = torch.optim.AdamW(model.parameters(), lr=schedule.lr)
     cycle = torch.optim.lr_scheduler.OneCycleLR(optimizer, schedule.lr, total_steps=schedule.steps)
     losses = []
@@ -201,7 +201,9 @@ class Tested:
     cpu_s: float
 
 
-def evaluate(model: BevDetector, val: FrameSet, test_set: FrameSet, height_dm: np.ndarray, schedule: Schedule) -> Tested:
+def evaluate(
+    model: BevDetector, val: FrameSet, test_set: FrameSet, height_dm: np.ndarray, schedule: Schedule
+) -> Tested:
     """Threshold on validation streets, counts on test streets; both as B sees them, with B's calibration."""
     start = time.process_time()
     threshold, val_iou = best_threshold(probabilities(model, val, len(val.state), schedule), val)

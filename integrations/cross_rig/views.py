@@ -21,11 +21,12 @@ from arbiview_aug.surface import SurfaceName
 from integrations.cross_rig.cache import Arrays
 
 Kind = Literal["raw", "oracle", "row_split", "retarget"]
+Geometry = Literal["points", "boxes_3d", "depth_m"]
 
 _TELEA_RADIUS_PX = 3
 """OpenCV's own example; holes are filled from their border inwards whatever it is."""
 
-RANDOM = {"yaw_deg": 5.0, "pitch_deg": 2.0, "height_m": 0.2, "focal_scale": 0.1}
+RANDOM: dict[str, Any] = {"yaw_deg": 5.0, "pitch_deg": 2.0, "height_m": 0.2, "focal_scale": 0.1}
 """Half-widths of the random rigs around B: a mounting tolerance well beyond real ones, less than the changes."""
 
 
@@ -49,7 +50,7 @@ class Arm:
     title: str
     kind: Kind
     surface: SurfaceName = "auto"
-    reads: tuple[Literal["points", "boxes_3d", "depth_m"], ...] = ()
+    reads: tuple[Geometry, ...] = ()
     mixed: bool = False
     augmented: bool = False
     filled: bool = False
@@ -112,7 +113,7 @@ class ViewMaker:
             "coverage": np.packbits(coverage, axis=-1),
             "K": K.astype(np.float32),
             "cam2ego": cam2ego.astype(np.float32),
-            "cpu_s": np.float32(seconds),
+            "cpu_s": np.array(seconds, np.float32),
         }
 
 

@@ -17,8 +17,8 @@ from integrations.cross_rig.training import Draws, Schedule
 
 TINY = Settings(
     size=(24, 64),
-    train_frames=4,
-    val_frames=2,
+    train_frames=2,
+    val_frames=1,
     test_frames=2,
     seeds=(0,),
     changes=("fov50",),
@@ -29,13 +29,13 @@ TINY = Settings(
 
 @pytest.fixture(autouse=True)
 def _short_chunks(monkeypatch):
-    monkeypatch.setattr(cache, "CHUNK_FRAMES", 2)
+    monkeypatch.setattr(cache, "CHUNK_FRAMES", 1)
 
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory) -> Run:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cache, "CHUNK_FRAMES", 2)
+        patch.setattr(cache, "CHUNK_FRAMES", 1)
         setup = Run(settings=TINY, output=tmp_path_factory.mktemp("cross_rig"))
         assert list(run(setup, 1, lambda line: None)) == [4, 3, 2, 1, 0]
     return setup
@@ -100,16 +100,16 @@ def test_arms_are_paired(done):
     """The same frames in the same order, whatever else an arm draws."""
     first = []
     for job in jobs(TINY):
-        draws = Draws(job.arm, done.training_set(job), done.true_set("train", None, 4), 4, seed=5)
-        first.append(np.concatenate([draws.batch(2).state.numpy() for _ in range(3)]))
+        draws = Draws(job.arm, done.training_set(job), done.true_set("train", None, 2), 2, seed=5)
+        first.append(np.concatenate([draws.batch(1).state.numpy() for _ in range(20)]))
     np.testing.assert_array_equal(first[0], first[1])
     np.testing.assert_array_equal(first[0], first[2])
 
 
 def test_mixed_arms_draw_raw_frames_half_of_the_time(done):
     job = next(job for job in jobs(TINY) if job.arm.mixed)
-    raw = done.true_set("train", None, 4)
-    draws = Draws(job.arm, done.training_set(job), raw, 4, seed=0)
+    raw = done.true_set("train", None, 2)
+    draws = Draws(job.arm, done.training_set(job), raw, 2, seed=0)
     from_raw = [bool(np.isclose(draws.batch(1).K[0, 0, 0], raw.rig.K[0, 0, 0])) for _ in range(200)]
     assert 75 < sum(from_raw) < 125
 

@@ -35,9 +35,7 @@ def test_yaw_turns_left():
 
 def test_hidden_vehicles_are_told_apart_and_people_are_not_vehicles():
     boxes = [(5, 5, 1, 2, 2, 2, 0), (-5, 5, 1, 2, 2, 2, 0), (5, -5, 1, 2, 2, 2, 0)]
-    state = cells(
-        *boxes, classes=[BoxClass.BUS, BoxClass.PEDESTRIAN, BoxClass.VAN], visible=[True, True, False]
-    ).state
+    state = cells(*boxes, classes=[BoxClass.BUS, BoxClass.PEDESTRIAN, BoxClass.VAN], visible=[True, True, False]).state
     assert [(state == k).sum() for k in (VEHICLE, HIDDEN)] == [4, 4]
     assert state[14, 14] == VEHICLE and state[4, 14] == FREE and state[14, 4] == HIDDEN
 

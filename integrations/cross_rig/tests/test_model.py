@@ -99,3 +99,14 @@ def test_frames_of_a_batch_do_not_mix(model):
         together = model(both)
         first, second = (model(batch([r], images=i)) for r, i in ((rig, both.images[:6]), (front, both.images[6:])))
     torch.testing.assert_close(together, torch.cat([first, second]), atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_the_larger_backbone_trains():
+    torch.manual_seed(0)
+    model = BevDetector(GRID, "resnet34")
+    model(batch([source_rig(SIZE)] * 2)).square().mean().backward()
+    assert all(
+        torch.isfinite(p.grad).all() and p.grad.abs().max() > 0 for p in model.parameters() if p.grad is not None
+    )
+    assert sum(p.grad is None for p in model.parameters()) == 0

@@ -15,8 +15,13 @@ SIZE = (24, 64)
 @pytest.fixture(scope="module")
 def frame() -> dict:
     drive = SyntheticDrive(source_rig(SIZE), num_frames=1, seed=9)
-    depth = drive.render(0).depth_m
-    return {**drive[0], "depth_m": torch.where(torch.isfinite(depth), depth, 0)}
+    views = drive.render(0)
+    return {
+        "images": views.images,
+        "depth_m": torch.where(torch.isfinite(views.depth_m), views.depth_m, 0),
+        "points": drive.points(0),
+        "boxes_3d": torch.from_numpy(drive.scene(0).boxes_ego(0.0)).float(),
+    }
 
 
 @pytest.mark.parametrize("name", [name for name, arm in ARMS.items() if arm.renders])
@@ -74,7 +79,7 @@ def test_streets_are_disjoint_and_rigs_stand_on_one_road():
 
 
 def test_unknown_names_are_refused():
-    with pytest.raises(ValueError, match="arms: expected some of raw, .*, got nothing"):
+    with pytest.raises(ValueError, match=r"arms: expected some of raw, .*, got nothing"):
         named_arms(["nothing"])
-    with pytest.raises(ValueError, match="changes: expected some of fov50, .*, got up7"):
+    with pytest.raises(ValueError, match=r"changes: expected some of fov50, .*, got up7"):
         named_changes(["up7"])
