@@ -43,8 +43,8 @@ def code_hash(module: str) -> str:
         if path is None:
             continue
         tree = ast.parse(path.read_text())
-        code[name] = ast.dump(_without_docstrings(tree))
-        todo.extend(n for n in _imported(tree) if n.startswith(f"{root}."))
+        todo.extend(n for n in _imports_and_strips(tree) if n.startswith(f"{root}."))
+        code[name] = ast.dump(tree)
     return content_hash(code)
 
 
@@ -57,22 +57,17 @@ def _source(name: str) -> Path | None:
     return Path(spec.origin) if spec is not None and spec.origin is not None else None
 
 
-def _imported(tree: ast.AST) -> set[str]:
+def _imports_and_strips(tree: ast.Module) -> set[str]:
+    """What a module imports; in the same walk its docstrings go, and the strings that document constants."""
     found: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
             found.update({node.module, *(f"{node.module}.{alias.name}" for alias in node.names)})
-    return found
-
-
-def _without_docstrings(tree: ast.Module) -> ast.Module:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
-            # A bare string is a docstring, or documents the constant above it.
+        elif isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
             node.body = [n for n in node.body if not (isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant))]
-    return tree
+    return found
 
 
 class FrameStore:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -131,7 +130,13 @@ class Run:
         raw = self.true_set("train", None, self.settings.train_frames)
         draws = Draws(job.arm, self.training_set(job), raw, self.settings.train_frames, job.seed)
         model, losses = train(draws, schedule, job.seed)
-        trained = {"cpu_s": time.process_time() - start, "losses": losses, "machine": platform.processor()}
+        frames_drawn = schedule.steps * schedule.batch
+        trained = {
+            "cpu_s": time.process_time() - start,
+            "augment_cpu_s": draws.augment_s / frames_drawn,
+            "losses": losses,
+            "torch": str(torch.__version__),
+        }
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_name(f".{os.getpid()}-{path.name}")
         torch.save({"weights": model.state_dict(), "trained": trained}, part)
@@ -194,7 +199,7 @@ def load_results(setup: Run) -> dict[str, dict[str, dict[int, dict[str, Any]]]]:
     return found
 
 
-def loading_seconds(setup: Run) -> dict[str, float]:
+def rendering_seconds(setup: Run) -> dict[str, float]:
     """CPU seconds that each arm's own rendering took for a frame: the median over its frames, then over changes."""
     by_arm: dict[str, list[float]] = {}
     for job in jobs(setup.settings):

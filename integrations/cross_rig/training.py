@@ -111,6 +111,9 @@ class Draws:
         raw: A's frames, for mixed arms.
         num_frames: Of each.
         seed: Of the training.
+
+    Attributes:
+        augment_s: CPU seconds that scaling and cropping took so far.
     """
 
     def __init__(self, arm: Arm, own: FrameSet, raw: FrameSet, num_frames: int, seed: int) -> None:
@@ -118,6 +121,7 @@ class Draws:
         self.order = np.random.default_rng([seed, 0])
         self.rng = np.random.default_rng([seed, 1])
         self.left: list[int] = []
+        self.augment_s = 0.0
 
     def batch(self, size: int) -> Batch:
         """The next batch; every frame once before any comes again."""
@@ -129,8 +133,10 @@ class Draws:
             from_raw = self.arm.mixed and self.rng.random() < 0.5
             frame = (self.raw if from_raw else self.own).frame(index)
             if self.arm.augmented:
+                start = time.process_time()
                 images, coverage, K = scaled_and_cropped(frame.images, frame.K, self.rng)
                 frame = _Frame(images, coverage, K, frame.cam2ego, frame.state, frame.counts)
+                self.augment_s += time.process_time() - start
             frames.append(frame)
         return batched(frames)
 
