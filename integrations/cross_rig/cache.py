@@ -21,6 +21,9 @@ import numpy as np
 CHUNK_FRAMES = 20
 """About 10 s of rendering: what a killed process loses at most."""
 
+_MAX_MAPS = 256
+"""Of one set: each holds a file open, of which a process commonly may have 1024."""
+
 Arrays = dict[str, np.ndarray]
 
 
@@ -104,6 +107,8 @@ class FrameStore:
         chunk, row = divmod(index, CHUNK_FRAMES)
         key = (chunk, name)
         if key not in self._open:
+            if len(self._open) >= _MAX_MAPS:
+                self._open.pop(next(iter(self._open)))
             self._open[key] = np.load(self._chunk(chunk) / f"{name}.npy", mmap_mode="r")
         return np.asarray(self._open[key][row])
 
