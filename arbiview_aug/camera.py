@@ -285,10 +285,10 @@ class Camera:
             near = np.abs(again.uv - uv).max(-1) <= UNPROJECT_TOLERANCE_PX
         return Rays(directions, again.valid & near)
 
-    def contains(self, uv: FloatArray) -> BoolArray:
+    def contains(self, uv: FloatArray, slack_px: float = 0.0) -> BoolArray:
         """Whether pixels (..., 2) lie between the outermost pixel centres, where bilinear sampling reads no border."""
-        u, v = uv[..., 0], uv[..., 1]
-        return (u >= 0) & (u <= self.width_px - 1) & (v >= 0) & (v <= self.height_px - 1)
+        u, v = uv[..., 0] + slack_px, uv[..., 1] + slack_px
+        return (u >= 0) & (u <= self.width_px - 1 + 2 * slack_px) & (v >= 0) & (v <= self.height_px - 1 + 2 * slack_px)
 
     def pixel_grid(self) -> FloatArray:
         """(h, w, 2) pixel centres (x, y)."""

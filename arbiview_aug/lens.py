@@ -26,6 +26,8 @@ MIN_DEPTH = 1e-6
 """Smallest z / |p| of a point in front of a pinhole or radtan camera (89.99994 degrees off axis)."""
 
 _NEWTON_STEPS = 40
+_FARTHEST = 1e12
+"""Largest distorted coordinate: the polynomial of a ray beside the camera can exceed what float32 maps hold, 1e38."""
 
 
 def distort(
@@ -52,7 +54,8 @@ def distort(
         return a, b, valid
     valid = valid & (a * a + b * b <= fold_limit**2)
     a, b = np.where(valid, a, 0.0), np.where(valid, b, 0.0)
-    return *_radtan(distortion, a, b), valid
+    xd, yd = _radtan(distortion, a, b)
+    return np.clip(xd, -_FARTHEST, _FARTHEST), np.clip(yd, -_FARTHEST, _FARTHEST), valid
 
 
 def _radtan(distortion: tuple[float, ...], a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:

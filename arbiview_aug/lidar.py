@@ -188,6 +188,12 @@ class LidarObjects(Objects):
         shown = first >= self.street.before_image(camera).reshape(-1)[pixel]
         return Drawn(pixel[shown], first[shown], face[shown])
 
+    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        """The first box along a ray with nothing measured before it, else the points' surface, 1/m (...,)."""
+        first = self._boxes_ahead(origin, directions)[0]
+        shown = (first > 0) & (first >= self.street.before(origin, directions))
+        return np.where(shown, first, self.street.inverse_distance(origin, directions))
+
     def shadows(self, camera: Camera) -> Shadows:
         """What boxes hide from a source, and what was measured."""
         new = camera not in self._shadows

@@ -1,8 +1,9 @@
 """Labelled 3D boxes as solids on the street: the geometry that keeps an object's height when cameras move.
 
 A static surface paints an object onto the road and the wall behind it: its base lands right, its roof stretches away.
-With boxes in the sample the nearest of street and box faces is what a ray meets. What a box hides from a source is not
-read from that source: the object's own colours would be smeared behind it. Where no other source sees it, it is a hole.
+With boxes in the sample a ray meets the first face of a box, and the street where it passes them all. What a box hides
+from a source is not read from that source: the object's own colours would be smeared behind it. Where no other source
+sees it, it is a hole.
 """
 
 from __future__ import annotations
@@ -110,8 +111,9 @@ class Objects(Layered):
 
     # --- rays ---------------------------------------------------------------------------------------------------------
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
-        """The nearer of street and boxes, 1/m (...,)."""
-        return np.maximum(self.street.inverse_distance(origin, directions), self._boxes_ahead(origin, directions)[0])
+        """The first box along a ray, else the street, 1/m (...,): the street is a guess, a box is not under it."""
+        first = self._boxes_ahead(origin, directions)[0]
+        return np.where(first > 0, first, self.street.inverse_distance(origin, directions))
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Mean error (...,) in 1/m: of a box against the object in it, of the street with what has no label."""

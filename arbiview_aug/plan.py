@@ -13,6 +13,7 @@ import hashlib
 from collections import Counter
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
+from typing import Any
 
 from arbiview_aug.camera import BoolArray
 from arbiview_aug.favs.config import FavsConfig
@@ -34,6 +35,7 @@ class RenderPlan:
         targets: One plan for each target camera.
         interpolation: ``linear`` or ``nearest``.
         counters: What was evaluated while building: pairs by surface, cells interpolated and exact, bands.
+        on_devices: The maps as tensors, by device, where they were asked for (``device_maps``); not pickled.
     """
 
     source: Rig
@@ -42,11 +44,16 @@ class RenderPlan:
     targets: tuple[TargetPlan, ...]
     interpolation: str
     counters: dict[str, int] = field(default_factory=dict)
+    on_devices: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "on_devices": {}}
 
     @property
     def nbytes(self) -> int:
-        """Memory held by the maps."""
-        return sum(t.nbytes for t in self.targets)
+        """Memory held by the maps, on devices too."""
+        on_devices = list(self.on_devices.values())
+        return sum(t.nbytes for t in self.targets) + sum(view.nbytes for views in on_devices for view in views)
 
     @property
     def coverage(self) -> list[BoolArray]:

@@ -45,6 +45,11 @@ def checked_images(images: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
         _check_image(k, image)
     if len({image.dtype for image in images}) > 1 or len({image.device for image in images}) > 1:
         raise SampleError("images: expected one dtype and device, got several; convert them alike")
+    if images[0].dtype != torch.uint8:
+        # All of a frame at once: a GPU is waited for once.
+        extremes = torch.stack([torch.stack(image.detach().aminmax()) for image in images]).tolist()
+        for k, (low, high) in enumerate(extremes):
+            _check_range(k, low, high)
     return tuple(images)
 
 
@@ -75,13 +80,14 @@ def _check_image(k: int, image: torch.Tensor) -> None:
     if image.layout != torch.strided or image.device.type == "meta":
         kind = image.layout if image.layout != torch.strided else "a meta tensor, which holds no pixels"
         raise SampleTypeError(f"images[{k}]: expected a dense tensor with pixels, got {kind}; use .to_dense()")
-    if image.dtype == torch.uint8:
-        return
-    if image.dtype not in _IMAGE_FLOATS:
+    if image.dtype != torch.uint8 and image.dtype not in _IMAGE_FLOATS:
         if image.dtype.is_floating_point:
             raise SampleTypeError(f"images[{k}]: expected uint8 or float, got {image.dtype}; convert with .float()")
         raise SampleTypeError(f"images[{k}]: expected uint8 or float, got {image.dtype}; convert with .to(torch.uint8)")
-    low, high = (float(x) for x in image.detach().aminmax())  # NaN wherever the image has one
+
+
+def _check_range(k: int, low: float, high: float) -> None:
+    """Refuse an image's least and largest value; both are NaN where it has one."""
     if not (low >= -1e-3 and high <= 1 + 1e-3):
         fix = "divide by 255" if high > 1.5 and low >= 0 else "normalise after retargeting, not before"
         if not (math.isfinite(low) and math.isfinite(high)):

@@ -36,9 +36,12 @@ class Surface(ABC):
 
     Attributes:
         smooth: Without creases: a map over it may be interpolated by what its values on a grid show.
+        slack: By how much more than settings say maps over it may err where they are interpolated: more than 1 where
+            the surface itself is not known that well.
     """
 
     smooth: ClassVar[bool]
+    slack: ClassVar[float] = 1.0
 
     @abstractmethod
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:

@@ -161,7 +161,7 @@ class TargetDraft:
         self.best, self.surface_by_name = best, surface_by_name
         self.counters = counters
         # From outside, the far wall is a narrow strip with edges, which a coarse grid could step over.
-        step = config.grid_step_px if is_within_wall(camera.center_m) else 1
+        step = config.grid_step_px if surface == "far" or is_within_wall(camera.center_m) else 1
         self.rays = TargetRays(camera, step, counters)
         self.grid = self.rays.grid
         # In content order, so that ties never depend on the order of the source list.
@@ -203,7 +203,7 @@ class TargetDraft:
         edge_px = edge_distance(source, pair.uv)
         seen = pair.valid & (edge_px > 0)
         level = self._level(pixels_per_pixel[seen], source.size) if self.config.antialias else 0
-        pair.set_tolerance(self.config.map_tolerance_px * 2**level)
+        pair.set_tolerance(self.config.map_tolerance_px * 2**level * pair.surface.slack)
         seen = pair.visible_nodes(level) & (edge_px > 0)
         parallax = self._expected_parallax(offset_m, focal_px, surface)
         score = (

@@ -55,14 +55,17 @@ def stacked(views: list[torch.Tensor]) -> torch.Tensor | list[torch.Tensor]:
     return torch.stack(views)
 
 
-def covered(winners: Sequence[np.ndarray], device: torch.device) -> torch.Tensor | list[torch.Tensor]:
+def covered(winners: Sequence[torch.Tensor]) -> torch.Tensor | list[torch.Tensor]:
     """Coverage, new memory, of (h, w) int8 winning sources: stacked where all sizes agree."""
     if len({winner.shape for winner in winners}) > 1:
-        return [torch.from_numpy(winner >= 0).to(device) for winner in winners]
-    block = np.empty((len(winners), *winners[0].shape), bool)
+        return [winner >= 0 for winner in winners]
+    block = winners[0].new_empty((len(winners), *winners[0].shape), dtype=torch.bool)
     for winner, coverage in zip(winners, block, strict=True):
-        np.greater_equal(winner, 0, out=coverage)
-    return torch.from_numpy(block).to(device)
+        if winner.device.type == "cpu":  # six times as fast as torch.ge
+            np.greater_equal(winner.numpy(), 0, out=coverage.numpy())
+        else:
+            torch.ge(winner, 0, out=coverage)
+    return block
 
 
 def gathered(parts: Sequence[Any], lead: tuple[int, ...]) -> Any:

@@ -40,6 +40,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("favs.refinement",),
     ("target_plan",),
     ("plan",),
+    ("device_maps",),
     ("favs.synthesis",),
     ("tensors", "sample_images", "random_rig", "explain"),
     ("sample",),

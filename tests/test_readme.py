@@ -43,6 +43,12 @@ TINY = {
     "bench --data FOLDER --budget-ms 20 --moves": [
         *("--quality", "draft", "--surface", "far", "--reduce", "4", "--size", "40x72", "--repeats", "1")
     ],
+    "bench loader --data FOLDER": [
+        *["--surface", "street", "--size", "32x88", "--reduce", "4", "--workers", "0", "1"],
+        *["--frames", "2", "--epochs", "1"],
+    ],
+    "bench scene --data FOLDER": ["--reduce", "4", "--repeats", "1", "--only", "p skips"],
+    "bench device": ["--device", "cpu", "--sizes", "32x88", "--repeats", "1"],
     "bench speed --data FOLDER": ["--repeats", "1"],
     "bench speed": ["--repeats", "1"],
     "bench ablation --data FOLDER": ["--reduce", "4", "--only", "street, not far"],

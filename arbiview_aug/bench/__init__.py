@@ -2,7 +2,9 @@
 
 ``trade``, the default: speed against accuracy of all settings (``bench.trade``). ``speed``: milliseconds against bare
 ``cv2.remap`` calls (``bench.speed``). ``ablation``: each stage and setting on and off, dB and milliseconds
-(``bench.ablation``).
+(``bench.ablation``). ``device``: batches by torch, on a GPU where there is one (``bench.device``). ``loader``: frames
+per second out of a ``DataLoader`` (``bench.loader``). ``scene``: what is not done where a scene does not require it
+(``bench.scene``).
 """
 
 from __future__ import annotations
@@ -14,7 +16,10 @@ from importlib import import_module
 BENCHMARKS = {
     "trade": "speed against accuracy of all settings, and which to use (the default)",
     "speed": "milliseconds against bare cv2.remap calls",
+    "device": "batches by torch, on a GPU where there is one: milliseconds, share of copy bandwidth",
     "ablation": "each stage and setting on and off: dB and milliseconds",
+    "loader": "frames per second of a DataLoader, memory per worker",
+    "scene": "only what a scene requires is done: counters and milliseconds",
 }
 
 

@@ -12,13 +12,15 @@ from typing import Any, get_args
 
 import torch
 
+from arbiview_aug.command_line import REAL_TARGET
 from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.images import Reduce
-from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_source_rig
+from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.datasets.writing import write_frame
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.frames import Frame, LidarReference, make_frame
-from arbiview_aug.rig import Rig
+from arbiview_aug.evaluate.targets import without_masks
+from arbiview_aug.rig import Rig, load_rig
 
 REDUCES: tuple[Reduce, ...] = get_args(Reduce)
 
@@ -47,6 +49,12 @@ class Recorded:
         data = open_data(self.root, reduce=reduce)
         data.load_points = False
         return partial(data.__getitem__, 0)
+
+    def target(self, name: str | None, size: tuple[int, int]) -> Rig:
+        """The rig to render at (h, w): by its name or file, else what the commands take where none is named."""
+        if name is None and self.truth is not None:
+            return demo_target_rig(size)
+        return without_masks(load_rig(name or REAL_TARGET)).resized(size)
 
     def frame(self, index: int, reduce: Reduce, reference: Reduce) -> Frame:
         """A frame to evaluate on, with images at 1 / ``reduce``, scored by the colours of images at 1 / ``reference``.
@@ -83,8 +91,13 @@ def recorded(data: str | Path | None, *, frames: int = 1, size: tuple[int, int] 
 
 
 def as_of_another_frame(sample: Mapping[str, Any]) -> dict[str, Any]:
-    """The same sample with its points and boxes a millimetre away: nothing that was planned for the one fits it."""
-    moved = dict(sample)
+    """The same sample with its images a pixel aside and its points and boxes a millimetre: nothing that was planned or
+    estimated for the one fits the other. Memory lies as it did."""
+    images = sample["images"]
+    aside: Any = images.clone() if isinstance(images, torch.Tensor) else [image.clone() for image in images]
+    for to, image in zip(aside, images, strict=True):
+        to[..., 1:] = image[..., :-1]
+    moved = dict(sample) | {"images": aside}
     for key in ("points", "boxes_3d"):
         if key in sample:
             shift = torch.zeros(sample[key].shape[-1])

@@ -48,10 +48,38 @@ def quartiles(times_ms: npt.NDArray[np.float64]) -> Quartiles:
     return Quartiles(median, q1, q3)
 
 
+def process_ms(run: Callable[[], Any]) -> float:
+    """CPU milliseconds of the process."""
+    start = time.process_time()
+    run()
+    return 1e3 * (time.process_time() - start)
+
+
+def cuda_ms(device: torch.device) -> Callable[[Callable[[], Any]], float]:
+    """A clock for ``timed_rounds``: milliseconds between two events of a GPU's stream, which is empty before."""
+
+    def clock(run: Callable[[], Any]) -> float:
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        torch.cuda.synchronize(device)
+        stream = torch.cuda.current_stream(device)
+        start.record(stream)
+        run()
+        end.record(stream)
+        end.synchronize()
+        return start.elapsed_time(end)
+
+    return clock
+
+
 def timed_rounds(
-    candidates: Mapping[str, Callable[[], Any]], rounds: int, label: str, *, enough_ms: float = math.inf
+    candidates: Mapping[str, Callable[[], Any]],
+    rounds: int,
+    label: str,
+    *,
+    enough_ms: float = math.inf,
+    clock: Callable[[Callable[[], Any]], float] = process_ms,
 ) -> dict[str, npt.NDArray[np.float64]]:
-    """CPU milliseconds of each candidate, in every round.
+    """Milliseconds of each candidate, in every round.
 
     Args:
         candidates: What to run, by name.
@@ -59,6 +87,7 @@ def timed_rounds(
         label: Names the progress bar.
         enough_ms: A candidate that has taken as much in ``_LEAST_ROUNDS`` or more sits the others out: long times
             vary less.
+        clock: Runs a candidate and says how long it took.
     """
     times: dict[str, list[float]] = {name: [] for name in candidates}
     for _ in tqdm(range(rounds), desc=label, unit="round", leave=False):
@@ -66,9 +95,7 @@ def timed_rounds(
             if len(times[name]) >= _LEAST_ROUNDS and sum(times[name]) >= enough_ms:
                 continue
             run()
-            start = time.process_time()
-            run()
-            times[name].append(1e3 * (time.process_time() - start))
+            times[name].append(clock(run))
     return {name: np.array(taken) for name, taken in times.items()}
 
 

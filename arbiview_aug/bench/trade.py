@@ -23,13 +23,11 @@ from arbiview_aug.bench.others import OURS, ROW_SPLIT, STITCHING, every_move, lo
 from arbiview_aug.bench.plot import save_plot
 from arbiview_aug.bench.sweep import REFERENCE, REPEATS, Execution, Sweep, settings
 from arbiview_aug.bench.timing import Quartiles, machine, machine_line, one_thread, versions, write_json
-from arbiview_aug.command_line import REAL_TARGET, add_data, add_target, count, size, writable_folder
-from arbiview_aug.datasets.synthetic import demo_target_rig
+from arbiview_aug.command_line import add_data, add_target, count, size, writable_folder
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.tables import markdown_table
-from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.favs.config import Quality
-from arbiview_aug.rig import Rig, load_rig
+from arbiview_aug.rig import Rig
 from arbiview_aug.surface import SurfaceName
 
 SIZE = (256, 704)
@@ -91,7 +89,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     """All figures, as plain data for JSON."""
     load_before = os.getloadavg()
     source: Rig = data.sample(0, REFERENCE)["rig"]
-    target = _target(arguments, data)
+    target = data.target(arguments.target, arguments.size)
     qualities: Sequence[Quality] = arguments.quality or get_args(Quality)
     if "paper" in qualities:  # homographies know no lens, and all settings are of one target
         target = target.undistorted()
@@ -131,12 +129,6 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
         "machine": machine(load_before),
         "versions": versions(),
     }
-
-
-def _target(arguments: argparse.Namespace, data: Recorded) -> Rig:
-    if arguments.target is None and data.truth is not None:
-        return demo_target_rig(arguments.size)
-    return without_masks(load_rig(arguments.target or REAL_TARGET)).resized(arguments.size)
 
 
 def _advice(advice: Advice) -> dict[str, Any]:

@@ -345,7 +345,8 @@ def _visible(camera: Camera, H: FloatArray, coverage: BoolArray) -> Region:
 
 def _masked(camera: Camera, image: torch.Tensor) -> Float32Image:
     """(H, W, 3) float32 0..255, black where the own car is."""
-    array = image.permute(1, 2, 0).contiguous().numpy().astype(np.float32)
+    copied = image.permute(1, 2, 0).to(torch.float32, copy=True, memory_format=torch.contiguous_format)
+    array = copied.numpy()  # by torch, as numpy has no bfloat16
     if image.dtype != torch.uint8:
         array *= 255
     if camera.mask is not None:

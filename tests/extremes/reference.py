@@ -24,11 +24,13 @@ class Seen(NamedTuple):
         uv: (h, w, 2) source pixels; NaN where there is none.
         valid: The point lies in front of the source and on its lens's rising branch.
         point_m: (h, w, 3) scene points, NaN at infinity.
+        unsure: The target's ray is not known: close to the fold of a radtan lens OpenCV's iteration does not settle.
     """
 
     uv: np.ndarray
     valid: np.ndarray
     point_m: np.ndarray
+    unsure: np.ndarray
 
 
 def fisheye_radius(camera: Camera, theta: np.ndarray) -> np.ndarray:
@@ -52,7 +54,7 @@ def fold(camera: Camera) -> float:
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (..., 2) of camera-frame points or directions (..., 3), NaN where the camera has none, and where it has."""
+    """Pixels (..., 2) of camera-frame points or directions (..., 3), NaN where there is none, and where there is."""
     x, y, z = np.moveaxis(points / np.linalg.norm(points, axis=-1, keepdims=True), -1, 0)
     with np.errstate(all="ignore"):
         if camera.lens == "fisheye":
@@ -145,7 +147,7 @@ def seen(source: Camera, target: Camera, surface: str, ground_z_m: float, boxes:
         point = np.where(q[..., None] > 1e-9, target.center_m + directions / q[..., None], np.nan)
     ahead = np.where(np.isnan(point), directions, point - source.center_m)
     uv, valid = project(source, ahead @ source.cam2ego[:3, :3])
-    return Seen(uv, valid & certain, point)
+    return Seen(uv, valid & certain, point, ~certain & (target.lens == "radtan"))
 
 
 def hidden(source: Camera, point_m: np.ndarray, boxes: np.ndarray, shrink_m: float) -> np.ndarray:

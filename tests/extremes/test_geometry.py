@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -81,6 +82,15 @@ TARGETS: dict[str, Callable[[], Camera]] = {
 }
 
 
+@contextmanager
+def no_numpy_warnings() -> Iterator[None]:
+    """Overflow, division by 0 and NaN raise, and so do warnings, but for targets that nobody sees."""
+    with warnings.catch_warnings(), np.errstate(over="raise", divide="raise", invalid="raise"):
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message="the target rig")
+        yield
+
+
 def check(plan: RenderPlan, surface: str, scene: Scene, worst: Worst) -> None:
     """Every covered pixel is read where float64 geometry puts it, inside its source, in front of it.
 
@@ -115,8 +125,7 @@ def check(plan: RenderPlan, surface: str, scene: Scene, worst: Worst) -> None:
 @pytest.mark.parametrize("name", TARGETS)
 def test_targets_at_the_edges(name: str, surface: str, worst: Worst) -> None:
     source, target, scene = ring(), TARGETS[name](), SCENES[surface]
-    with warnings.catch_warnings(), np.errstate(over="raise", divide="raise", invalid="raise"):
-        warnings.simplefilter("error")
+    with no_numpy_warnings():
         plan = build_plan(source, Rig([target]), surface=surface, scene=scene, config=FavsConfig(certainty=True))
     check(plan, surface, scene, worst)
 
@@ -146,8 +155,7 @@ SOURCES: dict[str, Callable[[], Rig]] = {
 @pytest.mark.parametrize("name", SOURCES)
 def test_sources_at_the_edges(name: str, surface: str, worst: Worst) -> None:
     scene, target = SCENES[surface], Rig([camera("t0"), camera("t1", azimuth_deg=70.0, position_m=(0.0, 0.6, 1.9))])
-    with warnings.catch_warnings(), np.errstate(over="raise", divide="raise", invalid="raise"):
-        warnings.simplefilter("error")
+    with no_numpy_warnings():
         plan = build_plan(SOURCES[name](), target, surface=surface, scene=scene)
     check(plan, surface, scene, worst)
 
@@ -168,3 +176,90 @@ def test_pixels_are_finite_and_in_range(name: str, dtype: torch.dtype, quality: 
     assert out["images"].dtype == dtype and out["confidence"].isfinite().all()
     if dtype != torch.uint8:
         assert out["images"].isfinite().all() and 0 <= out["images"].min() <= out["images"].max() <= 1
+
+
+# --- exactly on the edge ----------------------------------------------------------------------------------------------
+FORWARD = [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]]  # no cosine of 90 degrees: exact
+LEFT = [[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]]
+LENSES: dict[str, Any] = {
+    "pinhole": {},
+    "radtan": {"lens": "radtan", "distortion": (0.2, 0.05, 0.001, 0.001, 0.02)},
+    "fisheye": {"lens": "fisheye", "distortion": (0.0,) * 4},
+}
+
+
+def exact(name: str, cam2ego: list[list[float]], focal_px: float, **values: Any) -> Camera:
+    K = [[focal_px, 0, 48.0], [0, focal_px, 36.0], [0, 0, 1]]
+    return Camera(name=name, width_px=97, height_px=73, K=K, cam2ego=cam2ego, **values)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_points_on_the_image_plane(lens: str) -> None:
+    """z = 0 is seen by a fisheye alone; the centre, what is just behind, and what is straight behind by none."""
+    source = exact("s", FORWARD, 30.0, **LENSES[lens])
+    beside = [[0.0, y, z] for y in (-9.0, 1e-3, 1e9) for z in (0.0, 1.5, 1e6)]
+    got = source.project(beside)
+    assert np.isfinite(got.uv).all() and (got.valid == (lens == "fisheye")).all()
+    never = source.project([[0.0, 0.0, 1.5], [-5.0, 0.0, 1.5], [-1e-300, 0.0, 1.5], [-1e9, 0.0, 1.5]])
+    assert np.isfinite(never.uv).all() and not never.valid.any()
+    behind = source.project([[-1e-12 * y, y, 1.5] for y in (1.0, -3.0, 1e9)])
+    assert np.isfinite(behind.uv).all() and (behind.valid == (lens == "fisheye")).all()
+
+
+@pytest.mark.parametrize("surface", ["far", "ground", "street", "lidar"])
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_column_of_pixels_on_the_image_plane(lens: str, surface: str, worst: Worst) -> None:
+    """The target looks at right angles to the source: its middle column shows what lies in the source's image plane."""
+    source, target = exact("s", FORWARD, 10.0, **LENSES[lens]), exact("t", LEFT, 30.0)
+    with no_numpy_warnings():
+        plan = build_plan(Rig([source]), Rig([target]), surface=surface, scene=SCENES[surface])
+    check(plan, surface, SCENES[surface], worst)
+    coverage = plan.targets[0].coverage
+    if lens == "fisheye":
+        assert coverage[:, 48].any() and coverage[:, :48].any(), "it sees past a right angle"
+    else:
+        assert not coverage[:, :49].any() and coverage[:, 49:].any()
+
+
+@pytest.mark.parametrize("shift_px", [1.2e-6, 3e-6])
+def test_rays_just_beside_a_lens(shift_px: float) -> None:
+    """A node of the coarse grid a millionth before the image plane: the lens's polynomial exceeds float32 there."""
+    source = exact("s", FORWARD, 60.0, **LENSES["radtan"])
+    target = camera(
+        "t", azimuth_deg=90 - np.degrees(shift_px + np.arctan2(40, 30)), K=[[30, 0, 43.5], [0, 30, 35.5], [0, 0, 1]]
+    )
+    with no_numpy_warnings():
+        plan = build_plan(Rig([source]), Rig([target]), surface="far", config=FavsConfig(certainty=True))
+    assert plan.targets[0].coverage.any()
+
+
+@pytest.mark.parametrize("surface", ["far", "ground", "street"])
+def test_a_horizon_exactly_on_a_row(surface: str, worst: Worst) -> None:
+    """Rays of row 36 are level to the last bit: they meet the wall, or nothing, and never the road."""
+    source, target = exact("s", FORWARD, 50.0), exact("t", FORWARD, 50.0).shifted(z_m=0.7)
+    plan = build_plan(Rig([source]), Rig([target]), surface=surface)
+    check(plan, surface, Scene(), worst)
+    view = plan.targets[0]
+    directions = target.unproject(target.pixel_grid()).directions
+    assert (directions[36, :, 2] == 0).all()
+    assert view.coverage[35:38].all()
+    rise_px = 36 - view.at.to_float()[35:38, 48, 1]
+    distance_m = np.inf if surface == "far" else 41.0  # the wall straight ahead: 40 m from 1 m before the origin
+    assert rise_px[1] == pytest.approx(50.0 * 0.7 / distance_m, abs=MAP_TOLERANCE_PX)
+    assert np.abs(np.diff(rise_px) + 1).max() <= 2 * MAP_TOLERANCE_PX + 1e-3, "the rows beside it continue it"
+
+
+def test_a_rotation_off_by_1e_7(worst: Worst) -> None:
+    """Published digits: what they change is less than a position's rounding."""
+    rng = np.random.default_rng(0)
+    rig, target = ring(K=focal(1000.0), width_px=1600, height_px=900), camera("t", K=focal(1000.0), width_px=320)
+    noisy = []
+    for c in rig:
+        pose = c.cam2ego.copy()
+        pose[:3, :3] += rng.uniform(-1e-7, 1e-7, (3, 3))
+        noisy.append(Camera(name=c.name, width_px=1600, height_px=900, K=c.K, cam2ego=pose))
+    one, two = (build_plan(r, Rig([target]), surface="street").targets[0] for r in (rig, Rig(noisy)))
+    assert np.array_equal(one.coverage, two.coverage)
+    error = np.abs(one.at.to_float() - two.at.to_float())[one.source_camera == two.source_camera].max()
+    worst("px, rotations off by 1e-7", error)
+    assert error <= MAP_TOLERANCE_PX

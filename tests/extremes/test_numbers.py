@@ -1,0 +1,318 @@
+"""Numbers at the edges: ill-conditioned homographies, weights of nothing, gains at the clamp, few or broken points."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from arbiview_aug import Camera, FavsConfig, PaperConfig, Rig, RigRetarget
+from arbiview_aug.favs.adaptive_fusion import fuse
+from arbiview_aug.favs.feature_matching import (
+    Matches,
+    Region,
+    accept,
+    consistency,
+    h_base,
+    normalised,
+    optimise_transformation,
+)
+from arbiview_aug.favs.geometric_transformation import check_homography, h_geom
+from arbiview_aug.favs.paper import render_paper
+from arbiview_aug.favs.photometric import HarmoniseConfig, estimate_gains
+from arbiview_aug.favs.synthesis import render_opencv, render_torch
+from arbiview_aug.plan import build_plan
+from arbiview_aug.tone import ToneCurve
+from tests.extremes.conftest import Worst
+from tests.extremes.test_geometry import SOURCES, TARGETS, camera, no_numpy_warnings, ring
+
+SIZE = (300, 800)  # the width at which PaperConfig states its lengths
+EVERYWHERE = Region(0, 0, 799, 299)
+
+
+# --- homographies -----------------------------------------------------------------------------------------------------
+def conditioned(exponent: int, seed: int) -> np.ndarray:
+    """A random (3, 3) with a condition number of 10**exponent and a positive determinant."""
+    rng = np.random.default_rng(seed)
+    U, V = (np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(2))
+    H = U @ np.diag(10.0 ** (-exponent * np.array([0, rng.random(), 1]))) @ V
+    return H * np.sign(np.linalg.det(H))
+
+
+@pytest.mark.parametrize("exponent", range(13))
+def test_sign_and_scale_of_a_homography_mean_nothing(exponent: int, worst: Worst) -> None:
+    """Up to a relative error of the condition number times that of float64."""
+    tolerance = 10.0 ** (exponent - 14)
+    for seed in range(10):
+        H, other = conditioned(exponent, seed), conditioned(min(exponent, 3), seed + 100)
+        for factor in (-1.0, 1e6, -1e6, 1e-6, -1e-6):
+            with no_numpy_warnings():
+                once, again = normalised(H), normalised(factor * H)
+                assert np.linalg.det(once) == pytest.approx(1, rel=tolerance)
+                error = np.abs(again - once).max() / np.abs(once).max()
+                worst("relative error by sign and scale, over the condition number", error / 10.0**exponent)
+                assert error <= tolerance
+                assert check_homography(H, SIZE) == check_homography(factor * H, SIZE)
+                blends = [h_base(other, H, 0.3), h_base(other, factor * H, 0.3), h_base(-other, H, 0.3)]
+                assert all(np.allclose(b, blends[0], rtol=0, atol=tolerance * np.abs(blends[0]).max()) for b in blends)
+                motion = [consistency(other, f * H, EVERYWHERE.corners) for f in (1, factor)]
+            assert motion == [np.inf] * 2 or motion[1] == pytest.approx(motion[0], rel=max(1e3 * tolerance, 1e-9))
+
+
+def test_real_homographies_are_the_same_whatever_their_sign_and_scale(worst: Worst) -> None:
+    """Cameras of 0.01 to 100,000 px: condition numbers to 4e10."""
+    for source in ring(3), ring(3, K=[[1e-2, 0, 47.5], [0, 1e-2, 35.5], [0, 0, 1]]):
+        for name in ("focal 0.01 px", "focal 100000 px", "field of view 179", "principal point outside"):
+            H = h_geom(source[0], TARGETS[name]())
+            worst("condition number of a homography", np.linalg.cond(H))
+            for factor in (-1.0, 1e6, 1e-6):
+                with no_numpy_warnings():
+                    assert np.allclose(normalised(factor * H), normalised(H), rtol=1e-9)
+                    assert check_homography(factor * H, (72, 96)) == check_homography(H, (72, 96))
+
+
+@pytest.mark.parametrize("exponent", range(13))
+def test_matches_that_nearly_determine_nothing_move_nothing_far(exponent: int, worst: Worst) -> None:
+    """Matches on a line but for 10**-exponent px: what they say is declined in words, or it is bounded."""
+    rng = np.random.default_rng(exponent)
+    config = PaperConfig()
+    for slope in (0.0, 0.3):
+        x = np.linspace(50, 750, 40)
+        points = np.stack([x, 150 + slope * (x - 400) + 10.0**-exponent * rng.normal(size=40)], 1)
+        matches = Matches(points, points + (3, 2) + 1e-3 * rng.normal(size=(40, 2)))
+        for H_geometric in (np.eye(3), -1e6 * np.eye(3), 1e-6 * np.eye(3)):
+            with no_numpy_warnings():
+                report = accept(H_geometric, matches, EVERYWHERE, EVERYWHERE, 1.0, 1.0, config)
+                moved_px = consistency(np.eye(3), report.H_base, EVERYWHERE.corners)
+            assert report.reason and np.isfinite(report.H_base).all() and 0 <= report.quality <= 1
+            assert np.linalg.det(report.H_base) > 0
+            worst("px, corners moved by nearly collinear matches (bound 24)", moved_px)
+            assert moved_px <= config.inconsistent_px
+
+
+@pytest.mark.parametrize("exponent", [0, 3, 6, 9, 12])
+def test_ill_conditioned_geometry_is_declined_in_words(exponent: int) -> None:
+    texture = np.random.default_rng(0).integers(0, 256, SIZE, dtype=np.uint8)
+    everywhere = np.ones(SIZE, bool)
+    for seed in range(3):
+        H = conditioned(exponent, seed)
+        with no_numpy_warnings():
+            report = optimise_transformation(
+                H, texture, texture, (everywhere, everywhere), EVERYWHERE, 1.0, PaperConfig(max_features=50)
+            )
+        assert np.isfinite(report.H_base).all() and report.reason
+        assert exponent < 6 or (report.case == "geometric" and "distorts" in report.reason)
+
+
+@pytest.mark.parametrize("name", ["one camera", "focal 1e-2 px", "focal 1e5 px", "179 degrees", "upside down"])
+def test_the_published_stages_at_the_edges(name: str) -> None:
+    source = SOURCES[name]()
+    generator = torch.Generator().manual_seed(0)
+    coarse = torch.rand(len(source), 3, 18, 24, generator=generator)
+    images = torch.nn.functional.interpolate(coarse, size=source[0].size, mode="bicubic").clamp(0, 1)
+    for make in TARGETS.values():
+        target = make()
+        if target.lens != "pinhole":
+            continue
+        with no_numpy_warnings():
+            view = render_paper(source, Rig([target]), list(images)).targets[0]
+        assert view.image.isfinite().all() and view.image.min() >= 0 and view.image.max() <= 1
+        assert all(np.isfinite(report.H_final).all() and report.features.reason for report in view.reports)
+
+
+# --- weights ----------------------------------------------------------------------------------------------------------
+WEIGHTS = (0.0, 5e-324, 1e-310, 1e-45, 1e-30, 1.0, 1e30, 1e308)
+
+
+@given(weights=hnp.arrays(np.float64, (4, 2, 3), elements=st.sampled_from(WEIGHTS)), scale=st.sampled_from([1e-3, 1e3]))
+def test_fused_pixels_lie_between_those_that_count(weights: np.ndarray, scale: float) -> None:
+    images = np.random.default_rng(0).uniform(0, 255, (4, 2, 3, 3))
+    fused, covered = fuse(images, weights)
+    counts = weights > 0
+    assert np.array_equal(covered, counts.any(axis=0)) and np.isfinite(fused).all()
+    low = np.where(counts[..., None], images, np.inf).min(axis=0)[covered]
+    high = np.where(counts[..., None], images, -np.inf).max(axis=0)[covered]
+    assert (fused[covered] >= low - 1e-9).all() and (fused[covered] <= high + 1e-9).all()
+    assert (fused[~covered] == 0).all()
+    usual = np.where((weights > 1e-40) & (weights < 1e40), weights, 0)
+    assert np.allclose(fuse(images, usual)[0], fuse(images, scale * usual)[0], rtol=1e-12)
+
+
+def shaded(rig: Rig, target: Rig, config: FavsConfig, execution: str) -> tuple[np.ndarray, np.ndarray, Any]:
+    """A view of sources that are each of one shade, its coverage and its plan."""
+    plan = build_plan(rig, target, surface="street", config=config)
+    images = [torch.full((3, *c.size), s) for c, s in zip(rig, np.linspace(0.2, 1, len(rig)).tolist(), strict=True)]
+    if execution == "opencv":
+        return render_opencv(plan, images)[0].numpy()[0], plan.targets[0].coverage, plan
+    return render_torch(plan, [image[None] for image in images])[0][0].numpy()[0], plan.targets[0].coverage, plan
+
+
+@pytest.mark.parametrize("execution", ["opencv", "torch"])
+@pytest.mark.parametrize("weight", [0.0, 5e-324, 1e-45, 1e-38, 1e-30])
+def test_coverage_does_not_depend_on_weights(weight: float, execution: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Weights of nothing, or nearly: the same pixels are covered, by shades of the sources that see them."""
+    rig, target = ring(8), Rig([camera("t", azimuth_deg=20.0, position_m=(0.1, 0.2, 1.7))])
+    config = FavsConfig(seam_width=0.1)
+    _, covered, _ = shaded(rig, target, config, execution)
+    monkeypatch.setattr("arbiview_aug.target_plan.distance_weight", lambda d, *_: np.full(d.shape, weight))
+    with no_numpy_warnings():
+        image, still, plan = shaded(rig, target, config, execution)
+    assert np.array_equal(still, covered) and np.isfinite(image).all()
+    assert (image[covered] >= 0.2 - 1e-4).all() and image.max() <= 1 and (image[~covered] == 0).all()
+    assert all(0 <= band.weight.min() and band.weight.max() <= 0.5 for band in plan.targets[0].bands)
+
+
+@pytest.mark.parametrize("gamma", [0.0, 16.0])
+@pytest.mark.parametrize("bonus", [1.0, 1e12])
+def test_coverage_does_not_depend_on_settings(gamma: float, bonus: float) -> None:
+    """(d / d_max) ** 16 is subnormal near the border; the published stages too cover what any source sees."""
+    rig, target = ring(8), Rig([camera("t", azimuth_deg=20.0, position_m=tuple(ring(8)[0].center_m))])
+    _, covered, _ = shaded(rig, target, FavsConfig(), "opencv")
+    _, still, _ = shaded(rig, target, FavsConfig(distance_gamma=gamma, primary_bonus=bonus, seam_width=0.5), "opencv")
+    assert np.array_equal(still, covered)
+    images = [torch.rand(3, *c.size) for c in rig]
+    usual = render_paper(rig, target, images).targets[0].coverage
+    config = PaperConfig(distance_gamma=gamma, primary_bonus=bonus, unmatched_quality=1e-6, gradient_sigma=1e-3)
+    assert np.array_equal(render_paper(rig, target, images, config).targets[0].coverage, usual)
+
+
+def test_blending_across_a_seam_has_no_step(worst: Worst) -> None:
+    """Two sources whose overlap is narrower than the seam: shares are of the sum of the weights, which is small there.
+
+    A share of the second weight alone would leave a step in the middle, where the two weigh the same.
+    """
+    width_px, overlap_deg = 200, 8.0
+    rig = Rig(
+        [
+            Camera.looking(
+                name=name,
+                azimuth_deg=a,
+                width_px=width_px,
+                height_px=100,
+                horizontal_fov_deg=60.0,
+                position_m=(1, 0, 1.5),
+            )
+            for name, a in (("left", 30 - overlap_deg / 2), ("right", -30 + overlap_deg / 2))
+        ]
+    )
+    target = Rig([rig[0].turned(yaw_deg=overlap_deg / 2 - 30)])
+    for execution in ("opencv", "torch"):
+        image, covered, _ = shaded(rig, target, FavsConfig(seam_width=0.3), execution)
+        rows = image[30:70]
+        assert covered[30:70].all()
+        steps = np.abs(np.diff(rows, axis=1))
+        blended = ((rows > 0.2 + 0.01) & (rows < 1 - 0.01)).sum(axis=1)
+        assert blended.min() >= 8, "a ramp"
+        worst("share of the difference, largest step across a blended seam", steps.max() / 0.8)
+        assert steps.max() <= 0.8 / 4
+
+
+# --- gains ------------------------------------------------------------------------------------------------------------
+def pictures(rig: Rig) -> list[torch.Tensor]:
+    """What cameras at one centre see of a smooth world at infinity, (3, h, w) in [0.05, 0.85]."""
+    waves = np.array([[5.0, 3.0, 7.0], [-6.0, 4.0, 3.0], [2.0, -7.0, 5.0]])
+    rays = [camera.unproject(camera.pixel_grid()).directions for camera in rig]
+    return [torch.from_numpy((0.45 + 0.4 * np.sin(d @ waves.T)).transpose(2, 0, 1).copy()).float() for d in rays]
+
+
+@pytest.mark.parametrize("max_gain", [2.5, 8.0])
+@pytest.mark.parametrize("execution", ["opencv", "torch"])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.float16])
+def test_gains_at_the_clamp(dtype: torch.dtype, execution: str, max_gain: float) -> None:
+    rig = ring(6, position_m=(0.0, 0.0, 1.5))
+    images = pictures(rig)
+    images[2] = images[2] / 12
+    images = [(image * 255).round().to(dtype) if dtype == torch.uint8 else image.to(dtype) for image in images]
+    config = HarmoniseConfig(max_gain=max_gain, prior_log_gain=10.0, dark=0.0)
+    report = estimate_gains(rig, images, config)
+    assert report.accepted and report.gains[2] == pytest.approx(max_gain, rel=1e-12), str(report)
+    assert all(1 / max_gain <= gain <= max_gain for gain in report.gains)
+    with no_numpy_warnings():
+        out = RigRetarget(rig.turned(yaw_deg=25), harmonise=config, execution=execution)({"images": images, "rig": rig})
+    views = out["images"].float() / (255 if dtype == torch.uint8 else 1)
+    assert views.isfinite().all() and views.min() >= 0 and views.max() <= 1
+
+
+@pytest.mark.parametrize("knee", [0.05, 0.9, 0.99])
+@pytest.mark.parametrize("gain", [1e-3, 1 / 16, 1 / 2.5, 2.5, 16.0, 1e3])
+def test_curves_stay_in_range_and_rise(gain: float, knee: float, worst: Worst) -> None:
+    curve = ToneCurve(gain, knee)
+    x = np.linspace(0, 1, 4097)
+    with no_numpy_warnings():
+        exact, single = curve.of_array(x), curve.of_array(x.astype(np.float32))
+        torched = curve.of_tensor(torch.from_numpy(x.astype(np.float32))).numpy()
+        levels = np.arange(256, dtype=np.uint8).reshape(1, 256, 1).repeat(3, 2)
+        curve.apply(levels)
+    for y in (exact, single, torched):
+        assert y[0] == 0 and y[-1] == pytest.approx(1, abs=1e-6) and (np.diff(y) >= -1e-6).all()
+    assert (np.diff(levels[0, :, 0].astype(int)) >= 0).all() and levels[0, 255, 0] == 255
+    error = 255 * max(np.abs(single - exact).max(), np.abs(torched - exact).max())
+    worst("grey levels, tone curves in float32", error)
+    assert error <= 1e-3
+
+
+@pytest.mark.parametrize("gain", [0.0, -1.0, 1e-320, 1e4, 1e300, float("inf"), float("nan")])
+def test_impossible_gains_are_refused(gain: float) -> None:
+    with pytest.raises(ValueError, match=r"harmonise: expected .* a gain from 0.001 to 1000, got"):
+        RigRetarget(ring(), harmonise=(1.0, gain))
+
+
+# --- half precision ---------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("quality", ["draft", "fast", "accurate", "paper"])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_shows_what_float32_shows(quality: Any, dtype: torch.dtype, worst: Worst) -> None:
+    """The images are rounded, the geometry is not: within two roundings of the same values in float32."""
+    rig = ring()
+    images = [image.to(dtype) for image in pictures(rig)]
+    retarget = RigRetarget(rig.turned(yaw_deg=20), quality=quality, surface="auto" if quality == "paper" else "street")
+    half = retarget({"images": images, "rig": rig})["images"]
+    single = retarget({"images": [image.float() for image in images], "rig": rig})["images"]
+    assert half.dtype == dtype
+    error = (half.float() - single).abs().max().item()
+    worst(f"grey levels, {str(dtype).removeprefix('torch.')} images against float32", 255 * error)
+    assert error <= 2 * torch.finfo(dtype).eps
+
+
+# --- LiDAR ------------------------------------------------------------------------------------------------------------
+NAN = float("nan")
+POINTS: dict[str, Any] = {
+    "none": torch.zeros(0, 3),
+    "one": [[12.0, 1.0, 1.0]],
+    "one at the camera": [[1.5, 0.0, 1.5]],
+    "NaN alone": [[NAN, NAN, NAN]] * 5,
+    "duplicates": [[12.0, 1.0, 1.0]] * 1000,
+    "at infinity": [[float("inf"), 0.0, 0.0], [1e300, 1e300, 0.0], [0.0, -float("inf"), NAN]],
+    "on the image plane": [[1.5, 5.0, 1.5], [1.5, -5.0, 1.5], [1.5, 0.0, 9.0]],
+}
+
+
+@pytest.mark.parametrize("quality", ["draft", "fast", "accurate"])
+@pytest.mark.parametrize("name", POINTS)
+def test_few_or_broken_points(name: str, quality: Any) -> None:
+    rig = ring(2, position_m=(1.5, 0.0, 1.5), horizontal_fov_deg=90.0)
+    images = torch.stack(pictures(rig))
+    points = torch.as_tensor(POINTS[name], dtype=torch.float32)
+    sample = {"images": images, "rig": rig, "points": points}
+    retarget = RigRetarget(Rig([camera("t", position_m=(1.5, 0.3, 1.9))]), quality=quality, surface="lidar")
+    with no_numpy_warnings():
+        out = retarget(sample)
+    assert out["images"].isfinite().all() and 0 <= out["images"].min() <= out["images"].max() <= 1
+    if name in ("none", "NaN alone"):  # nothing was measured: the street
+        street = RigRetarget(Rig([camera("t", position_m=(1.5, 0.3, 1.9))]), quality=quality, surface="street")
+        assert torch.equal(out["images"], street(sample)["images"])
+
+
+def test_broken_points_among_good_ones_change_nothing() -> None:
+    rng = np.random.default_rng(0)
+    good = rng.normal(size=(2000, 3)) * (20, 20, 1) + (0, 0, 1)
+    broken = np.concatenate([good, np.full((50, 3), NAN), [[float("inf"), 0, 0]]])
+    rig = ring()
+    retarget = RigRetarget(rig.shifted(z_m=0.4), surface="lidar")
+    images = torch.stack(pictures(rig))
+    views = [retarget({"images": images, "rig": rig, "points": torch.from_numpy(p)})["images"] for p in (good, broken)]
+    assert torch.equal(*views)
