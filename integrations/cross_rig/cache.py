@@ -33,12 +33,12 @@ def content_hash(spec: Mapping[str, Any]) -> str:
 
 
 @cache
-def code_hash(module: str) -> str:
-    """16 hex digits of the code that ``module`` runs: its own and all it imports of the same package.
+def code_hash(module: str, within: str | None = None) -> str:
+    """16 hex digits of the code that ``module`` runs: its own and all it imports of ``within``, by default its package.
 
     Comments and docstrings do not count, so that mending words makes nothing anew.
     """
-    root = module.partition(".")[0]
+    root = within or module.partition(".")[0]
     todo, code = [module], {}
     while todo:
         name = todo.pop()

@@ -79,4 +79,8 @@ def test_code_hash_follows_imports_and_ignores_words(tmp_path, monkeypatch):
     assert fresh() == before
     (package / "low.py").write_text('X = 2\n"""Documented."""\n')
     assert fresh() != before
+    alone = code_hash("hashed_package.top", within="hashed_package.top")
+    (package / "low.py").write_text("X = 3\n")
+    code_hash.cache_clear()
+    assert code_hash("hashed_package.top", within="hashed_package.top") == alone
     code_hash.cache_clear()
