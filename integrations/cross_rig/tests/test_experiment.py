@@ -141,7 +141,7 @@ def test_command_lists_and_refuses(capsys, tmp_path):
 
 
 @pytest.mark.cross
-@pytest.mark.timeout(1800)
+@pytest.mark.timeout(900)
 def test_quick_oracle_is_above_raw(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(cache, "CHUNK_FRAMES", 20)
     assert command.main(["--quick", "--output", str(tmp_path)]) == 0
