@@ -30,8 +30,8 @@ from arbiview_aug.projection import (
     project_rays,
     source_points,
 )
-from arbiview_aug.sampling import Slot
-from arbiview_aug.shadowing import SeenSolids, at_level, cells_near_shadow, halved_camera, nearest_pixel, read_nearest
+from arbiview_aug.sampling import Slot, at_level
+from arbiview_aug.shadowing import SeenSolids, cells_near_shadow, halved_camera, nearest_pixel, read_nearest
 from arbiview_aug.surface import Dense, Layered, Shadows, Static, Surface
 from arbiview_aug.target_rays import TargetRays
 

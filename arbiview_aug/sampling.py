@@ -15,6 +15,7 @@ import math
 import threading
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -103,8 +104,8 @@ class Slot:
     size: tuple[int, int]
 
     def from_source(self, uv: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-        """Atlas positions of source pixels (..., 2): halving keeps outer edges, so x' = (x + 0.5) / 2^level - 0.5."""
-        half = (uv + 0.5) / 2**self.level - 0.5 if self.level else uv
+        """Atlas positions of source pixels (..., 2)."""
+        half = at_level(uv, self.level)
         return half + np.array([self.x, self.y]) if self.x or self.y else half
 
     def to_source(self, at: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
@@ -172,6 +173,11 @@ class AtlasLayout:
     def slot(self, source: int, level: int) -> Slot:
         """The place of one source at one level."""
         return next(s for s in self.slots if (s.source, s.level) == (source, level))
+
+
+def at_level(uv: npt.NDArray[np.floating], level: int) -> Any:
+    """Pixels (..., 2) in an image halved ``level`` times: halving keeps outer edges, x' = (x + 0.5) / 2^level - 0.5."""
+    return (uv + 0.5) / 2**level - 0.5 if level else uv
 
 
 def level_size(size: tuple[int, int], level: int) -> tuple[int, int]:

@@ -79,11 +79,6 @@ def halved_camera(camera: Camera, level: int) -> Camera:
     return camera.crop(0, 0, (h << level, w << level)).resize((h, w)) if level else camera
 
 
-def at_level(uv: FloatArray, level: int) -> FloatArray:
-    """Pixels (..., 2) in an image that was halved ``level`` times."""
-    return (uv + 0.5) / 2**level - 0.5
-
-
 def cells_near_shadow(shadow: npt.NDArray[np.float32], uv: FloatArray) -> BoolArray:
     """Cells (ny - 1, nx - 1) whose corners (ny, nx, 2) span a part of a shadow image that is not free of shadow."""
     tile = _SHADOW_TILE_PX

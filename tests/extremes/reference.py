@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from arbiview_aug import Camera
+from arbiview_aug.sampling import Slot
 from arbiview_aug.surface import MAX_INVERSE_DISTANCE, WALL_CENTER_M, Ground, Street
 
 LEAST_DEPTH = 1e-6  # of unit directions, for lenses that see less than half a turn
@@ -148,6 +149,15 @@ def seen(source: Camera, target: Camera, surface: str, ground_z_m: float, boxes:
     ahead = np.where(np.isnan(point), directions, point - source.center_m)
     uv, valid = project(source, ahead @ source.cam2ego[:3, :3])
     return Seen(uv, valid & certain, point, ~certain & (target.lens == "radtan"))
+
+
+def atlas_position(slot: Slot, uv: np.ndarray) -> np.ndarray:
+    """Where pixels (..., 2) of an image lie once it is halved and has its place in an atlas.
+
+    Outer edges stay, -0.5 is -0.5. The outer half pixel of the full image is read at the halved one's border.
+    """
+    halved = (uv + 0.5) / 2**slot.level - 0.5
+    return np.array([slot.x, slot.y]) + np.clip(halved, 0, np.array(slot.size[::-1]) - 1)
 
 
 def hidden(source: Camera, point_m: np.ndarray, boxes: np.ndarray, shrink_m: float) -> np.ndarray:

@@ -28,6 +28,7 @@ from arbiview_aug.favs.photometric import HarmoniseConfig, estimate_gains
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
 from arbiview_aug.plan import build_plan
 from arbiview_aug.tone import ToneCurve
+from tests.extremes import reference
 from tests.extremes.conftest import Worst
 from tests.extremes.test_geometry import SOURCES, TARGETS, camera, no_numpy_warnings, ring
 
@@ -123,6 +124,20 @@ def test_the_published_stages_at_the_edges(name: str) -> None:
             view = render_paper(source, Rig([target]), list(images)).targets[0]
         assert view.image.isfinite().all() and view.image.min() >= 0 and view.image.max() <= 1
         assert all(np.isfinite(report.H_final).all() and report.features.reason for report in view.reports)
+
+
+@pytest.mark.parametrize("fov_deg", [60.0, 120.0])
+@pytest.mark.parametrize("azimuth_deg", [0.0, 45.0, 90.0, 110.0, -135.0, 180.0])
+def test_the_published_stages_show_nothing_from_behind(azimuth_deg: float, fov_deg: float) -> None:
+    """A homography maps what lies behind the source into its image too: mirrored, and not in front."""
+    source = camera("s", horizontal_fov_deg=fov_deg)
+    target = camera("t", horizontal_fov_deg=150.0, azimuth_deg=azimuth_deg)
+    coverage = render_paper(Rig([source]), Rig([target]), [torch.ones(3, *source.size)]).targets[0].coverage
+    uv, valid, *_ = reference.seen(source, target, "far", 0.0)
+    uv = np.where(valid[..., None], uv, -9.0)
+    last = np.array([source.width_px - 1, source.height_px - 1])
+    assert not coverage[~((uv >= -1e-3) & (uv <= last + 1e-3)).all(-1)].any()
+    assert coverage[((uv >= 1e-3) & (uv <= last - 1e-3)).all(-1)].all()
 
 
 # --- weights ----------------------------------------------------------------------------------------------------------
