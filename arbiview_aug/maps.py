@@ -240,11 +240,11 @@ class PairMap:
     def full_resolution(
         self, slot: Slot, rows: tuple[int, int]
     ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
-        """Atlas positions and visibility over the pixels between some rows of the nodes in use.
+        """Positions in the source and visibility over the pixels between some rows of the nodes in use.
 
         Args:
-            slot: Where the source lies in the atlas. Its affine change of coordinates is applied to the nodes, where
-                it is exact and costs nothing.
+            slot: The source at the level it is read at, alone (``Slot.alone``). Its affine change of coordinates is
+                applied to the nodes, where it is exact and costs nothing.
             rows: First and last row of nodes.
 
         Returns:
@@ -277,13 +277,13 @@ class PairMap:
             visible &= grid.cells_to_pixels(self._use, nodes)
         if q is not None:
             beyond = self._in_light(slot.level)[0].beyond
-            visible &= cv2.compare(read_nearest(beyond, at, slot), q, cv2.CMP_LE).astype(np.uint8)
+            visible &= cv2.compare(read_nearest(beyond, at), q, cv2.CMP_LE).astype(np.uint8)
         if self.solids is not None:
             self._put_solids(at, visible, nodes, slot)
         if source.mask is not None and not source.mask.all():
             if slot.level not in self._clean:
                 self._clean[slot.level] = clean_pixels(source, slot.level)
-            visible &= mask_at(self._clean[slot.level], slot, at)
+            visible &= mask_at(self._clean[slot.level], at)
         if slot.level:
             # The outer half pixel of the full image lies outside the halved one: read its border pixel.
             h, w = slot.size
@@ -299,7 +299,7 @@ class PairMap:
         for part in self._parts_near_shadow(shadows.beyond, nodes, slot.level):
             t, b, le, r = grid.pixels(part)
             here = slice(t - y0, b - y0), slice(le - x0, r - x0)
-            first = read_nearest(shadows.beyond, at[here], slot)
+            first = read_nearest(shadows.beyond, at[here])
             beyond: Any = 0 if isinstance(self.surface, Static) else grid.upsample(self._from_source_q, part)
             visible[here] *= first <= beyond  # not cv2.compare: to it a part of one or four pixels is a scalar
         visible &= self.rays.solids(self.whole_surface).free[y0:y1, x0:x1]

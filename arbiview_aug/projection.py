@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.dense import FAR_AWAY_PX
-from arbiview_aug.sampling import Slot, halved
+from arbiview_aug.sampling import halved
 
 CORNERS = tuple((a, b) for a in (slice(None, -1), slice(1, None)) for b in (slice(None, -1), slice(1, None)))
 
@@ -106,18 +106,10 @@ def clean_pixels(source: Camera, level: int) -> npt.NDArray[np.uint8]:
     return cv2.inRange(halved(clean, level), 255, 255) if level else clean  # type: ignore[call-overload,return-value]
 
 
-def mask_at(clean: npt.NDArray[np.uint8], slot: Slot, at: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-    """255 where every bilinear tap with a weight at atlas positions (h, w, 2) lies on ``clean_pixels``."""
-    share: Any = cv2.remap(clean, in_slot(at, slot), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+def mask_at(clean: npt.NDArray[np.uint8], at: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+    """255 where every bilinear tap with a weight at positions (h, w, 2) lies on ``clean_pixels``."""
+    share: Any = cv2.remap(clean, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
     return np.asarray(cv2.inRange(share, 255, 255), np.uint8)  # cv2.compare refuses a single pixel
-
-
-def in_slot(at: npt.NDArray[np.float32], slot: Slot) -> npt.NDArray[np.float32]:
-    """Atlas positions (h, w, 2) as positions in one of its images."""
-    if not (slot.x or slot.y):
-        return at
-    moved: Any = cv2.subtract(at, (slot.x, slot.y, 0, 0))  # type: ignore[call-overload]  # numpy takes ten times as long
-    return moved
 
 
 def edge_distance(source: Camera, uv: FloatArray) -> FloatArray:
