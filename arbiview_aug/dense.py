@@ -1,17 +1,21 @@
 """Scene points of all pixels of a target, projected into a source: in float32, three planes of numbers at a time.
 
 For surfaces that step anywhere nothing can be interpolated between coarse nodes, so every pixel is projected. A
-pinhole's rays need no memory: their planes are a row and a column that broadcast. Positions in images of 1600 px are
-within 1/500 px of float64.
+pinhole's rays need no memory: their planes are a row and a column that broadcast. Those of a lens are inverted on a
+coarse grid and interpolated, where that is precise. Positions in images of 1600 px are within 1/500 px of float64, with
+interpolated rays within 1/200.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.camera import Camera
-from arbiview_aug.grid import Box
+from arbiview_aug.grid import Box, Grid
 from arbiview_aug.sampling import Slot
 
 Layer = npt.NDArray[np.float32]
@@ -26,14 +30,43 @@ def pixel_rays(camera: Camera) -> Planes:
     """Rays of all pixels: a pinhole's have z = 1, those of lenses unit length; 0 where there is none."""
     h, w = camera.size
     if camera.lens != "pinhole":
-        rays, valid = camera.unproject_cam(camera.pixel_grid())
-        x, y, z = (np.where(valid, rays[..., k], 0).astype(np.float32) for k in range(3))
+        planes = _interpolated_rays(camera)
+        if planes is None:
+            rays, valid = camera.unproject_cam(camera.pixel_grid())
+            planes = tuple(np.where(valid, rays[..., k], 0).astype(np.float32) for k in range(3))
+        x, y, z = planes
         return x, y, z
     K = camera.K
     v = ((np.arange(h) - K[1, 2]) / K[1, 1])[:, None]
     u = ((np.arange(w) - K[0, 2]) / K[0, 0])[None]
     x = u - K[0, 1] / K[0, 0] * v if K[0, 1] else u
     return x.astype(np.float32), v.astype(np.float32), np.ones((1, 1), np.float32)
+
+
+def _interpolated_rays(camera: Camera) -> tuple[Layer, ...] | None:
+    """Unit rays of all pixels from those on coarse nodes; None where a lens bends too much for that, or has no rays."""
+    grid = Grid(camera.size, _STEP_PX)
+    rays, valid = camera.unproject_cam(grid.nodes())
+    # What Grid leaves: cubic between the nodes, bilinear over a quarter of their spacing.
+    error = 0.0
+    for axis in (0, 1):
+        for order, share in ((2, 1 / 8 / 16), (4, 3 / 128)):
+            error += share * float(np.abs(np.diff(rays, order, axis=axis)).max(initial=0.0))
+    if not valid.all() or not error * float(camera.K[0, 0]) <= _RAY_PX:
+        return None
+    ny, nx = grid.shape
+    nodes = 0, ny - 1, 0, nx - 1
+    pairs = [np.ascontiguousarray(rays[..., pair], np.float32) for pair in ([0, 1], [2, 2])]
+    (x, y), (z, _) = (cv2.split(grid.upsample_refined(grid.refined(pair, nodes), nodes, (0, ny - 1))) for pair in pairs)
+    return x, y, z
+
+
+_STEP_PX = 8
+"""As plans: 25 times as fast as every pixel."""
+
+_RAY_PX = 1 / 128
+"""Half of what plans may interpolate by, as a bound; radial lenses of vehicles stay below 1/300 px, fisheyes near
+their fold do not."""
 
 
 def cropped(planes: Planes, box: Box) -> Planes:
@@ -69,19 +102,33 @@ def project_pixels(
     turn = (to_source @ target.cam2ego[:3, :3]).astype(np.float32)
     offset = (to_source @ (target.center_m - source.center_m)).astype(np.float32)
     a, b, c = planes
+    work = np.empty_like(q)  # one plane of scratch memory: fresh ones cost as much as the arithmetic
     # The points times q.
-    x, y, z = (turn[k, 0] * a + (turn[k, 1] * b + turn[k, 2] * c) + offset[k] * q for k in range(3))
-    from_source = q / np.maximum(np.sqrt(x * x + y * y + z * z), np.float32(1e-30))
-    at = np.empty((*q.shape, 2), np.float32)
+    x, y, z = (turn[k, 0] * a + (turn[k, 1] * b + turn[k, 2] * c) for k in range(3))
+    for axis, shift in zip((x, y, z), offset, strict=True):
+        axis += np.multiply(shift, q, out=work)
+    from_source = x * x
+    from_source += np.multiply(y, y, out=work)
+    from_source += np.multiply(z, z, out=work)
+    np.maximum(np.sqrt(from_source, out=from_source), np.float32(1e-30), out=from_source)
+    np.divide(q, from_source, out=from_source)
     if source.lens == "pinhole":
-        valid = z > 1e-6
+        invalid = z <= 1e-6
         K, shrink, first = source.K.astype(np.float32), 2.0**-slot.level, slot.from_source(source.K[:2, 2])
-        scale = np.float32(shrink) / np.where(valid, z, np.float32(1))
-        at[..., 0] = (K[0, 0] * x + K[0, 1] * y if K[0, 1] else K[0, 0] * x) * scale + np.float32(first[0])
-        at[..., 1] = K[1, 1] * y * scale + np.float32(first[1])
+        np.copyto(z, np.float32(1), where=invalid)
+        scale = np.divide(np.float32(shrink), z, out=z)
+        x *= K[0, 0]
+        if K[0, 1]:
+            x += np.multiply(K[0, 1], y, out=work)
+        y *= K[1, 1]
+        for axis, centre in ((x, first[0]), (y, first[1])):
+            axis *= scale
+            axis += np.float32(centre)
+            np.clip(axis, -FAR_AWAY_PX, FAR_AWAY_PX, out=axis)
+            np.copyto(axis, np.float32(-FAR_AWAY_PX), where=invalid)
     else:
         uv, _, valid = source.project_cam(np.stack([x, y, z], -1).astype(np.float64))
-        at[:] = slot.from_source(uv)
-    np.clip(at, -FAR_AWAY_PX, FAR_AWAY_PX, out=at)
-    at[~valid] = -FAR_AWAY_PX
+        positions = np.clip(slot.from_source(uv), -FAR_AWAY_PX, FAR_AWAY_PX)
+        x, y = (np.where(valid, positions[..., k], -FAR_AWAY_PX).astype(np.float32) for k in range(2))
+    at: Any = cv2.merge([x, y])
     return at, from_source

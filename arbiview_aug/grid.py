@@ -146,6 +146,11 @@ def _halved_spacing(part: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     return fine
 
 
+def around(one: Box, two: Box) -> Box:
+    """The box around two boxes."""
+    return min(one[0], two[0]), max(one[1], two[1]), min(one[2], two[2]), max(one[3], two[3])
+
+
 def runs(flags: BoolArray) -> Iterator[tuple[int, int]]:
     """First and last index of each run of True."""
     edges = np.flatnonzero(np.diff(np.r_[False, flags, False].astype(np.int8)))

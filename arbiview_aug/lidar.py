@@ -6,24 +6,20 @@ No sensor's place is assumed: points are z-buffered and made dense anew for each
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import cv2
 import numpy as np
 
-from arbiview_aug.camera import BoolArray, Camera, FloatArray
+from arbiview_aug.camera import BoolArray, Camera, FloatArray, Rays
 from arbiview_aug.errors import SampleError
 from arbiview_aug.objects import Objects, within_boxes
 from arbiview_aug.panorama import CELL_RAD, Layer, Panorama, Window, angles, panorama
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Dense, Drawn, Shadows, Static
+from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Dense, Drawn, Points, Shadows, Static
 
 OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
 """(x, y) ranges in the ego frame whose returns are the own car's: a car's about the middle of its rear axle."""
-
-NEAREST_M = 0.5
-"""Nearer to a camera than this nothing of the scene stands: such points are the vehicle's, or the camera itself."""
 
 BOX_AIR_M = 0.2
 """Points this far outside a box are its object's too: mirrors, and the noise of points and labels."""
@@ -48,7 +44,7 @@ class LidarSurface(Dense):
 
     smooth: ClassVar[bool] = False
     street: Static
-    points: FloatArray
+    points: Points
     _panoramas: dict[bytes, list[Panorama]] = field(default_factory=dict, repr=False)
     _shadows: dict[Camera, Shadows] = field(default_factory=dict, repr=False)
     _rays: dict[Camera, _Located] = field(default_factory=dict, repr=False)
@@ -110,14 +106,17 @@ class LidarSurface(Dense):
         if camera in self._rays:
             return self._rays[camera]
         step = max(1, round(CELL_RAD * float(camera.K[0, 0])))
-        # A lens may have no rays next to its image.
-        if step > 1 and camera.lens == "pinhole":
-            rays = _Located.of(camera, self._view, step)
-            # Azimuths bend near the zenith, and columns jump somewhere in a panorama that goes all around.
-            if float(np.abs(rays.directions[..., 2]).max()) <= _STEEP and not rays.view.window.is_whole:
-                self._rays[camera] = rays
-                return rays
-        return _Located.of(camera, self._view, 1)
+        if step > 1:
+            directions, valid = _spaced_rays(camera, step)
+            # A lens may have no rays next to its image; azimuths bend near the zenith.
+            if valid.all() and float(np.abs(directions[..., 2]).max()) <= _STEEP:
+                rays = _Located(camera.size, step, directions, *self._view(camera.center_m, directions))
+                if not rays.view.window.is_whole:  # columns jump somewhere in a panorama that goes all around
+                    self._rays[camera] = rays
+                    return rays
+        directions, valid = _spaced_rays(camera, 1)
+        directions = np.where(valid[..., None], directions, camera.cam2ego[:3, 2])
+        return _Located(camera.size, 1, directions, *self._view(camera.center_m, directions))
 
     def _view(self, origin: FloatArray, directions: FloatArray) -> tuple[Panorama, Layer, Layer]:
         """The panorama around a centre that holds the rays, and their rows and columns in it."""
@@ -126,8 +125,7 @@ class LidarSurface(Dense):
         held = self._panoramas.setdefault(np.asarray(origin, np.float64).tobytes(), [])
         view = next((p for p in held if p.window.holds(asked)), None)
         if view is None:
-            near = ((self.points - origin) ** 2).sum(1) < NEAREST_M**2
-            view = panorama(asked.widened(), origin, self.points[~near], self.street)
+            view = panorama(asked.widened(), origin, self.points, self.street)
             held.append(view)
         return view, *view.window.cells(azimuth, elevation)
 
@@ -138,7 +136,7 @@ class _Located(NamedTuple):
     Attributes:
         size: (h, w) of the image.
         step: Their spacing in pixels; they start one step before the centre of the image's first block.
-        directions: (ny, nx, 3) unit rays in the ego frame.
+        directions: (ny, nx, 3) unit rays in the ego frame; the optical axis where there is none.
         view: The panorama.
         row: (ny, nx) in it.
         column: (ny, nx).
@@ -151,15 +149,6 @@ class _Located(NamedTuple):
     row: Layer
     column: Layer
 
-    @classmethod
-    def of(
-        cls, camera: Camera, view: Callable[[FloatArray, FloatArray], tuple[Panorama, Layer, Layer]], step: int
-    ) -> _Located:
-        v, u = (step * np.arange(-1.0, -(-n // step) + 1) + (step - 1) / 2 for n in camera.size)
-        directions, valid = camera.unproject(np.stack(np.meshgrid(u, v), -1))
-        directions = np.where(valid[..., None], directions, camera.cam2ego[:3, 2])
-        return cls(camera.size, step, directions, *view(camera.center_m, directions))
-
     def to_pixels(self, values: Layer) -> Any:
         """Bilinear interpolation (ny, nx) to all pixels (h, w)."""
         s, (h, w) = self.step, self.size
@@ -167,6 +156,12 @@ class _Located(NamedTuple):
         if s > 1:
             enlarged = cv2.resize(values, None, fx=s, fy=s, interpolation=cv2.INTER_LINEAR)
         return enlarged[s : s + h, s : s + w]
+
+
+def _spaced_rays(camera: Camera, step: int) -> Rays:
+    """Rays in the ego frame, from one step before the centre of the image's first block to one behind the last's."""
+    v, u = (step * np.arange(-1.0, -(-n // step) + 1) + (step - 1) / 2 for n in camera.size)
+    return camera.unproject(np.stack(np.meshgrid(u, v), -1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +178,7 @@ class LidarObjects(Objects):
     street: LidarSurface
 
     @classmethod
-    def among(cls, street: Static, points: FloatArray, boxes: FloatArray) -> LidarObjects:
+    def among(cls, street: Static, points: Points, boxes: FloatArray) -> LidarObjects:
         """Boxes (B, 7) among points (P, 3)."""
         return cls(LidarSurface(street, points[~within_boxes(boxes, points, BOX_AIR_M)]), boxes)
 
@@ -192,6 +187,12 @@ class LidarObjects(Objects):
         pixel, first, face = super().drawn(camera)
         shown = first >= self.street.before_image(camera).reshape(-1)[pixel]
         return Drawn(pixel[shown], first[shown], face[shown])
+
+    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        """The first box along a ray with nothing measured before it, else the points' surface, 1/m (...,)."""
+        first = self._boxes_ahead(origin, directions)[0]
+        shown = (first > 0) & (first >= self.street.before(origin, directions))
+        return np.where(shown, first, self.street.inverse_distance(origin, directions))
 
     def shadows(self, camera: Camera) -> Shadows:
         """What boxes hide from a source, and what was measured."""
@@ -216,15 +217,16 @@ class LidarObjects(Objects):
         return self.street.uncertainty(origin, directions, inverse_distance)
 
 
-def own_car(points: FloatArray) -> BoolArray:
+def own_car(points: Points) -> BoolArray:
     """(P,) points within ``OWN_CAR_M``."""
     (x0, x1), (y0, y1) = OWN_CAR_M
     x, y = points[:, 0], points[:, 1]
     return np.asarray((x > x0) & (x < x1) & (y > y0) & (y < y1))
 
 
-def checked_points(points: FloatArray, key: str = "points") -> FloatArray:
-    """(P, 3) finite points of a sample's (P, >= 3); rows that are not finite are dropped.
+def checked_points(points: Points, key: str = "points") -> Points:
+    """(P, 3) finite points of a sample's (P, >= 3); rows that are not finite are dropped, and nothing is copied if all
+    are.
 
     Raises:
         SampleError: Another shape.
@@ -234,7 +236,8 @@ def checked_points(points: FloatArray, key: str = "points") -> FloatArray:
     if points.ndim != 2 or points.shape[1] < 3:
         raise SampleError(f"{key}: expected shape (P, >= 3), x y z in the ego frame, got {points.shape}")
     xyz = points[:, :3]
-    return xyz[np.isfinite(xyz).all(axis=1)]
+    finite = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
+    return xyz if finite.all() else xyz[finite]
 
 
 def points_of_depth(camera: Camera, depth_m: FloatArray) -> FloatArray:

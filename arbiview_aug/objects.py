@@ -1,8 +1,9 @@
 """Labelled 3D boxes as solids on the street: the geometry that keeps an object's height when cameras move.
 
 A static surface paints an object onto the road and the wall behind it: its base lands right, its roof stretches away.
-With boxes in the sample the nearest of street and box faces is what a ray meets. What a box hides from a source is not
-read from that source: the object's own colours would be smeared behind it. Where no other source sees it, it is a hole.
+With boxes in the sample a ray meets the first face of a box, and the street where it passes them all. What a box hides
+from a source is not read from that source: the object's own colours would be smeared behind it. Where no other source
+sees it, it is a hole.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.grid import Grid
 from arbiview_aug.solids import draw_boxes
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn, Layered, Shadows, Static, Surface
+from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn, Layered, Points, Shadows, Static, Surface
 
+_CHUNK = 1 << 15  # points tested at once: they stay in the cache, however many there are
 _LENS_STEP_PX = 8  # cells in which rays of a lens are cast or not
 
 _UNLABELLED = 0.45
@@ -109,8 +111,9 @@ class Objects(Layered):
 
     # --- rays ---------------------------------------------------------------------------------------------------------
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
-        """The nearer of street and boxes, 1/m (...,)."""
-        return np.maximum(self.street.inverse_distance(origin, directions), self._boxes_ahead(origin, directions)[0])
+        """The first box along a ray, else the street, 1/m (...,): the street is a guess, a box is not under it."""
+        first = self._boxes_ahead(origin, directions)[0]
+        return np.where(first > 0, first, self.street.inverse_distance(origin, directions))
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Mean error (...,) in 1/m: of a box against the object in it, of the street with what has no label."""
@@ -173,14 +176,17 @@ def _first_face(
     return np.where(hit, 1 / np.maximum(enter, 1 / MAX_INVERSE_DISTANCE), 0.0), side
 
 
-def within_boxes(boxes: FloatArray, points: FloatArray, air_m: float = 0.0) -> BoolArray:
+def within_boxes(boxes: FloatArray, points: Points, air_m: float = 0.0) -> BoolArray:
     """(P,) points that lie in any box (B, 7), or no farther than ``air_m`` beside its faces."""
     within = np.zeros(len(points), bool)
-    x, y = np.ascontiguousarray(points[:, :2].T)
-    for box in boxes:
-        reach_m = float(np.hypot(box[3], box[4])) / 2 + 2 * air_m
-        near = np.flatnonzero((np.abs(x - box[0]) <= reach_m) & (np.abs(y - box[1]) <= reach_m))
-        within[near] |= np.all(np.abs(_in_box_frame(box, points[near] - box[:3])) <= box[3:6] / 2 + air_m, axis=1)
+    reach_m = np.hypot(boxes[:, 3], boxes[:, 4]) / 2 + 2 * air_m
+    for first in range(0, len(points), _CHUNK):
+        chunk = points[first : first + _CHUNK]
+        x, y = chunk[:, :2].T.astype(np.float64, order="C")
+        for box, reach in zip(boxes, reach_m.tolist(), strict=True):
+            near = np.flatnonzero((np.abs(x - box[0]) <= reach) & (np.abs(y - box[1]) <= reach))
+            inside = np.abs(_in_box_frame(box, chunk[near] - box[:3])) <= box[3:6] / 2 + air_m
+            within[first + near] |= inside.all(axis=1)
     return within
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, FloatArray
-from arbiview_aug.surface import Static
+from arbiview_aug.surface import Points, Static
 
 Layer = npt.NDArray[np.float32]
 
@@ -54,6 +54,10 @@ SHRINK_RAD = math.radians(0.4)
 """What is measured hides what is behind it; this closes gaps between scan lines without widening outlines by all of
 ``SUPPORT_RAD``. With 0.2 degrees false holes cost 0.1 to 1 dB on nuScenes and DDAD."""
 
+NEAREST_M = 0.5
+"""Nearer to a centre than this nothing of the scene stands: such points are the vehicle's, or the camera itself."""
+
+_CHUNK = 1 << 15  # points worked on at once: their coordinates stay in the cache, ten millions take no memory
 _ROOM_RAD = math.radians(1.0)  # panoramas are this much wider than what is asked first: later questions fit in
 _REMAP_LIMIT = 16384  # cv2.remap wants sizes below 32767
 _HALO_RAD = math.radians(4.0)  # points around a window that its filters need
@@ -106,6 +110,18 @@ class Window:
         """Rows and columns, with the halo."""
         h, w = (math.ceil((side + 2 * _HALO_RAD) / CELL_RAD) + 1 for side in (self.height_rad, self.width_rad))
         return h, w
+
+    def may_hold(self, away: FloatArray, length: FloatArray) -> BoolArray:
+        """Points (3, P) from the centre, of these lengths (P,), that may lie in it, halo included: two cells of slack.
+
+        Without an angle: 10 ns a point, a tenth of what ``cells`` takes.
+        """
+        x, y, z = away
+        slack = _HALO_RAD + 2 * CELL_RAD
+        middle, half = self.start_rad + self.width_rad / 2, min(self.width_rad / 2 + slack, math.pi)
+        low, high = max(self.low_rad - slack, -math.pi / 2), min(self.low_rad + self.height_rad + slack, math.pi / 2)
+        inside = (z >= math.sin(low) * length) & (z <= math.sin(high) * length)
+        return inside & (x * math.cos(middle) + y * math.sin(middle) >= math.cos(half) * np.sqrt(x * x + y * y))
 
     def cells(self, azimuth: Layer, elevation: Layer) -> tuple[Layer, Layer]:
         """Row and column (...,) of rays; columns of rays beyond the end may exceed the shape."""
@@ -160,14 +176,14 @@ def angles(directions: FloatArray) -> tuple[Layer, Layer]:
     return np.arctan2(y, x), np.arcsin(np.clip(z, -1, 1))
 
 
-def panorama(window: Window, origin: FloatArray, points: FloatArray, base: Static) -> Panorama:
+def panorama(window: Window, origin: FloatArray, points: Points, base: Static) -> Panorama:
     """The points (P, 3) as seen from ``origin`` (3,), made dense over a static surface.
 
-    Nearest point first in each cell; points that shine through gaps of what is nearer are dropped; each cell takes the
-    residual of its nearest point; residuals are averaged, on both sides of a step apart.
+    Nearest point first in each cell, none within ``NEAREST_M``; points that shine through gaps of what is nearer are
+    dropped; each cell takes the residual of its nearest point; residuals are averaged, on both sides of a step apart.
     """
     shape = window.shape
-    distance, residual = _nearest_points(window, origin, points, base)
+    distance, residual = _nearest_residuals(window, origin, points, base)
     kept = distance > 0
     if kept.any():
         kept &= distance >= _hidden_below(_nearer_on_both_sides(distance))
@@ -208,25 +224,39 @@ def _on_cells(window: Window, origin: FloatArray, base: Static, step: int = 4) -
     return cv2.remap(coarse.astype(np.float32), x, y, cv2.INTER_LINEAR)
 
 
-def _nearest_points(window: Window, origin: FloatArray, points: FloatArray, base: Static) -> tuple[Layer, Layer]:
+def _nearest_residuals(window: Window, origin: FloatArray, points: Points, base: Static) -> tuple[Layer, Layer]:
     """Inverse distance and residual of the nearest point in each cell, 0 where there is none."""
-    away = points - origin
+    number = _nearest_points(window, origin, points)
+    distance, residual = np.zeros(window.shape, np.float32), np.zeros(window.shape, np.float32)
+    cell = np.flatnonzero(number >= 0)
+    away = points[number[cell]] - origin
     length = np.linalg.norm(away, axis=1)
-    directions = away / length[:, None]
-    shape = window.shape
-    row, column = (np.round(a).astype(np.int64) for a in window.cells(*angles(directions)))
-    turn = round(2 * math.pi / CELL_RAD)
-    distance, residual = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    inside = (row >= 0) & (row < shape[0]) & (column % turn < shape[1])
-    index = np.flatnonzero(inside)
-    index = index[np.argsort(-length[index], kind="stable")]  # the last one written to a cell stays: the nearest
-    q = 1 / length[index]
-    r = q - base.inverse_distance(origin, directions[index])
-    for shift in (0, turn):  # the halo of a whole turn holds some points twice
-        y, x = row[index], column[index] % turn + shift
-        here = x < shape[1]
-        distance[y[here], x[here]], residual[y[here], x[here]] = q[here], r[here]
+    q = 1 / length
+    distance.reshape(-1)[cell] = q
+    residual.reshape(-1)[cell] = q - base.inverse_distance(origin, away / length[:, None])
     return distance, residual
+
+
+def _nearest_points(window: Window, origin: FloatArray, points: Points) -> npt.NDArray[np.int64]:
+    """The nearest point in each cell (rows x columns,), of equally near ones the last; -1 where there is none."""
+    h, w = window.shape
+    number, nearest = np.full(h * w, -1), np.full(h * w, np.inf)
+    turn = round(2 * math.pi / CELL_RAD)
+    for first in range(0, len(points), _CHUNK):
+        away = points[first : first + _CHUNK].T.astype(np.float64, order="C") - origin[:, None]
+        length = np.sqrt((away * away).sum(axis=0))
+        some = np.flatnonzero(window.may_hold(away, length) & (length >= NEAREST_M))
+        length = length[some]
+        directions = np.moveaxis(away[:, some] / length, 0, -1)
+        row, column = (np.round(a).astype(np.int64) for a in window.cells(*angles(directions)))
+        for shift in range(0, w, turn):  # the halo of a whole turn holds some points twice
+            x = column % turn + shift
+            inside = np.flatnonzero((row >= 0) & (row < h) & (x < w))
+            cell, away_m = row[inside] * w + x[inside], length[inside]
+            np.minimum.at(nearest, cell, away_m)
+            first_here = away_m == nearest[cell]
+            number[cell[first_here]] = first + some[inside[first_here]]  # the last one written to a cell stays
+    return number
 
 
 def _nearer_on_both_sides(distance: Layer) -> Layer:

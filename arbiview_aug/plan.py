@@ -13,16 +13,14 @@ import hashlib
 from collections import Counter
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
+from typing import Any
 
-import numpy as np
-
-from arbiview_aug.camera import BoolArray, FloatArray
+from arbiview_aug.camera import BoolArray
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.held import Held
 from arbiview_aug.rig import Rig, content_order
 from arbiview_aug.sampling import AtlasLayout, Scratch
 from arbiview_aug.scene import Scene
-from arbiview_aug.surface import worst_parallax_px
 from arbiview_aug.target_plan import TargetDraft, TargetPlan
 
 
@@ -37,6 +35,7 @@ class RenderPlan:
         targets: One plan for each target camera.
         interpolation: ``linear`` or ``nearest``.
         counters: What was evaluated while building: pairs by surface, cells interpolated and exact, bands.
+        on_devices: The maps as tensors, by device, where they were asked for (``device_maps``); not pickled.
     """
 
     source: Rig
@@ -45,11 +44,16 @@ class RenderPlan:
     targets: tuple[TargetPlan, ...]
     interpolation: str
     counters: dict[str, int] = field(default_factory=dict)
+    on_devices: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "on_devices": {}}
 
     @property
     def nbytes(self) -> int:
-        """Memory held by the maps."""
-        return sum(t.nbytes for t in self.targets)
+        """Memory held by the maps, on devices too."""
+        on_devices = list(self.on_devices.values())
+        return sum(t.nbytes for t in self.targets) + sum(view.nbytes for views in on_devices for view in views)
 
     @property
     def coverage(self) -> list[BoolArray]:
@@ -82,20 +86,6 @@ def plan_key(source: Rig, target: Rig, surface: str, config: FavsConfig, scene: 
     settings = tuple(getattr(config, f.name) for f in fields(config))
     geometry = (scene or Scene()).key
     return hashlib.sha256(repr((source.content_key, target.content_key, surface, settings, geometry)).encode()).digest()
-
-
-def baselines_m(source: Rig, target: Rig) -> FloatArray:
-    """(M, N) distances between the target's and the source's optical centres, roads and origins made to coincide."""
-    target = target.in_frame_of(source)
-    return np.asarray(np.linalg.norm(target.cam2ego[:, None, :3, 3] - source.cam2ego[None, :, :3, 3], axis=-1))
-
-
-def needs_geometry(source: Rig, target: Rig, config: FavsConfig) -> bool:
-    """Whether ``auto`` asks for a surface nearer than ``far`` for any pair of cameras."""
-    return any(
-        worst_parallax_px(float(row.max()), float(camera.K[0, 0])) >= config.far_parallax_px
-        for row, camera in zip(baselines_m(source, target), target, strict=True)
-    )
 
 
 def build_plan(
@@ -133,5 +123,12 @@ def build_plan(
     layout = AtlasLayout.for_sources(source.sizes, used)
     scratch = Scratch()
     targets = tuple(draft.finish(layout, scratch) for draft in drafts)
+    read = {
+        (region.source, region.level)
+        for draft, target in zip(drafts, targets, strict=True)
+        for region in draft.regions
+        if region.source in target.sources
+    }
+    layout = layout.without_others(read)
     counters["bands"] = sum(len(t.bands) for t in targets)
     return RenderPlan(source, target, layout, targets, config.interpolation, dict(counters))

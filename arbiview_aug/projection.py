@@ -5,6 +5,7 @@ Directions are held plane by plane, (3, ny, nx) in memory: three times faster.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import cv2
@@ -13,7 +14,7 @@ import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.dense import FAR_AWAY_PX
-from arbiview_aug.sampling import Slot, halved
+from arbiview_aug.sampling import halved
 
 CORNERS = tuple((a, b) for a in (slice(None, -1), slice(1, None)) for b in (slice(None, -1), slice(1, None)))
 
@@ -55,6 +56,23 @@ def source_points(
     return np.moveaxis(points.reshape(3, *directions.shape[:-1]), 0, -1)
 
 
+def look_apart(one: Camera, two: Camera, nearest: float) -> bool:
+    """Whether the viewing cones of two cameras, widened by the parallax of the nearest scene point, cannot meet.
+
+    Args:
+        one: A camera.
+        two: Another one, in the same ego frame.
+        nearest: The point's inverse distance from either of them, 1/m.
+    """
+    # Law of sines: a point at 1 / q is seen from the two centres in directions that differ by at most asin(b q); by
+    # any angle where it is nearer than the baseline b.
+    nearness = float(np.linalg.norm(one.center_m - two.center_m)) * nearest
+    if nearness >= 1:
+        return False
+    apart = math.acos(float(np.clip(one.cam2ego[:3, 2] @ two.cam2ego[:3, 2], -1, 1)))
+    return apart > one.half_angle_rad + two.half_angle_rad + math.asin(nearness) + 0.01
+
+
 def beyond_image(source: Camera, points: FloatArray, uv: FloatArray, valid: BoolArray) -> npt.NDArray[np.uint8]:
     """Outcodes (...,): which of the image's borders, or the camera's plane, a scene point lies beyond; 0 is unknown.
 
@@ -81,14 +99,16 @@ def larger(vectors: FloatArray) -> FloatArray:
     return np.maximum(np.abs(vectors[..., 0]), np.abs(vectors[..., 1]))
 
 
-def mask_at(source: Camera, slot: Slot, at: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-    """255 where every bilinear tap with a weight at atlas positions (h, w, 2) lies on the scene, not on the own car."""
+def clean_pixels(source: Camera, level: int) -> npt.NDArray[np.uint8]:
+    """255 (h, w) where a source that is halved ``level`` times shows the scene alone, 0 where some of its own car."""
     assert source.mask is not None
-    clean: Any = source.mask.astype(np.uint8) * 255
-    if slot.level:
-        clean = cv2.inRange(halved(clean, slot.level), 255, 255)  # a halved pixel is clean where all in it are
-    local = at - np.array([slot.x, slot.y], np.float32) if slot.x or slot.y else at
-    share = cv2.remap(clean, local, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+    clean: Any = source.mask.view(np.uint8) * np.uint8(255)
+    return cv2.inRange(halved(clean, level), 255, 255) if level else clean  # type: ignore[call-overload,return-value]
+
+
+def mask_at(clean: npt.NDArray[np.uint8], at: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+    """255 where every bilinear tap with a weight at positions (h, w, 2) lies on ``clean_pixels``."""
+    share: Any = cv2.remap(clean, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
     return np.asarray(cv2.inRange(share, 255, 255), np.uint8)  # cv2.compare refuses a single pixel
 
 
@@ -97,7 +117,7 @@ def edge_distance(source: Camera, uv: FloatArray) -> FloatArray:
     inside it; negative outside the image."""
     u, v = uv[..., 0], uv[..., 1]
     edge = np.minimum(np.minimum(u, source.width_px - 1 - u), np.minimum(v, source.height_px - 1 - v)) + 0.5
-    if source.mask is None:
+    if source.mask is None or source.mask.all():
         return edge
     h, w = source.size
     whole = cv2.copyMakeBorder(source.mask.astype(np.float32), 0, -h % 8, 0, -w % 8, cv2.BORDER_REPLICATE)

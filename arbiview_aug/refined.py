@@ -23,6 +23,10 @@ _STEPS = 2
 """Fixed-point iterations: a corrected point lies elsewhere in the view between the cameras, and its change is read
 again. A third one moves nothing by more than 0.02 dB on two real frames."""
 
+_SLACK = 8.0
+"""Maps may err by 1/8 px: distances are measured to a pixel of a view 400 px wide. Against 1/64 px on nuScenes at half
+resolution, raised: 99 % of the positions within 1/16 px, views 61 dB alike, and a third of the time."""
+
 _ROW = 4096  # remap's sizes must stay below 32767
 
 
@@ -66,6 +70,7 @@ class Refined(Static):
     """
 
     smooth: ClassVar[bool] = True
+    slack: ClassVar[float] = _SLACK
     base: Static
     corrections: tuple[Correction, ...]
 
@@ -79,16 +84,18 @@ class Refined(Static):
 
     def _change(self, origin: FloatArray, directions: FloatArray, q: FloatArray) -> FloatArray:
         """Relative change (...,) at the points on rays."""
-        flat, inverse = directions.reshape(-1, 3), q.reshape(-1)
-        total = np.zeros((len(flat), 2), np.float32)
+        rays, inverse = np.moveaxis(directions, -1, 0).reshape(3, -1), q.reshape(-1)
+        total = np.zeros((inverse.size, 2), np.float32)
         for correction in self.corrections:
+            # Views are pinholes. Homogeneous: a point at infinity has q = 0, and most points lie outside a view, which
+            # shows without a division.
             view = correction.view
-            # Homogeneous: a point at infinity has q = 0.
-            points = (flat + inverse[:, None] * (origin - view.center_m)) @ view.cam2ego[:3, :3]
-            ahead = np.flatnonzero(points[:, 2] > 0)
-            uv, _, valid = view.project_cam(points[ahead])
-            inside = valid & view.contains(uv)
-            total[ahead[inside]] += _read(correction.planes, uv[inside])
+            P = view.K @ view.cam2ego[:3, :3].T
+            x, y, z = P @ rays + np.outer(P @ (origin - view.center_m), inverse)
+            h, w = view.size
+            inside = np.flatnonzero((z > 0) & (x >= 0) & (x <= (w - 1) * z) & (y >= 0) & (y <= (h - 1) * z))
+            uv = np.stack([x[inside], y[inside]], axis=-1) / z[inside, None]
+            total[inside] += _read(correction.planes, uv)
         return (total[:, 0] / np.maximum(total[:, 1], 1)).astype(np.float64).reshape(q.shape)
 
 

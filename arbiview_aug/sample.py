@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,7 +14,9 @@ from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.lidar import checked_points, points_of_depth
 from arbiview_aug.objects import checked_boxes
 from arbiview_aug.rig import Rig
+from arbiview_aug.sample_images import check_container, checked_images
 from arbiview_aug.scene import Scene
+from arbiview_aug.surface import Points
 from arbiview_aug.tensors import leading_shape, split
 
 CALIBRATION_KEYS = (
@@ -33,7 +34,6 @@ CALIBRATION_KEYS = (
 """Keys that describe the source's images; they are replaced by the target's or consumed."""
 
 MAX_CAMERAS = 128  # winning sources are int8
-_IMAGE_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)  # torch cannot compare 8 bit floats
 _OFF_CENTER = 0.2  # share of the image's size by which both coordinates of a principal point never lie off its centre
 
 
@@ -67,7 +67,7 @@ def check_inputs(sample: Any, source_rig: Rig | None) -> list[SourceFrame]:
     if "images" not in sample:
         raise SampleError(f"sample: expected a key 'images', got {', '.join(map(str, sample)) or 'an empty dict'}")
     images = sample["images"]
-    _check_container(images)
+    check_container(images)
     lead = leading_shape(images)
     if 0 in lead:
         raise SampleError(f"images: expected at least one frame, got the leading dimensions {lead}")
@@ -77,7 +77,7 @@ def check_inputs(sample: Any, source_rig: Rig | None) -> list[SourceFrame]:
         raise SampleError(f"images: {error}") from None
     indices = list(np.ndindex(*lead))
     return [
-        _frame(_checked_images(frame), sample, source_rig, lead, index)
+        _frame(checked_images(frame), sample, source_rig, lead, index)
         for frame, index in zip(of_frames, indices, strict=True)
     ]
 
@@ -114,18 +114,18 @@ def scenes_of_frames(
     solid: list[FloatArray | None] = [None] * count
     if boxes is not None:
         solid = [checked_boxes(of_frame) for of_frame in _of_frames("boxes_3d", boxes, count, lead)]
-    measured = [None] * count if points is None else points
+    measured: Sequence[Points | None] = [None] * count if points is None else points
     return [Scene(b, p) for b, p in zip(solid, measured, strict=True)]
 
 
 def _points_of_frames(
     sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...]
-) -> list[FloatArray] | None:
+) -> list[Points] | None:
     """(P, 3) measured points of each frame: its ``points``, and those of its depth maps ``depth_m``; None without."""
     points, depth_m = sample.get("points"), sample.get("depth_m")
     if points is None and depth_m is None:
         return None
-    parts: list[list[FloatArray]] = [[] for _ in frames]
+    parts: list[list[np.ndarray]] = [[] for _ in frames]
     if points is not None:
         for part, of_frame in zip(parts, _of_frames("points", points, len(frames), lead), strict=True):
             part.append(checked_points(of_frame))
@@ -141,7 +141,7 @@ def _points_of_frames(
                 raise SampleError(f"depth_m: expected {len(frame.rig)} maps (H, W), one for each image")
             for camera, depth in zip(frame.rig, of_cameras, strict=True):
                 part.append(points_of_depth(camera, _numbers("depth_m", depth, ())))
-    return [np.concatenate(part) for part in parts]
+    return [part[0] if len(part) == 1 else np.concatenate(part) for part in parts]
 
 
 def names_of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[object]:
@@ -156,10 +156,10 @@ def names_of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> 
     return [str(v.tolist()) if isinstance(v, torch.Tensor) else str(v) for v in values]
 
 
-def _of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[np.ndarray]:
+def _of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[Points]:
     """Numbers of each frame: a tensor with the images' leading dimensions, or a list with an entry for each frame."""
     if not lead:
-        return [_numbers(key, value, ())]
+        return [_recorded(key, value)]
     try:
         frames = value if isinstance(value, list | tuple) else split(value, lead)
     except (AttributeError, TypeError, ValueError, RuntimeError):
@@ -167,71 +167,7 @@ def _of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[
     if len(frames) != count:
         got = f"shape {tuple(value.shape)}" if hasattr(value, "shape") else type(value).__name__
         raise SampleError(f"{key}: expected a tensor {lead} + (n, ...), or a list of {count} of them, got {got}")
-    return [_numbers(key, frame, ()) for frame in frames]
-
-
-# --- images -----------------------------------------------------------------------------------------------------------
-def _check_container(images: Any) -> None:
-    if isinstance(images, torch.Tensor):
-        if images.ndim < 4:
-            raise SampleError(f"images: expected shape (..., N, 3, H, W), got {tuple(images.shape)}")
-    elif isinstance(images, list | tuple):
-        for k, image in enumerate(images):
-            if not isinstance(image, torch.Tensor):
-                raise _not_a_tensor(f"images[{k}]", image)
-    else:
-        raise _not_a_tensor("images", images)
-
-
-def _checked_images(images: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
-    if len(images) == 0:
-        raise SampleError("images: expected at least one image, got none")
-    for k, image in enumerate(images):
-        _check_image(k, image)
-    if len({image.dtype for image in images}) > 1 or len({image.device for image in images}) > 1:
-        raise SampleError("images: expected one dtype and device, got several; convert them alike")
-    return tuple(images)
-
-
-def _not_a_tensor(what: str, value: Any) -> SampleTypeError:
-    kind = type(value).__name__
-    if isinstance(value, np.ndarray):
-        fix = "torch.from_numpy(array).permute(2, 0, 1) for an (H, W, 3) RGB array"
-    elif "PIL" in type(value).__module__:
-        fix = "torchvision.transforms.v2.functional.pil_to_tensor(image)"
-    else:
-        fix = "a (N, 3, H, W) tensor, or a list of (3, H, W) tensors"
-    return SampleTypeError(f"{what}: expected torch tensors, got {kind}; use {fix}")
-
-
-def _check_image(k: int, image: torch.Tensor) -> None:
-    shape = tuple(image.shape)
-    if image.ndim != 3 or shape[0] != 3:
-        fix = ""
-        if image.ndim == 2 or (image.ndim == 3 and shape[0] == 1):
-            fix = "; expand grey images to three channels: image.expand(3, -1, -1)"
-        elif image.ndim == 3 and shape[0] == 4:
-            fix = "; drop the alpha channel: image[:3]"
-        elif image.ndim == 3 and shape[-1] in (1, 3, 4):
-            fix = "; permute(2, 0, 1) puts the channels first"
-        raise SampleError(f"images[{k}]: expected an RGB image (3, H, W), got shape {shape}{fix}")
-    if 0 in shape:
-        raise SampleError(f"images[{k}]: expected pixels, got shape {shape}")
-    if image.layout != torch.strided or image.device.type == "meta":
-        kind = image.layout if image.layout != torch.strided else "a meta tensor, which holds no pixels"
-        raise SampleTypeError(f"images[{k}]: expected a dense tensor with pixels, got {kind}; use .to_dense()")
-    if image.dtype == torch.uint8:
-        return
-    if image.dtype not in _IMAGE_FLOATS:
-        if image.dtype.is_floating_point:
-            raise SampleTypeError(f"images[{k}]: expected uint8 or float, got {image.dtype}; convert with .float()")
-        raise SampleTypeError(f"images[{k}]: expected uint8 or float, got {image.dtype}; convert with .to(torch.uint8)")
-    low, high = (float(x) for x in image.detach().aminmax())  # NaN wherever the image has one
-    if not (low >= -1e-3 and high <= 1 + 1e-3):
-        fix = "divide by 255" if high > 1.5 and low >= 0 else "normalise after retargeting, not before"
-        if not (math.isfinite(low) and math.isfinite(high)):
-            fix = "mend them first: torch.nan_to_num(images)"
-        raise SampleError(f"images[{k}]: expected floats in [0, 1], got {low:g} to {high:g}; {fix}")
+    return [_recorded(key, frame) for frame in frames]
 
 
 # --- calibration ------------------------------------------------------------------------------------------------------
@@ -378,16 +314,27 @@ def numbers(key: str, value: Any) -> FloatArray:
     Raises:
         SampleTypeError: It holds no real numbers.
     """
+    return np.asarray(_recorded(key, value), np.float64)
+
+
+def _recorded(key: str, value: Any) -> Points:
+    """An entry of a sample as an array: float32 as it is, the same memory, anything else as float64.
+
+    Raises:
+        SampleTypeError: It holds no real numbers.
+    """
     try:
         if isinstance(value, torch.Tensor):
             if value.layout != torch.strided or value.device.type == "meta":
                 raise TypeError(f"{value.layout} on {value.device}")
             if value.is_complex():
                 raise TypeError("complex numbers")
-            return value.detach().cpu().double().numpy()
+            value = value.detach().cpu()
+            return (value if value.dtype == torch.float32 else value.double()).numpy()
         if np.iscomplexobj(value):
             raise TypeError("complex numbers")
-        return np.asarray(value, dtype=np.float64)
+        array = np.asarray(value)
+        return array if array.dtype == np.float32 else np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # RuntimeError: quantised tensors
         why = " ".join(str(error).split())[:120]
         raise SampleTypeError(f"{key}: expected a tensor of numbers, got {type(value).__name__} ({why})") from None

@@ -11,9 +11,10 @@ An atlas holds the source images that a plan reads, below and beside each other,
 
 from __future__ import annotations
 
+import math
 import threading
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -165,6 +166,10 @@ class AtlasLayout:
             )
         return cls(tuple(slots), (max(rows, 1), max(columns, 1)), False)
 
+    def without_others(self, read: Collection[tuple[int, int]]) -> AtlasLayout:
+        """The same places for the (source, level) pairs that are read: images that win no pixel are not copied."""
+        return replace(self, slots=tuple(slot for slot in self.slots if (slot.source, slot.level) in read))
+
     def slot(self, source: int, level: int) -> Slot:
         """The place of one source at one level."""
         return next(s for s in self.slots if (s.source, s.level) == (source, level))
@@ -265,15 +270,19 @@ def torch_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Te
     """The atlas (B, 3, rows, columns) float32 of (B, 3, H, W) images in 0..255 or [0, 1]; differentiable."""
     whole = images[0].dtype == torch.uint8
     batch, device = images[0].shape[0], images[0].device
-    atlas = torch.zeros((batch, 3, *layout.size), dtype=torch.float32, device=device)
+    # What no slot fills must be finite: bilinear taps of weight 0 read it.
+    is_full = sum(math.prod(slot.size) for slot in layout.slots) == math.prod(layout.size)
+    atlas = (torch.empty if is_full else torch.zeros)((batch, 3, *layout.size), dtype=torch.float32, device=device)
     for slot in layout.slots:
         h, w = slot.size
-        image = images[slot.source].float()
+        image = images[slot.source]
+        if slot.level:
+            image = image.float()
         for _ in range(slot.level):
             image = torch.nn.functional.avg_pool2d(image, 2)
             if whole:
                 image = torch.floor(image + 0.5)  # as OpenCV rounds its halved uint8 images
-        atlas[:, :, slot.y : slot.y + h, slot.x : slot.x + w] = image
+        atlas[:, :, slot.y : slot.y + h, slot.x : slot.x + w] = image  # converts as it copies
     return atlas
 
 

@@ -5,11 +5,15 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 
+import numpy as np
+
 from arbiview_aug.camera import FloatArray
 from arbiview_aug.lidar import LidarObjects, LidarSurface
 from arbiview_aug.objects import Objects
 from arbiview_aug.refined import Correction, Refined
-from arbiview_aug.surface import Far, Ground, Static, Street, Surface, SurfaceName
+from arbiview_aug.surface import Far, Ground, Points, Static, Street, Surface, SurfaceName
+
+_ROWS = 1 << 18  # hashed at once: bytes of ten million points would be another copy of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +27,7 @@ class Scene:
     """
 
     boxes: FloatArray | None = None
-    points: FloatArray | None = None
+    points: Points | None = None
     corrections: tuple[Correction, ...] = ()
 
     @property
@@ -43,7 +47,9 @@ class Scene:
         """Content hash: scenes with equal keys are the same."""
         digest = hashlib.sha256()
         for array in (self.boxes, self.points):
-            digest.update(b"none" if array is None else repr(array.shape).encode() + array.tobytes())
+            digest.update(b"none" if array is None else repr((array.shape, array.dtype.str)).encode())
+            for rows in () if array is None else np.array_split(array, 1 + len(array) // _ROWS):
+                digest.update(rows.tobytes())
         for correction in self.corrections:
             digest.update(correction.key)
         return digest.digest()

@@ -12,7 +12,7 @@ from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.dense import Layer
 from arbiview_aug.grid import Box, Grid
 from arbiview_aug.projection import CORNERS, source_points
-from arbiview_aug.sampling import Slot, level_size
+from arbiview_aug.sampling import level_size
 from arbiview_aug.surface import Layered, Shadows
 from arbiview_aug.target_rays import TargetRays
 
@@ -102,10 +102,9 @@ def _tiles_between(position: FloatArray, count: int) -> tuple[npt.NDArray[np.int
     return first.clip(0, count).astype(np.int64), last.clip(0, count).astype(np.int64)
 
 
-def read_nearest(image: Layer, at: Layer, slot: Slot) -> Any:
-    """Values (h, w) of a source's image at the pixels nearest to atlas positions (h, w, 2), 0 outside it."""
-    local = at - np.array([slot.x, slot.y], np.float32)
-    return cv2.remap(image, local, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
+def read_nearest(image: Layer, at: Layer) -> Any:
+    """Values (h, w) of a source's image at the pixels nearest to positions (h, w, 2), 0 outside it."""
+    return cv2.remap(image, at, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
 
 
 def nearest_pixel(image: npt.NDArray[Any], at: FloatArray) -> tuple[tuple[Any, Any], BoolArray]:

@@ -17,7 +17,8 @@ from arbiview_aug.favs.paper import PaperRendering, check_settings, render_paper
 from arbiview_aug.favs.photometric import Harmoniser
 from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
-from arbiview_aug.plan import PlanCache, RenderPlan, baselines_m, build_plan, needs_geometry, plan_key
+from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
+from arbiview_aug.required import baselines_m, needs_geometry
 from arbiview_aug.rig import Rig
 from arbiview_aug.sample import SourceFrame, names_of_frames, scenes_of_frames
 from arbiview_aug.sampling import Scratch
@@ -110,10 +111,15 @@ class Stitcher:
         """
         if isinstance(self.config, PaperConfig):
             return [View(rendering) for rendering in self._published(self.config, sample, frames, lead, target)]
-        scenes = scenes_of_frames(sample, frames, lead, self.surface)
+        # What decides no pixel is not even read.
+        needed = [needs_geometry(frame.rig, target, self.surface, self.config) for frame in frames]
+        scenes = [Scene()] * len(frames)
+        if any(needed) or self.surface != "auto":
+            scenes = scenes_of_frames(sample, frames, lead, self.surface)
+        names = self._names(sample, len(frames), lead)
         views = []
-        for frame, scene, name in zip(frames, scenes, self._names(sample, len(frames), lead), strict=True):
-            depth = self._depth(self.config, frame, target, scene, name)
+        for frame, scene, name, needs in zip(frames, scenes, names, needed, strict=True):
+            depth = self._depth(self.config, frame, scene, name) if needs else None
             known = scene if depth is None else replace(scene, corrections=depth.corrections)
             views.append(View(self.plan(frame.rig, target, known), depth))
         return views
@@ -145,7 +151,7 @@ class Stitcher:
         if isinstance(self.config, PaperConfig):
             raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
         config, known = self.config, scene or Scene()
-        if self.surface == "auto" and not known.is_empty and not needs_geometry(source, target, config):
+        if not known.is_empty and not needs_geometry(source, target, self.surface, config):
             known = Scene()
         # A frame's geometry never comes back, unless it is a refinement that is reused: its plan must not push out
         # those that do.
@@ -157,7 +163,7 @@ class Stitcher:
     def _built(self, source: Rig, target: Rig, config: FavsConfig, scene: Scene) -> RenderPlan:
         plan = build_plan(source, target, surface=self.surface, config=config, scene=scene)
         self._warn_unreachable(plan)
-        if self.surface == "auto" and scene.best == "street":
+        if self.surface == "auto" and scene.best == "street" and needs_geometry(source, target, "auto", config):
             self._warn_static(source, target)
         return plan
 
@@ -175,14 +181,10 @@ class Stitcher:
             raise SampleError(f"refinement: expected {key!r} in the sample, to tell which frames share a refinement")
         return names_of_frames(key, sample[key], count, lead)
 
-    def _depth(
-        self, config: FavsConfig, frame: SourceFrame, target: Rig, scene: Scene, name: object
-    ) -> OverlapDepth | None:
-        """Depth from overlap, where it is asked for and any pixel's place depends on it: not where it was measured."""
+    def _depth(self, config: FavsConfig, frame: SourceFrame, scene: Scene, name: object) -> OverlapDepth | None:
+        """Depth from overlap, where it is asked for and nothing was measured."""
         surface = scene.best if self.surface == "auto" else self.surface
         if not config.overlap_depth or surface in ("far", "ground", "lidar"):
-            return None
-        if self.surface == "auto" and not needs_geometry(frame.rig, target, config):
             return None
         boxes = scene.boxes if surface == "objects" else None
         if self.refinement is None:

@@ -18,6 +18,9 @@ from arbiview_aug.camera import BoolArray, Camera, FloatArray
 SurfaceName = Literal["auto", "far", "ground", "street", "objects", "lidar"]
 """Surfaces a user can ask for. ``auto`` decides per pair of target and source camera (see ``plan``)."""
 
+Points = npt.NDArray[np.float32] | npt.NDArray[np.float64]
+"""(P, 3) points as they were recorded: millions of them are not copied. They are worked with in float64."""
+
 MAX_INVERSE_DISTANCE = 100.0
 """Nothing is nearer to a camera than 1 cm: keeps points finite when a camera touches a surface."""
 
@@ -33,9 +36,12 @@ class Surface(ABC):
 
     Attributes:
         smooth: Without creases: a map over it may be interpolated by what its values on a grid show.
+        slack: By how much more than settings say maps over it may err where they are interpolated: more than 1 where
+            the surface itself is not known that well.
     """
 
     smooth: ClassVar[bool]
+    slack: ClassVar[float] = 1.0
 
     @abstractmethod
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:

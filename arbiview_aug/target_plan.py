@@ -21,14 +21,12 @@ from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.grid import Box, runs
 from arbiview_aug.maps import PairMap
 from arbiview_aug.projection import edge_distance, resolution
+from arbiview_aug.required import SAME_CENTER_M, serves_alone
 from arbiview_aug.rig import Rig
 from arbiview_aug.sampling import AtlasLayout, FixedMap, Scratch
 from arbiview_aug.surface import Surface, is_within_wall, worst_parallax_px
 from arbiview_aug.target_rays import TargetRays
 from arbiview_aug.tone import Patch, patches
-
-SAME_CENTER_M = 1e-6
-"""Centres closer than this coincide: a homography is exact whatever the scene."""
 
 _STRIP_PX = 128  # rows worked on at once: they fit a cache, and slanted seams make narrow rectangles
 _LEAST_SHARE = 1 / 256  # a source that adds less than this to a pixel cannot change a grey level
@@ -99,6 +97,11 @@ class TargetPlan:
         """(h, w) True where some source sees the pixel."""
         return self.source_camera >= 0
 
+    @property
+    def sources(self) -> set[int]:
+        """Indices of the source cameras that are read."""
+        return {pair.source for pair in self.pairs} | {band.source for band in self.bands}
+
     @cached_property
     def patches(self) -> list[list[Patch]]:
         """For each strip of rows, which source wins where, for tone curves; found when first asked for."""
@@ -162,9 +165,19 @@ class TargetDraft:
         self.rays = TargetRays(camera, step, counters)
         self.grid = self.rays.grid
         # In content order, so that ties never depend on the order of the source list.
-        self.regions = [region for k in order if (region := self._region(k)) is not None]
+        self.regions = [region for k in self._required(order) if (region := self._region(k)) is not None]
 
     # --- what a source sees -------------------------------------------------------------------------------------------
+    def _required(self, order: list[int]) -> list[int]:
+        """The sources that can win a pixel: where one serves the target alone, those at its centre."""
+        if not any(serves_alone(self.source[k], self.camera, self.config) for k in order):
+            return order
+        self.counters["served_alone"] += 1
+        return [k for k in order if self._baseline_m(k) < SAME_CENTER_M]
+
+    def _baseline_m(self, index: int) -> float:
+        return float(np.linalg.norm(self.camera.center_m - self.source[index].center_m))
+
     def _choose_surface(self, baseline_m: float, focal_px: float) -> tuple[str, str]:
         if baseline_m < SAME_CENTER_M:
             return "far", "centres coincide: exact"
@@ -178,7 +191,7 @@ class TargetDraft:
     def _region(self, index: int) -> _Region | None:
         source = self.source[index]
         offset_m = self.camera.center_m - source.center_m
-        baseline_m = float(np.linalg.norm(offset_m))
+        baseline_m = self._baseline_m(index)
         focal_px = float(self.camera.K[0, 0])
         name, reason = self._choose_surface(baseline_m, focal_px)
         surface = self.surface_by_name(name)
@@ -190,7 +203,7 @@ class TargetDraft:
         edge_px = edge_distance(source, pair.uv)
         seen = pair.valid & (edge_px > 0)
         level = self._level(pixels_per_pixel[seen], source.size) if self.config.antialias else 0
-        pair.set_tolerance(self.config.map_tolerance_px * 2**level)
+        pair.set_tolerance(self.config.map_tolerance_px * 2**level * pair.surface.slack)
         seen = pair.visible_nodes(level) & (edge_px > 0)
         parallax = self._expected_parallax(offset_m, focal_px, surface)
         score = (

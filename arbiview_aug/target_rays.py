@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.camera import Camera, FloatArray
-from arbiview_aug.dense import Layer, Planes, pixel_rays
-from arbiview_aug.grid import Grid
+from arbiview_aug.dense import Layer, Planes, cropped, pixel_rays
+from arbiview_aug.grid import Box, Grid, around
 from arbiview_aug.projection import ego_rays
 from arbiview_aug.surface import Dense, Layered, Surface
 
@@ -49,6 +49,7 @@ class TargetRays:
         self._uncertainty: dict[Surface, FloatArray] = {}
         self._solids: dict[Layered, SolidPixels] = {}
         self._dense: dict[Dense, Layer] = {}
+        self._asked: dict[Dense, Box] = {}
         ny, nx = self.grid.shape
         self.sparse_index = np.ix_(np.unique(np.r_[0:ny:4, ny - 1]), np.unique(np.r_[0:nx:4, nx - 1]))
         planes = np.ascontiguousarray(np.moveaxis(self.directions[self.sparse_index], -1, 0))
@@ -102,11 +103,19 @@ class TargetRays:
         """Rays of all pixels."""
         return pixel_rays(self.camera)
 
+    def ask(self, surface: Dense, nodes: Box) -> None:
+        """Say that the pixels between some nodes will be asked for, before any are: no others are evaluated."""
+        held = self._asked.get(surface, nodes)
+        self._asked[surface] = around(held, nodes)
+
     def dense(self, surface: Dense) -> Layer:
-        """Inverse distances (h, w) along ``planes``, in their lengths; evaluated once for each surface."""
+        """Inverse distances (h, w) along ``planes``, in their lengths; evaluated once for each surface, where asked."""
         if surface not in self._dense:
-            x, y, z = self.planes
-            q = surface.image(self.camera) * np.sqrt(x * x + (y * y + z * z))
+            q = np.zeros(self.camera.size, np.float32)
+            y0, y1, x0, x1 = box = self.grid.pixels(self._asked[surface])
+            x, y, z = cropped(self.planes, box)
+            part = self.camera.crop(y0, x0, (y1 - y0, x1 - x0))
+            q[y0:y1, x0:x1] = surface.image(part) * np.sqrt(x * x + (y * y + z * z))
             self._dense[surface] = q
-            self.counters["dense_pixels"] += q.size
+            self.counters["dense_pixels"] += (y1 - y0) * (x1 - x0)
         return self._dense[surface]

@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 import torch
 
-from arbiview_aug.camera import MAX_SIZE_PX
+from arbiview_aug.calibration import MAX_SIZE_PX
 from arbiview_aug.confidence import confidence
+from arbiview_aug.device_maps import maps_on
 from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError
 from arbiview_aug.explain import Explanation, PaperExplanation
@@ -280,14 +281,14 @@ class RigRetarget(torch.nn.Module):
             made, device = views[b].made, images[0].device
             part = self._described(made.target, device)
             part["images"] = stacked(images)
-            winners = [view.source_camera for view in made.targets]
-            part["coverage"] = covered(winners, device)
+            winners = _winners(made, device)
+            part["coverage"] = covered(winners)
             if seams is not None and isinstance(made, RenderPlan):
                 certain = [view.certainty for view in made.targets if view.certainty is not None]
                 of_views = zip(images, certain, part["coverage"], seams[b], strict=True)
                 part["confidence"] = stacked([confidence(*of_view) for of_view in of_views])
             if "source_camera" in self.outputs:
-                part["source_camera"] = stacked([torch.from_numpy(winner.copy()).to(device) for winner in winners])
+                part["source_camera"] = stacked([winner.clone() for winner in winners])
             parts.append(part)
         return parts, [view.made for view in views]
 
@@ -296,7 +297,7 @@ class RigRetarget(torch.nn.Module):
         device = frame.images[0].device
         part = self._described(frame.rig.resized(size), device)
         part["images"] = stacked([resized(image, size) for image in frame.images])
-        part["coverage"] = covered([np.zeros(size, np.int8)] * len(frame.rig), device)
+        part["coverage"] = torch.ones((len(frame.rig), *size), dtype=torch.bool, device=device)
         if "confidence" in self.outputs:
             part["confidence"] = part["coverage"].float()
         if "source_camera" in self.outputs:
@@ -377,6 +378,13 @@ class RigRetarget(torch.nn.Module):
         if self._limited_process != os.getpid() and torch.utils.data.get_worker_info() is not None:
             cv2.setNumThreads(0)
             self._limited_process = os.getpid()
+
+
+def _winners(made: RenderPlan | PaperRendering, device: torch.device) -> list[torch.Tensor]:
+    """(h, w) int8 of each view, which source won; a GPU holds them with the plan."""
+    if isinstance(made, RenderPlan) and device.type != "cpu":
+        return [view.source for view in maps_on(made, device)]
+    return [torch.from_numpy(view.source_camera) for view in made.targets]
 
 
 def _one_of(name: str, value: Any, choices: Sequence[str]) -> None:

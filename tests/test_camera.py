@@ -9,7 +9,8 @@ import re
 import numpy as np
 import pytest
 
-from arbiview_aug.camera import MAX_SIZE_PX, Camera
+from arbiview_aug.calibration import MAX_SIZE_PX
+from arbiview_aug.camera import Camera
 from arbiview_aug.errors import ArbiviewError, CalibrationError
 from arbiview_aug.rotations import nearest_rotation
 
@@ -130,8 +131,48 @@ def test_looking_wants_either_k_or_a_field_of_view() -> None:
     for both in ({}, {"K": K, "horizontal_fov_deg": 60.0}):
         with pytest.raises(CalibrationError, match=r"camera 'a': expected either K or horizontal_fov_deg"):
             Camera.looking(name="a", azimuth_deg=0, width_px=64, height_px=48, **both)
-    with pytest.raises(CalibrationError, match="finite angles"):
-        Camera.looking(name="a", azimuth_deg=np.nan, width_px=64, height_px=48, K=K)
+
+
+WORDS = {
+    "azimuth in words": (
+        lambda: looking(azimuth_deg="30"),
+        r"azimuth, elevation, roll: expected finite angles in degrees, got \('30', 0.0, 0.0\)",
+    ),
+    "no elevation": (lambda: looking(elevation_deg=None), r"expected finite angles in degrees, got \(0.0, None, 0.0\)"),
+    "azimuth not a number": (lambda: looking(azimuth_deg=np.nan), r"expected finite angles in degrees, got \(nan"),
+    "azimuth past all floats": (lambda: looking(azimuth_deg=10**400), r"expected finite angles in degrees"),
+    "position in words": (
+        lambda: looking(position_m=("1", "2", "3")),
+        r"position_m: expected finite \(x, y, z\) in metres, got \('1', '2', '3'\)",
+    ),
+    "place without height": (lambda: looking(position_m=(1.0, 2.0)), r"position_m: expected finite \(x, y, z\)"),
+    "position past all floats": (lambda: looking(position_m=(0, 0, 10**400)), r"position_m: expected finite"),
+    "angle of view in words": (lambda: looking(horizontal_fov_deg="60"), r"horizontal_fov_deg: expected .* got '60'"),
+    "lens as an array": (lambda: looking(lens=np.zeros(3)), r"lens: expected one of pinhole, radtan, fisheye"),
+    "move 3x3": (lambda: looking().moved(np.eye(3)), r"ego2ego: expected shape \(4, 4\), got shape \(3, 3\)"),
+    "move in words": (lambda: looking().moved("left"), r"ego2ego: expected numbers of shape \(4, 4\), got str"),
+    "move of words": (lambda: looking().moved([["1 m"] * 4] * 4), r"ego2ego: expected numbers of shape \(4, 4\)"),
+    "complex move": (lambda: looking().moved(1j * np.eye(4)), r"ego2ego: .* got ndarray \(complex numbers\)"),
+    "turn in words": (lambda: looking().turned(yaw_deg="3"), r"yaw, pitch, roll: expected finite angles in degrees"),
+    "endless turn": (lambda: looking().turned(yaw_deg=np.inf), r"yaw, pitch, roll: expected finite angles"),
+    "shift in words": (lambda: looking().shifted(z_m="1"), r"shift: expected finite \(x, y, z\) in metres"),
+    "one side": (lambda: looking().resize(5), r"size: expected \(h, w\) in pixels, got 5"),
+    "size in words": (lambda: looking().resize(("4", "5")), r"height_px: expected a whole number of pixels .* got '4'"),
+    "half a pixel": (lambda: looking().crop(0.5, 0, (4, 4)), r"top: expected a whole number of pixels .* got 0.5"),
+}
+
+
+def looking(**changes: object) -> Camera:
+    values: dict = dict(name="front", azimuth_deg=0.0, width_px=64, height_px=48, horizontal_fov_deg=60.0)
+    return Camera.looking(**{**values, **changes})
+
+
+@pytest.mark.parametrize("case", WORDS)
+def test_words_and_wrong_shapes_are_refused_by_name(case: str) -> None:
+    change, message = WORDS[case]
+    with pytest.raises(CalibrationError, match=message) as caught:
+        change()
+    assert "camera 'front'" in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import pytest
 from arbiview_aug.camera import Camera
 from arbiview_aug.dense import FAR_AWAY_PX, cropped, pixel_rays, project_pixels
 from arbiview_aug.projection import ego_rays, project_rays
+from arbiview_aug.rig import load_rig
 from arbiview_aug.sampling import Slot
 
 PINHOLE = Camera.looking(
@@ -45,6 +46,19 @@ def test_positions(target: str, source: str, level: int) -> None:
     distance = np.linalg.norm(points, axis=-1)
     expected = np.where(q > 0, 1 / np.maximum(distance, 1e-9), 0.0)
     assert np.allclose(from_source[part], expected[20:290, 31:390][part], rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("name", "share"), [("waymo", 0.2), ("nuplan", 0.2), ("waymo", 0.4), ("fisheye_surround", 0.2)]
+)
+def test_rays_of_lenses(name: str, share: float) -> None:
+    """Inverted on a coarse grid where that is precise, and at every pixel of lenses that bend more."""
+    for camera in load_rig(name).resized(share):
+        rays, valid = camera.unproject_cam(camera.pixel_grid())
+        x, y, z = pixel_rays(camera)
+        off_px = np.linalg.norm(np.dstack([x, y, z]) - rays, axis=-1)[valid] * camera.K[0, 0]
+        assert off_px.max() < 1 / 200
+        assert all((plane[~valid] == 0).all() for plane in (x, y, z))
 
 
 def test_what_lies_behind_a_source_is_far_away() -> None:

@@ -35,6 +35,13 @@ def test_rays_meet_the_nearest_face() -> None:
     assert np.allclose(q[2:], Street().inverse_distance(EYE, rays[2:]))  # beside, above, behind
 
 
+def test_a_box_that_reaches_below_the_road_is_not_cut_off_by_it() -> None:
+    sunk = CAR + np.array([0, 0, -0.3, 0, 0, 0, 0])
+    ray = unit(8, 0, -1.6)[None]
+    assert Street().inverse_distance(EYE, ray) > 1 / np.linalg.norm([8, 0, -1.6])  # a guess
+    assert 1 / Objects(Street(), sunk).inverse_distance(EYE, ray)[0] == pytest.approx(np.linalg.norm([8, 0, -1.6]))
+
+
 def test_a_turned_box_shows_its_corner() -> None:
     turned = CAR.copy()
     turned[0, 6] = np.pi / 2  # 2 m deep now

@@ -176,6 +176,14 @@ def test_minifying_targets_read_halved_sources() -> None:
     assert levels == {1.0: {0}, 0.6: {0}, 0.5: {1}, 0.25: {2}}
 
 
+def test_sources_that_win_nothing_have_no_place_in_the_atlas() -> None:
+    waymo = half_size("waymo")
+    plan = build_plan(half_size("nuscenes"), waymo.with_cameras([waymo[0]]))
+    (view,) = plan.targets
+    assert plan.counters["pairs_street"] == 3 and view.sources == {0}
+    assert [slot.source for slot in plan.layout.slots] == [0] and plan.layout.is_stack
+
+
 def test_road_planes_are_aligned() -> None:
     nuscenes, argoverse = load_rig("nuscenes").resized(0.1), load_rig("argoverse2").resized(0.1)
     plan = build_plan(nuscenes, argoverse)

@@ -12,7 +12,13 @@ from typing import get_args
 import pytest
 
 from arbiview_aug.__main__ import main
+from arbiview_aug.bench import trade
+from arbiview_aug.bench.ablation import NOTES, ROWS, STEPS, markdown
+from arbiview_aug.bench.sweep import settings
 from arbiview_aug.evaluate import paper_tables
+from arbiview_aug.evaluate.frames import Frame
+from arbiview_aug.evaluate.methods import study_methods
+from arbiview_aug.evaluate.paper_tables import REAL_FRAMES, SETS, SYNTHETIC, Study, paper_report
 from arbiview_aug.favs.config import Quality
 from arbiview_aug.rig import shipped_rigs
 from arbiview_aug.surface import SurfaceName
@@ -31,9 +37,21 @@ TINY = {
     "evaluate --paper": ["--size", "16x44", "--frames", "1"],
     "evaluate --figure --data FOLDER": ["--reduce", "4"],
     "inspect nuscenes waymo": [],
+    "bench --data FOLDER --budget-ms 20": [
+        *("--quality", "draft", "--surface", "far", "street", "--reduce", "4", "--size", "40x72", "--repeats", "1")
+    ],
+    "bench --data FOLDER --budget-ms 20 --moves": [
+        *("--quality", "draft", "--surface", "far", "--reduce", "4", "--size", "40x72", "--repeats", "1")
+    ],
+    "bench loader --data FOLDER": [
+        *["--surface", "street", "--size", "32x88", "--reduce", "4", "--workers", "0", "1"],
+        *["--frames", "2", "--epochs", "1"],
+    ],
+    "bench scene --data FOLDER": ["--reduce", "4", "--repeats", "1", "--only", "p skips"],
+    "bench device": ["--device", "cpu", "--sizes", "32x88", "--repeats", "1"],
     "bench speed --data FOLDER": ["--repeats", "1"],
     "bench speed": ["--repeats", "1"],
-    "bench ablation --data FOLDER": ["--reduce", "4", "--only", "far surface"],
+    "bench ablation --data FOLDER": ["--reduce", "4", "--only", "street, not far"],
 }
 """Every command of the README, and options that make it quick."""
 
@@ -46,6 +64,23 @@ def commands() -> set[str]:
 
 def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def measured(mark: str) -> str:
+    """What stands between two marks."""
+    (found,) = re.findall(rf"<!-- {mark}\b.*?-->\n(.*?)<!-- /{mark} -->", README, re.DOTALL)
+    return found
+
+
+def tables(markdown: str) -> list[list[list[str]]]:
+    """The cells of each table, row by row."""
+    found = re.findall(r"(?:^\|.*\n?)+", markdown, re.MULTILINE)
+    return [[[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()] for table in found]
+
+
+def words(markdown: str) -> list[str]:
+    """The paragraphs that are no tables."""
+    return [part.strip() for part in markdown.split("\n\n") if part.strip() and not part.lstrip().startswith("|")]
 
 
 def test_the_code_runs() -> None:
@@ -71,9 +106,53 @@ def test_the_commands_run(
     if "--paper" in arguments:  # whole, it takes long
         monkeypatch.delenv("ARBIVIEW_DATA", raising=False)
         monkeypatch.setattr(paper_tables, "SETS", ("truck",))
+    monkeypatch.setattr(trade, "MOVES", ("truck",))
     monkeypatch.chdir(tmp_path)
     assert main([*arguments, *TINY[command]]) == 0
     assert any(path.is_file() for path in tmp_path.rglob("*"))
+
+
+def test_the_ablation_is_the_commands() -> None:
+    """``bench ablation --data nuscenes-one ddad-one``: headings and steps, all that frames without boxes can tell."""
+    move = {"psnr_db": 1.0, "gain_db": 1.0, "gain_db_per_ms": 1.0}
+    figures = {"turned": move, "raised": move, "ms": 1.0, "added_ms": {"median_ms": 1.0}}
+    steps = {name: figures for name, step in STEPS.items() if ROWS[step.row].fits(Frame({}))}
+    of = {"steps": steps, "overlap": [{}, {}]}
+    (printed,) = tables(markdown({"data": dict.fromkeys(REAL_FRAMES, of)}))
+    (shown,) = tables(measured("ablation"))
+    assert shown[0] == printed[0] and [row[:2] for row in shown] == [row[:2] for row in printed]
+    assert all(re.fullmatch(r"\d\d\.\d\d \([+-]\d\.\d\d\)", row[k]) for row in shown[2:] for k in (2, 3, 6, 7))
+    assert NOTES in words(measured("ablation"))
+
+
+def test_the_trade_is_the_commands() -> None:
+    (block,) = re.findall(r"<!-- trade -->\n(.*?)<!-- /trade -->", README, re.DOTALL)
+    (table,) = re.findall(r"((?:^\|.*\n)+)", block, re.MULTILINE)
+    head, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+    assert head == ["", "", *(heading for heading, _ in trade.COLUMNS)]
+    known = {setting.name for setting in settings(["far", "ground", "street", "lidar"])}
+    assert {name for name, *_ in rows} <= known and sum(mark == "step" for _, mark, *_ in rows) >= 4
+    assert trade.NOTES in block and block.count("kornia's warp_perspective") == 2
+    assert re.search(r"^Recommended, the most accurate within 20 ms a frame: ", block, re.MULTILINE)
+
+
+def test_the_papers_tables_are_the_commands() -> None:
+    """``evaluate --paper``: headings, methods, the paper's own numbers and the words between."""
+    metrics = ("raw_psnr_db", "raw_ssim", "raw_mae", "raw_rmse")
+    real = dict.fromkeys((*metrics, "even_psnr_db"), 1.0)
+    true = dict.fromkeys((*metrics, "true_psnr_db", "true_covered_psnr_db"), 1.0)
+    of_sets = {**dict.fromkeys(REAL_FRAMES, real), SYNTHETIC: true}
+    study = Study({of: {m.name: dict.fromkeys(SETS, row) for m in study_methods()} for of, row in of_sets.items()})
+    for shown, printed in zip(tables(measured("paper")), tables(paper_report(study)), strict=True):
+        assert shown[0] == printed[0] and len(shown) == len(printed)
+        for cells, wanted in zip(shown[2:], printed[2:], strict=True):
+            assert len(cells) == len(wanted)
+            assert all(re.fullmatch(r"-|[\d.]+( / [\d.]+)?", cell) for cell in cells[1:])
+            assert cells[0] == wanted[0]
+            assert [c == "-" for c in cells] == [w == "-" for w in wanted]
+        if "published" in printed[0][1]:
+            assert [row[:5] for row in shown] == [row[:5] for row in printed]
+    assert set(words(paper_report(study))) <= set(words(measured("paper")))
 
 
 def test_measurements_name_tests_that_are_there() -> None:
@@ -84,8 +163,9 @@ def test_measurements_name_tests_that_are_there() -> None:
 
 
 def test_pictures_and_files_exist() -> None:
-    (picture,) = re.findall(r"!\[[^]]*\]\(([^)]+)\)", README)
-    assert 0 < (ROOT / picture).stat().st_size <= LARGEST_PICTURE_BYTES
+    pictures = re.findall(r"!\[[^]]*\]\(([^)]+)\)", README)
+    assert len(pictures) == 2
+    assert all(0 < (ROOT / picture).stat().st_size <= LARGEST_PICTURE_BYTES for picture in pictures)
     for path in re.findall(r"`((?:arbiview_aug|tests|\.ci)/[^`\s]+)`", README):
         assert (ROOT / path).exists(), path
 

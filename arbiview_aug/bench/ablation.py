@@ -1,284 +1,297 @@
 """``python -m arbiview_aug bench ablation``: what each stage and setting is worth, in dB and in milliseconds.
 
-Every row is a configuration of ``RigRetarget``; all render the same targets: the paper's six configurations (each
-camera turned by a share of the spacing to its neighbour) and the rig raised by 0.6 m. On a real frame they are scored
-by the paper's measure, LiDAR points with the colours that the source cameras saw (``evaluate.sparse``), after making
-the exposures even; on the synthetic street against the true views. Pixels that no source sees are black and count.
+Every row is a method; all render the same targets: the paper's six configurations (each camera turned by a share of
+the spacing to its neighbour) and the rig raised by 0.6 m. On real frames they are scored by the paper's measure, LiDAR
+points with the colours that the source cameras saw, exposures made even, unseen pixels black; on the synthetic street
+against the true views, on seen pixels (``evaluate.frames``). A step is the difference of two rows.
 
 Milliseconds are CPU time of a frame on one thread, the median over the targets, without the plan that a calibration
-needs once. The paper's own numbers are printed beside: of nuScenes, raw exposures, and another renderer.
+needs once; steps whose plan belongs to one frame pay for it. What a step adds is the median over the targets of the
+difference between its two rows: rows take turns on each target, so that what else the machine does slows all alike.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
-from arbiview_aug.bench.speed import cpu_model, one_thread
-from arbiview_aug.camera import BoolArray, Camera
-from arbiview_aug.datasets import FrameFolder
+from arbiview_aug.bench.timing import cpu_model, one_thread, quartiles, write_json
+from arbiview_aug.datasets import open_data, reduced_rig
+from arbiview_aug.datasets.images import Reduce
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
-from arbiview_aug.evaluate.methods import paper_stages
-from arbiview_aug.evaluate.overlap import overlap_scores
-from arbiview_aug.evaluate.paper_tables import PUBLISHED
+from arbiview_aug.evaluate.consistency import source_overlap, summary
+from arbiview_aug.evaluate.frames import Frame, make_frame, scores
+from arbiview_aug.evaluate.images import View
+from arbiview_aug.evaluate.methods import Method, Sample, paper_stages, retargeting
 from arbiview_aug.evaluate.scores import mean_of
-from arbiview_aug.evaluate.sparse import coloured_points, equalised, sparse_metrics
+from arbiview_aug.evaluate.tables import Column, cell, markdown_table
 from arbiview_aug.evaluate.targets import UP_M, paper_targets, shifted_target
-from arbiview_aug.evaluate.truth import truth_metrics
-from arbiview_aug.favs.config import FavsConfig, PaperConfig
+from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality
 from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.rig import Rig
-from arbiview_aug.transforms import RigRetarget
+from arbiview_aug.surface import SurfaceName
 
+SYNTHETIC = "synthetic street"
 _WEIGHTS = ("distance", "gradient", "quality", "primary")
-_NO_WEIGHTS: dict[str, Any] = {f"use_{name}_weight": False for name in _WEIGHTS}
-_NO_STAGES_2_3: dict[str, Any] = {"use_feature_matching": False, "use_object_alignment": False}
 
 
-def _without_weight(name: str) -> PaperConfig:
-    off: dict[str, Any] = {f"use_{name}_weight": False}
-    return PaperConfig(**_NO_STAGES_2_3, **off)
+def _stages_1_and_4(*without: str) -> PaperConfig:
+    off: dict[str, Any] = {f"use_{weight}_weight": False for weight in without}
+    return replace(paper_stages()["paper without stages 2 and 3"], **off)
 
 
-ROWS: dict[str, dict[str, Any]] = {
-    **{name: {"quality": config} for name, config in paper_stages().items()},
-    **{f"... and without w_{w}": {"quality": _without_weight(w)} for w in _WEIGHTS},
-    "paper, stage 1 alone": {"quality": PaperConfig(**_NO_STAGES_2_3, **_NO_WEIGHTS)},
-    "draft": {"quality": "draft"},
-    "fast": {"quality": "fast"},
-    "fast on the far surface": {"quality": "fast", "surface": "far"},
-    "fast on the ground surface": {"quality": "fast", "surface": "ground"},
-    "fast on the street surface": {"quality": "fast", "surface": "street"},
-    "fast without blended seams": {"quality": FavsConfig(seam_width=0.0)},
-    "fast, harmonised": {"quality": "fast", "harmonise": True},
-    "accurate": {"quality": "accurate"},
-    "accurate, depth held": {"quality": "accurate", "refinement": True},
+class Row(NamedTuple):
+    """Settings of ``retargeting``; ``held``: with depth from overlap held; ``reduce``: targets 1 / this as large."""
+
+    quality: Quality | FavsConfig | PaperConfig
+    surface: SurfaceName = "street"
+    harmonise: bool = False
+    held: bool = False
+    reduce: Reduce = 1
+
+    def method(self, name: str) -> Method:
+        """The row as a method that holds nothing yet."""
+        refinement = RefinementCache() if self.held else None
+        return retargeting(self.quality, self.surface, name, harmonise=self.harmonise, refinement=refinement)
+
+    def fits(self, frame: Frame) -> bool:
+        """Whether a frame can tell what the row is worth.
+
+        Boxes are needed to stand on the street. LiDAR's colours are read at points: no measure for antialiased views.
+        """
+        if self.reduce > 1:
+            return frame.truth is not None
+        return self.surface != "objects" or "boxes_3d" in frame.sample
+
+
+ROWS: dict[str, Row] = {
+    **{name: Row(config, "far") for name, config in paper_stages().items()},
+    **{f"stages 1 and 4 without w_{w}": Row(_stages_1_and_4(w), "far") for w in _WEIGHTS},
+    "stage 1": Row(_stages_1_and_4(*_WEIGHTS), "far"),
+    "draft": Row("draft"),
+    "fast without blended seams": Row(FavsConfig(seam_width=0.0)),
+    "fast": Row("fast"),
+    "fast, far": Row("fast", "far"),
+    "fast, ground": Row("fast", "ground"),
+    "fast, objects": Row("fast", "objects"),
+    "fast, a quarter as large": Row("fast", reduce=4),
+    "fast, a quarter as large, aliased": Row(FavsConfig(antialias=False), reduce=4),
+    "fast, harmonised": Row("fast", harmonise=True),
+    "accurate": Row("accurate"),
+    "accurate, held": Row("accurate", held=True),
 }
-"""Settings of ``RigRetarget`` by name; ``refinement``: with a cache of its own."""
+"""Methods by name."""
 
 
-def settings_of(name: str) -> dict[str, Any]:
-    """A row's arguments of ``RigRetarget``."""
-    settings = ROWS[name]
-    return {**settings, "refinement": RefinementCache()} if "refinement" in settings else settings
+class Step(NamedTuple):
+    """Two rows that differ by one thing; ``replanned``: with it, every frame needs a plan of its own."""
+
+    row: str
+    without: str
+    replanned: bool = False
 
 
-OWN_CAMERA = "own camera only, far surface"
-"""A row of its own: each target view from the source camera that it was made of."""
+STEPS: dict[str, Step] = {
+    "stage 2, matching": Step("paper", "paper without stage 2, matching"),
+    "stage 3, objects": Step("paper", "paper without stage 3, objects"),
+    "stages 2 and 3": Step("paper", "paper without stages 2 and 3"),
+    "stage 4, weights": Step("paper", "paper without stage 4, weights"),
+    "stages 2, 3 and 4": Step("paper", "stage 1"),
+    **{f"w_{w}": Step("paper without stages 2 and 3", f"stages 1 and 4 without w_{w}") for w in _WEIGHTS},
+    "bilinear, not nearest": Step("fast without blended seams", "draft"),
+    "blended seams": Step("fast", "fast without blended seams"),
+    "ground, not far": Step("fast, ground", "fast, far"),
+    "street, not far": Step("fast", "fast, far"),
+    "street, not ground": Step("fast", "fast, ground"),
+    "boxes on the street": Step("fast, objects", "fast", replanned=True),
+    "antialiasing": Step("fast, a quarter as large", "fast, a quarter as large, aliased"),
+    "depth from overlap": Step("accurate", "fast", replanned=True),
+    "depth from overlap, held": Step("accurate, held", "fast"),
+    "harmonising": Step("fast, harmonised", "fast"),
+}
+"""What is switched on, by name."""
 
-_PUBLISHED = {f"published: {row.name.split(',')[0]}": row._asdict() for row in PUBLISHED.values()}
-"""The paper's Tables 1 and 2."""
-
-_COLUMNS = (
-    ("PSNR dB", "psnr_db", 2),
-    ("SSIM", "ssim", 4),
-    ("MAE", "mae", 2),
-    ("RMSE", "rmse", 2),
-    ("covered dB", "covered_psnr_db", 2),
-    ("raised dB", "raised_psnr_db", 2),
-    ("ms", "ms", 1),
+NOTES = (
+    f"PSNR in dB on the paper's six configurations (turned) and {UP_M} m higher (raised): on real frames at LiDAR "
+    "points, exposures made even, unseen pixels black; on the synthetic street against the true views, on seen pixels. "
+    "CPU ms a frame on one thread, without plans, but for boxes and depth from overlap, where every frame needs its "
+    "own. In parentheses what the step adds; last what a ms of it buys, in 0.001 dB turned / raised; *no time*: the "
+    "added time is within its spread over the targets."
 )
-
-Score = Callable[[Camera, Image, BoolArray], dict[str, float]]
-
-
-@dataclass(frozen=True)
-class _Work:
-    """A frame, what to render of it, and how views are scored.
-
-    Attributes:
-        sample: Images and rig, and boxes where there are any. No points: the score is made of them.
-        turned: The paper's six configurations.
-        raised: The rig raised.
-        scores: For each target rig, in the order of ``turned`` and ``raised``, the score of a view; empty without one.
-        raw: The images as recorded.
-    """
-
-    sample: dict[str, Any]
-    turned: list[Rig]
-    raised: Rig
-    scores: list[Score]
-    raw: Any = field(repr=False)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print the table, write the JSON."""
     parser = argparse.ArgumentParser(
         prog="python -m arbiview_aug bench ablation",
-        description="Each stage and setting on and off: accuracy and milliseconds on one thread.",
+        description="Each stage and setting on and off: accuracy, milliseconds on one thread, and what a ms buys.",
     )
-    parser.add_argument("--data", metavar="FOLDER", help="a frame folder with LiDAR (default: a synthetic street)")
+    parser.add_argument(
+        "--data",
+        metavar="FOLDER",
+        nargs="+",
+        type=Path,
+        default=[],
+        help="data with LiDAR, of each its first frame (default: a synthetic street)",
+    )
     parser.add_argument(
         "--reduce", type=int, choices=(1, 2, 4), default=2, help="decode its images at 1/N (default: %(default)s)"
     )
     parser.add_argument("--seed", type=int, default=0, help="of the synthetic street (default: %(default)s)")
-    parser.add_argument("--only", metavar="TEXT", default="", help="rows whose names contain it")
+    parser.add_argument("--only", metavar="TEXT", default="", help="steps whose names contain it")
     parser.add_argument("--json", action="store_true", help="print JSON instead of the table")
     parser.add_argument("--output", default="output/ablation.json", metavar="FILE", help="(default: %(default)s)")
     arguments = parser.parse_args(argv)
-    names = [name for name in (*ROWS, OWN_CAMERA) if arguments.only in name]
-    if not names:
-        parser.error(f"argument --only: expected part of one of {', '.join((*ROWS, OWN_CAMERA))}")
+    steps = [name for name in STEPS if arguments.only in name]
+    if not steps:
+        parser.error(f"argument --only: expected part of one of {', '.join(STEPS)}")
+    if len({folder.resolve().name for folder in arguments.data}) < len(arguments.data):
+        parser.error("argument --data: expected folders of different names")
     with one_thread(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of targets that are half outside: the paper's are
-        report = measure(arguments.data, names, reduce=arguments.reduce, seed=arguments.seed)
-    text = json.dumps(report, indent=1)
-    print(text if arguments.json else table(report))
+        report = measure(arguments.data, steps, reduce=arguments.reduce, seed=arguments.seed)
     path = Path(arguments.output)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text + "\n")
-    except OSError as error:
-        raise DataError(f"--output {path}: expected a file that can be written to, got {error.strerror}") from None
-    if not arguments.json:
-        print(f"report: {path}")
+    text = write_json(report, path)
+    print(text if arguments.json else f"{markdown(report)}\n\n{report['cpu']}; report: {path}")
     return 0
 
 
 def measure(
-    data: str | Path | None,
-    names: Sequence[str],
+    data: Sequence[Path],
+    steps: Sequence[str],
     *,
-    reduce: int = 2,
+    reduce: Reduce = 2,
     seed: int = 0,
     size: tuple[int, int] = (256, 704),
 ) -> dict[str, Any]:
-    """All rows asked for, as plain data for JSON.
+    """All steps asked for and the rows that they need, as plain data for JSON.
 
     Args:
-        data: A frame folder with LiDAR; None for a synthetic street.
-        names: Names out of ``ROWS``, or ``OWN_CAMERA``.
-        reduce: The frame's images are decoded at 1 / this.
+        data: Folders of data with LiDAR, of each the first frame; none for a synthetic street.
+        steps: Names out of ``STEPS``.
+        reduce: The images of folders are decoded at 1 / this.
         seed: Of the street.
         size: (h, w) of its images.
     """
-    work = _street(seed, size) if data is None else _real(Path(data), reduce)
-    rows = {name: _row(name, work) for name in tqdm(names, unit="row", leave=False)}
-    overlap = None
-    if data is not None:
-        rig = work.sample["rig"]
-        overlap = {h: _raw_overlap_db(rig, work.raw, h == "harmonised") for h in ("as recorded", "harmonised")}
-    return {
-        "benchmark": "ablation",
-        "data": "synthetic street" if data is None else Path(data).name,
-        "size": list(work.sample["rig"].sizes[0]),
-        "cpu": cpu_model(),
-        "rows": rows,
-        "raw_overlap_db": overlap,
-        "published": _PUBLISHED,
-    }
+    found = {}
+    for name, frame in _frames(data, reduce, seed, size):
+        fitting = {step: STEPS[step] for step in steps if ROWS[STEPS[step].row].fits(frame)}
+        rows = _rows(name, frame, {row for step in fitting.values() for row in (step.row, step.without)})
+        metric = "even_psnr_db" if frame.truth is None else "true_covered_psnr_db"
+        found[name] = {
+            "size": list(frame.sample["rig"].sizes[0]),
+            "rows": rows,
+            "steps": {step: step_figures(which, rows, metric) for step, which in fitting.items()},
+            "overlap": [_overlap(frame, harmonised) for harmonised in (False, True) if "harmonising" in fitting],
+        }
+    return {"benchmark": "ablation", "cpu": cpu_model(), "data": found}
 
 
-def table(report: Mapping[str, Any]) -> str:
-    """The report to read."""
-    h, w = report["size"]
-    against = "true views" if report["data"] == "synthetic street" else "LiDAR colours, exposures even"
-    lines = [
-        f"{report['data']} at {w}x{h}, against {against}; {report['cpu']}, one thread",
-        f"{'':<34}" + "".join(f"{heading:>12}" for heading, *_ in _COLUMNS),
+def markdown(report: Mapping[str, Any]) -> str:
+    """The table of steps, data sets side by side, and what is to be known about it."""
+    sets: Mapping[str, Any] = report["data"]
+    head = ["", "part of", *(h for name in sets for h in (f"{name}: turned", "raised", "ms", "mdB a ms"))]
+    rows = [
+        [name, step.row, *(text for of in sets.values() for text in _cells(of["steps"].get(name)))]
+        for name, step in STEPS.items()
+        if any(name in of["steps"] for of in sets.values())
     ]
-    for name, row in (report["rows"] | report["published"]).items():
-        cells = [f"{row[key]:.{digits}f}" if key in row else "-" for _, key, digits in _COLUMNS]
-        lines.append(f"{name:<34}" + "".join(f"{cell:>12}" for cell in cells))
-    if report["raw_overlap_db"]:
-        found = ", ".join(f"{name} {value:.2f}" for name, value in report["raw_overlap_db"].items())
-        lines.append(f"Overlaps of neighbours on the raw frame, odd tiles, street surface, PSNR in dB: {found}")
-    lines.append(f"The paper's six turns; raised by {UP_M} m; unseen pixels black, except in 'covered'.")
-    return "\n".join(lines)
+    parts = [NOTES, markdown_table(head, rows, left=2)]
+    db = Column("", "overlap_raw_psnr_db")
+    overlaps = [
+        f"{name} {' to '.join(cell(row, db) for row in of['overlap'])}" for name, of in sets.items() if of["overlap"]
+    ]
+    if overlaps:
+        parts.append(f"Harmonising is for where neighbours overlap: as recorded, in dB, {', '.join(overlaps)}.")
+    return "\n\n".join(parts)
 
 
 # --- what is measured -------------------------------------------------------------------------------------------------
-def _real(folder: Path, reduce: int) -> _Work:
-    frame = FrameFolder(folder, reduce=reduce)[0]  # type: ignore[arg-type]
-    if "points" not in frame:
-        raise DataError(f"--data {folder}: expected LiDAR points to score by, got none")
-    rig, points = frame["rig"], frame["points"].numpy().astype(np.float64)
-    even: list[Image] = list(equalised(rig, as_arrays(frame["images"]), points))
-    coloured = coloured_points(rig, even, points)
-
-    def score(camera: Camera, view: Image, coverage: BoolArray) -> dict[str, float]:
-        found = sparse_metrics(view, camera, coloured, coverage=coverage)
-        return {} if found is None else found.as_dict()
-
-    targets = paper_targets(rig)
-    sample = {"images": as_tensors(even), "rig": rig}
-    sample |= {key: frame[key] for key in ("boxes_3d", "box_names") if key in frame}
-    return _Work(sample, targets, shifted_target(rig, z_m=UP_M), [score] * (len(targets) + 1), frame["images"])
+def _frames(data: Sequence[Path], reduce: Reduce, seed: int, size: tuple[int, int]) -> Iterator[tuple[str, Frame]]:
+    for folder in data:
+        sample = open_data(folder, reduce=reduce)[0]
+        if "points" not in sample:
+            raise DataError(f"--data {folder}: expected LiDAR points to score by, got none")
+        yield folder.resolve().name, make_frame(sample, exposures=("even",))
+    if not data:
+        drive = SyntheticDrive(demo_source_rig(size), num_frames=1, seed=seed, lidar=False)
+        yield SYNTHETIC, make_frame(drive[0], truth=partial(drive.render, 0), exposures=())
 
 
-def _street(seed: int, size: tuple[int, int]) -> _Work:
-    source = demo_source_rig(size)
-    drive = SyntheticDrive(source, num_frames=1, seed=seed, lidar=False)
-    frame, targets, raised = drive[0], paper_targets(source), shifted_target(source, z_m=UP_M)
-
-    def against(target: Rig) -> Score:
-        truth = dict(zip(target.names, as_arrays(drive.render(0, target).images), strict=True))
-        return lambda camera, view, coverage: truth_metrics(view, truth[camera.name], coverage=coverage)
-
-    sample = {key: frame[key] for key in ("images", "rig", "boxes_3d")}
-    return _Work(sample, targets, raised, [against(target) for target in (*targets, raised)], frame["images"])
-
-
-def _row(name: str, work: _Work) -> dict[str, float]:
-    times: list[float] = []
-    turned: list[dict[str, float]] = []
-    raised: list[dict[str, float]] = []
-    for k, (target, score) in enumerate(zip((*work.turned, work.raised), work.scores, strict=True)):
-        views, coverage, seconds = _own_camera(work, target) if name == OWN_CAMERA else _rendered(name, work, target)
-        times.append(1e3 * seconds)
-        mounted = target.in_frame_of(work.sample["rig"])
-        rows = [score(*view) for view in zip(mounted, views, coverage, strict=True)]
-        (turned if k < len(work.turned) else raised).extend(row for row in rows if row)
-    wanted = [key for _, key, _ in _COLUMNS]
-    means = {key: value for key, value in mean_of(turned).items() if key in wanted}
-    return means | {"raised_psnr_db": mean_of(raised)["psnr_db"], "ms": statistics.median(times)}
+def _rows(data: str, frame: Frame, names: set[str]) -> dict[str, dict[str, Any]]:
+    """Of each row the mean metrics, ``turned`` and ``raised``, and the times on each target, ``ms`` and ``plan_ms``."""
+    rig: Rig = frame.sample["rig"]
+    targets = [("turned", target) for target in paper_targets(rig)] + [("raised", shifted_target(rig, z_m=UP_M))]
+    keys = ("turned", "raised", "ms", "plan_ms")
+    found: dict[str, dict[str, Any]] = {row: {key: [] for key in keys} for row in ROWS if row in names}
+    with tqdm(total=len(targets) * len(found), desc=data, unit="row", leave=False) as progress:
+        for move, target in targets:
+            for name, row in found.items():
+                metrics, times = _timed(frame, name, target)
+                row[move] += metrics
+                row["ms"].append(times[-1])
+                row["plan_ms"].append(times[0] - times[-1])
+                progress.update()
+    return {name: row | {move: mean_of(row[move]) for move in ("turned", "raised")} for name, row in found.items()}
 
 
-def _rendered(name: str, work: _Work, target: Rig) -> tuple[list[Image], list[BoolArray], float]:
-    retarget = RigRetarget(target, **settings_of(name))
-    if not isinstance(retarget.config, PaperConfig):  # which plans nothing
-        retarget(work.sample)
-    start = time.process_time()
-    out = retarget(work.sample)
-    return as_arrays(out["images"]), [seen.numpy() for seen in out["coverage"]], time.process_time() - start
+def _timed(frame: Frame, name: str, target: Rig) -> tuple[list[dict[str, float]], list[float]]:
+    """Metrics of a row's views, and CPU ms of the first call, which plans, and of the next; the paper plans nothing."""
+    row, times = ROWS[name], []
+    method, calls = row.method(name), 1 if isinstance(row.quality, PaperConfig) else 2
+
+    def render(sample: Sample, rig: Rig) -> list[View]:
+        for _ in range(calls):
+            start = time.process_time()
+            views = method.render(sample, rig)
+            times.append(1e3 * (time.process_time() - start))
+        return views
+
+    return scores(frame, render, reduced_rig(target, row.reduce), ("even",))[1], times
 
 
-def _own_camera(work: _Work, target: Rig) -> tuple[list[Image], list[BoolArray], float]:
-    rig = work.sample["rig"]
-    views, coverage, seconds = [], [], 0.0
-    for k, camera in enumerate(target):
-        retarget = RigRetarget(target.with_cameras([camera]), surface="far")
-        sample = {"images": [work.sample["images"][k]], "rig": rig.with_cameras([rig[k]])}
-        retarget(sample)
-        start = time.process_time()
-        out = retarget(sample)
-        seconds += time.process_time() - start
-        views.extend(as_arrays(out["images"]))
-        coverage.append(out["coverage"][0].numpy())
-    return views, coverage, seconds
+def step_figures(step: Step, rows: Mapping[str, Any], metric: str) -> dict[str, Any]:
+    """What a step reaches, what it adds, and how much of it for each ms; None where the ms are within their spread."""
+    row, without = rows[step.row], rows[step.without]
+    ms = np.add(row["ms"], row["plan_ms"]) if step.replanned else np.array(row["ms"])
+    added = quartiles(ms - np.array(without["ms"]))
+    figures: dict[str, Any] = {"ms": statistics.median(ms.tolist()), "added_ms": added._asdict()}
+    for move in ("turned", "raised"):
+        gain = row[move][metric] - without[move][metric]
+        per_ms = gain / added.median_ms if added.q1_ms > 0 else None
+        figures[move] = {"psnr_db": row[move][metric], "gain_db": gain, "gain_db_per_ms": per_ms}
+    return figures
 
 
-def _raw_overlap_db(rig: Rig, images: Any, harmonised: bool) -> float:
-    """Mean PSNR over the pairs of neighbours between their renderings of the view between them."""
-    gains = RigRetarget(rig, harmonise=harmonised).harmonisation({"images": images, "rig": rig}).gains
+def _cells(step: Mapping[str, Any] | None) -> list[str]:
+    if step is None:
+        return ["-"] * 4
+    moves, ms, added_ms = (step["turned"], step["raised"]), step["ms"], step["added_ms"]["median_ms"]
+    digits = 0 if ms >= 100 else 1
+    bought = [move["gain_db_per_ms"] for move in moves]
+    return [
+        *(f"{move['psnr_db']:.2f} ({_signed(move['gain_db'], 2)})" for move in moves),
+        f"{ms:.{digits}f} ({_signed(added_ms, digits)})",
+        "no time" if None in bought else " / ".join(_signed(1e3 * db, 0) for db in bought),
+    ]
 
-    def render(view: Camera, source: int) -> tuple[Image, BoolArray]:
-        one, target = rig.with_cameras([rig[source]]), rig.with_cameras([view])
-        retarget = RigRetarget(target, surface="street", harmonise=[gains[source]])
-        out = retarget({"images": [images[source]], "rig": one})
-        return as_arrays(out["images"])[0], out["coverage"][0].numpy()
 
-    found = [score.raw_psnr_db for score in overlap_scores(rig, render)]
-    return float(np.mean([value for value in found if value is not None]))
+def _signed(value: float, digits: int) -> str:
+    """With a sign, of which a rounded 0 has +."""
+    return f"{round(value, digits) + 0.0:+.{digits}f}"
+
+
+def _overlap(frame: Frame, harmonised: bool) -> dict[str, float]:
+    """Agreement of neighbours in the view between them, on the frame as recorded."""
+    return summary("overlap", source_overlap(frame.sample, retargeting("fast", "street", harmonise=harmonised)))

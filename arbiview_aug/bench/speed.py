@@ -8,10 +8,8 @@ preallocated outputs of the target's size, with float32 maps that read a source 
 (x, y the output pixel): a mild stretch, one source each. Every figure is a ratio to the floor of the same output size,
 because milliseconds of different machines cannot be compared.
 
-One thread. The clock is the process's CPU time, over all of its threads: on an idle machine that is the time on the
-wall, on a busy one it leaves the waiting out. Each round runs the floor and all candidates of one size in turn, each
-once unmeasured to warm its caches and then once measured, so that what else the machine does slows all alike. A time is
-the median over the rounds; a ratio is the median over the rounds of candidate / floor within a round.
+How times are taken stands in ``bench.timing``. A time is the median over the rounds; a ratio is the median over the
+rounds of candidate / floor within a round.
 
 ``frame`` is the cached plan executed: the sample's uint8 images in, one uint8 (M, 3, h, w) tensor out. ``interleaved``
 images lie channels-last in one block, as this package's readers give them, ``planar`` ones are contiguous. ``whole
@@ -23,15 +21,10 @@ the frame with known gains for all cameras.
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import platform
 import statistics
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +32,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
-from tqdm import tqdm
 
+from arbiview_aug.bench.timing import machine, machine_line, one_thread, quartiles, timed_rounds, versions, write_json
 from arbiview_aug.datasets import FrameFolder, reduced_rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.targets import without_masks
@@ -61,7 +54,6 @@ _EGO_MOTION = (0.4, 0.07)
 """Largest movement (m) and turn (deg) of a camera between its own and the LiDAR's time on nuScenes."""
 _GAINS = (0.8, 1.1, 0.9, 1.25, 1.05, 0.95)
 """Gains of every source, as far apart as a real frame's: none of them is free."""
-_DISTRIBUTIONS = ("arbiview_aug", "torch", "numpy")
 
 
 @dataclass(frozen=True)
@@ -117,11 +109,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     report = measure(arguments.data or default_data(), arguments.repeats)
     print(table(report))
     path = Path(arguments.output)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(report, indent=1) + "\n")
-    except OSError as error:
-        raise DataError(f"--output {path}: expected a file that can be written to, got {error.strerror}") from None
+    write_json(report, path)
     print(f"report: {path}")
     return 0
 
@@ -160,24 +148,16 @@ def measure(
         "data": "random smooth images" if data is None else Path(data).name,
         "sources": [list(size) for size in rig.sizes],
         "rounds": {"full size": repeats, "small": repeats * _SMALL_ROUNDS},
-        "machine": {
-            "cpu": cpu_model(),
-            "cores": os.cpu_count(),
-            "threads": 1,
-            "load_before": load_before,
-            "load_after": os.getloadavg(),
-        },
-        "versions": {"python": platform.python_version(), "opencv": cv2.__version__} | _versions(),
+        "machine": machine(load_before),
+        "versions": versions(),
         "measures": [asdict(m) for m in measures],
     }
 
 
 def table(report: dict[str, Any]) -> str:
     """The report to read."""
-    machine, versions = report["machine"], report["versions"]
     lines = [
-        f"{machine['cpu']}, one thread of {machine['cores']} cores, load {machine['load_before'][0]:.1f} to "
-        f"{machine['load_after'][0]:.1f}; " + ", ".join(f"{name} {version}" for name, version in versions.items()),
+        machine_line(report),
         f"{'':<44}{'median':>11}{'quartiles':>18}  ratio to",
     ]
     for m in report["measures"]:
@@ -194,7 +174,7 @@ def _full_size(rig: Rig, images: torch.Tensor) -> list[_Candidate]:
     label = "{1}x{0}".format(*rig.sizes[0])
     floor, frame = f"{label} floor", f"{label} frame, interleaved"
     return [
-        _Candidate(floor, _floor(images, rig.sizes[0])),
+        _Candidate(floor, remap_floor(images, rig.sizes[0])),
         _Candidate(frame, _frame(rig, target, images), floor, 1.5),
         _Candidate(f"{label} frame, planar", _frame(rig, target, images.contiguous()), floor, 1.5),
         _Candidate(f"{label} frame, harmonised", _frame(rig, target, images, _GAINS), frame),
@@ -209,7 +189,7 @@ def _small_size(rig: Rig, images: torch.Tensor, halves: torch.Tensor, size: tupl
     label = "{1}x{0}".format(*size)
     floor, full, half = f"{label} floor", f"{label} frame, from full size", f"{label} frame, from half size"
     return [
-        _Candidate(floor, _floor(images, size)),
+        _Candidate(floor, remap_floor(images, size)),
         _Candidate(full, _frame(rig, target, images), floor, 2.2),
         _Candidate(f"{full}, harmonised", _frame(rig, target, images, _GAINS), full),
         _Candidate(half, _frame(half_rig, target, halves), floor, 1.6),
@@ -221,7 +201,8 @@ def _small_size(rig: Rig, images: torch.Tensor, halves: torch.Tensor, size: tupl
     ]
 
 
-def _floor(images: torch.Tensor, size: tuple[int, int]) -> Callable[[], None]:
+def remap_floor(images: torch.Tensor, size: tuple[int, int]) -> Callable[[], None]:
+    """The floor: bare remaps of as many views of ``size`` (h, w) as there are images (N, 3, >=h, >=w) uint8."""
     h, w = size
     sources = [np.ascontiguousarray(image.permute(1, 2, 0).numpy()[:h, :w]) for image in images]
     y, x = np.indices((h, w), dtype=np.float32)
@@ -275,45 +256,20 @@ def _plan_with_ego_motion(source: Rig, target: Rig) -> Callable[[], Any]:
 
 # --- measuring --------------------------------------------------------------------------------------------------------
 def _run(candidates: list[_Candidate], rounds: int, label: str) -> list[Measure]:
-    times = {candidate.name: np.empty(rounds) for candidate in candidates}
-    for k in tqdm(range(rounds), desc=label, unit="round", leave=False):
-        for candidate in candidates:
-            candidate.run()
-            start = time.process_time()
-            candidate.run()
-            times[candidate.name][k] = 1e3 * (time.process_time() - start)
+    times = timed_rounds({candidate.name: candidate.run for candidate in candidates}, rounds, label)
     return [_measure(candidate, times) for candidate in candidates]
 
 
 def _measure(candidate: _Candidate, times: dict[str, npt.NDArray[np.float64]]) -> Measure:
     own = times[candidate.name]
-    q1, median, q3 = np.quantile(own, [0.25, 0.5, 0.75])
     ratio = statistics.median(own / times[candidate.of]) if candidate.of else 1.0
     return Measure(
         name=candidate.name,
         of=candidate.of,
-        median_ms=float(median),
-        q1_ms=float(q1),
-        q3_ms=float(q3),
+        **quartiles(own)._asdict(),
         ratio=float(ratio),
         bound=candidate.bound,
     )
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """OpenCV, torch and the linear algebra behind numpy on one thread; as before afterwards."""
-    from threadpoolctl import threadpool_limits  # a dependency of scikit-learn
-
-    before = cv2.getNumThreads(), torch.get_num_threads()
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
-    try:
-        with threadpool_limits(1, user_api="blas"):
-            yield
-    finally:
-        cv2.setNumThreads(before[0])
-        torch.set_num_threads(before[1])
 
 
 def _inputs(data: str | Path | None, full_size: tuple[int, int] | None) -> tuple[Rig, torch.Tensor, torch.Tensor]:
@@ -334,23 +290,3 @@ def _smooth_images(count: int, size: tuple[int, int]) -> torch.Tensor:
     coarse = rng.integers(0, 256, (count, 24, 40, 3), np.uint8)
     block = np.stack([cv2.resize(image, size[::-1], interpolation=cv2.INTER_CUBIC) for image in coarse])
     return torch.from_numpy(block).permute(0, 3, 1, 2)
-
-
-def cpu_model() -> str:
-    """As the kernel names it; platforms without /proc have at least the architecture."""
-    try:
-        text = Path("/proc/cpuinfo").read_text()
-    except OSError:
-        text = ""
-    names = [line.partition(":")[2].strip() for line in text.splitlines() if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
-
-
-def _versions() -> dict[str, str]:
-    found = {}
-    for name in _DISTRIBUTIONS:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found

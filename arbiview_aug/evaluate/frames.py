@@ -60,6 +60,11 @@ class Frame:
     held_out: bool = False
     truth: Callable[[Rig], RenderedViews] | None = None
 
+    @property
+    def scored_sample(self) -> dict[str, Any]:
+        """What methods get where views are scored: with exposures made even, where points score so."""
+        return self.lidar["even"].sample if "even" in self.lidar else self.sample
+
 
 def make_frame(
     sample: Mapping[str, Any],

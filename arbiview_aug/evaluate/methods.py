@@ -10,12 +10,16 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
+import torch
+
 from arbiview_aug.evaluate.baselines import BASELINES, Renderer
 from arbiview_aug.evaluate.images import Image, View, as_arrays
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config, paper
 from arbiview_aug.favs.overlap_depth import OverlapDepth, overlap_depth
+from arbiview_aug.favs.photometric import Harmonise, Harmoniser
 from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.rig import Rig
+from arbiview_aug.sample import check_inputs, scenes_of_frames
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.transforms import RigRetarget
 
@@ -23,6 +27,9 @@ Sample = Mapping[str, Any]
 
 READS_POINTS = ("auto", "lidar")
 """Surfaces that may be made of a sample's ``points``."""
+
+OURS: tuple[Quality, ...] = ("draft", "fast", "accurate")
+"""The presets that are not the published method."""
 
 _HELD_TRANSFORMS = 8  # as many as a set of targets has; full-size plans take 50 MB each
 
@@ -58,6 +65,8 @@ def retargeting(
     name: str = "",
     *,
     outputs: Sequence[str] = (),
+    harmonise: Harmonise = None,
+    refinement: RefinementCache | None = None,
 ) -> Method:
     """``RigRetarget`` as a method; a transform, with its last plan, for each of the last target rigs.
 
@@ -66,41 +75,76 @@ def retargeting(
         surface: As for ``RigRetarget``.
         name: For tables; by default made of both.
         outputs: Further outputs, ``confidence`` where there is to be one.
+        harmonise: As for ``RigRetarget``.
+        refinement: As for ``RigRetarget``.
     """
 
     @lru_cache(_HELD_TRANSFORMS)
     def transform(target: Rig) -> RigRetarget:
-        return RigRetarget(target, quality=quality, surface=surface, outputs=outputs, cache_bytes=0)
+        return RigRetarget(
+            target,
+            quality=quality,
+            surface=surface,
+            outputs=outputs,
+            harmonise=harmonise,
+            refinement=refinement,
+            cache_bytes=0,
+        )
 
     def render(sample: Sample, target: Rig) -> list[View]:
         return views_of(transform(target)(sample))
 
     def render_alone(sample: Sample, camera: int, target: Rig) -> View:
-        """The depth that all cameras' overlaps gave, as if it had been found before."""
-        given = one_camera(sample, camera)
-        depth = RefinementCache()
-        depth.get((given["rig"].content_key, None), lambda: whole.get(sample))
-        retarget = RigRetarget(target, quality=quality, surface=surface, refinement=depth, cache_bytes=0)
+        """With the depth and the gain that all cameras' overlaps gave, as if they had been found before."""
+        given, (depth, gains) = one_camera(sample, camera), overlaps.get(sample)
+        held = None
+        if depth is not None:
+            held, found = RefinementCache(), depth
+            held.get((given["rig"].content_key, None), lambda: found)
+        gain = None if gains is None else gains[camera : camera + 1]
+        retarget = RigRetarget(target, quality=quality, surface=surface, harmonise=gain, refinement=held, cache_bytes=0)
         (view,) = views_of(retarget(given))
         return view
 
-    config, whole = favs_config(quality), _LastDepth()
+    config = favs_config(quality)
     label = name or (f"{quality}, {surface}" if isinstance(quality, str) else f"{type(quality).__name__}, {surface}")
     learns = isinstance(config, FavsConfig) and config.overlap_depth
+    overlaps = _LastOverlaps(surface if learns else None, Harmoniser(harmonise))
     reads_points = surface in READS_POINTS and not isinstance(config, PaperConfig)
-    return Method(label, render, reads_points, render_alone if learns else None)
+    return Method(label, render, reads_points, render_alone if overlaps.tell else None)
 
 
-class _LastDepth:
-    """Depth from overlap of the last sample: a dozen views of it are rendered in a row."""
+class _LastOverlaps:
+    """What the overlaps of the last sample tell: a dozen views of it are rendered in a row.
 
-    def __init__(self) -> None:
-        self._last: tuple[Sample, OverlapDepth] | None = None
+    Args:
+        surface: The surface whose distances they correct; None where depth is not asked for.
+        harmoniser: Gives the gains.
+    """
 
-    def get(self, sample: Sample) -> OverlapDepth:
+    def __init__(self, surface: SurfaceName | None, harmoniser: Harmoniser) -> None:
+        self._surface, self._harmoniser = surface, harmoniser
+        self._last: tuple[Sample, tuple[OverlapDepth | None, Sequence[float] | None]] | None = None
+
+    @property
+    def tell(self) -> bool:
+        """Whether anything is asked of them."""
+        return self._surface is not None or self._harmoniser.is_on
+
+    def get(self, sample: Sample) -> tuple[OverlapDepth | None, Sequence[float] | None]:
+        """Depth and gains, each where it is asked for."""
         if self._last is None or self._last[0] is not sample:
-            self._last = sample, overlap_depth(sample["rig"], list(sample["images"]))
+            rig, images = sample["rig"], list(sample["images"])
+            gains = self._harmoniser.report(rig, images).gains if self._harmoniser.is_on else None
+            self._last = sample, (self._depth(sample, rig, images), gains)
         return self._last[1]
+
+    def _depth(self, sample: Sample, rig: Rig, images: list[torch.Tensor]) -> OverlapDepth | None:
+        if self._surface is None:
+            return None
+        (scene,) = scenes_of_frames(sample, check_inputs(sample, None), (), self._surface)
+        surface = scene.best if self._surface == "auto" else self._surface
+        return overlap_depth(rig, images, scene.boxes if surface == "objects" else None)  # as ``Stitcher`` measures it
 
 
 def one_camera(sample: Sample, camera: int) -> dict[str, Any]:
@@ -156,5 +200,5 @@ def study_methods() -> list[Method]:
     return [
         *map(baseline, BASELINES),
         *published,
-        *(retargeting(q, "street", q) for q in ("draft", "fast", "accurate")),
+        *(retargeting(quality, "street", quality) for quality in OURS),
     ]

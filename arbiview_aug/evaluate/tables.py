@@ -75,6 +75,20 @@ def text_table(
     return "\n".join([*lines, *(f"  {note}" for note in notes)])
 
 
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> str:
+    """A Markdown table that reads well as it is: the first ``left`` columns to the left, the others to the right."""
+    widths = [max(3, *(len(line[k]) for line in (head, *rows))) for k in range(len(head))]
+    rule = ["-" * width if k < left else "-" * (width - 1) + ":" for k, width in enumerate(widths)]
+    lines = [
+        [
+            text.ljust(width) if k < left else text.rjust(width)
+            for k, (text, width) in enumerate(zip(line, widths, strict=True))
+        ]
+        for line in (head, rule, *rows)
+    ]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
 def cell(row: Mapping[str, float], column: Column) -> str:
     """One number as it is printed."""
     value = row.get(column.metric)

@@ -247,8 +247,8 @@ def accurate() -> FavsConfig:
 
 
 def paper() -> PaperConfig:
-    """Stages 1 to 4 as published: a named baseline. On the two real frames at hand it is 4.0 and 2.6 dB below ``fast``
-    with its own surface (the paper's turns, sparse PSNR), and takes 43 to 64 times as long."""
+    """Stages 1 to 4 as published: a named baseline. On the two real frames at hand it is 4.1 and 2.6 dB below ``fast``
+    with its own surface (the paper's turns, sparse PSNR), and takes 36 to 55 times as long."""
     return PaperConfig()
 
 

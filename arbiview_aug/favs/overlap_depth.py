@@ -24,6 +24,7 @@ import numpy.typing as npt
 import torch
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
+from arbiview_aug.favs.dense_flow import dense_flow, why_ambiguous
 from arbiview_aug.favs.photometric import reduced
 from arbiview_aug.neighbours import adjacent_pairs, half_way_view, odd_tiles
 from arbiview_aug.projection import edge_distance, ego_rays, project_rays
@@ -43,9 +44,6 @@ MIN_RISE_DB = 0.2
 
 SMOOTHING_PX = 5.0
 """σ of the normalised smoothing of depth, at a view 400 px wide."""
-
-ROUND_TRIP_PX = 0.75
-"""Flow there and back that misses by this much counts half: it has been to something else."""
 
 LEAST_PARALLAX_PX = 1.5
 """Where the views shift by less than this when the distance halves, flow's own error would become depth: changes are
@@ -247,11 +245,10 @@ def _refine(
     names = cameras[0].name, cameras[1].name
     one, two = (_read_over(strip.q, strip, c, image) for c, image in zip(cameras, images, strict=True))
     fit, test = strip.fit, strip.test
-    if min(float(view[strip.both].std()) for view in (one, two)) < _BLANK_GREY:
-        return None, PairReport(*names, False, "one of the images shows nothing")
-    if max(_repetition(view, strip.both) for view in (one, two)) > _REPEATS:
-        return None, PairReport(*names, False, "the texture repeats itself: matches would be ambiguous")
-    flow, trust = _flow(one, two, strip.both)
+    ambiguous = why_ambiguous(one, two, strip.both)
+    if ambiguous:
+        return None, PairReport(*names, False, ambiguous)
+    flow, trust = dense_flow(one, two, strip.both)
     if not np.any(trust > 0.5):
         return None, PairReport(*names, False, "nothing in one image is found in the other and back")
     along, epipolar = _epipolar(strip, cameras, surface, flow)
@@ -269,32 +266,6 @@ def _refine(
     return _extended(strip, final, views), PairReport(*names, True, words, before, after)
 
 
-_BLANK_GREY = 2.0  # spread of grey levels below which an image is blank, or black night
-
-
-_REPEATS = 0.7
-"""Correlation of an overlap with itself, shifted sideways, from which on its texture repeats: gratings have 0.9 and
-more, the overlaps of three real frames 0.35 at most."""
-
-
-def _repetition(image: npt.NDArray[np.float32], inside: BoolArray) -> float:
-    """Highest correlation of a view (h, w, 3) with itself, shifted along its rows beyond where it first fell to 0.3."""
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    window = inside.astype(np.float32)
-    size = cv2.getOptimalDFTSize(2 * inside.shape[1])
-    mean = cv2.blur(grey * window, (33, 33)) / np.maximum(cv2.blur(window, (33, 33)), 1e-3)
-    detail = (grey - mean) * window
-    spectra = [np.fft.rfft(values, size, axis=1) for values in (detail, detail**2, window)]
-    products = ((0, 0), (1, 2), (2, 1), (2, 2))
-    shifted, here, there, pixels = (
-        np.fft.irfft((spectra[a] * spectra[b].conj()).sum(axis=0), size)[: inside.shape[1] // 2] for a, b in products
-    )
-    correlation = shifted / np.sqrt(np.maximum(here, 1e-6) * np.maximum(there, 1e-6))
-    correlation = correlation[pixels > pixels[0] / 4]  # fewer say nothing
-    fallen = np.flatnonzero(correlation < 0.3)
-    return float(correlation[fallen[0] :].max()) if len(fallen) else 0.0
-
-
 def _read_over(q: FloatArray, strip: _Strip, camera: Camera, small: _Small) -> npt.NDArray[np.float32]:
     """A camera's image (h, w, 3) in the half-way view, over a surface."""
     uv, _ = project_rays(camera, strip.rays, q, strip.view.center_m - camera.center_m)
@@ -304,37 +275,6 @@ def _read_over(q: FloatArray, strip: _Strip, camera: Camera, small: _Small) -> n
         cv2.remap(small.image, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),  # type: ignore[call-overload]
         np.float32,
     )
-
-
-def _flow(
-    one: npt.NDArray[np.float32], two: npt.NDArray[np.float32], both: BoolArray
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Optical flow (h, w, 2) from one view to the other, and how far to trust it, (h, w) in [0, 1].
-
-    The views are brought to one brightness. What only one of them shows is filled by the mean of both, blurred, so that
-    nothing moves there.
-    """
-    grey = [cv2.cvtColor(view, cv2.COLOR_RGB2GRAY) for view in (one, two)]
-    log = [np.log(np.maximum(view[both], 4)) for view in grey]
-    half = np.exp(np.median(log[0] - log[1]) / 2)
-    grey = [grey[0] / half, grey[1] * half]
-    inside = both.astype(np.float32)
-    around = cv2.GaussianBlur((grey[0] + grey[1]) / 2 * inside, (0, 0), 6) / np.maximum(
-        cv2.GaussianBlur(inside, (0, 0), 6), 1e-3
-    )
-    first, second = (np.clip(np.where(both, view, around), 0, 255).astype(np.uint8) for view in grey)
-    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    dis.setFinestScale(0)
-    dis.setVariationalRefinementIterations(0)  # half the time, and depth is smoothed anyway
-    there: Any = dis.calc(first, second, None)  # type: ignore[call-overload]
-    back: Any = dis.calc(second, first, None)  # type: ignore[call-overload]
-    h, w = both.shape
-    x, y = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
-    x, y = x + there[..., 0], y + there[..., 1]
-    returned = cv2.remap(back, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1e3, 1e3))
-    found = cv2.remap(inside, x, y, cv2.INTER_NEAREST)
-    miss = np.linalg.norm(there + returned, axis=-1)
-    return there, np.where(both & (found > 0), 1 / (1 + (miss / ROUND_TRIP_PX) ** 4), 0).astype(np.float32)
 
 
 def _epipolar(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
 
 from arbiview_aug import sampling
+from arbiview_aug.device_maps import Blend, maps_on
 from arbiview_aug.plan import RenderPlan
 from arbiview_aug.sampling import Scratch
 from arbiview_aug.tone import STRIP_ROWS, ToneCurve
@@ -88,51 +90,73 @@ def render_torch(
         M views (B, 3, h, w) of the images' type.
     """
     dtype, device = images[0].dtype, images[0].device
+    whole = dtype == torch.uint8
     atlas = sampling.torch_atlas(plan.layout, images)
+    tones = None if curves is None else _Tones.of(curves, len(images), device, 255.0 if whole else 1.0)
     views = []
-    for target in plan.targets:
-        coverage = torch.from_numpy(target.coverage).to(device)
-        grid = sampling.torch_grid(target.at.to_float(), plan.layout.size, device)
-        view = sampling.grid_sample(atlas, grid, plan.interpolation) * coverage
-        if curves is not None:
-            view = _toned(view, torch.from_numpy(target.source_camera).to(device), curves, dtype == torch.uint8)
-        if seams is not None:
-            seams.append(view.new_zeros(view.shape[0], *coverage.shape))
-        for band in target.bands:
-            bh, bw = band.weight.shape
-            part = (slice(None), slice(None), slice(band.y, band.y + bh), slice(band.x, band.x + bw))
-            second = sampling.grid_sample(
-                atlas, sampling.torch_grid(band.at.to_float(), plan.layout.size, device), plan.interpolation
-            )
-            if curves is not None:
-                second = _toned(second, torch.tensor(band.source, device=device), curves, dtype == torch.uint8)
-            weight = torch.from_numpy(band.weight).to(device)
-            if seams is not None:
-                seams[-1][(slice(None), *part[2:])] += (view[part] - second).detach().abs().mean(1) * weight
-            blended = view.clone()
-            blended[part] = torch.lerp(view[part], second, weight.expand_as(second))
-            view = blended
+    for maps in maps_on(plan, device):
+        view = sampling.grid_sample(atlas, maps.grid, plan.interpolation)
+        if tones is not None:
+            view = tones.applied(view, maps.source.long(), whole)
+        change = None if seams is None else view.new_zeros(view.shape[0], *view.shape[2:])
+        if maps.blend is not None:
+            view = _blended(view, atlas, maps.blend, plan.interpolation, tones, whole, change)
+        if seams is not None and change is not None:
+            seams.append(change)
         views.append(_rounded(view, dtype))
     return views
 
 
-def _toned(
-    views: torch.Tensor, source: torch.Tensor, curves: Sequence[Sequence[ToneCurve] | None], whole: bool
+def _blended(
+    view: torch.Tensor,
+    atlas: torch.Tensor,
+    blend: Blend,
+    interpolation: str,
+    tones: _Tones | None,
+    whole: bool,
+    change: torch.Tensor | None,
 ) -> torch.Tensor:
-    """Views (B, 3, h, w) after the curves of the sources (h, w), or the one source (), that they are read from."""
-    frames = []
-    for view, of_sources in zip(views, curves, strict=True):
-        if of_sources is None:
-            frames.append(view)
-            continue
+    """A view (B, 3, h, w) with its second sources; into ``change`` (B, h, w) goes what they changed."""
+    second = sampling.grid_sample(atlas, blend.grid, interpolation)[:, :, 0]  # [B, 3, n]
+    if tones is not None:
+        second = tones.applied(second, blend.source, whole)
+    first = view.flatten(2)[:, :, blend.pixel]
+    if change is not None:
+        change.flatten(1)[:, blend.pixel] = (first - second).detach().abs().mean(1) * blend.weight
+    mixed = torch.lerp(first, second, blend.weight.expand_as(second))
+    return view.flatten(2).index_copy(2, blend.pixel, mixed).view_as(view)
+
+
+class _Tones(NamedTuple):
+    """The curves of all frames and sources as tensors: two straight lines each (see ``ToneCurve``).
+
+    Attributes:
+        gain: (B, N) slope of the lower line; 1 where nothing changes.
+        slope: (B, N) of the upper line.
+        offset: (B, N) its value at 0.
+    """
+
+    gain: torch.Tensor
+    slope: torch.Tensor
+    offset: torch.Tensor
+
+    @classmethod
+    def of(cls, curves: Sequence[Sequence[ToneCurve] | None], sources: int, device: torch.device, top: float) -> _Tones:
+        none = [ToneCurve(1.0)] * sources
+        frames = [none if of_frame is None else of_frame for of_frame in curves]
+        lines = [[(c.gain, c.upper_slope, top * (1 - c.upper_slope)) for c in of_frame] for of_frame in frames]
+        return cls(*torch.tensor(lines, dtype=torch.float32).to(device).unbind(-1))
+
+    def applied(self, view: torch.Tensor, source: torch.Tensor, whole: bool) -> torch.Tensor:
+        """Views (B, 3, ...) read from sources (...,), -1 for none, after their curves."""
+        gain, slope, offset = (lines[:, source][:, None] for lines in self)  # [B, 1, ...]
         # Whole numbers as the OpenCV execution has them, which looks them up in a table.
         read = torch.floor(view + 0.5) if whole else view
-        for k in source.unique().tolist():
-            if k >= 0 and of_sources[k].gain != 1:
-                toned = of_sources[k].of_tensor(read, 255.0 if whole else 1.0)
-                view = torch.where(source == k, torch.floor(toned + 0.5).clamp(0, 255) if whole else toned, view)
-        frames.append(view)
-    return torch.stack(frames)
+        lower, upper = read * gain, read * slope + offset
+        toned = torch.where(gain > 1, torch.minimum(lower, upper), torch.maximum(lower, upper))
+        if whole:
+            toned = torch.floor(toned + 0.5).clamp(0, 255)
+        return torch.where((gain != 1) & (source >= 0), toned, view)
 
 
 def render_labels(plan: RenderPlan, labels: Sequence[torch.Tensor], fill: float) -> list[torch.Tensor]:

@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.evaluate import methods
 from arbiview_aug.evaluate.baselines import BASELINES, row_split
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.methods import baseline, one_camera, paper_stages, retargeting, study_methods, views_of
 from arbiview_aug.favs.config import PaperConfig
-from arbiview_aug.favs.overlap_depth import overlap_depth
+from arbiview_aug.favs.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.neighbours import half_way_view
 from arbiview_aug.rig import Rig
 from arbiview_aug.transforms import RigRetarget
@@ -88,6 +89,43 @@ def test_depth_from_overlap_reaches_a_camera_alone() -> None:
         (accurate.alone(sample, k, view).image != fast.alone(sample, k, view).image).any() for k in range(len(rig))
     ]
     assert any(changed)
+
+
+@pytest.mark.filterwarnings("ignore:the target rig")
+def test_a_camera_alone_knows_the_depth_that_all_together_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where boxes stand on the street, what shows them is not measured; over the street alone it is."""
+    drive = SyntheticDrive(demo_source_rig((48, 132)), num_frames=1, lidar=False)
+    sample, given = drive[0], []
+    rig: Rig = sample["rig"]
+    view = rig.with_cameras([half_way_view(rig[0], rig[1], (28, 50))])
+
+    def spied(rig: Rig, images: list, boxes: np.ndarray | None = None) -> OverlapDepth:
+        given.append(boxes)
+        return overlap_depth(rig, images, boxes)
+
+    monkeypatch.setattr(methods, "overlap_depth", spied)
+    for surface in ("street", "objects", "auto"):
+        method = retargeting("accurate", surface)
+        for _ in range(2):  # found once
+            method.alone(sample, 0, view)
+    street, *with_boxes = given
+    assert street is None and [len(boxes) for boxes in with_boxes] == [len(sample["boxes_3d"])] * 2
+
+
+@pytest.mark.filterwarnings("ignore:the target rig")
+def test_a_camera_alone_has_the_gain_that_all_together_give_it() -> None:
+    sample = SyntheticDrive(demo_source_rig((128, 352)), num_frames=1, lidar=False)[0]
+    sample["images"][0] //= 2  # the others are twice as bright
+    rig: Rig = sample["rig"]
+    view = rig.with_cameras([half_way_view(rig[0], rig[1], (28, 50))])
+    harmonised = retargeting("fast", "street", harmonise=True)
+    gains = RigRetarget(rig, harmonise=True).harmonisation(sample).gains
+    assert gains[0] > 1.2 * gains[1]
+    for k in (0, 1):
+        out = RigRetarget(view, surface="street", harmonise=[gains[k]])(one_camera(sample, k))
+        np.testing.assert_array_equal(harmonised.alone(sample, k, view).image, as_arrays(out["images"])[0])
+    as_it_is = retargeting("fast", "street").alone(sample, 0, view).image
+    assert harmonised.alone(sample, 0, view).image.mean() > 1.2 * as_it_is.mean()
 
 
 def test_confidence_comes_along() -> None:

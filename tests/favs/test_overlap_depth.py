@@ -15,6 +15,7 @@ from arbiview_aug.favs.config import accurate, favs_config
 from arbiview_aug.favs.overlap_depth import LIMITS, MIN_RISE_DB, OverlapDepth, overlap_depth
 from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.neighbours import half_way_view
+from arbiview_aug.plan import RenderPlan, build_plan
 from arbiview_aug.refined import Correction, Refined
 from arbiview_aug.rig import Rig
 from arbiview_aug.scene import Scene
@@ -226,6 +227,24 @@ def test_a_correction_belongs_to_the_scene_not_to_a_ray() -> None:
     uv, _, valid = view.project(origin + rays / q[:, None])
     assert valid.all()
     np.testing.assert_allclose(q / base - 1, uv[:, 0] / (SIZE[1] - 1) * 0.4, atol=2e-3)
+
+
+def test_maps_over_corrections_err_by_an_eighth_of_a_pixel(
+    nearer: tuple[torch.Tensor, OverlapDepth], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not by a 64th: the distances are not known that well, and every bend would be evaluated pixel by pixel."""
+    scene = Scene(corrections=nearer[1].corrections)
+
+    def built(slack: float) -> RenderPlan:
+        monkeypatch.setattr(Refined, "slack", slack)
+        return build_plan(RIG, TARGET, surface="street", scene=scene)
+
+    quick, thorough = built(Refined.slack), built(1.0)
+    assert quick.counters["cells_exact"] < 0.6 * thorough.counters["cells_exact"]
+    for one, two in zip(quick.targets, thorough.targets, strict=True):
+        same = (one.source_camera == two.source_camera) & one.coverage
+        off_px = np.abs(one.at.to_float() - two.at.to_float()).max(-1)[same]
+        assert same.mean() > 0.99 * one.coverage.mean() and np.quantile(off_px, 0.99) <= 1 / 8
 
 
 def test_two_corrections_count_by_their_shares() -> None:

@@ -1,10 +1,13 @@
 """Executing plans: identity, agreement of the executions, agreement with a warp by H_geom, labels, gradients."""
 
+import pickle
+
 import cv2
 import numpy as np
 import pytest
 import torch
 
+from arbiview_aug.device_maps import maps_on
 from arbiview_aug.favs.config import draft
 from arbiview_aug.favs.geometric_transformation import h_geom
 from arbiview_aug.favs.synthesis import render_labels, render_opencv, render_torch
@@ -157,6 +160,42 @@ def test_batches_equal_single_frames() -> None:
     for b, images in enumerate(frames):
         single = render_torch(plan, [image[None] for image in images])
         assert all(torch.equal(x[b], y[0]) for x, y in zip(batch, single, strict=True))
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("autocast", [False, True])
+def test_half_precision_images_keep_float32_positions(dtype: torch.dtype, autocast: bool) -> None:
+    rig = load_rig("nuscenes").resized(0.2)
+    plan = build_plan(rig, rig.turned(yaw_deg=12))
+    images = [(image[None].float() / 255).to(dtype) for image in noise_images(rig)]
+    with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+        views = render_torch(plan, images)
+    exact = render_torch(plan, [image.float() for image in images])  # the same values
+    assert all(view.dtype == dtype for view in views)
+    assert all(torch.equal(view, other.to(dtype)) for view, other in zip(views, exact, strict=True))
+    maps = maps_on(plan, torch.device("cpu"))[0]
+    assert maps.grid.dtype == torch.float32 and (maps.blend is None or maps.blend.grid.dtype == torch.float32)
+    # What half precision would have done: pixels elsewhere.
+    seen = maps.source >= 0
+    rows = (maps.grid.bfloat16().float() - maps.grid)[seen][:, 1].abs() * plan.layout.size[0] / 2
+    assert rows.max() > 0.5
+
+
+def test_maps_are_moved_to_a_device_once() -> None:
+    rig = load_rig("nuscenes").resized(0.2)
+    plan, device = build_plan(rig, rig.turned(yaw_deg=12)), torch.device("cpu")
+    before = plan.nbytes
+    maps = maps_on(plan, device)
+    assert maps_on(plan, device) is maps and plan.nbytes == before + sum(view.nbytes for view in maps)
+    again = pickle.loads(pickle.dumps(plan))
+    assert not again.on_devices and again.nbytes == before
+    for view, target in zip(maps, plan.targets, strict=True):
+        second = np.zeros(target.coverage.shape, int)
+        for band in target.bands:
+            h, w = band.weight.shape
+            second[band.y : band.y + h, band.x : band.x + w] += band.weight > 0
+        assert second.max() == 1 and view.blend is not None  # or the order of the bands would matter
+        assert np.array_equal(np.flatnonzero(second), np.sort(view.blend.pixel.numpy()))
 
 
 def test_uncovered_pixels_are_black() -> None:

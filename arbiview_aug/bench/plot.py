@@ -1,0 +1,72 @@
+"""The plot of ``bench trade``: milliseconds across, decibels up, the front joined."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+_COLOURS = {"draft": "#7f7f7f", "fast": "#1f77b4", "accurate": "#2ca02c", "paper": "#d62728"}
+_MARKERS = {"opencv": "o", "torch": "^", "cuda": "s"}
+
+
+def save_plot(rows: Sequence[Mapping[str, Any]], steps: Sequence[str], title: str, path: Path) -> None:
+    """Write the plot as a PNG.
+
+    Args:
+        rows: Settings with their figures, as in the report.
+        steps: Names of those on the front that are worth telling apart: they are named.
+        title: Above.
+        path: The file.
+    """
+    # Without pyplot: no global state, and no display is looked for.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 6.2), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for row in rows:
+        middle, low, high = row["median_ms"], row["q1_ms"], row["q3_ms"]
+        colour = _COLOURS[row["quality"]]
+        spread = [[max(middle - low, 0)], [max(high - middle, 0)]]
+        on_front = row["front"]
+        axes.errorbar(
+            middle,
+            row["psnr_db"],
+            xerr=spread,
+            fmt=_MARKERS[row["execution"]],
+            color=colour,
+            markersize=8 if on_front else 5,
+            markerfacecolor=colour if on_front else "none",
+            alpha=1 if on_front else 0.55,
+            elinewidth=1,
+        )
+    front = sorted((row["median_ms"], row["psnr_db"]) for row in rows if row["front"])
+    axes.step(*zip(*front, strict=True), where="post", color="black", linewidth=0.8, alpha=0.6)
+    named = sorted((row for row in rows if row["name"] in steps), key=lambda row: row["median_ms"])
+    middle = math.sqrt(front[0][0] * max(row["median_ms"] for row in rows))
+    for k, row in enumerate(named):
+        right = row["median_ms"] > middle
+        axes.annotate(
+            row["name"],
+            (row["median_ms"], row["psnr_db"]),
+            xytext=(-8 if right else 8, 8 if k % 2 else -14),
+            textcoords="offset points",
+            fontsize=8,
+            ha="right" if right else "left",
+        )
+    axes.set_xscale("log")
+    axes.set_xlabel("CPU milliseconds a frame, one thread (median, quartiles)")
+    axes.set_ylabel("PSNR where some source sees, dB")
+    axes.set_title(title, fontsize=10)
+    axes.grid(True, which="both", alpha=0.2)
+    for label, colour in _COLOURS.items():
+        if all(row["quality"] != label for row in rows):
+            continue
+        axes.plot([], [], "o", color=colour, label=label)
+    for label in dict.fromkeys(row["execution"] for row in rows):
+        axes.plot([], [], _MARKERS[label], color="black", markerfacecolor="none", label=label)
+    axes.legend(fontsize=8, loc="best")
+    figure.savefig(path)

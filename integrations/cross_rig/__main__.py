@@ -1,0 +1,86 @@
+"""``python -m integrations.cross_rig --quick | --pilot | --full | --large``, from the repository's root."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from integrations.cross_rig.arms import ARMS
+from integrations.cross_rig.experiment import Run, run
+from integrations.cross_rig.report import markdown, write_report
+from integrations.cross_rig.settings import Settings, full, jobs, large, pilot, quick
+from integrations.cross_rig.worlds import CHANGES
+
+PRESETS = {"quick": quick, "pilot": pilot, "full": full, "large": large}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Make what is missing and write the report; killed, the same command goes on where it was."""
+    arguments = _parser().parse_args(argv)
+    settings = _settings(arguments)
+    setup = Run(settings=settings, output=arguments.output)
+    missing = setup.missing()
+    if arguments.list:
+        waiting = {job.name for job in missing}
+        for job in jobs(settings):
+            print(f"{'missing' if job.name in waiting else 'done   '}  {job.name}")
+        return 0
+    began = time.monotonic()
+
+    def log(line: str) -> None:
+        print(f"[{time.monotonic() - began:6.0f} s] {line}", file=sys.stderr, flush=True)
+
+    log(f"{len(missing)} of {len(jobs(settings))} trainings to do, in {arguments.output}")
+    report: dict[str, Any] = {}
+    for left in run(setup, arguments.workers, log):
+        report = write_report(setup)
+        log(f"{left} trainings left")
+    print(markdown(report))
+    print(f"{arguments.output / 'report.json'}, report.md, report.png")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m integrations.cross_rig",
+        description="Does a detector trained on retargeted frames of vehicle A work on vehicle B? Everything that is "
+        "made is kept in the output folder: a command that is killed goes on where it was.",
+    )
+    preset = parser.add_mutually_exclusive_group(required=True)
+    for name, settings in PRESETS.items():
+        preset.add_argument(f"--{name}", dest="preset", action="store_const", const=name, help=settings.__doc__)
+    parser.add_argument("--output", type=Path, default=Path("output/cross_rig"), metavar="DIR", help="(%(default)s)")
+    parser.add_argument(
+        "--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes of one thread (%(default)s)"
+    )
+    parser.add_argument("--list", action="store_true", help="only say which trainings are done")
+    change = parser.add_argument_group("instead of the preset's")
+    change.add_argument("--changes", nargs="+", choices=CHANGES, metavar="CHANGE", help=", ".join(CHANGES))
+    change.add_argument("--arms", nargs="+", choices=ARMS, metavar="ARM", help=", ".join(ARMS))
+    change.add_argument("--seeds", nargs="+", type=int, metavar="SEED")
+    change.add_argument("--train-frames", type=int, metavar="N")
+    change.add_argument("--val-frames", type=int, metavar="N")
+    change.add_argument("--test-frames", type=int, metavar="N")
+    change.add_argument("--steps", type=int, metavar="N")
+    change.add_argument("--precision", choices=("bf16", "fp32"))
+    change.add_argument("--device", help="of the trainings, cpu or cuda")
+    return parser
+
+
+def _settings(arguments: argparse.Namespace) -> Settings:
+    settings = PRESETS[arguments.preset]()
+    names = ("changes", "arms", "seeds", "train_frames", "val_frames", "test_frames")
+    given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
+    given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
+    of_schedule = {n: getattr(arguments, n) for n in ("steps", "precision", "device") if getattr(arguments, n)}
+    return replace(settings, schedule=replace(settings.schedule, **of_schedule), **given)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

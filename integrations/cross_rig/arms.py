@@ -1,0 +1,51 @@
+"""The arms of the experiment, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from integrations.cross_rig.views import Arm, Geometry
+
+_ALL: tuple[Geometry, ...] = ("points", "boxes_3d")
+ARMS: dict[str, Arm] = {
+    arm.name: arm
+    for arm in (
+        Arm(name="raw", title="raw A", kind="raw"),
+        Arm(name="scale_crop", title="raw A, scaled and cropped", kind="raw", augmented=True),
+        Arm(name="row_split", title="row split", kind="row_split"),
+        Arm(name="far", title="far", kind="retarget", surface="far"),
+        Arm(name="street", title="street", kind="retarget", surface="street"),
+        Arm(name="objects", title="objects", kind="retarget", surface="objects", reads=("boxes_3d",)),
+        Arm(name="points", title="lidar, no boxes", kind="retarget", surface="lidar", reads=("points",)),
+        Arm(name="lidar", title="lidar", kind="retarget", surface="lidar", reads=_ALL),
+        Arm(name="auto", title="auto", kind="retarget", surface="auto", reads=_ALL),
+        Arm(name="auto_bare", title="auto, images alone", kind="retarget", surface="auto"),
+        Arm(name="depth", title="true depth", kind="retarget", surface="lidar", reads=("depth_m",)),
+        Arm(name="street_mixed", title="street + raw", kind="retarget", surface="street", mixed=True),
+        Arm(
+            name="objects_mixed",
+            title="objects + raw",
+            kind="retarget",
+            surface="objects",
+            reads=("boxes_3d",),
+            mixed=True,
+        ),
+        Arm(name="lidar_mixed", title="lidar + raw", kind="retarget", surface="lidar", reads=_ALL, mixed=True),
+        Arm(name="lidar_filled", title="lidar, Telea", kind="retarget", surface="lidar", reads=_ALL, filled=True),
+        Arm(name="random", title="RandomRig around B, auto", kind="retarget", reads=_ALL, random=True),
+        Arm(name="oracle", title="B's own frames", kind="oracle"),
+    )
+}
+"""By name, in the order of tables."""
+
+
+def named_arms(names: Sequence[str]) -> list[Arm]:
+    """Arms by name, in the order of ``ARMS``.
+
+    Raises:
+        ValueError: An unknown name.
+    """
+    unknown = [name for name in names if name not in ARMS]
+    if unknown:
+        raise ValueError(f"arms: expected some of {', '.join(ARMS)}, got {', '.join(unknown)}")
+    return [arm for arm in ARMS.values() if arm.name in names]

@@ -1,0 +1,210 @@
+"""Runs what is missing: frames, then trainings, then tests; each is a file, and a run can be killed at any time."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from integrations.cross_rig.cache import code_hash, content_hash
+from integrations.cross_rig.frames import Source, make_frames, one_thread
+from integrations.cross_rig.labels import Grid, covered_cells
+from integrations.cross_rig.model import BevDetector
+from integrations.cross_rig.settings import Job, Settings, jobs
+from integrations.cross_rig.training import Draws, FrameSet, Tested, evaluate, train
+from integrations.cross_rig.worlds import Split
+
+Log = Callable[[str], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """A run and its folder: ``frames/``, ``models/`` and ``results/`` below ``output``."""
+
+    settings: Settings
+    output: Path
+
+    # --- frames -----------------------------------------------------------------------------------------------------
+    def source(self, split: Split, change: str | None = None, arm: str | None = None) -> Source:
+        """A set of frames of this run."""
+        return Source(root=self.output / "frames", size=self.settings.size, split=split, change=change, arm=arm)
+
+    def sources(self) -> list[tuple[Source, int]]:
+        """Every set that the run needs and its length, in the order in which they can be made."""
+        s = self.settings
+        needed = [(self.source("train"), s.train_frames)]
+        for change in s.changes:
+            needed += [(self.source("val", change), s.val_frames), (self.source("test", change), s.test_frames)]
+        for job in jobs(s):
+            if job.arm.kind != "raw":
+                needed.append((self.images(job), s.train_frames))
+        return list({source.store().key: (source, count) for source, count in needed}.values())
+
+    def images(self, job: Job) -> Source:
+        """What a job is trained on."""
+        return self.source("train", job.change, job.arm.name if job.arm.renders else None)
+
+    def training_set(self, job: Job) -> FrameSet:
+        """A job's frames. What counts: objects that the rig of the recording sees, in the cells that B covers."""
+        images = self.images(job)
+        labels = images.original() if job.arm.renders else images
+        state = labels.store().stacked("state", self.settings.train_frames)
+        counts = covered_cells(Grid(), images.rig)
+        return FrameSet(images.store(), images.rig, state, counts, retargeted=job.arm.renders)
+
+    def true_set(self, split: Split, change: str | None, num_frames: int) -> FrameSet:
+        """Frames as a rig really sees them."""
+        source = self.source(split, change)
+        state = source.store().stacked("state", num_frames)
+        return FrameSet(source.store(), source.rig, state, covered_cells(Grid(), source.rig))
+
+    # --- trainings and tests ----------------------------------------------------------------------------------------
+    def tested_on(self, job: Job) -> tuple[str, ...]:
+        """The changes whose vehicle B a job's model is tested on."""
+        return self.settings.changes if job.change is None else (job.change,)
+
+    def training_key(self, job: Job) -> str:
+        """Of everything that a training depends on."""
+        arm = job.arm
+        return content_hash(
+            {
+                "frames": self.images(job).store().key,
+                "raw": self.source("train").store().key if arm.mixed else None,
+                "augmented": arm.augmented,
+                "count": self.settings.train_frames,
+                "schedule": asdict(self.settings.schedule),
+                "seed": job.seed,
+                "code": code_hash("integrations.cross_rig.training"),
+            }
+        )
+
+    def result_path(self, job: Job, change: str) -> Path:
+        """Where a test's counts lie."""
+        key = content_hash(
+            {
+                "training": self.training_key(job),
+                "val": [self.source("val", change).store().key, self.settings.val_frames],
+                "test": [self.source("test", change).store().key, self.settings.test_frames],
+            }
+        )
+        return self.output / "results" / f"{job.name}-on-{change}-{key}.json"
+
+    def missing(self) -> list[Job]:
+        """Jobs of which some result is not there."""
+        return [j for j in jobs(self.settings) if not all(self.result_path(j, c).is_file() for c in self.tested_on(j))]
+
+    def do(self, job: Job) -> str:
+        """Train, unless the weights are there, and test; returns a line for the log."""
+        one_thread()
+        model, trained = self._trained(job)
+        lines = []
+        for change in self.tested_on(job):
+            path = self.result_path(job, change)
+            if not path.is_file():
+                val = self.true_set("val", change, self.settings.val_frames)
+                test = self.true_set("test", change, self.settings.test_frames)
+                height = test.store.stacked("height_dm", self.settings.test_frames)
+                tested = evaluate(model, val, test, height, self.settings.schedule)
+                _write_text(path, json.dumps(_result(job, change, trained, tested)))
+                lines.append(f"{change} val {100 * tested.val_iou:.1f}")
+        return f"{job.name}: {trained['cpu_s']:.0f} s of training, {', '.join(lines)}"
+
+    def _trained(self, job: Job) -> tuple[BevDetector, dict[str, Any]]:
+        path = self.output / "models" / f"{job.name}-{self.training_key(job)}.pt"
+        schedule = self.settings.schedule
+        if path.is_file():
+            saved = torch.load(path, weights_only=True, map_location=schedule.device)
+            model = BevDetector(Grid(), schedule.backbone).to(schedule.device)
+            model.load_state_dict(saved["weights"])
+            return model.eval(), saved["trained"]
+        start = time.process_time()
+        raw = self.true_set("train", None, self.settings.train_frames)
+        draws = Draws(job.arm, self.training_set(job), raw, self.settings.train_frames, job.seed)
+        model, losses = train(draws, schedule, job.seed)
+        frames_drawn = schedule.steps * schedule.batch
+        trained = {
+            "cpu_s": time.process_time() - start,
+            "augment_cpu_s": draws.augment_s / frames_drawn,
+            "losses": losses,
+            "torch": str(torch.__version__),
+        }
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_name(f".{os.getpid()}-{path.name}")
+        torch.save({"weights": model.state_dict(), "trained": trained}, part)
+        part.replace(path)
+        return model, trained
+
+
+def _result(job: Job, change: str, trained: dict[str, Any], tested: Tested) -> dict[str, Any]:
+    return {
+        "arm": job.arm.name,
+        "change": change,
+        "seed": job.seed,
+        "trained": trained,
+        "threshold": tested.threshold,
+        "val_iou": tested.val_iou,
+        "test_cpu_s": tested.cpu_s,
+        "by_distance": tested.tally.by_distance.tolist(),
+        "by_height": tested.tally.by_height.tolist(),
+    }
+
+
+def _write_text(path: Path, text: str) -> None:
+    """All of it or nothing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{os.getpid()}-{path.name}")
+    part.write_text(text)
+    part.replace(path)
+
+
+def run(setup: Run, workers: int, log: Log) -> Iterator[int]:
+    """Make everything that is missing; yields the number of missing jobs, before the first and after each."""
+    for source, count in setup.sources():
+        start = time.monotonic()
+        for done, todo in make_frames(source, count, workers):
+            if todo and done in (0, todo):
+                what = f"{source.split} frames, {source.change or 'A'}, {source.arm or 'true'}"
+                log(f"{what}: {todo} chunks" if not done else f"{what}: made in {time.monotonic() - start:.0f} s")
+    missing = setup.missing()
+    yield len(missing)
+    if workers == 1 or setup.settings.schedule.device != "cpu":  # one training at a time fills a GPU
+        for done, job in enumerate(missing, 1):
+            log(setup.do(job))
+            yield len(missing) - done
+        return
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        waiting = [pool.submit(setup.do, job) for job in missing]
+        for done, future in enumerate(as_completed(waiting), 1):
+            log(future.result())
+            yield len(missing) - done
+
+
+def load_results(setup: Run) -> dict[str, dict[str, dict[int, dict[str, Any]]]]:
+    """The results that are there: by change, arm and seed."""
+    found: dict[str, dict[str, dict[int, dict[str, Any]]]] = {}
+    for job in jobs(setup.settings):
+        for change in setup.tested_on(job):
+            path = setup.result_path(job, change)
+            if path.is_file():
+                found.setdefault(change, {}).setdefault(job.arm.name, {})[job.seed] = json.loads(path.read_text())
+    return found
+
+
+def rendering_seconds(setup: Run) -> dict[str, float]:
+    """CPU seconds that each arm's own rendering took for a frame: the median over its frames, then over changes."""
+    by_arm: dict[str, list[float]] = {}
+    for job in jobs(setup.settings):
+        source = setup.images(job)
+        if job.arm.renders and not source.store().missing(setup.settings.train_frames):
+            seconds = source.store().stacked("cpu_s", setup.settings.train_frames)
+            by_arm.setdefault(job.arm.name, []).append(float(np.median(seconds)))
+    return {name: float(np.median(values)) for name, values in by_arm.items()}

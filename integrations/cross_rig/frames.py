@@ -1,0 +1,162 @@
+"""The frames of the experiment on disk: A's streets, B's truth, each arm's training set."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from arbiview_aug import Rig
+from arbiview_aug.datasets.synthetic import SyntheticDrive
+from integrations.cross_rig.arms import ARMS
+from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, fill
+from integrations.cross_rig.labels import Grid, box_cells, visible_objects
+from integrations.cross_rig.views import ViewMaker
+from integrations.cross_rig.worlds import CHANGES, STREET_SEEDS, Size, Split, source_rig
+
+_WORLD = "arbiview_aug.datasets.synthetic"
+_FORMAT = 1
+"""Part of every set's name: raise it when this file stores something else."""
+_MAX_FRAMES = 1 << 20
+"""Length of the streets' datasets: a set of frames grows without becoming another."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """Which frames: plain data, so that worker processes can be told.
+
+    Attributes:
+        root: Folder of all sets.
+        size: (h, w) of the images.
+        split: Streets.
+        change: Vehicle B by its change; None: vehicle A.
+        arm: Whose training set; None: the rig's own true frames.
+    """
+
+    root: Path
+    size: Size
+    split: Split
+    change: str | None = None
+    arm: str | None = None
+
+    @property
+    def rig(self) -> Rig:
+        """The cameras of the images (the base, where they are drawn around it), in A's ego frame."""
+        return source_rig(self.size) if self.change is None else CHANGES[self.change].target(self.size)
+
+    def store(self) -> FrameStore:
+        """Where they lie."""
+        spec: dict[str, Any] = {
+            "format": _FORMAT,
+            "rig": self.rig.content_key.hex(),
+            "streets": STREET_SEEDS[self.split],
+            "grid": vars(Grid()),
+            # Not the cameras' code: theirs is pinned by tests, and a change there must not cost hours of rendering.
+            "world": code_hash(_WORLD, within=_WORLD),
+            "labels": code_hash("integrations.cross_rig.labels"),
+        }
+        if self.arm is not None:
+            arm = ARMS[self.arm]
+            renderer = "transforms" if arm.kind == "retarget" else "evaluate.baselines"
+            spec |= {
+                "source": source_rig(self.size).content_key.hex(),
+                "arm": arm.views_spec(),
+                "renderer": code_hash(f"arbiview_aug.{renderer}"),
+                "views": code_hash("integrations.cross_rig.views"),
+            }
+        return FrameStore(self.root, spec)
+
+    def original(self) -> Source:
+        """A's true frames of the same streets."""
+        return Source(root=self.root, size=self.size, split=self.split)
+
+
+def make_frames(source: Source, num_frames: int, workers: int) -> Iterator[tuple[int, int]]:
+    """Make what is missing; yields (chunks done, chunks to do), first (0, n).
+
+    A's own frames must be there before those of an arm.
+    """
+    missing = source.store().missing(num_frames)
+    yield 0, len(missing)
+    if workers == 1 or len(missing) < 2:
+        for done, chunk in enumerate(missing, 1):
+            _make_chunk(source, chunk)
+            yield done, len(missing)
+        return
+    # Spawned: forked children of a process with threads may hang.
+    with ProcessPoolExecutor(min(workers, len(missing)), mp_context=get_context("spawn")) as pool:
+        waiting = [pool.submit(_make_chunk, source, chunk) for chunk in missing]
+        for done, future in enumerate(waiting, 1):
+            future.result()
+            yield done, len(missing)
+
+
+def _make_chunk(source: Source, chunk: int) -> None:
+    one_thread()
+    fill(source.store(), _maker(source), chunk)
+
+
+@lru_cache(maxsize=2)  # a worker goes from chunk to chunk of one source
+def _maker(source: Source) -> _TrueFrames | _ArmFrames:
+    return _TrueFrames(source) if source.arm is None else _ArmFrames(source)
+
+
+def one_thread() -> None:
+    """The calling process works on one thread: many such processes do not fight for cores."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+
+
+class _TrueFrames:
+    """What a rig really sees: images, labels; A's training frames with their depth."""
+
+    def __init__(self, source: Source) -> None:
+        self.source, self.rig = source, source.rig
+        self.drive = SyntheticDrive(self.rig, num_frames=_MAX_FRAMES, seed=STREET_SEEDS[source.split], lidar=False)
+
+    def __call__(self, index: int) -> Arrays:
+        start = time.process_time()
+        scene, views = self.drive.scene(index), self.drive.render(index)
+        boxes = scene.boxes_ego(self.rig.ground_z_m)
+        visible = visible_objects(views.visible_pixels(len(boxes)).numpy(), self.source.size)
+        cells = box_cells(Grid(), boxes, scene.box_classes, visible)
+        assert isinstance(views.images, torch.Tensor) and isinstance(views.depth_m, torch.Tensor)
+        arrays = {"images": views.images.numpy(), "state": cells.state, "height_dm": cells.height_dm}
+        if self.source.change is None:
+            depth = views.depth_m.numpy()
+            # Half precision: 6 cm at 100 m. The sky becomes 0: unknown.
+            arrays["depth_m"] = np.where(np.isfinite(depth), depth, 0).astype(np.float16)
+        return {**arrays, "cpu_s": np.array(time.process_time() - start, np.float32)}
+
+
+class _ArmFrames:
+    """A's frames as an arm re-renders them; points are cast anew, since that is cheaper than keeping them."""
+
+    def __init__(self, source: Source) -> None:
+        assert source.arm is not None
+        self.original = source.original()
+        self.store = self.original.store()
+        self.reads = ARMS[source.arm].reads
+        self.views = ViewMaker(ARMS[source.arm], self.original.rig, source.rig)
+        seed = STREET_SEEDS[source.split]
+        self.drive = SyntheticDrive(self.original.rig, num_frames=_MAX_FRAMES, seed=seed, lidar=False)
+
+    def __call__(self, index: int) -> Arrays:
+        frame: dict[str, Any] = {"images": torch.from_numpy(self.store.read(index, "images").copy())}
+        if "boxes_3d" in self.reads:
+            boxes = self.drive.scene(index).boxes_ego(self.original.rig.ground_z_m)
+            frame["boxes_3d"] = torch.from_numpy(boxes.astype(np.float32))
+        if "points" in self.reads:
+            frame["points"] = self.drive.points(index)
+        if "depth_m" in self.reads:
+            frame["depth_m"] = torch.from_numpy(self.store.read(index, "depth_m").astype(np.float32))
+        return self.views(index, frame)

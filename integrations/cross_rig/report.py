@@ -1,0 +1,131 @@
+"""What the results say: JSON, a Markdown table, a plot."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from integrations.cross_rig.arms import ARMS
+from integrations.cross_rig.counting import DISTANCES_M, HEIGHTS_M, iou
+from integrations.cross_rig.experiment import Run, load_results, rendering_seconds
+from integrations.cross_rig.scoring import arm_scores
+from integrations.cross_rig.settings import jobs
+from integrations.cross_rig.worlds import CHANGES
+
+Results = Mapping[str, Mapping[int, Mapping[str, Any]]]
+"""Of one change: by arm and seed."""
+
+
+def write_report(setup: Run) -> dict[str, Any]:
+    """Write ``report.json``, ``report.md`` and ``report.png`` from the results that are there; returns the first."""
+    results = load_results(setup)
+    rendering = rendering_seconds(setup)
+    changes = {name: _of_change(results[name], rendering) for name in setup.settings.changes if name in results}
+    total = sum(len(setup.tested_on(job)) for job in jobs(setup.settings))
+    there = sum(len(seeds) for arms in results.values() for seeds in arms.values())
+    report = {
+        "settings": asdict(setup.settings),
+        "tests_done": there,
+        "tests": total,
+        "changes": changes,
+    }
+    setup.output.mkdir(parents=True, exist_ok=True)
+    (setup.output / "report.json").write_text(json.dumps(report, indent=1))
+    (setup.output / "report.md").write_text(markdown(report))
+    if changes:
+        save_plot(report, setup.output / "report.png")
+    return report
+
+
+def _of_change(arms: Results, rendering: Mapping[str, float]) -> dict[str, Any]:
+    """Scores over the seeds that every arm has."""
+    seeds = sorted(set.intersection(*(set(by_seed) for by_seed in arms.values())))
+    if not seeds:
+        return {"seeds": [], "arms": {}}
+    cells = {name: np.array([arms[name][s]["by_distance"] for s in seeds]) for name in arms}  # [S, F, bins, 3]
+    scores = arm_scores({name: array.sum(2) for name, array in cells.items()})
+    rows = {}
+    for name in (n for n in ARMS if n in arms):
+        heights = np.array([arms[name][s]["by_height"] for s in seeds]).sum((0, 1))
+        trained = [arms[name][s]["trained"] for s in seeds]
+        rows[name] = asdict(scores[name]) | {
+            "by_distance_iou": iou(cells[name].sum((0, 1))).tolist(),
+            "by_height_recall": (heights[:, 0] / np.maximum(heights[:, 1], 1)).tolist(),
+            "thresholds": [arms[name][s]["threshold"] for s in seeds],
+            "training_cpu_s": float(np.median([t["cpu_s"] for t in trained])),
+            # A mixed arm renders every other frame.
+            "loading_cpu_s": rendering.get(name, 0.0) * (0.5 if ARMS[name].mixed else 1)
+            + float(np.median([t["augment_cpu_s"] for t in trained])),
+        }
+    return {"seeds": seeds, "arms": rows}
+
+
+def markdown(report: Mapping[str, Any]) -> str:
+    """The tables, one for each change."""
+    s = report["settings"]
+    lines = [
+        f"{s['train_frames']} training and {s['test_frames']} test frames at {s['size'][0]}×{s['size'][1]}, "
+        f"{s['schedule']['steps']} steps of {s['schedule']['batch']}, {report['tests_done']} of {report['tests']} "
+        "tests done. IoU of vehicle cells in %, [95 % interval] over seeds and frames; recovered: (arm − raw) / "
+        "(oracle − raw), where oracle − raw is at least 5 points; loading: CPU ms that the arm adds to a frame that "
+        "is drawn.",
+    ]
+    distances = [f"{a:g}–{b:g} m" for a, b in pairwise(DISTANCES_M)]
+    heights = [f"{a:g}–{b:g} m high" for a, b in pairwise(HEIGHTS_M)]
+    head = ["arm", "IoU", "over raw", "recovered %", *(f"IoU {d}" for d in distances)]
+    head += [*(f"recall {h}" for h in heights), "loading"]
+    for name, change in report["changes"].items():
+        if not change["arms"]:
+            continue
+        lines += ["", f"**{CHANGES[name].title}**, seeds {', '.join(map(str, change['seeds']))}", ""]
+        lines += ["| " + " | ".join(head) + " |", "| --- |" + " ---: |" * (len(head) - 1)]
+        for arm, row in change["arms"].items():
+            cells = [ARMS[arm].title, _text(row["iou"], 1), _text(row["over_raw"], 1, sign=True)]
+            cells.append(_text(row["share"], 0))
+            cells += [f"{100 * value:.1f}" for value in (*row["by_distance_iou"], *row["by_height_recall"])]
+            cells.append(f"{1000 * row['loading_cpu_s']:.1f}")
+            lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _text(value: Mapping[str, float] | None, digits: int, *, sign: bool = False) -> str:
+    if value is None:
+        return "–"
+    form = f"{'+' if sign else ''}.{digits}f"
+    return f"{100 * value['value']:{form}} [{100 * value['low']:{form}}, {100 * value['high']:{form}}]"
+
+
+def save_plot(report: Mapping[str, Any], path: Path) -> None:
+    """A panel for each change: IoU of each arm with its interval; raw and oracle as lines."""
+    # Without pyplot: no global state, and no display is looked for.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    changes = {name: change["arms"] for name, change in report["changes"].items() if change["arms"]}
+    if not changes:
+        return
+    names = [name for name in ARMS if any(name in arms for arms in changes.values())]
+    figure = Figure(figsize=(2 + 3 * len(changes), 1.4 + 0.32 * len(names)), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(changes), sharey=True, squeeze=False)[0]
+    for panel, (change, arms) in zip(panels, changes.items(), strict=True):
+        for name, colour in (("raw", "#d62728"), ("oracle", "#2ca02c")):
+            if name in arms:
+                panel.axvline(100 * arms[name]["iou"]["value"], color=colour, linewidth=0.8, alpha=0.6)
+        for k, name in enumerate(names):
+            if name not in arms:
+                continue
+            middle, low, high = (100 * arms[name]["iou"][part] for part in ("value", "low", "high"))
+            panel.errorbar(middle, k, xerr=[[max(middle - low, 0)], [max(high - middle, 0)]], fmt="o", color="#1f77b4")
+        panel.set_title(CHANGES[change].title, fontsize=10)
+        panel.set_xlabel("IoU, %")
+        panel.grid(True, axis="x", alpha=0.2)
+    panels[0].set_yticks(range(len(names)), [ARMS[name].title for name in names])
+    panels[0].invert_yaxis()
+    figure.savefig(path)

@@ -1,0 +1,150 @@
+"""A whole run, tiny: it goes on after being killed, and ends with the numbers of an uninterrupted one."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from integrations.cross_rig import __main__ as command
+from integrations.cross_rig import cache, experiment
+from integrations.cross_rig.experiment import Run, load_results, run
+from integrations.cross_rig.report import markdown, write_report
+from integrations.cross_rig.settings import Settings, full, jobs, pilot, quick
+from integrations.cross_rig.training import Draws, Schedule
+
+TINY = Settings(
+    size=(24, 64),
+    train_frames=2,
+    val_frames=1,
+    test_frames=2,
+    seeds=(0,),
+    changes=("fov50",),
+    arms=("raw", "scale_crop", "objects_mixed", "oracle"),
+    schedule=Schedule(steps=3, batch=2, precision="fp32"),
+)
+
+
+@pytest.fixture(autouse=True)
+def _short_chunks(monkeypatch):
+    monkeypatch.setattr(cache, "CHUNK_FRAMES", 1)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory) -> Run:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cache, "CHUNK_FRAMES", 1)
+        setup = Run(settings=TINY, output=tmp_path_factory.mktemp("cross_rig"))
+        assert list(run(setup, 1, lambda line: None)) == [4, 3, 2, 1, 0]
+    return setup
+
+
+def counts(setup: Run) -> dict[str, list]:
+    return {arm: by_seed[0]["by_distance"] for arm, by_seed in load_results(setup)["fov50"].items()}
+
+
+def test_a_killed_run_goes_on_to_the_same_numbers(done, tmp_path, monkeypatch):
+    shutil.copytree(done.output / "frames", tmp_path / "frames")
+    shutil.rmtree(tmp_path / "frames" / done.source("test", "fov50").store().key / "00000")
+    killed = replace(done, output=tmp_path)
+    train, trained = experiment.train, []
+
+    def dying(draws, schedule, seed):
+        if len(trained) == 2:
+            raise KeyboardInterrupt
+        trained.append(draws.arm.name)
+        return train(draws, schedule, seed)
+
+    monkeypatch.setattr(experiment, "train", dying)
+    with pytest.raises(KeyboardInterrupt):
+        list(run(killed, 1, lambda line: None))
+    assert [job.arm.name for job in killed.missing()] == ["objects_mixed", "oracle"]
+    trained.clear()
+    assert list(run(killed, 1, lambda line: None)) == [2, 1, 0]
+    assert trained == ["objects_mixed", "oracle"]
+    assert counts(killed) == counts(done)
+    assert not list(tmp_path.rglob(".*"))
+
+
+def test_what_is_done_is_not_done_again(done, monkeypatch):
+    monkeypatch.setattr(experiment, "train", None)
+    assert list(run(done, 1, lambda line: None)) == [0]
+    # Other test streets: the weights are there.
+    more = replace(done, settings=replace(TINY, test_frames=1, arms=("raw",)))
+    assert list(run(more, 1, lambda line: None)) == [1, 0]
+
+
+def test_report(done):
+    report = write_report(done)
+    assert json.loads((done.output / "report.json").read_text()) == json.loads(json.dumps(report))
+    assert (done.output / "report.png").stat().st_size > 1000
+    assert report["tests_done"] == report["tests"] == 4
+    rows = report["changes"]["fov50"]["arms"]
+    assert list(rows) == list(TINY.arms)
+    for name, row in rows.items():
+        assert (row["loading_cpu_s"] > 0) == (name in ("scale_crop", "objects_mixed"))
+        assert 0 <= row["iou"]["low"] <= row["iou"]["value"] <= row["iou"]["high"] <= 1
+    assert "| objects + raw |" in markdown(report)
+
+
+def test_labels_are_the_sources_within_the_targets_cells(done):
+    raw, _, mixed, oracle = (done.training_set(job) for job in jobs(TINY))
+    np.testing.assert_array_equal(raw.state, mixed.state)
+    np.testing.assert_array_equal(mixed.counts, oracle.counts)
+    assert raw.counts.sum() > oracle.counts.sum()
+
+
+def test_arms_are_paired(done):
+    """The same frames in the same order, whatever else an arm draws."""
+    first = []
+    for job in jobs(TINY):
+        draws = Draws(job.arm, done.training_set(job), done.true_set("train", None, 2), 2, seed=5)
+        first.append(np.concatenate([draws.batch(1).state.numpy() for _ in range(20)]))
+    np.testing.assert_array_equal(first[0], first[1])
+    np.testing.assert_array_equal(first[0], first[2])
+
+
+def test_mixed_arms_draw_raw_frames_half_of_the_time(done):
+    job = next(job for job in jobs(TINY) if job.arm.mixed)
+    raw = done.true_set("train", None, 2)
+    draws = Draws(job.arm, done.training_set(job), raw, 2, seed=0)
+    from_raw = [bool(np.isclose(draws.batch(1).K[0, 0, 0], raw.rig.K[0, 0, 0])) for _ in range(200)]
+    assert 75 < sum(from_raw) < 125
+
+
+def test_presets():
+    assert len(jobs(quick())) == 3
+    # Raw and scale/crop once for each seed, five arms for each change: 3 * (2 + 3 * 5).
+    assert len(jobs(pilot())) == 51
+    names = [job.name for job in jobs(full())]
+    assert len(names) == len(set(names)) == 3 * (2 + 6 * 15)
+
+
+def test_keys_follow_what_matters(done):
+    raw, _, mixed, oracle = jobs(TINY)
+    keys = {done.training_key(job) for job in (raw, mixed, oracle)}
+    assert len(keys) == 3
+    longer = replace(done, settings=replace(TINY, schedule=replace(TINY.schedule, steps=4)))
+    assert longer.training_key(raw) != done.training_key(raw)
+    assert longer.images(raw).store().key == done.images(raw).store().key
+    assert done.result_path(raw, "fov50") != longer.result_path(raw, "fov50")
+
+
+def test_command_lists_and_refuses(capsys, tmp_path):
+    assert command.main(["--pilot", "--seeds", "0", "--changes", "up70", "--list", "--output", str(tmp_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 7 and all(line.startswith("missing") for line in lines)
+    with pytest.raises(SystemExit):
+        command.main(["--pilot", "--arms", "nothing"])
+
+
+@pytest.mark.cross
+@pytest.mark.timeout(900)
+def test_quick_oracle_is_above_raw(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(cache, "CHUNK_FRAMES", 20)
+    assert command.main(["--quick", "--output", str(tmp_path)]) == 0
+    arms = json.loads((tmp_path / "report.json").read_text())["changes"]["up70"]["arms"]
+    assert arms["oracle"]["iou"]["value"] > arms["raw"]["iou"]["value"]
+    assert set(arms) == {"raw", "lidar", "oracle"}

@@ -1,0 +1,112 @@
+"""The model reads the calibration, in the package's conventions, and nothing that no camera saw."""
+
+import numpy as np
+import pytest
+import torch
+
+from integrations.cross_rig.labels import Grid
+from integrations.cross_rig.model import Batch, BevDetector, voxel_bags
+from integrations.cross_rig.worlds import source_rig
+
+SIZE = (32, 64)
+GRID = Grid(side_m=20.0, cells=20)
+
+
+def batch(rigs, images=None, coverage=None) -> Batch:
+    count = sum(len(rig) for rig in rigs)
+    if images is None:
+        images = torch.randint(0, 255, (count, 3, *SIZE), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    return Batch(
+        images=images,
+        coverage=torch.ones((count, *SIZE), dtype=torch.bool) if coverage is None else coverage,
+        K=torch.from_numpy(np.concatenate([rig.K for rig in rigs])).float(),
+        cam2ego=torch.from_numpy(np.concatenate([rig.cam2ego for rig in rigs])).float(),
+        frame=torch.arange(len(rigs)).repeat_interleave(torch.tensor([len(rig) for rig in rigs])),
+        state=torch.zeros((len(rigs), 20, 20), dtype=torch.uint8),
+        counts=torch.ones((len(rigs), 20, 20), dtype=torch.bool),
+    )
+
+
+@pytest.fixture
+def model() -> BevDetector:
+    torch.manual_seed(0)
+    return BevDetector(GRID).eval()
+
+
+@pytest.mark.parametrize("stride", [1, 4])
+def test_a_voxel_reads_the_pixel_that_it_projects_to(stride):
+    """A feature map that holds its own pixel coordinates gives the camera model's projection."""
+    rig = source_rig(SIZE)
+    rng = np.random.default_rng(0)
+    points = np.stack([rng.uniform(4, 20, 200), rng.uniform(-8, 8, 200), rng.uniform(0, 3, 200)], 1)
+    alone = rig.with_cameras([rig["front"]])
+    bags = voxel_bags(batch([alone]), torch.from_numpy(points).float(), (SIZE[0] // stride, SIZE[1] // stride), stride)
+    v, u = np.indices((SIZE[0] // stride, SIZE[1] // stride)).reshape(2, -1) * stride + (stride - 1) / 2
+    maps = torch.from_numpy(np.stack([u, v], 1)).float()
+    read = torch.nn.functional.embedding_bag(
+        bags.rows, maps, bags.offsets, mode="sum", per_sample_weights=bags.weights
+    ).numpy()
+    uv, depth, _ = rig["front"].project(points)
+    margin = stride / 2
+    inner = (depth > 0) & (uv > margin).all(-1) & (uv < (SIZE[1] - 1 - margin, SIZE[0] - 1 - margin)).all(-1)
+    assert inner.sum() > 50
+    np.testing.assert_allclose(read[inner], uv[inner], atol=2e-3)
+    outside = (depth <= 0) | (uv < -0.5).any(-1) | (uv > (SIZE[1] - 0.5, SIZE[0] - 0.5)).any(-1)
+    assert outside.any() and not read[outside].any()
+
+
+def test_moving_a_camera_moves_the_features(model):
+    rig = source_rig(SIZE)
+    still, moved = (model.voxel_features(batch([r])) for r in (rig, rig.shifted(1.0, 0, 0)))
+    # Voxels are 2 m wide here: one column of them is seen from a place half a voxel further back.
+    assert not torch.allclose(still, moved)
+    farther = rig.shifted(2.0, 0, 0)
+    shifted = model.voxel_features(batch([farther]))
+    torch.testing.assert_close(shifted[:, :, 1:], still[:, :, :-1], atol=1e-3, rtol=1e-3)
+
+
+def test_gradients_reach_every_parameter(model):
+    model.train()
+    model(batch([source_rig(SIZE), source_rig(SIZE)])).square().mean().backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None and torch.isfinite(parameter.grad).all(), name
+        # Normalisation takes away what a bias or a mean adds, but for rounding.
+        assert parameter.grad.abs().max() > 0, name
+
+
+def test_uncovered_pixels_do_not_matter(model):
+    rig = source_rig(SIZE)
+    coverage = torch.ones((6, *SIZE), dtype=torch.bool)
+    coverage[:, :16, :40] = False
+    whole = batch([rig], coverage=coverage)
+    painted = whole.images.clone()
+    painted[~coverage[:, None].expand_as(painted)] = 7
+    with torch.no_grad():
+        torch.testing.assert_close(model(whole), model(batch([rig], images=painted, coverage=coverage)))
+
+
+def test_voxels_that_only_uncovered_pixels_show_are_empty(model):
+    nothing = torch.zeros((6, *SIZE), dtype=torch.bool)
+    assert not model.voxel_features(batch([source_rig(SIZE)], coverage=nothing)).any()
+
+
+def test_frames_of_a_batch_do_not_mix(model):
+    """Also where they differ in their number of cameras."""
+    rig = source_rig(SIZE)
+    front = rig.with_cameras(rig.cameras[:3])
+    both = batch([rig, front])
+    with torch.no_grad():
+        together = model(both)
+        first, second = (model(batch([r], images=i)) for r, i in ((rig, both.images[:6]), (front, both.images[6:])))
+    torch.testing.assert_close(together, torch.cat([first, second]), atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_the_larger_backbone_trains():
+    torch.manual_seed(0)
+    model = BevDetector(GRID, "resnet34")
+    model(batch([source_rig(SIZE)] * 2)).square().mean().backward()
+    assert all(
+        torch.isfinite(p.grad).all() and p.grad.abs().max() > 0 for p in model.parameters() if p.grad is not None
+    )
+    assert sum(p.grad is None for p in model.parameters()) == 0

@@ -1,0 +1,81 @@
+"""Counts by hand, and intervals whose widths are known."""
+
+import numpy as np
+import pytest
+
+from integrations.cross_rig.counting import iou, tally
+from integrations.cross_rig.labels import HIDDEN, VEHICLE
+from integrations.cross_rig.scoring import arm_scores, bootstrap_ious
+
+
+def frames(hits: np.ndarray) -> np.ndarray:
+    """(S, F, 3): frames of one cell, hit (true positive) or not (false positive)."""
+    return np.stack([hits, ~hits, np.zeros_like(hits)], -1).astype(np.int64)
+
+
+def share(p: float, count: int = 1000, seeds: int = 1) -> np.ndarray:
+    """(S, F) bool with exactly the share ``p`` of hits in every seed."""
+    return np.tile(np.arange(count) < round(p * count), (seeds, 1))
+
+
+def test_frame_interval_is_the_binomial_one():
+    score = arm_scores({"raw": frames(share(0.3))})["raw"]
+    half = 1.96 * np.sqrt(0.3 * 0.7 / 1000)
+    assert score.iou.value == pytest.approx(0.3)
+    assert score.iou.high - 0.3 == pytest.approx(half, rel=0.1)
+    assert 0.3 - score.iou.low == pytest.approx(half, rel=0.1)
+
+
+def test_seeds_widen_the_interval():
+    seeds = np.concatenate([share(0.2), share(0.3), share(0.4)])
+    draws = bootstrap_ious({"arm": frames(seeds)})["arm"]
+    # The mean of three draws of three seeds, and of the frames of each.
+    between, within = np.var([0.2, 0.3, 0.4]) / 3, np.mean([0.16, 0.21, 0.24]) / 1000 / 3
+    assert draws.std() == pytest.approx(np.sqrt(between + within), rel=0.05)
+
+
+def test_arms_are_paired():
+    """An arm that is right wherever raw is, and on a fixed tenth more, is above it by exactly that."""
+    raw = np.random.default_rng(0).random((3, 1000)) < 0.4
+    draws = bootstrap_ious({"raw": frames(raw), "same": frames(raw)})
+    np.testing.assert_array_equal(draws["raw"], draws["same"])
+
+
+def test_share_recovered():
+    arms = {"raw": share(0.4, seeds=3), "arm": share(0.5, seeds=3), "oracle": share(0.6, seeds=3)}
+    score = arm_scores({name: frames(hits) for name, hits in arms.items()})["arm"]
+    assert score.share is not None and score.over_raw is not None
+    assert score.share.value == pytest.approx(0.5) and score.over_raw.value == pytest.approx(0.1)
+    assert score.share.low < 0.5 < score.share.high
+    assert score.over_raw.high - score.over_raw.low < 0.04
+    assert score.seeds == pytest.approx([0.5, 0.5, 0.5])
+
+
+def test_no_share_of_a_small_gap_or_without_an_oracle():
+    arms = {"raw": share(0.40), "arm": share(0.42), "oracle": share(0.44)}
+    assert arm_scores({name: frames(hits) for name, hits in arms.items()})["arm"].share is None
+    del arms["oracle"]
+    assert arm_scores({name: frames(hits) for name, hits in arms.items()})["arm"].share is None
+
+
+def test_arms_of_different_length_are_refused():
+    with pytest.raises(ValueError, match="same seeds and frames"):
+        bootstrap_ious({"a": frames(share(0.5)), "b": frames(share(0.5, count=10))})
+
+
+def test_tally_by_hand():
+    state, height = np.zeros((1, 50, 50), np.uint8), np.zeros((1, 50, 50), np.uint8)
+    predicted, covered = np.zeros((1, 50, 50), bool), np.ones((50, 50), bool)
+    state[0, 25, 25:29] = VEHICLE  # 1 m cells (50 m wide), up to 3.5 m away
+    height[0, 25, 25:29] = 15
+    state[0, 45, 25:27] = VEHICLE  # 20.5 m ahead
+    height[0, 45, 25:27] = 30
+    state[0, 30, 30] = HIDDEN
+    predicted[0, 25, 26:31] = True  # three right, two wrong
+    predicted[0, 30, 30] = True  # hidden: does not count
+    predicted[0, 45, 25] = True
+    covered[25, 30] = False  # one of the wrong ones lies where nobody looks
+    found = tally(predicted, state, height, covered)
+    assert found.by_distance.tolist() == [[[3, 1, 1], [0, 0, 0], [1, 0, 1]]]
+    assert found.by_height.tolist() == [[[3, 4], [0, 0], [1, 2]]]
+    assert iou(found.by_distance.sum((0, 1))) == pytest.approx(4 / 7)

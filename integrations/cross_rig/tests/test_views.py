@@ -1,0 +1,85 @@
+"""What the arms make of A's frames."""
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug.datasets.synthetic import SyntheticDrive
+from integrations.cross_rig.arms import ARMS, named_arms
+from integrations.cross_rig.views import SCALE, ViewMaker, scaled_and_cropped
+from integrations.cross_rig.worlds import CHANGES, STREET_SEEDS, named_changes, source_rig
+
+SIZE = (24, 64)
+
+
+@pytest.fixture(scope="module")
+def frame() -> dict:
+    drive = SyntheticDrive(source_rig(SIZE), num_frames=1, seed=9)
+    views = drive.render(0)
+    return {
+        "images": views.images,
+        "depth_m": torch.where(torch.isfinite(views.depth_m), views.depth_m, 0),
+        "points": drive.points(0),
+        "boxes_3d": torch.from_numpy(drive.scene(0).boxes_ego(0.0)).float(),
+    }
+
+
+@pytest.mark.parametrize("name", [name for name, arm in ARMS.items() if arm.renders])
+@pytest.mark.filterwarnings("ignore")
+def test_every_arm_renders(frame, name):
+    source, target = source_rig(SIZE), CHANGES["waymo"].target(SIZE)
+    views = ViewMaker(ARMS[name], source, target)(0, frame)
+    coverage = np.unpackbits(views["coverage"], axis=-1, count=SIZE[1]).astype(bool)
+    assert views["images"].shape == (5, 3, *SIZE) and views["images"].dtype == np.uint8
+    assert coverage.shape == (5, *SIZE) and coverage.mean() > 0.4
+    assert not views["images"].transpose(0, 2, 3, 1)[~coverage].any()
+    if ARMS[name].filled:
+        assert coverage.all()
+    if ARMS[name].random:
+        assert not np.allclose(views["K"], target.K)
+        again = ViewMaker(ARMS[name], source, target)(0, frame)
+        np.testing.assert_array_equal(again["images"], views["images"])
+    else:
+        np.testing.assert_allclose(views["K"], target.K, rtol=1e-6)
+        np.testing.assert_allclose(views["cam2ego"], target.cam2ego, atol=1e-6)
+
+
+def test_scaled_and_cropped_keeps_pixels_and_calibration_together():
+    rng = np.random.default_rng(0)
+    K = source_rig((48, 64)).K[:1].astype(np.float32)
+    scales = []
+    for _ in range(20):
+        image = np.zeros((1, 3, 48, 64), np.uint8)
+        row, column = int(rng.integers(16, 32)), int(rng.integers(22, 42))
+        image[0, :, row - 1 : row + 2, column - 1 : column + 2] = 255
+        out, coverage, K2 = scaled_and_cropped(image, K, rng)
+        moved = K2[0] @ np.linalg.inv(K[0]) @ (column, row, 1)
+        scales.append(K2[0, 0, 0] / K[0, 0, 0])
+        if not (2 < moved[0] < 61 and 2 < moved[1] < 45):
+            continue
+        weight = out[0, 0].astype(float)
+        v, u = np.indices(weight.shape)
+        centre = (weight * u).sum() / weight.sum(), (weight * v).sum() / weight.sum()
+        np.testing.assert_allclose(centre, moved[:2], atol=0.1)
+        # A smaller picture leaves a border that nobody saw; a larger one fills the window.
+        assert coverage.mean() == pytest.approx(min(1, scales[-1] ** 2), abs=0.05)
+    assert SCALE[0] <= min(scales) < 0.9 and 1.15 < max(scales) <= SCALE[1]
+
+
+def test_streets_are_disjoint_and_rigs_stand_on_one_road():
+    assert len(set(STREET_SEEDS.values())) == 3
+    for change in CHANGES.values():
+        rig = change.target((96, 256))
+        assert rig.ground_z_m == 0 and set(rig.sizes) == {(96, 256)}
+    heights = {name: float(np.median(change.target(SIZE).cam2ego[:, 2, 3])) for name, change in CHANGES.items()}
+    assert heights == pytest.approx(
+        {"fov50": 1.5, "up70": 2.2, "up35": 1.85, "down35": 1.15, "waymo": 2.1, "av2": 1.73}, abs=0.02
+    )
+    assert CHANGES["fov50"].target(SIZE)[0].fov_deg[0] == pytest.approx(50)
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(ValueError, match=r"arms: expected some of raw, .*, got nothing"):
+        named_arms(["nothing"])
+    with pytest.raises(ValueError, match=r"changes: expected some of fov50, .*, got up7"):
+        named_changes(["up7"])

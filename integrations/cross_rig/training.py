@@ -1,0 +1,218 @@
+"""One training and its test, on frames that lie on disk."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import torch.nn.functional as F
+
+from arbiview_aug import Rig
+from integrations.cross_rig.cache import FrameStore
+from integrations.cross_rig.counting import Tally, iou, tally
+from integrations.cross_rig.labels import HIDDEN, VEHICLE, Grid
+from integrations.cross_rig.model import Backbone, Batch, BevDetector
+from integrations.cross_rig.views import Arm, scaled_and_cropped
+
+THRESHOLDS = tuple(round(0.05 * k, 2) for k in range(1, 20))
+_EVAL_BATCH = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """The same for every arm.
+
+    Attributes:
+        steps: Of the optimiser.
+        batch: Frames a step.
+        lr: The peak of a one-cycle schedule; AdamW's default decay.
+        backbone: Of the model.
+        precision: ``bf16`` runs the networks in bfloat16 (autocast): twice as fast on CPUs with AMX.
+        device: Where to train.
+    """
+
+    steps: int
+    batch: int = 4
+    lr: float = 3e-3
+    backbone: Backbone = "small"
+    precision: Literal["bf16", "fp32"] = "bf16"
+    device: str = "cpu"
+
+
+@dataclass(frozen=True)
+class FrameSet:
+    """Frames with labels, as the model gets them.
+
+    Attributes:
+        store: Images; with coverage and calibration where a rig's own do not hold.
+        rig: The cameras of frames that bring no calibration.
+        state: (F, cells, cells) of ``labels``.
+        counts: (cells, cells) bool, the cells that count.
+        retargeted: Whether the store has coverage and calibration.
+    """
+
+    store: FrameStore
+    rig: Rig
+    state: npt.NDArray[np.uint8]
+    counts: npt.NDArray[np.bool_]
+    retargeted: bool = False
+
+    def frame(self, index: int) -> _Frame:
+        """One frame's arrays."""
+        images = self.store.read(index, "images")
+        if not self.retargeted:
+            covered = np.ones((len(images), *images.shape[-2:]), bool)
+            K, cam2ego = self.rig.K.astype(np.float32), self.rig.cam2ego.astype(np.float32)
+        else:
+            packed = self.store.read(index, "coverage")
+            covered = np.unpackbits(packed, axis=-1, count=images.shape[-1]).astype(bool)
+            K, cam2ego = self.store.read(index, "K"), self.store.read(index, "cam2ego")
+        return _Frame(images, covered, K, cam2ego, self.state[index], self.counts)
+
+
+@dataclass(frozen=True)
+class _Frame:
+    images: npt.NDArray[np.uint8]
+    coverage: npt.NDArray[np.bool_]
+    K: npt.NDArray[np.float32]
+    cam2ego: npt.NDArray[np.float32]
+    state: npt.NDArray[np.uint8]
+    counts: npt.NDArray[np.bool_]
+
+
+def batched(frames: list[_Frame]) -> Batch:
+    """Frames of any number of cameras as one batch."""
+
+    def joined(name: str) -> torch.Tensor:
+        return torch.from_numpy(np.concatenate([getattr(frame, name) for frame in frames]))
+
+    lengths = [len(frame.images) for frame in frames]
+    return Batch(
+        images=joined("images"),
+        coverage=joined("coverage"),
+        K=joined("K"),
+        cam2ego=joined("cam2ego"),
+        frame=torch.arange(len(frames)).repeat_interleave(torch.tensor(lengths)),
+        state=torch.from_numpy(np.stack([frame.state for frame in frames])),
+        counts=torch.from_numpy(np.stack([frame.counts for frame in frames])),
+    )
+
+
+class Draws:
+    """The batches of a training: which frames they hold depends on the seed alone, so that arms are paired.
+
+    Args:
+        arm: How to draw.
+        own: The arm's frames.
+        raw: A's frames, for mixed arms.
+        num_frames: Of each.
+        seed: Of the training.
+
+    Attributes:
+        augment_s: CPU seconds that scaling and cropping took so far.
+    """
+
+    def __init__(self, arm: Arm, own: FrameSet, raw: FrameSet, num_frames: int, seed: int) -> None:
+        self.arm, self.own, self.raw, self.num_frames = arm, own, raw, num_frames
+        self.order = np.random.default_rng([seed, 0])
+        self.rng = np.random.default_rng([seed, 1])
+        self.left: list[int] = []
+        self.augment_s = 0.0
+
+    def batch(self, size: int) -> Batch:
+        """The next batch; every frame once before any comes again."""
+        frames = []
+        for _ in range(size):
+            if not self.left:
+                self.left = [int(k) for k in self.order.permutation(self.num_frames)]
+            index = self.left.pop()
+            from_raw = self.arm.mixed and self.rng.random() < 0.5
+            frame = (self.raw if from_raw else self.own).frame(index)
+            if self.arm.augmented:
+                start = time.process_time()
+                images, coverage, K = scaled_and_cropped(frame.images, frame.K, self.rng)
+                frame = _Frame(images, coverage, K, frame.cam2ego, frame.state, frame.counts)
+                self.augment_s += time.process_time() - start
+            frames.append(frame)
+        return batched(frames)
+
+
+def loss(logits: torch.Tensor, batch: Batch) -> torch.Tensor:
+    """Mean binary cross-entropy over the cells that count."""
+    counts = batch.counts & (batch.state != HIDDEN)
+    return F.binary_cross_entropy_with_logits(logits.float()[counts], (batch.state == VEHICLE)[counts].float())
+
+
+def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[BevDetector, list[float]]:
+    """A trained detector and its mean loss over each tenth of the steps."""
+    torch.manual_seed(seed)
+    device = torch.device(schedule.device)
+    model = BevDetector(Grid(), schedule.backbone).to(device).to(memory_format=torch.channels_last)
+    optimizer = torch.optim.AdamW(model.parameters(), lr=schedule.lr)
+    cycle = torch.optim.lr_scheduler.OneCycleLR(optimizer, schedule.lr, total_steps=schedule.steps)
+    losses = []
+    model.train()
+    for _ in range(schedule.steps):
+        batch = draws.batch(schedule.batch).to(device)
+        with _autocast(schedule):
+            logits = model(batch)
+        value = loss(logits, batch)
+        optimizer.zero_grad(set_to_none=True)
+        value.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+        cycle.step()
+        losses.append(float(value.detach()))
+    return model.eval(), [float(np.mean(part)) for part in np.array_split(losses, min(10, len(losses)))]
+
+
+def _autocast(schedule: Schedule) -> torch.autocast:
+    device = torch.device(schedule.device).type
+    return torch.autocast(device, torch.bfloat16, enabled=schedule.precision == "bf16")
+
+
+@torch.no_grad()
+def probabilities(model: BevDetector, frames: FrameSet, num_frames: int, schedule: Schedule) -> np.ndarray:
+    """(F, cells, cells) float16."""
+    out = []
+    for start in range(0, num_frames, _EVAL_BATCH):
+        indices = range(start, min(start + _EVAL_BATCH, num_frames))
+        batch = batched([frames.frame(k) for k in indices]).to(torch.device(schedule.device))
+        with _autocast(schedule):
+            logits = model(batch)
+        out.append(logits.float().sigmoid().cpu().numpy().astype(np.float16))
+    return np.concatenate(out)
+
+
+def best_threshold(probability: np.ndarray, frames: FrameSet) -> tuple[float, float]:
+    """The threshold with the highest IoU on these frames, and that IoU."""
+    counts = frames.counts[None] & (frames.state != HIDDEN)
+    p, truth = probability[counts], (frames.state == VEHICLE)[counts]
+    found = [((p > t) & truth, (p > t) & ~truth, ~(p > t) & truth) for t in THRESHOLDS]
+    scores = iou(np.array([[kind.sum() for kind in kinds] for kinds in found]))
+    best = int(scores.argmax())
+    return THRESHOLDS[best], float(scores[best])
+
+
+@dataclass(frozen=True)
+class Tested:
+    """What a model reached on vehicle B."""
+
+    threshold: float
+    val_iou: float
+    tally: Tally
+    cpu_s: float
+
+
+def evaluate(
+    model: BevDetector, val: FrameSet, test_set: FrameSet, height_dm: np.ndarray, schedule: Schedule
+) -> Tested:
+    """Threshold on validation streets, counts on test streets; both as B sees them, with B's calibration."""
+    start = time.process_time()
+    threshold, val_iou = best_threshold(probabilities(model, val, len(val.state), schedule), val)
+    predicted = probabilities(model, test_set, len(test_set.state), schedule) > threshold
+    counts = tally(predicted, test_set.state, height_dm, test_set.counts)
+    return Tested(threshold, val_iou, counts, time.process_time() - start)

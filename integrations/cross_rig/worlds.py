@@ -1,0 +1,108 @@
+"""The vehicles and the streets of the experiment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from arbiview_aug import Camera, Rig, load_rig
+from arbiview_aug.datasets.synthetic import demo_target_rig
+
+Size = tuple[int, int]
+"""(h, w) of every image."""
+
+Split = Literal["train", "val", "test"]
+
+STREET_SEEDS: dict[Split, int] = {"train": 101, "val": 102, "test": 103}
+"""Seeds of ``SyntheticDrive``: datasets with different seeds share no street."""
+
+_AZIMUTHS_DEG = (0.0, 55.0, -55.0, 110.0, -110.0, 180.0)
+"""nuScenes' six cameras."""
+_NAMES = ("front", "front_left", "front_right", "back_left", "back_right", "back")
+_RING_RADIUS_M = 0.8
+_RING_CENTRE_X_M = 0.9
+_HEIGHT_M = 1.5
+_FOV_DEG = 65.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Change:
+    """A change of vehicle.
+
+    Attributes:
+        name: On the command line and in files.
+        title: In tables.
+        target: Vehicle B at a size, in A's ego frame.
+    """
+
+    name: str
+    title: str
+    target: Callable[[Size], Rig]
+
+
+def source_rig(size: Size, *, fov_deg: float = _FOV_DEG, height_m: float = _HEIGHT_M) -> Rig:
+    """Vehicle A: six cameras around a car's roof, all with one field of view."""
+    cameras = []
+    for name, azimuth in zip(_NAMES, _AZIMUTHS_DEG, strict=True):
+        angle = math.radians(azimuth)
+        x, y = _RING_CENTRE_X_M + _RING_RADIUS_M * math.cos(angle), 0.6 * _RING_RADIUS_M * math.sin(angle)
+        cameras.append(
+            Camera.looking(
+                name=name,
+                azimuth_deg=azimuth,
+                position_m=(x, y, height_m),
+                width_px=size[1],
+                height_px=size[0],
+                horizontal_fov_deg=fov_deg,
+            )
+        )
+    return Rig(cameras, name="A")
+
+
+def _narrow(size: Size) -> Rig:
+    return source_rig(size, fov_deg=50.0)
+
+
+def _lifted(by_m: float) -> Callable[[Size], Rig]:
+    return lambda size: source_rig(size, height_m=_HEIGHT_M + by_m)
+
+
+def _argoverse2(size: Size) -> Rig:
+    """The shipped seven-camera rig, each camera cut to the aspect of ``size`` around its principal row."""
+    rig = load_rig("argoverse2")
+    cameras = []
+    for camera in rig:
+        height = min(camera.height_px, round(camera.width_px * size[0] / size[1]))
+        top = int(np.clip(round(camera.K[1, 2] - height / 2), 0, camera.height_px - height))
+        cameras.append(camera.crop(top, 0, (height, camera.width_px)).resize(size))
+    return rig.with_cameras(cameras).in_frame_of(source_rig(size))
+
+
+CHANGES: dict[str, Change] = {
+    change.name: change
+    for change in (
+        Change(name="fov50", title="FOV 65° → 50°", target=_narrow),
+        Change(name="up70", title="+0.7 m", target=_lifted(0.7)),
+        Change(name="up35", title="+0.35 m", target=_lifted(0.35)),
+        Change(name="down35", title="−0.35 m", target=_lifted(-0.35)),
+        Change(name="waymo", title="Waymo-like, 5 at 2.1 m", target=demo_target_rig),
+        Change(name="av2", title="Argoverse-2-like, 7 cameras", target=_argoverse2),
+    )
+}
+"""By name. ``waymo``: Waymo's azimuths and height at A's field of view, so that it stays a change of the layout."""
+
+
+def named_changes(names: Sequence[str]) -> list[Change]:
+    """Changes by name.
+
+    Raises:
+        ValueError: An unknown name.
+    """
+    unknown = [name for name in names if name not in CHANGES]
+    if unknown:
+        raise ValueError(f"changes: expected some of {', '.join(CHANGES)}, got {', '.join(unknown)}")
+    return [CHANGES[name] for name in names]

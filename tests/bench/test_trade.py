@@ -1,0 +1,137 @@
+"""``python -m arbiview_aug bench``: the sweep, its plot and its recommendation."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from arbiview_aug.__main__ import main
+from arbiview_aug.bench.data import recorded
+from arbiview_aug.bench.others import OURS, ROW_SPLIT, STITCHING, every_move, lost_moves, same_rotation
+from arbiview_aug.bench.sweep import Setting, settings
+from arbiview_aug.bench.trade import _moves, table
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.errors import SampleError
+from arbiview_aug.rig import load_rig
+
+SIZE = (64, 176)
+
+
+def test_settings_differ_and_leave_out_what_is_the_same() -> None:
+    found = settings(["far", "street", "lidar"])
+    assert len({setting.name for setting in found}) == len(found)
+    assert {s.surface for s in found if s.quality == "accurate"} == {"street"}
+    assert {s.held for s in found if s.quality == "accurate"} == {True, False}
+    assert not any(s.held for s in found if s.quality != "accurate")
+    assert {(s.surface, s.execution) for s in found if s.quality == "paper"} == {("far", "opencv")}
+    assert {s.reduce for s in found} == {1, 2, 4} and {s.execution for s in found} == {"opencv", "torch"}
+    assert Setting("accurate", "street", 2, "torch", True).name == "accurate, street, depth held, 1/2, torch"
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    folder = tmp_path_factory.mktemp("trade")
+    only = ["--quality", "draft", "fast", "--surface", "far", "street", "--reduce", "1", "2"]
+    tiny = ["--size", "{}x{}".format(*SIZE), "--repeats", "2", "--budget-ms", "1000", "--output", str(folder)]
+    assert main(["bench", *only, *tiny]) == 0
+    picture = cv2.imread(str(folder / "trade.png"))
+    assert picture.shape[0] > 400 and picture.std() > 10
+    return json.loads((folder / "trade.json").read_text())
+
+
+def test_the_sweep(report: dict[str, Any]) -> None:
+    rows = {row["name"]: row for row in report["settings"]}
+    assert len(rows) == 2 * 2 * 2 * 2 and report["against"] == "true views" and report["size"] == list(SIZE)
+    for row in rows.values():
+        assert 0 < row["q1_ms"] <= row["median_ms"] <= row["q3_ms"] and row["floor_ratio"] > 0
+        assert row["decode_ratio"] == pytest.approx(row["median_ms"] / row["decode_ms"])
+        assert 0.5 < row["seen"] <= 1 and row["psnr_db"] >= row["whole_psnr_db"] > 10
+        same = rows[row["name"].replace("torch", "opencv")]
+        assert row["psnr_db"] == pytest.approx(same["psnr_db"], abs=0.1), "both executions render the same"
+    assert rows["fast, street, 1/2, opencv"]["psnr_db"] > rows["fast, far, 1/2, opencv"]["psnr_db"] + 1
+    assert rows["fast, street, 1/2, opencv"]["psnr_db"] > rows["draft, street, 1/2, opencv"]["psnr_db"]
+    best = max(rows.values(), key=lambda row: row["psnr_db"])
+    assert best["front"] and report["steps"] and set(report["steps"]) <= {n for n, row in rows.items() if row["front"]}
+    assert report["advice"]["setting"] == best["name"] and report["advice"]["again"]["median_ms"] < 1000
+    assert report["moves"] is None
+    printed = table(report)
+    assert all(f"| {name}" in printed for name, row in rows.items() if row["front"])
+    assert f"Recommended, the most accurate within 1000 ms a frame: {best['name']}" in printed
+    assert "kornia's warp_perspective" in printed and "more settings, none of them on the front" in printed
+
+
+def test_what_nothing_keeps_to_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    only = ["--quality", "draft", "--surface", "far", "--reduce", "1", "--execution", "opencv", "--size", "32x88"]
+    assert main(["bench", "trade", *only, "--repeats", "1", "--min-psnr", "90", "--output", str(tmp_path)]) == 1
+    printed = capsys.readouterr().out
+    assert "No recommendation: nothing reaches 90 dB: the best has" in printed
+    assert "| draft, far, 1/1, opencv | step |" in printed
+
+
+def test_real_frames_need_points(fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "--data", str(fisheye_root), "--output", str(tmp_path)]) == 2
+    assert "expected LiDAR points to score by, got none" in capsys.readouterr().err
+
+
+def test_real_frames_are_scored_by_points_that_nobody_read(nuscenes_root: Path) -> None:
+    """Whatever is decoded, the same points score, by the same colours."""
+    with recorded(nuscenes_root) as data:
+        frames = [data.frame(0, reduce, 4) for reduce in (4, 2)]
+    score = [frame.lidar["even"].points for frame in frames]
+    assert np.array_equal(score[0].colours, score[1].colours) and frames[0].held_out
+    assert frames[1].sample["images"].shape[-1] == 2 * frames[0].sample["images"].shape[-1]
+    read = {tuple(p) for p in frames[0].sample["points"][:, :3].double().numpy().round(6)}
+    assert not read & {tuple(p) for p in score[0].points.round(6)}
+
+
+def test_kornia_renders_the_same_rotation() -> None:
+    rig = demo_source_rig(SIZE)
+    images = SyntheticDrive(rig, num_frames=1, lidar=False)[0]["images"]
+    found = same_rotation(rig, images, SIZE, 1)
+    assert found["mean_difference"] < 0.6, "half a grey level is rounding"
+    assert all(time["median_ms"] > 0 for time in found["times"].values())
+    with pytest.raises(SampleError, match="expected pinhole cameras"):
+        same_rotation(load_rig("waymo"), images, SIZE, 1)
+
+
+@pytest.fixture(scope="module")
+def moves() -> dict[str, dict[str, Any]]:
+    with recorded(None, size=SIZE) as data:
+        return every_move(data, 1, 1, ("truck", "yaw"))
+
+
+def test_rivals_at_every_move(moves: dict[str, dict[str, Any]]) -> None:
+    assert list(moves) == ["frame 0: truck", *(f"frame 0: yaw {yaw:+g}" for yaw in (11, -11, 22, -22, 35))]
+    assert lost_moves(moves, "common_psnr_db", OURS, ROW_SPLIT) == []
+    assert lost_moves(moves, "common_psnr_db", OURS, STITCHING) == []
+    first = {name: {"psnr_db": 20.0 + k} for k, name in enumerate((OURS, ROW_SPLIT))}
+    printed = _moves(moves)
+    assert f"{OURS} against {ROW_SPLIT}, common pixels: better at 6 of 6 moves\n" in printed
+    assert lost_moves({"turned": first}, "psnr_db") == ["turned 20.00 against 21.00 dB"]
+
+
+@pytest.mark.bench
+@pytest.mark.xfail("CI" in os.environ, reason="on shared machines times are reported, not asserted", strict=False)
+def test_the_trade_on_a_real_frame(nuscenes_root: Path, tmp_path: Path) -> None:
+    """Steps to choose from, a budget that is kept, kornia slower, decoding dearer, row split worse at each move."""
+    only = ["--reduce", "2", "--execution", "opencv", "--budget-ms", "20", "--output", str(tmp_path), "--moves"]
+    assert main(["bench", "--data", str(nuscenes_root), *only]) == 0
+    report = json.loads((tmp_path / "trade.json").read_text())
+    rows = {row["name"]: row for row in report["settings"]}
+    print(table(report))
+    assert len(rows) >= 8 and len(report["steps"]) >= 4
+    steps = [rows[name] for name in report["steps"]]
+    for one, two in itertools.pairwise(steps):
+        assert two["psnr_db"] >= one["psnr_db"] + 0.2 and two["q1_ms"] > one["q3_ms"]
+    assert report["advice"]["again"]["median_ms"] <= 20
+    assert rows["fast, street, 1/2, opencv"]["decode_ratio"] < 1
+    assert all(ratio < 1 for rotation in report["same_rotation"] for ratio in rotation["ratio"].values())
+    for metric in ("psnr_db", "common_psnr_db"):
+        assert len(report["moves"]) == 16 and lost_moves(report["moves"], metric) == []
