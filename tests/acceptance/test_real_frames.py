@@ -10,16 +10,13 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import cv2
 import pytest
-import torch
 
+from arbiview_aug.bench.timing import one_thread
 from arbiview_aug.camera import Camera
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
 from arbiview_aug.evaluate.sparse import coloured_points, equalised, score_targets
@@ -39,18 +36,6 @@ LARGEST_LOSS_DB = {"yaw": 0.1, "up": 0.25, "paper": 0.1}
 
 Scores = dict[tuple[str, bool], dict[str, float]]
 """By (method, raw): PSNR of each set of targets."""
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    before = cv2.getNumThreads(), torch.get_num_threads()
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before[0])
-        torch.set_num_threads(before[1])
 
 
 class Frame:
