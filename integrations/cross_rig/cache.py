@@ -24,6 +24,9 @@ CHUNK_FRAMES = 20
 _MAX_MAPS = 256
 """Of one set: each holds a file open, of which a process commonly may have 1024."""
 
+_DIGESTS = "digests.json"
+"""Of a chunk's arrays, by name: what depends on frames is named after what they hold, not after what made them."""
+
 Arrays = dict[str, np.ndarray]
 
 
@@ -97,8 +100,12 @@ class FrameStore:
         part = self.folder / f".part-{chunk}"
         shutil.rmtree(part, ignore_errors=True)  # left by a process that died
         part.mkdir(parents=True)
+        digests = {}
         for name in rows[0]:
-            np.save(part / f"{name}.npy", np.stack([row[name] for row in rows]))
+            array = np.stack([row[name] for row in rows])
+            digests[name] = hashlib.sha256(f"{array.dtype}{array.shape}".encode() + array.tobytes()).hexdigest()[:16]
+            np.save(part / f"{name}.npy", array)
+        (part / _DIGESTS).write_text(json.dumps(digests))
         (self.folder / "spec.json").write_text(json.dumps(self.spec, indent=1))
         part.rename(self._chunk(chunk))
 
@@ -117,8 +124,19 @@ class FrameStore:
         chunks = [np.load(self._chunk(k) / f"{name}.npy") for k in range(-(-num_frames // CHUNK_FRAMES))]
         return np.asarray(np.concatenate(chunks)[:num_frames])
 
+    def digest(self, names: Iterable[str], num_frames: int) -> str:
+        """16 hex digits of the content of some arrays, of all chunks that hold the first ``num_frames``."""
+        chunks = [_digests(self._chunk(k)) for k in range(-(-num_frames // CHUNK_FRAMES))]
+        return content_hash({name: [chunk[name] for chunk in chunks] for name in names})
+
     def _chunk(self, chunk: int) -> Path:
         return self.folder / f"{chunk:05}"
+
+
+@cache
+def _digests(chunk: Path) -> dict[str, str]:
+    found: dict[str, str] = json.loads((chunk / _DIGESTS).read_text())
+    return found
 
 
 def fill(store: FrameStore, make: Callable[[int], Arrays], chunk: int) -> None:

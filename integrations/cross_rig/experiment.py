@@ -73,34 +73,62 @@ class Run:
         return self.settings.changes if job.change is None else (job.change,)
 
     def training_key(self, job: Job) -> str:
-        """Of everything that a training depends on."""
-        arm = job.arm
+        """Of everything that a training depends on; arms whose frames are the same, bit by bit, share it.
+
+        The frames must be there.
+        """
+        count, images = self.settings.train_frames, self.images(job)
+        names = ("images", "coverage", "K", "cam2ego") if job.arm.renders else ("images", "state")
+        raw = self._content(self.source("train"), count)
         return content_hash(
             {
-                "frames": self.images(job).store().key,
-                "raw": self.source("train").store().key if arm.mixed else None,
-                "augmented": arm.augmented,
-                "count": self.settings.train_frames,
+                "frames": images.store().digest(names, count),
+                "rig": images.rig.content_key.hex(),
+                "raw": raw if job.arm.mixed or job.arm.renders else None,  # the labels are A's
+                "mixed": job.arm.mixed,
+                "augmented": job.arm.augmented,
+                "count": count,
                 "schedule": asdict(self.settings.schedule),
                 "seed": job.seed,
                 "code": code_hash("integrations.cross_rig.training"),
             }
         )
 
+    def _content(self, source: Source, count: int) -> str:
+        """Of a rig's true frames."""
+        return source.store().digest(("images", "state", "height_dm"), count) + source.rig.content_key.hex()
+
     def result_path(self, job: Job, change: str) -> Path:
-        """Where a test's counts lie."""
+        """Where a test's counts lie; the frames must be there."""
+        s = self.settings
         key = content_hash(
             {
                 "training": self.training_key(job),
-                "val": [self.source("val", change).store().key, self.settings.val_frames],
-                "test": [self.source("test", change).store().key, self.settings.test_frames],
+                "val": [self._content(self.source("val", change), s.val_frames), s.val_frames],
+                "test": [self._content(self.source("test", change), s.test_frames), s.test_frames],
             }
         )
-        return self.output / "results" / f"{job.name}-on-{change}-{key}.json"
+        return self.output / "results" / f"{change}-{job.seed}-{key}.json"
+
+    def result_paths(self, job: Job) -> dict[str, Path]:
+        """By change, of the tests whose frames are there, and the job's own."""
+        s = self.settings
+        own = [(self.images(job), s.train_frames), (self.source("train"), s.train_frames)]
+        found = {}
+        for change in self.tested_on(job):
+            needed = [*own, (self.source("val", change), s.val_frames), (self.source("test", change), s.test_frames)]
+            if not any(source.store().missing(count) for source, count in needed):
+                found[change] = self.result_path(job, change)
+        return found
 
     def missing(self) -> list[Job]:
         """Jobs of which some result is not there."""
-        return [j for j in jobs(self.settings) if not all(self.result_path(j, c).is_file() for c in self.tested_on(j))]
+
+        def done(job: Job) -> bool:
+            paths = self.result_paths(job)
+            return len(paths) == len(self.tested_on(job)) and all(path.is_file() for path in paths.values())
+
+        return [job for job in jobs(self.settings) if not done(job)]
 
     def do(self, job: Job) -> str:
         """Train, unless the weights are there, and test; returns a line for the log."""
@@ -119,7 +147,7 @@ class Run:
         return f"{job.name}: {trained['cpu_s']:.0f} s of training, {', '.join(lines)}"
 
     def _trained(self, job: Job) -> tuple[BevDetector, dict[str, Any]]:
-        path = self.output / "models" / f"{job.name}-{self.training_key(job)}.pt"
+        path = self.output / "models" / f"{self.training_key(job)}.pt"
         schedule = self.settings.schedule
         if path.is_file():
             saved = torch.load(path, weights_only=True, map_location=schedule.device)
@@ -146,7 +174,6 @@ class Run:
 
 def _result(job: Job, change: str, trained: dict[str, Any], tested: Tested) -> dict[str, Any]:
     return {
-        "arm": job.arm.name,
         "change": change,
         "seed": job.seed,
         "trained": trained,
@@ -167,14 +194,17 @@ def _write_text(path: Path, text: str) -> None:
 
 
 def run(setup: Run, workers: int, log: Log) -> Iterator[int]:
-    """Make everything that is missing; yields the number of missing jobs, before the first and after each."""
+    """Make everything that is missing; yields the number of missing trainings, before the first and after each."""
     for source, count in setup.sources():
         start = time.monotonic()
         for done, todo in make_frames(source, count, workers):
             if todo and done in (0, todo):
                 what = f"{source.split} frames, {source.change or 'A'}, {source.arm or 'true'}"
                 log(f"{what}: {todo} chunks" if not done else f"{what}: made in {time.monotonic() - start:.0f} s")
-    missing = setup.missing()
+    first: dict[tuple[str, str | None], Job] = {}  # arms that come to the same frames are one training
+    for job in setup.missing():
+        first.setdefault((setup.training_key(job), job.change), job)
+    missing = list(first.values())
     yield len(missing)
     if workers == 1 or setup.settings.schedule.device != "cpu":  # one training at a time fills a GPU
         for done, job in enumerate(missing, 1):
@@ -192,11 +222,21 @@ def load_results(setup: Run) -> dict[str, dict[str, dict[int, dict[str, Any]]]]:
     """The results that are there: by change, arm and seed."""
     found: dict[str, dict[str, dict[int, dict[str, Any]]]] = {}
     for job in jobs(setup.settings):
-        for change in setup.tested_on(job):
-            path = setup.result_path(job, change)
+        for change, path in setup.result_paths(job).items():
             if path.is_file():
                 found.setdefault(change, {}).setdefault(job.arm.name, {})[job.seed] = json.loads(path.read_text())
     return found
+
+
+def same_frames(setup: Run, change: str) -> dict[str, str]:
+    """Arms whose results are another's, since their frames are the same bit by bit: each and the first of its kind."""
+    first: dict[Path, str] = {}
+    same = {}
+    for job in jobs(setup.settings):
+        path = setup.result_paths(job).get(change)
+        if path is not None and first.setdefault(path, job.arm.name) != job.arm.name:
+            same[job.arm.name] = first[path]
+    return same
 
 
 def rendering_seconds(setup: Run) -> dict[str, float]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from integrations.cross_rig.arms import ARMS
 from integrations.cross_rig.counting import DISTANCES_M, HEIGHTS_M, iou
-from integrations.cross_rig.experiment import Run, load_results, rendering_seconds
+from integrations.cross_rig.experiment import Run, load_results, rendering_seconds, same_frames
 from integrations.cross_rig.scoring import arm_scores
 from integrations.cross_rig.settings import jobs
 from integrations.cross_rig.worlds import CHANGES
@@ -26,7 +26,11 @@ def write_report(setup: Run) -> dict[str, Any]:
     """Write ``report.json``, ``report.md`` and ``report.png`` from the results that are there; returns the first."""
     results = load_results(setup)
     rendering = rendering_seconds(setup)
-    changes = {name: _of_change(results[name], rendering) for name in setup.settings.changes if name in results}
+    changes = {
+        name: _of_change(results[name], rendering) | {"same_frames": same_frames(setup, name)}
+        for name in setup.settings.changes
+        if name in results
+    }
     total = sum(len(setup.tested_on(job)) for job in jobs(setup.settings))
     there = sum(len(seeds) for arms in results.values() for seeds in arms.values())
     report = {
@@ -86,7 +90,9 @@ def markdown(report: Mapping[str, Any]) -> str:
         lines += ["", f"**{CHANGES[name].title}**, seeds {', '.join(map(str, change['seeds']))}", ""]
         lines += ["| " + " | ".join(head) + " |", "| --- |" + " ---: |" * (len(head) - 1)]
         for arm, row in change["arms"].items():
-            cells = [ARMS[arm].title, _text(row["iou"], 1), _text(row["over_raw"], 1, sign=True)]
+            same = change["same_frames"].get(arm)
+            title = ARMS[arm].title + (f" (the frames of {ARMS[same].title})" if same else "")
+            cells = [title, _text(row["iou"], 1), _text(row["over_raw"], 1, sign=True)]
             cells.append(_text(row["share"], 0))
             cells += [f"{100 * value:.1f}" for value in (*row["by_distance_iou"], *row["by_height_recall"])]
             cells.append(f"{1000 * row['loading_cpu_s']:.1f}")

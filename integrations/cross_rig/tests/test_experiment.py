@@ -76,6 +76,17 @@ def test_what_is_done_is_not_done_again(done, monkeypatch):
     assert list(run(more, 1, lambda line: None)) == [1, 0]
 
 
+def test_arms_with_the_same_frames_are_one_training(done):
+    """Every surface is the same when the centres stay: only the far one is trained."""
+    more = replace(done, settings=replace(TINY, arms=("raw", "far", "street", "oracle")))
+    assert list(run(more, 1, lambda line: None)) == [1, 0]
+    results = load_results(more)["fov50"]
+    assert set(results) == {"raw", "far", "street", "oracle"} and results["far"] == results["street"]
+    report = write_report(more)
+    assert report["changes"]["fov50"]["same_frames"] == {"street": "far"}
+    assert "| street (the frames of far) |" in markdown(report)
+
+
 def test_report(done):
     report = write_report(done)
     assert json.loads((done.output / "report.json").read_text()) == json.loads(json.dumps(report))
