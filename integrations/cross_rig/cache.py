@@ -107,7 +107,12 @@ class FrameStore:
             np.save(part / f"{name}.npy", array)
         (part / _DIGESTS).write_text(json.dumps(digests))
         (self.folder / "spec.json").write_text(json.dumps(self.spec, indent=1))
-        part.rename(self._chunk(chunk))
+        try:
+            part.rename(self._chunk(chunk))
+        except OSError:
+            if not self._chunk(chunk).is_dir():
+                raise
+            shutil.rmtree(part)  # a worker that outlived its killed parent was first, with the same frames
 
     def read(self, index: int, name: str) -> np.ndarray:
         """One array of one frame, mapped from disk."""
