@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from integrations.cross_rig.views import Arm, Geometry
+from integrations.cross_rig.arm import Arm, Geometry
 
 _ALL: tuple[Geometry, ...] = ("points", "boxes_3d")
 ARMS: dict[str, Arm] = {
@@ -32,6 +32,9 @@ ARMS: dict[str, Arm] = {
         ),
         Arm(name="lidar_mixed", title="lidar + raw", kind="retarget", surface="lidar", reads=_ALL, mixed=True),
         Arm(name="lidar_filled", title="lidar, Telea", kind="retarget", surface="lidar", reads=_ALL, filled=True),
+        Arm(name="auto_mixed", title="auto + raw", kind="retarget", reads=_ALL, mixed=True),
+        Arm(name="true_covered", title="auto's holes in B's own frames", kind="retarget", reads=_ALL, truth="covered"),
+        Arm(name="true_holes", title="auto, holes filled with the truth", kind="retarget", reads=_ALL, truth="holes"),
         Arm(name="random", title="RandomRig around B, auto", kind="retarget", reads=_ALL, random=True),
         Arm(name="oracle", title="B's own frames", kind="oracle"),
     )

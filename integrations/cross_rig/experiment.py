@@ -45,6 +45,8 @@ class Run:
         for change in s.changes:
             needed += [(self.source("val", change), s.val_frames), (self.source("test", change), s.test_frames)]
         for job in jobs(s):
+            if job.arm.truth is not None:
+                needed.append((self.images(job).true(), s.train_frames))
             if job.arm.kind != "raw":
                 needed.append((self.images(job), s.train_frames))
         return list({source.store().key: (source, count) for source, count in needed}.values())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
@@ -79,11 +79,15 @@ class Source:
         """A's true frames of the same streets."""
         return Source(root=self.root, size=self.size, split=self.split)
 
+    def true(self) -> Source:
+        """The same streets as the rig of these images really sees them."""
+        return replace(self, arm=None)
+
 
 def make_frames(source: Source, num_frames: int, workers: int) -> Iterator[tuple[int, int]]:
     """Make what is missing; yields (chunks done, chunks to do), first (0, n).
 
-    A's own frames must be there before those of an arm.
+    A's own frames must be there before those of an arm, and B's before those of an arm that shows them.
     """
     missing = source.store().missing(num_frames)
     yield 0, len(missing)
@@ -143,20 +147,27 @@ class _ArmFrames:
 
     def __init__(self, source: Source) -> None:
         assert source.arm is not None
+        self.source, self.arm = source, ARMS[source.arm]
         self.original = source.original()
-        self.store = self.original.store()
-        self.reads = ARMS[source.arm].reads
-        self.views = ViewMaker(ARMS[source.arm], self.original.rig, source.rig)
+        self.store, self.truth = self.original.store(), source.true().store()
+        self.views = ViewMaker(self.arm, self.original.rig, source.rig)
         seed = STREET_SEEDS[source.split]
         self.drive = SyntheticDrive(self.original.rig, num_frames=_MAX_FRAMES, seed=seed, lidar=False)
 
     def __call__(self, index: int) -> Arrays:
         frame: dict[str, Any] = {"images": torch.from_numpy(self.store.read(index, "images").copy())}
-        if "boxes_3d" in self.reads:
+        if "boxes_3d" in self.arm.reads:
             boxes = self.drive.scene(index).boxes_ego(self.original.rig.ground_z_m)
             frame["boxes_3d"] = torch.from_numpy(boxes.astype(np.float32))
-        if "points" in self.reads:
+        if "points" in self.arm.reads:
             frame["points"] = self.drive.points(index)
-        if "depth_m" in self.reads:
+        if "depth_m" in self.arm.reads:
             frame["depth_m"] = torch.from_numpy(self.store.read(index, "depth_m").astype(np.float32))
-        return self.views(index, frame)
+        arrays = self.views(index, frame)
+        if self.arm.truth is None:
+            return arrays
+        covered = np.unpackbits(arrays["coverage"], axis=-1, count=self.source.size[1]).astype(bool)
+        shown = covered if self.arm.truth == "covered" else ~covered
+        images = np.where(shown[:, None], self.truth.read(index, "images"), arrays["images"])
+        coverage = covered | shown
+        return arrays | {"images": images, "coverage": np.packbits(coverage, axis=-1)}

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from integrations.cross_rig.arm import Arm
 from integrations.cross_rig.arms import ARMS, named_arms
 from integrations.cross_rig.training import Schedule
-from integrations.cross_rig.views import Arm
 from integrations.cross_rig.worlds import CHANGES, Size, named_changes
 
 

@@ -12,11 +12,12 @@ import torch
 import torch.nn.functional as F
 
 from arbiview_aug import Rig
+from integrations.cross_rig.arm import Arm
+from integrations.cross_rig.augmentation import scaled_and_cropped
 from integrations.cross_rig.cache import FrameStore
 from integrations.cross_rig.counting import Tally, iou, tally
 from integrations.cross_rig.labels import HIDDEN, VEHICLE, Grid
 from integrations.cross_rig.model import Backbone, Batch, BevDetector
-from integrations.cross_rig.views import Arm, scaled_and_cropped
 
 THRESHOLDS = tuple(round(0.05 * k, 2) for k in range(1, 20))
 _EVAL_BATCH = 4

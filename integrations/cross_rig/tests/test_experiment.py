@@ -87,6 +87,23 @@ def test_arms_with_the_same_frames_are_one_training(done):
     assert "| street (the frames of far) |" in markdown(report)
 
 
+def test_true_pixels_replace_what_was_rendered(done):
+    """The two arms of the diagnosis: the truth where something was seen, or where nothing was."""
+    more = replace(
+        done, settings=replace(TINY, changes=("up70",), arms=("auto", "true_covered", "true_holes", "oracle"))
+    )
+    assert list(run(more, 1, lambda line: None))[-1] == 0
+    auto, covered, holes, oracle = (more.training_set(job).frame(1) for job in jobs(more.settings))
+    seen = np.broadcast_to(auto.coverage[:, None], auto.images.shape)
+    assert 0.05 < 1 - seen.mean() < 0.95
+    np.testing.assert_array_equal(covered.coverage, auto.coverage)
+    np.testing.assert_array_equal(covered.images[seen], oracle.images[seen])
+    np.testing.assert_array_equal(covered.images[~seen], auto.images[~seen])
+    assert holes.coverage.all()
+    np.testing.assert_array_equal(holes.images[seen], auto.images[seen])
+    np.testing.assert_array_equal(holes.images[~seen], oracle.images[~seen])
+
+
 def test_report(done):
     report = write_report(done)
     assert json.loads((done.output / "report.json").read_text()) == json.loads(json.dumps(report))
@@ -130,7 +147,7 @@ def test_presets():
     # Raw and scale/crop once for each seed, five arms for each change: 3 * (2 + 3 * 5).
     assert len(jobs(pilot())) == 51
     names = [job.name for job in jobs(full())]
-    assert len(names) == len(set(names)) == 3 * (2 + 6 * 15)
+    assert len(names) == len(set(names)) == 3 * (2 + 6 * 18)
 
 
 def test_keys_follow_what_matters(done):

@@ -6,7 +6,8 @@ import torch
 
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from integrations.cross_rig.arms import ARMS, named_arms
-from integrations.cross_rig.views import SCALE, ViewMaker, scaled_and_cropped
+from integrations.cross_rig.augmentation import SCALE, scaled_and_cropped
+from integrations.cross_rig.views import ViewMaker
 from integrations.cross_rig.worlds import CHANGES, STREET_SEEDS, named_changes, source_rig
 
 SIZE = (24, 64)

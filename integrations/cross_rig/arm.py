@@ -1,0 +1,55 @@
+"""An arm of the experiment: one way to train a detector for vehicle B on A's frames. The list stands in ``arms``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from arbiview_aug.surface import SurfaceName
+
+Kind = Literal["raw", "oracle", "row_split", "retarget"]
+Geometry = Literal["points", "boxes_3d", "depth_m"]
+
+
+RANDOM: dict[str, Any] = {"yaw_deg": 5.0, "pitch_deg": 2.0, "height_m": 0.2, "focal_scale": 0.1}
+"""Half-widths of the random rigs around B: a mounting tolerance well beyond real ones, less than the changes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arm:
+    """One way to train.
+
+    Attributes:
+        name: On the command line and in files.
+        title: In tables.
+        kind: Where its images come from: A's as they are, B's own, or A's re-rendered.
+        surface: Of ``RigRetarget``.
+        reads: Which of the frame's geometry it is given, besides the images.
+        mixed: Half of the frames drawn are raw ones.
+        augmented: Frames are scaled and cropped at random as they are drawn.
+        filled: What no camera saw is inpainted, and counts as seen.
+        random: Targets are drawn around B, one for each frame.
+        truth: To find out where the rest is lost: B's true pixels where something is covered, or where nothing is
+            (which then counts as seen).
+    """
+
+    name: str
+    title: str
+    kind: Kind
+    surface: SurfaceName = "auto"
+    reads: tuple[Geometry, ...] = ()
+    mixed: bool = False
+    augmented: bool = False
+    filled: bool = False
+    random: bool = False
+    truth: Literal["covered", "holes"] | None = None
+
+    @property
+    def renders(self) -> bool:
+        """Whether it has a training set of its own on disk."""
+        return self.kind in ("row_split", "retarget")
+
+    def views_spec(self) -> dict[str, Any]:
+        """What its images depend on, besides rigs and code: arms that differ in how they draw share them."""
+        settings = {"kind": self.kind, "surface": self.surface, "reads": list(self.reads), "filled": self.filled}
+        return settings | ({"random": RANDOM} if self.random else {}) | ({"truth": self.truth} if self.truth else {})
