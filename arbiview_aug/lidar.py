@@ -11,18 +11,17 @@ from typing import Any, ClassVar, NamedTuple
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray, Rays
 from arbiview_aug.errors import SampleError
-from arbiview_aug.objects import Objects, within_boxes
+from arbiview_aug.measured import MeasuredObject, measured_objects
+from arbiview_aug.objects import Objects, meets, silhouettes
 from arbiview_aug.panorama import CELL_RAD, Layer, Panorama, Window, angles, panorama
 from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Dense, Drawn, Points, Shadows, Static
 
 OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
 """(x, y) ranges in the ego frame whose returns are the own car's: a car's about the middle of its rear axle."""
-
-BOX_AIR_M = 0.2
-"""Points this far outside a box are its object's too: mirrors, and the noise of points and labels."""
 
 _STEEP = 0.9
 """Sine of the elevation up to which azimuths are interpolated over 0.2 degrees: 64 degrees."""
@@ -40,14 +39,17 @@ class LidarSurface(Dense):
     Attributes:
         street: What there is where nothing was measured.
         points: (P, 3) in the ego frame, finite, metres.
+        objects: Whose points are among them: nothing behind these is seen through gaps between their points.
     """
 
     smooth: ClassVar[bool] = False
     street: Static
     points: Points
+    objects: tuple[MeasuredObject, ...] = ()
     _panoramas: dict[bytes, list[Panorama]] = field(default_factory=dict, repr=False)
     _shadows: dict[Camera, Shadows] = field(default_factory=dict, repr=False)
     _rays: dict[Camera, _Located] = field(default_factory=dict, repr=False)
+    _seen: dict[Camera, list[_Seen]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", self.points[~own_car(self.points)])
@@ -56,6 +58,8 @@ class LidarSurface(Dense):
         """The points' dense surface, 1/m (...,)."""
         view, row, column = self._view(origin, directions)
         known = self.street.inverse_distance(origin, directions) + view.residual(row, column)
+        for one in self._objects_on(origin, directions):
+            one.fill(known)
         return np.asarray(np.clip(known, 0.0, MAX_INVERSE_DISTANCE), np.float64)
 
     def image(self, camera: Camera) -> Layer:
@@ -66,6 +70,8 @@ class LidarSurface(Dense):
         rays = self._located(camera)
         street = self.street.inverse_distance(camera.center_m, rays.directions).astype(np.float32)
         known = rays.to_pixels(street) + rays.view.residual(rays.to_pixels(rays.row), rays.to_pixels(rays.column))
+        for one in self._objects_in(camera):
+            one.fill(known)
         return np.clip(known, 0, np.float32(MAX_INVERSE_DISTANCE), out=known)
 
     def shadows(self, camera: Camera) -> Shadows:
@@ -75,10 +81,13 @@ class LidarSurface(Dense):
             self._shadows[camera] = Shadows(self.before_image(camera), none)
         return self._shadows[camera]
 
-    def before_image(self, camera: Camera) -> Layer:
+    def before_image(self, camera: Camera, *, widened: bool = True) -> Layer:
         """``before`` at all pixels of a camera (h, w), interpolated between rays a panorama's cell apart."""
         rays = self._located(camera)
-        return np.asarray(rays.to_pixels(rays.view.before(rays.row, rays.column)))
+        before = rays.to_pixels(rays.view.before(rays.row, rays.column)).copy()
+        for one in self._objects_in(camera):
+            one.hide(before, widened)
+        return np.asarray(before)
 
     def hides(
         self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
@@ -90,16 +99,44 @@ class LidarSurface(Dense):
         """
         return np.asarray(inverse_distance < self.before(origin, directions))
 
-    def before(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
-        """Inverse distances (...,) beyond which ``hides`` says that points are hidden, 1/m."""
+    def before(self, origin: FloatArray, directions: FloatArray, *, widened: bool = True) -> FloatArray:
+        """Inverse distances (...,) beyond which ``hides`` says that points are hidden, 1/m.
+
+        Args:
+            origin: (3,) the rays' common start.
+            directions: (..., 3) unit rays.
+            widened: Objects reach half a scan line's spacing above their highest points: they may, and a source that
+                shows them there must not be read for what is behind. Otherwise they end with their points.
+        """
         view, row, column = self._view(origin, directions)
-        return view.before(row, column).astype(np.float64)
+        before = view.before(row, column).astype(np.float64)
+        for one in self._objects_on(origin, directions):
+            one.hide(before, widened)
+        return before
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Small where a point is near, the street's elsewhere: 1/m (...,)."""
         view, row, column = self._view(origin, directions)
         unknown = self.street.uncertainty(origin, directions, inverse_distance)
         return np.where(view.is_measured(row, column), _MEASURED_SPREAD * inverse_distance, unknown)
+
+    def _objects_on(self, origin: FloatArray, directions: FloatArray) -> list[_Seen]:
+        """What rays (..., 3) see of the objects."""
+        rays = directions.reshape(-1, 3)
+        met = [np.flatnonzero(meets(one.box, origin, rays)) for one in self.objects]
+        return [_Seen(ray, *one.seen(origin, rays[ray])) for one, ray in zip(self.objects, met, strict=True)]
+
+    def _objects_in(self, camera: Camera) -> list[_Seen]:
+        """What a camera's pixels see of the objects; kept for the next question."""
+        if camera not in self._seen:
+            boxes = np.array([one.box for one in self.objects]).reshape(-1, 7)
+            found = []
+            for one, pixel in zip(self.objects, silhouettes(camera, boxes), strict=True):
+                v, u = np.divmod(pixel, camera.width_px)
+                directions, _ = camera.unproject(np.stack([u, v], -1))
+                found.append(_Seen(pixel, *one.seen(camera.center_m, directions)))
+            self._seen[camera] = found
+        return self._seen[camera]
 
     def _located(self, camera: Camera) -> _Located:
         """Rays to interpolate a camera's pixels between; kept for the next question unless they are all pixels'."""
@@ -128,6 +165,29 @@ class LidarSurface(Dense):
             view = panorama(asked.widened(), origin, self.points, self.street)
             held.append(view)
         return view, *view.window.cells(azimuth, elevation)
+
+
+class _Seen(NamedTuple):
+    """What rays see of an object: ``MeasuredObject.seen`` of the rays of these numbers (n,).
+
+    Where the points around say that a ray goes on behind the object, it is the object that it meets.
+    """
+
+    ray: npt.NDArray[np.int64]
+    own: FloatArray
+    beyond: FloatArray
+
+    def fill(self, known: FloatArray | Layer) -> None:
+        """Put the object into inverse distances."""
+        flat = known.reshape(-1)
+        behind = (self.own > 0) & (flat[self.ray] < self.beyond)
+        flat[self.ray[behind]] = self.own[behind]
+
+    def hide(self, before: FloatArray | Layer, widened: bool) -> None:
+        """Put what it hides into ``before``."""
+        flat = before.reshape(-1)
+        beyond = self.beyond if widened else np.where(self.own > 0, self.beyond, 0)
+        flat[self.ray] = np.maximum(flat[self.ray], beyond)
 
 
 class _Located(NamedTuple):
@@ -168,7 +228,8 @@ def _spaced_rays(camera: Camera, step: int) -> Rays:
 class LidarObjects(Objects):
     """Labelled boxes among points made dense: a box decides within its silhouette, what was measured before it wins.
 
-    An object's points are left out of the panoramas, where they would blur over its outline.
+    An object of few points is its box; they are left out of the panoramas, where they would blur over its outline. One
+    of many is what they say (``measured``).
 
     Attributes:
         street: The points' surface; ``among`` leaves out those within boxes.
@@ -180,18 +241,19 @@ class LidarObjects(Objects):
     @classmethod
     def among(cls, street: Static, points: Points, boxes: FloatArray) -> LidarObjects:
         """Boxes (B, 7) among points (P, 3)."""
-        return cls(LidarSurface(street, points[~within_boxes(boxes, points, BOX_AIR_M)]), boxes)
+        objects, boxes, in_box = measured_objects(boxes, points)
+        return cls(LidarSurface(street, points[~in_box], objects), boxes)
 
     def drawn(self, camera: Camera) -> Drawn:
         """The pixels of a camera that show boxes with nothing measured before them."""
         pixel, first, face = super().drawn(camera)
-        shown = first >= self.street.before_image(camera).reshape(-1)[pixel]
+        shown = first >= self.street.before_image(camera, widened=False).reshape(-1)[pixel]
         return Drawn(pixel[shown], first[shown], face[shown])
 
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """The first box along a ray with nothing measured before it, else the points' surface, 1/m (...,)."""
         first = self._boxes_ahead(origin, directions)[0]
-        shown = (first > 0) & (first >= self.street.before(origin, directions))
+        shown = (first > 0) & (first >= self.street.before(origin, directions, widened=False))
         return np.where(shown, first, self.street.inverse_distance(origin, directions))
 
     def shadows(self, camera: Camera) -> Shadows:

@@ -20,7 +20,8 @@ from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.grid import Grid
 from arbiview_aug.solids import draw_boxes
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn, Layered, Points, Shadows, Static, Surface
+from arbiview_aug.solids import silhouettes as pinhole_silhouettes
+from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn, Far, Layered, Points, Shadows, Static, Surface
 
 _CHUNK = 1 << 15  # points tested at once: they stay in the cache, however many there are
 _LENS_STEP_PX = 8  # cells in which rays of a lens are cast or not
@@ -160,6 +161,19 @@ class Objects(Layered):
         return q.reshape(directions.shape[:-1]), number.reshape(directions.shape[:-1])
 
 
+def silhouettes(camera: Camera, boxes: FloatArray) -> list[npt.NDArray[np.int64]]:
+    """For each box (B, 7) the pixels whose rays meet it, into the flattened image (h, w), whatever stands before it."""
+    if camera.lens == "pinhole":
+        return pinhole_silhouettes(camera, boxes)
+    return [Objects(Far(), box[None]).drawn(camera).pixel for box in boxes]
+
+
+def meets(box: FloatArray, origin: FloatArray, directions: FloatArray) -> BoolArray:
+    """Which rays (..., 3) from a point outside a box (7,) meet it: the plain reference of ``silhouettes``."""
+    first, _ = _first_face(box, origin, directions.reshape(-1, 3))
+    return (first > 0).reshape(directions.shape[:-1])
+
+
 def _first_face(
     box: FloatArray, origin: FloatArray, directions: FloatArray
 ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
@@ -176,18 +190,18 @@ def _first_face(
     return np.where(hit, 1 / np.maximum(enter, 1 / MAX_INVERSE_DISTANCE), 0.0), side
 
 
-def within_boxes(boxes: FloatArray, points: Points, air_m: float = 0.0) -> BoolArray:
-    """(P,) points that lie in any box (B, 7), or no farther than ``air_m`` beside its faces."""
-    within = np.zeros(len(points), bool)
+def points_in(boxes: FloatArray, points: Points, air_m: float = 0.0) -> list[npt.NDArray[np.int64]]:
+    """For each box (B, 7) the points (P, 3) that lie in it, or no farther than ``air_m`` beside its faces."""
+    found: list[list[npt.NDArray[np.int64]]] = [[np.zeros(0, np.int64)] for _ in boxes]
     reach_m = np.hypot(boxes[:, 3], boxes[:, 4]) / 2 + 2 * air_m
     for first in range(0, len(points), _CHUNK):
         chunk = points[first : first + _CHUNK]
         x, y = chunk[:, :2].T.astype(np.float64, order="C")
-        for box, reach in zip(boxes, reach_m.tolist(), strict=True):
+        for box, reach, numbers in zip(boxes, reach_m.tolist(), found, strict=True):
             near = np.flatnonzero((np.abs(x - box[0]) <= reach) & (np.abs(y - box[1]) <= reach))
             inside = np.abs(_in_box_frame(box, chunk[near] - box[:3])) <= box[3:6] / 2 + air_m
-            within[first + near] |= inside.all(axis=1)
-    return within
+            numbers.append(first + near[inside.all(axis=1)])
+    return [np.concatenate(numbers) for numbers in found]
 
 
 def _in_box_frame(box: FloatArray, vectors: FloatArray) -> FloatArray:

@@ -76,10 +76,10 @@ class Window:
     def around(cls, azimuth: Layer, elevation: Layer) -> Window:
         """The smallest window that holds rays (...,)."""
         middle = float(azimuth.reshape(-1)[0])
-        offset = _wrapped(azimuth - middle)
+        offset = wrapped(azimuth - middle)
         if float(offset.max() - offset.min()) > math.pi:  # they may lie around the back of the first one
             middle = math.atan2(float(np.sin(azimuth).mean()), float(np.cos(azimuth).mean()))
-            offset = _wrapped(azimuth - middle)
+            offset = wrapped(azimuth - middle)
         low, first = float(elevation.min()), float(offset.min())
         return cls(middle + first, float(offset.max()) - first, low, float(elevation.max()) - low)
 
@@ -314,7 +314,7 @@ def _floored(angle_rad: float) -> float:
     return math.floor(angle_rad / CELL_RAD) * CELL_RAD
 
 
-def _wrapped(angle: Layer) -> Layer:
+def wrapped(angle: Layer) -> Layer:
     """Differences of two azimuths, in [-pi, pi]."""
     turn = np.float32(2 * math.pi)
     return np.where(angle > math.pi, angle - turn, np.where(angle < -math.pi, angle + turn, angle))

@@ -6,13 +6,16 @@ each row of pixels that is one interval. All of it is evaluated in float64.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from arbiview_aug.camera import Camera, FloatArray
+from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn
+
+Layer = npt.NDArray[np.float32]
 
 _TOUCHES_M = 1e-9
 """A camera this close to a face's plane does not see the face."""
@@ -46,6 +49,32 @@ def draw_boxes(camera: Camera, boxes: FloatArray) -> Drawn:
         boxes: (B, 7) centre x, y, z, length, width, height (metres), yaw (radians), in the ego frame.
     """
     nearest, shown_face = np.zeros(camera.size, np.float32), np.zeros(camera.size, np.int32)
+    for here, inside, face, number in _face_images(camera, boxes):
+        first = inside & (face > nearest[here])
+        np.copyto(nearest[here], face, where=first)
+        np.copyto(shown_face[here], number, where=first)
+    index = np.flatnonzero(nearest != 0)  # faster than of floats
+    v, u = np.divmod(index, camera.width_px)
+    y = (v - camera.K[1, 2]) / camera.K[1, 1]
+    x = (u - camera.K[0, 2] - camera.K[0, 1] * y) / camera.K[0, 0]
+    distance = nearest.reshape(-1)[index] / np.sqrt(x * x + y * y + 1)
+    return Drawn(index, np.minimum(distance, MAX_INVERSE_DISTANCE), shown_face.reshape(-1)[index])
+
+
+def silhouettes(camera: Camera, boxes: FloatArray) -> list[npt.NDArray[np.int64]]:
+    """For each box (B, 7) the pixels of a pinhole camera, into the flattened image, whose rays meet it: none is hidden.
+
+    A box that holds the camera is not seen.
+    """
+    found: list[list[npt.NDArray[np.int64]]] = [[np.zeros(0, np.int64)] for _ in boxes]
+    for (rows, columns), inside, _, number in _face_images(camera, boxes):
+        v, u = np.nonzero(inside)
+        found[number // 6].append((v + rows.start) * camera.width_px + u + columns.start)
+    return [np.unique(np.concatenate(parts)) for parts in found]  # edges belong to two faces
+
+
+def _face_images(camera: Camera, boxes: FloatArray) -> Iterator[tuple[tuple[slice, slice], BoolArray, Layer, int]]:
+    """For each face in the image: rows and columns around it, which pixels show it, inverse depths, its number."""
     columns = np.arange(camera.width_px, dtype=np.float64)
     for plane, sides, (x0, x1, y0, y1), number in zip(*_faces(camera, boxes), strict=True):
         rows = np.arange(y0, y1, dtype=np.float64)
@@ -63,15 +92,7 @@ def draw_boxes(camera: Camera, boxes: FloatArray) -> Drawn:
         right = int(np.floor(min(high[shown].max(), x1 - 1))) + 1
         u, here = columns[left:right], (slice(y0 + top, y0 + bottom), slice(left, right))
         face = ((plane[0] * u)[None] + (plane[1] * rows[top:bottom] + plane[2])[:, None]).astype(np.float32)
-        first = (u >= low[top:bottom, None]) & (u <= high[top:bottom, None]) & (face > nearest[here])
-        np.copyto(nearest[here], face, where=first)
-        np.copyto(shown_face[here], number, where=first)
-    index = np.flatnonzero(nearest != 0)  # faster than of floats
-    v, u = np.divmod(index, camera.width_px)
-    y = (v - camera.K[1, 2]) / camera.K[1, 1]
-    x = (u - camera.K[0, 2] - camera.K[0, 1] * y) / camera.K[0, 0]
-    distance = nearest.reshape(-1)[index] / np.sqrt(x * x + y * y + 1)
-    return Drawn(index, np.minimum(distance, MAX_INVERSE_DISTANCE), shown_face.reshape(-1)[index])
+        yield here, (u >= low[top:bottom, None]) & (u <= high[top:bottom, None]), face, int(number)
 
 
 def _faces(camera: Camera, boxes: FloatArray) -> _Faces:

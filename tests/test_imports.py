@@ -22,6 +22,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("surface", "grid", "neighbours", "tone", "command_line"),
     ("solids", "refined", "panorama"),
     ("objects",),
+    ("measured",),
     ("lidar",),
     ("scene",),
     ("sampling",),
