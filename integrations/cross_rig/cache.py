@@ -36,13 +36,14 @@ def content_hash(spec: Mapping[str, Any]) -> str:
 
 
 @cache
-def code_hash(module: str, within: str | None = None) -> str:
+def code_hash(module: str, within: str | None = None, without: tuple[str, ...] = ()) -> str:
     """16 hex digits of the code that ``module`` runs: its own and all it imports of ``within``, by default its package.
 
-    Comments and docstrings do not count, so that mending words makes nothing anew.
+    Comments and docstrings do not count, so that mending words makes nothing anew; nor do modules ``without``.
     """
     root = within or module.partition(".")[0]
-    todo, code = [module], {}
+    todo: list[str] = [module]
+    code: dict[str, str] = {name: "" for name in without}
     while todo:
         name = todo.pop()
         path = None if name in code else _source(name)

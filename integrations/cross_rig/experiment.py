@@ -69,6 +69,12 @@ class Run:
         state = source.store().stacked("state", num_frames)
         return FrameSet(source.store(), source.rig, state, covered_cells(Grid(), source.rig))
 
+    def draws(self, job: Job) -> Draws:
+        """The batches of a job's training."""
+        count = self.settings.train_frames
+        raw = self.true_set("train", None, count) if job.arm.mixed else None
+        return Draws(self.training_set(job), raw, count, job.seed, augmented=job.arm.augmented)
+
     # --- trainings and tests ----------------------------------------------------------------------------------------
     def tested_on(self, job: Job) -> tuple[str, ...]:
         """The changes whose vehicle B a job's model is tested on."""
@@ -157,8 +163,7 @@ class Run:
             model.load_state_dict(saved["weights"])
             return model.eval(), saved["trained"]
         start = time.process_time()
-        raw = self.true_set("train", None, self.settings.train_frames)
-        draws = Draws(job.arm, self.training_set(job), raw, self.settings.train_frames, job.seed)
+        draws = self.draws(job)
         model, losses = train(draws, schedule, job.seed)
         frames_drawn = schedule.steps * schedule.batch
         trained = {

@@ -71,7 +71,8 @@ class Source:
                 "source": source_rig(self.size).content_key.hex(),
                 "arm": arm.views_spec(),
                 "renderer": code_hash(f"arbiview_aug.{renderer}"),
-                "views": code_hash("integrations.cross_rig.views"),
+                # What an arm says of its views is in ``arm``; another arm's needs may change without it.
+                "views": code_hash("integrations.cross_rig.views", without=("integrations.cross_rig.arm",)),
             }
         return FrameStore(self.root, spec)
 

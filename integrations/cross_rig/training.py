@@ -12,7 +12,6 @@ import torch
 import torch.nn.functional as F
 
 from arbiview_aug import Rig
-from integrations.cross_rig.arm import Arm
 from integrations.cross_rig.augmentation import scaled_and_cropped
 from integrations.cross_rig.cache import FrameStore
 from integrations.cross_rig.counting import Tally, iou, tally
@@ -107,18 +106,20 @@ class Draws:
     """The batches of a training: which frames they hold depends on the seed alone, so that arms are paired.
 
     Args:
-        arm: How to draw.
         own: The arm's frames.
-        raw: A's frames, for mixed arms.
+        raw: A's frames, half of which are drawn instead; None: none.
         num_frames: Of each.
         seed: Of the training.
+        augmented: Frames are scaled and cropped.
 
     Attributes:
         augment_s: CPU seconds that scaling and cropping took so far.
     """
 
-    def __init__(self, arm: Arm, own: FrameSet, raw: FrameSet, num_frames: int, seed: int) -> None:
-        self.arm, self.own, self.raw, self.num_frames = arm, own, raw, num_frames
+    def __init__(
+        self, own: FrameSet, raw: FrameSet | None, num_frames: int, seed: int, *, augmented: bool = False
+    ) -> None:
+        self.own, self.raw, self.num_frames, self.augmented = own, raw, num_frames, augmented
         self.order = np.random.default_rng([seed, 0])
         self.rng = np.random.default_rng([seed, 1])
         self.left: list[int] = []
@@ -131,9 +132,9 @@ class Draws:
             if not self.left:
                 self.left = [int(k) for k in self.order.permutation(self.num_frames)]
             index = self.left.pop()
-            from_raw = self.arm.mixed and self.rng.random() < 0.5
-            frame = (self.raw if from_raw else self.own).frame(index)
-            if self.arm.augmented:
+            drawn_from = self.raw if self.raw is not None and self.rng.random() < 0.5 else self.own
+            frame = drawn_from.frame(index)
+            if self.augmented:
                 start = time.process_time()
                 images, coverage, K = scaled_and_cropped(frame.images, frame.K, self.rng)
                 frame = _Frame(images, coverage, K, frame.cam2ego, frame.state, frame.counts)
