@@ -20,6 +20,9 @@ ARMS: dict[str, Arm] = {
         Arm(name="lidar", title="lidar", kind="retarget", surface="lidar", reads=_ALL),
         Arm(name="auto", title="auto", kind="retarget", surface="auto", reads=_ALL),
         Arm(name="auto_bare", title="auto, images alone", kind="retarget", surface="auto"),
+        Arm(name="same_height", title="street at A's height", kind="retarget", surface="street", stays="height"),
+        Arm(name="same_centre", title="street at A's centres", kind="retarget", surface="street", stays="centre"),
+        Arm(name="far_mixed", title="far + raw", kind="retarget", surface="far", mixed=True),
         Arm(name="depth", title="true depth", kind="retarget", surface="lidar", reads=("depth_m",)),
         Arm(name="street_mixed", title="street + raw", kind="retarget", surface="street", mixed=True),
         Arm(

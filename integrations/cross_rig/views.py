@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -30,6 +31,8 @@ class ViewMaker:
     """
 
     def __init__(self, arm: Arm, source: Rig, target: Rig) -> None:
+        if arm.stays:
+            target = stayed(target, source, height_only=arm.stays == "height")
         self.arm, self.source, self.target = arm, source, target
         self.random = RandomRig(target, **RANDOM) if arm.random else None
         self.retarget = RigRetarget(self.random or target, source_rig=source, surface=arm.surface)
@@ -68,6 +71,21 @@ class ViewMaker:
             "cam2ego": cam2ego.astype(np.float32),
             "cpu_s": np.array(seconds, np.float32),
         }
+
+
+def stayed(target: Rig, source: Rig, *, height_only: bool) -> Rig:
+    """A target rig (in the source's ego frame) that moves no camera, or none up or down.
+
+    Each takes the centre, or its height, of the source camera whose axis is nearest to its own.
+    """
+    cameras = []
+    for camera in target:
+        nearest = max(source, key=lambda one: float(one.cam2ego[:3, 2] @ camera.cam2ego[:3, 2]))
+        cam2ego = camera.cam2ego.copy()
+        kept = slice(2, 3) if height_only else slice(0, 3)
+        cam2ego[kept, 3] = nearest.center_m[kept]
+        cameras.append(replace(camera, cam2ego=cam2ego))
+    return target.with_cameras(cameras)
 
 
 def _filled(image: np.ndarray, coverage: np.ndarray) -> np.ndarray:

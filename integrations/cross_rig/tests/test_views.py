@@ -42,7 +42,10 @@ def test_every_arm_renders(frame, name):
         np.testing.assert_array_equal(again["images"], views["images"])
     else:
         np.testing.assert_allclose(views["K"], target.K, rtol=1e-6)
-        np.testing.assert_allclose(views["cam2ego"], target.cam2ego, atol=1e-6)
+        np.testing.assert_allclose(views["cam2ego"][:, :3, :3], target.cam2ego[:, :3, :3], atol=1e-6)
+        away = views["cam2ego"][:, :3, 3] - target.cam2ego[:, :3, 3]
+        np.testing.assert_allclose(away[:, 2], -0.6 if ARMS[name].stays else 0, atol=1e-6)
+        assert (np.abs(away[:, :2]).max() > 0.01) == (ARMS[name].stays == "centre")
 
 
 def test_scaled_and_cropped_keeps_pixels_and_calibration_together():
