@@ -71,7 +71,7 @@ class RigRetarget(torch.nn.Module):
             any.
         surface: ``far``, ``ground``, ``street``; ``objects``: the sample's ``boxes_3d`` stand on the street, so that
             objects keep their height when cameras move; ``lidar``: its ``points`` (ego frame) or ``depth_m`` (..., N,
-            H, W; z-depth in metres, 0 or NaN where unknown), with ``boxes_3d`` before them where there are any;
+            H, W; z-depth in metres, 0 or NaN where unknown), with ``boxes_3d`` for objects of few points;
             ``auto``: for each pair of cameras ``far`` where their centres coincide, else the best that the sample
             offers: ``lidar``, else ``objects``, else ``street``, with a warning where cameras move (``paper``: always
             ``far``). Plans over points and boxes are made anew for every frame.

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from integrations.cross_rig.arm import Arm
 from integrations.cross_rig.cache import code_hash, content_hash
 from integrations.cross_rig.frames import Source, make_frames, one_thread
 from integrations.cross_rig.labels import Grid, covered_cells
@@ -34,7 +35,7 @@ class Run:
     output: Path
 
     # --- frames -----------------------------------------------------------------------------------------------------
-    def source(self, split: Split, change: str | None = None, arm: str | None = None) -> Source:
+    def source(self, split: Split, change: str | None = None, arm: Arm | None = None) -> Source:
         """A set of frames of this run."""
         return Source(root=self.output / "frames", size=self.settings.size, split=split, change=change, arm=arm)
 
@@ -45,15 +46,13 @@ class Run:
         for change in s.changes:
             needed += [(self.source("val", change), s.val_frames), (self.source("test", change), s.test_frames)]
         for job in jobs(s):
-            if job.arm.truth is not None:
-                needed.append((self.images(job).true(), s.train_frames))
-            if job.arm.kind != "raw":
-                needed.append((self.images(job), s.train_frames))
+            images = self.images(job)
+            needed += [(source, s.train_frames) for source in (*images.needs(), images)]
         return list({source.store().key: (source, count) for source, count in needed}.values())
 
     def images(self, job: Job) -> Source:
         """What a job is trained on."""
-        return self.source("train", job.change, job.arm.name if job.arm.renders else None)
+        return self.source("train", job.change, job.arm if job.arm.renders else None)
 
     def training_set(self, job: Job) -> FrameSet:
         """A job's frames. What counts: objects that the rig of the recording sees, in the cells that B covers."""
@@ -206,7 +205,7 @@ def run(setup: Run, workers: int, log: Log) -> Iterator[int]:
         start = time.monotonic()
         for done, todo in make_frames(source, count, workers):
             if todo and done in (0, todo):
-                what = f"{source.split} frames, {source.change or 'A'}, {source.arm or 'true'}"
+                what = f"{source.split} frames, {source.change or 'A'}, {source.arm.title if source.arm else 'true'}"
                 log(f"{what}: {todo} chunks" if not done else f"{what}: made in {time.monotonic() - start:.0f} s")
     first: dict[tuple[str, str | None], Job] = {}  # arms that come to the same frames are one training
     for job in setup.missing():

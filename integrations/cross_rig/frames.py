@@ -17,10 +17,10 @@ import torch
 
 from arbiview_aug import Rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive
-from integrations.cross_rig.arms import ARMS
+from integrations.cross_rig.arm import Arm
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, fill
 from integrations.cross_rig.labels import Grid, box_cells, visible_objects
-from integrations.cross_rig.views import ViewMaker
+from integrations.cross_rig.views import ViewMaker, filled
 from integrations.cross_rig.worlds import CHANGES, STREET_SEEDS, Size, Split, source_rig
 
 _WORLD = "arbiview_aug.datasets.synthetic"
@@ -39,14 +39,14 @@ class Source:
         size: (h, w) of the images.
         split: Streets.
         change: Vehicle B by its change; None: vehicle A.
-        arm: Whose training set; None: the rig's own true frames.
+        arm: Whose training set; None: the rig's own true frames. Arms that differ in how they draw share theirs.
     """
 
     root: Path
     size: Size
     split: Split
     change: str | None = None
-    arm: str | None = None
+    arm: Arm | None = None
 
     @property
     def rig(self) -> Rig:
@@ -65,7 +65,7 @@ class Source:
             "labels": code_hash("integrations.cross_rig.labels"),
         }
         if self.arm is not None:
-            arm = ARMS[self.arm]
+            arm = self.arm
             renderer = "transforms" if arm.kind == "retarget" else "evaluate.baselines"
             spec |= {
                 "source": source_rig(self.size).content_key.hex(),
@@ -80,6 +80,22 @@ class Source:
         """A's true frames of the same streets."""
         return Source(root=self.root, size=self.size, split=self.split)
 
+    def rendered(self) -> Source:
+        """The same views as they were rendered: without what is put into their holes, or over them."""
+        assert self.arm is not None
+        return replace(self, arm=replace(self.arm, filled=False, truth=None))
+
+    def needs(self) -> list[Source]:
+        """The sets that must be there before this one can be made."""
+        if self.arm is None:
+            return []
+        needed = [self.original()]
+        if self.arm.truth is not None:
+            needed.append(self.true())
+        if self.rendered() != self:
+            needed.append(self.rendered())
+        return needed
+
     def true(self) -> Source:
         """The same streets as the rig of these images really sees them."""
         return replace(self, arm=None)
@@ -88,7 +104,7 @@ class Source:
 def make_frames(source: Source, num_frames: int, workers: int) -> Iterator[tuple[int, int]]:
     """Make what is missing; yields (chunks done, chunks to do), first (0, n).
 
-    A's own frames must be there before those of an arm, and B's before those of an arm that shows them.
+    Those that the source needs must be there.
     """
     missing = source.store().missing(num_frames)
     yield 0, len(missing)
@@ -111,8 +127,10 @@ def _make_chunk(source: Source, chunk: int) -> None:
 
 
 @lru_cache(maxsize=2)  # a worker goes from chunk to chunk of one source
-def _maker(source: Source) -> _TrueFrames | _ArmFrames:
-    return _TrueFrames(source) if source.arm is None else _ArmFrames(source)
+def _maker(source: Source) -> _TrueFrames | _ArmFrames | _ChangedFrames:
+    if source.arm is None:
+        return _TrueFrames(source)
+    return _ArmFrames(source) if source.rendered() == source else _ChangedFrames(source)
 
 
 def one_thread() -> None:
@@ -148,9 +166,8 @@ class _ArmFrames:
 
     def __init__(self, source: Source) -> None:
         assert source.arm is not None
-        self.source, self.arm = source, ARMS[source.arm]
-        self.original = source.original()
-        self.store, self.truth = self.original.store(), source.true().store()
+        self.arm, self.original = source.arm, source.original()
+        self.store = self.original.store()
         self.views = ViewMaker(self.arm, self.original.rig, source.rig)
         seed = STREET_SEEDS[source.split]
         self.drive = SyntheticDrive(self.original.rig, num_frames=_MAX_FRAMES, seed=seed, lidar=False)
@@ -164,11 +181,28 @@ class _ArmFrames:
             frame["points"] = self.drive.points(index)
         if "depth_m" in self.arm.reads:
             frame["depth_m"] = torch.from_numpy(self.store.read(index, "depth_m").astype(np.float32))
-        arrays = self.views(index, frame)
-        if self.arm.truth is None:
-            return arrays
-        covered = np.unpackbits(arrays["coverage"], axis=-1, count=self.source.size[1]).astype(bool)
-        shown = covered if self.arm.truth == "covered" else ~covered
-        images = np.where(shown[:, None], self.truth.read(index, "images"), arrays["images"])
-        coverage = covered | shown
-        return arrays | {"images": images, "coverage": np.packbits(coverage, axis=-1)}
+        return self.views(index, frame)
+
+
+class _ChangedFrames:
+    """Rendered views with something else in their holes, or over them."""
+
+    def __init__(self, source: Source) -> None:
+        assert source.arm is not None
+        self.arm, self.width = source.arm, source.size[1]
+        self.store, self.truth = source.rendered().store(), source.true().store()
+
+    def __call__(self, index: int) -> Arrays:
+        start = time.process_time()
+        arrays = {name: self.store.read(index, name) for name in ("images", "K", "cam2ego", "cpu_s")}
+        covered = np.unpackbits(self.store.read(index, "coverage"), axis=-1, count=self.width).astype(bool)
+        if self.arm.truth is not None:
+            shown = covered if self.arm.truth == "covered" else ~covered
+            arrays["images"] = np.where(shown[:, None], self.truth.read(index, "images"), arrays["images"])
+            covered = covered | shown
+        if self.arm.filled:
+            arrays["images"] = np.stack([filled(*view) for view in zip(arrays["images"], covered, strict=True)])
+            covered = np.ones_like(covered)
+        arrays["coverage"] = np.packbits(covered, axis=-1)
+        arrays["cpu_s"] = (arrays["cpu_s"] + time.process_time() - start).astype(np.float32)
+        return arrays

@@ -60,9 +60,6 @@ class ViewMaker:
             out = self.retarget(given, drawn)
             images, coverage = out["images"].numpy(), out["coverage"].numpy()
             K, cam2ego = out["K"].numpy(), out["cam2ego"].numpy()
-        if self.arm.filled:
-            images = np.stack([_filled(*view) for view in zip(images, coverage, strict=True)])
-            coverage = np.ones_like(coverage)
         seconds = time.process_time() - start
         return {
             "images": images,
@@ -88,7 +85,7 @@ def stayed(target: Rig, source: Rig, *, height_only: bool) -> Rig:
     return target.with_cameras(cameras)
 
 
-def _filled(image: np.ndarray, coverage: np.ndarray) -> np.ndarray:
+def filled(image: np.ndarray, coverage: np.ndarray) -> np.ndarray:
     """(3, h, w) with what is not covered inpainted (Telea)."""
     if not coverage.any():  # nothing to start from
         return image

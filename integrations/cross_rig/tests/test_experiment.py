@@ -88,18 +88,21 @@ def test_arms_with_the_same_frames_are_one_training(done):
 
 
 def test_true_pixels_replace_what_was_rendered(done):
-    """The two arms of the diagnosis: the truth where something was seen, or where nothing was."""
+    """The two arms of the diagnosis: the truth where something was seen, or where nothing was; and inpainting."""
     more = replace(
-        done, settings=replace(TINY, changes=("up70",), arms=("auto", "true_covered", "true_holes", "oracle"))
+        done,
+        settings=replace(TINY, changes=("up70",), arms=("auto", "auto_filled", "true_covered", "true_holes", "oracle")),
     )
     assert list(run(more, 1, lambda line: None))[-1] == 0
-    auto, covered, holes, oracle = (more.training_set(job).frame(1) for job in jobs(more.settings))
+    auto, filled, covered, holes, oracle = (more.training_set(job).frame(1) for job in jobs(more.settings))
     seen = np.broadcast_to(auto.coverage[:, None], auto.images.shape)
     assert 0.05 < 1 - seen.mean() < 0.95
     np.testing.assert_array_equal(covered.coverage, auto.coverage)
     np.testing.assert_array_equal(covered.images[seen], oracle.images[seen])
     np.testing.assert_array_equal(covered.images[~seen], auto.images[~seen])
-    assert holes.coverage.all()
+    assert holes.coverage.all() and filled.coverage.all()
+    np.testing.assert_array_equal(filled.images[seen], auto.images[seen])
+    assert (filled.images[~seen] != auto.images[~seen]).mean() > 0.5
     np.testing.assert_array_equal(holes.images[seen], auto.images[seen])
     np.testing.assert_array_equal(holes.images[~seen], oracle.images[~seen])
 

@@ -34,8 +34,6 @@ def test_every_arm_renders(frame, name):
     assert views["images"].shape == (5, 3, *SIZE) and views["images"].dtype == np.uint8
     assert coverage.shape == (5, *SIZE) and coverage.mean() > 0.4
     assert not views["images"].transpose(0, 2, 3, 1)[~coverage].any()
-    if ARMS[name].filled:
-        assert coverage.all()
     if ARMS[name].random:
         assert not np.allclose(views["K"], target.K)
         again = ViewMaker(ARMS[name], source, target)(0, frame)
