@@ -28,9 +28,9 @@ from arbiview_aug.bench.timing import (
     one_thread,
     process_ms,
     quartiles,
+    show,
     timed_rounds,
     versions,
-    write_json,
 )
 from arbiview_aug.command_line import add_data, count, size
 from arbiview_aug.device_maps import maps_on
@@ -80,10 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             compiled=device.type != "cpu" if arguments.compile is None else arguments.compile,
             repeats=arguments.repeats,
         )
-    print(table(report))
-    path = Path(arguments.output)
-    write_json(report, path)
-    print(f"report: {path}")
+    show(table(report), report, Path(arguments.output))
     return 0
 
 

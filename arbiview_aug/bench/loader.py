@@ -29,7 +29,7 @@ from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 from arbiview_aug.bench.data import REDUCES, Recorded, recorded
-from arbiview_aug.bench.timing import Quartiles, machine, machine_line, one_thread, quartiles, versions, write_json
+from arbiview_aug.bench.timing import Quartiles, machine, machine_line, one_thread, quartiles, show, versions
 from arbiview_aug.command_line import add_data, add_target, count, size
 from arbiview_aug.datasets import RetargetedDataset, open_data
 from arbiview_aug.datasets.images import Reduce
@@ -135,10 +135,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             frames=arguments.frames,
             epochs=arguments.epochs,
         )
-    print(table(report))
-    path = Path(arguments.output)
-    write_json(report, path)
-    print(f"report: {path}")
+    show(table(report), report, Path(arguments.output))
     return 0
 
 

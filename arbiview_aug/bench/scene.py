@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.bench.data import REDUCES, as_of_another_frame, recorded
-from arbiview_aug.bench.timing import machine, machine_line, one_thread, quartiles, timed_rounds, versions, write_json
+from arbiview_aug.bench.timing import machine, machine_line, one_thread, quartiles, show, timed_rounds, versions
 from arbiview_aug.command_line import add_data, count
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.explain import Explanation
@@ -123,10 +123,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         report = measure(data.sample(0, arguments.reduce), data.name, arguments.repeats, arguments.only)
     if not report["situations"]:
         parser.error(f"argument --only: no situation of this data has {arguments.only!r} in its name")
-    print(table(report))
-    path = Path(arguments.output)
-    write_json(report, path)
-    print(f"report: {path}")
+    show(table(report), report, Path(arguments.output))
     return 0
 
 

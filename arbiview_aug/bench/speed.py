@@ -33,7 +33,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from arbiview_aug.bench.timing import machine, machine_line, one_thread, quartiles, timed_rounds, versions, write_json
+from arbiview_aug.bench.timing import machine, machine_line, one_thread, quartiles, show, timed_rounds, versions
 from arbiview_aug.datasets import FrameFolder, reduced_rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.targets import without_masks
@@ -107,10 +107,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.repeats < 1:
         parser.error(f"argument --repeats: expected a whole number above 0, got {arguments.repeats}")
     report = measure(arguments.data or default_data(), arguments.repeats)
-    print(table(report))
-    path = Path(arguments.output)
-    write_json(report, path)
-    print(f"report: {path}")
+    show(table(report), report, Path(arguments.output))
     return 0
 
 

@@ -185,6 +185,17 @@ def write_json(report: Mapping[str, Any], path: Path) -> str:
     return text
 
 
+def show(table: str, report: Mapping[str, Any], path: Path) -> None:
+    """Print a report's table, write the report, and say where it is.
+
+    Raises:
+        DataError: It cannot be written.
+    """
+    print(table)
+    write_json(report, path)
+    print(f"report: {path}")
+
+
 def _status_kib(field: str) -> int:
     found = re.search(rf"^{field}:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
     if found is None:
