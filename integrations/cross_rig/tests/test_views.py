@@ -46,6 +46,16 @@ def test_every_arm_renders(frame, name):
         assert (np.abs(away[:, :2]).max() > 0.01) == (ARMS[name].stays == "centre")
 
 
+@pytest.mark.parametrize("change", ["up70", "waymo"])
+@pytest.mark.parametrize(("default", "surface"), [("auto", "lidar"), ("auto_bare", "street")])
+@pytest.mark.filterwarnings("ignore")
+def test_what_auto_picks_where_cameras_move(frame, change, default, surface):
+    """So one of the two is enough of an arm."""
+    views = [ViewMaker(ARMS[a], source_rig(SIZE), CHANGES[change].target(SIZE))(0, frame) for a in (default, surface)]
+    for key in ("images", "coverage", "cam2ego"):
+        np.testing.assert_array_equal(views[0][key], views[1][key])
+
+
 def test_scaled_and_cropped_keeps_pixels_and_calibration_together():
     rng = np.random.default_rng(0)
     K = source_rig((48, 64)).K[:1].astype(np.float32)
