@@ -55,6 +55,11 @@ class Explanation:
         ]
         if self.harmonisation is not None:
             lines.append(f"  {self.harmonisation}")
+        for camera, lift_m in zip(self.plan.target, self.plan.not_lifted_m, strict=True):
+            if lift_m:
+                where = f"{abs(lift_m):.2f} m {'below' if lift_m > 0 else 'above'} the target's place"
+                why = "nothing is known of what stands on the street"
+                lines.append(f"  {camera.name}: {where}, at the source's height: {why}")
         if self.depth is not None:
             lines.extend(f"  {line}" for line in str(self.depth).splitlines())
         return "\n".join([*lines, *_lines(self.as_dict(), _source_line)])

@@ -17,6 +17,7 @@ from arbiview_aug.favs.paper import PaperRendering, check_settings, render_paper
 from arbiview_aug.favs.photometric import Harmoniser
 from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
+from arbiview_aug.heights import MOVED_M
 from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
 from arbiview_aug.required import baselines_m, needs_geometry
 from arbiview_aug.rig import Rig
@@ -28,9 +29,6 @@ from arbiview_aug.surface import SurfaceName
 Execution = Literal["auto", "opencv", "torch"]
 
 _UNREACHABLE = 0.5  # a target camera of which less than this is covered is worth a warning
-_MOVED_M = 0.2
-"""A target camera farther than this from every source is worth a warning where only the static street is known: what
-stands 10 m away shifts by more than a degree, and the street does not know that it stands there."""
 
 
 class WarnOnce:
@@ -164,7 +162,7 @@ class Stitcher:
         plan = build_plan(source, target, surface=self.surface, config=config, scene=scene)
         self._warn_unreachable(plan)
         if self.surface == "auto" and scene.best == "street" and needs_geometry(source, target, "auto", config):
-            self._warn_static(source, target)
+            self._warn_static(plan)
         return plan
 
     # --- depth from overlap -------------------------------------------------------------------------------------------
@@ -247,9 +245,18 @@ class Stitcher:
                 f"{', '.join(poor)}; train with the coverage mask, or choose another target",
             )
 
-    def _warn_static(self, source: Rig, target: Rig) -> None:
-        moved_m = float(baselines_m(source, target).min(axis=1).max())
-        if moved_m > _MOVED_M:
+    def _warn_static(self, plan: RenderPlan) -> None:
+        lifted_m = max((abs(lift) for lift in plan.not_lifted_m), default=0.0)
+        if lifted_m > 0:
+            self.warn(
+                "height",
+                f"target cameras stand up to {lifted_m:.2f} m above or below the source's, and the sample does not say "
+                "what stands on the street: they are rendered at the source's height, and cam2ego says so, since a "
+                "static surface stretches objects, which trains worse than untouched images. Pass 'points' or "
+                "'boxes_3d' in the samples, or have them moved all the same with surface='street'",
+            )
+        moved_m = float(baselines_m(plan.source, plan.target).min(axis=1).max())
+        if moved_m > MOVED_M:
             self.warn(
                 "static",
                 f"target cameras stand up to {moved_m:.2f} m from the nearest source camera, and the sample does not "

@@ -73,8 +73,8 @@ class RigRetarget(torch.nn.Module):
             objects keep their height when cameras move; ``lidar``: its ``points`` (ego frame) or ``depth_m`` (..., N,
             H, W; z-depth in metres, 0 or NaN where unknown), with ``boxes_3d`` for objects of few points;
             ``auto``: for each pair of cameras ``far`` where their centres coincide, else the best that the sample
-            offers: ``lidar``, else ``objects``, else ``street``, with a warning where cameras move (``paper``: always
-            ``far``). Plans over points and boxes are made anew for every frame.
+            offers: ``lidar``, else ``objects``, else ``street``, over which cameras keep the source's height, with a
+            warning (``paper``: always ``far``). Plans over points and boxes are made anew for every frame.
         harmonise: Bring the sources to one exposure (``arbiview_aug.favs.photometric``): True or a ``HarmoniseConfig``
             estimates a gain for each camera in every frame; numbers are gains to use as they are. Off by default.
             Samples that ``p`` skips keep their colours.

@@ -38,13 +38,23 @@ def test_entries_are_plain_data_and_add_up() -> None:
 
 
 def test_in_words() -> None:
-    lifted = nuscenes().shifted(z_m=0.6)
-    text = str(explained(lifted))
+    ahead = nuscenes().shifted(x_m=0.6)
+    text = str(explained(ahead))
     assert text.splitlines()[0].endswith("6 cameras to 6")
     for name in nuscenes().names:
         assert f"  {name}: " in text and f" from {name} over the street surface (centres 0.60 m apart, about" in text
     assert "px of parallax where depth is unknown" in text
-    assert repr(explained(lifted)) == text
+    assert repr(explained(ahead)) == text
+
+
+@pytest.mark.filterwarnings("ignore:target cameras stand")
+def test_cameras_that_keep_their_height_are_named() -> None:
+    lines = str(explained(nuscenes().shifted(z_m=0.6))).splitlines()
+    for name in nuscenes().names:
+        why = "nothing is known of what stands on the street"
+        assert f"  {name}: 0.60 m below the target's place, at the source's height: {why}" in lines
+    assert "0.60 m above the target's place" in str(explained(nuscenes().shifted(z_m=-0.6)))
+    assert "target's place" not in str(explained(nuscenes().shifted(z_m=0.1)))
 
 
 def test_what_has_to_be_invented() -> None:

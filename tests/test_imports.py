@@ -32,7 +32,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("favs.paper",),
     ("dense",),
     ("projection",),
-    ("required",),
+    ("required", "heights"),
     ("target_rays",),
     ("shadowing",),
     ("maps",),

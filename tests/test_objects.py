@@ -242,12 +242,37 @@ def test_auto_takes_boxes_where_there_are_some_and_warns_where_cameras_move_with
         )
         RigRetarget(rig.shifted(z_m=0.1))(sample)  # little harm
         RigRetarget(rig.shifted(z_m=0.5), surface="street")(sample)  # asked for
+    ahead = RigRetarget(rig.shifted(x_m=0.5))
     with pytest.warns(UserWarning, match=r"target cameras stand up to 0\.50 m from the nearest source camera"):
-        bare = lifted(sample)
+        bare = ahead(sample)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        lifted(sample)  # said once
-    assert torch.equal(bare["images"], RigRetarget(lifted.target, surface="street")(sample)["images"])
+        ahead(sample)  # said once
+    assert torch.equal(bare["images"], RigRetarget(ahead.target, surface="street")(sample)["images"])
+
+
+def test_auto_keeps_the_sources_height_where_nothing_is_known_of_the_street() -> None:
+    rig = demo_source_rig((64, 176))
+    sample = {"images": torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8), "rig": rig}
+    narrow = rig.shifted(z_m=0.5)
+    narrow = narrow.with_cameras([c.crop(8, 16, (40, 120)) for c in narrow])
+    for target in (narrow, rig.shifted(z_m=-0.5)):
+        retarget = RigRetarget(target)
+        with pytest.warns(
+            UserWarning, match=r"0\.50 m above or below the source's, .* rendered at the source's height"
+        ):
+            out = retarget(sample)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert torch.equal(retarget(sample)["images"], out["images"])  # said once
+        assert np.allclose(out["cam2ego"][:, 2, 3], [c.center_m[2] for c in rig])
+        assert np.allclose(out["cam2ego"][:, :3, :3], target.cam2ego[:, :3, :3]) and np.allclose(out["K"], target.K)
+        at_heights = target.with_cameras(
+            [dataclasses.replace(t, cam2ego=c.cam2ego) for t, c in zip(target, rig, strict=True)]
+        )
+        assert torch.equal(out["images"], RigRetarget(at_heights)(sample)["images"])
+    moved = RigRetarget(narrow, surface="street")(sample)
+    assert np.allclose(moved["cam2ego"][:, 2, 3], [c.center_m[2] for c in narrow])
 
 
 def test_auto_plans_once_where_objects_cannot_matter() -> None:

@@ -309,7 +309,7 @@ def _only(sample: Mapping[str, Any], cameras: Sequence[int], settings: Mapping[s
     """The frame of some cameras, raised."""
     rig = sample["rig"].with_cameras([sample["rig"][k] for k in cameras])
     images = [sample["images"][k] for k in cameras]
-    return Case({"images": images, "rig": rig}, rig.shifted(z_m=UP_M), settings)
+    return Case({"images": images, "rig": rig}, rig.shifted(z_m=UP_M), {"surface": "street", **settings})
 
 
 # --- measuring --------------------------------------------------------------------------------------------------------

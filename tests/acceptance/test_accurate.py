@@ -62,7 +62,9 @@ class Frame:
             self.cameras = referee.equalised(self.cameras, self.lidar)
 
     def render(self, target: Rig, quality: Quality) -> tuple[list[Image], BoolArray]:
-        retarget = RigRetarget(target, source_rig=self.rig, quality=quality)
+        lifted = not np.allclose(target.cam2ego[:, 2, 3], self.rig.cam2ego[:, 2, 3])
+        surface: SurfaceName = "street" if lifted else "auto"  # auto would keep the height
+        retarget = RigRetarget(target, source_rig=self.rig, quality=quality, surface=surface)
         out = retarget({"images": as_tensors(self.images)})
         return as_arrays(out["images"]), out["coverage"].numpy()
 
