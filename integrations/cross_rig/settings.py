@@ -82,16 +82,16 @@ def quick() -> Settings:
         test_frames=60,
         seeds=(0,),
         changes=("up70",),
-        arms=("raw", "lidar", "oracle"),
+        arms=("raw", "auto", "oracle"),
         schedule=Schedule(steps=250),
     )
 
 
 def pilot() -> Settings:
-    """Three changes, the arms that decide, three seeds: an hour or two on two cores."""
+    """Three changes, the arms that decide, three seeds: an evening on two cores."""
     return Settings(
         changes=("fov50", "up70", "waymo"),
-        arms=("raw", "scale_crop", "row_split", "street", "objects_mixed", "lidar", "oracle"),
+        arms=("raw", "scale_crop", "row_split", "street", "objects_mixed", "auto", "oracle"),
     )
 
 

@@ -32,7 +32,7 @@ class ViewMaker:
 
     def __init__(self, arm: Arm, source: Rig, target: Rig) -> None:
         if arm.stays:
-            target = stayed(target, source, height_only=arm.stays == "height")
+            target = stayed(target, source)
         self.arm, self.source, self.target = arm, source, target
         self.random = RandomRig(target, **RANDOM) if arm.random else None
         self.retarget = RigRetarget(self.random or target, source_rig=source, surface=arm.surface)
@@ -70,17 +70,13 @@ class ViewMaker:
         }
 
 
-def stayed(target: Rig, source: Rig, *, height_only: bool) -> Rig:
-    """A target rig (in the source's ego frame) that moves no camera, or none up or down.
-
-    Each takes the centre, or its height, of the source camera whose axis is nearest to its own.
-    """
+def stayed(target: Rig, source: Rig) -> Rig:
+    """The target rig, in the source's ego frame, with each camera in the centre of the source camera most like it."""
     cameras = []
     for camera in target:
         nearest = max(source, key=lambda one: float(one.cam2ego[:3, 2] @ camera.cam2ego[:3, 2]))
         cam2ego = camera.cam2ego.copy()
-        kept = slice(2, 3) if height_only else slice(0, 3)
-        cam2ego[kept, 3] = nearest.center_m[kept]
+        cam2ego[:3, 3] = nearest.center_m
         cameras.append(replace(camera, cam2ego=cam2ego))
     return target.with_cameras(cameras)
 

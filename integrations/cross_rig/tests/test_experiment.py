@@ -149,7 +149,7 @@ def test_presets():
     # Raw and scale/crop once for each seed, five arms for each change: 3 * (2 + 3 * 5).
     assert len(jobs(pilot())) == 51
     names = [job.name for job in jobs(full())]
-    assert len(names) == len(set(names)) == 3 * (2 + 6 * 21)
+    assert len(names) == len(set(names)) == 3 * (2 + 6 * 19)
 
 
 def test_keys_follow_what_matters(done):
@@ -177,4 +177,4 @@ def test_quick_oracle_is_above_raw(tmp_path: Path, monkeypatch):
     assert command.main(["--quick", "--output", str(tmp_path)]) == 0
     arms = json.loads((tmp_path / "report.json").read_text())["changes"]["up70"]["arms"]
     assert arms["oracle"]["iou"]["value"] > arms["raw"]["iou"]["value"]
-    assert set(arms) == {"raw", "lidar", "oracle"}
+    assert set(arms) == {"raw", "auto", "oracle"}
