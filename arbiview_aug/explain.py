@@ -12,7 +12,9 @@ from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.favs.overlap_depth import OverlapDepth
 from arbiview_aug.favs.paper import PaperRendering, SourceReport
 from arbiview_aug.favs.photometric import PhotometricReport
+from arbiview_aug.heights import MOVED_M, lifts_m
 from arbiview_aug.plan import RenderPlan
+from arbiview_aug.rig import Rig
 from arbiview_aug.target_plan import PairReport
 
 
@@ -22,11 +24,13 @@ class Explanation:
 
     Attributes:
         plan: The plan.
+        asked: The target rig that was asked for, in its own ego frame.
         harmonisation: The sources' gains and why, where harmonisation was asked for.
         depth: What became of each pair of neighbours, where depth from overlap was asked for and matters.
     """
 
     plan: RenderPlan
+    asked: Rig
     harmonisation: PhotometricReport | None = None
     depth: OverlapDepth | None = None
 
@@ -55,8 +59,8 @@ class Explanation:
         ]
         if self.harmonisation is not None:
             lines.append(f"  {self.harmonisation}")
-        for camera, lift_m in zip(self.plan.target, self.plan.not_lifted_m, strict=True):
-            if lift_m:
+        for camera, lift_m in zip(self.plan.target, lifts_m(self.asked, self.plan.target), strict=True):
+            if abs(lift_m) > MOVED_M:
                 where = f"{abs(lift_m):.2f} m {'below' if lift_m > 0 else 'above'} the target's place"
                 why = "nothing is known of what stands on the street"
                 lines.append(f"  {camera.name}: {where}, at the source's height: {why}")

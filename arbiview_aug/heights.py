@@ -25,8 +25,12 @@ def at_source_heights(source: Rig, target: Rig) -> Rig:
 
     Args:
         source: The rig that recorded the images.
-        target: The rig to render, in the source's ego frame.
+        target: The rig to render, in its own ego frame.
+
+    Returns:
+        A rig in the source's ego frame.
     """
+    target = target.in_frame_of(source)
     cameras = list(target)
     for k, camera in enumerate(target):
         alike = max(source, key=lambda one: float(one.cam2ego[:3, 2] @ camera.cam2ego[:3, 2]))
@@ -36,3 +40,14 @@ def at_source_heights(source: Rig, target: Rig) -> Rig:
             cam2ego[2, 3] = height_m
             cameras[k] = replace(camera, cam2ego=cam2ego)
     return target.with_cameras(cameras)
+
+
+def lifts_m(asked: Rig, rendered: Rig) -> list[float]:
+    """By how much each camera was asked for higher than it is rendered, metres.
+
+    Args:
+        asked: A target rig, in its own ego frame.
+        rendered: The same in a source's ego frame.
+    """
+    asked = asked.in_frame_of(rendered)
+    return [float(a.center_m[2] - r.center_m[2]) for a, r in zip(asked, rendered, strict=True)]

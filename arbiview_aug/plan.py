@@ -17,7 +17,6 @@ from typing import Any
 
 from arbiview_aug.camera import BoolArray
 from arbiview_aug.favs.config import FavsConfig
-from arbiview_aug.heights import at_source_heights
 from arbiview_aug.held import Held
 from arbiview_aug.rig import Rig, content_order
 from arbiview_aug.sampling import AtlasLayout, Scratch
@@ -31,8 +30,7 @@ class RenderPlan:
 
     Attributes:
         source: The source rig.
-        target: The target rig in the source's ego frame, on the source's road, as it is rendered.
-        asked: The same as it was asked for: its cameras may stand higher or lower.
+        target: The target rig in the source's ego frame, on the source's road.
         layout: Where the sources lie in the atlas.
         targets: One plan for each target camera.
         interpolation: ``linear`` or ``nearest``.
@@ -42,7 +40,6 @@ class RenderPlan:
 
     source: Rig
     target: Rig
-    asked: Rig
     layout: AtlasLayout
     targets: tuple[TargetPlan, ...]
     interpolation: str
@@ -57,11 +54,6 @@ class RenderPlan:
         """Memory held by the maps, on devices too."""
         on_devices = list(self.on_devices.values())
         return sum(t.nbytes for t in self.targets) + sum(view.nbytes for views in on_devices for view in views)
-
-    @property
-    def not_lifted_m(self) -> list[float]:
-        """By how much each target camera was asked for higher than it is rendered (``heights``), metres."""
-        return [float(a.center_m[2] - t.center_m[2]) for a, t in zip(self.asked, self.target, strict=True)]
 
     @property
     def coverage(self) -> list[BoolArray]:
@@ -111,8 +103,7 @@ def build_plan(
         target: The rig to render, in its own ego frame: the two roads are made to coincide.
         surface: ``far``, ``ground``, ``street``, ``objects`` (needs boxes), ``lidar`` (needs points); or ``auto``: for
             each pair of target and source camera, ``far`` where their centres coincide or the worst-case parallax is
-            below ``config.far_parallax_px``, else the scene's best; and where that is the static street, cameras
-            stay at the height of the source's (``heights``).
+            below ``config.far_parallax_px``, else the scene's best.
         config: Settings; the ``fast`` preset by default.
         scene: What is known of the geometry, in the source's ego frame.
 
@@ -120,12 +111,10 @@ def build_plan(
         The plan. Targets that no source sees have zero coverage.
     """
     config = config or FavsConfig()
-    asked = target = target.in_frame_of(source)
+    target = target.in_frame_of(source)
     counters: Counter[str] = Counter()
     order = content_order(source.cameras)
     known = scene or Scene()
-    if surface == "auto" and known.best == "street":
-        target = at_source_heights(source, asked)
     surface_by_name = lru_cache(None)(lambda name: known.surface(name, source.ground_z_m))
     drafts = [
         TargetDraft(source, order, camera, surface, known.best, surface_by_name, config, counters) for camera in target
@@ -142,4 +131,4 @@ def build_plan(
     }
     layout = layout.without_others(read)
     counters["bands"] = sum(len(t.bands) for t in targets)
-    return RenderPlan(source, target, asked, layout, targets, config.interpolation, dict(counters))
+    return RenderPlan(source, target, layout, targets, config.interpolation, dict(counters))

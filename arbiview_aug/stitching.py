@@ -17,7 +17,7 @@ from arbiview_aug.favs.paper import PaperRendering, check_settings, render_paper
 from arbiview_aug.favs.photometric import Harmoniser
 from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
-from arbiview_aug.heights import MOVED_M
+from arbiview_aug.heights import MOVED_M, at_source_heights, lifts_m
 from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
 from arbiview_aug.required import baselines_m, needs_geometry
 from arbiview_aug.rig import Rig
@@ -71,6 +71,7 @@ class Stitcher:
         execution: ``opencv``, ``torch`` or ``auto``.
         cache_bytes: Memory for plans that may come back.
         warn: Says what a user should know.
+        mixed: Half of the samples or more are left untouched: ``auto`` then moves cameras over the street.
 
     Raises:
         ValueError: Settings that contradict each other.
@@ -85,6 +86,7 @@ class Stitcher:
         execution: Execution,
         cache_bytes: int,
         warn: WarnOnce,
+        mixed: bool = False,
     ) -> None:
         if isinstance(config, PaperConfig):
             check_settings(surface, execution)
@@ -93,7 +95,7 @@ class Stitcher:
         if refinement is not None and not (isinstance(config, FavsConfig) and config.overlap_depth):
             raise ValueError("refinement: expected quality='accurate' (or overlap_depth=True) with a RefinementCache")
         self.config, self.surface, self.harmoniser = config, surface, harmoniser
-        self.refinement, self.execution, self.warn = refinement, execution, warn
+        self.refinement, self.execution, self.warn, self.mixed = refinement, execution, warn, mixed
         self.plans = PlanCache(cache_bytes)
         self._plan_of_frame = PlanCache(0)  # holds one
         self._scratch = Scratch()
@@ -149,6 +151,9 @@ class Stitcher:
         if isinstance(self.config, PaperConfig):
             raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
         config, known = self.config, scene or Scene()
+        asked = target
+        if self.surface == "auto" and known.best == "street" and not self.mixed:
+            target = at_source_heights(source, asked)
         if not known.is_empty and not needs_geometry(source, target, self.surface, config):
             known = Scene()
         # A frame's geometry never comes back, unless it is a refinement that is reused: its plan must not push out
@@ -156,13 +161,15 @@ class Stitcher:
         comes_back = known.is_empty or (self.refinement is not None and known.best == "street")
         cache = self.plans if comes_back else self._plan_of_frame
         key = plan_key(source, target, self.surface, config, known)
-        return cache.get(key, lambda: self._built(source, target, config, known))
+        return cache.get(key, lambda: self._built(source, target, asked, config, known))
 
-    def _built(self, source: Rig, target: Rig, config: FavsConfig, scene: Scene) -> RenderPlan:
+    def _built(self, source: Rig, target: Rig, asked: Rig, config: FavsConfig, scene: Scene) -> RenderPlan:
         plan = build_plan(source, target, surface=self.surface, config=config, scene=scene)
         self._warn_unreachable(plan)
-        if self.surface == "auto" and scene.best == "street" and needs_geometry(source, target, "auto", config):
-            self._warn_static(plan)
+        if self.surface == "auto" and scene.best == "street":
+            self._warn_lifted(asked, plan)
+            if needs_geometry(source, target, "auto", config):
+                self._warn_static(source, target)
         return plan
 
     # --- depth from overlap -------------------------------------------------------------------------------------------
@@ -245,17 +252,19 @@ class Stitcher:
                 f"{', '.join(poor)}; train with the coverage mask, or choose another target",
             )
 
-    def _warn_static(self, plan: RenderPlan) -> None:
-        lifted_m = max((abs(lift) for lift in plan.not_lifted_m), default=0.0)
-        if lifted_m > 0:
+    def _warn_lifted(self, asked: Rig, plan: RenderPlan) -> None:
+        lifted_m = max(abs(lift) for lift in lifts_m(asked, plan.target))
+        if lifted_m > MOVED_M:
             self.warn(
                 "height",
                 f"target cameras stand up to {lifted_m:.2f} m above or below the source's, and the sample does not say "
-                "what stands on the street: they are rendered at the source's height, and cam2ego says so, since a "
-                "static surface stretches objects, which trains worse than untouched images. Pass 'points' or "
-                "'boxes_3d' in the samples, or have them moved all the same with surface='street'",
+                "what stands on the street: they are rendered at the source's height, and cam2ego says so, since views "
+                "over a static surface alone train worse than untouched images. Pass 'points' or 'boxes_3d' in the "
+                "samples, mix with untouched ones (p=0.5), or have them moved all the same with surface='street'",
             )
-        moved_m = float(baselines_m(plan.source, plan.target).min(axis=1).max())
+
+    def _warn_static(self, source: Rig, target: Rig) -> None:
+        moved_m = float(baselines_m(source, target).min(axis=1).max())
         if moved_m > MOVED_M:
             self.warn(
                 "static",

@@ -186,7 +186,7 @@ def test_sources_that_win_nothing_have_no_place_in_the_atlas() -> None:
 
 def test_road_planes_are_aligned() -> None:
     nuscenes, argoverse = load_rig("nuscenes").resized(0.1), load_rig("argoverse2").resized(0.1)
-    plan = build_plan(nuscenes, argoverse, surface="street")
+    plan = build_plan(nuscenes, argoverse)
     above = [c.center_m[2] - argoverse.ground_z_m for c in argoverse]
     assert np.allclose([c.center_m[2] for c in plan.target], above)  # nuScenes' road is at 0
     assert plan.target.ground_z_m == 0.0
