@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from arbiview_aug.camera import FloatArray
 from arbiview_aug.objects import points_in
-from arbiview_aug.panorama import SIDE_RAD, Layer, angles, wrapped
+from arbiview_aug.panorama import NEAREST_M, SIDE_RAD, Layer, angles, wrapped
 from arbiview_aug.surface import Points
 
 BOX_AIR_M = 0.2
@@ -118,7 +118,7 @@ def measured_objects(
 
 
 def _raster(box: FloatArray, points: FloatArray, origin: FloatArray) -> _Raster | None:
-    """None where the centre is within the object's bounds: it has no outline from there."""
+    """None where the centre is within the object's bounds, or all but touches it: it has no outline from there."""
     to_middle = box[:3] - origin
     radius_m = float(np.linalg.norm(box[3:6])) / 2
     distance_m = float(np.linalg.norm(to_middle))
@@ -126,6 +126,9 @@ def _raster(box: FloatArray, points: FloatArray, origin: FloatArray) -> _Raster 
         return None
     away = points - origin
     length = np.linalg.norm(away, axis=1)
+    away, length = away[length >= NEAREST_M], length[length >= NEAREST_M]
+    if not len(away):
+        return None
     azimuth, elevation = angles(away / length[:, None])
     # Less than half a turn, about the azimuth of its middle.
     middle = math.atan2(to_middle[1], to_middle[0])

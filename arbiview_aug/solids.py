@@ -64,13 +64,13 @@ def draw_boxes(camera: Camera, boxes: FloatArray) -> Drawn:
 def silhouettes(camera: Camera, boxes: FloatArray) -> list[npt.NDArray[np.int64]]:
     """For each box (B, 7) the pixels of a pinhole camera, into the flattened image, whose rays meet it: none is hidden.
 
-    A box that holds the camera is not seen.
+    A box that holds the camera is not seen; a pixel on an edge may come twice.
     """
     found: list[list[npt.NDArray[np.int64]]] = [[np.zeros(0, np.int64)] for _ in boxes]
     for (rows, columns), inside, _, number in _face_images(camera, boxes):
         v, u = np.nonzero(inside)
         found[number // 6].append((v + rows.start) * camera.width_px + u + columns.start)
-    return [np.unique(np.concatenate(parts)) for parts in found]  # edges belong to two faces
+    return [np.concatenate(parts) for parts in found]
 
 
 def _face_images(camera: Camera, boxes: FloatArray) -> Iterator[tuple[tuple[slice, slice], BoolArray, Layer, int]]:

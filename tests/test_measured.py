@@ -80,7 +80,7 @@ def test_few_points_leave_the_box() -> None:
     assert not objects and len(boxes) == 1  # the road's points show no shape
 
 
-@pytest.mark.parametrize("eye", [CAR[:3], np.array([12.0, 0.9, 2.2]), np.array([12.0, 1.2, 0.8])])
+@pytest.mark.parametrize("eye", [CAR[:3], np.array([12.0, 0.9, 2.2]), np.array([12.0, 1.2, 0.8]), car()[0]])
 def test_a_camera_within_or_at_an_object_sees_something(eye: np.ndarray) -> None:
     surface = LidarObjects.among(Street(), np.concatenate([car(), FAR]), CAR[None])
     rays = np.random.default_rng(0).normal(size=(200, 3))
