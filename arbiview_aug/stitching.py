@@ -71,7 +71,6 @@ class Stitcher:
         execution: ``opencv``, ``torch`` or ``auto``.
         cache_bytes: Memory for plans that may come back.
         warn: Says what a user should know.
-        mixed: Half of the samples or more are left untouched: ``auto`` then moves cameras over the street.
 
     Raises:
         ValueError: Settings that contradict each other.
@@ -86,7 +85,6 @@ class Stitcher:
         execution: Execution,
         cache_bytes: int,
         warn: WarnOnce,
-        mixed: bool = False,
     ) -> None:
         if isinstance(config, PaperConfig):
             check_settings(surface, execution)
@@ -95,7 +93,7 @@ class Stitcher:
         if refinement is not None and not (isinstance(config, FavsConfig) and config.overlap_depth):
             raise ValueError("refinement: expected quality='accurate' (or overlap_depth=True) with a RefinementCache")
         self.config, self.surface, self.harmoniser = config, surface, harmoniser
-        self.refinement, self.execution, self.warn, self.mixed = refinement, execution, warn, mixed
+        self.refinement, self.execution, self.warn = refinement, execution, warn
         self.plans = PlanCache(cache_bytes)
         self._plan_of_frame = PlanCache(0)  # holds one
         self._scratch = Scratch()
@@ -152,7 +150,7 @@ class Stitcher:
             raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
         config, known = self.config, scene or Scene()
         asked = target
-        if self.surface == "auto" and known.best == "street" and not self.mixed:
+        if self.surface == "auto" and known.best == "street":
             target = at_source_heights(source, asked)
         if not known.is_empty and not needs_geometry(source, target, self.surface, config):
             known = Scene()
@@ -259,8 +257,8 @@ class Stitcher:
                 "height",
                 f"target cameras stand up to {lifted_m:.2f} m above or below the source's, and the sample does not say "
                 "what stands on the street: they are rendered at the source's height, and cam2ego says so, since views "
-                "over a static surface alone train worse than untouched images. Pass 'points' or 'boxes_3d' in the "
-                "samples, mix with untouched ones (p=0.5), or have them moved all the same with surface='street'",
+                "over a static surface train worse than untouched images. Pass 'points' or 'boxes_3d' in the samples, "
+                "or have them moved all the same with surface='street'",
             )
 
     def _warn_static(self, source: Rig, target: Rig) -> None:

@@ -37,10 +37,6 @@ from arbiview_aug.tensors import covered, gathered, leading_shape, lens_names, l
 Made = RenderPlan | PaperRendering | tuple[int, int]
 """What a frame's views are made by: a plan, the published stages; or it is only resized, to this size."""
 
-_MIXED_P = 0.5
-"""Up to this ``p`` views over the street are worth having although objects lean in them: half of them mixed with
-untouched frames won over those alone, where nothing but them lost (``integrations/cross_rig``)."""
-
 OUTPUTS = ("source_camera", "confidence")
 """What a sample can hold besides, on request."""
 
@@ -77,9 +73,8 @@ class RigRetarget(torch.nn.Module):
             objects keep their height when cameras move; ``lidar``: its ``points`` (ego frame) or ``depth_m`` (..., N,
             H, W; z-depth in metres, 0 or NaN where unknown), with ``boxes_3d`` for objects of few points;
             ``auto``: for each pair of cameras ``far`` where their centres coincide, else the best that the sample
-            offers: ``lidar``, else ``objects``, else ``street``, over which cameras keep the source's height unless
-            ``p <= 0.5``, with a warning (``paper``: always ``far``). Plans over points and boxes are made anew for
-            every frame.
+            offers: ``lidar``, else ``objects``, else ``street``, over which cameras keep the source's height, with a
+            warning (``paper``: always ``far``). Plans over points and boxes are made anew for every frame.
         harmonise: Bring the sources to one exposure (``arbiview_aug.favs.photometric``): True or a ``HarmoniseConfig``
             estimates a gain for each camera in every frame; numbers are gains to use as they are. Off by default.
             Samples that ``p`` skips keep their colours.
@@ -178,7 +173,6 @@ class RigRetarget(torch.nn.Module):
             execution,
             cache_bytes=0 if once else cache_bytes,
             warn=self._warn,
-            mixed=self.p <= _MIXED_P,
         )
         self._fixed_target = self._sized(self.target) if isinstance(self.target, Rig) else None
         self._limited_process: int | None = None
