@@ -117,7 +117,7 @@ class Stitcher:
         names = self._names(sample, len(frames), lead)
         views = []
         for frame, scene, name, needs in zip(frames, scenes, names, needed, strict=True):
-            depth = self._depth(self.config, frame, scene, name) if needs else None
+            depth = self._depth(self.config, frame, target, scene, name) if needs else None
             known = scene if depth is None else replace(scene, corrections=depth.corrections)
             views.append(View(self.plan(frame.rig, target, known), depth))
         return views
@@ -149,9 +149,6 @@ class Stitcher:
         if isinstance(self.config, PaperConfig):
             raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
         config, known = self.config, scene or Scene()
-        asked = target
-        if self.surface == "auto" and known.best == "street":
-            target = at_source_heights(source, asked)
         if not known.is_empty and not needs_geometry(source, target, self.surface, config):
             known = Scene()
         # A frame's geometry never comes back, unless it is a refinement that is reused: its plan must not push out
@@ -159,9 +156,10 @@ class Stitcher:
         comes_back = known.is_empty or (self.refinement is not None and known.best == "street")
         cache = self.plans if comes_back else self._plan_of_frame
         key = plan_key(source, target, self.surface, config, known)
-        return cache.get(key, lambda: self._built(source, target, asked, config, known))
+        return cache.get(key, lambda: self._built(source, target, config, known))
 
-    def _built(self, source: Rig, target: Rig, asked: Rig, config: FavsConfig, scene: Scene) -> RenderPlan:
+    def _built(self, source: Rig, asked: Rig, config: FavsConfig, scene: Scene) -> RenderPlan:
+        target = self._placed(source, asked, config, scene)
         plan = build_plan(source, target, surface=self.surface, config=config, scene=scene)
         self._warn_unreachable(plan)
         if self.surface == "auto" and scene.best == "street":
@@ -169,6 +167,11 @@ class Stitcher:
             if needs_geometry(source, target, "auto", config):
                 self._warn_static(source, target)
         return plan
+
+    def _placed(self, source: Rig, target: Rig, config: FavsConfig, scene: Scene) -> Rig:
+        """The target as ``auto`` renders it: at the source's heights where only the street is known, and matters."""
+        guessed = self.surface == "auto" and scene.best == "street" and needs_geometry(source, target, "auto", config)
+        return at_source_heights(source, target) if guessed else target
 
     # --- depth from overlap -------------------------------------------------------------------------------------------
     def _names(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[object]:
@@ -184,10 +187,15 @@ class Stitcher:
             raise SampleError(f"refinement: expected {key!r} in the sample, to tell which frames share a refinement")
         return names_of_frames(key, sample[key], count, lead)
 
-    def _depth(self, config: FavsConfig, frame: SourceFrame, scene: Scene, name: object) -> OverlapDepth | None:
-        """Depth from overlap, where it is asked for and nothing was measured."""
+    def _depth(
+        self, config: FavsConfig, frame: SourceFrame, target: Rig, scene: Scene, name: object
+    ) -> OverlapDepth | None:
+        """Depth from overlap, where it is asked for and decides a pixel, and nothing was measured."""
         surface = scene.best if self.surface == "auto" else self.surface
         if not config.overlap_depth or surface in ("far", "ground", "lidar"):
+            return None
+        placed = self._placed(frame.rig, target, config, scene)
+        if placed is not target and not needs_geometry(frame.rig, placed, self.surface, config):
             return None
         boxes = scene.boxes if surface == "objects" else None
         if self.refinement is None:

@@ -271,8 +271,20 @@ def test_auto_keeps_the_sources_height_where_nothing_is_known_of_the_street() ->
             [dataclasses.replace(t, cam2ego=c.cam2ego) for t, c in zip(target, rig, strict=True)]
         )
         assert torch.equal(out["images"], RigRetarget(at_heights)(sample)["images"])
+    with pytest.warns(UserWarning, match="at the source's height"):
+        assert RigRetarget(narrow, quality="accurate").explain(sample).depth is None  # it would decide nothing there
     moved = RigRetarget(narrow, surface="street")(sample)
     assert np.allclose(moved["cam2ego"][:, 2, 3], [c.center_m[2] for c in narrow])
+
+
+def test_cameras_are_where_they_were_asked_for_if_no_pixel_depends_on_the_street() -> None:
+    """Nothing is seen of the target: its boxes are not even read, and that says nothing of the street."""
+    one = Rig([demo_source_rig((64, 176))[0]])
+    behind = one.turned(yaw_deg=180).shifted(z_m=0.5)
+    sample = {"images": torch.zeros((1, 3, 64, 176)), "rig": one, "boxes_3d": torch.from_numpy(CAR)}
+    with pytest.warns(UserWarning, match="cannot be reached") as told:
+        out = RigRetarget(behind)(sample)
+    assert len(told) == 1 and np.allclose(out["cam2ego"], behind.cam2ego)
 
 
 def test_auto_plans_once_where_objects_cannot_matter() -> None:
