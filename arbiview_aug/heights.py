@@ -9,8 +9,7 @@ so.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
+from arbiview_aug.camera import Camera
 from arbiview_aug.rig import Rig
 
 MOVED_M = 0.2
@@ -31,15 +30,16 @@ def at_source_heights(source: Rig, target: Rig) -> Rig:
         A rig in the source's ego frame.
     """
     target = target.in_frame_of(source)
-    cameras = list(target)
-    for k, camera in enumerate(target):
-        alike = max(source, key=lambda one: float(one.cam2ego[:3, 2] @ camera.cam2ego[:3, 2]))
-        height_m = float(alike.center_m[2])
-        if abs(float(camera.center_m[2]) - height_m) > MOVED_M:
-            cam2ego = camera.cam2ego.copy()
-            cam2ego[2, 3] = height_m
-            cameras[k] = replace(camera, cam2ego=cam2ego)
+    cameras = []
+    for camera in target:
+        lift_m = float(camera.center_m[2] - most_alike(source, camera).center_m[2])
+        cameras.append(camera.shifted(z_m=-lift_m) if abs(lift_m) > MOVED_M else camera)
     return target.with_cameras(cameras)
+
+
+def most_alike(rig: Rig, camera: Camera) -> Camera:
+    """The camera of a rig whose optical axis is nearest to that of another one, both in one ego frame."""
+    return max(rig, key=lambda one: float(one.cam2ego[:3, 2] @ camera.cam2ego[:3, 2]))
 
 
 def lifts_m(asked: Rig, rendered: Rig) -> list[float]:

@@ -10,13 +10,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.camera import FloatArray
 from arbiview_aug.objects import points_in
-from arbiview_aug.panorama import NEAREST_M, SIDE_RAD, Layer, angles, wrapped
+from arbiview_aug.panorama import NEAREST_M, SIDE_RAD, Layer, angles, spread, wrapped
 from arbiview_aug.surface import Points
 
 BOX_AIR_M = 0.2
@@ -141,10 +140,6 @@ def _raster(box: FloatArray, points: FloatArray, origin: FloatArray) -> _Raster 
     np.maximum.at(top, column, elevation)
     there = np.flatnonzero(np.isfinite(top))
     top = np.interp(np.arange(len(top)), there, top[there])
-    _, label = cv2.distanceTransformWithLabels(
-        (nearest == 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    values = np.zeros(int(label.max()) + 1, np.float32)
-    values[label[nearest > 0]] = nearest[nearest > 0]
+    _, (nearest,) = spread(nearest > 0, nearest)
     beyond = 1 / (distance_m + radius_m + BOX_AIR_M)
-    return _Raster(middle + left, low, values[label], top.astype(np.float32), beyond)
+    return _Raster(middle + left, low, nearest, top.astype(np.float32), beyond)

@@ -190,19 +190,28 @@ def panorama(window: Window, origin: FloatArray, points: Points, base: Static) -
     if not kept.any():
         nothing = np.zeros(shape, np.float32)
         return Panorama(window, nothing, nothing, nothing, nothing, nothing)
-    away, label = cv2.distanceTransformWithLabels(
-        (~kept).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
+    away, (residual, distance) = spread(kept, residual, distance)
     away *= CELL_RAD
-    values = np.zeros((2, int(label.max()) + 1), np.float32)
-    values[:, label[kept]] = residual[kept], distance[kept]
-    filled = values[0][label] * np.clip((REACH_RAD - away) / (REACH_RAD / 2), 0, 1)
-    near, far, share = _layers(filled, values[1][label])
+    near, far, share = _layers(residual * np.clip((REACH_RAD - away) / (REACH_RAD / 2), 0, 1), distance)
     measured = (away <= SUPPORT_RAD).astype(np.float32)
     certain = cv2.erode(measured, _square(SHRINK_RAD)) > 0  # closes gaps between scan lines, but not outwards
     known = np.where(share > 0.5, near, far) + _on_cells(window, origin, base)
     hidden_below = np.where(certain, _hidden_below(known), np.float32(0))
     return Panorama(window, near, far, share, hidden_below, measured)
+
+
+def spread(kept: BoolArray, *layers: Layer) -> tuple[Any, list[Layer]]:
+    """Values of the cells (h, w) that are kept, some of them, given to all: each takes those of the nearest one.
+
+    Returns:
+        How many cells away that is, and the layers.
+    """
+    away, label = cv2.distanceTransformWithLabels(
+        (~kept).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    values = np.zeros((len(layers), int(label.max()) + 1), np.float32)
+    values[:, label[kept]] = [layer[kept] for layer in layers]
+    return away, [value[label] for value in values]
 
 
 def _hidden_below(known: Any) -> Any:

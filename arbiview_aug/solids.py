@@ -15,8 +15,6 @@ import numpy.typing as npt
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.surface import MAX_INVERSE_DISTANCE, Drawn
 
-Layer = npt.NDArray[np.float32]
-
 _TOUCHES_M = 1e-9
 """A camera this close to a face's plane does not see the face."""
 
@@ -73,7 +71,9 @@ def silhouettes(camera: Camera, boxes: FloatArray) -> list[npt.NDArray[np.int64]
     return [np.concatenate(parts) for parts in found]
 
 
-def _face_images(camera: Camera, boxes: FloatArray) -> Iterator[tuple[tuple[slice, slice], BoolArray, Layer, int]]:
+def _face_images(
+    camera: Camera, boxes: FloatArray
+) -> Iterator[tuple[tuple[slice, slice], BoolArray, npt.NDArray[np.float32], int]]:
     """For each face in the image: rows and columns around it, which pixels show it, inverse depths, its number."""
     columns = np.arange(camera.width_px, dtype=np.float64)
     for plane, sides, (x0, x1, y0, y1), number in zip(*_faces(camera, boxes), strict=True):

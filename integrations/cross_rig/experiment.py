@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -149,7 +150,8 @@ class Run:
                 test = self.true_set("test", change, self.settings.test_frames)
                 height = test.store.stacked("height_dm", self.settings.test_frames)
                 tested = evaluate(model, val, test, height, self.settings.schedule)
-                _write_text(path, json.dumps(_result(job, change, trained, tested)))
+                text = json.dumps(_result(job, change, trained, tested))
+                _write(path, partial(Path.write_text, data=text))
                 lines.append(f"{change} val {100 * tested.val_iou:.1f}")
         return f"{job.name}: {trained['cpu_s']:.0f} s of training, {', '.join(lines)}"
 
@@ -171,10 +173,7 @@ class Run:
             "losses": losses,
             "torch": str(torch.__version__),
         }
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(f".{os.getpid()}-{path.name}")
-        torch.save({"weights": model.state_dict(), "trained": trained}, part)
-        part.replace(path)
+        _write(path, lambda part: torch.save({"weights": model.state_dict(), "trained": trained}, part))
         return model, trained
 
 
@@ -191,11 +190,11 @@ def _result(job: Job, change: str, trained: dict[str, Any], tested: Tested) -> d
     }
 
 
-def _write_text(path: Path, text: str) -> None:
-    """All of it or nothing."""
+def _write(path: Path, write: Callable[[Path], object]) -> None:
+    """All of a file or nothing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{os.getpid()}-{path.name}")
-    part.write_text(text)
+    write(part)
     part.replace(path)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -14,6 +13,7 @@ import torch
 from arbiview_aug import RandomRig, Rig, RigRetarget
 from arbiview_aug.evaluate.baselines import row_split
 from arbiview_aug.evaluate.images import as_arrays
+from arbiview_aug.heights import most_alike
 from integrations.cross_rig.arm import RANDOM, Arm
 from integrations.cross_rig.cache import Arrays
 
@@ -72,13 +72,8 @@ class ViewMaker:
 
 def stayed(target: Rig, source: Rig) -> Rig:
     """The target rig, in the source's ego frame, with each camera in the centre of the source camera most like it."""
-    cameras = []
-    for camera in target:
-        nearest = max(source, key=lambda one: float(one.cam2ego[:3, 2] @ camera.cam2ego[:3, 2]))
-        cam2ego = camera.cam2ego.copy()
-        cam2ego[:3, 3] = nearest.center_m
-        cameras.append(replace(camera, cam2ego=cam2ego))
-    return target.with_cameras(cameras)
+    moves = (most_alike(source, camera).center_m - camera.center_m for camera in target)
+    return target.with_cameras([camera.shifted(*move) for camera, move in zip(target, moves, strict=True)])
 
 
 def filled(image: np.ndarray, coverage: np.ndarray) -> np.ndarray:
