@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.camera import FloatArray
-from arbiview_aug.objects import points_in
+from arbiview_aug.objects import beyond, is_over, points_in
 from arbiview_aug.panorama import NEAREST_M, SIDE_RAD, Layer, angles, spread, wrapped
 from arbiview_aug.surface import Points
 
@@ -58,7 +58,10 @@ class MeasuredObject:
         raster = self._rasters[key]
         if raster is None:
             return np.zeros(len(directions)), np.zeros(len(directions))
-        return raster.seen(directions)
+        met, hides = raster.seen(directions)
+        # No point of the object lies farther along a ray than where it leaves the box with air around it.
+        widened = self.box + 2 * BOX_AIR_M * np.array([0, 0, 0, 1, 1, 1, 0])
+        return met, np.where(hides, beyond(widened, origin, directions), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,16 +73,15 @@ class _Raster:
         elevation_rad: Of the first row.
         nearest: (rows, columns) inverse distances, those between points from the nearest cell.
         top_rad: (columns,) elevation of the highest points.
-        beyond: All of the object has a larger inverse distance.
     """
 
     azimuth_rad: float
     elevation_rad: float
     nearest: Layer
     top_rad: Layer
-    beyond: float
 
-    def seen(self, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def seen(self, directions: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+        """Inverse distances where rays (n, 3) pass below the highest points; which pass so, or just above them."""
         azimuth, elevation = angles(directions)
         column = wrapped(azimuth - self.azimuth_rad) / _CELL_RAD
         h, w = self.nearest.shape
@@ -88,8 +90,7 @@ class _Raster:
         top = np.interp(column, np.arange(w), self.top_rad)
         row = np.clip(np.round((elevation - self.elevation_rad) / _CELL_RAD), 0, h - 1).astype(np.intp)
         own = self.nearest[row, np.clip(np.round(column), 0, w - 1).astype(np.intp)]
-        met = np.where(across & (elevation <= top), own, 0.0)
-        return met, np.where(across & (elevation <= top + SIDE_RAD), self.beyond, 0.0)
+        return np.where(across & (elevation <= top), own, 0.0), across & (elevation <= top + SIDE_RAD)
 
 
 def measured_objects(
@@ -117,11 +118,8 @@ def measured_objects(
 
 
 def _raster(box: FloatArray, points: FloatArray, origin: FloatArray) -> _Raster | None:
-    """None where the centre is within the object's bounds, or all but touches it: it has no outline from there."""
-    to_middle = box[:3] - origin
-    radius_m = float(np.linalg.norm(box[3:6])) / 2
-    distance_m = float(np.linalg.norm(to_middle))
-    if np.hypot(to_middle[0], to_middle[1]) <= float(np.hypot(box[3], box[4])) / 2:
+    """None where the centre is over the object or in it, or all but touches its points: it has no outline there."""
+    if is_over(box, origin, BOX_AIR_M):
         return None
     away = points - origin
     length = np.linalg.norm(away, axis=1)
@@ -129,8 +127,8 @@ def _raster(box: FloatArray, points: FloatArray, origin: FloatArray) -> _Raster 
     if not len(away):
         return None
     azimuth, elevation = angles(away / length[:, None])
-    # Less than half a turn, about the azimuth of its middle.
-    middle = math.atan2(to_middle[1], to_middle[0])
+    # Less than half a turn, about the azimuth of its middle: the footprint is convex, and the centre beside it.
+    middle = math.atan2(box[1] - origin[1], box[0] - origin[0])
     offset = wrapped(azimuth - middle)
     left, low = float(offset.min()), float(elevation.min())
     column, row = (np.round(a / _CELL_RAD).astype(np.intp) for a in (offset - left, elevation - low))
@@ -141,5 +139,4 @@ def _raster(box: FloatArray, points: FloatArray, origin: FloatArray) -> _Raster 
     there = np.flatnonzero(np.isfinite(top))
     top = np.interp(np.arange(len(top)), there, top[there])
     _, (nearest,) = spread(nearest > 0, nearest)
-    beyond = 1 / (distance_m + radius_m + BOX_AIR_M)
-    return _Raster(middle + left, low, nearest, top.astype(np.float32), beyond)
+    return _Raster(middle + left, low, nearest, top.astype(np.float32))

@@ -178,16 +178,27 @@ def _first_face(
     box: FloatArray, origin: FloatArray, directions: FloatArray
 ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     """Inverse distance to where rays (n, 3) enter a box, 0 where they miss it; which side they enter (slab method)."""
-    rays = _in_box_frame(box, directions)
-    rays = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
-    start, half = _in_box_frame(box, origin - box[:3]), box[3:6] / 2
-    one, two = (-half - start) / rays, (half - start) / rays
-    near, far = np.minimum(one, two), np.maximum(one, two)
+    near, far, rays = _slabs(box, origin, directions)
     axis = near.argmax(axis=-1)
     enter, leave = near.max(axis=-1), far.min(axis=-1)
     hit = (leave >= enter) & (enter > 0)
     side = 2 * axis + (np.take_along_axis(rays, axis[:, None], axis=-1)[:, 0] < 0)
     return np.where(hit, 1 / np.maximum(enter, 1 / MAX_INVERSE_DISTANCE), 0.0), side
+
+
+def beyond(box: FloatArray, origin: FloatArray, directions: FloatArray) -> FloatArray:
+    """Inverse distance (n,) at which rays (n, 3) that meet a box (7,) leave it, 1/m."""
+    _, far, _ = _slabs(box, origin, directions)
+    return np.asarray(1 / np.maximum(far.min(axis=-1), 1 / MAX_INVERSE_DISTANCE))
+
+
+def _slabs(box: FloatArray, origin: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Distances (n, 3) at which rays (n, 3) enter and leave what lies between a box's opposite faces; its rays."""
+    rays = _in_box_frame(box, directions)
+    rays = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
+    start, half = _in_box_frame(box, origin - box[:3]), box[3:6] / 2
+    one, two = (-half - start) / rays, (half - start) / rays
+    return np.minimum(one, two), np.maximum(one, two), rays
 
 
 def points_in(boxes: FloatArray, points: Points, air_m: float = 0.0) -> list[npt.NDArray[np.int64]]:
@@ -202,6 +213,11 @@ def points_in(boxes: FloatArray, points: Points, air_m: float = 0.0) -> list[npt
             inside = np.abs(_in_box_frame(box, chunk[near] - box[:3])) <= box[3:6] / 2 + air_m
             numbers.append(first + near[inside.all(axis=1)])
     return [np.concatenate(numbers) for numbers in found]
+
+
+def is_over(box: FloatArray, point: FloatArray, air_m: float = 0.0) -> bool:
+    """Whether a point (3,) stands over, in or under the footprint of a box (7,), or within ``air_m`` beside it."""
+    return bool((np.abs(_in_box_frame(box, point - box[:3]))[:2] <= box[3:5] / 2 + air_m).all())
 
 
 def _in_box_frame(box: FloatArray, vectors: FloatArray) -> FloatArray:

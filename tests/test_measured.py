@@ -89,6 +89,20 @@ def test_a_camera_within_or_at_an_object_sees_something(eye: np.ndarray) -> None
     assert np.isfinite(q).all() and (q >= 0).all()
 
 
+@pytest.mark.parametrize("beside_m", [1.6, 4.0])
+def test_a_bus_alongside_hides_what_is_behind_it(beside_m: float) -> None:
+    """Nearer than half its diagonal, but not in it: its scan lines, up to 7 degrees apart, are closed there too."""
+    bus = np.array([2.0, 0.0, 1.6, 12.0, 2.5, 3.2, 0.0])
+    side = grid(np.arange(-3.9, 7.9, 0.03)[:, None], np.array(-1.23), np.arange(0.3, 3.2, 0.2)[None])
+    wall = grid(np.arange(-20, 20, 0.12)[:, None], np.array(20.0), np.arange(-1.0, 9.0, 0.12)[None])
+    surface = LidarObjects.among(Street(), np.concatenate([side, wall]), bus[None])
+    assert len(surface.boxes) == 0
+    eye = np.array([2.5, -1.25 - beside_m, 1.5])
+    rays, q = towards([(x, -1.23, z) for x in (-3.0, 0.5, 2.6, 7.0) for z in (0.5, 1.3, 2.1, 2.8)], eye)
+    assert surface.hides(eye, rays, np.full(len(rays), 1 / 22), PIXEL_RAD).all()
+    assert (surface.inverse_distance(eye, rays) > q / 1.6).all()  # in the bus, not on the wall
+
+
 VIEWS = {
     "ahead": Camera.looking(
         name="ahead", azimuth_deg=0, position_m=tuple(EYE), width_px=320, height_px=120, horizontal_fov_deg=65
