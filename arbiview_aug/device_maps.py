@@ -15,7 +15,7 @@ import torch
 
 from arbiview_aug import sampling
 from arbiview_aug.plan import RenderPlan
-from arbiview_aug.target_plan import TargetPlan
+from arbiview_aug.target_view import TargetPlan
 
 
 @dataclass(frozen=True)
@@ -43,16 +43,19 @@ class ViewMaps:
         grid: (h, w, 2) float32, where the winning source is read; outside the atlas where none sees.
         source: (h, w) int8, which one; -1 where none sees.
         blend: Its bands; None without any.
+        edge: Of a view that is read by cubics the pixels (n,) int64, into the flattened view, that are not, and their
+            grid (1, n, 2); None without any.
     """
 
     grid: torch.Tensor
     source: torch.Tensor
     blend: Blend | None
+    edge: tuple[torch.Tensor, torch.Tensor] | None
 
     @property
     def nbytes(self) -> int:
         """Memory held."""
-        tensors = [self.grid, self.source]
+        tensors = [self.grid, self.source, *(self.edge or ())]
         if self.blend is not None:
             tensors += [self.blend.pixel, self.blend.grid, self.blend.weight, self.blend.source]
         return sum(tensor.nbytes for tensor in tensors)
@@ -69,7 +72,11 @@ def maps_on(plan: RenderPlan, device: torch.device) -> Sequence[ViewMaps]:
 
 def _view_maps(target: TargetPlan, atlas_size: tuple[int, int], device: torch.device) -> ViewMaps:
     grid = sampling.torch_grid(target.at.to_float(), atlas_size, device)
-    return ViewMaps(grid, torch.from_numpy(target.source_camera).to(device), _blend(target, atlas_size, device))
+    source, blend = torch.from_numpy(target.source_camera).to(device), _blend(target, atlas_size, device)
+    if target.edge is None:
+        return ViewMaps(grid, source, blend, None)
+    at_edge = sampling.torch_grid(target.edge.at.to_float(), atlas_size, device)
+    return ViewMaps(grid, source, blend, (torch.from_numpy(target.edge.pixel).to(device), at_edge))
 
 
 def _blend(target: TargetPlan, atlas_size: tuple[int, int], device: torch.device) -> Blend | None:

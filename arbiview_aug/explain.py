@@ -15,7 +15,7 @@ from arbiview_aug.favs.photometric import PhotometricReport
 from arbiview_aug.heights import MOVED_M, lifts_m
 from arbiview_aug.plan import RenderPlan
 from arbiview_aug.rig import Rig
-from arbiview_aug.target_plan import PairReport
+from arbiview_aug.target_view import PairReport
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ from arbiview_aug.held import Held
 from arbiview_aug.rig import Rig, content_order
 from arbiview_aug.sampling import AtlasLayout, Scratch
 from arbiview_aug.scene import Scene
-from arbiview_aug.target_plan import TargetDraft, TargetPlan
+from arbiview_aug.target_plan import TargetDraft
+from arbiview_aug.target_view import TargetPlan
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,6 @@ class RenderPlan:
         target: The target rig in the source's ego frame, on the source's road.
         layout: Where the sources lie in the atlas.
         targets: One plan for each target camera.
-        interpolation: ``linear`` or ``nearest``.
         counters: What was evaluated while building: pairs by surface, cells interpolated and exact, bands.
         on_devices: The maps as tensors, by device, where they were asked for (``device_maps``); not pickled.
     """
@@ -42,7 +42,6 @@ class RenderPlan:
     target: Rig
     layout: AtlasLayout
     targets: tuple[TargetPlan, ...]
-    interpolation: str
     counters: dict[str, int] = field(default_factory=dict)
     on_devices: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
@@ -131,4 +130,4 @@ def build_plan(
     }
     layout = layout.without_others(read)
     counters["bands"] = sum(len(t.bands) for t in targets)
-    return RenderPlan(source, target, layout, targets, config.interpolation, dict(counters))
+    return RenderPlan(source, target, layout, targets, dict(counters))

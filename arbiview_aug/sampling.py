@@ -259,10 +259,14 @@ def halved(image: np.ndarray, level: int, dst: np.ndarray | None = None) -> np.n
 
 
 def remap(atlas: np.ndarray, at: FixedMap, interpolation: str, dst: np.ndarray | None = None) -> np.ndarray:
-    """Read the atlas at a map, (h, w, 3); ``OUTSIDE`` is black. Nearest sampling wants a ``rounded`` map."""
+    """Read the atlas at a map, (h, w, 3); ``OUTSIDE`` is black. Nearest sampling wants a ``rounded`` map.
+
+    Cubic sampling overshoots: float images may leave their range by a little.
+    """
     if interpolation == "nearest":
         return cv2.remap(atlas, at.xy, None, cv2.INTER_NEAREST, dst=dst)  # type: ignore[call-overload]
-    return cv2.remap(atlas, at.xy, at.frac, cv2.INTER_LINEAR, dst=dst)
+    flag = cv2.INTER_CUBIC if interpolation == "cubic" else cv2.INTER_LINEAR
+    return cv2.remap(atlas, at.xy, at.frac, flag, dst=dst)
 
 
 # --- torch ------------------------------------------------------------------------------------------------------------
@@ -296,6 +300,6 @@ def torch_grid(uv: npt.NDArray[np.floating], atlas_size: tuple[int, int], device
 
 def grid_sample(atlas: torch.Tensor, grid: torch.Tensor, interpolation: str) -> torch.Tensor:
     """Read a (B, 3, H, W) atlas at an (h, w, 2) grid: (B, 3, h, w); outside is black."""
-    mode = "nearest" if interpolation == "nearest" else "bilinear"
+    mode = {"nearest": "nearest", "linear": "bilinear", "cubic": "bicubic"}[interpolation]  # both cubics have a = -0.75
     batched = grid.expand(atlas.shape[0], *grid.shape)
     return torch.nn.functional.grid_sample(atlas, batched, mode=mode, padding_mode="zeros", align_corners=True)

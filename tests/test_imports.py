@@ -33,7 +33,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("dense",),
     ("projection",),
     ("required", "heights"),
-    ("target_rays",),
+    ("target_rays", "target_view"),
     ("shadowing",),
     ("maps",),
     ("favs.photometric", "confidence"),

@@ -14,8 +14,8 @@ Quality = Literal["draft", "fast", "accurate", "paper"]
 class FavsConfig:
     """How target views are planned and fused. The values that the paper leaves open are fields with their reason."""
 
-    interpolation: Literal["linear", "nearest"] = "linear"
-    """Sampling of the sources."""
+    interpolation: Literal["nearest", "linear", "cubic"] = "cubic"
+    """Sampling of the sources. ``cubic`` is so only where a target camera magnifies what it reads (``MAGNIFIED``)."""
 
     antialias: bool = True
     """Read from a source halved until the target no longer minifies it by two or more: 47 against 42 dB at 256x704."""
@@ -56,8 +56,10 @@ class FavsConfig:
         check_ranges(self, _RANGES)
         if self.grid_step_px not in (1, 4, 8, 16, 32):
             raise ValueError(f"FavsConfig.grid_step_px: expected 1, 4, 8, 16 or 32, got {self.grid_step_px!r}")
-        if self.interpolation not in ("linear", "nearest"):
-            raise ValueError(f"FavsConfig.interpolation: expected 'linear' or 'nearest', got {self.interpolation!r}")
+        if self.interpolation not in ("nearest", "linear", "cubic"):
+            raise ValueError(
+                f"FavsConfig.interpolation: expected 'nearest', 'linear' or 'cubic', got {self.interpolation!r}"
+            )
 
 
 _RANGES: dict[str, tuple[float, float]] = {

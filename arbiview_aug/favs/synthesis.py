@@ -13,7 +13,10 @@ from arbiview_aug import sampling
 from arbiview_aug.device_maps import Blend, maps_on
 from arbiview_aug.plan import RenderPlan
 from arbiview_aug.sampling import Scratch
+from arbiview_aug.target_view import Edge
 from arbiview_aug.tone import STRIP_ROWS, ToneCurve
+
+_REMAP_COLUMNS = 32000  # remap needs sizes below 32767
 
 
 def render_opencv(
@@ -53,7 +56,9 @@ def render_opencv(
         buffer = scratch.get(f"view{h}x{w}", (h, w, 3), atlas.dtype)
         for y in range(0, h, STRIP_ROWS):
             strip = buffer[y : y + STRIP_ROWS]
-            sampling.remap(atlas, target.at.rows(y, y + STRIP_ROWS), plan.interpolation, dst=strip)
+            sampling.remap(atlas, target.at.rows(y, y + STRIP_ROWS), target.interpolation, dst=strip)
+            if target.edge is not None:
+                _put_edge(target.edge.rows(y, y + STRIP_ROWS, w), atlas, strip)
             # Not in the sources: a target has no more pixels, they are in the cache, and a source need not be copied.
             if curves is not None:
                 for patch in target.patches[y // STRIP_ROWS]:
@@ -61,7 +66,7 @@ def render_opencv(
         for band in target.bands:
             bh, bw = band.weight.shape
             part = buffer[band.y : band.y + bh, band.x : band.x + bw]
-            second = sampling.remap(atlas, band.at, plan.interpolation)
+            second = sampling.remap(atlas, band.at, target.seam_interpolation)
             if curves is not None:
                 curves[band.source].apply(second)
             if change is not None:
@@ -70,6 +75,16 @@ def render_opencv(
             part[...] = cv2.blendLinear(part, second, 1 - band.weight, band.weight)
         cv2.split(buffer, list(views[k].numpy()))
     return [view.to(dtype) for view in views]
+
+
+def _put_edge(edge: Edge, atlas: np.ndarray, strip: np.ndarray) -> None:
+    """Read what cubics must not reach bilinearly; bring float images back into their range."""
+    if strip.dtype != np.uint8:
+        np.clip(strip, 0, 1, out=strip)
+    flat = strip.reshape(-1, 3)
+    for first in range(0, len(edge.pixel), _REMAP_COLUMNS):
+        some = slice(first, first + _REMAP_COLUMNS)
+        flat[edge.pixel[some]] = sampling.remap(atlas, edge.at.part(slice(None), some), "linear")[0]
 
 
 def render_torch(
@@ -94,13 +109,17 @@ def render_torch(
     atlas = sampling.torch_atlas(plan.layout, images)
     tones = None if curves is None else _Tones.of(curves, len(images), device, 255.0 if whole else 1.0)
     views = []
-    for maps in maps_on(plan, device):
-        view = sampling.grid_sample(atlas, maps.grid, plan.interpolation)
+    for target, maps in zip(plan.targets, maps_on(plan, device), strict=True):
+        view = sampling.grid_sample(atlas, maps.grid, target.interpolation)
+        if maps.edge is not None:
+            pixel, grid = maps.edge
+            at_edge = sampling.grid_sample(atlas, grid, "linear")[:, :, 0]
+            view = view.clamp(0, 255 if whole else 1).flatten(2).index_copy(2, pixel, at_edge).view_as(view)
         if tones is not None:
             view = tones.applied(view, maps.source.long(), whole)
         change = None if seams is None else view.new_zeros(view.shape[0], *view.shape[2:])
         if maps.blend is not None:
-            view = _blended(view, atlas, maps.blend, plan.interpolation, tones, whole, change)
+            view = _blended(view, atlas, maps.blend, target.seam_interpolation, tones, whole, change)
         if seams is not None and change is not None:
             seams.append(change)
         views.append(_rounded(view, dtype))
