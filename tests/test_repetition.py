@@ -84,6 +84,7 @@ def test_opencv_is_left_as_it_was() -> None:
     assert (cv2.getNumThreads(), cv2.ipp.useIPP()) == before
 
 
+@pytest.mark.slow
 def test_a_street_in_two_processes() -> None:
     one, two = (in_another_process(seed) for seed in (1, 2))
     assert one == two and len(set(one)) == 2 * len(SETTINGS)

@@ -244,12 +244,12 @@ def same_frames(setup: Run, change: str) -> dict[str, str]:
     return same
 
 
-def rendering_seconds(setup: Run) -> dict[str, float]:
-    """CPU seconds that each arm's own rendering took for a frame: the median over its frames, then over changes."""
-    by_arm: dict[str, list[float]] = {}
+def rendering_seconds(setup: Run, change: str) -> dict[str, float]:
+    """CPU seconds that each arm's own rendering took for a frame: the median over the frames of a change."""
+    found = {}
     for job in jobs(setup.settings):
         source = setup.images(job)
-        if job.arm.renders and not source.store().missing(setup.settings.train_frames):
+        if job.arm.renders and job.change == change and not source.store().missing(setup.settings.train_frames):
             seconds = source.store().stacked("cpu_s", setup.settings.train_frames)
-            by_arm.setdefault(job.arm.name, []).append(float(np.median(seconds)))
-    return {name: float(np.median(values)) for name, values in by_arm.items()}
+            found[job.arm.name] = float(np.median(seconds))
+    return found

@@ -25,9 +25,8 @@ Results = Mapping[str, Mapping[int, Mapping[str, Any]]]
 def write_report(setup: Run) -> dict[str, Any]:
     """Write ``report.json``, ``report.md`` and ``report.png`` from the results that are there; returns the first."""
     results = load_results(setup)
-    rendering = rendering_seconds(setup)
     changes = {
-        name: _of_change(results[name], rendering) | {"same_frames": same_frames(setup, name)}
+        name: _of_change(results[name], rendering_seconds(setup, name)) | {"same_frames": same_frames(setup, name)}
         for name in setup.settings.changes
         if name in results
     }

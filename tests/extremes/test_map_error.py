@@ -116,6 +116,7 @@ def sweep(scale: float, surfaces: tuple[str, ...], at_most: int, views: slice = 
 SURFACES = ("street", "ground", "far", "objects")
 
 
+@pytest.mark.slow
 def test_small_images() -> None:
     """12 % of the recorded sizes: the street's join of road and wall is as narrow as the coarse grid there."""
     sweep(0.12, ("street",), at_most=10**6, views=slice(None, None, 3))
