@@ -79,11 +79,11 @@ class TargetRays:
         return np.maximum(background, self.at_nodes(near))
 
     def at_nodes(self, image: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Values (ny, nx) at the pixel nearest to each node, 0 outside the image."""
+        """Values (ny, nx) of the image's type at the pixel nearest to each node, 0 or False outside the image."""
         h, w = self.camera.size
         x, y = (np.floor(self.nodes[..., k]).astype(np.int64) for k in (0, 1))
         inside = (x >= 0) & (x < w) & (y >= 0) & (y < h)
-        return np.where(inside, image[y.clip(0, h - 1), x.clip(0, w - 1)], 0)
+        return np.where(inside, image[y.clip(0, h - 1), x.clip(0, w - 1)], image.dtype.type(0))
 
     def solids(self, surface: Layered) -> SolidPixels:
         """The target's pixels that show solids; drawn once for each surface."""

@@ -24,7 +24,7 @@ BOXES = np.array([[12.03, 1.0, 0.807, 4.5, 1.9, 1.613, 0.3], [-8.0, -3.0, 1.01, 
 MAP_TOLERANCE_PX = 1 / 32
 ROUNDING_PX = 1e-3  # the slack that maps allow at an image's border
 BLEND_ERROR = 1e-4  # cv2.blendLinear adds 1e-5 to the sum of its weights, once for every band
-UNBLENDED = FavsConfig(seam_width=0.0)
+UNBLENDED = FavsConfig(seam_width=0.0, interpolation="linear")
 
 # Shrinking rigs takes minutes, past the time limit, and explains little.
 any_drawn = settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much], phases=[Phase.generate])
