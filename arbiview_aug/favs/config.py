@@ -15,7 +15,8 @@ class FavsConfig:
     """How target views are planned and fused. The values that the paper leaves open are fields with their reason."""
 
     interpolation: Literal["nearest", "linear", "cubic"] = "cubic"
-    """Sampling of the sources. ``cubic`` is so only where a target camera magnifies what it reads (``MAGNIFIED``)."""
+    """Sampling of the sources. ``cubic`` is so only where a target camera magnifies what it reads at its own centre
+    (``arbiview_aug.target_plan.MAGNIFIED``)."""
 
     antialias: bool = True
     """Read from a source halved until the target no longer minifies it by two or more: 47 against 42 dB at 256x704."""

@@ -282,7 +282,7 @@ def test_only_magnified_views_are_read_by_cubics(factor: float, expected: str) -
 
 
 def test_magnified_views_are_sharper() -> None:
-    """65 to 50 degrees: what took the detector of ``integrations/cross_rig`` from 77 to 94 % of the gap."""
+    """65 to 50 degrees: what took the detector of ``integrations/cross_rig`` from 77 to 91 % of the gap."""
     rig = demo_source_rig((96, 256))
     target, drive = zoomed(rig, 1.37), SyntheticDrive(rig, num_frames=3, seed=7, lidar=False)
     psnr = []
