@@ -27,7 +27,7 @@ from arbiview_aug.bench.timing import machine, machine_line, one_thread, quartil
 from arbiview_aug.command_line import add_data, count
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.explain import Explanation
-from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.favs.config import FavsConfig, accurate
 from arbiview_aug.neighbours import adjacent_pairs
 from arbiview_aug.plan import build_plan
 from arbiview_aug.rig import Rig
@@ -191,6 +191,9 @@ def situations(sample: Mapping[str, Any]) -> list[Situation]:
     rig = without_masks(sample["rig"])  # of what the own car hides no source sees all
     bare = {key: value for key, value in sample.items() if key not in _GEOMETRY} | {"rig": rig}
     turned, cut = rig.turned(yaw_deg=YAW_DEG), zoomed(rig, ZOOM)
+    # The cameras beside theirs, which look everything over, magnify nothing at their own centres: compared is one kind
+    # of reading.
+    bilinear = FavsConfig(interpolation="linear")
 
     def over(name: str, target: Rig, frame: Mapping[str, Any], **settings: Any) -> Case:
         return Case(frame, nearly(target), {"surface": name, **settings})
@@ -211,14 +214,14 @@ def situations(sample: Mapping[str, Any]) -> list[Situation]:
         Situation(
             f"one source sees all (zoom {ZOOM:g})",
             "no neighbour is looked at, no seam is blended",
-            Case(bare, cut),
-            over("street", cut, bare),
+            Case(bare, cut, {"quality": bilinear}),
+            over("street", cut, bare, quality=bilinear),
         ),
         Situation(
             "the same, accurate",
             "no overlap is matched",
-            Case(bare, cut, {"quality": "accurate"}),
-            over("street", cut, bare, quality="accurate"),
+            Case(bare, cut, {"quality": replace(accurate(), interpolation="linear")}),
+            over("street", cut, bare, quality=replace(accurate(), interpolation="linear")),
         ),
     ]
     if "points" in sample:
@@ -234,8 +237,8 @@ def situations(sample: Mapping[str, Any]) -> list[Situation]:
             Situation(
                 f"LiDAR, one source sees all (zoom {ZOOM:g})",
                 "no point is read, the plan is held",
-                Case(points, cut),
-                over("lidar", cut, points),
+                Case(points, cut, {"quality": bilinear}),
+                over("lidar", cut, points, quality=bilinear),
             ),
             Situation(
                 f"LiDAR, all cameras at one centre, turned by {YAW_DEG:g} deg",
