@@ -12,6 +12,7 @@ from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.favs.overlap_depth import OverlapDepth
 from arbiview_aug.favs.paper import PaperRendering, SourceReport
 from arbiview_aug.favs.photometric import PhotometricReport
+from arbiview_aug.fills import Fills
 from arbiview_aug.heights import MOVED_M, lifts_m
 from arbiview_aug.plan import RenderPlan
 from arbiview_aug.rig import Rig
@@ -27,19 +28,26 @@ class Explanation:
         asked: The target rig that was asked for, in its own ego frame.
         harmonisation: The sources' gains and why, where harmonisation was asked for.
         depth: What became of each pair of neighbours, where depth from overlap was asked for and matters.
+        fills: What other frames of the drive show of the holes, where the sample has any.
     """
 
     plan: RenderPlan
     asked: Rig
     harmonisation: PhotometricReport | None = None
     depth: OverlapDepth | None = None
+    fills: Fills | None = None
 
     def as_dict(self) -> list[dict[str, Any]]:
-        """One entry for each target camera: coverage, share to invent, and its sources with surface and reason."""
-        return [
-            _entry(camera, target.coverage, [self._source(pair) for pair in target.pairs])
-            for camera, target in zip(self.plan.target, self.plan.targets, strict=True)
-        ]
+        """One entry for each target camera: coverage, share to invent, and its sources with surface and reason.
+
+        With other frames of the drive also ``filled``: the share that they show besides, no more than which is filled.
+        """
+        shares = [0.0] * len(self.plan.targets) if self.fills is None else self.fills.shares(self.plan)
+        entries = []
+        for camera, target, share in zip(self.plan.target, self.plan.targets, shares, strict=True):
+            entry = _entry(camera, target.coverage, [self._source(pair) for pair in target.pairs])
+            entries.append(entry if self.fills is None else entry | {"filled": share})
+        return entries
 
     def _source(self, pair: PairReport) -> dict[str, Any]:
         return {
@@ -66,6 +74,8 @@ class Explanation:
                 lines.append(f"  {camera.name}: {where}, at the source's height: {why}")
         if self.depth is not None:
             lines.extend(f"  {line}" for line in str(self.depth).splitlines())
+        if self.fills is not None:
+            lines.extend(f"  {line}" for line in self.fills.lines(self.plan))
         return "\n".join([*lines, *_lines(self.as_dict(), _source_line)])
 
     __repr__ = __str__
@@ -125,6 +135,8 @@ def _lines(entries: list[dict[str, Any]], words: Callable[[dict[str, Any]], str]
     for entry in entries:
         to_invent = entry["to_invent"]
         note = f", {to_invent:.1%} that no camera saw: masked, or for a generator to invent" if to_invent else ""
+        if entry.get("filled"):
+            note = f", up to {entry['filled']:.1%} more by other frames of the drive{note}"
         yield f"  {entry['camera']}: {entry['coverage']:.1%} covered{note}"
         if not entry["sources"]:
             yield "    no source camera looks there"

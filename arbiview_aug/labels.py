@@ -25,8 +25,8 @@ PIXEL_BOUND_KEYS = (
     "depth",
     "depth_m",
     "keypoints_2d",
-    "neighbours",
     "source_camera",
+    "source_frame",
     "confidence",
     "generated",
 )

@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from dataclasses import dataclass, field, fields
-from functools import lru_cache
+from functools import partial
 from typing import Any
 
 from arbiview_aug.camera import BoolArray
@@ -114,10 +114,8 @@ def build_plan(
     counters: Counter[str] = Counter()
     order = content_order(source.cameras)
     known = scene or Scene()
-    surface_by_name = lru_cache(None)(lambda name: known.surface(name, source.ground_z_m))
-    drafts = [
-        TargetDraft(source, order, camera, surface, known.best, surface_by_name, config, counters) for camera in target
-    ]
+    by_name = partial(known.surface, ground_z_m=source.ground_z_m)
+    drafts = [TargetDraft(source, order, camera, surface, known.best, by_name, config, counters) for camera in target]
     used = [(region.source, region.level) for draft in drafts for region in draft.regions]
     layout = AtlasLayout.for_sources(source.sizes, used)
     scratch = Scratch()

@@ -29,6 +29,7 @@ CALIBRATION_KEYS = (
     "ground_z_m",
     "coverage",
     "ignore",
+    "neighbours",
     "retarget_params",
 )
 """Keys that describe the source's images; they are replaced by the target's or consumed."""
@@ -171,6 +172,16 @@ def _of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[
 
 
 # --- calibration ------------------------------------------------------------------------------------------------------
+def frame_from(images: tuple[torch.Tensor, ...], entry: Mapping[str, Any], source_rig: Rig | None) -> SourceFrame:
+    """One frame of an unbatched sample, whose images are checked already.
+
+    Raises:
+        SampleError: Missing calibration, mismatched counts or sizes.
+        CalibrationError: K, cam2ego or a lens that no real camera has.
+    """
+    return _frame(images, entry, source_rig, (), ())
+
+
 def _frame(
     images: tuple[torch.Tensor, ...],
     sample: Mapping[str, Any],

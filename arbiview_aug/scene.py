@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -29,6 +29,7 @@ class Scene:
     boxes: FloatArray | None = None
     points: Points | None = None
     corrections: tuple[Correction, ...] = ()
+    _surfaces: dict[tuple[str, float], Surface] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def is_empty(self) -> bool:
@@ -55,11 +56,17 @@ class Scene:
         return digest.digest()
 
     def surface(self, name: str, ground_z_m: float) -> Surface:
-        """A surface by name, over a road at ``ground_z_m``.
+        """A surface by name, over a road at ``ground_z_m``; kept, with what it holds of its own.
 
         Raises:
             ValueError: An unknown name, or geometry that the scene lacks.
         """
+        key = name, ground_z_m
+        if key not in self._surfaces:
+            self._surfaces[key] = self._made(name, ground_z_m)
+        return self._surfaces[key]
+
+    def _made(self, name: str, ground_z_m: float) -> Surface:
         street: Static = Street(ground_z_m=ground_z_m)
         if self.corrections:
             street = Refined(street, self.corrections)

@@ -10,14 +10,16 @@ from typing import Any, Literal
 import torch
 
 from arbiview_aug.detections import OfCameras, detections_of_frames
-from arbiview_aug.errors import SampleError
+from arbiview_aug.errors import ArbiviewError, SampleError
 from arbiview_aug.favs.config import FavsConfig, PaperConfig
 from arbiview_aug.favs.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.favs.paper import PaperRendering, check_settings, render_paper
 from arbiview_aug.favs.photometric import Harmoniser
 from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
+from arbiview_aug.fills import Fills, Patch, Reach, fill_views, plan_fills
 from arbiview_aug.heights import MOVED_M, at_source_heights, lifts_m
+from arbiview_aug.neighbours import neighbours_of_frames, warn_lost
 from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
 from arbiview_aug.required import baselines_m, needs_geometry
 from arbiview_aug.rig import Rig
@@ -54,10 +56,12 @@ class View:
     Attributes:
         made: Its plan; or the frame rendered by the published stages, for which nothing can be planned.
         depth: What became of its overlaps, where depth from overlap was asked for and matters.
+        fills: How its holes are filled from neighbouring frames, where those show any of them.
     """
 
     made: RenderPlan | PaperRendering
     depth: OverlapDepth | None = None
+    fills: Fills | None = None
 
 
 class Stitcher:
@@ -70,6 +74,7 @@ class Stitcher:
         refinement: Where refinements are held, for settings with depth from overlap.
         execution: ``opencv``, ``torch`` or ``auto``.
         cache_bytes: Memory for plans that may come back.
+        reach: What neighbouring frames may fill; None leaves them out.
         warn: Says what a user should know.
 
     Raises:
@@ -84,6 +89,7 @@ class Stitcher:
         refinement: RefinementCache | None,
         execution: Execution,
         cache_bytes: int,
+        reach: Reach | None,
         warn: WarnOnce,
     ) -> None:
         if isinstance(config, PaperConfig):
@@ -93,7 +99,7 @@ class Stitcher:
         if refinement is not None and not (isinstance(config, FavsConfig) and config.overlap_depth):
             raise ValueError("refinement: expected quality='accurate' (or overlap_depth=True) with a RefinementCache")
         self.config, self.surface, self.harmoniser = config, surface, harmoniser
-        self.refinement, self.execution, self.warn = refinement, execution, warn
+        self.refinement, self.execution, self.reach, self.warn = refinement, execution, reach, warn
         self.plans = PlanCache(cache_bytes)
         self._plan_of_frame = PlanCache(0)  # holds one
         self._scratch = Scratch()
@@ -115,11 +121,16 @@ class Stitcher:
         if any(needed) or self.surface != "auto":
             scenes = scenes_of_frames(sample, frames, lead, self.surface)
         names = self._names(sample, len(frames), lead)
+        near = [[] for _ in frames] if self.reach is None else neighbours_of_frames(sample, frames, lead, self.warn)
         views = []
-        for frame, scene, name, needs in zip(frames, scenes, names, needed, strict=True):
+        for frame, scene, name, needs, neighbours in zip(frames, scenes, names, needed, near, strict=True):
             depth = self._depth(self.config, frame, target, scene, name) if needs else None
             known = scene if depth is None else replace(scene, corrections=depth.corrections)
-            views.append(View(self.plan(frame.rig, target, known), depth))
+            plan, fills = self.plan(frame.rig, target, known), None
+            if neighbours and self.reach is not None:
+                surface = known.best if self.surface == "auto" else self.surface
+                fills = plan_fills(plan, neighbours, known, surface, self.config, self.reach)
+            views.append(View(plan, depth, fills))
         return views
 
     def _published(
@@ -238,6 +249,28 @@ class Stitcher:
         if seams is not None:
             seams.extend(changes[b] for b in range(len(frames)))
         return [done[b] for b in range(len(frames))]
+
+    def filled(
+        self, frame: SourceFrame, view: View, images: list[torch.Tensor]
+    ) -> tuple[list[torch.Tensor], list[Patch]]:
+        """The target images of one frame with their holes filled from its neighbours, and what was filled in."""
+        if view.fills is None:
+            return images, []
+        curves = self.harmoniser.curves(frame.rig, frame.images)
+        rendered = []
+        for fill in view.fills.fills:
+            try:
+                sources = fill.neighbour.images(frame.images)
+            except (ArbiviewError, OSError) as error:
+                warn_lost(self.warn, fill.neighbour.name, error)
+                continue
+            if self._uses_torch(frame):
+                batches = render_torch(fill.plan, [image[None] for image in sources], [curves])
+                rendered.append((fill, [batch[0] for batch in batches]))
+            else:
+                # A camera's exposure is that of the same camera now: fills overlap the current views too little.
+                rendered.append((fill, render_opencv(fill.plan, sources, self._scratch, curves)))
+        return fill_views(images, view.fills, rendered) if rendered else (images, [])
 
     def _uses_torch(self, frame: SourceFrame) -> bool:
         wanted = any(image.device.type != "cpu" or image.requires_grad for image in frame.images)

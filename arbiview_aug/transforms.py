@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from numbers import Real
 from pathlib import Path
@@ -24,6 +24,7 @@ from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_conf
 from arbiview_aug.favs.paper import PaperRendering, check_pinhole
 from arbiview_aug.favs.photometric import Harmonise, Harmoniser, PhotometricReport
 from arbiview_aug.favs.refinement import RefinementCache
+from arbiview_aug.fills import Patch, Reach, filled_certainty
 from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_target, target_labels
 from arbiview_aug.plan import PlanCache, RenderPlan
 from arbiview_aug.random_rig import RandomRig
@@ -37,7 +38,7 @@ from arbiview_aug.tensors import covered, gathered, leading_shape, lens_names, l
 Made = RenderPlan | PaperRendering | tuple[int, int]
 """What a frame's views are made by: a plan, the published stages; or it is only resized, to this size."""
 
-OUTPUTS = ("source_camera", "confidence")
+OUTPUTS = ("source_camera", "source_frame", "confidence")
 """What a sample can hold besides, on request."""
 
 
@@ -81,6 +82,9 @@ class RigRetarget(torch.nn.Module):
         refinement: For ``quality="accurate"``, whose depth from overlap depends on the images: None computes it, and
             plans anew, for every frame; a ``RefinementCache`` reuses both where its key says that the scene is the
             same.
+        neighbours: What other frames of the drive may fill, where the sample has ``neighbours`` (their format:
+            ``arbiview_aug.neighbours``): ``ground``, the road near the cameras that no source sees now; ``all``,
+            whatever the surface says; None does not read them. Never what the current frame sees. ``paper`` has none.
         size: (h, w) of every output image; the target cameras are resized to it.
         p: Probability of retargeting. A skipped sample keeps its own cameras, resized to ``size``, with full coverage;
             so ``p < 1`` needs ``size`` and equal camera counts. The output then always has ``lens``, ``distortion``
@@ -91,9 +95,10 @@ class RigRetarget(torch.nn.Module):
         label_keys: Keys that hold label maps (..., N, H, W) or lists of them, besides ``tv_tensors.Mask``.
         label_fill: Value of label pixels that no source sees (False for bool maps).
         pass_keys: Keys to keep although they look bound to the source's pixels.
-        outputs: Further outputs: ``source_camera`` (..., M, h, w) int8, -1 where uncovered; ``confidence``
-            (..., M, h, w) float32 in [0, 1], exp(-e / 10) for an expected error of e grey levels of 255: 1 where
-            the source is exact, 0 where uncovered (``arbiview_aug.confidence``; not with ``paper``).
+        outputs: Further outputs: ``source_camera`` (..., M, h, w) int8, -1 where uncovered; ``source_frame`` (..., M,
+            h, w) int8, 0 for the current frame, n + 1 for number n of the neighbours, -1 where uncovered;
+            ``confidence`` (..., M, h, w) float32 in [0, 1], exp(-e / 10) for an expected error of e grey levels of
+            255: 1 where the source is exact, 0 where uncovered (``arbiview_aug.confidence``; not with ``paper``).
         execution: ``opencv`` (CPU), ``torch`` (any device, differentiable); ``auto`` takes OpenCV for CPU images that
             need no gradient.
         cache_bytes: Memory for plans; the least recently used go first.
@@ -113,6 +118,7 @@ class RigRetarget(torch.nn.Module):
         surface: SurfaceName = "auto",
         harmonise: Harmonise = None,
         refinement: RefinementCache | None = None,
+        neighbours: Reach | None = "ground",
         size: tuple[int, int] | None = None,
         p: float = 1.0,
         rng: torch.Generator | None = None,
@@ -130,6 +136,8 @@ class RigRetarget(torch.nn.Module):
         _one_of("surface", surface, get_args(SurfaceName))
         _one_of("label_frame", label_frame, ("source", "target"))
         _one_of("execution", execution, get_args(Execution))
+        if neighbours is not None:
+            _one_of("neighbours", neighbours, get_args(Reach))
         for name in _checked_names("outputs", outputs):
             _one_of("outputs", name, OUTPUTS)
         if not _is_number(p) or not 0 <= p <= 1:
@@ -172,6 +180,7 @@ class RigRetarget(torch.nn.Module):
             refinement,
             execution,
             cache_bytes=0 if once else cache_bytes,
+            reach=neighbours,
             warn=self._warn,
         )
         self._fixed_target = self._sized(self.target) if isinstance(self.target, Rig) else None
@@ -279,16 +288,23 @@ class RigRetarget(torch.nn.Module):
         parts = []
         for b, images in enumerate(self.stitcher.render(frames, views, seams)):
             made, device = views[b].made, images[0].device
+            filled, patches = self.stitcher.filled(frames[b], views[b], images)
             part = self._described(made.target, device)
-            part["images"] = stacked(images)
+            part["images"] = stacked(filled)
             winners = _winners(made, device)
             part["coverage"] = covered(winners)
+            _put(patches, part["coverage"], lambda patch: patch.frame >= 0)
             if seams is not None and isinstance(made, RenderPlan):
                 certain = [view.certainty for view in made.targets if view.certainty is not None]
-                of_views = zip(images, certain, part["coverage"], seams[b], strict=True)
+                certain = [filled_certainty(of_view, k, patches) for k, of_view in enumerate(certain)]
+                of_views = zip(filled, certain, part["coverage"], seams[b], strict=True)
                 part["confidence"] = stacked([confidence(*of_view) for of_view in of_views])
             if "source_camera" in self.outputs:
                 part["source_camera"] = stacked([winner.clone() for winner in winners])
+                _put(patches, part["source_camera"], lambda patch: patch.camera)
+            if "source_frame" in self.outputs:
+                part["source_frame"] = stacked([winner.clamp(max=0) for winner in winners])
+                _put(patches, part["source_frame"], lambda patch: patch.frame + 1)
             parts.append(part)
         return parts, [view.made for view in views]
 
@@ -304,6 +320,8 @@ class RigRetarget(torch.nn.Module):
             part["source_camera"] = stacked(
                 [torch.full(size, k, dtype=torch.int8, device=device) for k in range(len(frame.rig))]
             )
+        if "source_frame" in self.outputs:
+            part["source_frame"] = stacked([torch.zeros(size, dtype=torch.int8, device=device) for _ in frame.rig])
         return part
 
     def _described(self, rig: Rig, device: torch.device) -> dict[str, Any]:
@@ -364,7 +382,7 @@ class RigRetarget(torch.nn.Module):
         if isinstance(view.made, PaperRendering):
             return PaperExplanation(view.made)
         gains = self.harmonisation(sample) if self.stitcher.harmoniser.is_on else None
-        return Explanation(view.made, target, gains, view.depth)
+        return Explanation(view.made, target, gains, view.depth, view.fills)
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
         """The gains that a sample's source images would get, and why; of a batch, its first frame."""
@@ -384,6 +402,16 @@ def _winners(made: RenderPlan | PaperRendering, device: torch.device) -> list[to
     if isinstance(made, RenderPlan) and device.type != "cpu":
         return [view.source for view in maps_on(made, device)]
     return [torch.from_numpy(view.source_camera) for view in made.targets]
+
+
+def _put(
+    patches: Sequence[Patch], maps: torch.Tensor | list[torch.Tensor], value: Callable[[Patch], torch.Tensor]
+) -> None:
+    """Write what was filled in into maps (M, h, w) of a frame's views."""
+    for patch in patches:
+        there = patch.frame >= 0
+        place = maps[patch.target][patch.rows, patch.columns]
+        place[there] = value(patch)[there]
 
 
 def _one_of(name: str, value: Any, choices: Sequence[str]) -> None:

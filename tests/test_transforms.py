@@ -263,7 +263,7 @@ def test_outputs_collate() -> None:
 def test_pixel_bound_keys_are_dropped_with_one_warning() -> None:
     source, retarget = ring(), RigRetarget(ring().turned(yaw_deg=3))
     sample = sample_of(source, boxes_2d=torch.rand(3, 4), depth=torch.rand(4, *SIZE), neighbours=[])
-    with pytest.warns(UserWarning, match="drops boxes_2d, depth, neighbours: they speak of the source's pixels"):
+    with pytest.warns(UserWarning, match="drops boxes_2d, depth: they speak of the source's pixels"):
         out = retarget(sample)
     assert not {"boxes_2d", "depth", "neighbours"} & set(out)
     retarget(sample)  # without a second warning
@@ -662,7 +662,7 @@ def test_prepare_builds_the_plan_that_samples_use() -> None:
         ({"surface": "sphere"}, "surface: expected one of .*far.* got 'sphere'"),
         ({"label_frame": "world"}, "label_frame: expected one of source, target, got 'world'"),
         ({"execution": "jax"}, "execution: expected one of auto, opencv, torch, got 'jax'"),
-        ({"outputs": ["depth"]}, "outputs: expected one of source_camera, confidence, got 'depth'"),
+        ({"outputs": ["depth"]}, "outputs: expected one of source_camera, source_frame, confidence, got 'depth'"),
         ({"p": 1.5}, "p: expected a probability from 0 to 1, got 1.5"),
         ({"p": float("nan")}, "p: expected a probability"),
         ({"size": 256}, r"size: expected \(h, w\) in pixels, got 256"),

@@ -28,7 +28,7 @@ from arbiview_aug.command_line import add_data, count
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.explain import Explanation
 from arbiview_aug.favs.config import FavsConfig, accurate
-from arbiview_aug.neighbours import adjacent_pairs
+from arbiview_aug.overlaps import adjacent_pairs
 from arbiview_aug.plan import build_plan
 from arbiview_aug.rig import Rig
 from arbiview_aug.sample import check_inputs, scenes_of_frames

@@ -4,10 +4,13 @@ from arbiview_aug.datasets.frame_folder import FrameFolder
 from arbiview_aug.datasets.images import decode_images, reduced_camera, reduced_rig
 from arbiview_aug.datasets.nuscenes import NuScenesDataset
 from arbiview_aug.datasets.opening import open_data
+from arbiview_aug.datasets.sequence import LazyFrame, Neighbours
 from arbiview_aug.datasets.wrappers import RetargetedDataset, RetargetedIterable
 
 __all__ = [
     "FrameFolder",
+    "LazyFrame",
+    "Neighbours",
     "NuScenesDataset",
     "RetargetedDataset",
     "RetargetedIterable",

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,12 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.camera import BoolArray, Camera
 from arbiview_aug.datasets.images import Reduce, check_reduce, decode_images, reduced_rig
-from arbiview_aug.errors import CalibrationError, DataError
+from arbiview_aug.datasets.sequence import Drive, LazyFrame, Neighbours, Unreadable
+from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError
 from arbiview_aug.rig import Rig, read_mask
 
 CALIBRATION_FILE = "calib.json"
+SEQUENCE_FILE = "sequence.json"
 POINTS_FILE = "lidar.npy"
 
 # Masks a worker keeps: those of two eight-camera rigs, 2 MB each at full size.
@@ -48,24 +50,37 @@ class FrameFolder(Dataset[dict[str, Any]]):
           "lidar": {"file": "lidar.npy"}     optional: names the points; lidar.npy is found without it
         }
 
+    A folder of frames may hold ``sequence.json``, the frames of one drive in the order in which they were recorded::
+
+        {"frames": ["000", {"name": "001", "time_s": 0.1}, ...]}      names of folders; seconds if known
+
     The points are a float .npy of shape (P, >=3), x y z first, in the ego frame, metres.
 
     A sample is a dict: ``images`` (N, 3, h, w) uint8 RGB, or a list where sizes differ; ``rig`` (names, lenses, masks,
     ground); ``K`` (N, 3, 3) and ``cam2ego`` (N, 4, 4) float64; ``token`` (the folder's name); and, where the frame has
-    them, ``points`` (P, >=3) float32, ``boxes_3d`` (B, >=7) float32 and ``ego2world`` (4, 4) float64. The numbers of
+    them, ``points`` (P, >=3) float32, ``boxes_3d`` (B, >=7) float32 and ``ego2world`` (4, 4) float64; ``time_s``
+    and, if asked for, ``neighbours``, where ``sequence.json`` has the frame and both have a pose. The numbers of
     points and boxes vary: batch with ``batch_size=None`` or a ``collate_fn`` that keeps them as lists.
 
     Args:
         root: The folder.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size; the rig follows (see ``decode_images``).
         load_points: Whether to read the points.
+        neighbours: Which other frames of the drive come with a frame; None for none.
 
     Raises:
         DataError: No frame under ``root``; on access, a file that is missing, broken or inconsistent.
         CalibrationError: On access, an impossible calibration, by camera.
     """
 
-    def __init__(self, root: str | Path, *, reduce: Reduce = 1, load_points: bool = True) -> None:
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        reduce: Reduce = 1,
+        load_points: bool = True,
+        neighbours: Neighbours | None = None,
+    ) -> None:
         check_reduce(reduce)
         self.root = Path(root)
         self.reduce = reduce
@@ -73,6 +88,9 @@ class FrameFolder(Dataset[dict[str, Any]]):
         self._frames = _find_frames(self.root)
         self._index = {folder.name: k for k, folder in enumerate(self._frames)}
         self._last_rig: tuple[str, Rig] | None = None
+        self._times_s, order = _read_sequence(self.root, self._index)
+        self.neighbours = neighbours
+        self._drive = None if neighbours is None else self._find_drive(order)
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -98,10 +116,8 @@ class FrameFolder(Dataset[dict[str, Any]]):
         calib = _read_calibration(folder)
         where = str(folder / CALIBRATION_FILE)
         rig = self._rig(calib, folder, where)
-        files = [_image_file(entry, folder, where) for entry in calib["cameras"]]
-        sizes = [(int(entry["height"]), int(entry["width"])) for entry in calib["cameras"]]
         sample: dict[str, Any] = {
-            "images": decode_images(files, names=rig.names, sizes=sizes, reduce=self.reduce),
+            "images": self._images(calib, folder, rig),
             "rig": rig,
             "K": torch.from_numpy(rig.K),
             "cam2ego": torch.from_numpy(rig.cam2ego),
@@ -113,7 +129,45 @@ class FrameFolder(Dataset[dict[str, Any]]):
             sample["boxes_3d"] = _boxes(calib["boxes_3d"], where)
         if calib.get("ego2world") is not None:
             sample["ego2world"] = _pose(calib["ego2world"], where)
+        if folder.name in self._times_s:
+            sample["time_s"] = self._times_s[folder.name]
+        if self._drive is not None and self.neighbours is not None:
+            near = self._drive.neighbours(folder.name, self.neighbours)
+            sample["neighbours"] = [self._neighbour(name) for name in near]
         return sample
+
+    def _images(self, calib: Mapping[str, Any], folder: Path, rig: Rig) -> torch.Tensor | list[torch.Tensor]:
+        files = [_image_file(entry, folder, str(folder / CALIBRATION_FILE)) for entry in calib["cameras"]]
+        sizes = [(int(entry["height"]), int(entry["width"])) for entry in calib["cameras"]]
+        return decode_images(files, names=rig.names, sizes=sizes, reduce=self.reduce)
+
+    def _find_drive(self, order: Sequence[str]) -> Drive:
+        """The frames of ``sequence.json`` that have a pose."""
+        positions_m = {}
+        for name in order:
+            folder = self._frames[self._index[name]]
+            pose = _read_calibration(folder).get("ego2world")
+            if pose is not None:
+                positions_m[name] = _pose(pose, str(folder / CALIBRATION_FILE)).numpy()[:3, 3]
+        timed = all(name in self._times_s for name in positions_m)
+        return Drive(positions_m, self._times_s if timed else None, str(self.root / SEQUENCE_FILE))
+
+    def _neighbour(self, name: str) -> Mapping[str, Any]:
+        """What of a frame needs no decoding; what is broken is said where it is used."""
+        folder = self._frames[self._index[name]]
+        where = str(folder / CALIBRATION_FILE)
+        known: dict[str, Any] = {"token": name}
+        try:
+            calib = _read_calibration(folder)
+            rig = self._rig(calib, folder, where)
+            known |= {"rig": rig, "ego2world": _pose(calib["ego2world"], where)}
+            if calib.get("boxes_3d") is not None:
+                known["boxes_3d"] = _boxes(calib["boxes_3d"], where)
+        except ArbiviewError as error:
+            return Unreadable(known, error)
+        if name in self._times_s:
+            known["time_s"] = self._times_s[name]
+        return LazyFrame(known, partial(self._images, calib, folder, rig))
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_last_rig": None}
@@ -144,6 +198,29 @@ def _find_frames(root: Path) -> list[Path]:
             "FrameFolder's documentation has the format"
         )
     return frames
+
+
+def _read_sequence(root: Path, index: Mapping[str, int]) -> tuple[dict[str, float], list[str]]:
+    """Seconds by frame, and the frames in their order; nothing where there is no ``sequence.json``."""
+    path = root / SEQUENCE_FILE
+    if not path.is_file():
+        return {}, []
+    try:
+        given = json.loads(path.read_text(encoding="utf-8"))["frames"]
+        entries = [entry if isinstance(entry, Mapping) else {"name": entry} for entry in given]
+        names = [str(entry["name"]) for entry in entries]
+        times_s = {str(entry["name"]): float(entry["time_s"]) for entry in entries if "time_s" in entry}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        expected = "{'frames': [names, or {'name': ..., 'time_s': ...}]}"
+        raise DataError(f"{path}: expected {expected}, got {type(error).__name__}: {error}") from None
+    for name in names:
+        if name not in index:
+            raise DataError(f"{path}: expected names of the folders beside it, got {name!r}")
+        if not np.isfinite(times_s.get(name, 0.0)):
+            raise DataError(f"{path}: frame {name!r}: time_s: expected a finite number, got {times_s[name]}")
+    if len(set(names)) < len(names):
+        raise DataError(f"{path}: expected each frame once, got {len(names)} entries for {len(set(names))} frames")
+    return times_s, names
 
 
 def _read_calibration(folder: Path) -> dict[str, Any]:

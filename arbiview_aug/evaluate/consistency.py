@@ -14,7 +14,7 @@ from arbiview_aug.evaluate.images import Image, View, as_arrays, as_tensors
 from arbiview_aug.evaluate.methods import Method
 from arbiview_aug.evaluate.overlap import OverlapScore, overlap_scores
 from arbiview_aug.favs.synthesis import render_opencv
-from arbiview_aug.neighbours import VIEW_SIZE
+from arbiview_aug.overlaps import VIEW_SIZE
 from arbiview_aug.plan import build_plan
 from arbiview_aug.rig import Rig
 

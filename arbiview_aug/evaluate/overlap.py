@@ -16,7 +16,7 @@ import numpy.typing as npt
 from arbiview_aug.camera import BoolArray, Camera
 from arbiview_aug.evaluate.images import Image
 from arbiview_aug.evaluate.scores import psnr_db
-from arbiview_aug.neighbours import TILE_PX, VIEW_SIZE, adjacent_pairs, half_way_view, odd_tiles
+from arbiview_aug.overlaps import TILE_PX, VIEW_SIZE, adjacent_pairs, half_way_view, odd_tiles
 from arbiview_aug.rig import Rig
 
 MIN_PIXELS = 500

@@ -26,7 +26,7 @@ import torch
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.favs.dense_flow import dense_flow, why_ambiguous
 from arbiview_aug.favs.photometric import reduced
-from arbiview_aug.neighbours import adjacent_pairs, half_way_view, odd_tiles
+from arbiview_aug.overlaps import adjacent_pairs, half_way_view, odd_tiles
 from arbiview_aug.projection import edge_distance, ego_rays, project_rays
 from arbiview_aug.refined import Correction
 from arbiview_aug.rig import Rig, content_order

@@ -25,7 +25,7 @@ from arbiview_aug.camera import BoolArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import check_ranges
 from arbiview_aug.held import Held
-from arbiview_aug.neighbours import adjacent_pairs, half_way_view, odd_tiles
+from arbiview_aug.overlaps import adjacent_pairs, half_way_view, odd_tiles
 from arbiview_aug.projection import edge_distance, ego_rays, project_rays
 from arbiview_aug.rig import Rig, content_order
 from arbiview_aug.sampling import Slot, halved, interleaved, level_size

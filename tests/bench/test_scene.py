@@ -11,7 +11,7 @@ import pytest
 from arbiview_aug.__main__ import main
 from arbiview_aug.bench.scene import Done, Situation, done, situations, subsets
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.neighbours import adjacent_pairs
+from arbiview_aug.overlaps import adjacent_pairs
 from arbiview_aug.rig import load_rig
 
 SIZE = (72, 200)

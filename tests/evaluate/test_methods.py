@@ -13,7 +13,7 @@ from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.methods import baseline, one_camera, paper_stages, retargeting, study_methods, views_of
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.favs.overlap_depth import OverlapDepth, overlap_depth
-from arbiview_aug.neighbours import half_way_view
+from arbiview_aug.overlaps import half_way_view
 from arbiview_aug.rig import Rig
 from arbiview_aug.transforms import RigRetarget
 

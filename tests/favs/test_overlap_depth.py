@@ -14,7 +14,7 @@ from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import accurate, favs_config
 from arbiview_aug.favs.overlap_depth import LIMITS, MIN_RISE_DB, OverlapDepth, overlap_depth
 from arbiview_aug.favs.refinement import RefinementCache
-from arbiview_aug.neighbours import half_way_view
+from arbiview_aug.overlaps import half_way_view
 from arbiview_aug.plan import RenderPlan, build_plan
 from arbiview_aug.refined import Correction, Refined
 from arbiview_aug.rig import Rig

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from arbiview_aug.camera import Camera
+from arbiview_aug.datasets.sequence import LazyFrame, Neighbours
 from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, cast, find_candidates, scene_from
 from arbiview_aug.datasets.synthetic.render import Renderer, stack_or_list
 from arbiview_aug.datasets.synthetic.scene import Material, Scene, SceneClass
@@ -60,7 +62,9 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
 
     ``drive[i]`` is a dict: ``images`` (N, 3, h, w) uint8 (a list where sizes differ), ``rig``, ``K`` (N, 3, 3) and
     ``cam2ego`` (N, 4, 4) float64, ``points`` (P, 4) float32 x y z intensity (0 to 255), ``boxes_3d`` (B, 7) float32
-    centre x y z, length, width, height, yaw, ``box_classes`` (B,) int64 ``BoxClass``, ``token``.
+    centre x y z, length, width, height, yaw, ``box_classes`` (B,) int64 ``BoxClass``, ``token``; with ``neighbours``
+    also ``ego2world`` (4, 4) float64 and ``time_s``, and the same street a little earlier and later, when the vehicle
+    and the traffic were elsewhere (``Scene.after``).
 
     Args:
         rig: The cameras; their masks do not matter here (what a mask hides is rendered all the same).
@@ -68,6 +72,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         seed: Of the world, not negative.
         supersampling: Rays across a pixel at outlines; 1 switches antialiasing of outlines off.
         lidar: Whether samples carry ``points``.
+        neighbours: Which other frames of the drive come with a sample; None for none.
         device: Where to render; what is returned lies on the CPU. Two kinds of device agree to rounding, not in bits.
 
     Raises:
@@ -83,12 +88,16 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         seed: int = 0,
         supersampling: int = 2,
         lidar: bool = True,
+        neighbours: Neighbours | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         self.rig = _checked_rig(rig)
         self.num_frames = _checked_count("num_frames", num_frames, 1, 1 << 40)
         self.seed = _checked_count("seed", seed, 0, 1 << 60)
         self.lidar = bool(lidar)
+        if neighbours is not None and not isinstance(neighbours, Neighbours):
+            raise TypeError(f"SyntheticDrive neighbours: expected Neighbours or None, got {type(neighbours).__name__}")
+        self.neighbours = neighbours
         self._renderer = Renderer(supersampling=_checked_count("supersampling", supersampling, 1, 8), device=device)
         self._scene: tuple[int, Scene] | None = None
 
@@ -127,7 +136,29 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         }
         if self.lidar:
             sample["points"] = self.points(index)
+        if self.neighbours is not None:
+            sample |= {"ego2world": torch.from_numpy(scene.ego2street), "time_s": 0.0}
+            moments = [
+                sign * k * self.neighbours.step_m / scene.speed_mps
+                for sign in self.neighbours.signs
+                for k in range(1, self.neighbours.count + 1)
+            ]
+            sample["neighbours"] = [self._neighbour(scene.after(s), s, sample["token"]) for s in moments]
         return sample
+
+    def _neighbour(self, scene: Scene, seconds: float, token: str) -> LazyFrame:
+        known = {
+            "rig": self.rig,
+            "ego2world": torch.from_numpy(scene.ego2street),
+            "time_s": seconds,
+            "boxes_3d": torch.from_numpy(scene.boxes_ego(self.rig.ground_z_m).astype(np.float32)),
+            "token": f"{token}{seconds:+.3f}s",
+        }
+        return LazyFrame(known, partial(self._images, scene))
+
+    def _images(self, scene: Scene) -> Tensor | list[Tensor]:
+        views = self._renderer.render(scene, self.rig.cameras, self.rig.ground_z_m)
+        return stack_or_list([v.image for v in views])
 
     def render(self, index: int, rig: Rig | None = None) -> RenderedViews:
         """The true views of scene ``index`` for any rig; the dataset's own by default.

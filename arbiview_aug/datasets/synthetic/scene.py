@@ -8,7 +8,7 @@ the road at ``ego2street``. Two kinds of primitive suffice: boxes with slanted s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 
 import numpy as np
@@ -114,6 +114,8 @@ class Scene:
         param: (P, 4) numbers whose meaning is the material's.
         boxes: (B, 7) centre x y z, length, width, height, yaw (radians), street frame.
         box_classes: (B,) ``BoxClass``.
+        velocities: (B, 2) of the boxes, m/s, street frame.
+        speed_mps: Of the vehicle, straight ahead.
         ego2street: (4, 4) pose of the vehicle, its road plane at z = 0.
         salt: Seed of the textures.
     """
@@ -131,6 +133,8 @@ class Scene:
     param: FloatArray
     boxes: FloatArray
     box_classes: IntArray
+    velocities: FloatArray
+    speed_mps: float
     ego2street: FloatArray
     street: Street
     light: Light
@@ -148,6 +152,25 @@ class Scene:
         yaw = boxes[:, 6] - math.atan2(R[1, 0], R[0, 0])
         boxes[:, 6] = np.arctan2(np.sin(yaw), np.cos(yaw))
         return boxes
+
+    def after(self, seconds: float) -> Scene:
+        """The scene so much later (or earlier): the vehicle and what has a velocity have moved, straight on."""
+        ego2street = self.ego2street.copy()
+        ego2street[:3, 3] += self.speed_mps * seconds * ego2street[:3, 0]
+        moves = np.zeros((len(self.boxes) + 1, 3))  # the last one is what belongs to no box
+        moves[:-1, :2] = self.velocities * seconds
+        move = moves[self.instance]
+        planes, boxes = self.planes.copy(), self.boxes.copy()
+        planes[..., 3] += (planes[..., :3] * move[:, None]).sum(-1)
+        boxes[:, :3] += moves[:-1]
+        return replace(
+            self,
+            center=self.center + move,
+            planes=planes,
+            corners=self.corners + move[:, None],
+            boxes=boxes,
+            ego2street=ego2street,
+        )
 
 
 _SIGNS = np.array([[x, y, z] for x in (1, -1) for y in (1, -1) for z in (1, -1)], dtype=np.float64)

@@ -29,6 +29,9 @@ _MOVING_REACH_M = 95.0
 _KINDS = (BoxClass.CAR, BoxClass.VAN, BoxClass.TRUCK, BoxClass.BUS)
 _MOVING_SHARES = (0.62, 0.18, 0.14, 0.06)
 _PARKED_SHARES = (0.76, 0.19, 0.05, 0.0)
+_SPEED_MPS = (6.0, 14.0)
+_WAITING = 0.2
+"""Share that stands still of the people and of the traffic in other directions."""
 
 
 def make_scene(seed: int, index: int) -> Scene:
@@ -39,17 +42,38 @@ def make_scene(seed: int, index: int) -> Scene:
     world.add_blocks()
     world.add_buildings()
     world.add_parked()
+    parked = len(world.builder.boxes)
     world.add_moving()
     world.add_cross_traffic()
     world.add_furniture()
     world.add_pedestrians()
+    speed_mps, velocities = _motion(np.random.SeedSequence([seed, index, 2]), world.builder, parked)
     return Scene(
+        speed_mps=speed_mps,
+        velocities=velocities,
         ego2street=ego2street,
         street=street,
         light=_light(rng),
         salt=int(rng.integers(1 << 20)),
         **world.builder.arrays(),
     )
+
+
+def _motion(seed: np.random.SeedSequence, builder: SceneBuilder, parked: int) -> tuple[float, np.ndarray]:
+    """The vehicle's own speed and all velocities (B, 2): the first ``parked`` vehicles stand, some others wait.
+
+    Traffic in the vehicle's direction keeps about its speed, so that it stays off the place before and behind it.
+    """
+    rng = np.random.default_rng(seed)
+    speed_mps = float(rng.uniform(*_SPEED_MPS))
+    velocities = np.zeros((len(builder.boxes), 2))
+    for row, (box, cls) in enumerate(zip(builder.boxes, builder.box_classes, strict=True)):
+        yaw, walks = box[6], cls == BoxClass.PEDESTRIAN
+        own = float(rng.uniform(0.8, 1.7)) if walks else speed_mps * float(rng.uniform(0.9, 1.1))
+        waits = rng.random() < _WAITING and math.cos(yaw) < 0.5
+        if row >= parked and not waits:
+            velocities[row] = own * math.cos(yaw), own * math.sin(yaw)
+    return speed_mps, velocities
 
 
 def _layout(rng: np.random.Generator) -> tuple[Street, np.ndarray]:

@@ -1,0 +1,148 @@
+"""Which other frames of a drive come with a frame, as its ``neighbours`` (format: ``arbiview_aug.neighbours``)."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal
+
+import numpy as np
+
+from arbiview_aug.camera import FloatArray
+from arbiview_aug.errors import ArbiviewError
+
+Direction = Literal["both", "past", "future"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Neighbours:
+    """Frames by distance travelled: standing still, there are none.
+
+    Attributes:
+        count: At most so many in each direction.
+        step_m: Metres of travel from one to the next; the frames are the first at or beyond them.
+        direction: ``past`` frames, ``future`` ones, or ``both``.
+
+    Raises:
+        ValueError: A count below 1, a step that is not positive, another direction.
+    """
+
+    count: int = 1
+    step_m: float = 1.2
+    direction: Direction = "both"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.count, int) or isinstance(self.count, bool) or self.count < 1:
+            raise ValueError(f"neighbours: count: expected a whole number from 1, got {self.count!r}")
+        if not 0 < self.step_m < float("inf"):
+            raise ValueError(f"neighbours: step_m: expected metres above 0, got {self.step_m!r}")
+        if self.direction not in ("both", "past", "future"):
+            raise ValueError(f"neighbours: direction: expected both, past or future, got {self.direction!r}")
+
+    @property
+    def signs(self) -> tuple[int, ...]:
+        """-1 for the past, 1 for the future."""
+        return {"both": (-1, 1), "past": (-1,), "future": (1,)}[self.direction]
+
+    def picked(self, travelled_m: FloatArray, index: int) -> list[int]:
+        """The neighbours of one frame of a drive, the nearest first in each direction.
+
+        Args:
+            travelled_m: (F,) distance along the drive at each of its frames, never falling.
+            index: Of the frame.
+        """
+        found = []
+        for sign in self.signs:
+            for k in range(1, self.count + 1):
+                # Poses waver by millimetres while a vehicle stands.
+                wanted = travelled_m[index] + sign * (k * self.step_m - 1e-3)
+                if sign > 0:
+                    at = int(np.searchsorted(travelled_m, wanted, side="left"))
+                else:
+                    at = int(np.searchsorted(travelled_m, wanted, side="right")) - 1
+                if 0 <= at < len(travelled_m) and at not in found:
+                    found.append(at)
+        return found
+
+
+class Drive:
+    """The order of a drive's frames, and how far the vehicle came from one to the next.
+
+    Where the clock goes back, with a warning, what is before and what is after are no neighbours.
+
+    Args:
+        positions_m: (3,) of the vehicle in the world, by frame, in the order of the drive.
+        times_s: Seconds by frame, or None.
+        where: Named in the warning.
+    """
+
+    def __init__(self, positions_m: Mapping[str, FloatArray], times_s: Mapping[str, float] | None, where: str) -> None:
+        self._names = list(positions_m)
+        steps_m, part = [0.0], [0]
+        for one, two in pairwise(self._names):
+            goes_back = times_s is not None and times_s[two] <= times_s[one]
+            steps_m.append(float(np.linalg.norm(positions_m[two] - positions_m[one])))
+            part.append(part[-1] + goes_back)
+            if goes_back:
+                message = (
+                    f"{where}: the clock goes back from frame {one!r} to {two!r}: neither is the other's neighbour"
+                )
+                warnings.warn(message, stacklevel=4)
+        self._travelled_m, self._part = np.cumsum(steps_m), np.array(part)
+        self._index = {name: k for k, name in enumerate(self._names)}
+
+    def neighbours(self, name: str, wanted: Neighbours) -> list[str]:
+        """The neighbours of one frame; none of a frame that is not of the drive."""
+        if name not in self._index:
+            return []
+        index = self._index[name]
+        own = np.flatnonzero(self._part == self._part[index])
+        near = wanted.picked(self._travelled_m[own], index - int(own[0]))
+        return [self._names[own[k]] for k in near]
+
+
+class LazyFrame(Mapping[str, Any]):
+    """A neighbour whose images are decoded when they are asked for: where nothing is to be filled, never.
+
+    Args:
+        known: What needs no decoding: pose, calibration, time, token.
+        load: Gives the images.
+    """
+
+    def __init__(self, known: Mapping[str, Any], load: Callable[[], Any]) -> None:
+        self._known, self._load = dict(known), load
+
+    def __getitem__(self, key: str) -> Any:
+        if key == "images" and key not in self._known:
+            self._known[key] = self._load()
+        return self._known[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter({**self._known, "images": None})
+
+    def __len__(self) -> int:
+        return len({**self._known, "images": None})
+
+    def __repr__(self) -> str:
+        return f"LazyFrame({', '.join(self)})"
+
+
+class Unreadable(LazyFrame):
+    """A neighbour that is broken: whoever asks for anything but its token is told why.
+
+    Args:
+        known: Its token.
+        error: What is wrong with it.
+    """
+
+    def __init__(self, known: Mapping[str, Any], error: ArbiviewError) -> None:
+        super().__init__(known, self._refuse)
+        self._error = error
+
+    def __getitem__(self, key: str) -> Any:
+        return super().__getitem__(key) if key == "token" else self._refuse()
+
+    def _refuse(self) -> Any:
+        raise self._error
