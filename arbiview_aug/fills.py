@@ -160,12 +160,13 @@ def plan_fills(
     if not holes:
         return None
     # Between two cameras of a neighbour nothing is blended: one of them may look at what moved.
-    settings = replace(config, seam_width=0.0, overlap_depth=False)
+    settings = replace(config, seam_width=0.0)
     rig = Rig([hole.camera for hole in holes], ground_z_m=plan.source.ground_z_m)
     fills = []
     for neighbour in neighbours:
         made = build_plan(neighbour.rig, rig, surface=surface, config=settings, scene=scene)
-        seen = [_seen(hole, target, neighbour, scene.boxes) for hole, target in zip(holes, made.targets, strict=True)]
+        objects = _labelled(neighbour, scene.boxes)
+        seen = [_seen(hole, target, neighbour.rig, objects) for hole, target in zip(holes, made.targets, strict=True)]
         if any((hole.free & usable).any() for hole, (usable, _) in zip(holes, seen, strict=True)):
             fills.append(Fill(neighbour, made, [usable for usable, _ in seen], [blur for _, blur in seen]))
     return Fills(holes, fills) if fills else None
@@ -179,8 +180,7 @@ def _hole(plan: RenderPlan, index: int, surface: Surface, reach: Reach) -> Hole 
     margin_px = max(2, round(_SEAM * camera.width_px))
     around: Any = cv2.dilate(empty.view(np.uint8), np.ones((2 * margin_px + 1,) * 2, np.uint8))
     pixel = np.flatnonzero(around)
-    v, u = np.divmod(pixel, camera.width_px)
-    directions, valid = ego_rays(camera, np.stack([u, v], -1).astype(np.float64))
+    directions, valid = _rays(camera, pixel)
     if reach == "ground":
         # A surface may be dear to ask: first what is certainly not near.
         road = plane_inverse_distance(camera.center_m, directions, plan.source.ground_z_m)
@@ -211,25 +211,32 @@ def _with_margin(flags: BoolArray, margin: int) -> tuple[int, int]:
     return max(int(there[0]) - margin, 0), min(int(there[-1]) + 1 + margin, len(flags))
 
 
-def _seen(
-    hole: Hole, target: TargetPlan, neighbour: Neighbour, boxes: FloatArray | None
-) -> tuple[BoolArray, npt.NDArray[np.uint8]]:
-    """What a neighbour shows of a hole, no labelled object in between, none of then and none of now; how coarsely."""
+def _rays(camera: Camera, pixel: npt.NDArray[np.int64]) -> tuple[FloatArray, BoolArray]:
+    """Unit rays (n, 3) in the ego frame of pixels (n,) of the flattened view, and their validity."""
+    v, u = np.divmod(pixel, camera.width_px)
+    return ego_rays(camera, np.stack([u, v], -1).astype(np.float64))
+
+
+def _labelled(neighbour: Neighbour, boxes: FloatArray | None) -> Objects:
+    """The labelled objects of then and of now, with air around them."""
     solid = np.concatenate([np.zeros((0, 7)), *(b for b in (boxes, neighbour.boxes) if b is not None)])
     solid = solid + np.array([0, 0, 0, 2 * _AIR_M, 2 * _AIR_M, 0, 0])
-    objects = Objects(Street(ground_z_m=neighbour.rig.ground_z_m), solid)
+    return Objects(Street(ground_z_m=neighbour.rig.ground_z_m), solid)
+
+
+def _seen(hole: Hole, target: TargetPlan, rig: Rig, objects: Objects) -> tuple[BoolArray, npt.NDArray[np.uint8]]:
+    """What a neighbour's cameras show of a hole, no labelled object in between; how coarsely."""
     seen = target.coverage & (hole.free | hole.seam)
     blur = np.zeros(seen.shape, np.uint8)
     for pair in target.pairs:
         pixel = np.flatnonzero(seen & (target.source_camera == pair.source))
-        v, u = np.divmod(pixel, hole.camera.width_px)
-        directions, _ = ego_rays(hole.camera, np.stack([u, v], -1).astype(np.float64))
-        source = neighbour.rig[pair.source]
+        directions, _ = _rays(hole.camera, pixel)
+        source = rig[pair.source]
         q = np.maximum(hole.inverse_distance.reshape(-1)[pixel], 1e-6)
         away = (hole.camera.center_m - source.center_m) + directions / q[:, None]
         length = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
         away /= length[:, None]
-        if len(solid):
+        if len(objects.boxes):
             hidden = objects.hides(source.center_m, away, 1 / length, float(1 / source.K[0, 0]))
             seen.reshape(-1)[pixel[hidden]] = False
         # Pixels a metre of road, along the road, where they are fewest: as the sine of the incidence over the distance.
@@ -404,13 +411,3 @@ def _patch(
             certainty = torch.zeros_like(frame, dtype=torch.uint8) if certainty is None else certainty
             certainty[taken] = torch.from_numpy(target.certainty).to(chosen.device)[taken]
     return Patch(hole.target, *place, frame, camera, certainty)
-
-
-def filled_certainty(certainty: npt.NDArray[np.uint8], target: int, patches: Sequence[Patch]) -> npt.NDArray[np.uint8]:
-    """A view's certainty (h, w) with that of what was filled in."""
-    whole = certainty.copy()
-    for patch in patches:
-        if patch.target == target and patch.certainty is not None:
-            there = (patch.frame >= 0).cpu().numpy()
-            whole[patch.rows, patch.columns][there] = patch.certainty.cpu().numpy()[there]
-    return whole

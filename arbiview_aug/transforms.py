@@ -24,7 +24,7 @@ from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_conf
 from arbiview_aug.favs.paper import PaperRendering, check_pinhole
 from arbiview_aug.favs.photometric import Harmonise, Harmoniser, PhotometricReport
 from arbiview_aug.favs.refinement import RefinementCache
-from arbiview_aug.fills import Patch, Reach, filled_certainty
+from arbiview_aug.fills import Patch, Reach
 from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_target, target_labels
 from arbiview_aug.plan import PlanCache, RenderPlan
 from arbiview_aug.random_rig import RandomRig
@@ -296,7 +296,9 @@ class RigRetarget(torch.nn.Module):
             _put(patches, part["coverage"], lambda patch: patch.frame >= 0)
             if seams is not None and isinstance(made, RenderPlan):
                 certain = [view.certainty for view in made.targets if view.certainty is not None]
-                certain = [filled_certainty(of_view, k, patches) for k, of_view in enumerate(certain)]
+                if patches:
+                    certain = [of_view.copy() for of_view in certain]  # the plan's own are kept
+                    _put(patches, [torch.from_numpy(of_view) for of_view in certain], lambda patch: patch.certainty)
                 of_views = zip(filled, certain, part["coverage"], seams[b], strict=True)
                 part["confidence"] = stacked([confidence(*of_view) for of_view in of_views])
             if "source_camera" in self.outputs:
@@ -405,13 +407,14 @@ def _winners(made: RenderPlan | PaperRendering, device: torch.device) -> list[to
 
 
 def _put(
-    patches: Sequence[Patch], maps: torch.Tensor | list[torch.Tensor], value: Callable[[Patch], torch.Tensor]
+    patches: Sequence[Patch], maps: torch.Tensor | list[torch.Tensor], value: Callable[[Patch], torch.Tensor | None]
 ) -> None:
-    """Write what was filled in into maps (M, h, w) of a frame's views."""
+    """Write what was filled in into maps (M, h, w) of a frame's views, where there is such a value."""
     for patch in patches:
-        there = patch.frame >= 0
-        place = maps[patch.target][patch.rows, patch.columns]
-        place[there] = value(patch)[there]
+        place, values = maps[patch.target][patch.rows, patch.columns], value(patch)
+        if values is not None:
+            there = patch.frame >= 0
+            place[there.to(place.device)] = values[there].to(place.device)
 
 
 def _one_of(name: str, value: Any, choices: Sequence[str]) -> None:

@@ -125,16 +125,22 @@ class FrameFolder(Dataset[dict[str, Any]]):
         }
         if self.load_points and (points := _read_points(calib, folder, where)) is not None:
             sample["points"] = points
-        if calib.get("boxes_3d") is not None:
-            sample["boxes_3d"] = _boxes(calib["boxes_3d"], where)
-        if calib.get("ego2world") is not None:
-            sample["ego2world"] = _pose(calib["ego2world"], where)
-        if folder.name in self._times_s:
-            sample["time_s"] = self._times_s[folder.name]
+        sample |= self._in_ego_frame(calib, folder, where)
         if self._drive is not None and self.neighbours is not None:
             near = self._drive.neighbours(folder.name, self.neighbours)
             sample["neighbours"] = [self._neighbour(name) for name in near]
         return sample
+
+    def _in_ego_frame(self, calib: Mapping[str, Any], folder: Path, where: str) -> dict[str, Any]:
+        """The boxes, the pose and the time that a frame has."""
+        found: dict[str, Any] = {}
+        if calib.get("boxes_3d") is not None:
+            found["boxes_3d"] = _boxes(calib["boxes_3d"], where)
+        if calib.get("ego2world") is not None:
+            found["ego2world"] = _pose(calib["ego2world"], where)
+        if folder.name in self._times_s:
+            found["time_s"] = self._times_s[folder.name]
+        return found
 
     def _images(self, calib: Mapping[str, Any], folder: Path, rig: Rig) -> torch.Tensor | list[torch.Tensor]:
         files = [_image_file(entry, folder, str(folder / CALIBRATION_FILE)) for entry in calib["cameras"]]
@@ -160,13 +166,9 @@ class FrameFolder(Dataset[dict[str, Any]]):
         try:
             calib = _read_calibration(folder)
             rig = self._rig(calib, folder, where)
-            known |= {"rig": rig, "ego2world": _pose(calib["ego2world"], where)}
-            if calib.get("boxes_3d") is not None:
-                known["boxes_3d"] = _boxes(calib["boxes_3d"], where)
+            known |= {"rig": rig, **self._in_ego_frame(calib, folder, where)}
         except ArbiviewError as error:
             return Unreadable(known, error)
-        if name in self._times_s:
-            known["time_s"] = self._times_s[name]
         return LazyFrame(known, partial(self._images, calib, folder, rig))
 
     def __getstate__(self) -> dict[str, Any]:
