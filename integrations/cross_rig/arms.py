@@ -19,6 +19,7 @@ ARMS: dict[str, Arm] = {
         Arm(name="points", title="lidar, no boxes", kind="retarget", surface="lidar", reads=("points",)),
         Arm(name="auto", title="auto: LiDAR, boxes", kind="retarget", surface="auto", reads=_ALL),
         Arm(name="auto_bare", title="auto: images alone", kind="retarget", surface="auto"),
+        Arm(name="auto_bare_mixed", title="auto: images alone, + raw", kind="retarget", surface="auto", mixed=True),
         Arm(name="same_centre", title="street at A's centres", kind="retarget", surface="street", stays=True),
         Arm(name="far_mixed", title="far + raw", kind="retarget", surface="far", mixed=True),
         Arm(name="depth", title="true depth", kind="retarget", surface="lidar", reads=("depth_m",)),
