@@ -18,7 +18,7 @@ from arbiview_aug.favs.photometric import Harmoniser
 from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
 from arbiview_aug.fills import Fills, Patch, Reach, fill_views, plan_fills
-from arbiview_aug.heights import MOVED_M, at_source_heights, lifts_m
+from arbiview_aug.heights import MOVED_M, at_source_heights, lifts_m, only_heights_differ
 from arbiview_aug.neighbours import neighbours_of_frames, warn_lost
 from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
 from arbiview_aug.required import baselines_m, needs_geometry
@@ -75,6 +75,7 @@ class Stitcher:
         execution: ``opencv``, ``torch`` or ``auto``.
         cache_bytes: Memory for plans that may come back.
         reach: What neighbouring frames may fill; None leaves them out.
+        mixed: Half of the samples or more stay untouched.
         warn: Says what a user should know.
 
     Raises:
@@ -90,6 +91,7 @@ class Stitcher:
         execution: Execution,
         cache_bytes: int,
         reach: Reach | None,
+        mixed: bool,
         warn: WarnOnce,
     ) -> None:
         if isinstance(config, PaperConfig):
@@ -100,6 +102,7 @@ class Stitcher:
             raise ValueError("refinement: expected quality='accurate' (or overlap_depth=True) with a RefinementCache")
         self.config, self.surface, self.harmoniser = config, surface, harmoniser
         self.refinement, self.execution, self.reach, self.warn = refinement, execution, reach, warn
+        self.mixed = mixed
         self.plans = PlanCache(cache_bytes)
         self._plan_of_frame = PlanCache(0)  # holds one
         self._scratch = Scratch()
@@ -173,16 +176,18 @@ class Stitcher:
         target = self._placed(source, asked, config, scene)
         plan = build_plan(source, target, surface=self.surface, config=config, scene=scene)
         self._warn_unreachable(plan)
-        if self.surface == "auto" and scene.best == "street":
+        if self.surface == "auto" and scene.best == "street" and not self.mixed:
             self._warn_lifted(asked, plan)
             if needs_geometry(source, target, "auto", config):
                 self._warn_static(source, target)
         return plan
 
     def _placed(self, source: Rig, target: Rig, config: FavsConfig, scene: Scene) -> Rig:
-        """The target as ``auto`` renders it: at the source's heights where only the street is known, and matters."""
+        """The target as ``auto`` renders it: at the source's heights where only these differ, only the street is known,
+        and no untouched samples are mixed in."""
         guessed = self.surface == "auto" and scene.best == "street" and needs_geometry(source, target, "auto", config)
-        return at_source_heights(source, target) if guessed else target
+        kept = guessed and not self.mixed and only_heights_differ(source, target)
+        return at_source_heights(source, target) if kept else target
 
     # --- depth from overlap -------------------------------------------------------------------------------------------
     def _names(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[object]:
@@ -298,8 +303,8 @@ class Stitcher:
                 "height",
                 f"target cameras stand up to {lifted_m:.2f} m above or below the source's, and the sample does not say "
                 "what stands on the street: they are rendered at the source's height, and cam2ego says so, since views "
-                "over a static surface train worse than untouched images. Pass 'points' or 'boxes_3d' in the samples, "
-                "or have them moved all the same with surface='street'",
+                "over a static surface alone train worse than untouched images. Pass 'points' or 'boxes_3d' in the "
+                "samples; or mix with untouched ones (p=0.5), and they move; or move them with surface='street'",
             )
 
     def _warn_static(self, source: Rig, target: Rig) -> None:
@@ -308,7 +313,7 @@ class Stitcher:
             self.warn(
                 "static",
                 f"target cameras stand up to {moved_m:.2f} m from the nearest source camera, and the sample does not "
-                "say what stands on the street: objects will lean and stretch, which can harm a detector. Pass "
-                "'points' or 'boxes_3d' in the samples, mix with untouched ones (p=0.5), or accept it with "
-                "surface='street'",
+                "say what stands on the street: objects will lean and stretch, and a detector trained on that alone is "
+                "worse than one trained on untouched images. Pass 'points' or 'boxes_3d' in the samples, mix with "
+                "untouched ones (p=0.5), or accept it with surface='street'",
             )

@@ -41,6 +41,10 @@ Made = RenderPlan | PaperRendering | tuple[int, int]
 OUTPUTS = ("source_camera", "source_frame", "confidence")
 """What a sample can hold besides, on request."""
 
+_MIXED_P = 0.5
+"""With half of the samples untouched or more, views over a static street alone help a detector instead of harming it:
+``arbiview_aug.heights``. Other shares have not been measured."""
+
 
 class RigRetarget(torch.nn.Module):
     """Re-renders a sample's cameras as a target rig's, and keeps everything that depends on them consistent.
@@ -74,8 +78,9 @@ class RigRetarget(torch.nn.Module):
             objects keep their height when cameras move; ``lidar``: its ``points`` (ego frame) or ``depth_m`` (..., N,
             H, W; z-depth in metres, 0 or NaN where unknown), with ``boxes_3d`` for objects of few points;
             ``auto``: for each pair of cameras ``far`` where their centres coincide, else the best that the sample
-            offers: ``lidar``, else ``objects``, else ``street``, over which cameras keep the source's height, with a
-            warning (``paper``: always ``far``). Plans over points and boxes are made anew for every frame.
+            offers: ``lidar``, else ``objects``, else ``street``, with a warning, unless ``p`` mixes half untouched
+            samples in; where the target differs from the source in heights alone, the cameras then keep the source's
+            (``paper``: always ``far``). Plans over points and boxes are made anew for every frame.
         harmonise: Bring the sources to one exposure (``arbiview_aug.favs.photometric``): True or a ``HarmoniseConfig``
             estimates a gain for each camera in every frame; numbers are gains to use as they are. Off by default.
             Samples that ``p`` skips keep their colours.
@@ -181,6 +186,7 @@ class RigRetarget(torch.nn.Module):
             execution,
             cache_bytes=0 if once else cache_bytes,
             reach=neighbours,
+            mixed=p <= _MIXED_P,
             warn=self._warn,
         )
         self._fixed_target = self._sized(self.target) if isinstance(self.target, Rig) else None

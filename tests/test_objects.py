@@ -277,6 +277,27 @@ def test_auto_keeps_the_sources_height_where_nothing_is_known_of_the_street() ->
     assert np.allclose(moved["cam2ego"][:, 2, 3], [c.center_m[2] for c in narrow])
 
 
+def test_cameras_move_over_the_street_where_samples_are_mixed_or_the_layout_differs_too() -> None:
+    """Measured: half untouched samples turn the harm of a static street into a gain; the source's heights alone do not
+    help where cameras also stand and look elsewhere."""
+    rig = demo_source_rig((64, 176))
+    sample = {"images": torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8), "rig": rig}
+    raised, turned = rig.shifted(z_m=0.5), rig.turned(yaw_deg=10).shifted(z_m=0.5)
+    mixed = RigRetarget(raised, size=(64, 176), p=0.5, rng=torch.Generator().manual_seed(1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # nothing is wrong with that
+        outputs = [mixed(sample) for _ in range(8)]
+    moved = [out for out in outputs if not out["retarget_params"]["skipped"]]
+    assert 0 < len(moved) < 8
+    street = RigRetarget(raised, surface="street")(sample)["images"]
+    for out in moved:
+        assert np.allclose(out["cam2ego"], raised.cam2ego) and torch.equal(out["images"], street)
+    with pytest.warns(UserWarning, match=r"objects will lean and stretch.*p=0\.5"):
+        assert np.allclose(RigRetarget(turned)(sample)["cam2ego"], turned.cam2ego)
+    with pytest.warns(UserWarning, match="at the source's height"):
+        RigRetarget(raised, size=(64, 176), p=0.9, rng=torch.Generator().manual_seed(0))(sample)
+
+
 def test_cameras_are_where_they_were_asked_for_if_no_pixel_depends_on_the_street() -> None:
     """Nothing is seen of the target: its boxes are not even read, and that says nothing of the street."""
     one = Rig([demo_source_rig((64, 176))[0]])

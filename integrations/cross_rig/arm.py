@@ -29,7 +29,7 @@ class Arm:
         augmented: Frames are scaled and cropped at random as they are drawn.
         filled: What no camera saw is inpainted, and counts as seen.
         random: Targets are drawn around B, one for each frame.
-        stays: B's cameras stay in the very centres of those of A that look most alike.
+        stays: B's cameras stay in the very centres of those of A that look most alike, or at their heights.
         truth: To find out where the rest is lost: B's true pixels where something is covered, or where nothing is
             (which then counts as seen).
     """
@@ -43,7 +43,7 @@ class Arm:
     augmented: bool = False
     filled: bool = False
     random: bool = False
-    stays: bool = False
+    stays: Literal["centre", "height"] | None = None
     truth: Literal["covered", "holes"] | None = None
 
     @property
@@ -54,5 +54,5 @@ class Arm:
     def views_spec(self) -> dict[str, Any]:
         """What its images depend on, besides rigs and code: arms that differ in how they draw share them."""
         settings = {"kind": self.kind, "surface": self.surface, "reads": list(self.reads), "filled": self.filled}
-        extra = {"random": RANDOM if self.random else None, "stays": self.stays or None, "truth": self.truth}
+        extra = {"random": RANDOM if self.random else None, "stays": self.stays, "truth": self.truth}
         return settings | {name: value for name, value in extra.items() if value is not None}

@@ -13,7 +13,7 @@ import torch
 from arbiview_aug import RandomRig, Rig, RigRetarget
 from arbiview_aug.evaluate.baselines import row_split
 from arbiview_aug.evaluate.images import as_arrays
-from arbiview_aug.heights import most_alike
+from arbiview_aug.heights import at_source_heights, most_alike
 from integrations.cross_rig.arm import RANDOM, Arm
 from integrations.cross_rig.cache import Arrays
 
@@ -31,8 +31,10 @@ class ViewMaker:
     """
 
     def __init__(self, arm: Arm, source: Rig, target: Rig) -> None:
-        if arm.stays:
-            target = stayed(target, source)
+        if arm.stays == "centre":
+            target = at_source_centres(source, target)
+        elif arm.stays == "height":
+            target = at_source_heights(source, target)
         self.arm, self.source, self.target = arm, source, target
         self.random = RandomRig(target, **RANDOM) if arm.random else None
         self.retarget = RigRetarget(self.random or target, source_rig=source, surface=arm.surface)
@@ -70,7 +72,7 @@ class ViewMaker:
         }
 
 
-def stayed(target: Rig, source: Rig) -> Rig:
+def at_source_centres(source: Rig, target: Rig) -> Rig:
     """The target rig, in the source's ego frame, with each camera in the centre of the source camera most like it."""
     moves = (most_alike(source, camera).center_m - camera.center_m for camera in target)
     return target.with_cameras([camera.shifted(*move) for camera, move in zip(target, moves, strict=True)])
