@@ -12,6 +12,7 @@ from arbiview_aug.errors import ArbiviewError
 COMMANDS = {
     "bench": ("arbiview_aug.bench", "measure speed, on your own data too"),
     "demo": ("arbiview_aug.demo", "the main job on a synthetic street or on real frames, with numbers and a picture"),
+    "depth": ("arbiview_aug.depth", "depth from motion of a drive's frames, for surface='motion'"),
     "evaluate": ("arbiview_aug.evaluate.command", "how good are the views: metrics, pictures, a report in HTML"),
     "inspect": ("arbiview_aug.inspect", "show rigs: tables, differences, a picture"),
 }

@@ -14,6 +14,7 @@ from arbiview_aug.favs.paper import PaperRendering, SourceReport
 from arbiview_aug.favs.photometric import PhotometricReport
 from arbiview_aug.fills import Fills
 from arbiview_aug.heights import MOVED_M, lifts_m
+from arbiview_aug.motion.depth import MotionDepth
 from arbiview_aug.plan import RenderPlan
 from arbiview_aug.rig import Rig
 from arbiview_aug.target_view import PairReport
@@ -28,6 +29,7 @@ class Explanation:
         asked: The target rig that was asked for, in its own ego frame.
         harmonisation: The sources' gains and why, where harmonisation was asked for.
         depth: What became of each pair of neighbours, where depth from overlap was asked for and matters.
+        motion: What motion said of the distances, where it was asked.
         fills: What other frames of the drive show of the holes, where the sample has any.
     """
 
@@ -35,6 +37,7 @@ class Explanation:
     asked: Rig
     harmonisation: PhotometricReport | None = None
     depth: OverlapDepth | None = None
+    motion: MotionDepth | None = None
     fills: Fills | None = None
 
     def as_dict(self) -> list[dict[str, Any]]:
@@ -74,6 +77,8 @@ class Explanation:
                 lines.append(f"  {camera.name}: {where}, at the source's height: {why}")
         if self.depth is not None:
             lines.extend(f"  {line}" for line in str(self.depth).splitlines())
+        if self.motion is not None:
+            lines.append(f"  {self.motion}")
         if self.fills is not None:
             lines.extend(f"  {line}" for line in self.fills.lines(self.plan))
         return "\n".join([*lines, *_lines(self.as_dict(), _source_line)])

@@ -302,7 +302,7 @@ def checked_points(points: Points, key: str = "points") -> Points:
     return xyz if finite.all() else xyz[finite]
 
 
-def points_of_depth(camera: Camera, depth_m: FloatArray) -> FloatArray:
+def points_of_depth(camera: Camera, depth_m: FloatArray, key: str = "depth_m") -> FloatArray:
     """(P, 3) ego-frame points of a depth map (H, W): z along the optical axis, metres; 0, NaN and inf are unknown.
 
     Pixels closer together than a panorama's cells are left out, and the own car by the camera's mask.
@@ -311,7 +311,7 @@ def points_of_depth(camera: Camera, depth_m: FloatArray) -> FloatArray:
         SampleError: A map of another size than the camera's.
     """
     if depth_m.shape != camera.size:
-        raise SampleError(f"depth_m: camera {camera.name!r}: expected a map of {camera.size}, got {depth_m.shape}")
+        raise SampleError(f"{key}: camera {camera.name!r}: expected a map of {camera.size}, got {depth_m.shape}")
     step = max(1, int(CELL_RAD * float(camera.K[0, 0])))
     pixels = camera.pixel_grid()[::step, ::step]
     depth = depth_m[::step, ::step]

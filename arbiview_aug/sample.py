@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,12 +12,16 @@ import torch
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.lidar import checked_points, points_of_depth
+from arbiview_aug.motion.sweep import reduced_camera
 from arbiview_aug.objects import checked_boxes
 from arbiview_aug.rig import Rig
 from arbiview_aug.sample_images import check_container, checked_images
 from arbiview_aug.scene import Scene
 from arbiview_aug.surface import Points
 from arbiview_aug.tensors import leading_shape, split
+
+MOTION_KEY = "motion_depth_m"
+"""Depth from motion that was found offline: (N, h, w) z-depth at the size of ``arbiview_aug.motion.sweep``."""
 
 CALIBRATION_KEYS = (
     "images",
@@ -30,6 +34,7 @@ CALIBRATION_KEYS = (
     "coverage",
     "ignore",
     "neighbours",
+    MOTION_KEY,
     "retarget_params",
 )
 """Keys that describe the source's images; they are replaced by the target's or consumed."""
@@ -98,7 +103,7 @@ def scenes_of_frames(
         SampleError: Geometry that the surface needs is missing or impossible.
     """
     count = len(frames)
-    boxes = sample.get("boxes_3d") if surface in ("auto", "objects", "lidar") else None
+    boxes = sample.get("boxes_3d") if surface in ("auto", "objects", "lidar", "motion") else None
     if boxes is None and surface == "objects":
         raise SampleError(
             "surface='objects': expected 'boxes_3d' (B, 7) in the sample, got none; an empty (0, 7) tensor says "
@@ -110,13 +115,16 @@ def scenes_of_frames(
             "surface='lidar': expected 'points' (P, >= 3) in the ego frame, or 'depth_m' (N, H, W), z-depth of each "
             "camera in metres, in the sample, got neither"
         )
-    if boxes is None and points is None:
+    motion = None
+    if surface == "motion" and sample.get(MOTION_KEY) is not None:
+        motion = _points_of_maps(MOTION_KEY, sample[MOTION_KEY], frames, lead, reduced_camera)
+    if boxes is None and points is None and motion is None:
         return [Scene()] * count
     solid: list[FloatArray | None] = [None] * count
     if boxes is not None:
         solid = [checked_boxes(of_frame) for of_frame in _of_frames("boxes_3d", boxes, count, lead)]
-    measured: Sequence[Points | None] = [None] * count if points is None else points
-    return [Scene(b, p) for b, p in zip(solid, measured, strict=True)]
+    measured, moved = ([None] * count if found is None else found for found in (points, motion))
+    return [Scene(b, p, m) for b, p, m in zip(solid, measured, moved, strict=True)]
 
 
 def _points_of_frames(
@@ -131,18 +139,35 @@ def _points_of_frames(
         for part, of_frame in zip(parts, _of_frames("points", points, len(frames), lead), strict=True):
             part.append(checked_points(of_frame))
     if depth_m is not None:
-        try:
-            maps = split(depth_m, lead)
-        except (AttributeError, TypeError, ValueError, RuntimeError) as error:
-            raise SampleError(f"depth_m: expected one map (H, W) for each image ({error})") from None
-        for part, frame, of_cameras in zip(parts, frames, maps, strict=True):
-            if isinstance(of_cameras, torch.Tensor | np.ndarray):
-                of_cameras = list(numbers("depth_m", of_cameras)) if of_cameras.ndim else ()
-            if not isinstance(of_cameras, list | tuple) or len(of_cameras) != len(frame.rig):
-                raise SampleError(f"depth_m: expected {len(frame.rig)} maps (H, W), one for each image")
-            for camera, depth in zip(frame.rig, of_cameras, strict=True):
-                part.append(points_of_depth(camera, _numbers("depth_m", depth, ())))
+        for part, of_frame in zip(parts, _points_of_maps("depth_m", depth_m, frames, lead, lambda c: c), strict=True):
+            part.append(of_frame)
     return [part[0] if len(part) == 1 else np.concatenate(part) for part in parts]
+
+
+def _points_of_maps(
+    key: str,
+    depth_m: Any,
+    frames: Sequence[SourceFrame],
+    lead: tuple[int, ...],
+    sized: Callable[[Camera], Camera],
+) -> list[Points]:
+    """(P, 3) points of each frame's depth maps, those of each camera at the size of ``sized`` of it."""
+    try:
+        maps = split(depth_m, lead)
+    except (AttributeError, TypeError, ValueError, RuntimeError) as error:
+        raise SampleError(f"{key}: expected one map (H, W) for each image ({error})") from None
+    found: list[Points] = []
+    for frame, of_cameras in zip(frames, maps, strict=True):
+        if isinstance(of_cameras, torch.Tensor | np.ndarray):
+            of_cameras = list(numbers(key, of_cameras)) if of_cameras.ndim else ()
+        if not isinstance(of_cameras, list | tuple) or len(of_cameras) != len(frame.rig):
+            raise SampleError(f"{key}: expected {len(frame.rig)} maps (H, W), one for each image")
+        points = [
+            points_of_depth(sized(camera), _numbers(key, depth, ()), key)
+            for camera, depth in zip(frame.rig, of_cameras, strict=True)
+        ]
+        found.append(np.concatenate(points))
+    return found
 
 
 def names_of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[object]:

@@ -23,18 +23,20 @@ class Scene:
     Attributes:
         boxes: (B, 7) labelled objects: centre x, y, z, length, width, height (metres), yaw (radians).
         points: (P, 3) measured points, metres.
+        motion: (P, 3) points that motion between frames measured, metres; none where it was declined.
         corrections: What overlaps say of the street's distances.
     """
 
     boxes: FloatArray | None = None
     points: Points | None = None
+    motion: Points | None = None
     corrections: tuple[Correction, ...] = ()
     _surfaces: dict[tuple[str, float], Surface] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def is_empty(self) -> bool:
         """Whether nothing is known but the road."""
-        return self.boxes is None and self.points is None and not self.corrections
+        return all(known is None for known in (self.boxes, self.points, self.motion)) and not self.corrections
 
     @property
     def best(self) -> SurfaceName:
@@ -47,7 +49,7 @@ class Scene:
     def key(self) -> bytes:
         """Content hash: scenes with equal keys are the same."""
         digest = hashlib.sha256()
-        for array in (self.boxes, self.points):
+        for array in (self.boxes, self.points, self.motion):
             digest.update(b"none" if array is None else repr((array.shape, array.dtype.str)).encode())
             for rows in () if array is None else np.array_split(array, 1 + len(array) // _ROWS):
                 digest.update(rows.tobytes())
@@ -78,11 +80,12 @@ class Scene:
             return street
         if name == "objects" and self.boxes is not None:
             return Objects(street, self.boxes)
-        if name == "lidar" and self.points is not None:
+        points = {"lidar": self.points, "motion": self.motion}.get(name)
+        if points is not None:
             some_boxes = self.boxes is not None and len(self.boxes) > 0
-            if len(self.points) == 0:
+            if len(points) == 0:
                 return self.surface("objects" if some_boxes else "street", ground_z_m)
             if self.boxes is not None and some_boxes:
-                return LidarObjects.among(street, self.points, self.boxes)
-            return LidarSurface(street, self.points)
+                return LidarObjects.among(street, points, self.boxes)
+            return LidarSurface(street, points)
         raise ValueError(f"surface: {name!r} is unknown, or the scene has no geometry for it")

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import numpy as np
 import torch
 
 from arbiview_aug.detections import OfCameras, detections_of_frames
@@ -19,11 +20,12 @@ from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
 from arbiview_aug.fills import Fills, Patch, Reach, fill_views, plan_fills
 from arbiview_aug.heights import MOVED_M, at_source_heights, lifts_m, only_heights_differ
-from arbiview_aug.neighbours import neighbours_of_frames, warn_lost
+from arbiview_aug.motion.depth import MotionDepth, motion_depth
+from arbiview_aug.neighbours import Neighbour, neighbours_of_frames, warn_lost
 from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
 from arbiview_aug.required import baselines_m, needs_geometry
 from arbiview_aug.rig import Rig
-from arbiview_aug.sample import SourceFrame, names_of_frames, scenes_of_frames
+from arbiview_aug.sample import MOTION_KEY, SourceFrame, names_of_frames, scenes_of_frames
 from arbiview_aug.sampling import Scratch
 from arbiview_aug.scene import Scene
 from arbiview_aug.surface import SurfaceName
@@ -56,11 +58,13 @@ class View:
     Attributes:
         made: Its plan; or the frame rendered by the published stages, for which nothing can be planned.
         depth: What became of its overlaps, where depth from overlap was asked for and matters.
+        motion: What motion said of its distances, where it was asked here and not offline.
         fills: How its holes are filled from neighbouring frames, where those show any of them.
     """
 
     made: RenderPlan | PaperRendering
     depth: OverlapDepth | None = None
+    motion: MotionDepth | None = None
     fills: Fills | None = None
 
 
@@ -124,16 +128,26 @@ class Stitcher:
         if any(needed) or self.surface != "auto":
             scenes = scenes_of_frames(sample, frames, lead, self.surface)
         names = self._names(sample, len(frames), lead)
-        near = [[] for _ in frames] if self.reach is None else neighbours_of_frames(sample, frames, lead, self.warn)
+        asks_motion = self.surface == "motion" and any(needed) and sample.get(MOTION_KEY) is None
+        if asks_motion and sample.get("neighbours") is None:
+            raise SampleError(
+                f"surface='motion': expected 'neighbours' in the sample, or {MOTION_KEY!r} from the depth command, got "
+                "neither"
+            )
+        wanted = asks_motion or self.reach is not None
+        near = neighbours_of_frames(sample, frames, lead, self.warn) if wanted else [[] for _ in frames]
         views = []
         for frame, scene, name, needs, neighbours in zip(frames, scenes, names, needed, near, strict=True):
             depth = self._depth(self.config, frame, target, scene, name) if needs else None
             known = scene if depth is None else replace(scene, corrections=depth.corrections)
+            motion = self._motion(frame, scene, neighbours) if asks_motion and needs else None
+            if self.surface == "motion" and known.motion is None:
+                known = replace(known, motion=np.zeros((0, 3)) if motion is None else motion.points(frame.rig))
             plan, fills = self.plan(frame.rig, target, known), None
             if neighbours and self.reach is not None:
                 surface = known.best if self.surface == "auto" else self.surface
                 fills = plan_fills(plan, neighbours, known, surface, self.config, self.reach)
-            views.append(View(plan, depth, fills))
+            views.append(View(plan, depth, motion, fills))
         return views
 
     def _published(
@@ -208,7 +222,7 @@ class Stitcher:
     ) -> OverlapDepth | None:
         """Depth from overlap, where it is asked for and decides a pixel, and nothing was measured."""
         surface = scene.best if self.surface == "auto" else self.surface
-        if not config.overlap_depth or surface in ("far", "ground", "lidar"):
+        if not config.overlap_depth or surface in ("far", "ground", "lidar", "motion"):
             return None
         placed = self._placed(frame.rig, target, config, scene)
         if placed is not target and not needs_geometry(frame.rig, placed, self.surface, config):
@@ -217,6 +231,22 @@ class Stitcher:
         if self.refinement is None:
             return overlap_depth(frame.rig, frame.images, boxes)
         return self.refinement.get((frame.rig.content_key, name), lambda: overlap_depth(frame.rig, frame.images, boxes))
+
+    def _motion(self, frame: SourceFrame, scene: Scene, neighbours: Sequence[Neighbour]) -> MotionDepth:
+        """Depth from motion; a warning, once, where there is none."""
+        device = frame.images[0].device
+        found = motion_depth(frame.rig, frame.images, neighbours, scene.boxes, lambda n: self._images(n, frame), device)
+        if not found.density:
+            self.warn("motion", str(found))
+        return found
+
+    def _images(self, neighbour: Neighbour, frame: SourceFrame) -> tuple[torch.Tensor, ...] | None:
+        """A neighbour's images; None, with a warning that names it, where they cannot be read."""
+        try:
+            return neighbour.images(frame.images)
+        except (ArbiviewError, OSError) as error:
+            warn_lost(self.warn, neighbour.name, error)
+            return None
 
     # --- images -------------------------------------------------------------------------------------------------------
     def render(
@@ -264,10 +294,8 @@ class Stitcher:
         curves = self.harmoniser.curves(frame.rig, frame.images)
         rendered = []
         for fill in view.fills.fills:
-            try:
-                sources = fill.neighbour.images(frame.images)
-            except (ArbiviewError, OSError) as error:
-                warn_lost(self.warn, fill.neighbour.name, error)
+            sources = self._images(fill.neighbour, frame)
+            if sources is None:
                 continue
             if self._uses_torch(frame):
                 batches = render_torch(fill.plan, [image[None] for image in sources], [curves])

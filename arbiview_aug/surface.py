@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 
-SurfaceName = Literal["auto", "far", "ground", "street", "objects", "lidar"]
+SurfaceName = Literal["auto", "far", "ground", "street", "objects", "lidar", "motion"]
 """Surfaces a user can ask for. ``auto`` decides per pair of target and source camera (see ``plan``)."""
 
 Points = npt.NDArray[np.float32] | npt.NDArray[np.float64]

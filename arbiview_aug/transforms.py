@@ -76,7 +76,9 @@ class RigRetarget(torch.nn.Module):
             any.
         surface: ``far``, ``ground``, ``street``; ``objects``: the sample's ``boxes_3d`` stand on the street, so that
             objects keep their height when cameras move; ``lidar``: its ``points`` (ego frame) or ``depth_m`` (..., N,
-            H, W; z-depth in metres, 0 or NaN where unknown), with ``boxes_3d`` for objects of few points;
+            H, W; z-depth in metres, 0 or NaN where unknown), with ``boxes_3d`` for objects of few points; ``motion``:
+            what its ``neighbours`` show of distances (``arbiview_aug.motion``; seconds a frame), or ``motion_depth_m``
+            of the ``depth`` command, with its ``boxes_3d``; the street where that is declined, with a warning;
             ``auto``: for each pair of cameras ``far`` where their centres coincide, else the best that the sample
             offers: ``lidar``, else ``objects``, else ``street``, with a warning, unless ``p`` mixes half untouched
             samples in; where the target differs from the source in heights alone, the cameras then keep the source's
@@ -390,7 +392,7 @@ class RigRetarget(torch.nn.Module):
         if isinstance(view.made, PaperRendering):
             return PaperExplanation(view.made)
         gains = self.harmonisation(sample) if self.stitcher.harmoniser.is_on else None
-        return Explanation(view.made, target, gains, view.depth, view.fills)
+        return Explanation(view.made, target, gains, view.depth, view.motion, view.fills)
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
         """The gains that a sample's source images would get, and why; of a batch, its first frame."""

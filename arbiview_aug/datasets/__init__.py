@@ -2,6 +2,7 @@
 
 from arbiview_aug.datasets.frame_folder import FrameFolder
 from arbiview_aug.datasets.images import decode_images, reduced_camera, reduced_rig
+from arbiview_aug.datasets.motion_depth import WithMotionDepth
 from arbiview_aug.datasets.nuscenes import NuScenesDataset
 from arbiview_aug.datasets.opening import open_data
 from arbiview_aug.datasets.sequence import LazyFrame, Neighbours
@@ -14,6 +15,7 @@ __all__ = [
     "NuScenesDataset",
     "RetargetedDataset",
     "RetargetedIterable",
+    "WithMotionDepth",
     "decode_images",
     "open_data",
     "reduced_camera",

@@ -1,0 +1,147 @@
+"""Depth from motion on disk: a file for each frame, beside the data set or elsewhere, and a dataset that brings it."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from arbiview_aug.dense import Layer
+from arbiview_aug.errors import DataError, SampleError
+from arbiview_aug.motion.depth import MotionDepth
+from arbiview_aug.motion.sweep import reduced_camera
+from arbiview_aug.rig import Rig
+from arbiview_aug.sample import MOTION_KEY
+
+FOLDER = "motion_depth"
+"""Name beside a data set."""
+
+_FORMAT = 1
+_SAME_PX, _SAME_POSE = 0.05, 1e-3
+"""By how much calibrations may differ: images decoded at half their size give the same maps."""
+
+
+class DepthFolder:
+    """Files ``<token>.npz``: z-depth of each camera in float16, the calibration it belongs to, and how it was found.
+
+    Args:
+        root: The folder; made by the first ``write``.
+    """
+
+    def __init__(self, root: str | Path) -> None:
+        self.root = Path(root)
+
+    def path(self, token: str) -> Path:
+        """Of a frame; what a file system would not have in a name is escaped."""
+        return self.root / f"{quote(token, safe='')}.npz"
+
+    def write(self, token: str, rig: Rig, depth: MotionDepth) -> None:
+        """Write a frame's depth: all of the file or nothing.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        self.root.mkdir(parents=True, exist_ok=True)
+        maps = {f"depth_{k:02}": one.astype(np.float16) for k, one in enumerate(depth.depth_m)}
+        part = self.root / f".{os.getpid()}.part"
+        try:
+            with part.open("wb") as file:
+                np.savez_compressed(
+                    file,
+                    format=_FORMAT,
+                    words=np.array(depth.words),
+                    **_calibration(rig),
+                    **maps,  # type: ignore[arg-type]
+                )
+            part.replace(self.path(token))
+        finally:
+            part.unlink(missing_ok=True)
+
+    def read(self, token: str, rig: Rig) -> MotionDepth:
+        """A frame's depth.
+
+        Args:
+            token: Of the frame.
+            rig: Its rig, as it is used now.
+
+        Raises:
+            DataError: The file is missing, broken, or of another calibration.
+        """
+        path = self.path(token)
+        if not path.is_file():
+            raise DataError(
+                f"{path}: expected depth from motion of frame {token!r}, found none; make it with "
+                "python -m arbiview_aug depth --data FOLDER"
+            )
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                held: dict[str, Any] = {name: file[name] for name in file.files}
+            depth = tuple(held[f"depth_{k:02}"].astype(np.float32) for k in range(len(held["K"])))
+            found = MotionDepth(depth, str(held["words"]))
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise DataError(f"{path}: expected depth from motion, got {type(error).__name__}; delete it") from None
+        if int(held["format"]) != _FORMAT or not _same(held, rig, depth):
+            raise DataError(
+                f"{path}: expected depth of this calibration, got another's; delete it and run the depth command again"
+            )
+        return found
+
+    def holds(self, token: str, rig: Rig) -> bool:
+        """Whether a frame's depth is there and fits."""
+        try:
+            self.read(token, rig)
+        except DataError:
+            return False
+        return True
+
+
+class WithMotionDepth(Dataset[dict[str, Any]]):
+    """A map-style dataset whose samples carry what the ``depth`` command found, as ``motion_depth_m``.
+
+    For ``RigRetarget(surface="motion")``; samples need a ``token`` and a ``rig`` (or ``source_rig``).
+
+    Args:
+        dataset: Of samples.
+        folder: Where the command wrote: ``motion_depth`` below the data set's root unless it was told otherwise.
+        source_rig: The rig of samples that carry none.
+
+    Raises:
+        DataError: On access, a file that is missing, broken or of another calibration.
+        SampleError: On access, a sample without a token or rig.
+    """
+
+    def __init__(self, dataset: Any, folder: str | Path, *, source_rig: Rig | None = None) -> None:
+        self.dataset, self.depths, self.source_rig = dataset, DepthFolder(folder), source_rig
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        sample: Mapping[str, Any] = self.dataset[index]
+        rig, token = sample.get("rig", self.source_rig), sample.get("token")
+        if rig is None or token is None:
+            raise SampleError("sample: expected 'rig' and 'token', to find depth from motion by; pass source_rig=")
+        maps = [torch.from_numpy(one) for one in self.depths.read(str(token), rig).depth_m]
+        same = len({one.shape for one in maps}) == 1
+        return {**sample, MOTION_KEY: torch.stack(maps) if same else maps}
+
+
+def _calibration(rig: Rig) -> dict[str, Any]:
+    small = [reduced_camera(camera) for camera in rig]
+    return {"K": np.stack([camera.K for camera in small]), "cam2ego": np.stack([camera.cam2ego for camera in small])}
+
+
+def _same(held: Mapping[str, Any], rig: Rig, depth: tuple[Layer, ...]) -> bool:
+    small, now = [reduced_camera(camera) for camera in rig], _calibration(rig)
+    return (
+        [one.shape for one in depth] == [camera.size for camera in small]
+        and np.allclose(held["K"], now["K"], rtol=0, atol=_SAME_PX)
+        and np.allclose(held["cam2ego"], now["cam2ego"], rtol=0, atol=_SAME_POSE)
+    )

@@ -1,0 +1,138 @@
+"""``python -m arbiview_aug depth --data FOLDER``: depth from motion of every frame, into files beside the data set."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch.utils.data import DataLoader, Dataset
+from tqdm import tqdm
+
+from arbiview_aug.command_line import count, gathered_warnings, writable_folder
+from arbiview_aug.datasets.motion_depth import FOLDER, DepthFolder
+from arbiview_aug.datasets.opening import open_data
+from arbiview_aug.datasets.sequence import Neighbours
+from arbiview_aug.errors import ArbiviewError
+from arbiview_aug.motion.depth import BEST_TRAVEL_M, motion_depth
+from arbiview_aug.neighbours import Neighbour, neighbours_of_frames, warn_lost
+from arbiview_aug.sample import check_inputs
+from arbiview_aug.stitching import WarnOnce
+
+WANTED = Neighbours(count=2, step_m=BEST_TRAVEL_M / 2)
+"""Half the best travel and all of it: whichever the recording comes nearer to is taken."""
+
+
+class Done(NamedTuple):
+    """What became of a frame.
+
+    Attributes:
+        token: Of the frame.
+        density: Share of the pixels whose distance is known; 0 where it was declined.
+        words: How, or why not.
+        failed: It could not even be read.
+        kept: Its file was there before.
+    """
+
+    token: str
+    density: float
+    words: str
+    failed: bool = False
+    kept: bool = False
+
+
+class _Frames(Dataset[Done]):
+    """Frames whose depth is found and written where they are asked for: in a DataLoader's workers."""
+
+    def __init__(self, data: Any, tokens: Sequence[str], depths: DepthFolder, device: str) -> None:
+        self.data, self.tokens, self.depths, self.device = data, tokens, depths, device
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def __getitem__(self, index: int) -> Done:
+        token = self.tokens[index]
+        try:
+            return self._done(token, self.data[index])
+        except (ArbiviewError, OSError) as error:
+            return Done(token, 0.0, str(error), failed=True)
+
+    def _done(self, token: str, sample: dict[str, Any]) -> Done:
+        rig = sample["rig"]
+        if self.depths.holds(token, rig):
+            return Done(token, self.depths.read(token, rig).density, "", kept=True)
+        (frame,) = check_inputs(sample, None)
+        warn = WarnOnce()
+        (neighbours,) = neighbours_of_frames(sample, [frame], (), warn)
+        boxes = None if sample.get("boxes_3d") is None else sample["boxes_3d"].numpy().astype(float)
+
+        def load(neighbour: Neighbour) -> Sequence[torch.Tensor] | None:
+            try:
+                return neighbour.images(frame.images)
+            except (ArbiviewError, OSError) as error:
+                warn_lost(warn, neighbour.name, error)
+                return None
+
+        found = motion_depth(frame.rig, frame.images, neighbours, boxes, load, self.device)
+        self.depths.write(token, rig, found)
+        return Done(token, found.density, str(found))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Find and write the depth of every frame that has none yet.
+
+    Returns:
+        0; 1 where frames could not be read or written, which are named.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m arbiview_aug depth",
+        description="Depth from motion of every frame of a drive, for surface='motion'. Frames that have theirs are "
+        "left as they are: run it again to go on.",
+    )
+    parser.add_argument(
+        "--data",
+        required=True,
+        metavar="FOLDER",
+        help="a folder of frame folders with a sequence.json, or a nuScenes root",
+    )
+    parser.add_argument("--output", metavar="FOLDER", help=f"where to write (default: {FOLDER} in the data's folder)")
+    parser.add_argument("--device", default="cpu", help="where to compute, such as cuda (default: %(default)s)")
+    parser.add_argument("--workers", type=count, default=1, help="processes, on the CPU (default: %(default)s)")
+    arguments = parser.parse_args(argv)
+    asked = arguments.output or str(Path(arguments.data) / FOLDER)
+    data: Any = open_data(arguments.data, neighbours=WANTED)
+    depths = DepthFolder(writable_folder(Path(asked), asked))
+    frames = _Frames(data, data.tokens, depths, arguments.device)
+    # On a GPU one process keeps it busy, and CUDA must not be forked.
+    workers = arguments.workers if arguments.device == "cpu" and arguments.workers > 1 else 0
+    loader = DataLoader(frames, batch_size=None, num_workers=workers, collate_fn=_as_it_is)
+    done: list[Done] = []
+    warned: list[str] = []
+    with gathered_warnings(warned):
+        for one in tqdm(loader, total=len(frames), unit="frame", desc="depth from motion"):
+            done.append(one)
+    for line in warned:
+        print(line, file=sys.stderr)
+    return _summary(done, depths)
+
+
+def _as_it_is(value: Any) -> Any:
+    return value
+
+
+def _summary(done: Sequence[Done], depths: DepthFolder) -> int:
+    made = [one for one in done if not one.kept and not one.failed]
+    declined = [one for one in made if one.density == 0]
+    failed = [one for one in done if one.failed]
+    known = [one.density for one in done if one.density > 0]
+    share = f", {sum(known) / len(known):.0%} of their pixels on average" if known else ""
+    kept = len(done) - len(made) - len(failed)
+    print(f"{depths.root}: {len(known)} of {len(done)} frames have depth{share}; {kept} were there before")
+    for one in declined:
+        print(f"  {one.token}: {one.words}")
+    for one in failed:
+        print(f"  {one.token}: failed: {one.words}", file=sys.stderr)
+    return 1 if failed else 0
