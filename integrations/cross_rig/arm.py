@@ -8,7 +8,7 @@ from typing import Any, Literal
 from arbiview_aug.surface import SurfaceName
 
 Kind = Literal["raw", "oracle", "row_split", "retarget"]
-Geometry = Literal["points", "boxes_3d", "depth_m"]
+Geometry = Literal["points", "boxes_3d", "depth_m", "neighbours"]
 
 
 RANDOM: dict[str, Any] = {"yaw_deg": 5.0, "pitch_deg": 2.0, "height_m": 0.2, "focal_scale": 0.1}
@@ -24,7 +24,8 @@ class Arm:
         title: In tables.
         kind: Where its images come from: A's as they are, B's own, or A's re-rendered.
         surface: Of ``RigRetarget``.
-        reads: Which of the frame's geometry it is given, besides the images.
+        reads: Which of the frame's geometry it is given, besides the images; ``neighbours``: the frames 1.2 m before
+            and after it, with boxes where it reads boxes.
         mixed: Half of the frames drawn are raw ones.
         augmented: Frames are scaled and cropped at random as they are drawn.
         filled: What no camera saw is inpainted, and counts as seen.

@@ -44,6 +44,21 @@ ARMS: dict[str, Arm] = {
         Arm(name="auto_filled_mixed", title="auto, Telea, + raw", kind="retarget", reads=_ALL, filled=True, mixed=True),
         Arm(name="true_covered", title="auto's holes in B's own frames", kind="retarget", reads=_ALL, truth="covered"),
         Arm(name="true_holes", title="auto, holes filled with the truth", kind="retarget", reads=_ALL, truth="holes"),
+        Arm(
+            name="auto_neighbours",
+            title="auto, near road from other frames",
+            kind="retarget",
+            reads=(*_ALL, "neighbours"),
+        ),
+        Arm(name="motion", title="depth from motion", kind="retarget", surface="motion", reads=("neighbours",)),
+        Arm(
+            name="motion_mixed",
+            title="depth from motion, + raw",
+            kind="retarget",
+            surface="motion",
+            reads=("neighbours",),
+            mixed=True,
+        ),
         Arm(name="random", title="RandomRig around B, auto", kind="retarget", reads=_ALL, random=True),
         Arm(name="oracle", title="B's own frames", kind="oracle"),
     )

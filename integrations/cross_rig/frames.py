@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,8 @@ import numpy as np
 import torch
 
 from arbiview_aug import Rig
-from arbiview_aug.datasets.synthetic import SyntheticDrive
+from arbiview_aug.datasets import LazyFrame, Neighbours
+from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive
 from integrations.cross_rig.arm import Arm
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, fill
 from integrations.cross_rig.labels import Grid, box_cells, visible_objects
@@ -26,6 +27,9 @@ from integrations.cross_rig.worlds import CHANGES, STREET_SEEDS, Size, Split, so
 _WORLD = "arbiview_aug.datasets.synthetic"
 _FORMAT = 1
 """Part of every set's name: raise it when this file stores something else."""
+NEIGHBOURS = Neighbours()
+"""One frame before and one after, 1.2 m away."""
+
 _MAX_FRAMES = 1 << 20
 """Length of the streets' datasets: a set of frames grows without becoming another."""
 
@@ -181,7 +185,35 @@ class _ArmFrames:
             frame["points"] = self.drive.points(index)
         if "depth_m" in self.arm.reads:
             frame["depth_m"] = torch.from_numpy(self.store.read(index, "depth_m").astype(np.float32))
+        if "neighbours" in self.arm.reads:
+            frame |= self._neighbours(index)
         return self.views(index, frame)
+
+    def _neighbours(self, index: int) -> dict[str, Any]:
+        """The frames before and after, and the pose that they refer to; rendered when they are asked for."""
+        scene, rig, near = self.drive.scene(index), self.original.rig, []
+        for sign in NEIGHBOURS.signs:
+            seconds = sign * NEIGHBOURS.step_m / scene.speed_mps
+            later = scene.after(seconds)
+            known = {"rig": rig, "ego2world": torch.from_numpy(later.ego2street), "time_s": seconds}
+            if "boxes_3d" in self.arm.reads:
+                known["boxes_3d"] = torch.from_numpy(later.boxes_ego(rig.ground_z_m).astype(np.float32))
+            near.append(LazyFrame(known, partial(self._images, index, seconds)))
+        return {"neighbours": near, "ego2world": torch.from_numpy(scene.ego2street), "time_s": 0.0}
+
+    def _images(self, index: int, seconds: float) -> torch.Tensor | list[torch.Tensor]:
+        return _Later(self.drive, seconds).render(index).images
+
+
+class _Later(SyntheticDrive):
+    """The same streets, so much later."""
+
+    def __init__(self, drive: SyntheticDrive, seconds: float) -> None:
+        super().__init__(drive.rig, num_frames=len(drive), seed=drive.seed, lidar=False)
+        self.seconds = seconds
+
+    def scene(self, index: int) -> Scene:
+        return super().scene(index).after(self.seconds)
 
 
 class _ChangedFrames:

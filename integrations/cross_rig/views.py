@@ -13,9 +13,12 @@ import torch
 from arbiview_aug import RandomRig, Rig, RigRetarget
 from arbiview_aug.evaluate.baselines import row_split
 from arbiview_aug.evaluate.images import as_arrays
+from arbiview_aug.fills import Reach
 from arbiview_aug.heights import at_source_heights, most_alike
 from integrations.cross_rig.arm import RANDOM, Arm
 from integrations.cross_rig.cache import Arrays
+
+_POSE = ("ego2world", "time_s")  # where neighbours are read
 
 _TELEA_RADIUS_PX = 3
 """OpenCV's own example; holes are filled from their border inwards whatever it is."""
@@ -37,7 +40,9 @@ class ViewMaker:
             target = at_source_heights(source, target)
         self.arm, self.source, self.target = arm, source, target
         self.random = RandomRig(target, **RANDOM) if arm.random else None
-        self.retarget = RigRetarget(self.random or target, source_rig=source, surface=arm.surface)
+        # Motion is asked for distances alone, so that the arm shows what these do.
+        reach: Reach | None = None if arm.surface == "motion" else "ground"
+        self.retarget = RigRetarget(self.random or target, source_rig=source, surface=arm.surface, neighbours=reach)
 
     def __call__(self, index: int, frame: Mapping[str, Any]) -> Arrays:
         """The arrays of a retargeted frame.
@@ -57,7 +62,7 @@ class ViewMaker:
             coverage = np.stack([view.coverage for view in views])
             K, cam2ego = self.target.K, self.target.cam2ego
         else:
-            given = {key: frame[key] for key in ("images", *self.arm.reads)}
+            given = {key: frame[key] for key in ("images", *self.arm.reads, *_POSE) if key in frame}
             drawn = None if self.random is None else self.random.draw(torch.Generator().manual_seed(index))
             out = self.retarget(given, drawn)
             images, coverage = out["images"].numpy(), out["coverage"].numpy()

@@ -9,6 +9,7 @@ import torch
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from integrations.cross_rig.arms import ARMS, named_arms
 from integrations.cross_rig.augmentation import SCALE, scaled_and_cropped
+from integrations.cross_rig.frames import NEIGHBOURS, Source, _ArmFrames
 from integrations.cross_rig.views import ViewMaker
 from integrations.cross_rig.worlds import CHANGES, STREET_SEEDS, named_changes, source_rig
 
@@ -17,9 +18,10 @@ SIZE = (24, 64)
 
 @pytest.fixture(scope="module")
 def frame() -> dict:
-    drive = SyntheticDrive(source_rig(SIZE), num_frames=1, seed=9)
-    views = drive.render(0)
+    drive = SyntheticDrive(source_rig(SIZE), num_frames=1, seed=9, neighbours=NEIGHBOURS)
+    views, sample = drive.render(0), drive[0]
     return {
+        **{key: sample[key] for key in ("neighbours", "ego2world", "time_s")},
         "images": views.images,
         "depth_m": torch.where(torch.isfinite(views.depth_m), views.depth_m, 0),
         "points": drive.points(0),
@@ -46,6 +48,22 @@ def test_every_arm_renders(frame, name):
         away = views["cam2ego"][:, :3, 3] - target.cam2ego[:, :3, 3]
         np.testing.assert_allclose(away[:, 2], -0.6 if ARMS[name].stays else 0, atol=1e-6)
         assert (np.abs(away[:, :2]).max() > 0.01) == (ARMS[name].stays == "centre")
+
+
+def test_arms_are_given_the_frames_before_and_after(tmp_path, frame):
+    source = Source(root=tmp_path, size=SIZE, split="train", change="up70", arm=ARMS["auto_neighbours"])
+    given = _ArmFrames(source)._neighbours(3)
+    drive = SyntheticDrive(
+        source_rig(SIZE), num_frames=4, seed=STREET_SEEDS["train"], lidar=False, neighbours=NEIGHBOURS
+    )
+    expected = drive[3]
+    assert torch.equal(given["ego2world"], expected["ego2world"]) and len(given["neighbours"]) == 2
+    for one, two in zip(given["neighbours"], expected["neighbours"], strict=True):
+        for key in ("images", "ego2world", "boxes_3d"):
+            assert torch.equal(one[key], two[key])
+        assert one["time_s"] == two["time_s"]
+    motion = replace(source, arm=ARMS["motion"])
+    assert all("boxes_3d" not in one for one in _ArmFrames(motion)._neighbours(3)["neighbours"])
 
 
 @pytest.mark.parametrize("change", ["up70", "waymo"])
