@@ -1,0 +1,153 @@
+"""Depth from motion against the truth of synthetic drives, and on a real pair of frames. Run with ``-s`` for numbers.
+
+Four streets, 128 by 352 pixels, one frame 1.2 m before and one after; views from 0.6 m higher and 1 m aside.
+"""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import Rig, RigRetarget
+from arbiview_aug.datasets import FrameFolder, Neighbours
+from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive, demo_source_rig
+from arbiview_aug.motion.depth import MotionDepth, motion_depth
+from arbiview_aug.neighbours import neighbours_of_frames
+from arbiview_aug.sample import MOTION_KEY, check_inputs
+
+RIG = demo_source_rig((128, 352))
+STREETS = (0, 1, 2, 3)
+MOVES = {"0.6 m higher": RIG.shifted(z_m=0.6), "1 m aside": RIG.shifted(y_m=1.0)}
+OFF_MOTION_DEG, FAR_M = 6.0, 80.0
+
+
+class Standing(SyntheticDrive):
+    """The same streets, where only the vehicle moves."""
+
+    def scene(self, index: int) -> Scene:
+        scene = super().scene(index)
+        return replace(scene, velocities=np.zeros_like(scene.velocities))
+
+
+@cache
+def drive(standing: bool) -> SyntheticDrive:
+    kind = Standing if standing else SyntheticDrive
+    return kind(RIG, num_frames=4, seed=9, lidar=False, neighbours=Neighbours())
+
+
+@cache
+def true_views(index: int, move: str) -> torch.Tensor:
+    return drive(True).render(index, MOVES[move]).images.float()
+
+
+def sample_of(index: int, standing: bool, labels: bool, turned_deg: float) -> dict[str, Any]:
+    """A frame; with a pose error, every neighbour is turned by so much about an axis of its own."""
+    sample = drive(standing)[index]
+    rng, near = np.random.default_rng(index), []
+    for entry in sample["neighbours"]:
+        axis = rng.normal(size=3)
+        pose = entry["ego2world"].numpy().copy()
+        pose[:3, :3] = pose[:3, :3] @ cv2.Rodrigues(np.radians(turned_deg) * axis / np.linalg.norm(axis))[0]
+        near.append({**{k: entry[k] for k in entry if labels or k != "boxes_3d"}, "ego2world": torch.from_numpy(pose)})
+    kept = {key: value for key, value in sample.items() if labels or key != "boxes_3d"}
+    return {**kept, "neighbours": near}
+
+
+def depth_of(sample: dict[str, Any]) -> MotionDepth:
+    (frame,) = check_inputs(sample, None)
+    (near,) = neighbours_of_frames(sample, [frame], (), lambda topic, message: pytest.fail(message))
+    boxes = sample["boxes_3d"].numpy().astype(float) if "boxes_3d" in sample else None
+    return motion_depth(frame.rig, frame.images, near, boxes, lambda n: n.images(frame.images))
+
+
+def right(index: int, depth: MotionDepth) -> tuple[int, int, int]:
+    """Pixels nearer than ``FAR_M`` and off the motion: all, with a depth, with one within a tenth of the truth."""
+    pixels = kept = good = 0
+    for camera, one, true in zip(RIG, depth.depth_m, drive(True).render(index).depth_m.numpy(), strict=True):
+        rays, _ = camera.unproject(camera.pixel_grid())
+        ask = (np.abs(rays[..., 0]) < np.cos(np.radians(OFF_MOTION_DEG))) & (true < FAR_M)
+        pixels, kept = pixels + ask.sum(), kept + (ask & (one > 0)).sum()
+        good += (ask & (one > 0) & (np.abs(one - true) <= 0.1 * true)).sum()
+    return pixels, kept, good
+
+
+def gain_db(index: int, move: str, sample: dict[str, Any], depth: MotionDepth) -> float:
+    """PSNR over the static street's, where both cover."""
+    outs = [
+        RigRetarget(MOVES[move], surface=surface, neighbours=None)(
+            sample | {MOTION_KEY: list(map(torch.from_numpy, depth.depth_m))}
+        )
+        for surface in ("motion", "street")
+    ]
+    both = (outs[0]["coverage"] & outs[1]["coverage"])[:, None]
+    squares = [float((((out["images"].float() - true_views(index, move)) ** 2) * both).sum()) for out in outs]
+    return float(10 * np.log10(squares[1] / squares[0]))
+
+
+@pytest.mark.truth
+@pytest.mark.timeout(900)
+@pytest.mark.filterwarnings("ignore:RigRetarget drops")
+@pytest.mark.parametrize(
+    ("standing", "labels", "turned_deg", "density", "share", "least_db"),
+    [
+        pytest.param(True, False, 0.0, 0.6, 0.9, 3.0, id="nothing else moves"),
+        pytest.param(False, True, 0.0, 0.0, 0.9, 3.0, id="traffic, labelled"),
+        pytest.param(False, False, 0.0, 0.6, 0.9, 1.5, id="traffic, no labels"),
+        pytest.param(True, False, 0.2, 0.6, 0.9, 3.0, id="poses 0.2 degrees wrong"),
+    ],
+)
+def test_depth_is_right_and_renders_better_than_the_street(
+    standing: bool, labels: bool, turned_deg: float, density: float, share: float, least_db: float
+) -> None:
+    """Unlabelled traffic is at wrong distances: there the 3 dB are not reached."""
+    counts, gains = np.zeros(3), {move: [] for move in MOVES}
+    for index in STREETS:
+        sample = sample_of(index, standing, labels, turned_deg)
+        depth = depth_of(sample)
+        counts += right(index, depth)
+        for move, found in gains.items():
+            found.append(gain_db(index, move, sample, depth))
+    mean = {move: float(np.mean(found)) for move, found in gains.items()}
+    words = ", ".join(
+        f"{move} {db:+.1f} dB ({min(gains[move]):+.1f} to {max(gains[move]):+.1f})" for move, db in mean.items()
+    )
+    print(f"\ndensity {counts[1] / counts[0]:.1%}, right {counts[2] / counts[1]:.1%}; over the street: {words}")
+    assert counts[1] >= density * counts[0] and counts[2] >= share * counts[1]
+    assert min(mean.values()) >= least_db
+    assert min(min(found) for found in gains.values()) >= -0.1
+
+
+@pytest.mark.acceptance
+def test_the_next_frame_as_truth(ddad_root: Path) -> None:
+    """DDAD's frame as its cameras see it 1.26 m on, by depth from the two: one side alone, the hard case.
+
+    What is compared is one of the two images that the depth was found in, as the issue asks; LiDAR has no such help.
+    """
+    now, ahead = (FrameFolder(root)[0] for root in (ddad_root, ddad_root.parent / "ddad-next"))
+    ego2ego = np.linalg.solve(now["ego2world"].numpy(), ahead["ego2world"].numpy())
+    cameras = [camera.moved(ego2ego) for camera in ahead["rig"]]
+    target = Rig(cameras, ground_z_m=now["rig"].ground_z_m).resized(0.5)
+    outs = {}
+    for surface in ("motion", "lidar", "street"):
+        sample = now | {"neighbours": [ahead]}
+        outs[surface] = RigRetarget(target, surface=surface, neighbours=None)(sample)
+    then = [
+        cv2.resize(image.numpy().transpose(1, 2, 0), camera.size[::-1], interpolation=cv2.INTER_AREA).astype(float)
+        for camera, image in zip(target, ahead["images"], strict=True)
+    ]
+    found = {}
+    for surface, out in outs.items():
+        rows = []
+        for k, (camera, true) in enumerate(zip(target, then, strict=True)):
+            seen = torch.stack([other["coverage"][k] for other in outs.values()]).all(0).numpy()
+            use = seen if camera.mask is None else seen & camera.mask
+            error = out["images"][k].numpy().transpose(1, 2, 0)[use] - true[use]
+            rows.append(10 * np.log10(255**2 / np.mean(error**2)))
+        found[surface] = float(np.mean(rows))
+    print(f"\nthe next frame as truth, dB: {found}")
+    assert found["motion"] >= found["street"] + 1.5
