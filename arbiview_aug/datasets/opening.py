@@ -7,17 +7,21 @@ from pathlib import Path
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, FrameFolder
 from arbiview_aug.datasets.images import Reduce
 from arbiview_aug.datasets.nuscenes import NuScenesDataset
+from arbiview_aug.datasets.sequence import Neighbours
 from arbiview_aug.errors import DataError
 
 _NUSCENES_VERSIONS = ("v1.0-mini", "v1.0-trainval")  # the first of these that is there, else whichever v1.0-*
 
 
-def open_data(folder: str | Path, *, reduce: Reduce = 1) -> FrameFolder | NuScenesDataset:
+def open_data(
+    folder: str | Path, *, reduce: Reduce = 1, neighbours: Neighbours | None = None
+) -> FrameFolder | NuScenesDataset:
     """Frame folders (also where there are nuScenes tables beside), else nuScenes.
 
     Args:
         folder: A frame folder, a folder of such folders, or a nuScenes root.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size.
+        neighbours: Which other frames of the drive come with a sample; None for none.
 
     Raises:
         DataError: Neither.
@@ -26,7 +30,7 @@ def open_data(folder: str | Path, *, reduce: Reduce = 1) -> FrameFolder | NuScen
     if not root.is_dir():
         raise DataError(f"data {root}: expected a folder, found none")
     if (root / CALIBRATION_FILE).is_file() or any(root.glob(f"*/{CALIBRATION_FILE}")):
-        return FrameFolder(root, reduce=reduce)
+        return FrameFolder(root, reduce=reduce, neighbours=neighbours)
     versions = sorted(path.name for path in root.glob("v1.0-*") if path.is_dir())
     if not versions:
         raise DataError(
@@ -34,4 +38,4 @@ def open_data(folder: str | Path, *, reduce: Reduce = 1) -> FrameFolder | NuScen
             "(with a folder of tables such as v1.0-mini), found neither"
         )
     version = next((v for v in _NUSCENES_VERSIONS if v in versions), versions[0])
-    return NuScenesDataset(root, version, reduce=reduce)
+    return NuScenesDataset(root, version, reduce=reduce, neighbours=neighbours)

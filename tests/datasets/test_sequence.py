@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from arbiview_aug import DataError, Rig, RigRetarget
-from arbiview_aug.datasets import FrameFolder, LazyFrame, Neighbours
-from arbiview_aug.datasets.sequence import Drive
+from arbiview_aug.datasets import FrameFolder, LazyFrame, Neighbours, NuScenesDataset
+from arbiview_aug.datasets.sequence import Drive, parts_of_clock, travelled_m
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.datasets.writing import write_frame
 
@@ -41,18 +41,32 @@ def test_settings_are_checked(bad: dict) -> None:
 
 
 def test_standing_still_has_no_neighbours() -> None:
-    drive = Drive({name: np.zeros(3) for name in "abc"}, None, "here")
-    assert drive.neighbours("b", Neighbours()) == []
-    assert drive.neighbours("elsewhere", Neighbours()) == []
+    """Though its poses waver: their steps alone would add up to 4 m."""
+    positions_m = 0.005 * np.random.default_rng(0).standard_normal((500, 3))
+    assert np.linalg.norm(np.diff(positions_m, axis=0), axis=1).sum() > 4
+    drive = Drive(positions_m, np.zeros(500, np.int64))
+    assert drive.neighbours(250, Neighbours()) == []
+
+
+def test_travel_is_counted_in_small_steps_too() -> None:
+    """A crawl of 1 cm a frame, on a bend."""
+    angle = np.arange(0, np.pi / 2, 0.001)
+    travelled = travelled_m(10 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1))
+    assert abs(travelled - 10 * angle).max() < 0.11 and (np.diff(travelled) >= 0).all()
 
 
 def test_nothing_is_a_neighbour_across_a_clock_that_goes_back() -> None:
-    positions_m = {name: np.array([k, 0.0, 0.0]) for k, name in enumerate("abcdef")}
     times_s = dict(zip("abcdef", [0.0, 1.0, 2.0, 0.5, 1.5, 2.5], strict=True))
     with pytest.warns(UserWarning, match="here: the clock goes back from frame 'c' to 'd'"):
-        drive = Drive(positions_m, times_s, "here")
-    wanted = Neighbours(step_m=1.0, count=9)
-    assert drive.neighbours("c", wanted) == ["b", "a"] and drive.neighbours("e", wanted) == ["d", "f"]
+        parts = parts_of_clock("abcdef", times_s, "here")
+    drive, wanted = Drive(np.arange(6.0)[:, None] * [1, 0, 0], parts), Neighbours(step_m=1.0, count=9)
+    assert drive.neighbours(2, wanted) == [1, 0] and drive.neighbours(4, wanted) == [3, 5]
+
+
+@pytest.mark.parametrize("reader", [FrameFolder, NuScenesDataset])
+def test_another_type_is_refused(reader: type, tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="neighbours: expected Neighbours or None, got int"):
+        reader(tmp_path, neighbours=2)
 
 
 def test_a_lazy_frame_decodes_once_and_only_when_asked() -> None:
