@@ -13,7 +13,7 @@ from arbiview_aug import DataError, Rig, RigRetarget
 from arbiview_aug.datasets import FrameFolder, LazyFrame, Neighbours, NuScenesDataset
 from arbiview_aug.datasets.sequence import Drive, parts_of_clock, travelled_m
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.datasets.writing import write_frame
+from arbiview_aug.datasets.writing import write_drive
 
 SIZE = (64, 176)
 
@@ -108,14 +108,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("drive")
     rig = demo_source_rig(SIZE)
     sample = SyntheticDrive(rig, num_frames=1, lidar=False, neighbours=Neighbours(step_m=1.3))[0]
-    before, after = sample["neighbours"]
-    for name, frame in (("000", before), ("001", sample), ("002", after)):
-        write_frame(root / name, dict(frame))
-        calib = json.loads((root / name / "calib.json").read_text())
-        calib["ego2world"] = frame["ego2world"].tolist()
-        (root / name / "calib.json").write_text(json.dumps(calib))
-    times = [{"name": f"{k:03}", "time_s": 0.1 * k} for k in range(3)]
-    (root / "sequence.json").write_text(json.dumps({"frames": times}))
+    write_drive(root, [sample, *sample["neighbours"]])
     return root
 
 
@@ -127,7 +120,7 @@ def test_folders_fill_the_road(recorded: Path) -> None:
     folder = FrameFolder(recorded, neighbours=Neighbours())
     assert [len(folder[k]["neighbours"]) for k in range(3)] == [1, 2, 1]
     sample = folder[1]
-    assert sample["time_s"] == pytest.approx(0.1) and [n["token"] for n in sample["neighbours"]] == ["000", "002"]
+    assert sample["time_s"] == 0 and [n["token"] for n in sample["neighbours"]] == ["0000", "0002"]
     out = RigRetarget(low(sample["rig"]), outputs=("source_frame",))(sample)
     alone = RigRetarget(low(sample["rig"]), neighbours=None)(sample)
     gained = out["coverage"] & ~alone["coverage"]
@@ -138,18 +131,18 @@ def test_folders_fill_the_road(recorded: Path) -> None:
 def test_a_broken_neighbour_is_named_and_left_out(recorded: Path, tmp_path: Path, broken: str) -> None:
     root = tmp_path / "drive"
     shutil.copytree(recorded, root)
-    victim = next((root / "002").glob("*.png"), None) or next((root / "002").glob("*.jpg"))
+    victim = next((root / "0002").glob("*.png"), None) or next((root / "0002").glob("*.jpg"))
     if broken == "image":
         victim.unlink()
     elif broken == "corrupt":
         victim.write_bytes(victim.read_bytes()[:200])
     folder = FrameFolder(root, neighbours=Neighbours())
     if broken == "calibration":
-        calib = json.loads((root / "002" / "calib.json").read_text())
+        calib = json.loads((root / "0002" / "calib.json").read_text())
         calib["cameras"][0]["K"] = [[0, 0, 0]] * 3
-        (root / "002" / "calib.json").write_text(json.dumps(calib))
+        (root / "0002" / "calib.json").write_text(json.dumps(calib))
     retarget, sample = RigRetarget(low(folder[1]["rig"]), outputs=("source_frame",)), folder[1]
-    with pytest.warns(UserWarning, match="neighbour '002' is left out: .*rendered without it"):
+    with pytest.warns(UserWarning, match="neighbour '0002' is left out: .*rendered without it"):
         out = retarget(sample)
     assert set(out["source_frame"].unique().tolist()) == {-1, 0, 1}
 
@@ -158,10 +151,10 @@ def test_a_broken_neighbour_is_named_and_left_out(recorded: Path, tmp_path: Path
     ("text", "why"),
     [
         ("[]", "expected {'frames'"),
-        ('{"frames": ["000", "nowhere"]}', "got 'nowhere'"),
-        ('{"frames": ["000", "000"]}', "each frame once"),
-        ('{"frames": [{"name": "000", "time_s": "soon"}]}', "ValueError"),
-        ('{"frames": [{"name": "000", "time_s": NaN}]}', "finite number"),
+        ('{"frames": ["0000", "nowhere"]}', "got 'nowhere'"),
+        ('{"frames": ["0000", "0000"]}', "each frame once"),
+        ('{"frames": [{"name": "0000", "time_s": "soon"}]}', "ValueError"),
+        ('{"frames": [{"name": "0000", "time_s": NaN}]}', "finite number"),
     ],
 )
 def test_a_wrong_sequence_is_refused(recorded: Path, tmp_path: Path, text: str, why: str) -> None:
