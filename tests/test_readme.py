@@ -48,7 +48,7 @@ TINY = {
         *["--frames", "2", "--epochs", "1"],
     ],
     "bench scene --data FOLDER": ["--reduce", "4", "--repeats", "1", "--only", "p skips"],
-    "bench neighbours": ["--size", "32x88", "--repeats", "1", "--counts", "0", "1"],
+    "bench neighbours": ["--size", "32x88", "--repeats", "1", "--counts", "0", "1", "--surface", "street"],
     "bench device": ["--device", "cpu", "--sizes", "32x88", "--repeats", "1"],
     "bench speed --data FOLDER": ["--repeats", "1"],
     "bench speed": ["--repeats", "1"],

@@ -29,7 +29,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four frames, 1.5 m apart; most neighbours has the third."""
     root = tmp_path_factory.mktemp("drive")
     wanted = Neighbours(count=2, step_m=1.5)
-    sample = SyntheticDrive(demo_source_rig((64, 176)), num_frames=1, lidar=False, neighbours=wanted)[0]
+    sample = SyntheticDrive(demo_source_rig((32, 88)), num_frames=1, lidar=False, neighbours=wanted)[0]
     write_drive(root, [sample, *sample["neighbours"][:3]])
     return root
 
@@ -82,7 +82,7 @@ def test_the_nearest_come_first() -> None:
 # --- without neighbours -----------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def sample() -> dict[str, Any]:
-    return SyntheticDrive(demo_source_rig((128, 352)), num_frames=1, lidar=False)[0]
+    return SyntheticDrive(demo_source_rig((64, 176)), num_frames=1, lidar=False)[0]
 
 
 @pytest.mark.filterwarnings("ignore:target cameras")
@@ -91,7 +91,7 @@ def test_without_neighbours_nothing_of_fills_is_built_or_called(
     sample: dict[str, Any], surface: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither where a sample has none, nor where they are not wanted, nor where a list of them is empty."""
-    target = lowered(sample["rig"], (64, 176))
+    target = lowered(sample["rig"], (32, 88))
     expected = RigRetarget(target, surface=surface, neighbours=None)(sample)
     for module, names in ((stitching, ("plan_fills", "fill_views")), (fills, ("build_plan", "merged"))):
         for name in names:

@@ -118,7 +118,7 @@ def test_images_are_read_where_they_fill(root: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(
         nuscenes, "decode_images", lambda files, **of: read.extend(map(str, files)) or decode(files, **of)
     )
-    sample = NuScenesDataset(root, neighbours=EVERY).by_token("goes-sample-2")
+    sample = NuScenesDataset(root, neighbours=Neighbours()).by_token("goes-sample-2")
     assert len(read) == 6
     RigRetarget(sample["rig"])(sample)
     assert len(read) == 6  # nothing is missing
@@ -299,7 +299,7 @@ def test_a_camera_that_lost_images(tmp_path: Path) -> None:
         lost = [row["token"] for row in rows_of(data, "CAM_BACK") if not row["is_key_frame"]]
         data["sample_data"] = [row for row in data["sample_data"] if row["token"] not in lost]
 
-    dataset = NuScenesDataset(write(tmp_path, lose), neighbours=EVERY)
+    dataset = NuScenesDataset(write(tmp_path, lose), neighbours=Neighbours())
     sample = dataset.by_token("goes-sample-2")
     with pytest.warns(UserWarning, match=r"neighbour 'goes-CAM_FRONT-.*' is left out: .* CAM_BACK within 0.1 s"):
         RigRetarget(sample["rig"].turned(pitch_deg=-12))(sample)
