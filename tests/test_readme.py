@@ -12,7 +12,7 @@ from typing import get_args
 import pytest
 
 from arbiview_aug.__main__ import main
-from arbiview_aug.bench import trade
+from arbiview_aug.bench import neighbours, trade
 from arbiview_aug.bench.ablation import NOTES, ROWS, STEPS, markdown
 from arbiview_aug.bench.sweep import settings
 from arbiview_aug.evaluate import paper_tables
@@ -48,6 +48,7 @@ TINY = {
         *["--frames", "2", "--epochs", "1"],
     ],
     "bench scene --data FOLDER": ["--reduce", "4", "--repeats", "1", "--only", "p skips"],
+    "bench neighbours": ["--size", "32x88", "--repeats", "1", "--counts", "0", "1", "--surface", "street"],
     "bench device": ["--device", "cpu", "--sizes", "32x88", "--repeats", "1"],
     "bench speed --data FOLDER": ["--repeats", "1"],
     "bench speed": ["--repeats", "1"],
@@ -138,6 +139,14 @@ def test_the_trade_is_the_commands() -> None:
     assert {name for name, *_ in rows} <= known and sum(mark == "step" for _, mark, *_ in rows) >= 4
     assert trade.NOTES in block and block.count("kornia's warp_perspective") == 2
     assert re.search(r"^Recommended, the most accurate within 20 ms a frame: ", block, re.MULTILINE)
+
+
+def test_the_neighbours_table_is_the_commands() -> None:
+    (table,) = tables(measured("neighbours"))
+    names = [neighbours.row_name(surface, n) for surface in neighbours.NEEDS for n in neighbours.COUNTS]
+    assert table[0] == ["", *neighbours.COLUMNS] and [row[0] for row in table[2:]] == names
+    assert all(re.fullmatch(r"[\d.]+%?", cell) for row in table[2:] for cell in row[1:])
+    assert neighbours.NOTES in measured("neighbours")
 
 
 def test_the_papers_tables_are_the_commands() -> None:

@@ -13,10 +13,10 @@ from typing import Any, get_args
 import torch
 
 from arbiview_aug.command_line import REAL_TARGET
-from arbiview_aug.datasets import open_data
+from arbiview_aug.datasets import Neighbours, open_data
 from arbiview_aug.datasets.images import Reduce
 from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_source_rig, demo_target_rig
-from arbiview_aug.datasets.writing import write_frame
+from arbiview_aug.datasets.writing import write_drive, write_frame
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.frames import Frame, LidarReference, make_frame
 from arbiview_aug.evaluate.targets import without_masks
@@ -88,6 +88,19 @@ def recorded(data: str | Path | None, *, frames: int = 1, size: tuple[int, int] 
         for k in range(frames):
             write_frame(Path(folder) / f"{k:04}", drive[k])
         yield Recorded("synthetic streets", Path(folder), drive.render)
+
+
+@contextmanager
+def recorded_drive(data: str | Path | None, wanted: Neighbours, *, size: tuple[int, int]) -> Iterator[tuple[str, Path]]:
+    """Name and folder of a user's drive; or of a synthetic one, a frame with the neighbours that are wanted, as JPEGs
+    of ``size`` (h, w) in a temporary folder."""
+    if data is not None:
+        yield Path(data).resolve().name, Path(data)
+        return
+    sample = SyntheticDrive(demo_source_rig(size), num_frames=1, lidar=False, neighbours=wanted)[0]
+    with tempfile.TemporaryDirectory() as folder:
+        write_drive(Path(folder), [sample, *sample["neighbours"]])
+        yield "synthetic drive", Path(folder)
 
 
 def as_of_another_frame(sample: Mapping[str, Any]) -> dict[str, Any]:

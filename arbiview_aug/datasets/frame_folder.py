@@ -15,7 +15,7 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.camera import BoolArray, Camera
 from arbiview_aug.datasets.images import Reduce, check_reduce, decode_images, reduced_rig
-from arbiview_aug.datasets.sequence import Drive, LazyFrame, Neighbours, Unreadable
+from arbiview_aug.datasets.sequence import Drive, LazyFrame, Neighbours, Unreadable, check_neighbours, parts_of_clock
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError
 from arbiview_aug.rig import Rig, read_mask
 
@@ -69,6 +69,7 @@ class FrameFolder(Dataset[dict[str, Any]]):
         neighbours: Which other frames of the drive come with a frame; None for none.
 
     Raises:
+        TypeError: ``neighbours`` is something else.
         DataError: No frame under ``root``; on access, a file that is missing, broken or inconsistent.
         CalibrationError: On access, an impossible calibration, by camera.
     """
@@ -82,6 +83,7 @@ class FrameFolder(Dataset[dict[str, Any]]):
         neighbours: Neighbours | None = None,
     ) -> None:
         check_reduce(reduce)
+        check_neighbours(neighbours)
         self.root = Path(root)
         self.reduce = reduce
         self.load_points = load_points
@@ -90,6 +92,7 @@ class FrameFolder(Dataset[dict[str, Any]]):
         self._last_rig: tuple[str, Rig] | None = None
         self._times_s, order = _read_sequence(self.root, self._index)
         self.neighbours = neighbours
+        self._driven: list[str] = []
         self._drive = None if neighbours is None else self._find_drive(order)
 
     def __len__(self) -> int:
@@ -127,8 +130,10 @@ class FrameFolder(Dataset[dict[str, Any]]):
             sample["points"] = points
         sample |= self._in_ego_frame(calib, folder, where)
         if self._drive is not None and self.neighbours is not None:
-            near = self._drive.neighbours(folder.name, self.neighbours)
-            sample["neighbours"] = [self._neighbour(name) for name in near]
+            near = []
+            if folder.name in self._driven:
+                near = self._drive.neighbours(self._driven.index(folder.name), self.neighbours)
+            sample["neighbours"] = [self._neighbour(self._driven[k]) for k in near]
         return sample
 
     def _in_ego_frame(self, calib: Mapping[str, Any], folder: Path, where: str) -> dict[str, Any]:
@@ -155,8 +160,10 @@ class FrameFolder(Dataset[dict[str, Any]]):
             pose = _read_calibration(folder).get("ego2world")
             if pose is not None:
                 positions_m[name] = _pose(pose, str(folder / CALIBRATION_FILE)).numpy()[:3, 3]
-        timed = all(name in self._times_s for name in positions_m)
-        return Drive(positions_m, self._times_s if timed else None, str(self.root / SEQUENCE_FILE))
+        self._driven = list(positions_m)
+        timed = all(name in self._times_s for name in self._driven)
+        parts = parts_of_clock(self._driven, self._times_s if timed else None, str(self.root / SEQUENCE_FILE))
+        return Drive(np.array(list(positions_m.values())).reshape(-1, 3), parts)
 
     def _neighbour(self, name: str) -> Mapping[str, Any]:
         """What of a frame needs no decoding; what is broken is said where it is used."""

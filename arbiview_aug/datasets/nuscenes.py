@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch.utils.data import Dataset
 
 from arbiview_aug.camera import Camera, FloatArray
 from arbiview_aug.datasets.frame_folder import checked_points
 from arbiview_aug.datasets.images import Reduce, check_reduce, decode_images, reduced_rig
+from arbiview_aug.datasets.nuscenes_boxes import read_annotations
+from arbiview_aug.datasets.nuscenes_recordings import IntArray, read_recordings
 from arbiview_aug.datasets.nuscenes_tables import Row, Tables
-from arbiview_aug.errors import CalibrationError, DataError
+from arbiview_aug.datasets.sequence import Drive, LazyFrame, Neighbours, Unreadable, check_neighbours
+from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError
 from arbiview_aug.rig import Rig
 
 CAMERA_RING = (
@@ -28,46 +32,28 @@ CAMERA_RING = (
 )
 """The order of the cameras in a sample, clockwise from above; others follow by name."""
 
-LIDAR = "LIDAR_TOP"
-"""The sensor whose time and ego pose are the sample's."""
-
 _POINT_FLOATS = 5  # x y z intensity ring
-
-
-class _Recording(NamedTuple):
-    """One sensor's file of a keyframe."""
-
-    file: str
-    size: tuple[int, int]
-    calibrated_sensor: int  # row in Tables.sensor2ego
-    ego_pose: int  # row in Tables.ego2global
-
-
-class _Annotations(NamedTuple):
-    """All boxes, grouped by sample: those of sample k are rows first[k] to first[k + 1]."""
-
-    first: npt.NDArray[np.int64]
-    tokens: npt.NDArray[np.str_]
-    categories: list[str]
-    category: npt.NDArray[np.int64]
-    centers_m: FloatArray  # [B, 3], global frame
-    sizes_m: FloatArray  # [B, 3], width length height as nuScenes has them
-    rotations: FloatArray  # [B, 3, 3], box to global
 
 
 class NuScenesDataset(Dataset[dict[str, Any]]):
     """The keyframes of a nuScenes v1.0 data set, in the order of its ``sample`` table.
 
     A sample is a dict, everything in the ego frame at the LiDAR's time: ``images`` (N, 3, h, w) uint8 RGB; ``rig``;
-    ``K`` (N, 3, 3) and ``cam2ego`` (N, 4, 4) float64; ``token``, ``scene_token``; ``ego2world`` (4, 4) float64; with
-    ``load_points`` the ``points`` (P, 5) float32: x y z intensity ring; with ``load_boxes`` the ``boxes_3d`` (B, 7)
-    float32: centre, length, width, height in metres, yaw in radians, with ``box_names`` (categories) and
-    ``box_tokens``. The numbers of points and boxes vary: batch with ``batch_size=None`` or a ``collate_fn`` that keeps
-    them as lists.
+    ``K`` (N, 3, 3) and ``cam2ego`` (N, 4, 4) float64; ``token``, ``scene_token``; ``ego2world`` (4, 4) float64;
+    ``time_s``; with ``load_points`` the ``points`` (P, 5) float32: x y z intensity ring; with ``load_boxes`` the
+    ``boxes_3d`` (B, 9) float32: centre, length, width, height in metres, yaw in radians, velocity x y in m/s over the
+    ground (NaN where nobody knows), with ``box_names`` (categories) and ``box_tokens``. The numbers of points and boxes
+    vary: batch with ``batch_size=None`` or a ``collate_fn`` that keeps them as lists.
 
     Cameras and LiDAR record at different times. With ``compensate_ego_motion`` a camera's pose is where the camera was
     when it recorded, seen from the ego at the LiDAR's time: inv(ego2global at LiDAR time) @ ego2global at camera time
     @ calibrated_sensor. Without, it is the mounting alone, which at 9 m/s is 0.4 m away from the pixels.
+
+    With ``neighbours`` a sample also has other frames of its scene: keyframes, and sweeps, what the cameras recorded
+    between them. The first of ``channels`` decides which: its images in the order of their ``prev``, by the distance
+    that the vehicle came. A sweep has its time and ego pose, and of each other camera the image beside it, posed as
+    above; its boxes are those of the keyframes around it, moved to its time (``Annotations.at_time``). Images are
+    decoded when they are asked for.
 
     The ego's origin is on the road (``ground_z_m`` = 0). Boxes stand upright: roll and pitch of the ego (below 2
     degrees) are left out of their yaw.
@@ -82,8 +68,12 @@ class NuScenesDataset(Dataset[dict[str, Any]]):
         load_points: Whether to read the LiDAR's points.
         load_boxes: Whether to read the boxes.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size; the rig follows (see ``decode_images``).
+        neighbours: Which other frames of the drive come with a sample; None for none. Opening takes half as long
+            again: the sweeps' rows are read too. Where their files are missing altogether, with a warning, only
+            keyframes are neighbours.
 
     Raises:
+        TypeError: ``neighbours`` is something else.
         DataError: A table that is missing or malformed, a token that leads nowhere, unknown scenes or channels; on
             access, a file that is missing or broken.
     """
@@ -100,24 +90,29 @@ class NuScenesDataset(Dataset[dict[str, Any]]):
         load_points: bool = True,
         load_boxes: bool = True,
         reduce: Reduce = 1,
+        neighbours: Neighbours | None = None,
     ) -> None:
         check_reduce(reduce)
+        check_neighbours(neighbours)
         tables = Tables(root, version, nusc)
         self.root = tables.root
         self.compensate_ego_motion = compensate_ego_motion
         self.load_points = load_points
         self.reduce = reduce
+        self.neighbours = neighbours
         samples = _chosen_samples(tables, split_scenes)
         self.tokens: list[str] = [row["token"] for row in samples]
         self._scene_tokens: list[str] = [row["scene_token"] for row in samples]
         self._index = {token: k for k, token in enumerate(self.tokens)}
-        self._sensor2ego, self._K, self._frames, self._ego2global = _recordings(tables, self._index)
+        scene = {token: k for k, token in enumerate(dict.fromkeys(self._scene_tokens))}
+        scenes = [scene[token] for token in self._scene_tokens]
         self.channels = _chosen_channels(tables, channels)
-        for token, frame in zip(self.tokens, self._frames, strict=True):
-            missing = [channel for channel in (*self.channels, LIDAR) if channel not in frame]
-            if missing:
-                raise tables.error("sample_data", f"keyframes of {', '.join(missing)} for sample {token}", "none")
-        self._annotations = _annotations(tables, self._index) if load_boxes else None
+        self._recordings = read_recordings(tables, self._index, scenes, self.channels, neighbours is not None)
+        times_s = self._recordings.time_s(self._recordings.keyframes[:, -1])
+        self._annotations = read_annotations(tables, self._index, times_s, np.array(scenes)) if load_boxes else None
+        self._driven = np.empty(0, np.int64) if neighbours is None else self._with_files()
+        positions_m = self._recordings.ego2global(self._driven)[:, :3, 3]
+        self._drive = Drive(positions_m, self._recordings.parts[self._driven])
 
     def __len__(self) -> int:
         return len(self.tokens)
@@ -137,47 +132,97 @@ class NuScenesDataset(Dataset[dict[str, Any]]):
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         index = range(len(self))[index]  # IndexError, and negative indices
-        frame = self._frames[index]
-        ego2global = self._ego2global[frame[LIDAR].ego_pose]
-        global2ego = _inverse(ego2global)
-        rig = self._rig(frame, global2ego)
-        recordings = [frame[channel] for channel in self.channels]
+        recordings = self._recordings
+        cameras, lidar = recordings.keyframes[index, :-1], recordings.keyframes[index, -1]
+        ego2global = recordings.ego2global(lidar)
+        rig = self._rig(cameras, ego2global)
         sample: dict[str, Any] = {
-            "images": decode_images(
-                [self.root / recording.file for recording in recordings],
-                names=self.channels,
-                sizes=[recording.size for recording in recordings],
-                reduce=self.reduce,
-            ),
+            "images": self._images(cameras),
             "rig": rig,
             "K": torch.from_numpy(rig.K),
             "cam2ego": torch.from_numpy(rig.cam2ego),
-            "ego2world": torch.from_numpy(ego2global.copy()),
+            "ego2world": torch.from_numpy(ego2global),
+            "time_s": float(recordings.time_s(lidar)),
             "token": self.tokens[index],
             "scene_token": self._scene_tokens[index],
         }
         if self.load_points:
-            lidar = frame[LIDAR]
-            sample["points"] = _read_points(self.root / lidar.file, self._sensor2ego[lidar.calibrated_sensor])
+            sensor2ego = recordings.sensor2ego[recordings.rows["sensor"][lidar]]
+            sample["points"] = _read_points(self.root / recordings.file(lidar), sensor2ego)
         if self._annotations is not None:
-            sample |= _boxes(self._annotations, index, global2ego)
+            boxes = self._annotations.rows(index)
+            sample["boxes_3d"] = torch.from_numpy(self._annotations.at_sample(index, _inverse(ego2global)))
+            sample["box_names"] = [self._annotations.categories[k] for k in self._annotations.category[boxes]]
+            sample["box_tokens"] = [token.decode() for token in self._annotations.tokens[boxes].tolist()]
+        if self.neighbours is not None:
+            place = int(np.searchsorted(self._driven, cameras[0]))
+            near = self._drive.neighbours(place, self.neighbours)
+            sample["neighbours"] = [self._neighbour(int(self._driven[k])) for k in near]
         return sample
 
-    def _rig(self, frame: Mapping[str, _Recording], global2ego: FloatArray) -> Rig:
-        cameras = []
-        for channel in self.channels:
-            recording = frame[channel]
-            cam2ego = self._sensor2ego[recording.calibrated_sensor]
+    def _rig(self, cameras: IntArray, ego2global: FloatArray) -> Rig:
+        """The cameras as rows of the recordings, seen from an ego pose."""
+        recordings, global2ego, found = self._recordings, _inverse(ego2global), []
+        moved = global2ego @ recordings.ego2global(cameras)
+        for channel, row, own2ego in zip(self.channels, cameras, moved, strict=True):
+            sensor = recordings.rows["sensor"][row]
+            cam2ego, K = recordings.sensor2ego[sensor], recordings.K[sensor]
             if self.compensate_ego_motion:
-                cam2ego = global2ego @ self._ego2global[recording.ego_pose] @ cam2ego
-            height_px, width_px = recording.size
-            K = self._K[recording.calibrated_sensor]
+                cam2ego = own2ego @ cam2ego
+            height_px, width_px = recordings.size(row)
             try:
                 camera = Camera(name=channel, width_px=width_px, height_px=height_px, K=K, cam2ego=cam2ego)
             except CalibrationError as error:
-                raise CalibrationError(f"nuScenes {self.root}: image {recording.file}: {error}") from None
-            cameras.append(camera)
-        return reduced_rig(Rig(cameras, ground_z_m=0.0, name="nuscenes"), self.reduce)
+                raise CalibrationError(f"nuScenes {self.root}: image {recordings.file(row)}: {error}") from None
+            found.append(camera)
+        return reduced_rig(Rig(found, ground_z_m=0.0, name="nuscenes"), self.reduce)
+
+    def _images(self, cameras: IntArray) -> torch.Tensor | list[torch.Tensor]:
+        return decode_images(
+            [self.root / self._recordings.file(row) for row in cameras],
+            names=self.channels,
+            sizes=[self._recordings.size(row) for row in cameras],
+            reduce=self.reduce,
+        )
+
+    # --- other frames of the drive ------------------------------------------------------------------------------------
+    def _with_files(self) -> IntArray:
+        """The first camera's recordings that can be neighbours: all, or where sweeps were not copied, keyframes."""
+        recordings = self._recordings
+        own, key = np.arange(len(recordings.tokens)), recordings.rows["key"]
+        sweeps = np.flatnonzero(~key)
+        _, of_channels = np.unique(recordings.rows["channel"][sweeps], return_index=True)
+        for row in sweeps[of_channels]:
+            folder = (self.root / recordings.file(row)).parent
+            if not folder.is_dir():
+                warnings.warn(f"nuScenes: {folder}: found no sweeps: only keyframes are neighbours", stacklevel=3)
+                return own[key[own]]
+        return own
+
+    def _neighbour(self, row: int) -> LazyFrame:
+        """What of another frame needs no decoding; what is broken is said where it is used."""
+        recordings, record = self._recordings, self._recordings.rows[row]
+        sample, is_keyframe = int(record["sample"]), recordings.is_keyframe(row)
+        moment = int(recordings.keyframes[sample, -1]) if is_keyframe else row
+        ego2global, time_s = recordings.ego2global(moment), float(recordings.time_s(moment))
+        known: dict[str, Any] = {
+            "token": self.tokens[sample] if is_keyframe else recordings.tokens[row].decode(),
+            "time_s": time_s,
+            "ego2world": torch.from_numpy(ego2global),
+        }
+        try:
+            cameras = recordings.around(row)
+            known["rig"] = self._rig(cameras, ego2global)
+        except ArbiviewError as error:
+            return Unreadable(known, error)
+        if self._annotations is not None:
+            global2ego = _inverse(ego2global)
+            if is_keyframe:
+                boxes = self._annotations.at_sample(sample, global2ego)
+            else:
+                boxes = self._annotations.at_time(int(record["scene"]), time_s, global2ego)
+            known["boxes_3d"] = torch.from_numpy(boxes)
+        return LazyFrame(known, partial(self._images, cameras))
 
 
 def _inverse(pose: FloatArray) -> FloatArray:
@@ -218,100 +263,6 @@ def _chosen_channels(tables: Tables, channels: Sequence[str] | None) -> list[str
         known, got = (", ".join(names) or "none" for names in (sorted(cameras), map(repr, unknown)))
         raise DataError(f"nuScenes {tables.root}: channels: expected some of {known}, got {got}")
     return chosen
-
-
-def _recordings(
-    tables: Tables, index: Mapping[str, int]
-) -> tuple[FloatArray, FloatArray, list[dict[str, _Recording]], FloatArray]:
-    """sensor2ego (C, 4, 4), K (C, 3, 3), each sample's recordings by channel, ego2global (E, 4, 4).
-
-    The sweeps between the keyframes, nine tenths of two tables, are dropped here.
-    """
-    sensors = tables.by_token("sensor")
-    wanted_sensors = {
-        token for token, row in sensors.items() if row.get("modality") == "camera" or row.get("channel") == LIDAR
-    }
-    calibrated: dict[str, int] = {}
-    rows: list[Row] = []
-    channels: list[str] = []
-    for row in tables.rows("calibrated_sensor"):
-        sensor = tables.follow("calibrated_sensor", row, "sensor_token", "sensor", sensors)
-        # Radars are calibrated too: known, so that their tokens are no dangling ones, but not read.
-        wanted = row["sensor_token"] in wanted_sensors
-        calibrated[tables.value("calibrated_sensor", row, "token")] = len(rows) if wanted else -1
-        if wanted:
-            rows.append(row)
-            channels.append(tables.value("sensor", sensor, "channel"))
-    sensor2ego = tables.poses("calibrated_sensor", rows)
-    K = np.tile(np.eye(3), (len(rows), 1, 1))
-    cameras = [k for k, row in enumerate(rows) if sensors[row["sensor_token"]].get("modality") == "camera"]
-    camera_rows = [rows[k] for k in cameras]
-    K[cameras] = tables.numbers("calibrated_sensor", camera_rows, "camera_intrinsic", (3, 3))
-
-    frames: list[dict[str, _Recording]] = [{} for _ in index]
-    ego_poses: dict[str, int] = {}
-    for row in tables.rows("sample_data"):
-        if not row.get("is_key_frame"):
-            continue
-        k = index.get(tables.value("sample_data", row, "sample_token"))
-        if k is None:
-            continue  # of a scene that was not chosen
-        c = tables.follow("sample_data", row, "calibrated_sensor_token", "calibrated_sensor", calibrated)
-        if c < 0:
-            continue
-        height_px, width_px = row.get("height") or 0, row.get("width") or 0  # none for the LiDAR
-        ego_pose = ego_poses.setdefault(tables.value("sample_data", row, "ego_pose_token"), len(ego_poses))
-        file = tables.value("sample_data", row, "filename")
-        frames[k][channels[c]] = _Recording(file, (height_px, width_px), c, ego_pose)
-
-    found = {row["token"]: row for row in tables.rows("ego_pose") if row.get("token") in ego_poses}
-    dangling = next((token for token in ego_poses if token not in found), None)
-    if dangling is not None:
-        raise tables.error("ego_pose", f"the token {dangling!r} that a row of sample_data names", "none")
-    return sensor2ego, K, frames, tables.poses("ego_pose", [found[token] for token in ego_poses])
-
-
-def _annotations(tables: Tables, index: Mapping[str, int]) -> _Annotations:
-    """As arrays: a million rows as dicts would be copied into every worker, page by page."""
-    categories = tables.by_token("category")
-    names = sorted({tables.value("category", row, "name") for row in categories.values()})
-    number = {name: k for k, name in enumerate(names)}
-    category_of = {
-        token: number[tables.follow("instance", row, "category_token", "category", categories)["name"]]
-        for token, row in tables.by_token("instance").items()
-    }
-    table = "sample_annotation"
-    rows = [row for row in tables.rows(table) if tables.value(table, row, "sample_token") in index]
-    sample = np.array([index[row["sample_token"]] for row in rows], dtype=np.int64)
-    category = [tables.follow(table, row, "instance_token", "instance", category_of) for row in rows]
-    order = np.argsort(sample, kind="stable")
-    sizes_m = tables.numbers(table, rows, "size", (3,))
-    for k in np.flatnonzero((sizes_m <= 0).any(axis=1))[:1]:
-        raise tables.error(table, "sizes above 0", f"{sizes_m[k].tolist()} in row {rows[k].get('token')!r}")
-    return _Annotations(
-        first=np.searchsorted(sample[order], np.arange(len(index) + 1)),
-        tokens=np.array([tables.value(table, row, "token") for row in rows], dtype=np.str_)[order],
-        categories=names,
-        category=np.array(category, dtype=np.int64)[order],
-        centers_m=tables.numbers(table, rows, "translation", (3,))[order],
-        sizes_m=sizes_m[order],
-        rotations=tables.rotations(table, rows)[order],
-    )
-
-
-def _boxes(annotations: _Annotations, index: int, global2ego: FloatArray) -> dict[str, Any]:
-    own = slice(annotations.first[index], annotations.first[index + 1])
-    R = global2ego[:3, :3]
-    centers_m = annotations.centers_m[own] @ R.T + global2ego[:3, 3]  # [B, 3]
-    heading = (R @ annotations.rotations[own])[:, :2, 0]  # [B, 2], the box's length axis in the ego's x-y plane
-    yaw = np.arctan2(heading[:, 1], heading[:, 0])
-    length_width_height_m = annotations.sizes_m[own][:, [1, 0, 2]]
-    boxes = np.concatenate([centers_m, length_width_height_m, yaw[:, None]], axis=1)
-    return {
-        "boxes_3d": torch.from_numpy(boxes.astype(np.float32)),
-        "box_names": [annotations.categories[k] for k in annotations.category[own]],
-        "box_tokens": annotations.tokens[own].tolist(),
-    }
 
 
 def _read_points(path: Path, sensor2ego: FloatArray) -> torch.Tensor:

@@ -1,11 +1,13 @@
-"""The nuScenes v1.0 tables as lists of rows, and errors that say which table, token and file is at fault."""
+"""The nuScenes v1.0 tables, read a part at a time, and errors that say which table, token and file is at fault."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -13,6 +15,14 @@ from arbiview_aug.camera import FloatArray
 from arbiview_aug.errors import DataError, SampleTypeError
 
 _QUATERNION_NORM_TOLERANCE = 1e-3
+
+_BATCH = 1 << 12
+"""Rows in memory at once, 6 MB of them: the largest tables have 2.6 million."""
+
+_BLOCK, _LONGEST_ROW = 1 << 20, 1 << 16
+"""Characters read at once, and more than a row has: it is never cut where a block ends."""
+
+_SPACE, _DELIMITER = re.compile(r"\s*"), re.compile(r"\s*([,\]])\s*")
 
 Row = Mapping[str, Any]
 
@@ -53,24 +63,39 @@ class Tables:
         self.root, self.version = Path(nusc.dataroot), str(getattr(nusc, "version", version))
 
     def rows(self, table: str) -> list[Row]:
-        """All rows of a table."""
+        """All rows of a small table."""
+        return [row for batch in self.batches(table) for row in batch]
+
+    def batches(self, table: str) -> Iterator[list[Row]]:
+        """The rows of a table, some thousand at a time.
+
+        Raises:
+            DataError: It is missing, or no JSON list of objects.
+        """
         if self.nusc is not None:
             rows = getattr(self.nusc, table, None)
             if rows is None:
                 raise self.error(table, "a list of rows", "no such attribute of the NuScenes object")
-            return list(rows)
+            rows = list(rows)
+            yield from (rows[k : k + _BATCH] for k in range(0, len(rows), _BATCH))
+            return
         path = self.root / self.version / f"{table}.json"
         try:
             with path.open(encoding="utf-8") as file:
-                rows = json.load(file)
+                entries = _entries(file)
+                while batch := list(islice(entries, _BATCH)):
+                    wrong = next((row for row in batch if not isinstance(row, dict)), None)
+                    if wrong is not None:
+                        raise self.error(table, "a list of objects", f"an entry {type(wrong).__name__}")
+                    yield batch
         except FileNotFoundError:
             fix = "the version's metadata archive has it"
             raise self.error(table, f"the file {path}", "none", fix) from None
+        except _NoListError as error:
+            raise self.error(table, "a list of objects", str(error)) from None
         except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-            raise self.error(table, "JSON", str(error), "unpack the archive again") from None
-        if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-            raise self.error(table, "a list of objects", type(rows).__name__)
-        return rows
+            # Without its place: it is counted from where a block begins.
+            raise self.error(table, "JSON", getattr(error, "msg", str(error)), "unpack the archive again") from None
 
     def by_token(self, table: str) -> dict[str, Row]:
         """A table's rows by their tokens."""
@@ -117,13 +142,17 @@ class Tables:
         return poses
 
     def rotations(self, table: str, rows: Sequence[Row]) -> FloatArray:
-        """(len(rows), 3, 3) from the column ``rotation``, quaternions w x y z."""
+        """(len(rows), 3, 3) from the column ``rotation``."""
+        return rotation_from_quaternion(self.quaternions(table, rows))
+
+    def quaternions(self, table: str, rows: Sequence[Row]) -> FloatArray:
+        """(len(rows), 4) w x y z from the column ``rotation``."""
         quaternions = self.numbers(table, rows, "rotation", (4,))
         bad = np.flatnonzero(np.abs(np.linalg.norm(quaternions, axis=-1) - 1) > _QUATERNION_NORM_TOLERANCE)
         if len(bad):
             row = rows[int(bad[0])]
             raise self.error(table, "unit quaternions w x y z", f"{row['rotation']} in row {row.get('token')!r}")
-        return rotation_from_quaternion(quaternions)
+        return quaternions
 
     def error(self, table: str, expected: str, got: str, fix: str = "") -> DataError:
         """An error to raise that names data set, version and table."""
@@ -141,3 +170,31 @@ def rotation_from_quaternion(wxyz: Any) -> FloatArray:
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+class _NoListError(ValueError):
+    """A file holds JSON, but no list; it says what."""
+
+
+def _entries(file: TextIO) -> Iterator[Any]:
+    """The entries of a JSON list, one by one: a table of a gigabyte is never whole in memory."""
+    decode = json.JSONDecoder().raw_decode
+    text, ended = file.read(_BLOCK), False
+    at = _SPACE.match(text).end()  # type: ignore[union-attr]  # it matches nothing, too
+    if not text.startswith("[", at):
+        raise _NoListError(type(json.loads(text + file.read())).__name__)
+    at = _SPACE.match(text, at + 1).end()  # type: ignore[union-attr]
+    if text.startswith("]", at):
+        return
+    while True:
+        if len(text) - at < _LONGEST_ROW and not ended:
+            block = file.read(_BLOCK)
+            text, at, ended = text[at:] + block, 0, not block
+        entry, at = decode(text, at)
+        yield entry
+        delimiter = _DELIMITER.match(text, at)
+        if delimiter is None:
+            raise json.JSONDecodeError("Expecting ',' delimiter", text, at)
+        if delimiter[1] == "]":
+            return
+        at = delimiter.end()

@@ -21,7 +21,7 @@ def open_data(
     Args:
         folder: A frame folder, a folder of such folders, or a nuScenes root.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size.
-        neighbours: Which other frames of the drive come with a frame; None for none.
+        neighbours: Which other frames of the drive come with a sample; None for none.
 
     Raises:
         DataError: Neither.
@@ -38,4 +38,4 @@ def open_data(
             "(with a folder of tables such as v1.0-mini), found neither"
         )
     version = next((v for v in _NUSCENES_VERSIONS if v in versions), versions[0])
-    return NuScenesDataset(root, version, reduce=reduce)
+    return NuScenesDataset(root, version, reduce=reduce, neighbours=neighbours)

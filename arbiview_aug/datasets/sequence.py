@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from arbiview_aug.camera import FloatArray
 from arbiview_aug.errors import ArbiviewError
+from arbiview_aug.neighbours import STILL_M
 
 Direction = Literal["both", "past", "future"]
 
@@ -67,40 +70,62 @@ class Neighbours:
         return found
 
 
-class Drive:
-    """The order of a drive's frames, and how far the vehicle came from one to the next.
+def check_neighbours(value: Any) -> None:
+    """Refuse what is neither ``Neighbours`` nor None, with TypeError."""
+    if value is not None and not isinstance(value, Neighbours):
+        raise TypeError(f"neighbours: expected Neighbours or None, got {type(value).__name__}")
 
-    Where the clock goes back, with a warning, what is before and what is after are no neighbours.
+
+class Drive:
+    """How far a vehicle came, frame by frame.
 
     Args:
-        positions_m: (3,) of the vehicle in the world, by frame, in the order of the drive.
+        positions_m: (F, 3) of the vehicle in the world, in the order in which the frames were recorded.
+        parts: (F,) whole numbers that never fall: frames of different ones are no neighbours.
+    """
+
+    def __init__(self, positions_m: FloatArray, parts: npt.NDArray[np.int64]) -> None:
+        self._travelled_m, self._parts = travelled_m(positions_m), parts
+
+    def neighbours(self, index: int, wanted: Neighbours) -> list[int]:
+        """The neighbours of one frame, by their numbers."""
+        part = self._parts[index]
+        first, end = (int(k) for k in np.searchsorted(self._parts, [part, part + 1]))
+        return [first + k for k in wanted.picked(self._travelled_m[first:end], index - first)]
+
+
+def travelled_m(positions_m: FloatArray) -> FloatArray:
+    """(F,) distance along a drive; what a vehicle's poses (F, 3) waver by while it stands is none."""
+    total, found = 0.0, []
+    there: list[float] | None = None
+    for here in positions_m.tolist():
+        step_m = 0.0 if there is None else math.dist(there, here)
+        if there is None or step_m >= STILL_M:
+            there, total = here, total + step_m
+        found.append(total)
+    return np.array(found)
+
+
+def parts_of_clock(names: Sequence[str], times_s: Mapping[str, float] | None, where: str) -> npt.NDArray[np.int64]:
+    """(F,) parts of a drive: where the clock goes back, with a warning, another one begins.
+
+    Args:
+        names: Its frames, in their order.
         times_s: Seconds by frame, or None.
         where: Named in the warning.
     """
+    parts = [0] * len(names)
+    for k, (one, two) in enumerate(pairwise(names), 1):
+        goes_back = times_s is not None and times_s[two] <= times_s[one]
+        parts[k] = parts[k - 1] + goes_back
+        if goes_back:
+            warnings.warn(went_back(where, one, two), stacklevel=4)
+    return np.array(parts, np.int64)
 
-    def __init__(self, positions_m: Mapping[str, FloatArray], times_s: Mapping[str, float] | None, where: str) -> None:
-        self._names = list(positions_m)
-        steps_m, part = [0.0], [0]
-        for one, two in pairwise(self._names):
-            goes_back = times_s is not None and times_s[two] <= times_s[one]
-            steps_m.append(float(np.linalg.norm(positions_m[two] - positions_m[one])))
-            part.append(part[-1] + goes_back)
-            if goes_back:
-                message = (
-                    f"{where}: the clock goes back from frame {one!r} to {two!r}: neither is the other's neighbour"
-                )
-                warnings.warn(message, stacklevel=4)
-        self._travelled_m, self._part = np.cumsum(steps_m), np.array(part)
-        self._index = {name: k for k, name in enumerate(self._names)}
 
-    def neighbours(self, name: str, wanted: Neighbours) -> list[str]:
-        """The neighbours of one frame; none of a frame that is not of the drive."""
-        if name not in self._index:
-            return []
-        index = self._index[name]
-        own = np.flatnonzero(self._part == self._part[index])
-        near = wanted.picked(self._travelled_m[own], index - int(own[0]))
-        return [self._names[own[k]] for k in near]
+def went_back(where: str, one: str, two: str) -> str:
+    """What to say of a clock that goes back from one frame to the next."""
+    return f"{where}: the clock goes back from frame {one!r} to {two!r}: neither is the other's neighbour"
 
 
 class LazyFrame(Mapping[str, Any]):

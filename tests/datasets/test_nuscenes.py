@@ -70,7 +70,7 @@ def tables() -> Tables:
             token = f"{sensor}-{k}"
             folder = {"front": "CAM_FRONT", "rear": "CAM_BACK"}.get(sensor, sensor)
             row = {"token": token, "sample_token": f"t{k}", "ego_pose_token": token, "is_key_frame": True}
-            row |= {"calibrated_sensor_token": f"cs-{sensor}", "width": 64, "height": 48}
+            row |= {"calibrated_sensor_token": f"cs-{sensor}", "width": 64, "height": 48, "timestamp": k * 500_000}
             row["filename"] = f"samples/{folder}/{k}.{'bin' if sensor in ('lidar', 'radar') else 'png'}"
             data["sample_data"].append(row)
             y = 49.5 if sensor == "front" else 50.0
@@ -119,7 +119,8 @@ def test_the_sample(tmp_path: Path) -> None:
     np.testing.assert_array_equal(sample["K"], sample["rig"].K)
     np.testing.assert_array_equal(sample["cam2ego"], sample["rig"].cam2ego)
     np.testing.assert_allclose(sample["points"], [[10, -2, 1.6, 7, 3], [5, 0, 1.6, 1, 2]], atol=1e-6)
-    np.testing.assert_allclose(sample["boxes_3d"], [[10, -2, 0.8, 4.5, 1.9, 1.6, 0]], atol=1e-5)
+    np.testing.assert_allclose(sample["boxes_3d"], [[10, -2, 0.8, 4.5, 1.9, 1.6, 0, np.nan, np.nan]], atol=1e-5)
+    assert sample["time_s"] == 0 and dataset[1]["time_s"] == 0.5
     assert sample["box_names"] == ["vehicle.car"] and sample["box_tokens"] == ["a0"]
     np.testing.assert_allclose(sample["ego2world"] @ torch.tensor([1.0, 0, 0, 1]).double(), [100, 51, 0, 1], atol=1e-9)
 
@@ -144,17 +145,17 @@ def test_lookup_scenes_channels_and_switches(tmp_path: Path) -> None:
         assert part.tokens == ["t1"] and part[0]["box_tokens"] == ["a1"]
     bare = NuScenesDataset(tmp_path, channels=["CAM_BACK"], load_points=False, load_boxes=False, reduce=2)
     sample = bare[0]
-    assert sorted(sample) == ["K", "cam2ego", "ego2world", "images", "rig", "scene_token", "token"]
+    assert sorted(sample) == ["K", "cam2ego", "ego2world", "images", "rig", "scene_token", "time_s", "token"]
     assert sample["images"].shape == (1, 3, 24, 32) and sample["rig"].sizes == [(24, 32)]
     assert NuScenesDataset(tmp_path, channels=["CAM_BACK", "CAM_FRONT"])[0]["rig"].names == ["CAM_BACK", "CAM_FRONT"]
 
 
 def test_a_keyframe_without_boxes(tmp_path: Path) -> None:
     dataset = NuScenesDataset(write(tmp_path, lambda data: data["sample_annotation"].pop(0)))
-    assert dataset[0]["boxes_3d"].shape == (0, 7) and dataset[0]["box_names"] == []
+    assert dataset[0]["boxes_3d"].shape == (0, 9) and dataset[0]["box_names"] == []
     assert dataset[1]["box_tokens"] == ["a1"]
     write(tmp_path / "none", lambda data: data["sample_annotation"].clear())
-    assert NuScenesDataset(tmp_path / "none")[1]["boxes_3d"].shape == (0, 7)
+    assert NuScenesDataset(tmp_path / "none")[1]["boxes_3d"].shape == (0, 9)
 
 
 @pytest.mark.parametrize("workers", [0, 2])
@@ -173,8 +174,9 @@ def test_a_devkit_object(tmp_path: Path) -> None:
     nusc = SimpleNamespace(dataroot=str(tmp_path), version="v1.0-mini", get=lambda table, token: None, **data)
     ours, theirs = NuScenesDataset(tmp_path)[1], NuScenesDataset(nusc=nusc)[1]
     assert ours["rig"] == theirs["rig"] and ours["box_tokens"] == theirs["box_tokens"]
-    for key in ("images", "points", "boxes_3d", "ego2world"):
+    for key in ("images", "points", "ego2world"):
         assert torch.equal(ours[key], theirs[key])
+    np.testing.assert_array_equal(ours["boxes_3d"], theirs["boxes_3d"])
 
 
 def test_quaternions_agree_with_kornia() -> None:

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from arbiview_aug import DataError, Rig, RigRetarget
-from arbiview_aug.datasets import FrameFolder, LazyFrame, Neighbours
-from arbiview_aug.datasets.sequence import Drive
+from arbiview_aug.datasets import FrameFolder, LazyFrame, Neighbours, NuScenesDataset
+from arbiview_aug.datasets.sequence import Drive, parts_of_clock, travelled_m
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.datasets.writing import write_frame
+from arbiview_aug.datasets.writing import write_drive
 
 SIZE = (64, 176)
 
@@ -41,18 +41,32 @@ def test_settings_are_checked(bad: dict) -> None:
 
 
 def test_standing_still_has_no_neighbours() -> None:
-    drive = Drive({name: np.zeros(3) for name in "abc"}, None, "here")
-    assert drive.neighbours("b", Neighbours()) == []
-    assert drive.neighbours("elsewhere", Neighbours()) == []
+    """Though its poses waver: their steps alone would add up to 4 m."""
+    positions_m = 0.005 * np.random.default_rng(0).standard_normal((500, 3))
+    assert np.linalg.norm(np.diff(positions_m, axis=0), axis=1).sum() > 4
+    drive = Drive(positions_m, np.zeros(500, np.int64))
+    assert drive.neighbours(250, Neighbours()) == []
+
+
+def test_travel_is_counted_in_small_steps_too() -> None:
+    """A crawl of 1 cm a frame, on a bend."""
+    angle = np.arange(0, np.pi / 2, 0.001)
+    travelled = travelled_m(10 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1))
+    assert abs(travelled - 10 * angle).max() < 0.11 and (np.diff(travelled) >= 0).all()
 
 
 def test_nothing_is_a_neighbour_across_a_clock_that_goes_back() -> None:
-    positions_m = {name: np.array([k, 0.0, 0.0]) for k, name in enumerate("abcdef")}
     times_s = dict(zip("abcdef", [0.0, 1.0, 2.0, 0.5, 1.5, 2.5], strict=True))
     with pytest.warns(UserWarning, match="here: the clock goes back from frame 'c' to 'd'"):
-        drive = Drive(positions_m, times_s, "here")
-    wanted = Neighbours(step_m=1.0, count=9)
-    assert drive.neighbours("c", wanted) == ["b", "a"] and drive.neighbours("e", wanted) == ["d", "f"]
+        parts = parts_of_clock("abcdef", times_s, "here")
+    drive, wanted = Drive(np.arange(6.0)[:, None] * [1, 0, 0], parts), Neighbours(step_m=1.0, count=9)
+    assert drive.neighbours(2, wanted) == [1, 0] and drive.neighbours(4, wanted) == [3, 5]
+
+
+@pytest.mark.parametrize("reader", [FrameFolder, NuScenesDataset])
+def test_another_type_is_refused(reader: type, tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="neighbours: expected Neighbours or None, got int"):
+        reader(tmp_path, neighbours=2)
 
 
 def test_a_lazy_frame_decodes_once_and_only_when_asked() -> None:
@@ -94,14 +108,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("drive")
     rig = demo_source_rig(SIZE)
     sample = SyntheticDrive(rig, num_frames=1, lidar=False, neighbours=Neighbours(step_m=1.3))[0]
-    before, after = sample["neighbours"]
-    for name, frame in (("000", before), ("001", sample), ("002", after)):
-        write_frame(root / name, dict(frame))
-        calib = json.loads((root / name / "calib.json").read_text())
-        calib["ego2world"] = frame["ego2world"].tolist()
-        (root / name / "calib.json").write_text(json.dumps(calib))
-    times = [{"name": f"{k:03}", "time_s": 0.1 * k} for k in range(3)]
-    (root / "sequence.json").write_text(json.dumps({"frames": times}))
+    write_drive(root, [sample, *sample["neighbours"]])
     return root
 
 
@@ -113,7 +120,7 @@ def test_folders_fill_the_road(recorded: Path) -> None:
     folder = FrameFolder(recorded, neighbours=Neighbours())
     assert [len(folder[k]["neighbours"]) for k in range(3)] == [1, 2, 1]
     sample = folder[1]
-    assert sample["time_s"] == pytest.approx(0.1) and [n["token"] for n in sample["neighbours"]] == ["000", "002"]
+    assert sample["time_s"] == 0 and [n["token"] for n in sample["neighbours"]] == ["0000", "0002"]
     out = RigRetarget(low(sample["rig"]), outputs=("source_frame",))(sample)
     alone = RigRetarget(low(sample["rig"]), neighbours=None)(sample)
     gained = out["coverage"] & ~alone["coverage"]
@@ -124,18 +131,18 @@ def test_folders_fill_the_road(recorded: Path) -> None:
 def test_a_broken_neighbour_is_named_and_left_out(recorded: Path, tmp_path: Path, broken: str) -> None:
     root = tmp_path / "drive"
     shutil.copytree(recorded, root)
-    victim = next((root / "002").glob("*.png"), None) or next((root / "002").glob("*.jpg"))
+    victim = next((root / "0002").glob("*.png"), None) or next((root / "0002").glob("*.jpg"))
     if broken == "image":
         victim.unlink()
     elif broken == "corrupt":
         victim.write_bytes(victim.read_bytes()[:200])
     folder = FrameFolder(root, neighbours=Neighbours())
     if broken == "calibration":
-        calib = json.loads((root / "002" / "calib.json").read_text())
+        calib = json.loads((root / "0002" / "calib.json").read_text())
         calib["cameras"][0]["K"] = [[0, 0, 0]] * 3
-        (root / "002" / "calib.json").write_text(json.dumps(calib))
+        (root / "0002" / "calib.json").write_text(json.dumps(calib))
     retarget, sample = RigRetarget(low(folder[1]["rig"]), outputs=("source_frame",)), folder[1]
-    with pytest.warns(UserWarning, match="neighbour '002' is left out: .*rendered without it"):
+    with pytest.warns(UserWarning, match="neighbour '0002' is left out: .*rendered without it"):
         out = retarget(sample)
     assert set(out["source_frame"].unique().tolist()) == {-1, 0, 1}
 
@@ -144,10 +151,10 @@ def test_a_broken_neighbour_is_named_and_left_out(recorded: Path, tmp_path: Path
     ("text", "why"),
     [
         ("[]", "expected {'frames'"),
-        ('{"frames": ["000", "nowhere"]}', "got 'nowhere'"),
-        ('{"frames": ["000", "000"]}', "each frame once"),
-        ('{"frames": [{"name": "000", "time_s": "soon"}]}', "ValueError"),
-        ('{"frames": [{"name": "000", "time_s": NaN}]}', "finite number"),
+        ('{"frames": ["0000", "nowhere"]}', "got 'nowhere'"),
+        ('{"frames": ["0000", "0000"]}', "each frame once"),
+        ('{"frames": [{"name": "0000", "time_s": "soon"}]}', "ValueError"),
+        ('{"frames": [{"name": "0000", "time_s": NaN}]}', "finite number"),
     ],
 )
 def test_a_wrong_sequence_is_refused(recorded: Path, tmp_path: Path, text: str, why: str) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from arbiview_aug.camera import Camera
-from arbiview_aug.datasets.sequence import LazyFrame, Neighbours
+from arbiview_aug.datasets.sequence import LazyFrame, Neighbours, check_neighbours
 from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, cast, find_candidates, scene_from
 from arbiview_aug.datasets.synthetic.render import Renderer, stack_or_list
 from arbiview_aug.datasets.synthetic.scene import Material, Scene, SceneClass
@@ -76,7 +76,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         device: Where to render; what is returned lies on the CPU. Two kinds of device agree to rounding, not in bits.
 
     Raises:
-        TypeError: ``rig`` is not a ``Rig``.
+        TypeError: ``rig`` is not a ``Rig``, or ``neighbours`` something else.
         ValueError: A count or seed out of range.
     """
 
@@ -95,8 +95,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         self.num_frames = _checked_count("num_frames", num_frames, 1, 1 << 40)
         self.seed = _checked_count("seed", seed, 0, 1 << 60)
         self.lidar = bool(lidar)
-        if neighbours is not None and not isinstance(neighbours, Neighbours):
-            raise TypeError(f"SyntheticDrive neighbours: expected Neighbours or None, got {type(neighbours).__name__}")
+        check_neighbours(neighbours)
         self.neighbours = neighbours
         self._renderer = Renderer(supersampling=_checked_count("supersampling", supersampling, 1, 8), device=device)
         self._scene: tuple[int, Scene] | None = None

@@ -1,0 +1,376 @@
+"""Other frames of a nuScenes scene: which, where their cameras were, what stood where, and what of them is lost."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import Rig, RigRetarget
+from arbiview_aug.datasets import Neighbours, NuScenesDataset, nuscenes
+from arbiview_aug.datasets.synthetic import SceneClass, demo_source_rig
+from arbiview_aug.datasets.synthetic.render import Renderer
+from tests.datasets.nuscenes_root import (
+    CHANNELS,
+    VERSION,
+    Street,
+    Tables,
+    seconds,
+    streets,
+    tables_of,
+    write_root,
+    write_views,
+)
+
+SIZE = (40, 112)
+RIG = demo_source_rig(SIZE)
+SPEED_MPS = 8.0
+STANDS_S = (0.6, 1.7)
+
+
+def stops(time_s: float) -> float:
+    """8 m/s, but for a second at a light."""
+    return SPEED_MPS * (time_s - np.clip(time_s - STANDS_S[0], 0, STANDS_S[1] - STANDS_S[0]))
+
+
+SCENES = streets(5, stops=stops, goes=lambda time_s: SPEED_MPS * time_s)
+STOPS, GOES = SCENES
+EVERY = Neighbours(count=3, step_m=1.2)
+
+
+def write(root: Path, change: Callable[[Tables], None] | None = None) -> Path:
+    data = tables_of(RIG, SCENES)
+    if change:
+        change(data)
+    return write_root(root, data, SIZE)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("nuscenes"))
+
+
+@pytest.fixture(scope="module")
+def dataset(root: Path) -> NuScenesDataset:
+    return NuScenesDataset(root, neighbours=EVERY)
+
+
+def ahead_m(sample: dict[str, Any]) -> list[float]:
+    """How far ahead each neighbour is."""
+    here = sample["ego2world"].numpy()
+    return [np.linalg.solve(here, n["ego2world"].numpy())[0, 3] for n in sample["neighbours"]]
+
+
+# --- which ------------------------------------------------------------------------------------------------------------
+def test_neighbours_are_a_step_of_travel_apart(dataset: NuScenesDataset) -> None:
+    """Every 0.05 or 0.1 s there is a frame, so at 8 m/s they are 1.2 to 2 m apart; a keyframe's time is the LiDAR's."""
+    sample = dataset.by_token("goes-sample-2")
+    past, future = np.array(ahead_m(sample)).reshape(2, 3)
+    for m in (-past, future):
+        assert (m[0] >= 0.9) and (m <= 1.2 * np.arange(1, 4) + 0.4 + 0.8).all() and (np.diff(m) >= 0.4 - 1e-6).all()
+    tokens = [n["token"] for n in sample["neighbours"]]
+    assert all(t.startswith("goes") for t in tokens) and len(set(tokens)) == 6
+    everything = NuScenesDataset(dataset.root, neighbours=Neighbours(count=9, step_m=1.2)).by_token("goes-sample-2")
+    kinds = {"sample" in n["token"] for n in everything["neighbours"]}
+    assert kinds == {True, False}
+
+
+def test_both_directions_can_be_chosen(root: Path) -> None:
+    for direction, sign in (("past", -1), ("future", 1)):
+        wanted = Neighbours(count=2, step_m=2.0, direction=direction)  # type: ignore[arg-type]
+        found = ahead_m(NuScenesDataset(root, neighbours=wanted).by_token("goes-sample-2"))
+        assert len(found) == 2 and all(sign * m > 1.5 for m in found)
+
+
+def test_a_scene_ends_where_it_ends(dataset: NuScenesDataset) -> None:
+    """Both scenes are at the same times and places."""
+    for token, expected in (("goes-sample-0", [0, 3]), ("goes-sample-4", [3, 0]), ("stops-sample-4", [3, 0])):
+        found = dataset.by_token(token)["neighbours"]
+        m = ahead_m(dataset.by_token(token))
+        assert [sum(x < 0 for x in m), sum(x > 0 for x in m)] == expected
+        assert all(n["token"].startswith(token.partition("-")[0]) for n in found)
+
+
+def test_standing_adds_nothing_and_costs_nothing(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The keyframes at 1.0 and 1.5 s are where the vehicle stands; 3 m of road lie on either side of it."""
+    near = NuScenesDataset(root, neighbours=Neighbours(count=1, step_m=1.2))
+    for token in ("stops-sample-2", "stops-sample-3"):
+        assert [round(abs(m)) >= 1 for m in ahead_m(near.by_token(token))] == [True, True]
+    standing = streets(5, stands=lambda time_s: 0.002 * np.sin(40 * time_s))
+    write_root(root / "standing", tables_of(RIG, standing), SIZE)
+    dataset = NuScenesDataset(root / "standing", neighbours=EVERY)
+    monkeypatch.setattr(NuScenesDataset, "_neighbour", lambda *_: pytest.fail("a neighbour is looked at"))
+    assert all(dataset[k]["neighbours"] == [] for k in range(len(dataset)))
+
+
+def test_images_are_read_where_they_fill(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[str] = []
+    decode = nuscenes.decode_images
+    monkeypatch.setattr(
+        nuscenes, "decode_images", lambda files, **of: read.extend(map(str, files)) or decode(files, **of)
+    )
+    sample = NuScenesDataset(root, neighbours=Neighbours()).by_token("goes-sample-2")
+    assert len(read) == 6
+    RigRetarget(sample["rig"])(sample)
+    assert len(read) == 6  # nothing is missing
+    out = RigRetarget(sample["rig"].turned(pitch_deg=-12), outputs=("source_frame",))(sample)
+    filled = sorted({*out["source_frame"].unique().tolist()} - {-1, 0})
+    assert filled and len(read) % 6 == 0 and len(read) >= 6 * (1 + len(filled))
+
+
+def test_without_neighbours_no_sweep_is_looked_at(root: Path) -> None:
+    plain = NuScenesDataset(root)
+    assert "neighbours" not in plain[0] and len(plain._recordings.rows) == 2 * 5 * 7
+
+
+# --- where ------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("channels", [CHANNELS, (CHANNELS[3], CHANNELS[0])])
+def test_convention_each_camera_is_where_it_recorded(root: Path, channels: tuple[str, ...]) -> None:
+    """Cameras expose one after the other: a neighbour's are within half an interval of where they expose in a keyframe,
+    and each has the pose of its own moment."""
+    rig = RIG.with_cameras([RIG[CHANNELS.index(channel)] for channel in channels])
+    dataset = NuScenesDataset(root, neighbours=EVERY, channels=channels)
+    recordings = dataset._recordings
+    for token in ("goes-sample-1", "stops-sample-3"):
+        street = next(street for street in SCENES if token.startswith(street.name))
+        for neighbour in dataset.by_token(token)["neighbours"]:
+            moment = neighbour["time_s"]
+            assert tuple(neighbour["rig"].names) == channels
+            np.testing.assert_allclose(neighbour["ego2world"], street.ego2world(seconds(1e6 * moment)), atol=1e-6)
+            files = [Path(f).name for f in files_of(neighbour)]
+            for camera, mounted, file in zip(neighbour["rig"], rig, files, strict=True):
+                assert camera.name in file
+                time_us = int(file.removesuffix(".png").rpartition("_")[2])
+                assert abs(1e-6 * time_us - moment) < 0.1
+                world = street.ego2world(seconds(time_us)) @ mounted.cam2ego
+                np.testing.assert_allclose(neighbour["ego2world"].numpy() @ camera.cam2ego, world, atol=1e-6)
+    assert recordings.channels == [*channels, "LIDAR_TOP"]
+
+
+def files_of(neighbour: Any) -> list[str]:
+    dataset, cameras = neighbour._load.func.__self__, neighbour._load.args[0]
+    return [dataset._recordings.file(row) for row in cameras]
+
+
+def test_images_of_one_turn_go_together(dataset: NuScenesDataset) -> None:
+    """Of each camera the same exposure, though another one's may lie nearer in time: 35 ms apart, every 50 ms."""
+    seen = 0
+    for k in range(len(dataset)):
+        for neighbour in dataset[k]["neighbours"]:
+            of_front, *others = (Path(file).name.partition("__")[2] for file in files_of(neighbour))
+            front_us = int(of_front.removesuffix(".png").rpartition("_")[2])
+            apart_s = [1e-6 * (int(o.removesuffix(".png").rpartition("_")[2]) - front_us) for o in others]
+            np.testing.assert_allclose(apart_s, [0.008, 0.017, 0.025, 0.033, -0.008], atol=1e-9)
+            seen += 1
+    assert seen > 30
+
+
+def test_without_compensation_the_mounting_alone(root: Path) -> None:
+    sample = NuScenesDataset(root, neighbours=EVERY, compensate_ego_motion=False).by_token("goes-sample-2")
+    for frame in (sample, *sample["neighbours"]):
+        for camera in frame["rig"]:
+            mounted = RIG[CHANNELS.index(camera.name)]
+            np.testing.assert_allclose(camera.cam2ego, mounted.cam2ego, atol=1e-9)
+
+
+# --- what stood where -------------------------------------------------------------------------------------------------
+def test_velocities_are_those_of_the_traffic(dataset: NuScenesDataset) -> None:
+    for street in SCENES:
+        sample = dataset.by_token(f"{street.name}-sample-2")
+        ego2street = street.scene.ego2street[:2, :2]
+        found = sample["boxes_3d"][:, 7:].numpy() @ ego2street.T
+        rows = [int(token.split("-")[1]) for token in sample["box_tokens"]]
+        np.testing.assert_allclose(found, street.scene.velocities[rows], atol=1e-4)
+        assert np.abs(found).max() > 3
+
+
+def test_velocities_that_nobody_knows() -> None:
+    """nuscenes-devkit's rule: over both neighbours in time up to 3 s, over one up to 1.5 s."""
+    from arbiview_aug.datasets.nuscenes_boxes import _in_time, _velocities_mps
+
+    times_s = np.array([0, 0.5, 1.0, 3.0, 0.0, 2.5, 3.5, 9.0])
+    of_object = np.array([0, 0, 0, 0, 1, 1, 1, 2], np.int32)
+    centers_m = np.stack([2 * times_s, 0 * times_s, 0 * times_s], -1)
+    shuffled = np.random.default_rng(0).permutation(8)
+    neighbours = _in_time(of_object[shuffled], np.zeros(8, np.int64), times_s[shuffled])
+    found = np.empty(8)
+    found[shuffled] = _velocities_mps(centers_m[shuffled], times_s[shuffled], *neighbours)[:, 0]
+    #                                       2.5 s  alone 2 s: none   2.5 s alone; 3.5 s: none
+    np.testing.assert_allclose(found, [2, 2, 2, np.nan, np.nan, np.nan, 2, np.nan], atol=1e-6)
+
+
+def test_boxes_are_where_things_were(dataset: NuScenesDataset) -> None:
+    """Between keyframes too, since the traffic goes straight on."""
+    sweeps = 0
+    for street in SCENES:
+        for k in range(street.keyframes):
+            for neighbour in dataset.by_token(f"{street.name}-sample-{k}")["neighbours"]:
+                moment = seconds(round(1e6 * neighbour["time_s"]))
+                expected = street.at(moment).boxes_ego(0.0)
+                found = neighbour["boxes_3d"].numpy()
+                order = [int(np.linalg.norm(found[:, :2] - box[:2], axis=1).argmin()) for box in expected]
+                assert sorted(order) == list(range(len(expected)))
+                np.testing.assert_allclose(found[order][:, :6], expected[:, :6], atol=2e-3)
+                off = found[order][:, 6] - expected[:, 6]
+                np.testing.assert_allclose(np.sin(off), 0, atol=1e-3)
+                sweeps += "sample" not in neighbour["token"]
+    assert sweeps > 20
+
+
+def test_what_one_keyframe_alone_has_moves_by_its_velocity(tmp_path: Path) -> None:
+    """What is labelled up to 1.0 s, or from 1.5 s on."""
+
+    def lose(data: Tables) -> None:
+        early = [f"goes-{b}-{k}" for b in range(0, 99, 2) for k in (3, 4)]
+        late = [f"goes-{b}-{k}" for b in range(1, 99, 2) for k in (0, 1, 2)]
+        data["sample_annotation"] = [row for row in data["sample_annotation"] if row["token"] not in {*early, *late}]
+
+    dataset = NuScenesDataset(write(tmp_path, lose), neighbours=EVERY)
+    between = [n for n in dataset.by_token("goes-sample-2")["neighbours"] if 1.05 < since(n) < 1.45]
+    assert between
+    for neighbour in between:
+        expected = GOES.at(since(neighbour)).boxes_ego(0.0)[:, :2]
+        found = neighbour["boxes_3d"].numpy()[:, :2]
+        assert len(found) == len(expected)
+        off_m = np.linalg.norm(found[:, None] - expected, axis=-1).min(0)
+        assert (off_m < 2e-3).all()
+
+
+def since(neighbour: Any) -> float:
+    return seconds(round(1e6 * neighbour["time_s"]))
+
+
+def test_without_boxes_there_are_none(root: Path) -> None:
+    sample = NuScenesDataset(root, neighbours=EVERY, load_boxes=False)[1]
+    assert "boxes_3d" not in sample and all("boxes_3d" not in n for n in sample["neighbours"])
+
+
+# --- what is lost -----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("damage", ["missing", "corrupt"])
+def test_a_lost_file_is_named_and_the_frame_rendered_without_it(root: Path, tmp_path: Path, damage: str) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(root, copy)
+    dataset = NuScenesDataset(copy, neighbours=Neighbours(count=1, step_m=1.2))
+    sample = dataset.by_token("goes-sample-2")
+    before, after = sample["neighbours"]
+    victim = copy / files_of(after)[0]
+    assert victim.parent.parent.name == "sweeps"
+    retarget = RigRetarget(sample["rig"].turned(pitch_deg=-12))
+    expected = retarget(sample | {"neighbours": [dict(before)]})
+    victim.unlink() if damage == "missing" else victim.write_bytes(victim.read_bytes()[:60])
+    match = f"neighbour '{after['token']}' is left out: camera 'CAM_FRONT': image .*{victim.name}"
+    with pytest.warns(UserWarning, match=match):
+        out = retarget(sample)
+    assert torch.equal(out["images"], expected["images"]) and torch.equal(out["coverage"], expected["coverage"])
+
+
+def test_sweeps_that_were_never_copied(root: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(root, copy, ignore=shutil.ignore_patterns("sweeps"))
+    with pytest.warns(UserWarning, match="sweeps/CAM_FRONT: found no sweeps: only keyframes are neighbours") as said:
+        dataset = NuScenesDataset(copy, neighbours=Neighbours(count=2, step_m=4.0))
+    assert len(said) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sample = dataset.by_token("goes-sample-2")
+        out = RigRetarget(sample["rig"].turned(pitch_deg=-12), outputs=("source_frame",))(sample)
+    assert [n["token"] for n in sample["neighbours"]] == [f"goes-sample-{k}" for k in (1, 0, 3, 4)]
+    assert (out["source_frame"] > 0).any()
+
+
+def rows_of(data: Tables, channel: str, street: Street = GOES) -> list[dict[str, Any]]:
+    rows = [row for row in data["sample_data"] if row["token"].startswith(f"{street.name}-{channel}-")]
+    return sorted(rows, key=lambda row: row["timestamp"])
+
+
+def test_a_camera_that_lost_images(tmp_path: Path) -> None:
+    """Half a second of one camera: what has no image of it is named and left out."""
+
+    def lose(data: Tables) -> None:
+        lost = [row["token"] for row in rows_of(data, "CAM_BACK") if not row["is_key_frame"]]
+        data["sample_data"] = [row for row in data["sample_data"] if row["token"] not in lost]
+
+    dataset = NuScenesDataset(write(tmp_path, lose), neighbours=Neighbours())
+    sample = dataset.by_token("goes-sample-2")
+    with pytest.warns(UserWarning, match=r"neighbour 'goes-CAM_FRONT-.*' is left out: .* CAM_BACK within 0.1 s"):
+        RigRetarget(sample["rig"].turned(pitch_deg=-12))(sample)
+
+
+@pytest.mark.parametrize("cut", ["prev", "clock"])
+def test_nothing_is_a_neighbour_across_a_cut(tmp_path: Path, cut: str) -> None:
+    """From the keyframe at 1.0 s on, the recording does not go on from what was before, or its clock starts anew."""
+
+    def change(data: Tables) -> None:
+        if cut == "prev":
+            rows_of(data, "CAM_FRONT")[12]["prev"] = ""
+            return
+        for row in data["sample_data"]:
+            if row["sample_token"] in {f"goes-sample-{k}" for k in (2, 3, 4)} and not (
+                row["sample_token"] == "goes-sample-2" and not row["is_key_frame"]
+            ):
+                row["timestamp"] -= 10_000_000
+
+    write(tmp_path, change)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        dataset = NuScenesDataset(tmp_path, neighbours=Neighbours(count=2, step_m=1.2))
+    words = [str(w.message) for w in said]
+    if cut == "clock":
+        assert (
+            len(words) == 1
+            and "the clock goes back from frame 'goes-CAM_FRONT-1-5' to 'goes-CAM_FRONT-2-0'" in words[0]
+        )
+    else:
+        assert not words
+    assert all(m > 0 for m in ahead_m(dataset.by_token("goes-sample-2")))
+    assert all(
+        n["token"].startswith(("goes-CAM_FRONT-0", "goes-CAM_FRONT-1", "goes-sample-0", "goes-sample-1"))
+        for n in dataset.by_token("goes-sample-1")["neighbours"]
+    )
+
+
+def test_tables_without_times_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(nuscenes.DataError, match="sample_data: expected timestamp, height and width as whole numbers"):
+        NuScenesDataset(write(tmp_path, lambda data: data["sample_data"][0].update(timestamp="noon")), neighbours=EVERY)
+
+
+# --- all of it --------------------------------------------------------------------------------------------------------
+def test_workers_and_devkit_objects_get_the_same(root: Path, dataset: NuScenesDataset) -> None:
+    data = {path.stem: json.loads(path.read_text()) for path in (root / VERSION).iterdir()}
+    devkit = SimpleNamespace(dataroot=str(root), version=VERSION, **data)
+    for other in (pickle.loads(pickle.dumps(dataset)), NuScenesDataset(nusc=devkit, neighbours=EVERY)):
+        one, two = (of.by_token("goes-sample-1")["neighbours"] for of in (dataset, other))
+        assert [n["token"] for n in one] == [n["token"] for n in two]
+        assert torch.equal(one[0]["images"], two[0]["images"]) and one[0]["rig"] == two[0]["rig"]
+
+
+def test_the_road_is_filled_with_the_road(tmp_path: Path) -> None:
+    """Cameras pitched down, from sweeps that are not synchronous, against the true views."""
+    (street,) = streets(3, goes=lambda time_s: SPEED_MPS * time_s)
+    rig = demo_source_rig((64, 176))
+    write_root(tmp_path, tables_of(rig, [street]), rig.sizes[0])
+    dataset = NuScenesDataset(tmp_path, neighbours=Neighbours())
+    near = dataset.by_token("goes-sample-1")["neighbours"]
+    assert not any("sample" in neighbour["token"] for neighbour in near)
+    keyframe = [dataset._recordings.file(row) for row in dataset._recordings.keyframes[1, :-1]]
+    write_views(tmp_path, rig, street, {*keyframe, *files_of(near[0]), *files_of(near[1])})
+    sample = dataset.by_token("goes-sample-1")
+    low: Rig = sample["rig"].turned(pitch_deg=-12)
+    out = RigRetarget(low, outputs=("source_frame",))(sample)
+    there = out["source_frame"] > 0
+    assert there.float().mean() > 0.04
+    truth = Renderer(supersampling=1, device="cpu").render(street.at(0.5), low.cameras, 0.0)
+    images = torch.stack([view.image for view in truth])
+    there &= torch.stack([view.classes for view in truth]) == SceneClass.GROUND
+    errors = (out["images"].float() - images.float()).square().mean(1)[there]
+    db = 10 * np.log10(255**2 / float(errors.mean()))
+    assert db > 33  # 30.6 with the cameras' mounting alone
