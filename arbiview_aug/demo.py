@@ -30,6 +30,7 @@ from arbiview_aug.command_line import (
     writable_folder,
 )
 from arbiview_aug.datasets import open_data
+from arbiview_aug.datasets.motion_depth import WANTED
 from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.evaluate.frames import Frame, make_frame, scores
 from arbiview_aug.evaluate.images import View, as_arrays
@@ -161,13 +162,14 @@ def _load(arguments: argparse.Namespace) -> _Data:
     target = None if name is None else load_rig(name)
     if target is not None and arguments.quality == "paper":  # homographies know no lens
         target = target.undistorted()
+    near = WANTED if arguments.surface == "motion" else None
     if arguments.data is not None:
         assert target is not None
-        return _Data(open_data(arguments.data), _resized(target, arguments.size), None)
+        return _Data(open_data(arguments.data, neighbours=near), _resized(target, arguments.size), None)
     size_given = {} if arguments.size is None else {"size": arguments.size}
     source = demo_source_rig(**size_given)
     target = demo_target_rig(**size_given) if target is None else _resized(target, arguments.size or source.sizes[0])
-    drive = SyntheticDrive(source, num_frames=arguments.frames, seed=arguments.seed, lidar=False)
+    drive = SyntheticDrive(source, num_frames=arguments.frames, seed=arguments.seed, lidar=False, neighbours=near)
     return _Data(drive, target, drive.render)
 
 

@@ -13,17 +13,13 @@ from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 from arbiview_aug.command_line import count, gathered_warnings, writable_folder
-from arbiview_aug.datasets.motion_depth import FOLDER, DepthFolder
+from arbiview_aug.datasets.motion_depth import FOLDER, WANTED, DepthFolder
 from arbiview_aug.datasets.opening import open_data
-from arbiview_aug.datasets.sequence import Neighbours
 from arbiview_aug.errors import ArbiviewError
-from arbiview_aug.motion.depth import BEST_TRAVEL_M, motion_depth
+from arbiview_aug.motion.depth import motion_depth
 from arbiview_aug.neighbours import Neighbour, neighbours_of_frames, warn_lost
 from arbiview_aug.sample import check_inputs
 from arbiview_aug.stitching import WarnOnce
-
-WANTED = Neighbours(count=2, step_m=BEST_TRAVEL_M / 2)
-"""Half the best travel and all of it: whichever the recording comes nearer to is taken."""
 
 
 class Done(NamedTuple):

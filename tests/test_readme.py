@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -52,6 +53,7 @@ TINY = {
     "bench device": ["--device", "cpu", "--sizes", "32x88", "--repeats", "1"],
     "bench speed --data FOLDER": ["--repeats", "1"],
     "bench speed": ["--repeats", "1"],
+    "depth --data FOLDER": ["--output", "depth"],
     "bench ablation --data FOLDER": ["--reduce", "4", "--only", "street, not far"],
 }
 """Every command of the README, and options that make it quick."""
@@ -143,7 +145,8 @@ def test_the_trade_is_the_commands() -> None:
 
 def test_the_neighbours_table_is_the_commands() -> None:
     (table,) = tables(measured("neighbours"))
-    names = [neighbours.row_name(surface, n) for surface in neighbours.NEEDS for n in neighbours.COUNTS]
+    counts = partial(neighbours.counts_of, counts=neighbours.COUNTS)
+    names = [neighbours.row_name(surface, n) for surface in neighbours.NEEDS for n in counts(surface)]
     assert table[0] == ["", *neighbours.COLUMNS] and [row[0] for row in table[2:]] == names
     assert all(re.fullmatch(r"[\d.]+%?", cell) for row in table[2:] for cell in row[1:])
     assert neighbours.NOTES in measured("neighbours")

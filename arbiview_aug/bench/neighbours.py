@@ -164,9 +164,9 @@ def measure(
         for surface in surfaces:
             needs = NEEDS[surface]
             if needs is None or needs in sample:
-                asked, rounds = (MOTION_COUNTS, MOTION_ROUNDS) if surface == "motion" else (counts, repeats)
-                numbers = sorted({0, *(min(n, len(near)) for n in asked)})
-                costs += _costs(data, index, surface, target, numbers, min(rounds, repeats))
+                numbers = sorted({0, *(min(n, len(near)) for n in counts_of(surface, counts))})
+                rounds = min(repeats, MOTION_ROUNDS) if surface == "motion" else repeats
+                costs += _costs(data, index, surface, target, numbers, rounds)
     return {
         "benchmark": "neighbours",
         "clock": "CPU time of the process, milliseconds, one thread",
@@ -179,6 +179,11 @@ def measure(
         "versions": versions(),
         "costs": [{"name": cost.name, **asdict(cost)} for cost in costs],
     }
+
+
+def counts_of(surface: str, counts: Sequence[int]) -> Sequence[int]:
+    """The numbers of neighbours that a surface is measured with."""
+    return MOTION_COUNTS if surface == "motion" else counts
 
 
 def lowered(rig: Rig, size: tuple[int, int]) -> Rig:

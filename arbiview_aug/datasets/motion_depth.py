@@ -13,15 +13,20 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
+from arbiview_aug.datasets.sequence import Neighbours
 from arbiview_aug.dense import Layer
 from arbiview_aug.errors import DataError, SampleError
-from arbiview_aug.motion.depth import MotionDepth
+from arbiview_aug.motion.depth import BEST_TRAVEL_M, MotionDepth
 from arbiview_aug.motion.sweep import reduced_camera
 from arbiview_aug.rig import Rig
 from arbiview_aug.sample import MOTION_KEY
 
 FOLDER = "motion_depth"
 """Name beside a data set."""
+
+WANTED = Neighbours(count=2, step_m=BEST_TRAVEL_M / 2)
+"""The neighbours to open a data set with: at half the best travel and at all of it; what the recording comes nearer to
+is taken."""
 
 _FORMAT = 1
 _SAME_PX, _SAME_POSE = 0.05, 1e-3

@@ -27,6 +27,7 @@ from arbiview_aug.command_line import (
     writable_folder,
 )
 from arbiview_aug.datasets import open_data
+from arbiview_aug.datasets.motion_depth import WANTED
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.figures import draw_figures
@@ -169,10 +170,11 @@ def _method(quality: Quality, surface: SurfaceName) -> Method:
 
 
 def _data(arguments: argparse.Namespace) -> Any:
+    near = WANTED if "motion" in arguments.surface else None
     if arguments.data is not None:
-        return open_data(arguments.data, reduce=arguments.reduce)
+        return open_data(arguments.data, reduce=arguments.reduce, neighbours=near)
     source = demo_source_rig(**({} if arguments.size is None else {"size": arguments.size}))
-    return SyntheticDrive(source, num_frames=arguments.frames or 1, seed=arguments.seed)
+    return SyntheticDrive(source, num_frames=arguments.frames or 1, seed=arguments.seed, neighbours=near)
 
 
 def _targets(arguments: argparse.Namespace, asked: Rig | None, source: Rig) -> dict[str, Rig]:

@@ -96,15 +96,15 @@ def gain_db(index: int, move: str, sample: dict[str, Any], depth: MotionDepth) -
     ("standing", "labels", "turned_deg", "density", "share", "least_db"),
     [
         pytest.param(True, False, 0.0, 0.6, 0.9, 3.0, id="nothing else moves"),
-        pytest.param(False, True, 0.0, 0.0, 0.9, 3.0, id="traffic, labelled"),
-        pytest.param(False, False, 0.0, 0.6, 0.9, 1.5, id="traffic, no labels"),
+        pytest.param(False, True, 0.0, 0.0, 0.9, 2.7, id="traffic, labelled"),
+        pytest.param(False, False, 0.0, 0.6, 0.9, 2.0, id="traffic, no labels"),
         pytest.param(True, False, 0.2, 0.6, 0.9, 3.0, id="poses 0.2 degrees wrong"),
     ],
 )
 def test_depth_is_right_and_renders_better_than_the_street(
     standing: bool, labels: bool, turned_deg: float, density: float, share: float, least_db: float
 ) -> None:
-    """Unlabelled traffic is at wrong distances: there the 3 dB are not reached."""
+    """With traffic the 3 dB are not reached from above: unlabelled it is at wrong distances, labelled it is boxes."""
     counts, gains = np.zeros(3), {move: [] for move in MOVES}
     for index in STREETS:
         sample = sample_of(index, standing, labels, turned_deg)
