@@ -11,6 +11,7 @@ cancels. ``scores_opencv`` and ``scores_torch`` are one computation on the CPU a
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -36,7 +37,7 @@ NEAREST_M = 2.0
 of view."""
 
 WIDTH_PX = 400
-"""Images are halved down to no less."""
+"""Images are halved until their width is nearest to this, by ratio: 283 to 566 px, of those that are wider."""
 
 _RADIUS_PX = 3
 """Windows of 7 x 7: 5 x 5 keep 10 % fewer pixels on synthetic streets, 9 x 9 widen outlines."""
@@ -88,7 +89,7 @@ class Family:
 
 
 def reduced_camera(camera: Camera) -> Camera:
-    """A camera at the size that is worked at: halved to no less than ``WIDTH_PX``, odd rows and columns left out."""
+    """A camera at the size that is worked at, odd rows and columns left out."""
     level = halvings(camera)
     if level == 0:
         return camera
@@ -98,7 +99,7 @@ def reduced_camera(camera: Camera) -> Camera:
 
 def halvings(camera: Camera) -> int:
     """How often a camera's images are halved."""
-    return max(0, (camera.width_px // WIDTH_PX).bit_length() - 1)
+    return max(0, round(math.log2(camera.width_px / WIDTH_PX)))
 
 
 def reduced_grey(camera: Camera, image: torch.Tensor) -> Layer:

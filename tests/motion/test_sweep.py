@@ -75,7 +75,7 @@ def test_exposure_does_not_matter() -> None:
     assert np.abs(one - two)[seen].max() < 1e-2
 
 
-def test_images_are_halved_to_no_less_than_400_px() -> None:
+def test_images_are_halved_to_about_400_px() -> None:
     rig = demo_source_rig((451, 1601))
     small = reduced_camera(rig[0])
     assert small.size == (112, 400)
@@ -85,6 +85,7 @@ def test_images_are_halved_to_no_less_than_400_px() -> None:
     big, little = rig[0].project(point).uv[0], small.project(point).uv[0]
     np.testing.assert_allclose((big + 0.5) / 4 - 0.5, little, atol=1e-9)
     assert reduced_camera(demo_source_rig((96, 256))[0]).size == (96, 256)
+    assert reduced_camera(demo_source_rig((256, 704))[0]).size == (128, 352)
 
 
 def test_aggregation_is_semi_global_matching_along_four_paths() -> None:
