@@ -2,7 +2,8 @@
 
 The current frame is never repainted. What may be filled is the near road, which stands still, unless everything is
 asked for; where it lies along a target ray says the current frame's own surface. A neighbour is not read where a
-labelled object stood before its camera, then or now, nor where two neighbours contradict each other: something moved.
+labelled object stood before its camera, then or now. What no labels vouch for, and what lies beside a labelled object
+that moved, is read where other frames bear it out (``merging``).
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ import torch
 
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.merging import Candidate, merged
+from arbiview_aug.moved import Doubt, doubts
 from arbiview_aug.neighbours import Neighbour
 from arbiview_aug.objects import Objects
 from arbiview_aug.plan import RenderPlan, build_plan
@@ -76,12 +79,14 @@ class Fill(NamedTuple):
         usable: For each hole (h, w) the pixels, free or on the seam, that it shows.
         blur: For each hole (h, w) uint8, how much coarser it shows them, in half octaves; 0 where it is as sharp as
             the target.
+        doubt: For each hole (h, w) uint8 ``moved.Doubt`` of what it shows.
     """
 
     neighbour: Neighbour
     plan: RenderPlan
     usable: list[BoolArray]
     blur: list[npt.NDArray[np.uint8]]
+    doubt: list[npt.NDArray[np.uint8]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,10 +170,10 @@ def plan_fills(
     fills = []
     for neighbour in neighbours:
         made = build_plan(neighbour.rig, rig, surface=surface, config=settings, scene=scene)
-        objects = _labelled(neighbour, scene.boxes)
-        seen = [_seen(hole, target, neighbour.rig, objects) for hole, target in zip(holes, made.targets, strict=True)]
-        if any((hole.free & usable).any() for hole, (usable, _) in zip(holes, seen, strict=True)):
-            fills.append(Fill(neighbour, made, [usable for usable, _ in seen], [blur for _, blur in seen]))
+        seen = [_seen(hole, target, neighbour) for hole, target in zip(holes, made.targets, strict=True)]
+        if any((hole.free & usable).any() for hole, (usable, *_) in zip(holes, seen, strict=True)):
+            usable, blur, doubt = (list(maps) for maps in zip(*seen, strict=True))
+            fills.append(Fill(neighbour, made, usable, blur, doubt))
     return Fills(holes, fills) if fills else None
 
 
@@ -217,28 +222,28 @@ def _rays(camera: Camera, pixel: npt.NDArray[np.int64]) -> tuple[FloatArray, Boo
     return ego_rays(camera, np.stack([u, v], -1).astype(np.float64))
 
 
-def _labelled(neighbour: Neighbour, boxes: FloatArray | None) -> Objects:
-    """The labelled objects of then and of now, with air around them."""
-    solid = np.concatenate([np.zeros((0, 7)), *(b for b in (boxes, neighbour.boxes) if b is not None)])
-    solid = solid + np.array([0, 0, 0, 2 * _AIR_M, 2 * _AIR_M, 0, 0])
-    return Objects(Street(ground_z_m=neighbour.rig.ground_z_m), solid)
-
-
-def _seen(hole: Hole, target: TargetPlan, rig: Rig, objects: Objects) -> tuple[BoolArray, npt.NDArray[np.uint8]]:
-    """What a neighbour's cameras show of a hole, no labelled object in between; how coarsely."""
+def _seen(
+    hole: Hole, target: TargetPlan, neighbour: Neighbour
+) -> tuple[BoolArray, npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
+    """What a neighbour's cameras show of a hole, no labelled object in between; how coarsely; the doubt about it."""
     seen = target.coverage & (hole.free | hole.seam)
-    blur = np.zeros(seen.shape, np.uint8)
+    blur, doubt = np.zeros(seen.shape, np.uint8), np.full(seen.shape, Doubt.UNLABELLED, np.uint8)
+    solid = neighbour.labelled + np.array([0, 0, 0, 2 * _AIR_M, 2 * _AIR_M, 0, 0])
+    objects = Objects(Street(ground_z_m=neighbour.rig.ground_z_m), solid)
     for pair in target.pairs:
         pixel = np.flatnonzero(seen & (target.source_camera == pair.source))
         directions, _ = _rays(hole.camera, pixel)
-        source = rig[pair.source]
+        source = neighbour.rig[pair.source]
         q = np.maximum(hole.inverse_distance.reshape(-1)[pixel], 1e-6)
-        away = (hole.camera.center_m - source.center_m) + directions / q[:, None]
+        offset_m = directions / q[:, None]
+        away = (hole.camera.center_m - source.center_m) + offset_m
         length = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
         away /= length[:, None]
-        if len(objects.boxes):
+        if len(solid):
             hidden = objects.hides(source.center_m, away, 1 / length, float(1 / source.K[0, 0]))
             seen.reshape(-1)[pixel[hidden]] = False
+        if neighbour.moved is not None:
+            doubt.reshape(-1)[pixel] = doubts(neighbour.moved, hole.camera.center_m + offset_m)
         # Pixels a metre of road, along the road, where they are fewest: as the sine of the incidence over the distance.
         here, there = (
             camera.K[0, 0] * np.abs(ray[:, 2]) * nearness
@@ -246,24 +251,10 @@ def _seen(hole: Hole, target: TargetPlan, rig: Rig, objects: Objects) -> tuple[B
         )
         octaves = np.log2(np.maximum(here, 1e-9) / np.maximum(there, 1e-9))
         blur.reshape(-1)[pixel] = np.clip(np.round(2 * octaves), 0, 255).astype(np.uint8)
-    return seen, blur
+    return seen, blur, doubt
 
 
 # --- pixels -----------------------------------------------------------------------------------------------------------
-_AGREEMENT_LEVELS = 16.0
-"""Two neighbours that differ by more, over 5 by 5 pixels, show different things; so do a neighbour and the current
-frame, on a seam, that differ by so much more than they do on most of it."""
-
-_FEW = 2
-"""Neighbours of which one is believed alone, where no labels say what moved: there are no more to ask."""
-
-_LEAST_SEAM_PX = 20
-"""Fewer pixels in common say nothing of the exposure."""
-
-_FAR_WEIGHT = 0.02
-"""Share of the seam's mean in the offset next to it: far from the seam it is all there is."""
-
-
 def fill_views(
     views: Sequence[torch.Tensor], fills: Fills, rendered: Sequence[tuple[Fill, Sequence[torch.Tensor]]]
 ) -> tuple[list[torch.Tensor], list[Patch]]:
@@ -284,7 +275,8 @@ def fill_views(
                 images[k],
                 torch.from_numpy(fill.usable[k]).to(view.device),
                 torch.from_numpy(fill.blur[k]).to(view.device),
-                trusted=fill.neighbour.boxes is not None,
+                torch.from_numpy(fill.doubt[k]).to(view.device),
+                fill.neighbour.is_later,
             )
             for fill, images in rendered
         ]
@@ -294,104 +286,6 @@ def fill_views(
         done[hole.target][:, rows, columns] = pixels
         patches.append(_patch(k, hole, (rows, columns), chosen, rendered))
     return done, patches
-
-
-class Candidate(NamedTuple):
-    """What a neighbour shows of a hole.
-
-    Attributes:
-        image: (3, h, w) of the view's type.
-        shows: (h, w) bool.
-        blur: (h, w) uint8, see ``Fill``.
-        trusted: Labels say what moved: where nobody else looks, it is believed.
-    """
-
-    image: torch.Tensor
-    shows: torch.Tensor
-    blur: torch.Tensor
-    trusted: bool
-
-
-def merged(
-    view: torch.Tensor, free: torch.Tensor, seam: torch.Tensor, candidates: Sequence[Candidate], margin_px: int
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """One view (3, h, w) with what is free taken from the sharpest candidate that most others confirm.
-
-    Candidates are brought to the view's exposure: by the difference at the seam beside it, by its mean farther in.
-
-    Args:
-        view: uint8, or float in [0, 1].
-        free: (h, w) bool, what may be filled.
-        seam: (h, w) bool, where view and candidates should look alike.
-        candidates: The nearest first.
-        margin_px: How wide the seam is.
-
-    Returns:
-        The view, and (h, w) int64 which candidate was taken, -1 for none.
-    """
-    unit = 1.0 if view.dtype == torch.uint8 else 1 / 255
-    current = view.float()
-    toned = []
-    for image, shows, *_ in candidates:
-        toned.append(image.float() + _offset(current - image.float(), seam & shows, margin_px, unit))
-    shown = torch.stack([one.shows for one in candidates]) & free
-    votes = torch.zeros(shown.shape, dtype=torch.int8, device=view.device)
-    for i in range(len(toned)):
-        for j in range(i):
-            both = shown[i] & shown[j]
-            apart = _mean_around((toned[i] - toned[j]).detach().abs().mean(0), both, 2)
-            agree = both & (apart < unit * _AGREEMENT_LEVELS)
-            votes[i] += agree
-            votes[j] += agree
-    witnesses = shown.sum(0)
-    trusted = torch.tensor([one.trusted or len(candidates) <= _FEW for one in candidates], device=view.device)
-    # Half of the others at least: two cars of one colour may pass the same place.
-    uncontradicted = shown & (2 * votes >= witnesses - 1) & ((witnesses > 1) | trusted[:, None, None])
-    blur = torch.stack([one.blur for one in candidates]).int()
-    # Of equals argmin may give any: the order decides.
-    order = torch.arange(len(candidates), device=view.device)[:, None, None]
-    rank = torch.where(uncontradicted, blur * len(candidates) + order, 256 * len(candidates))
-    chosen = torch.where(uncontradicted.any(0), rank.argmin(0), -1)
-    out = current
-    for k, image in enumerate(toned):
-        out = torch.where(chosen == k, image, out)
-    if view.dtype == torch.uint8:
-        return torch.round(out).clamp(0, 255).to(torch.uint8), chosen
-    return out.clamp(0, 1).to(view.dtype), chosen
-
-
-def _offset(difference: torch.Tensor, seam: torch.Tensor, margin: int, unit: float) -> torch.Tensor:
-    """What to add to a candidate (3, h, w): near the seam the difference there, farther away its mean.
-
-    It is smooth: found on cells of half a margin, read between them.
-    """
-    if int(seam.sum()) < _LEAST_SEAM_PX:
-        return torch.zeros_like(difference)
-    middle = torch.stack([channel[seam].median() for channel in difference.detach()])[:, None, None]
-    alike = seam & ((difference.detach() - middle).abs().amax(0) < unit * _AGREEMENT_LEVELS)
-    known = torch.cat([difference.detach() * alike, alike[None].to(difference)])
-    mean = known[:3].sum((1, 2), keepdim=True) / known[3:].sum().clamp(min=1)
-    cell, size = max(1, margin // 2), seam.shape
-    cells = torch.nn.functional.avg_pool2d(known[None], cell, ceil_mode=True)[0]
-    around = _box(_box(cells, 2), 2)
-    coarse = (around[:3] + _FAR_WEIGHT * mean) / (around[3:] + _FAR_WEIGHT)
-    whole = torch.nn.functional.interpolate(
-        coarse[None], size=[cell * n for n in coarse.shape[1:]], mode="bilinear", align_corners=False
-    )
-    return whole[0, :, : size[0], : size[1]]
-
-
-def _mean_around(values: torch.Tensor, where: torch.Tensor, radius: int) -> torch.Tensor:
-    """Mean (h, w) of what counts within a square around each pixel."""
-    total, count = (_box(part[None], radius) for part in (values * where, where.float()))
-    return (total / count.clamp(min=1e-6))[0]
-
-
-def _box(image: torch.Tensor, radius: int) -> torch.Tensor:
-    """Means (C, h, w) over squares; zeros around the image."""
-    side = 2 * radius + 1
-    across = torch.nn.functional.avg_pool2d(image[None], (1, side), 1, (0, radius))
-    return torch.nn.functional.avg_pool2d(across, (side, 1), 1, (radius, 0))[0]
 
 
 def _patch(

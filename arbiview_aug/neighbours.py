@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import torch
 
 from arbiview_aug.camera import FloatArray
 from arbiview_aug.errors import ArbiviewError, SampleError, SampleTypeError
+from arbiview_aug.moved import moved_boxes
 from arbiview_aug.objects import checked_boxes
 from arbiview_aug.rig import Rig
 from arbiview_aug.sample import SourceFrame, frame_from, numbers
@@ -50,7 +52,10 @@ class Neighbour:
         name: Its token, else its number.
         rig: Its cameras in the current frame's ego frame, over the current frame's road.
         travel_m: Distance between the two vehicles.
+        ahead_m: How far it stood before the current one, along its heading.
+        seconds: From the current frame to it; None where either has no time.
         boxes: (B, 7) where labelled objects were then, in the current ego frame; None where nobody said.
+        boxes_now: (B, 7) where they are in the current frame; None where nobody said.
         given: The entry itself; its images are read when they are asked for.
     """
 
@@ -58,8 +63,28 @@ class Neighbour:
     name: str
     rig: Rig
     travel_m: float
+    ahead_m: float
+    seconds: float | None
     boxes: FloatArray | None
+    boxes_now: FloatArray | None
     given: Mapping[str, Any]
+
+    @property
+    def is_later(self) -> bool:
+        """Whether it was recorded after the current frame: without times, whether it stood before it."""
+        return (self.seconds or self.ahead_m) > 0
+
+    @property
+    def labelled(self) -> FloatArray:
+        """(B, 7) the labelled objects, where they were and where they are, in the current ego frame."""
+        return np.concatenate([np.zeros((0, 7)), *(b for b in (self.boxes, self.boxes_now) if b is not None)])
+
+    @cached_property
+    def moved(self) -> FloatArray | None:
+        """(B, 7) the labels of both frames that moved between them; None where either has none."""
+        if self.boxes is None or self.boxes_now is None:
+            return None
+        return moved_boxes(self.boxes_now, self.boxes)
 
     def images(self, like: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
         """Its images, of the type and on the device of the current ones.
@@ -155,7 +180,8 @@ def _neighbour(
     _check_same_vehicle(frame.rig, own)
     cameras = [camera.moved(ego2ego) for camera in own]
     rig = Rig(cameras, ground_z_m=frame.rig.ground_z_m, name=f"{frame.rig.name} {name}".strip())
-    return Neighbour(number, name, rig, travel_m, _boxes(sample, index, entry, ego2ego, seconds), entry)
+    now, then = _boxes(sample, index, entry, ego2ego, seconds)
+    return Neighbour(number, name, rig, travel_m, float(ego2ego[0, 3]), seconds, then, now, entry)
 
 
 def _ego2ego(sample: Mapping[str, Any], index: tuple[int, ...], entry: Mapping[str, Any]) -> FloatArray:
@@ -236,21 +262,21 @@ def _boxes(
     entry: Mapping[str, Any],
     ego2ego: FloatArray,
     seconds: float | None,
-) -> FloatArray | None:
-    """Where labelled objects were, in the current ego frame."""
+) -> tuple[FloatArray | None, FloatArray | None]:
+    """Where labelled objects are, and where they were, in the current ego frame."""
+    current = sample.get("boxes_3d")
+    given = None if current is None else current[index[0]] if index else current
+    now = None if given is None else checked_boxes(given)
     if entry.get("boxes_3d") is not None:
         boxes = checked_boxes(entry["boxes_3d"])
         moved = boxes.copy()
         moved[:, :3] = boxes[:, :3] @ ego2ego[:3, :3].T + ego2ego[:3, 3]
         moved[:, 6] += np.arctan2(ego2ego[1, 0], ego2ego[0, 0])
-        return moved
-    current = sample.get("boxes_3d")
-    if current is None or seconds is None:
-        return None
-    given = numbers("boxes_3d", current[index[0]] if index else current)
-    if given.ndim != 2 or given.shape[1] < 9:
-        return None
-    moved = checked_boxes(given)
+        return now, moved
+    columns = 0 if given is None else numbers("boxes_3d", given).shape[-1]
+    if now is None or seconds is None or columns < 9:
+        return now, None
+    moved = now.copy()
     # Velocities that nobody knows are NaN in nuScenes.
-    moved[:, :2] += np.nan_to_num(given[:, 7:9]) * seconds
-    return moved
+    moved[:, :2] += np.nan_to_num(numbers("boxes_3d", given)[:, 7:9]) * seconds
+    return now, moved

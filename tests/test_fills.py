@@ -9,7 +9,8 @@ import torch
 from arbiview_aug import Rig, RigRetarget
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig
-from arbiview_aug.fills import Candidate, merged
+from arbiview_aug.merging import Candidate, merged
+from arbiview_aug.moved import Doubt
 
 RIG = demo_source_rig((96, 256))
 
@@ -127,48 +128,97 @@ FREE[8:] = True
 SEAM = torch.zeros(H, W, dtype=torch.bool)
 SEAM[4:8] = True
 ROAD = torch.full((3, H, W), 90, dtype=torch.uint8)
+HOLE = torch.where(FREE, 0, ROAD)
 
 
-def candidate(level: int, blur: int = 0, trusted: bool = False, shows: torch.Tensor | None = None) -> Candidate:
+def candidate(
+    level: int, blur: int = 0, doubt: Doubt = Doubt.UNLABELLED, later: bool = False, shows: torch.Tensor | None = None
+) -> Candidate:
     whole = torch.ones(H, W, dtype=torch.bool) if shows is None else shows
     image = torch.full((3, H, W), level, dtype=torch.uint8)
-    return Candidate(image, whole, torch.full((H, W), blur, dtype=torch.uint8), trusted)
+    return Candidate(image, whole, *(torch.full((H, W), n, dtype=torch.uint8) for n in (blur, doubt)), later)
 
 
 def test_exposure_follows_the_seam() -> None:
-    view = torch.where(FREE, 0, ROAD)
-    pixels, chosen = merged(view, FREE, SEAM, [candidate(98)], 2)
+    pixels, chosen = merged(HOLE, FREE, SEAM, [candidate(98)], 2)
     assert (chosen[FREE] == 0).all() and (pixels[:, FREE].int() - 90).abs().max() <= 1
-    assert torch.equal(pixels[:, ~FREE], view[:, ~FREE])
+    assert torch.equal(pixels[:, ~FREE], HOLE[:, ~FREE])
 
 
 def test_the_sharper_of_two_that_agree_is_taken() -> None:
-    _, chosen = merged(torch.where(FREE, 0, ROAD), FREE, SEAM, [candidate(90, blur=3), candidate(91, blur=1)], 2)
+    _, chosen = merged(HOLE, FREE, SEAM, [candidate(90, blur=3), candidate(91, blur=1)], 2)
     assert (chosen[FREE] == 1).all()
-    _, chosen = merged(torch.where(FREE, 0, ROAD), FREE, SEAM, [candidate(90, blur=1), candidate(91, blur=1)], 2)
+    _, chosen = merged(HOLE, FREE, SEAM, [candidate(90, blur=1), candidate(91, blur=1)], 2)
     assert (chosen[FREE] == 0).all()
 
 
-def passing(level: int) -> Candidate:
+def passing(level: int, doubt: Doubt = Doubt.UNLABELLED, later: bool = False) -> Candidate:
     """The road at the seam, something else farther in."""
-    one = candidate(90)
+    one = candidate(90, doubt=doubt, later=later)
     one.image[:, 12:] = level
     return one
 
 
 def test_two_that_contradict_each_other_leave_a_hole() -> None:
-    _, chosen = merged(torch.where(FREE, 0, ROAD), FREE, SEAM, [passing(200), candidate(90)], 2)
-    assert (chosen[16:] == -1).all() and (chosen[8:10] == 0).all()
+    for doubt in Doubt:
+        _, chosen = merged(HOLE, FREE, SEAM, [passing(200, doubt), candidate(90, doubt=doubt)], 2)
+        assert (chosen[16:] == -1).all() and (chosen[8:10] == 0).all()
 
 
-def test_the_majority_is_believed() -> None:
-    _, chosen = merged(torch.where(FREE, 0, ROAD), FREE, SEAM, [passing(200), candidate(90), candidate(92)], 2)
-    assert (chosen[16:] == 1).all()
+def test_where_labels_vouch_the_majority_is_believed() -> None:
+    for doubt in Doubt:
+        several = [passing(200, doubt), candidate(90, doubt=doubt), candidate(92, doubt=doubt)]
+        _, chosen = merged(HOLE, FREE, SEAM, several, 2)
+        assert (chosen[16:] == (1 if doubt == Doubt.NONE else -1)).all()
 
 
-def test_of_many_one_alone_is_believed_where_labels_say_what_moved() -> None:
+def test_one_alone_is_believed_unless_something_moved_beside_it() -> None:
     nothing = torch.zeros(H, W, dtype=torch.bool)
-    for trusted in (False, True):
-        several = [candidate(90, trusted=trusted), candidate(90, shows=nothing), candidate(90, shows=nothing)]
-        _, chosen = merged(torch.where(FREE, 0, ROAD), FREE, SEAM, several, 2)
-        assert (chosen[FREE] == (0 if trusted else -1)).all()
+    for doubt in Doubt:
+        several = [candidate(90, doubt=doubt), candidate(90, shows=nothing), candidate(90, shows=nothing)]
+        for of in (several, several[:2]):
+            _, chosen = merged(HOLE, FREE, SEAM, of, 2)
+            assert (chosen[FREE] == (0 if doubt <= Doubt.SHADED or len(of) == 2 else -1)).all()
+
+
+def test_without_labels_two_of_one_side_are_not_enough() -> None:
+    nothing = candidate(90, shows=torch.zeros(H, W, dtype=torch.bool))
+    for several in ([passing(200), passing(200), nothing], [passing(200), passing(200), passing(200)]):
+        _, chosen = merged(HOLE, FREE, SEAM, several, 2)
+        assert (chosen[16:] == (0 if several[2] is not nothing else -1)).all()
+
+
+def test_what_is_there_before_and_after_stood_still() -> None:
+    """Whatever farther frames show: a lorry may pass for as long as they last."""
+    lorry = [passing(200), passing(200), passing(200, later=True)]
+    _, chosen = merged(HOLE, FREE, SEAM, [candidate(90), candidate(90, later=True), *lorry], 2)
+    assert (chosen[16:] == 0).all()
+    _, chosen = merged(HOLE, FREE, SEAM, [candidate(90), *lorry[:2], lorry[2], candidate(90, later=True)], 2)
+    assert (chosen[16:] == -1).all()
+
+
+def test_what_the_current_frame_alone_shows_goes_on_into_the_hole() -> None:
+    view = HOLE.clone()
+    view[:, 4:8, :16] = 200
+    for doubt in Doubt:
+        several = [candidate(90, doubt=doubt), candidate(90, doubt=doubt, later=True)]
+        _, chosen = merged(view, FREE, SEAM, several, 2)
+        assert (chosen[8:12, 24:] == 0).all()
+        assert (chosen[8:, :14] == (-1 if doubt == Doubt.UNLABELLED else 0)).all()
+
+
+def test_an_exposure_that_is_another_object_is_not_taken_on() -> None:
+    """What passes at the seam of one neighbour alone neither recolours the road nor outvotes the others."""
+    blue = candidate(90, doubt=Doubt.NONE)
+    blue.image[:, :8] = torch.tensor([20, 40, 100], dtype=torch.uint8)[:, None, None]
+    pixels, _ = merged(HOLE, FREE, SEAM, [blue], 2)
+    assert (pixels[:, FREE] == 90).all()
+
+
+def test_a_neighbour_without_a_seam_follows_those_that_have_one() -> None:
+    """A camera twice as bright that sees the far half of the hole alone and the near one with another."""
+    near, far = torch.ones(H, W, dtype=torch.bool), torch.zeros(H, W, dtype=torch.bool)
+    near[18:], far[10:] = False, True
+    several = [candidate(90, doubt=Doubt.NONE, shows=near), candidate(180, doubt=Doubt.NONE, shows=far)]
+    pixels, chosen = merged(HOLE, FREE, SEAM, several, 2)
+    assert (chosen[18:] == 1).all() and (pixels[:, FREE].int() - 90).abs().max() <= 1
