@@ -5,7 +5,8 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import metadata
+from importlib import import_module, metadata
+from typing import Any
 
 import cv2
 
@@ -47,6 +48,20 @@ def warn_about_cv2_wheels() -> None:
         RuntimeWarning,
         stacklevel=3,
     )
+
+
+def optional_package(name: str, extra: str) -> Any:
+    """A package of one of this package's extras, imported.
+
+    Raises:
+        ImportError: It is not installed; with the command that installs it.
+    """
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name != name.split(".")[0]:
+            raise  # it is there, but what it needs is not
+        raise ImportError(f"{error.name} is not installed: pip install 'arbiview_aug[{extra}]'") from None
 
 
 @contextmanager

@@ -19,3 +19,7 @@ class SampleTypeError(ArbiviewError, TypeError):
 
 class DataError(ArbiviewError, ValueError):
     """A file of a data set that is missing, broken or inconsistent."""
+
+
+class GeneratorError(ArbiviewError, ValueError):
+    """A generator whose settings, weights and inputs do not fit together."""

@@ -1,0 +1,63 @@
+"""Between images and latents: Z = E(x), x̃ = D(Z) (appendix: Latent Diffusion Models)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import nn
+
+from arbiview_aug.errors import GeneratorError
+
+
+class Autoencoder(nn.Module):
+    """diffusers' ``AutoencoderKL`` with images in [0, 1] and latents of about unit variance; pixels without one.
+
+    Args:
+        vae: The ``AutoencoderKL``; None for latents that are the pixels, in [-1, 1].
+        scale: What latents are multiplied by; held as a number, since half precision would round it.
+    """
+
+    def __init__(self, vae: Any | None, scale: float = 1.0) -> None:
+        super().__init__()
+        self.vae = vae
+        self.scale = float(scale)
+
+    def encode(self, images: torch.Tensor) -> torch.Tensor:
+        """Latents (..., C, H / f, W / f) of images (..., 3, H, W) in [0, 1]: the mean, without sampling.
+
+        Raises:
+            GeneratorError: With weights in float16.
+        """
+        images = images * 2 - 1
+        if self.vae is None:
+            return images
+        self._refuse_float16()
+        flat = images.reshape(-1, *images.shape[-3:]).to(self.vae.dtype)
+        latents = self.vae.encode(flat).latent_dist.mode() * self.scale
+        return latents.reshape(*images.shape[:-3], *latents.shape[-3:])
+
+    def decode(self, latents: torch.Tensor) -> torch.Tensor:
+        """Images (..., 3, H, W) of latents (..., C, h, w), in [0, 1] up to over- and undershoot: clamp them.
+
+        Raises:
+            GeneratorError: With weights in float16.
+        """
+        if self.vae is None:
+            images = latents
+        else:
+            self._refuse_float16()
+            flat = latents.reshape(-1, *latents.shape[-3:]).to(self.vae.dtype)
+            images = self.vae.decode(flat / self.scale).sample
+            images = images.reshape(*latents.shape[:-3], *images.shape[-3:])
+        return images / 2 + 0.5
+
+    def _refuse_float16(self) -> None:
+        assert self.vae is not None
+        device = self.vae.device.type
+        autocast = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device) == torch.float16
+        if autocast or self.vae.dtype == torch.float16:
+            raise GeneratorError(
+                "autoencoder: expected float32 or bfloat16, got float16, in which Stable Diffusion's overflows; use "
+                "generator.to(torch.bfloat16)"
+            )

@@ -1,0 +1,149 @@
+"""What the denoiser is told besides the noise: condition latent, mask, confidence, viewing rays, and f_pose.
+
+The paper feeds "the pseudo images … and their poses" to the model and names a pose condition encoding f_pose without
+giving it. Here each view has
+
+- channels beside its noisy latent: the condition latent (FAVS at the view's pose, holes pre-filled), the mask of what
+  FAVS covers, its confidence, and the Plücker rays of its pixels;
+- one token, MLP(Fourier(R, t, K)), appended to the embedding of the empty prompt.
+
+Poses are relative to a reference camera: of a target, the source that looks most alike; of a source, itself. So turning
+the whole rig, or listing its cameras in another order, changes nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import nn
+from torch.nn import functional
+
+from arbiview_aug.camera import Camera, FloatArray
+
+RAY_CHANNELS = 6
+POSE_WIDTH = 16
+"""Numbers of a pose: R (9), t (3), K (4)."""
+
+_OCTAVES = 4
+"""Fourier frequencies π, 2π, 4π, 8π: the highest turns once in 0.25 of a rotation entry; 1° is a tenth of it."""
+
+
+class Views(NamedTuple):
+    """The conditions of the views of B frames, N views each, on the latent grid.
+
+    Attributes:
+        latent: (B, N, C, h, w) FAVS at the view's pose, pre-filled; of a source, its image.
+        mask: (B, N, 1, h, w) share of each latent pixel that is known, in [0, 1].
+        confidence: (B, N, 1, h, w) in [0, 1].
+        rays: (B, N, 6, h, w) Plücker rays, see ``plucker_rays``.
+        pose: (B, N, 16) see ``pose_vector``.
+    """
+
+    latent: torch.Tensor
+    mask: torch.Tensor
+    confidence: torch.Tensor
+    rays: torch.Tensor
+    pose: torch.Tensor
+
+    def dropped(self, drop: torch.Tensor) -> Views:
+        """Without conditions in the frames ``drop`` (B,) bool: for classifier-free guidance."""
+        return Views(*(value * ~drop.view(-1, *(1,) * (value.dim() - 1)) for value in self))
+
+    def channels(self, noisy: torch.Tensor) -> torch.Tensor:
+        """(B, N, 2 C + 8, h, w) the U-Net's input: noisy latent, condition latent, mask, confidence, rays."""
+        return torch.cat([noisy, self.latent, self.mask, self.confidence, self.rays], 2)
+
+
+def input_channels(latent_channels: int) -> int:
+    """Channels that ``Views.channels`` has."""
+    return 2 * latent_channels + 2 + RAY_CHANNELS
+
+
+# --- geometry ---------------------------------------------------------------------------------------------------------
+def reference_camera(target: Camera, sources: Sequence[Camera]) -> Camera:
+    """The source whose optical axis is nearest to the target's; by content where several are."""
+
+    def likeness(camera: Camera) -> tuple[float, bytes]:
+        return float(camera.cam2ego[:3, 2] @ target.cam2ego[:3, 2]), camera.content_key
+
+    return max(sources, key=likeness)
+
+
+def relative_pose(camera: Camera, reference: Camera) -> tuple[FloatArray, FloatArray]:
+    """R (3, 3) and t (3,) from the camera's frame to the reference's, t compressed to less than 1: t / (1 + |t|)."""
+    to_reference = reference.cam2ego[:3, :3].T
+    with np.errstate(over="ignore"):  # of poses beyond 1e154 m
+        t = to_reference @ (camera.center_m - reference.center_m)
+        return to_reference @ camera.cam2ego[:3, :3], t / (1 + np.linalg.norm(t))
+
+
+def plucker_rays(camera: Camera, reference: Camera, size: tuple[int, int]) -> torch.Tensor:
+    """(6, h, w) float32 direction d and moment o x d of each pixel's ray in the reference's frame; 0 off the lens.
+
+    Args:
+        camera: At any size.
+        reference: Whose frame.
+        size: (h, w) of the latent grid.
+    """
+    small = camera.resize(size)
+    R, o = relative_pose(camera, reference)
+    directions, valid = small.unproject_cam(small.pixel_grid())
+    d = np.where(valid[..., None], directions, 0.0) @ R.T
+    return torch.from_numpy(np.concatenate([d, np.cross(o, d)], -1).astype(np.float32)).movedim(-1, 0)
+
+
+def pose_vector(camera: Camera, reference: Camera) -> torch.Tensor:
+    """(16,) float32: R, compressed t, and K as log2 of the focal lengths and the principal point's offset, per side."""
+    R, t = relative_pose(camera, reference)
+    h, w = camera.size
+    K = camera.K
+    intrinsics = [math.log2(K[0, 0] / w), math.log2(K[1, 1] / h), (K[0, 2] + 0.5) / w - 0.5, (K[1, 2] + 0.5) / h - 0.5]
+    return torch.from_numpy(np.concatenate([R.ravel(), t, intrinsics]).astype(np.float32))
+
+
+def camera_conditions(
+    cameras: Sequence[Camera], references: Sequence[Camera], size: tuple[int, int]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rays (N, 6, h, w) and poses (N, 16) of the views of one frame."""
+    pairs = list(zip(cameras, references, strict=True))
+    rays = torch.stack([plucker_rays(camera, reference, size) for camera, reference in pairs])
+    return rays, torch.stack([pose_vector(camera, reference) for camera, reference in pairs])
+
+
+def pooled(maps: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    """Coverage or confidence (..., H, W) as means over latent pixels (..., h, w), float32."""
+    flat = maps.float().reshape(-1, 1, *maps.shape[-2:])
+    return functional.adaptive_avg_pool2d(flat, size).reshape(*maps.shape[:-2], *size)
+
+
+# --- the pose token ---------------------------------------------------------------------------------------------------
+class PoseContext(nn.Module):
+    """The U-Net's cross-attention context: the empty prompt's embedding and one pose token.
+
+    Args:
+        width: Cross-attention width of the U-Net.
+        prompt_tokens: Tokens of the empty prompt: 77 for Stable Diffusion, 0 where there is no text.
+    """
+
+    empty_prompt: torch.Tensor
+
+    def __init__(self, width: int, prompt_tokens: int = 0) -> None:
+        super().__init__()
+        inner = POSE_WIDTH * (1 + 2 * _OCTAVES)
+        self.mlp = nn.Sequential(nn.Linear(inner, width), nn.SiLU(), nn.Linear(width, width))
+        self.register_buffer("empty_prompt", torch.zeros(prompt_tokens, width))
+
+    def forward(self, pose: torch.Tensor) -> torch.Tensor:
+        """(n, prompt_tokens + 1, width) contexts of poses (n, 16), all zeros where the pose was dropped (is 0)."""
+        pose = pose.float()
+        angles = pose[..., None] * (math.pi * 2.0 ** torch.arange(_OCTAVES, device=pose.device))
+        features = torch.cat([pose, angles.sin().flatten(-2), angles.cos().flatten(-2)], -1)
+        dtype = self.empty_prompt.dtype
+        given = pose.abs().amax(-1, keepdim=True) > 0  # no pose is all zeros: R is not
+        token = self.mlp(features.to(dtype)) * given
+        prompt = self.empty_prompt.expand(len(pose), -1, -1)
+        return torch.cat([prompt, token[:, None]], 1)

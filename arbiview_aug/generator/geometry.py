@@ -1,0 +1,114 @@
+"""All that the denoiser is told about the cameras of a frame, as tensors: built on the CPU, batched, moved, used."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+
+from arbiview_aug.camera import Camera
+from arbiview_aug.generator.conditioning import Views, camera_conditions, pooled, reference_camera
+from arbiview_aug.generator.config import GeneratorConfig
+from arbiview_aug.generator.correspondence import Correspondence, Window, correspondences, stacked, token_sizes, window
+
+
+class FrameGeometry(NamedTuple):
+    """The N target and S source cameras of B frames. Sources are numbered before targets where both are read.
+
+    Attributes:
+        target_rays: (B, N, 6, h, w), see ``conditioning.plucker_rays``.
+        target_pose: (B, N, 16), see ``conditioning.pose_vector``.
+        source_rays: (B, S, 6, h, w).
+        source_pose: (B, S, 16).
+        target_reads: Where the targets' tokens lie in sources and targets, one for each token grid, the finest first.
+        source_reads: Where the sources' tokens lie in the other sources.
+    """
+
+    target_rays: torch.Tensor
+    target_pose: torch.Tensor
+    source_rays: torch.Tensor
+    source_pose: torch.Tensor
+    target_reads: list[Correspondence]
+    source_reads: list[Correspondence]
+
+    def to(self, device: torch.device | str) -> FrameGeometry:
+        """The same on a device."""
+        return FrameGeometry(
+            self.target_rays.to(device, non_blocking=True),
+            self.target_pose.to(device, non_blocking=True),
+            self.source_rays.to(device, non_blocking=True),
+            self.source_pose.to(device, non_blocking=True),
+            [c.to(device) for c in self.target_reads],
+            [c.to(device) for c in self.source_reads],
+        )
+
+    def target_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> Views:
+        """The targets' conditions.
+
+        Args:
+            latent: (B, N, C, h, w) of FAVS at their poses, pre-filled.
+            mask: (B, N, H, W) what FAVS covers, at any resolution.
+            confidence: (B, N, H, W) in [0, 1].
+        """
+        return _views(latent, mask, confidence, self.target_rays, self.target_pose)
+
+    def source_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> Views:
+        """The sources' conditions; their latents are their images'."""
+        return _views(latent, mask, confidence, self.source_rays, self.source_pose)
+
+    def target_windows(self, dropped: torch.Tensor | None = None) -> list[Window]:
+        """What targets read, without sources in the frames ``dropped`` (B,) bool: for classifier-free guidance."""
+        sources, targets = self.source_pose.shape[1], self.target_pose.shape[1]
+        reads = self.target_reads if dropped is None else [c.without(sources, dropped) for c in self.target_reads]
+        return [window(c, sources + targets) for c in reads]
+
+    def source_windows(self) -> list[Window]:
+        """What sources read."""
+        return [window(c, self.source_pose.shape[1]) for c in self.source_reads]
+
+
+def frame_geometry(
+    targets: Sequence[Camera], sources: Sequence[Camera], ground_z_m: float, config: GeneratorConfig
+) -> FrameGeometry:
+    """The geometry of one frame (B = 1).
+
+    Args:
+        targets: N cameras of any sizes, in one ego frame with the sources.
+        sources: S cameras.
+        ground_z_m: Height of the road in that frame.
+        config: Settings: the latents' size, the U-Net's levels, the depth levels.
+    """
+    size = config.latent_size
+    grids = token_sizes(size, len(config.unet.widths))
+    target_rays, target_pose = camera_conditions(targets, [reference_camera(t, sources) for t in targets], size)
+    source_rays, source_pose = camera_conditions(sources, sources, size)
+    everything, count = [*sources, *targets], len(sources)
+    settings = grids, ground_z_m, config.facing_m
+    return FrameGeometry(
+        target_rays[None],
+        target_pose[None],
+        source_rays[None],
+        source_pose[None],
+        correspondences(targets, everything, range(count, len(everything)), *settings),
+        correspondences(sources, sources, range(count), *settings),
+    )
+
+
+def batched(frames: Sequence[FrameGeometry]) -> FrameGeometry:
+    """One geometry of frames with as many targets and sources each."""
+    return FrameGeometry(
+        torch.cat([frame.target_rays for frame in frames]),
+        torch.cat([frame.target_pose for frame in frames]),
+        torch.cat([frame.source_rays for frame in frames]),
+        torch.cat([frame.source_pose for frame in frames]),
+        [stacked(grid) for grid in zip(*(frame.target_reads for frame in frames), strict=True)],
+        [stacked(grid) for grid in zip(*(frame.source_reads for frame in frames), strict=True)],
+    )
+
+
+def _views(
+    latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor, rays: torch.Tensor, pose: torch.Tensor
+) -> Views:
+    size = (latent.shape[-2], latent.shape[-1])
+    return Views(latent, pooled(mask, size)[:, :, None], pooled(confidence, size)[:, :, None], rays, pose)

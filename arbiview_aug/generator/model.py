@@ -1,0 +1,133 @@
+"""The generator: denoiser and autoencoder of one configuration; made, loaded, saved, and asked for missing pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from arbiview_aug.environment import optional_package
+from arbiview_aug.errors import GeneratorError
+from arbiview_aug.generator.autoencoder import Autoencoder
+from arbiview_aug.generator.checkpoint import check_tensors, read_checkpoint, write_checkpoint
+from arbiview_aug.generator.completion import complete
+from arbiview_aug.generator.conditioning import input_channels
+from arbiview_aug.generator.config import GeneratorConfig, paper
+from arbiview_aug.generator.correspondence import LEVELS
+from arbiview_aug.generator.denoiser import Denoiser
+from arbiview_aug.generator.stable_diffusion import empty_prompt as embedded_empty_prompt
+from arbiview_aug.generator.stable_diffusion import load_part
+
+
+class Generator(nn.Module):
+    """Completes target views where no camera saw anything (Sec. CVC-SSL).
+
+    ``from_pretrained`` loads one, ``from_config`` makes an untrained one, ``from_stable_diffusion`` one on top of
+    Stable Diffusion. ``to`` moves it to a GPU or to bfloat16.
+
+    Args:
+        config: Settings.
+        denoiser: The U-Net with its cross-view blocks.
+        autoencoder: Between images and latents.
+
+    Attributes:
+        calls: How often the denoiser was run by ``complete_views``, steps and guidance included.
+    """
+
+    def __init__(self, config: GeneratorConfig, denoiser: Denoiser, autoencoder: Autoencoder) -> None:
+        super().__init__()
+        self.config, self.denoiser, self.autoencoder = config, denoiser, autoencoder
+        if config.frozen_unet:
+            autoencoder.requires_grad_(False)
+            denoiser.requires_grad_(False)
+            for parameter in denoiser.own_parameters():
+                parameter.requires_grad_(True)
+        self.calls = 0
+
+    # --- made ---------------------------------------------------------------------------------------------------------
+    @classmethod
+    def from_config(cls, config: GeneratorConfig) -> Generator:
+        """An untrained generator, its weights drawn from torch's RNG."""
+        diffusers = optional_package("diffusers", "generator")
+        latent = config.autoencoder.latent_channels
+        unet = diffusers.UNet2DConditionModel(**config.unet.arguments(input_channels(latent), latent))
+        vae = diffusers.AutoencoderKL(**config.autoencoder.arguments()) if config.autoencoder.widths else None
+        denoiser = Denoiser(unet, len(LEVELS), config.prompt_tokens)
+        return cls(config, denoiser, Autoencoder(vae, config.autoencoder.scale))
+
+    @classmethod
+    def from_stable_diffusion(
+        cls,
+        where: str | Path,
+        config: GeneratorConfig | None = None,
+        *,
+        empty_prompt: torch.Tensor | None = None,
+    ) -> Generator:
+        """An untrained generator on Stable Diffusion's weights: it computes what Stable Diffusion does.
+
+        Args:
+            where: A folder or hub id in diffusers' layout.
+            config: ``paper()`` unless given; the weights must be those of its networks.
+            empty_prompt: (prompt tokens, width) the text encoder's last hidden state for ""; from the folder's text
+                encoder, for which transformers is needed, where None.
+
+        Raises:
+            GeneratorError: Weights that are missing, extra, or of another architecture.
+        """
+        config = config or paper()
+        latent = config.autoencoder.latent_channels
+        if not config.autoencoder.widths:
+            raise GeneratorError("from_stable_diffusion: expected a config with an autoencoder, got one on pixels")
+        unet = load_part("UNet2DConditionModel", where, "unet", config.unet.arguments(latent, latent))
+        shape = config.autoencoder.arguments()
+        del shape["scaling_factor"]  # the file's counts
+        vae = load_part("AutoencoderKL", where, "vae", shape)
+        config = replace(config, autoencoder=replace(config.autoencoder, scale=float(vae.config.scaling_factor)))
+        if empty_prompt is None and config.prompt_tokens:
+            empty_prompt = embedded_empty_prompt(where)
+        denoiser = Denoiser(unet, len(LEVELS), config.prompt_tokens)
+        if empty_prompt is not None:
+            expected = tuple(denoiser.context.empty_prompt.shape)
+            if tuple(empty_prompt.shape) != expected:
+                raise GeneratorError(f"empty_prompt: expected shape {expected}, got {tuple(empty_prompt.shape)}")
+            denoiser.context.empty_prompt.copy_(empty_prompt)
+        return cls(config, denoiser, Autoencoder(vae, config.autoencoder.scale)).eval()
+
+    # --- folders ------------------------------------------------------------------------------------------------------
+    @classmethod
+    def from_pretrained(cls, folder: str | Path) -> Generator:
+        """The generator of a folder by ``save_pretrained``, in float32 on the CPU, ready to run.
+
+        Raises:
+            GeneratorError: No such folder; settings or weights that are missing, extra or of another shape.
+        """
+        data, tensors = read_checkpoint(Path(folder))
+        config = GeneratorConfig.from_dict(data.get("generator", {}), f"{folder}/config.json")
+        with torch.device("meta"):
+            made = cls.from_config(config)
+        check_tensors(made.state_dict(), tensors, str(folder))
+        made.load_state_dict(
+            {name: t.float() if t.is_floating_point() else t for name, t in tensors.items()}, assign=True
+        )
+        return made.eval()
+
+    def save_pretrained(self, folder: str | Path, *, dtype: torch.dtype | None = None) -> None:
+        """Write the generator to a folder of its own; a checkpoint that is there is replaced once the new one is whole.
+
+        Args:
+            folder: Made if it is not there.
+            dtype: Of the stored weights; as they are where None. float16 halves a file, and is loaded as float32.
+
+        Raises:
+            OSError: The disk is full, or the folder cannot be written.
+        """
+        tensors = self.state_dict()
+        if dtype is not None:
+            tensors = {name: t.to(dtype) if t.is_floating_point() else t for name, t in tensors.items()}
+        scaled = replace(self.config.autoencoder, scale=self.autoencoder.scale)
+        write_checkpoint(Path(folder), {"generator": replace(self.config, autoencoder=scaled).to_dict()}, tensors)
+
+    # --- used ---------------------------------------------------------------------------------------------------------
+    complete_views = complete

@@ -1,0 +1,91 @@
+"""Stable Diffusion's U-Net, autoencoder and empty prompt, from a diffusers folder or hub id."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from arbiview_aug.environment import optional_package
+from arbiview_aug.errors import GeneratorError
+
+_EMPTY_PROMPT = [49406, *[49407] * 76]
+"""CLIP's tokens of "": start of text, then end of text up to the 77 that Stable Diffusion always feeds."""
+
+
+def load_part(kind: str, where: str | Path, subfolder: str, expected: Mapping[str, Any]) -> Any:
+    """A diffusers model, every weight from the file.
+
+    diffusers itself initialises what is missing and drops what is extra, with no more than a warning.
+
+    Args:
+        kind: The diffusers class.
+        where: Folder or hub id in diffusers' layout; of a hub id, safetensors are downloaded.
+        subfolder: ``unet`` or ``vae``.
+        expected: Entries that its configuration must have.
+
+    Raises:
+        GeneratorError: No such folder, another architecture, or weights that are missing, extra or of another shape.
+    """
+    cls = getattr(optional_package("diffusers", "generator"), kind)
+    label = f"{where}/{subfolder}"
+    try:
+        config = cls.load_config(where, subfolder=subfolder)
+    except (OSError, ValueError) as error:
+        raise GeneratorError(f"{label}: expected a diffusers folder or hub id with a {kind}: {error}") from None
+    for name, value in expected.items():
+        got = config.get(name, _default(cls, name))
+        if _plain(got) != _plain(value):
+            raise GeneratorError(f"{label}: expected {name} {_plain(value)}, got {_plain(got)}")
+    try:
+        model, report = cls.from_pretrained(
+            where, subfolder=subfolder, use_safetensors=True, output_loading_info=True, low_cpu_mem_usage=False
+        )
+    except (OSError, ValueError, RuntimeError) as error:  # no safetensors; shapes that do not fit
+        raise GeneratorError(f"{label}: expected the weights of this {kind} as safetensors: {error}") from None
+    wrong = [
+        f"{len(names)} {what}: {', '.join(sorted(map(str, names))[:4])}"
+        for what, names in (("missing", report["missing_keys"]), ("that do not belong", report["unexpected_keys"]))
+        if names
+    ]
+    if wrong:
+        raise GeneratorError(f"{label}: expected exactly the weights of this {kind}; {'; '.join(wrong)}")
+    return model
+
+
+def empty_prompt(where: str | Path) -> torch.Tensor:
+    """(77, width) CLIP's embedding of the empty prompt. Computed once: a generator's own folder holds it.
+
+    Raises:
+        GeneratorError: No text encoder in the folder.
+        ImportError: transformers is not installed.
+    """
+    try:
+        transformers = optional_package("transformers", "generator")
+    except ImportError:
+        raise ImportError(
+            "the empty prompt's embedding needs transformers, once: pip install transformers. "
+            "Or pass empty_prompt=, a (77, width) tensor of the text encoder's last hidden state"
+        ) from None
+    try:
+        encoder = transformers.CLIPTextModel.from_pretrained(where, subfolder="text_encoder", use_safetensors=True)
+    except (OSError, ValueError) as error:
+        raise GeneratorError(f"{where}/text_encoder: expected CLIP's text encoder: {error}") from None
+    with torch.no_grad():
+        return encoder(torch.tensor([_EMPTY_PROMPT])).last_hidden_state[0]
+
+
+def _default(cls: Any, name: str) -> Any:
+    import inspect
+
+    parameter = inspect.signature(cls.__init__).parameters.get(name)
+    return None if parameter is None else parameter.default
+
+
+def _plain(value: Any) -> Any:
+    """Lists as tuples; a tuple of one repeated value as that value, since diffusers takes both."""
+    if isinstance(value, list | tuple):
+        return value[0] if len(set(value)) == 1 else tuple(value)
+    return value
