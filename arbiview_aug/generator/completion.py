@@ -121,7 +121,7 @@ def complete(
     trust = [seen.float() for seen in coverage] if confidence is None else [c.float() for c in confidence]
     known = [seen & (c >= min_confidence) for seen, c in zip(coverage, trust, strict=True)]
     holes = [
-        ~k if c.mask is None else ~k & torch.from_numpy(c.mask).to(k.device)
+        ~k if c.mask is None else ~k & torch.tensor(c.mask, device=k.device)
         for k, c in zip(known, targets, strict=True)
     ]
     todo = []
@@ -244,7 +244,7 @@ def _at_size(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
 def _seen(camera: Camera, size: tuple[int, int]) -> torch.Tensor:
     """(H, W) float32: 1 where a source shows the scene, 0 on its own car."""
     mask = camera.resize(size).mask
-    return torch.ones(size) if mask is None else torch.from_numpy(mask).float()
+    return torch.ones(size) if mask is None else torch.tensor(mask, dtype=torch.float32)
 
 
 def _noise(generator: Generator, seed: int, frame: str | int, camera: str) -> torch.Tensor:

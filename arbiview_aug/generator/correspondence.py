@@ -16,7 +16,7 @@ Everything is computed in float64 on the CPU and held in float32: grids in half 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -131,43 +131,55 @@ def correspondences(
     Args:
         queries: Q cameras, in one ego frame.
         keys: V cameras that may be read.
-        own: For each query its own place among the keys, -1 if it is not there: no view reads itself.
+        own: For each query its own place among the keys: no view reads itself.
         sizes: (h, w) of the token grids, the finest first.
         ground_z_m: Height of the road in the ego frame.
         facing_m: Distance of the facing plane.
     """
-    found: list[list[tuple[int, list[tuple[FloatArray, BoolArray]]]]] = []
-    small = [[camera.resize(size) for camera in keys] for size in sizes]
+    small = [[camera.resize(size) for size in sizes] for camera in keys]
+    found = []
     for query, self_index in zip(queries, own, strict=True):
-        planes = plane_vectors(query, ground_z_m, facing_m)
-        small_query = [query.resize(size) for size in sizes]
-        rays = [camera.unproject_cam(camera.pixel_grid()) for camera in small_query]
-        slots = []
-        for j, key in enumerate(keys):
-            if j == self_index:
-                continue
-            same_centre = float(np.linalg.norm(query.center_m - key.center_m)) < SAME_CENTER_M
-            used = planes[:1] if same_centre else planes
-            first = correspond(query, rays[0], small[0][j], used)
-            if first[1].any():
-                coarser = [correspond(query, rays[k], small[k][j], used) for k in range(1, len(sizes))]
-                slots.append((j, [first, *coarser]))
-        found.append(slots)
-    levels = max((grids[0][1].shape[0] for slots in found for _, grids in slots), default=1)
-    width = max(1, *(len(slots) for slots in found))
+        others = {j: grids for j, grids in enumerate(small) if j != self_index}
+        found.append(_neighbours(query, others, plane_vectors(query, ground_z_m, facing_m)))
+    slots = max(1, *(len(of_query) for of_query in found))
+    levels = max((len(grids[0][0]) for of_query in found for _, grids in of_query), default=1)
     made = []
     for k, (h, w) in enumerate(sizes):
-        neighbour = torch.zeros((1, len(queries), width), dtype=torch.int64)
-        centre = torch.zeros((1, len(queries), width, levels, h, w, 2))
-        valid = torch.zeros((1, len(queries), width, levels, h, w), dtype=torch.bool)
-        for q, slots in enumerate(found):
-            for slot, (j, grids) in enumerate(slots):
+        neighbour = torch.zeros((1, len(queries), slots), dtype=torch.int64)
+        centre = torch.zeros((1, len(queries), slots, levels, h, w, 2))
+        valid = torch.zeros((1, len(queries), slots, levels, h, w), dtype=torch.bool)
+        for q, of_query in enumerate(found):
+            for slot, (j, grids) in enumerate(of_query):
                 at, there = grids[k]
                 neighbour[0, q, slot] = j
                 centre[0, q, slot, : len(at)] = torch.from_numpy(at.astype(np.float32))
                 valid[0, q, slot, : len(there)] = torch.from_numpy(there)
         made.append(Correspondence(neighbour, centre, valid))
     return made
+
+
+def _neighbours(
+    query: Camera, others: Mapping[int, Sequence[Camera]], planes: FloatArray
+) -> list[tuple[int, list[tuple[FloatArray, BoolArray]]]]:
+    """The views that overlap one, and ``correspond`` for each token grid.
+
+    Args:
+        query: View i.
+        others: Views j by number, at the sizes of all grids, the finest first.
+        planes: The depth levels, in ``query``'s frame.
+    """
+    sizes = next(iter(others.values()), ())
+    small = [query.resize(camera.size) for camera in sizes]
+    rays = [camera.unproject_cam(camera.pixel_grid()) for camera in small]
+    found = []
+    for j, grids in others.items():
+        same_centre = float(np.abs(query.center_m - grids[0].center_m).max()) < SAME_CENTER_M
+        used = planes[:1] if same_centre else planes
+        first = correspond(query, rays[0], grids[0], used)
+        if first[1].any():
+            rest = [correspond(query, ray, camera, used) for ray, camera in zip(rays[1:], grids[1:], strict=True)]
+            found.append((j, [first, *rest]))
+    return found
 
 
 def stacked(frames: Sequence[Correspondence]) -> Correspondence:

@@ -1,0 +1,236 @@
+"""Cross-view attention: the gathered reference against a naive loop, the dense path against it, extremes."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from arbiview_aug.generator.attention import HEAD_WIDTH, CrossViewAttention, PositionalEncoding, pays_dense
+from arbiview_aug.generator.correspondence import Window, correspondences, stacked, window
+from arbiview_aug.rig import Rig, load_rig
+from tests.generator.small import ring, stirred
+
+WIDTH = 64
+
+
+def block(width: int = WIDTH, levels: int = 3) -> CrossViewAttention:
+    torch.manual_seed(1)
+    made = CrossViewAttention(width, levels)
+    stirred(made, 0.05)
+    return made.eval()
+
+
+def windows(rig: Rig, size: tuple[int, int], copies: int = 1) -> Window:
+    reads = correspondences(list(rig), list(rig), range(len(rig)), [size], rig.ground_z_m)[0]
+    return window(stacked([reads] * copies), len(rig))
+
+
+def features(at: Window, views: int, seed: int = 0) -> torch.Tensor:
+    batch, _, tokens = at.read.shape
+    return torch.randn(batch, views, tokens, WIDTH, generator=torch.Generator().manual_seed(seed))
+
+
+def test_the_encoding_is_the_papers() -> None:
+    """concat(sin(W1 Δp), cos(W2 Δp)); at Δp = 0 the sines are 0 and the cosines 1."""
+    encoding = PositionalEncoding()
+    W1, W2 = encoding.maps(torch.device("cpu"))
+    delta = torch.tensor([[0.0, 0.0], [0.5, -1.25]])
+    assert torch.allclose(encoding(delta), torch.cat([(delta @ W1.T).sin(), (delta @ W2.T).cos()], 1))
+    assert encoding(delta)[0].tolist() == [0.0] * 16 + [1.0] * 16
+    assert float(W1.max()) <= math.pi + 1e-6  # what a grid of whole tokens tells apart
+
+
+def test_turned_queries_see_the_offset() -> None:
+    encoding = PositionalEncoding()
+    rng = torch.Generator().manual_seed(0)
+    q = torch.randn(5, 3, HEAD_WIDTH, generator=rng)
+    a, b = 20 * torch.rand(5, 2, generator=rng), 20 * torch.rand(5, 2, generator=rng)
+    expected = (q * encoding(a - b)[:, None]).sum(-1)
+    assert torch.allclose((encoding.turned(q, b) * encoding(a)[:, None]).sum(-1), expected, atol=1e-4)
+
+
+def test_gathered_attention_is_the_formula() -> None:
+    """Attention(Q_i, K_j, V_j) = Σ_l w_l Attention^(l), token by token, tap by tap."""
+    rig = Rig([c.shifted(z_m=0.1 * k) for k, c in enumerate(ring(4, fov_deg=110))])
+    h, w = size = (4, 6)
+    at, layer = windows(rig, size), block()
+    x = features(at, 4)
+    keys, values = layer.keys_values(x)
+    with torch.no_grad():
+        got, rows = layer(x, keys, values, at, dense=False, with_rows=True)
+        queries = layer.to_q(layer.norm(x))
+        reads = correspondences(list(rig), list(rig), range(4), [size], 0.0)[0]
+        w_l = torch.softmax(layer.level_logits, 0)
+        attended = torch.zeros_like(x)
+        predicted = {}
+        for i in range(4):
+            for p in range(h * w):
+                y, column = divmod(p, w)
+                outputs, evidence = [], []
+                for slot in range(reads.neighbour.shape[2]):
+                    j = int(reads.neighbour[0, i, slot])
+                    valid = reads.valid[0, i, slot, :, y, column]
+                    if not valid.any():
+                        continue
+                    share = w_l * valid / (w_l * valid).sum()
+                    out, logit_here = torch.zeros(2, HEAD_WIDTH), torch.zeros(2)
+                    for level in valid.nonzero().flatten().tolist():
+                        centre = reads.centre[0, i, slot, level, y, column]
+                        cx, cy = (int(v) for v in centre.round())
+                        taps = [(cx + dx, cy + dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+                        inside = [(tx, ty) for tx, ty in taps if 0 <= tx < w and 0 <= ty < h]
+                        for head in range(2):
+                            part = slice(32 * head, 32 * head + 32)
+                            q = queries[0, i, p, part]
+                            logits = torch.stack([
+                                q @ (keys[0, j, ty * w + tx, part]
+                                     + layer.positions(torch.tensor([tx, ty]) - centre)) / math.sqrt(32)
+                                for tx, ty in inside
+                            ])  # fmt: skip
+                            attention = torch.softmax(logits, 0)
+                            v = torch.stack([values[0, j, ty * w + tx, part] for tx, ty in inside])
+                            out[head] += share[level] * attention @ v
+                            logit_here[head] += share[level] * logits[inside.index((cx, cy))]
+                            predicted.setdefault((i, slot, level, p), torch.zeros(9))[
+                                [taps.index(tap) for tap in inside]
+                            ] += attention / 2
+                    outputs.append(out)
+                    evidence.append(logit_here)
+                if outputs:
+                    weight = torch.softmax(torch.stack(evidence), 0)[..., None]
+                    attended[0, i, p] = (weight * torch.stack(outputs)).sum(0).flatten()
+        gate = at.read[..., None].float()
+        expected = x + gate * layer.to_out(attended)
+        expected = expected + gate * layer.feed(layer.feed_norm(expected))
+    assert torch.allclose(got, expected, atol=1e-4)
+    assert len(rows) == len(predicted) == len(at.place)
+    order = torch.stack([predicted[key] for key in sorted(predicted)])  # places are sorted the same way
+    assert torch.allclose(rows, order, atol=1e-5)
+
+
+@pytest.mark.parametrize("case", ["turned", "ring", "nuscenes", "one centre"])
+def test_dense_attention_equals_gathered_attention(case: str) -> None:
+    rigs = {
+        "turned": Rig([c.turned(yaw_deg=3 * k) for k, c in enumerate(ring(3, radius_m=0.2, fov_deg=120))]),
+        "ring": ring(6),
+        "nuscenes": load_rig("nuscenes"),
+        "one centre": ring(5, radius_m=0.0),
+    }
+    rig = rigs[case]
+    at, layer = windows(rig, (5, 9), copies=2), block()
+    x = features(at, len(rig))
+    with torch.no_grad():
+        keys, values = layer.keys_values(x)
+        gathered = layer(x, keys, values, at, dense=False)[0]
+        dense = layer(x, keys, values, at, dense=True)[0]
+    assert at.valid.any()
+    assert (gathered - x).abs().max() > 0.1
+    assert (gathered - dense).abs().max() <= 1e-5
+
+
+def test_both_ways_have_the_same_gradients() -> None:
+    rig = ring(4, fov_deg=110)
+    at = windows(rig, (4, 6))
+    x = features(at, 4)
+    found = []
+    for dense in (False, True):
+        layer = block()
+        y, _ = layer(x, *layer.keys_values(x), at, dense=dense)
+        y.square().mean().backward()
+        found.append([parameter.grad for parameter in layer.parameters()])
+    for one, other in zip(*found, strict=True):
+        assert torch.allclose(one, other, atol=1e-5)
+
+
+def test_which_way_pays() -> None:
+    """Views that lie almost on each other on a small grid; never a ring, never a large grid (times in the module)."""
+    together = Rig([c.turned(yaw_deg=k) for k, c in enumerate([ring(1)[0]] * 1)] + [
+        ring(1, name="d")[0].turned(yaw_deg=2), ring(1, name="e")[0].turned(yaw_deg=-2)
+    ])  # fmt: skip
+    assert pays_dense(windows(together, (7, 13)))
+    assert not pays_dense(windows(together, (28, 50)))
+    assert not pays_dense(windows(ring(6), (7, 13)))
+
+
+def test_zero_initialised_it_changes_nothing() -> None:
+    torch.manual_seed(0)
+    rig = ring(6)
+    at, layer = windows(rig, (5, 9)), CrossViewAttention(WIDTH, 3)
+    x = features(at, 6)
+    for dense in (False, True):
+        assert torch.equal(layer(x, *layer.keys_values(x), at, dense=dense)[0], x)
+
+
+@pytest.mark.parametrize("dense", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_what_no_view_overlaps_is_returned_bit_for_bit(dense: bool, dtype: torch.dtype) -> None:
+    """With trained weights: a rig whose cameras look apart, and the tokens of a ring outside the overlap."""
+    layer = block().to(dtype)
+    for rig in (ring(4, fov_deg=60), ring(6, fov_deg=80), ring(1)):
+        at = windows(rig, (4, 7))
+        x = features(at, len(rig)).to(dtype)
+        with torch.no_grad():
+            y = layer(x, *layer.keys_values(x), at, dense=dense)[0]
+        assert torch.isfinite(y).all()
+        assert torch.equal(y[~at.read], x[~at.read])
+        if len(rig) == 6:
+            assert at.read.any() and not at.read.all() and not torch.equal(y[at.read], x[at.read])
+        else:
+            assert not at.read.any()
+
+
+@pytest.mark.parametrize("dense", [False, True])
+def test_every_parameter_has_a_finite_gradient_even_where_nothing_overlaps(dense: bool) -> None:
+    layer = block()
+    at = windows(ring(4, fov_deg=60), (3, 5))
+    x = features(at, 4).requires_grad_()
+    y, rows = layer(x, *layer.keys_values(x), at, dense=dense, with_rows=True)
+    (y.sum() + rows.sum()).backward()
+    for name, parameter in layer.named_parameters():
+        assert parameter.grad is not None and torch.isfinite(parameter.grad).all(), name
+
+
+def test_the_order_of_the_views_does_not_matter() -> None:
+    rig, order = ring(6), [3, 0, 5, 1, 4, 2]
+    layer = block()
+    at, moved = windows(rig, (4, 7)), windows(Rig([rig[k] for k in order]), (4, 7))
+    x = features(at, 6)
+    with torch.no_grad():
+        y = layer(x, *layer.keys_values(x), at)[0]
+        z = layer(x[:, order], *layer.keys_values(x[:, order]), moved)[0]
+    assert torch.allclose(z, y[:, order], atol=1e-5)
+
+
+def test_frames_of_a_batch_do_not_see_each_other() -> None:
+    rig = ring(5)
+    layer, at, alone = block(), windows(rig, (4, 7), copies=2), windows(rig, (4, 7))
+    x = features(at, 5)
+    with torch.no_grad():
+        both = layer(x, *layer.keys_values(x), at)[0]
+        one = layer(x[1:], *layer.keys_values(x[1:]), alone)[0]
+    assert torch.allclose(both[1:], one, atol=1e-6)
+
+
+def test_half_precision_stays_close() -> None:
+    """Grids and softmax are float32, so bfloat16 costs its own rounding and no more."""
+    rig = ring(6)
+    layer, at = block(), windows(rig, (14, 25))
+    x = features(at, 6)
+    with torch.no_grad():
+        exact = layer(x, *layer.keys_values(x), at)[0]
+        low = layer.to(torch.bfloat16)
+        x = x.to(torch.bfloat16)
+        near = low(x, *low.keys_values(x), at)[0].float()
+    assert (near - exact).abs().mean() < 0.02 * exact.abs().mean()
+
+
+def test_parameters() -> None:
+    """About 16 width²: 147.5 M for the widths of the paper."""
+    with torch.device("meta"):
+        blocks = [CrossViewAttention(w, 3) for w in (320, 640, 1280, 1280, 1280, 1280, 1280, 640, 320)]
+    count = sum(parameter.numel() for layer in blocks for parameter in layer.parameters())
+    assert round(count / 1e6, 1) == 147.6
+    with pytest.raises(ValueError, match="multiple of 32, got 48"):
+        CrossViewAttention(48, 3)

@@ -1,0 +1,148 @@
+"""A generator's own folder: what is saved is loaded, what is broken is refused, what is half written is not seen."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from unittest import mock
+
+import pytest
+import safetensors.torch
+import torch
+
+from arbiview_aug.errors import GeneratorError
+from arbiview_aug.generator import Generator, GeneratorConfig, compact, paper, small, tiny
+from arbiview_aug.generator.config import AutoencoderConfig
+from tests.generator.small import small_config
+
+
+def weights(folder: Path) -> Path:
+    (file,) = folder.glob("weights-*.safetensors")
+    return file
+
+
+def assert_same(one: Generator, other: Generator) -> None:
+    assert one.config == other.config
+    expected, found = one.state_dict(), other.state_dict()
+    assert list(expected) == list(found)
+    assert all(torch.equal(expected[name], found[name]) for name in expected)
+
+
+def test_what_is_saved_is_loaded(generator: Generator, tmp_path: Path) -> None:
+    generator.save_pretrained(tmp_path / "a" / "b")
+    loaded = Generator.from_pretrained(tmp_path / "a" / "b")
+    assert_same(generator, loaded)
+    assert not loaded.training
+    assert not any(p.is_meta for p in [*loaded.parameters(), *loaded.buffers()])
+    assert sorted(p.name for p in (tmp_path / "a" / "b").iterdir()) == ["config.json", weights(tmp_path / "a/b").name]
+
+
+def test_with_an_autoencoder_frozen_or_in_half_precision(tmp_path: Path) -> None:
+    vae = AutoencoderConfig(widths=(16, 16), layers=1, latent_channels=4, norm_groups=8)
+    made = Generator.from_config(small_config(autoencoder=vae, frozen_unet=True, prompt_tokens=3))
+    made.autoencoder.scale = 0.7  # as the trainer sets it from the data
+    made.save_pretrained(tmp_path, dtype=torch.float16)
+    loaded = Generator.from_pretrained(tmp_path)
+    assert loaded.autoencoder.scale == loaded.config.autoencoder.scale == 0.7
+    for name, value in made.state_dict().items():
+        found = loaded.state_dict()[name]
+        assert found.dtype == value.dtype == torch.float32 and torch.allclose(found, value, atol=1e-3), name
+    own = {id(p) for p in loaded.denoiser.own_parameters()}
+    assert all(p.requires_grad == (id(p) in own) for p in loaded.parameters())
+    size = weights(tmp_path).stat().st_size
+    assert size < 2.1 * sum(p.numel() for p in made.parameters()) + 1e5
+
+
+def test_a_checkpoint_is_replaced_whole(generator: Generator, tmp_path: Path) -> None:
+    generator.save_pretrained(tmp_path)
+    other = Generator.from_config(small_config(name="other"))
+    other.save_pretrained(tmp_path)
+    assert_same(other, Generator.from_pretrained(tmp_path))
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize("moment", ["weights", "flush", "config"])
+def test_a_full_disk_leaves_the_old_checkpoint(generator: Generator, tmp_path: Path, moment: str) -> None:
+    generator.save_pretrained(tmp_path)
+    other = Generator.from_config(small_config(name="other"))
+    full = OSError(28, "No space left on device")
+
+    def half(tensors: dict, path: Path) -> None:
+        path.write_bytes(b"half of the weights")
+        raise full
+
+    failing = {
+        "weights": mock.patch("safetensors.torch.save_file", half),
+        "flush": mock.patch("os.fsync", side_effect=full),
+        "config": mock.patch("pathlib.Path.write_text", side_effect=full),
+    }[moment]
+    with failing, pytest.raises(OSError, match="No space left"):
+        other.save_pretrained(tmp_path)
+    assert_same(generator, Generator.from_pretrained(tmp_path))
+    assert not list(tmp_path.glob("*.tmp")) and not list(tmp_path.glob(".*"))
+
+
+def test_a_process_killed_while_writing_leaves_the_old_checkpoint(generator: Generator, tmp_path: Path) -> None:
+    """What it leaves behind is not looked at, and gone after the next save."""
+    generator.save_pretrained(tmp_path)
+    (tmp_path / "weights-000000000000.safetensors").write_bytes(b"half")
+    assert_same(generator, Generator.from_pretrained(tmp_path))
+    generator.save_pretrained(tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_missing_extra_and_misshapen_weights_are_named(generator: Generator, tmp_path: Path) -> None:
+    generator.save_pretrained(tmp_path)
+    file = weights(tmp_path)
+    good = safetensors.torch.load_file(file)
+
+    def refused(tensors: dict[str, torch.Tensor], match: str) -> None:
+        safetensors.torch.save_file(tensors, file)
+        with pytest.raises(GeneratorError, match=match):
+            Generator.from_pretrained(tmp_path)
+
+    name = "denoiser.unet.conv_in.weight"
+    refused({k: v for k, v in good.items() if k != name}, rf"expected {len(good)} tensors; 1 missing: {name}")
+    refused({**good, "lora.up": torch.zeros(2)}, "1 that do not belong: lora.up")
+    refused({**good, name: torch.zeros(32, 4, 3, 3)}, rf"expected {name} of \(32, 14, 3, 3\), got \(32, 4, 3, 3\)")
+    file.write_bytes(file.read_bytes()[:1000])
+    with pytest.raises(GeneratorError, match="expected readable weights"):
+        Generator.from_pretrained(tmp_path)
+
+
+def test_broken_configurations_are_named(generator: Generator, tmp_path: Path) -> None:
+    with pytest.raises(GeneratorError, match=r"expected a generator's folder with config.json"):
+        Generator.from_pretrained(tmp_path / "nothing")
+    generator.save_pretrained(tmp_path)
+    path = tmp_path / "config.json"
+    good = json.loads(path.read_text())
+
+    def refused(text: str, match: str) -> None:
+        path.write_text(text)
+        with pytest.raises(GeneratorError, match=match):
+            Generator.from_pretrained(tmp_path)
+
+    refused("{", "expected a generator's configuration")
+    refused("[1]", "expected a generator's configuration")
+    refused(json.dumps({**good, "format": 9}), "expected format 1, got 9")
+    refused(json.dumps({**good, "weights": "elsewhere"}), "expected readable weights in elsewhere")
+    wide = {**good["generator"], "unet": {**good["generator"]["unet"], "context_width": 768}}
+    refused(json.dumps({**good, "generator": wide}), r"mlp.0.weight of \(768, 144\), got \(32, 144\)")
+    refused(json.dumps({**good, "generator": {**good["generator"], "colour": 1}}), "expected keys among .*got colour")
+
+
+@pytest.mark.parametrize("make", [paper, small, compact, tiny])
+def test_configurations_survive_json(make) -> None:
+    config = make()
+    assert GeneratorConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+
+
+def test_impossible_configurations_are_refused() -> None:
+    with pytest.raises(GeneratorError, match=r"image_size: expected multiples of 4, got \(30, 56\)"):
+        small_config(image_size=(30, 56), autoencoder=compact().autoencoder)
+    with pytest.raises(GeneratorError, match="zero_snr: expected prediction 'v_prediction'"):
+        small_config(prediction="epsilon")
+    with pytest.raises(GeneratorError, match="strength in"):
+        small_config(strength=0.0)
+    with pytest.raises(GeneratorError, match="expected multiples of 32"):
+        small_config(unet={"widths": (48,)} and type(tiny().unet)(widths=(48,), transformers=(True,)))

@@ -1,0 +1,235 @@
+"""The denoiser: a plain U-Net until its attention is trained, shared weights, and who reads whom."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from diffusers import UNet2DConditionModel
+
+from arbiview_aug.errors import GeneratorError
+from arbiview_aug.generator import Generator, compact, paper, small, tiny
+from arbiview_aug.generator.conditioning import Views
+from arbiview_aug.generator.correspondence import token_sizes
+from arbiview_aug.generator.denoiser import REGRESSION, Denoiser, Rows
+from arbiview_aug.generator.geometry import FrameGeometry, frame_geometry
+from tests.generator.small import ring, small_config
+
+
+def views(geometry: FrameGeometry, of: str, seed: int = 0, channels: int = 3) -> Views:
+    rays = geometry.target_rays if of == "target" else geometry.source_rays
+    b, n, _, h, w = rays.shape
+    rng = torch.Generator().manual_seed(seed)
+    latent = torch.randn(b, n, channels, h, w, generator=rng)
+    make = geometry.target_views if of == "target" else geometry.source_views
+    mask = torch.rand(b, n, h, w, generator=rng) < 0.7
+    return make(latent, mask, mask * torch.rand(b, n, h, w, generator=rng))
+
+
+def run(denoiser: Denoiser, geometry: FrameGeometry, t: int = 400, seed: int = 0, rows: list[Rows] | None = None):
+    targets, sources = views(geometry, "target", seed), views(geometry, "source", seed + 1)
+    noisy = torch.randn(targets.latent.shape, generator=torch.Generator().manual_seed(seed + 2))
+    read = denoiser.read_sources(sources, geometry.source_windows())
+    time = torch.full((len(noisy),), t)
+    return denoiser(noisy, time, targets, geometry.target_windows(), read, rows)
+
+
+@pytest.fixture
+def geometry() -> FrameGeometry:
+    sources = ring(4, fov_deg=100)
+    targets = ring(4, fov_deg=120, yaw_deg=20, name="t")
+    return frame_geometry(list(targets)[:2], list(sources), 0.0, small_config())
+
+
+@pytest.mark.parametrize("size", [(6, 10), (5, 7), (3, 5)])
+@pytest.mark.parametrize("checkpointing", [False, True])
+def test_untrained_attention_leaves_the_plain_unet(size: tuple[int, int], checkpointing: bool) -> None:
+    """Difference 0, also at odd sizes and under gradient checkpointing; the conditions enter by zero weights."""
+    torch.manual_seed(0)
+    config = small_config(image_size=size)
+    plain = UNet2DConditionModel(**config.unet.arguments(3, 3))
+    denoiser = Denoiser(copy.deepcopy(plain))
+    denoiser.gradient_checkpointing = checkpointing
+    geometry = frame_geometry(list(ring(3, name="t")), list(ring(3)), 0.0, config)
+    targets = views(geometry, "target")
+    noisy = torch.randn(targets.latent.shape)
+    read = denoiser.read_sources(views(geometry, "source"), geometry.source_windows())
+    got = denoiser(noisy, torch.tensor([400]), targets, geometry.target_windows(), read)
+    context = denoiser.context(targets.pose[0])
+    expected = plain(noisy[0], 400, encoder_hidden_states=context).sample
+    assert torch.equal(got[0], expected)
+
+
+def test_checkpointing_changes_no_gradient(generator: Generator, geometry: FrameGeometry) -> None:
+    found = []
+    for checkpointing in (False, True):
+        denoiser = copy.deepcopy(generator.denoiser).train()
+        denoiser.gradient_checkpointing = checkpointing
+        rows: list[Rows] = []
+        out = run(denoiser, geometry, rows=rows)
+        (out.square().mean() + sum(r.predicted.square().sum() for r in rows)).backward()
+        found.append({name: parameter.grad for name, parameter in denoiser.named_parameters()})
+    for name, gradient in found[0].items():
+        if name.startswith("regression"):
+            continue
+        assert gradient is not None and torch.isfinite(gradient).all(), name
+        assert torch.allclose(gradient, found[1][name], atol=1e-6), name
+
+
+def test_every_parameter_takes_part_in_every_step(generator: Generator) -> None:
+    """No overlap, one view, regression or not: unused parameters would hang distributed training."""
+    apart = frame_geometry(list(ring(1, name="t")), [ring(1)[0].turned(yaw_deg=180)], 0.0, small_config())
+    for t in (0, REGRESSION):
+        denoiser = copy.deepcopy(generator.denoiser)
+        run(denoiser, apart, t).sum().backward()
+        assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in denoiser.parameters())
+
+
+def test_sources_can_be_held_over_the_steps(generator: Generator, geometry: FrameGeometry) -> None:
+    """Their keys and values depend neither on the step nor on the targets."""
+    denoiser = generator.denoiser
+    sources = views(geometry, "source", 1)
+    with torch.no_grad():
+        read = denoiser.read_sources(sources, geometry.source_windows())
+        assert len(read) == len(denoiser.cross_view) == 5
+        kept = [k.clone() for k, _ in read]
+        run(denoiser, geometry, 10)
+        again = denoiser.read_sources(sources, geometry.source_windows())
+    assert all(torch.equal(a, b) and torch.equal(a, c) for a, (b, _), (c, _) in zip(kept, read, again, strict=True))
+
+
+def test_targets_read_sources_and_targets(generator: Generator, geometry: FrameGeometry) -> None:
+    denoiser, t = generator.denoiser, torch.tensor([400])
+    targets, sources = views(geometry, "target"), views(geometry, "source", 1)
+    noisy = torch.randn(targets.latent.shape, generator=torch.Generator().manual_seed(2))
+    with torch.no_grad():
+        read = denoiser.read_sources(sources, geometry.source_windows())
+        windows = geometry.target_windows()
+        base = denoiser(noisy, t, targets, windows, read)
+        other = sources._replace(latent=sources.latent + 1)
+        changed = denoiser(noisy, t, targets, windows, denoiser.read_sources(other, geometry.source_windows()))
+        assert (changed - base).abs().max() > 1e-3
+        noisy_too = noisy.clone()
+        noisy_too[:, 1] += 1
+        beside = denoiser(noisy_too, t, targets, windows, read)
+        assert (beside[:, 0] - base[:, 0]).abs().max() > 1e-3
+        # Without sources, as classifier-free guidance has it, nothing of them is left.
+        dropped = torch.tensor([True])
+        alone = [
+            denoiser(noisy, t, targets.dropped(dropped), geometry.target_windows(dropped), keys)
+            for keys in (read, denoiser.read_sources(other, geometry.source_windows()))
+        ]
+        assert torch.equal(*alone)
+
+
+def test_permuting_the_cameras_permutes_the_output(generator: Generator) -> None:
+    sources, targets, config = ring(4, fov_deg=100), ring(5, fov_deg=100, yaw_deg=15, name="t"), small_config()
+    denoiser, t = generator.denoiser, torch.tensor([300])
+    order, source_order = [4, 2, 0, 3, 1], [2, 3, 1, 0]
+    base = frame_geometry(list(targets), list(sources), 0.0, config)
+    moved = frame_geometry([targets[k] for k in order], [sources[k] for k in source_order], 0.0, config)
+    of_targets, of_sources = views(base, "target"), views(base, "source", 1)
+    noisy = torch.randn(of_targets.latent.shape, generator=torch.Generator().manual_seed(2))
+    with torch.no_grad():
+        read = denoiser.read_sources(of_sources, base.source_windows())
+        expected = denoiser(noisy, t, of_targets, base.target_windows(), read)[:, order]
+        of_sources = Views(*(value[:, source_order] for value in of_sources))
+        of_targets = Views(*(value[:, order] for value in of_targets))
+        assert torch.allclose(of_targets.pose, moved.target_pose)
+        read = denoiser.read_sources(of_sources, moved.source_windows())
+        got = denoiser(noisy[:, order], t, of_targets, moved.target_windows(), read)
+    assert torch.allclose(got, expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("count", [1, 2, 12])
+def test_any_number_of_views_on_the_smallest_grids_is_finite(
+    generator: Generator, count: int, dtype: torch.dtype
+) -> None:
+    denoiser = copy.deepcopy(generator.denoiser).to(dtype)
+    for size in ((1, 1), (1, 2), (3, 5)):
+        config = small_config(image_size=size)
+        geometry = frame_geometry(list(ring(count, name="t", yaw_deg=3)), list(ring(count)), 0.0, config)
+        assert [w.size for w in geometry.target_windows()] == token_sizes(size, 2)
+        with torch.no_grad():
+            out = run(denoiser, geometry)
+        assert out.shape == (1, count, 3, *size) and torch.isfinite(out).all()
+
+
+def test_regression_starts_from_the_prefilled_latent(generator: Generator, geometry: FrameGeometry) -> None:
+    torch.manual_seed(0)
+    fresh = Generator.from_config(small_config()).denoiser
+    rng = torch.Generator().manual_seed(2)
+    start = torch.randn((*geometry.target_rays.shape[:2], 3, 6, 10), generator=rng)
+    with torch.no_grad():
+        assert torch.equal(run(fresh, geometry, REGRESSION), start)  # its head is zero
+        assert not torch.equal(run(generator.denoiser, geometry, REGRESSION), start)
+
+
+def test_times_may_differ_between_views(generator: Generator, geometry: FrameGeometry) -> None:
+    """A batch may mix regression and diffusion."""
+    denoiser = generator.denoiser
+    targets, noisy = views(geometry, "target"), torch.randn(1, 2, 3, 6, 10)
+    with torch.no_grad():
+        read = denoiser.read_sources(views(geometry, "source", 1), geometry.source_windows())
+        out = denoiser(noisy, torch.tensor([[REGRESSION, 20]]), targets, geometry.target_windows(), read)
+    assert torch.isfinite(out).all()
+
+
+def test_rows_for_the_geometric_loss(generator: Generator, geometry: FrameGeometry) -> None:
+    """One entry a block; rows sum to 1; of untrained attention they are about uniform (1/3 off for a whole window)."""
+    torch.manual_seed(0)
+    fresh = Generator.from_config(small_config()).denoiser
+    rows: list[Rows] = []
+    run(fresh, geometry, rows=rows)
+    assert len(rows) == 5
+    for of_block in rows:
+        assert len(of_block.predicted) == len(of_block.target) == len(of_block.pair) > 0
+        assert torch.allclose(of_block.predicted.sum(1), torch.ones(len(of_block.predicted)), atol=1e-5)
+        loss = (of_block.predicted - of_block.target).square().sum(1).mean()
+        assert 0.1 < float(loss.detach()) < 0.7
+        assert of_block.predicted.requires_grad
+    loss.backward()  # with zero-initialised outputs this is all the gradient that queries and keys get
+    assert fresh.cross_view[-1].to_q.weight.grad.abs().max() > 0
+
+
+def test_parameter_counts() -> None:
+    """The table of the configurations."""
+    millions = {}
+    for config in (paper(), small(), compact(), tiny()):
+        with torch.device("meta"):
+            made = Generator.from_config(config)
+        parts = (made, made.denoiser.unet, made.denoiser.cross_view)
+        millions[config.name] = [sum(p.numel() for p in part.parameters()) / 1e6 for part in parts]
+        trained = sum(p.numel() for p in made.parameters() if p.requires_grad) / 1e6
+        assert trained < 150 if config.frozen_unet else trained == pytest.approx(millions[config.name][0])
+    assert millions["paper"][2] == pytest.approx(147.5, rel=1e-3)
+    assert millions["small"][1] == pytest.approx(63, rel=0.01) and millions["small"][2] == pytest.approx(10, rel=0.03)
+    assert millions["compact"][0] <= 7
+    assert millions["tiny"][1] == pytest.approx(1.7, rel=0.01)
+
+
+def test_unets_of_other_kinds_are_refused() -> None:
+    def unet(**changes: object) -> UNet2DConditionModel:
+        with torch.device("meta"):
+            return UNet2DConditionModel(**{**small_config().unet.arguments(3, 3), **changes})
+
+    with pytest.raises(GeneratorError, match=r"expected blocks of DownBlock2D.*got AttnDownBlock2D"):
+        Denoiser(unet(down_block_types=("AttnDownBlock2D", "DownBlock2D")))
+    with pytest.raises(GeneratorError, match=r"expected 3 input channels.*or all 14, got 9"):
+        Denoiser(unet(in_channels=9))
+    with pytest.raises(GeneratorError, match="expected no class_embed_type"):
+        Denoiser(unet(class_embed_type="timestep"))
+
+
+@pytest.mark.slow
+def test_compiled_it_computes_the_same(generator: Generator, geometry: FrameGeometry) -> None:
+    """One graph for the targets, without a break."""
+    denoiser = generator.denoiser
+    targets, noisy = views(geometry, "target"), torch.randn(1, 2, 3, 6, 10)
+    read = denoiser.read_sources(views(geometry, "source", 1), geometry.source_windows())
+    arguments = (noisy, torch.tensor([400]), targets, geometry.target_windows(), read)
+    with torch.no_grad():
+        compiled = torch.compile(denoiser, fullgraph=True)
+        assert torch.allclose(compiled(*arguments), denoiser(*arguments), atol=1e-4)
