@@ -59,9 +59,10 @@ def optional_package(name: str, extra: str) -> Any:
     try:
         return import_module(name)
     except ModuleNotFoundError as error:
-        if error.name != name.split(".")[0]:
+        top = name.split(".")[0]
+        if (error.name or "").split(".")[0] != top:
             raise  # it is there, but what it needs is not
-        raise ImportError(f"{error.name} is not installed: pip install 'arbiview_aug[{extra}]'") from None
+        raise ImportError(f"{top} is not installed: pip install 'arbiview_aug[{extra}]'") from None
 
 
 @contextmanager

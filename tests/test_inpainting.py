@@ -1,9 +1,11 @@
 """Telea's inpainting of holes: what is known stays bit for bit."""
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
-from arbiview_aug.inpainting import telea
+from arbiview_aug.inpainting import RADIUS_PX, telea
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.float64, torch.float16])
@@ -19,6 +21,20 @@ def test_known_pixels_stay_and_holes_take_their_surroundings(dtype: torch.dtype)
     inside = filled[:, hole].double() * (1 if dtype == torch.uint8 else 255)
     assert inside.min() >= 99 and inside.max() <= 151
     assert torch.equal(broken[:, hole], torch.zeros_like(broken[:, hole]))  # the input is not written to
+
+
+def test_only_what_is_around_the_holes_is_looked_at() -> None:
+    """The same bits as OpenCV gives for the whole image."""
+    rng = np.random.default_rng(0)
+    image = cv2.GaussianBlur(rng.integers(0, 256, (90, 120, 3), dtype=np.uint8), (0, 0), 3)
+    for trial in range(20):
+        hole = np.zeros((90, 120), np.uint8)
+        for _ in range(trial % 3 + 1):
+            y, x = rng.integers(0, 90), rng.integers(0, 120)
+            hole[y : y + rng.integers(1, 30), x : x + rng.integers(1, 30)] = 1
+        expected = cv2.inpaint(image, hole, RADIUS_PX, cv2.INPAINT_TELEA).transpose(2, 0, 1)
+        got = telea(torch.from_numpy(image).permute(2, 0, 1), torch.from_numpy(hole) > 0)
+        assert np.array_equal(got.numpy(), expected)
 
 
 def test_nothing_to_do_and_nothing_to_start_from() -> None:

@@ -31,6 +31,15 @@ REGRESSION = TIMESTEPS
 
 _BLOCKS = ("DownBlock2D", "CrossAttnDownBlock2D", "UNetMidBlock2DCrossAttn", "UpBlock2D", "CrossAttnUpBlock2D")
 
+_UNUSED = (
+    "class_embed_type",
+    "addition_embed_type",
+    "encoder_hid_dim",
+    "time_cond_proj_dim",
+    "time_embedding_act_fn",
+    "center_input_sample",
+)
+
 KeysValues = tuple[torch.Tensor, torch.Tensor]
 
 
@@ -255,8 +264,8 @@ def check_unet(unet: Any) -> None:
     strange = sorted({str(kind) for kind in kinds} - set(_BLOCKS))
     if strange:
         raise GeneratorError(f"U-Net: expected blocks of {', '.join(_BLOCKS)}, got {', '.join(strange)}")
-    for name in ("class_embed_type", "addition_embed_type", "encoder_hid_dim", "time_cond_proj_dim"):
-        if getattr(config, name) is not None:
+    for name in _UNUSED:
+        if getattr(config, name):
             raise GeneratorError(
                 f"U-Net: expected no {name}, as in Stable Diffusion 1.5, got {getattr(config, name)!r}"
             )
