@@ -70,9 +70,10 @@ class PositionalEncoding(nn.Module):
         return W, W
 
     def forward(self, delta: torch.Tensor) -> torch.Tensor:
-        """(..., width) of Δp (..., 2), computed in float32."""
+        """(..., width) of Δp (..., 2), in float32: a matrix product would be bfloat16 or TF32 on a GPU."""
+        delta = delta.float()[..., None, :]
         W1, W2 = self.maps(delta.device)
-        return torch.cat([torch.sin(delta.float() @ W1.T), torch.cos(delta.float() @ W2.T)], -1)
+        return torch.cat([torch.sin((delta * W1).sum(-1)), torch.cos((delta * W2).sum(-1))], -1)
 
     def turned(self, queries: torch.Tensor, back: torch.Tensor) -> torch.Tensor:
         """Queries (..., heads, width) turned, so that turned(q, b)·PE(a) = q·PE(a − b).

@@ -42,6 +42,13 @@ def test_the_encoding_is_the_papers() -> None:
     assert float(W1.max()) <= math.pi + 1e-6  # what a grid of whole tokens tells apart
 
 
+def test_the_encoding_is_float32_under_autocast() -> None:
+    far = torch.tensor([[99.25, 41.5]])
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(PositionalEncoding()(far), PositionalEncoding()(far.double()))
+    assert PositionalEncoding()(far.bfloat16()).dtype == torch.float32
+
+
 def test_turned_queries_see_the_offset() -> None:
     encoding = PositionalEncoding()
     rng = torch.Generator().manual_seed(0)

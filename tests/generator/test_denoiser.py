@@ -167,6 +167,19 @@ def test_regression_starts_from_the_prefilled_latent(generator: Generator, geome
         assert not torch.equal(run(generator.denoiser, geometry, REGRESSION), start)
 
 
+def test_it_trains_under_autocast(generator: Generator, geometry: FrameGeometry) -> None:
+    """bfloat16 with float32 weights, as accelerate has it."""
+    denoiser, rows = copy.deepcopy(generator.denoiser).train(), []
+    with torch.autocast("cpu", torch.bfloat16):
+        out = run(denoiser, geometry, rows=rows)
+        loss = out.float().square().mean() + sum(r.predicted.square().mean() for r in rows)
+    loss.backward()
+    assert all(p.grad is None or torch.isfinite(p.grad).all() for p in denoiser.parameters())
+    with torch.no_grad():
+        exact = run(denoiser, geometry)
+    assert (out.float() - exact).abs().mean() < 0.05 * exact.abs().mean()
+
+
 def test_times_may_differ_between_views(generator: Generator, geometry: FrameGeometry) -> None:
     """A batch may mix regression and diffusion."""
     denoiser = generator.denoiser
