@@ -1,4 +1,4 @@
-"""Inference: which pixels of a frame's target views are generated, and how (Sec. CVC-SSL; GENERATOR's "Inference").
+"""Inference: which pixels of a frame's target views are generated, and how (Sec. CVC-SSL).
 
 Known is what FAVS covers with enough confidence; it is never changed. A view that is almost whole gets the rest by
 Telea's inpainting, without a call of the denoiser. The others are denoised together, so that they agree.
