@@ -32,9 +32,10 @@ def batches(dataset: Any, workers: int, start: str | None = None, **settings: An
 
 
 def same(one: Any, two: Any) -> bool:
-    """Equal in every bit, through dicts and lists."""
+    """Equal in every bit, through dicts and lists; velocities that nobody knows are NaN."""
     if isinstance(one, torch.Tensor):
-        return one.dtype == two.dtype and torch.equal(one, two)
+        alike = one.shape == two.shape and bool(((one == two) | (one.isnan() & two.isnan())).all())
+        return one.dtype == two.dtype and alike
     if isinstance(one, dict):
         return list(one) == list(two) and all(same(one[key], two[key]) for key in one)
     if isinstance(one, list | tuple):
