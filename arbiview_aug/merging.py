@@ -125,7 +125,9 @@ def _believed(
     nobody_says = doubt == Doubt.UNLABELLED
     if bool(nobody_says.any()):
         stood = _stood_still(toned, shown, [one.later for one in candidates], unanimous & (votes >= (0 if few else 2)))
-        believed = torch.where(nobody_says, stood & ~_has_come(current, toned, seam, candidates), believed)
+        if len(candidates) > 1:  # a single one may itself be what is wrong
+            stood &= ~_has_come(current, toned, seam, candidates)
+        believed = torch.where(nobody_says, stood, believed)
     return believed
 
 
