@@ -187,7 +187,7 @@ def test_pictures_and_files_exist() -> None:
 
 
 def test_install_lines() -> None:
-    demo, tests, _ = blocks("bash")
+    demo, tests, *_ = blocks("bash")
     assert demo.startswith("python -m venv .venv && .venv/bin/pip install . &&")
     assert tests.strip() == "python -m venv .venv && .venv/bin/pip install -e '.[dev]' && .venv/bin/python -m pytest"
 
