@@ -25,10 +25,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from arbiview_aug.bench.timing import cpu_model, one_thread, quartiles, write_json
+from arbiview_aug.bench.timing import cpu_model, quartiles, write_json
 from arbiview_aug.datasets import open_data, reduced_rig
 from arbiview_aug.datasets.images import Reduce
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.environment import one_thread
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.consistency import source_overlap, summary
 from arbiview_aug.evaluate.frames import Frame, make_frame, scores

@@ -5,11 +5,13 @@ Needs diffusers and safetensors, imported where they are used: ``pip install arb
 - ``correspondence``: where a token looks in other views; ``attention``: how it reads them;
 - ``conditioning``: what else the denoiser is told; ``geometry``: a frame's cameras for both;
 - ``denoiser``: the U-Net with all of it; ``autoencoder``: between images and latents;
-- ``sampler``: the reverse process; ``completion``: inference on a frame; ``model``: ``Generator``.
+- ``sampler``: the reverse process; ``completion``: inference on a frame; ``batches``: on what transforms give;
+- ``model``: ``Generator``.
 """
 
+from arbiview_aug.generator.batches import CompletedLoader
 from arbiview_aug.generator.completion import Completed
 from arbiview_aug.generator.config import GeneratorConfig, compact, paper, small, tiny
 from arbiview_aug.generator.model import Generator
 
-__all__ = ["Completed", "Generator", "GeneratorConfig", "compact", "paper", "small", "tiny"]
+__all__ = ["Completed", "CompletedLoader", "Generator", "GeneratorConfig", "compact", "paper", "small", "tiny"]

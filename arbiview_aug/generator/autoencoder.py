@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from torch import nn
+from torch.nn import functional
 
 from arbiview_aug.errors import GeneratorError
 
@@ -16,12 +17,14 @@ class Autoencoder(nn.Module):
     Args:
         vae: The ``AutoencoderKL``; None for latents that are the pixels, in [-1, 1].
         scale: What latents are multiplied by; held as a number, since half precision would round it.
+        patch: Without a ``vae``, side of the square of pixels that a latent pixel holds.
     """
 
-    def __init__(self, vae: Any | None, scale: float = 1.0) -> None:
+    def __init__(self, vae: Any | None, scale: float = 1.0, patch: int = 1) -> None:
         super().__init__()
         self.vae = vae
         self.scale = float(scale)
+        self.patch = patch
 
     def encode(self, images: torch.Tensor) -> torch.Tensor:
         """Latents (..., C, H / f, W / f) of images (..., 3, H, W) in [0, 1]: the mean, without sampling.
@@ -31,7 +34,7 @@ class Autoencoder(nn.Module):
         """
         images = images * 2 - 1
         if self.vae is None:
-            return images
+            return functional.pixel_unshuffle(images, self.patch)
         self._refuse_float16()
         flat = images.reshape(-1, *images.shape[-3:]).to(self.vae.dtype)
         latents = self.vae.encode(flat).latent_dist.mode() * self.scale
@@ -44,7 +47,7 @@ class Autoencoder(nn.Module):
             GeneratorError: With weights in float16.
         """
         if self.vae is None:
-            images = latents
+            images = functional.pixel_shuffle(latents, self.patch)
         else:
             self._refuse_float16()
             flat = latents.reshape(-1, *latents.shape[-3:]).to(self.vae.dtype)

@@ -6,7 +6,6 @@ disk or a killed process leaves the old one. Nothing is ever unpickled.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from collections.abc import Mapping
@@ -17,6 +16,7 @@ import torch
 
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError
+from arbiview_aug.files import checksum
 
 FORMAT = 1
 CONFIG_FILE = "config.json"
@@ -40,7 +40,7 @@ def write_checkpoint(folder: Path, config: Mapping[str, Any], tensors: Mapping[s
     try:
         save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, weights)
         _synchronise(weights)
-        named = folder / f"weights-{_digest(weights)}.safetensors"
+        named = folder / f"weights-{checksum(weights)[:12]}.safetensors"
         weights.replace(named)
         text.write_text(json.dumps({"format": FORMAT, "weights": named.name, **config}, indent=1) + "\n")
         _synchronise(text)
@@ -63,6 +63,19 @@ def read_checkpoint(folder: Path) -> tuple[dict[str, Any], dict[str, torch.Tenso
         GeneratorError: No checkpoint, one of another format, or a broken one.
     """
     safetensors = optional_package("safetensors.torch", "generator")
+    config, weights = read_config(folder)
+    try:
+        return config, safetensors.load_file(folder / weights)
+    except Exception as error:  # safetensors has an error of its own
+        raise GeneratorError(f"{folder}: expected readable weights in {weights}: {error}") from None
+
+
+def read_config(folder: Path) -> tuple[dict[str, Any], str]:
+    """The configuration of a folder by ``write_checkpoint``, and the name of its weights, which says what is in them.
+
+    Raises:
+        GeneratorError: No checkpoint, or one of another format.
+    """
     path = folder / CONFIG_FILE
     if not path.is_file():
         raise GeneratorError(f"{folder}: expected a generator's folder with {CONFIG_FILE}, found none")
@@ -73,10 +86,7 @@ def read_checkpoint(folder: Path) -> tuple[dict[str, Any], dict[str, torch.Tenso
         raise GeneratorError(f"{path}: expected a generator's configuration ({error!r})") from None
     if found != FORMAT:
         raise GeneratorError(f"{path}: expected format {FORMAT}, got {found!r}")
-    try:
-        return config, safetensors.load_file(folder / weights)
-    except Exception as error:  # safetensors has an error of its own
-        raise GeneratorError(f"{folder}: expected readable weights in {weights}: {error}") from None
+    return config, str(weights)
 
 
 def check_tensors(expected: Mapping[str, torch.Tensor], found: Mapping[str, torch.Tensor], where: str) -> None:
@@ -111,11 +121,3 @@ def _shown(names: list[str]) -> str:
 def _synchronise(path: Path) -> None:
     with path.open("rb+") as file:
         os.fsync(file.fileno())
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        digest = hashlib.sha256()
-        while chunk := file.read(1 << 24):
-            digest.update(chunk)
-    return digest.hexdigest()[:12]

@@ -17,7 +17,8 @@ from arbiview_aug.camera import Camera
 from arbiview_aug.errors import GeneratorError, SampleError
 from arbiview_aug.generator.conditioning import Views
 from arbiview_aug.generator.correspondence import Window
-from arbiview_aug.generator.geometry import frame_geometry
+from arbiview_aug.generator.denoiser import REGRESSION
+from arbiview_aug.generator.geometry import FrameGeometry, frame_geometry
 from arbiview_aug.generator.sampler import Solver, guided, noise_schedule, sample
 from arbiview_aug.inpainting import telea
 from arbiview_aug.rig import Rig
@@ -116,14 +117,13 @@ def complete(
             "CPU, or complete batches after they are collated"
         )
     targets = targets.in_frame_of(sources)
-    _check_sizes(views, coverage, targets, source_images, sources)
+    if len(source_images) != len(sources):
+        raise SampleError(f"complete: expected {len(sources)} source images, got {len(source_images)}")
+    _check_sizes(views, coverage, targets)
     images = [image for image in views]
     trust = [seen.float() for seen in coverage] if confidence is None else [c.float() for c in confidence]
     known = [seen & (c >= min_confidence) for seen, c in zip(coverage, trust, strict=True)]
-    holes = [
-        ~k if c.mask is None else ~k & torch.tensor(c.mask, device=k.device)
-        for k, c in zip(known, targets, strict=True)
-    ]
+    holes = _holes(known, targets)
     todo = []
     for m, hole in enumerate(holes):
         share = float(hole.float().mean())
@@ -140,6 +140,37 @@ def complete(
         for m, image in zip(todo, made, strict=True):
             images[m] = _pasted(image, images[m], holes[m])
     return Completed(stacked(images), stacked(holes), todo)
+
+
+@torch.no_grad()
+def inpainted(
+    views: torch.Tensor | Sequence[torch.Tensor],
+    coverage: torch.Tensor | Sequence[torch.Tensor],
+    targets: Rig,
+    *,
+    confidence: torch.Tensor | Sequence[torch.Tensor] | None = None,
+    min_confidence: float = 0.0,
+) -> Completed:
+    """``complete`` without a generator: Telea's inpainting everywhere, the baseline that generators have to beat.
+
+    Raises:
+        SampleError: Views, coverage and cameras that do not fit together.
+    """
+    _check_sizes(views, coverage, targets)
+    trust = coverage if confidence is None else confidence
+    known = [seen & (c >= min_confidence) for seen, c in zip(coverage, trust, strict=True)]
+    holes = _holes(known, targets)
+    return Completed(
+        stacked([_filled(*of_view) for of_view in zip(views, known, holes, strict=True)]), stacked(holes), []
+    )
+
+
+def _holes(known: Sequence[torch.Tensor], targets: Rig) -> list[torch.Tensor]:
+    """(h, w) bool of each view: what is to be made up. Nobody needs the scene behind the own car."""
+    return [
+        ~k if c.mask is None else ~k & torch.tensor(c.mask, device=k.device)
+        for k, c in zip(known, targets, strict=True)
+    ]
 
 
 def _denoised(
@@ -166,34 +197,70 @@ def _denoised(
         noise: (1, n, C, h, w).
         how: Settings.
     """
-    config, denoiser, autoencoder = generator.config, generator.denoiser, generator.autoencoder
-    device = noise.device
+    config, device = generator.config, noise.device
     used = sorted({k for target in targets for k in nearest_sources(target, sources)})
     cameras = [sources[k] for k in used]
     images = torch.stack([_at_size(source_images[k], config.image_size) for k in used])[None].to(device)
     seen = torch.stack([_seen(camera, config.image_size) for camera in cameras])[None].to(device)
     geometry = frame_geometry(targets, cameras, sources.ground_z_m, config).to(device)
+    return denoised(generator, geometry, prefilled, known, confidence, images, seen, noise, how)[0]
+
+
+def denoised(
+    generator: Generator,
+    geometry: FrameGeometry,
+    prefilled: torch.Tensor,
+    known: torch.Tensor,
+    confidence: torch.Tensor,
+    images: torch.Tensor,
+    seen: torch.Tensor,
+    noise: torch.Tensor,
+    how: Sampling,
+) -> torch.Tensor:
+    """(B, N, 3, H, W) float32 images in [0, 1] of the N targets of B frames, all on one device.
+
+    Args:
+        generator: The model.
+        geometry: Of the targets and S sources.
+        prefilled: (B, N, 3, H, W) in [0, 1].
+        known: (B, N, H, W) bool, or shares in [0, 1].
+        confidence: (B, N, H, W) in [0, 1].
+        images: (B, S, 3, H, W) of the sources, in [0, 1].
+        seen: (B, S, H, W) what they show, bool, or 0 and 1.
+        noise: (B, N, C, h, w) standard normal.
+        how: Settings.
+    """
+    config, denoiser, autoencoder = generator.config, generator.denoiser, generator.autoencoder
     latent = autoencoder.encode(prefilled).float()
     views, windows = geometry.target_views(latent, known, confidence), geometry.target_windows()
     source_views = geometry.source_views(autoencoder.encode(images).float(), seen, seen)
     read = denoiser.read_sources(source_views, geometry.source_windows())
-    everything = torch.ones(1, dtype=torch.bool, device=device)
+    everything = torch.ones(len(noise), dtype=torch.bool, device=noise.device)
     is_guided = how.guidance != 1 and how.steps > 1
     unconditional = (views.dropped(everything), geometry.target_windows(everything)) if is_guided else None
 
     def predict(x: torch.Tensor, t: int) -> torch.Tensor:
         def run(views: Views, windows: Sequence[Window]) -> torch.Tensor:
             generator.calls += 1
-            return denoiser(x, torch.full((1,), t, device=device), views, windows, read).float()
+            return denoiser(x, torch.full((len(x),), t, device=x.device), views, windows, read).float()
 
         conditional = run(views, windows)
-        if unconditional is None:
+        if unconditional is None or t == REGRESSION:
             return conditional
         return guided(conditional, run(*unconditional), how.guidance, config.guidance_rescale)
 
     schedule = noise_schedule(prediction=config.prediction, zero_snr=config.zero_snr, solver=how.solver)
-    x0 = sample(predict, latent, noise, schedule, steps=how.steps, strength=how.strength)
-    return autoencoder.decode(x0)[0].float().clamp(0, 1)
+    x0 = sample(
+        predict,
+        latent,
+        noise,
+        schedule,
+        steps=how.steps,
+        strength=how.strength,
+        temperature=config.temperature,
+        warm=config.residual,
+    )
+    return autoencoder.decode(x0).float().clamp(0, 1)
 
 
 def nearest_sources(target: Camera, sources: Rig) -> list[int]:
@@ -222,7 +289,7 @@ def _prefilled(
 
 def _filled(image: torch.Tensor, known: torch.Tensor, hole: torch.Tensor) -> torch.Tensor:
     """A view with its hole inpainted; what is neither known nor a hole is not read."""
-    return torch.where(hole, telea(image, ~known), image)
+    return torch.where(hole, telea(image, ~known), image) if bool(hole.any()) else image
 
 
 def _pasted(made: torch.Tensor, image: torch.Tensor, hole: torch.Tensor) -> torch.Tensor:
@@ -256,17 +323,11 @@ def _noise(generator: Generator, seed: int, frame: str | int, camera: str) -> to
 
 
 def _check_sizes(
-    views: torch.Tensor | Sequence[torch.Tensor],
-    coverage: torch.Tensor | Sequence[torch.Tensor],
-    targets: Rig,
-    source_images: torch.Tensor | Sequence[torch.Tensor],
-    sources: Rig,
+    views: torch.Tensor | Sequence[torch.Tensor], coverage: torch.Tensor | Sequence[torch.Tensor], targets: Rig
 ) -> None:
     counts = {"views": len(views), "coverage": len(coverage), "target cameras": len(targets)}
     if len(set(counts.values())) > 1:
         raise SampleError(f"complete: expected as many of each, got {counts}")
-    if len(source_images) != len(sources):
-        raise SampleError(f"complete: expected {len(sources)} source images, got {len(source_images)}")
     for camera, view, seen in zip(targets, views, coverage, strict=True):
         if tuple(view.shape) != (3, *camera.size) or tuple(seen.shape) != camera.size:
             got = f"{tuple(view.shape)} and {tuple(seen.shape)}"

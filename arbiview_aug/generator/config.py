@@ -22,6 +22,9 @@ class UNetConfig:
     transformers: tuple[bool, ...]
     """Whether a level has self- and cross-attention inside its blocks."""
 
+    cross_view: tuple[bool, ...] = ()
+    """Whether views read each other at a level; at all levels where empty. The finest costs most."""
+
     layers: int = 2
     """Residual layers of an encoder block; decoder blocks have one more."""
 
@@ -41,6 +44,9 @@ class UNetConfig:
             raise GeneratorError(
                 f"UNetConfig.transformers: expected {len(self.widths)} values, got {self.transformers}"
             )
+        if self.cross_view and (len(self.cross_view) != len(self.widths) or not any(self.cross_view)):
+            expected = f"{len(self.widths)} values, one of them true"
+            raise GeneratorError(f"UNetConfig.cross_view: expected {expected}, got {self.cross_view}")
         if any(width % self.norm_groups for width in self.widths):
             raise GeneratorError(f"UNetConfig.norm_groups: expected a divisor of {self.widths}, got {self.norm_groups}")
 
@@ -65,13 +71,16 @@ class AutoencoderConfig:
     """The autoencoder between images and latents: diffusers' ``AutoencoderKL``, or none."""
 
     widths: tuple[int, ...] = ()
-    """Channels of each level; one level less than halvings. Empty: latents are the pixels."""
+    """Channels of each level; one level less than halvings. Empty: latents are squares of pixels, nothing is lost."""
+
+    patch: int = 1
+    """Side of those squares: what a latent pixel holds without an ``AutoencoderKL``."""
 
     layers: int = 2
     """Residual layers of an encoder block."""
 
     latent_channels: int = 3
-    """Channels of a latent; 3 where latents are pixels."""
+    """Channels of a latent; of squares of pixels all their values, 3 patch²."""
 
     norm_groups: int = 16
     """Groups of the group norms."""
@@ -80,8 +89,11 @@ class AutoencoderConfig:
     """What latents are multiplied by to have about unit variance; set from the data once it is trained."""
 
     def __post_init__(self) -> None:
-        if not self.widths and self.latent_channels != 3:
-            raise GeneratorError(f"AutoencoderConfig: pixels have 3 latent channels, got {self.latent_channels}")
+        if self.patch < 1 or (self.widths and self.patch != 1):
+            raise GeneratorError(f"AutoencoderConfig.patch: expected 1, or more without widths, got {self.patch}")
+        pixels = 3 * self.patch**2
+        if not self.widths and self.latent_channels != pixels:
+            raise GeneratorError(f"AutoencoderConfig: pixels have {pixels} latent channels, got {self.latent_channels}")
         if any(width % self.norm_groups for width in self.widths):
             groups = self.norm_groups
             raise GeneratorError(f"AutoencoderConfig.norm_groups: expected a divisor of {self.widths}, got {groups}")
@@ -89,7 +101,7 @@ class AutoencoderConfig:
     @property
     def factor(self) -> int:
         """Pixels along a side of a latent pixel."""
-        return 2 ** max(len(self.widths) - 1, 0)
+        return 2 ** (len(self.widths) - 1) if self.widths else self.patch
 
     def arguments(self) -> dict[str, Any]:
         """Arguments of ``AutoencoderKL``."""
@@ -123,6 +135,10 @@ class GeneratorConfig:
     zero_snr: bool = True
     """Nothing of the image is left at t = 999; never with ε."""
 
+    residual: bool = True
+    """What is diffused is what the pre-filled condition lacks of the image, see ``Denoiser``; never with ε. The first
+    of several steps is then the regression, whose result is put back into noise."""
+
     frozen_unet: bool = False
     """Train only attention, pose, the one-step head and the widened ``conv_in``."""
 
@@ -141,18 +157,30 @@ class GeneratorConfig:
     guidance_rescale: float = 0.7
     """φ of the rescaled guidance, where there is guidance."""
 
-    strength: float = 0.6
-    """How far pre-filled latents are put back into noise: 0.6 starts at t = 599."""
+    strength: float = 1.0
+    """How far pre-filled latents are put back into noise: 0.6 starts at t = 599. What a residual generator puts back is
+    what the condition lacks: in full. A ``tiny`` after 150 steps, at temperature 0.75, Telea 18.99 dB: from 0.6 17.89
+    dB and 1.88 of the true gradient energy, from 0.8 18.25 and 1.30, from 1 18.57 and 0.93."""
+
+    temperature: float = 0.5
+    """Deviation of the noise that a sample starts from; at 1 a perfect sampler is 3 dB below the posterior's mean.
+
+    dB against Telea's inpainting in holes of held-out streets, and gradient energy against the truth, of 4 steps:
+    ``tiny``, 64 views: 0.7 -0.47 and 2.11, 0.5 -0.14 and 1.29; ``compact`` at two thirds of its training, 24 views:
+    0.7 -0.17 and 1.55, 0.5 +0.35 and 0.87, 0.35 +0.63 and 0.51."""
 
     def __post_init__(self) -> None:
         factor = self.autoencoder.factor
         if any(side <= 0 or side % factor for side in self.image_size):
             raise GeneratorError(f"GeneratorConfig.image_size: expected multiples of {factor}, got {self.image_size}")
-        if self.zero_snr and self.prediction == "epsilon":
-            raise GeneratorError("GeneratorConfig.zero_snr: expected prediction 'v_prediction', got 'epsilon'")
+        for name in ("zero_snr", "residual"):
+            if getattr(self, name) and self.prediction == "epsilon":
+                raise GeneratorError(f"GeneratorConfig.{name}: expected prediction 'v_prediction', got 'epsilon'")
         if self.steps < 1 or not 0 < self.strength <= 1:
             got = f"{self.steps} and {self.strength}"
             raise GeneratorError(f"GeneratorConfig: expected steps >= 1 and strength in (0, 1], got {got}")
+        if not 0 <= self.temperature <= 1:
+            raise GeneratorError(f"GeneratorConfig.temperature: expected 0 to 1, got {self.temperature}")
 
     @property
     def latent_size(self) -> tuple[int, int]:
@@ -210,6 +238,9 @@ def paper() -> GeneratorConfig:
         autoencoder=AutoencoderConfig(widths=(128, 256, 512, 512), latent_channels=4, norm_groups=32, scale=0.18215),
         prediction="epsilon",
         zero_snr=False,
+        residual=False,
+        strength=0.6,
+        temperature=1.0,
         frozen_unet=True,
         prompt_tokens=77,
         steps=50,
@@ -228,21 +259,38 @@ def small() -> GeneratorConfig:
 
 
 def compact() -> GeneratorConfig:
-    """At most 7 M parameters in all, 16 MB in half precision: what can ship with the package."""
+    """At most 7 M parameters in all, 16 MB in half precision: what can ship with the package.
+
+    Squares of 4 x 4 pixels of 64 x 112 images: at 128 x 224 an hour on a CPU sees a fifth as many views, and an
+    ``AutoencoderKL`` of 1.3 M costs more than the denoiser.
+    """
     return GeneratorConfig(
         name="compact",
-        image_size=(128, 224),
-        unet=UNetConfig(widths=(64, 96, 96), transformers=(False, True, True), layers=1, context_width=64),
-        autoencoder=AutoencoderConfig(widths=(32, 64, 64), latent_channels=4),
+        image_size=(64, 112),
+        unet=UNetConfig(
+            widths=(64, 96, 128),
+            transformers=(False, True, True),
+            cross_view=(False, True, True),
+            layers=1,
+            context_width=64,
+        ),
+        autoencoder=AutoencoderConfig(patch=4, latent_channels=48),
+        steps=1,  # trained for an hour, its samples are nearer to the truth than inpainting, and speckled
     )
 
 
 def tiny() -> GeneratorConfig:
-    """A CPU, minutes: pixels of 32 x 56 images."""
+    """A CPU, minutes: squares of 2 x 2 pixels of 32 x 56 images, a quarter of the time that single pixels take."""
     return GeneratorConfig(
         name="tiny",
         image_size=(32, 56),
         unet=UNetConfig(
-            widths=(32, 64, 64), transformers=(False, True, True), layers=1, context_width=64, norm_groups=8
+            widths=(32, 64, 64),
+            transformers=(False, True, True),
+            cross_view=(False, True, True),
+            layers=1,
+            context_width=64,
+            norm_groups=8,
         ),
+        autoencoder=AutoencoderConfig(patch=2, latent_channels=12),
     )

@@ -5,8 +5,9 @@ target branches (noisy, t) read sources and targets. So the sources' keys and va
 computed once (``read_sources``) and held while the targets are denoised.
 
 A ``CrossViewAttention`` follows each of the U-Net's encoder blocks, its middle block and its decoder blocks, before
-their resamplers: for Stable Diffusion widths (320, 640, 1280, 1280), 1280, (1280, 1280, 640, 320). The U-Net is loaded
-first and composed with them afterwards: with their zero-initialised outputs it computes exactly what it did before.
+their resamplers: for Stable Diffusion widths (320, 640, 1280, 1280), 1280, (1280, 1280, 640, 320). Models for a CPU
+leave it out of the finest level. The U-Net is loaded first and composed with them afterwards: with their
+zero-initialised outputs it computes exactly what it did before.
 """
 
 from __future__ import annotations
@@ -61,6 +62,20 @@ class Rows(NamedTuple):
     pair: torch.Tensor
 
 
+class Lacking(NamedTuple):
+    """What the condition lacks of the image, in its own units: see ``Denoiser._lacking``.
+
+    Attributes:
+        given: (B, N, C, h, w) float32 z, what the network sees of x_t.
+        linear: (B, N, C, h, w) v of the linear guess.
+        scale: (B, N, 1, h, w) what the network's output counts in v.
+    """
+
+    given: torch.Tensor
+    linear: torch.Tensor
+    scale: torch.Tensor
+
+
 class Denoiser(nn.Module):
     """ε_θ(x_t, t, f_pose) for N target views at once, and x0 in one step at t = ``REGRESSION``.
 
@@ -68,25 +83,49 @@ class Denoiser(nn.Module):
         unet: A diffusers ``UNet2DConditionModel``; its ``conv_in`` is widened, with zeros, to the conditions.
         levels: Depth levels of the attention.
         prompt_tokens: Tokens of the empty prompt's embedding.
+        cross_view: For each level, the finest first, whether views read each other there; at all where empty.
+        signal: (T,) sqrt of the schedule's ᾱ_t: the network then sees and predicts what the condition lacks
+            of the image; None leaves its output as it is, as Stable Diffusion's weights need.
 
     Attributes:
-        cross_view: One block for each of the U-Net's encoder blocks, its middle block and its decoder blocks.
+        deviation: (2,) standard deviation of what the condition lacks, inside the holes and outside; measured before
+            training.
+        cross_view: The cross-view blocks by their place among the U-Net's encoder blocks, its middle block and its
+            decoder blocks.
         gradient_checkpointing: Recompute blocks in the backward pass instead of holding them.
     """
 
-    def __init__(self, unet: Any, levels: int = len(LEVELS), prompt_tokens: int = 0) -> None:
+    deviation: torch.Tensor
+
+    def __init__(
+        self,
+        unet: Any,
+        levels: int = len(LEVELS),
+        prompt_tokens: int = 0,
+        cross_view: Sequence[bool] = (),
+        signal: torch.Tensor | None = None,
+    ) -> None:
         super().__init__()
         check_unet(unet)
         self.latent_channels = int(unet.config.out_channels)
         widen(unet, input_channels(self.latent_channels))
         self.unet = unet
         widths = tuple(unet.config.block_out_channels)
-        self.cross_view = nn.ModuleList(CrossViewAttention(w, levels) for w in (*widths, widths[-1], *widths[::-1]))
+        there = tuple(cross_view) or (True,) * len(widths)
+        places = zip((*widths, widths[-1], *widths[::-1]), (*there, there[-1], *there[::-1]), strict=True)
+        self.cross_view = nn.ModuleDict(
+            {str(k): CrossViewAttention(width, levels) for k, (width, used) in enumerate(places) if used}
+        )
         self.context = PoseContext(int(unet.config.cross_attention_dim), prompt_tokens)
         self.regression = nn.Conv2d(widths[0], self.latent_channels, 3, padding=1)
         nn.init.zeros_(self.regression.weight)
         nn.init.zeros_(self.regression.bias)  # type: ignore[arg-type]
         self.gradient_checkpointing = False
+        self.signal = signal  # no buffer: half precision would round it
+        if signal is not None:
+            self.register_buffer("deviation", torch.tensor([0.3, 0.1]))
+            nn.init.zeros_(unet.conv_out.weight)
+            nn.init.zeros_(unet.conv_out.bias)
 
     @property
     def token_levels(self) -> int:
@@ -113,7 +152,8 @@ class Denoiser(nn.Module):
         count = sources.latent.shape[:2]
         t = torch.zeros(count, dtype=torch.long, device=sources.latent.device)
         read: Sources = []
-        self._run(sources.latent, t, sources, windows, None, read, None)
+        clean = sources.latent if self.signal is None else torch.zeros_like(sources.latent)  # they lack nothing
+        self._run(clean, t, sources, windows, None, read, None)
         return read
 
     def forward(
@@ -139,13 +179,51 @@ class Denoiser(nn.Module):
             (B, N, C, h, w): what the schedule predicts (ε or v); x0 where t is ``REGRESSION``.
         """
         t = t[:, None].expand(noisy.shape[:2]) if t.dim() == 1 else t
-        h = self._run(noisy, t, targets, windows, sources, None, rows)
+        at_once = (t == REGRESSION)[:, :, None, None, None]
+        given = noisy
+        if self.signal is not None:
+            lacking = self._lacking(noisy, t, targets)
+            given = lacking.given.masked_fill(at_once, 0)
+        h = self._run(given, t, targets, windows, sources, None, rows)
         unet = self.unet
         if unet.conv_norm_out is not None:
             h = unet.conv_act(unet.conv_norm_out(h))
         predicted, change = (head(h).unflatten(0, noisy.shape[:2]) for head in (unet.conv_out, self.regression))
-        at_once = (t == REGRESSION)[:, :, None, None, None]
+        if self.signal is not None:
+            predicted = lacking.linear - lacking.scale * predicted.float()
         return torch.where(at_once, noisy.to(change.dtype) + change, predicted)
+
+    def _lacking(self, noisy: torch.Tensor, t: torch.Tensor, targets: Views) -> Lacking:
+        """How a network sees, and predicts, what the condition lacks.
+
+        With x_t = a x0 + s ε and x0 = c + r, r of variance σ² given nothing else, z = (x_t − a c) / √D of
+        D = a² σ² + s² has unit variance, and the best linear guess is x0 = c + a σ² / √D z. The network gets z and adds
+        σ s / √D times its output n (the preconditioning of Karras et al. 2022, around c instead of 0). Then
+        v = (a x_t − x0) / s = −s c + a s (1 − σ²) / √D z − σ / √D n, which is finite for all t.
+        """
+        a, s, deviation, root = self._deviations(t, targets)
+        condition = targets.latent.float()
+        z = (noisy.float() - a * condition) / root
+        return Lacking(z, -s * condition + a * s * (1 - deviation**2) / root * z, deviation / root)
+
+    def unit(self, t: torch.Tensor, targets: Views) -> torch.Tensor:
+        """What the network's output counts in what ``forward`` gives at t (B, N), (B, N, 1, h, w): errors in this unit
+        are of one size at all t, in holes and outside. 1 where the network predicts v or ε itself."""
+        if self.signal is None:
+            return torch.ones_like(targets.mask, dtype=torch.float32)
+        _, _, deviation, root = self._deviations(t, targets)
+        return torch.where((t == REGRESSION)[:, :, None, None, None], deviation, deviation / root)
+
+    def _deviations(
+        self, t: torch.Tensor, targets: Views
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """a, s, σ and √D of ``_lacking``."""
+        assert self.signal is not None
+        a = self.signal.to(t.device)[t.clamp(max=TIMESTEPS - 1)][:, :, None, None, None]
+        s = (1 - a**2).sqrt()
+        inside, outside = self.deviation.float()
+        deviation = inside + (outside - inside) * targets.mask.float()
+        return a, s, deviation, ((a * deviation) ** 2 + s**2).sqrt()
 
     def _run(
         self,
@@ -162,15 +240,18 @@ class Denoiser(nn.Module):
         x = views.channels(noisy).flatten(0, 1).to(self.dtype)
         emb = unet.time_embedding(unet.time_proj(t.flatten()).to(self.dtype))
         context = self.context(views.pose.flatten(0, 1))
-        place = 0
+        place, done = 0, 0  # blocks of the U-Net, and cross-view blocks among them
 
         def attend(h: torch.Tensor, window: Window) -> torch.Tensor:
-            nonlocal place
-            known = None if sources is None else sources[place]
-            block = self.cross_view[place]
+            nonlocal place, done
+            name, place = str(place), place + 1
+            if name not in self.cross_view:
+                return h
+            known = None if sources is None else sources[done]
+            block = self.cross_view[name]
             assert isinstance(block, CrossViewAttention)
-            place += 1
-            if read is not None and place == len(self.cross_view):  # nothing is decoded of a source
+            done += 1
+            if read is not None and done == len(self.cross_view):  # nothing is decoded of a source
                 read.append(block.keys_values(_tokens(h, count)))
                 return h
             h, own, of_block = self._saved(_attended, block, h, window, known, count, rows is not None)
@@ -196,6 +277,8 @@ class Denoiser(nn.Module):
             del skips[-len(block.resnets) :]
             h = self._saved(_decoded, block, h, taken, emb, context)
             h = attend(h, window)
+            if read is not None and done == len(self.cross_view):
+                break
             if block.upsamplers is not None:
                 h = block.upsamplers[0](h, skips[-1].shape[-2:])  # odd sizes need to be told
         return h

@@ -11,14 +11,38 @@ from torch import nn
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator.autoencoder import Autoencoder
-from arbiview_aug.generator.checkpoint import check_tensors, read_checkpoint, write_checkpoint
+from arbiview_aug.generator.batches import complete_batch
+from arbiview_aug.generator.checkpoint import (
+    CONFIG_FILE,
+    check_tensors,
+    read_checkpoint,
+    read_config,
+    write_checkpoint,
+)
 from arbiview_aug.generator.completion import complete
 from arbiview_aug.generator.conditioning import input_channels
 from arbiview_aug.generator.config import GeneratorConfig, paper
 from arbiview_aug.generator.correspondence import LEVELS
 from arbiview_aug.generator.denoiser import Denoiser
+from arbiview_aug.generator.sampler import noise_schedule
 from arbiview_aug.generator.stable_diffusion import empty_prompt as embedded_empty_prompt
 from arbiview_aug.generator.stable_diffusion import load_part
+
+_SHIPPED = Path(__file__).with_name("weights")
+
+
+def has_shipped() -> bool:
+    """Whether the package was installed with its weights."""
+    return (_SHIPPED / CONFIG_FILE).is_file()
+
+
+def shipped_weights() -> str:
+    """Name of the file of the package's weights, after their content.
+
+    Raises:
+        GeneratorError: The package was installed without its data.
+    """
+    return read_config(_SHIPPED)[1]
 
 
 class Generator(nn.Module):
@@ -33,7 +57,7 @@ class Generator(nn.Module):
         autoencoder: Between images and latents.
 
     Attributes:
-        calls: How often the denoiser was run by ``complete_views``, steps and guidance included.
+        calls: How often the denoiser was run for samples, steps and guidance included.
     """
 
     def __init__(self, config: GeneratorConfig, denoiser: Denoiser, autoencoder: Autoencoder) -> None:
@@ -54,8 +78,13 @@ class Generator(nn.Module):
         latent = config.autoencoder.latent_channels
         unet = diffusers.UNet2DConditionModel(**config.unet.arguments(input_channels(latent), latent))
         vae = diffusers.AutoencoderKL(**config.autoencoder.arguments()) if config.autoencoder.widths else None
-        denoiser = Denoiser(unet, len(LEVELS), config.prompt_tokens)
-        return cls(config, denoiser, Autoencoder(vae, config.autoencoder.scale))
+        signal = None
+        if config.residual:
+            with torch.device("cpu"):  # also where the weights are on meta
+                schedule = noise_schedule(prediction=config.prediction, zero_snr=config.zero_snr)
+            signal = schedule.alphas_cumprod.double().sqrt().float()
+        denoiser = Denoiser(unet, len(LEVELS), config.prompt_tokens, config.unet.cross_view, signal)
+        return cls(config, denoiser, Autoencoder(vae, config.autoencoder.scale, config.autoencoder.patch))
 
     @classmethod
     def from_stable_diffusion(
@@ -87,13 +116,13 @@ class Generator(nn.Module):
         config = replace(config, autoencoder=replace(config.autoencoder, scale=float(vae.config.scaling_factor)))
         if empty_prompt is None and config.prompt_tokens:
             empty_prompt = embedded_empty_prompt(where)
-        denoiser = Denoiser(unet, len(LEVELS), config.prompt_tokens)
+        denoiser = Denoiser(unet, len(LEVELS), config.prompt_tokens, config.unet.cross_view)
         if empty_prompt is not None:
             expected = tuple(denoiser.context.empty_prompt.shape)
             if tuple(empty_prompt.shape) != expected:
                 raise GeneratorError(f"empty_prompt: expected shape {expected}, got {tuple(empty_prompt.shape)}")
             denoiser.context.empty_prompt.copy_(empty_prompt)
-        return cls(config, denoiser, Autoencoder(vae, config.autoencoder.scale)).eval()
+        return cls(config, denoiser, Autoencoder(vae, config.autoencoder.scale, config.autoencoder.patch)).eval()
 
     # --- folders ------------------------------------------------------------------------------------------------------
     @classmethod
@@ -113,6 +142,15 @@ class Generator(nn.Module):
         )
         return made.eval()
 
+    @classmethod
+    def shipped(cls) -> Generator:
+        """The ``compact`` generator that comes with the package; see ``weights/README.md`` for what it was trained on.
+
+        Raises:
+            GeneratorError: The package was installed without its data.
+        """
+        return cls.from_pretrained(_SHIPPED)
+
     def save_pretrained(self, folder: str | Path, *, dtype: torch.dtype | None = None) -> None:
         """Write the generator to a folder of its own; a checkpoint that is there is replaced once the new one is whole.
 
@@ -131,3 +169,4 @@ class Generator(nn.Module):
 
     # --- used ---------------------------------------------------------------------------------------------------------
     complete_views = complete
+    complete_batch = complete_batch

@@ -60,7 +60,15 @@ def timesteps(steps: int, strength: float) -> list[int]:
 
 
 def sample(
-    predict: Predict, prefilled: torch.Tensor, noise: torch.Tensor, schedule: Any, *, steps: int, strength: float
+    predict: Predict,
+    prefilled: torch.Tensor,
+    noise: torch.Tensor,
+    schedule: Any,
+    *,
+    steps: int,
+    strength: float,
+    temperature: float = 1.0,
+    warm: bool = False,
 ) -> torch.Tensor:
     """x0 (B, N, C, h, w) float32.
 
@@ -71,14 +79,18 @@ def sample(
         schedule: From ``noise_schedule``; its state is used up.
         steps: 1 is the one-step regression: neither noise nor schedule. More are so many calls of ``predict``.
         strength: In (0, 1]: how much of the diffusion the pre-filled latent is put back; 0.6 starts at t = 599.
+        temperature: What the noise is multiplied by.
+        warm: The first step is the regression, and what it gives is put back instead.
     """
     prefilled = prefilled.float()
+    if steps == 1 or warm:
+        prefilled = predict(prefilled, REGRESSION).float()
     if steps == 1:
-        return predict(prefilled, REGRESSION).float()
-    schedule.set_timesteps(timesteps=timesteps(steps, strength))
+        return prefilled
+    schedule.set_timesteps(timesteps=timesteps(steps - warm, strength))
     schedule.set_begin_index(0)
     times = schedule.timesteps.tolist()
-    x = schedule.add_noise(prefilled, noise.float(), torch.tensor(times[:1]))
+    x = schedule.add_noise(prefilled, temperature * noise.float(), torch.tensor(times[:1]))
     for t in times:
         x = schedule.step(predict(x, t).float(), t, x, return_dict=False)[0]
     return x

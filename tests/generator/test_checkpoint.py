@@ -11,8 +11,8 @@ import safetensors.torch
 import torch
 
 from arbiview_aug.errors import GeneratorError
-from arbiview_aug.generator import Generator, GeneratorConfig, compact, paper, small, tiny
-from arbiview_aug.generator.config import AutoencoderConfig
+from arbiview_aug.generator import Generator, compact, paper, small, tiny
+from arbiview_aug.generator.config import AutoencoderConfig, GeneratorConfig, UNetConfig
 from tests.generator.small import small_config
 
 
@@ -142,6 +142,16 @@ def test_impossible_configurations_are_refused() -> None:
         small_config(image_size=(30, 56), autoencoder=compact().autoencoder)
     with pytest.raises(GeneratorError, match="zero_snr: expected prediction 'v_prediction'"):
         small_config(prediction="epsilon")
+    with pytest.raises(GeneratorError, match="residual: expected prediction 'v_prediction'"):
+        small_config(prediction="epsilon", zero_snr=False)
+    with pytest.raises(GeneratorError, match="temperature: expected 0 to 1"):
+        small_config(temperature=1.5)
+    with pytest.raises(GeneratorError, match="patch: expected 1"):
+        small_config(autoencoder=AutoencoderConfig(patch=2, widths=(32,)))
+    with pytest.raises(GeneratorError, match="12 latent channels, got 3"):
+        AutoencoderConfig(patch=2)
+    with pytest.raises(GeneratorError, match="cross_view: expected 2 values, one of them true"):
+        UNetConfig(widths=(32, 32), transformers=(False, True), cross_view=(False, False))
     with pytest.raises(GeneratorError, match="strength in"):
         small_config(strength=0.0)
     with pytest.raises(GeneratorError, match="expected multiples of 32"):

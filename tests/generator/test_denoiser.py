@@ -10,11 +10,13 @@ from diffusers import UNet2DConditionModel
 
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator import Generator, compact, paper, small, tiny
+from arbiview_aug.generator.autoencoder import Autoencoder
 from arbiview_aug.generator.conditioning import Views
+from arbiview_aug.generator.config import UNetConfig
 from arbiview_aug.generator.correspondence import token_sizes
 from arbiview_aug.generator.denoiser import REGRESSION, Denoiser, Rows
 from arbiview_aug.generator.geometry import FrameGeometry, frame_geometry
-from tests.generator.small import ring, small_config
+from tests.generator.small import ring, small_config, stirred
 
 
 def views(geometry: FrameGeometry, of: str, seed: int = 0, channels: int = 3) -> Views:
@@ -204,7 +206,7 @@ def test_rows_for_the_geometric_loss(generator: Generator, geometry: FrameGeomet
         assert 0.1 < float(loss.detach()) < 0.7
         assert of_block.predicted.requires_grad
     loss.backward()  # with zero-initialised outputs this is all the gradient that queries and keys get
-    assert fresh.cross_view[-1].to_q.weight.grad.abs().max() > 0
+    assert fresh.cross_view["4"].to_q.weight.grad.abs().max() > 0
 
 
 def test_parameter_counts() -> None:
@@ -250,3 +252,61 @@ def test_it_is_one_graph_for_torch_compile(generator: Generator) -> None:
             read = denoiser.read_sources(views(geometry, "source", 1), geometry.source_windows())
             arguments = (noisy, torch.tensor([400]), views(geometry, "target"), geometry.target_windows(), read)
             assert torch.allclose(compiled(*arguments), denoiser(*arguments), atol=1e-4)
+
+
+# --- what the condition lacks -----------------------------------------------------------------------------------------
+@pytest.mark.parametrize("t", [0, 1, 300, 999])
+def test_an_untrained_residual_network_is_the_best_linear_guess(t: int) -> None:
+    """Of a residual that is white in truth: nobody does better, at any noise; and x0 comes back where nothing lacks."""
+    torch.manual_seed(0)
+    config = small_config()
+    denoiser = Generator.from_config(config).denoiser
+    denoiser.deviation.copy_(torch.tensor([0.4, 0.1]))
+    geometry = frame_geometry(list(ring(3, name="t")), list(ring(3)), 0.0, config)
+    targets = views(geometry, "target")
+    targets = targets._replace(mask=targets.mask.round())
+    signal = denoiser.signal
+    assert signal is not None
+    a = float(signal[t])
+    s = (1 - a**2) ** 0.5
+    deviation = torch.where(targets.mask > 0.5, 0.1, 0.4)
+    lacking = deviation * torch.randn(targets.latent.shape)
+    eps = torch.randn(targets.latent.shape)
+
+    def x0_of(r: torch.Tensor) -> torch.Tensor:
+        x = a * (targets.latent + r) + s * eps
+        read = denoiser.read_sources(views(geometry, "source"), geometry.source_windows())
+        with torch.no_grad():
+            v = denoiser(x, torch.tensor([t]), targets, geometry.target_windows(), read)
+        return a * x - s * v
+
+    share = (a * deviation) ** 2 / ((a * deviation) ** 2 + s**2)
+    expected = targets.latent + share * (lacking + s / max(a, 1e-8) * eps)
+    assert torch.allclose(x0_of(lacking), expected, atol=1e-3 if a > 1e-3 else 0.1)
+    assert x0_of(torch.zeros_like(lacking)).isfinite().all()
+
+
+def test_views_read_each_other_at_the_chosen_levels_alone() -> None:
+    torch.manual_seed(0)
+    unet = {"widths": (32, 32), "transformers": (False, True), "layers": 1, "context_width": 32, "norm_groups": 8}
+    config = small_config(unet=UNetConfig(**unet, cross_view=(False, True)))
+    denoiser = stirred(Generator.from_config(config).denoiser).eval()
+    assert sorted(denoiser.cross_view) == ["1", "2", "3"]
+    geometry = frame_geometry(list(ring(3, name="t")), list(ring(3, fov_deg=130)), 0.0, config)
+    with torch.no_grad():
+        read = denoiser.read_sources(views(geometry, "source"), geometry.source_windows())
+        assert len(read) == 3
+        out = run(denoiser, geometry)
+        other = [(k + 1, v + 1) for k, v in read]
+        targets = views(geometry, "target")
+        noisy = torch.randn(targets.latent.shape, generator=torch.Generator().manual_seed(2))
+        changed = denoiser(noisy, torch.tensor([400]), targets, geometry.target_windows(), other)
+    assert out.isfinite().all() and not torch.equal(out, changed)
+
+
+def test_squares_of_pixels_are_latents_without_loss() -> None:
+    images = torch.rand(2, 3, 3, 8, 12)
+    autoencoder = Autoencoder(None, patch=4)
+    latents = autoencoder.encode(images)
+    assert latents.shape == (2, 3, 48, 2, 3)
+    assert torch.allclose(autoencoder.decode(latents), images, atol=1e-6)

@@ -88,6 +88,20 @@ def test_one_step_is_the_regression() -> None:
     assert calls == [REGRESSION]
 
 
+def test_a_warm_start_is_the_regressions_result_and_one_of_the_steps() -> None:
+    starts = []
+
+    def predict(x: torch.Tensor, t: int) -> torch.Tensor:
+        starts.append((t, x))
+        return x + 1 if t == REGRESSION else torch.zeros_like(x)
+
+    plan = schedule()
+    sample(predict, randn(0), randn(1), plan, steps=4, strength=0.6, temperature=0.5, warm=True)
+    a = plan.alphas_cumprod[599]
+    assert [t for t, _ in starts] == [REGRESSION, *timesteps(3, 0.6)]
+    assert torch.allclose(starts[1][1], a.sqrt() * (randn(0) + 1) + 0.5 * (1 - a).sqrt() * randn(1), atol=1e-5)
+
+
 def test_extreme_predictions_stay_finite() -> None:
     for value in (0.0, 1e4, -1e4):
         for prediction in ("v_prediction", "epsilon"):

@@ -69,7 +69,7 @@ def test_the_paper_configuration_has_stable_diffusions_layout() -> None:
     assert shapes(made.autoencoder.vae) == shapes(vae)
     assert shapes(made.denoiser) == shapes(attached)
     assert tuple(made.denoiser.context.empty_prompt.shape) == (77, 768)
-    assert [block.to_q.in_features for block in made.denoiser.cross_view] == [
+    assert [block.to_q.in_features for block in made.denoiser.cross_view.values()] == [
         320, 640, 1280, 1280, 1280, 1280, 1280, 640, 320,
     ]  # fmt: skip
 
@@ -83,7 +83,7 @@ def config() -> GeneratorConfig:
             heads=(2, 2, 2, 2), norm_groups=8,
         ),
         autoencoder=AutoencoderConfig(widths=(16, 16, 16, 16), layers=1, latent_channels=4, norm_groups=8),
-        prediction="epsilon", zero_snr=False, frozen_unet=True, prompt_tokens=5,
+        prediction="epsilon", zero_snr=False, residual=False, frozen_unet=True, prompt_tokens=5,
     )  # fmt: skip
 
 

@@ -1,0 +1,9 @@
+"""CVC-SSL training (Sec. Cross-View Consistency Self-Supervised Learning): ``python -m arbiview_aug.train --help``.
+
+Needs accelerate besides what the generator needs: ``pip install arbiview_aug[generator]``.
+
+- ``config``: settings and the four configurations; ``data``: frames and their split by scenes;
+- ``pseudo_views``: Algorithm 1's items, ``masks``: holes as targets have them;
+- ``losses``, ``step``: L_main, L_geo, L_perceptual; ``autoencoder``: the stage before;
+- ``state``, ``trainer``: the run; ``measure``, ``held_out``, ``ablation``: what came of it.
+"""

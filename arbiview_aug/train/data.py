@@ -1,0 +1,155 @@
+"""Frames to train on: any of the package's readers, at the training size, split by scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch.utils.data import DataLoader, Dataset
+from tqdm import tqdm
+
+from arbiview_aug.datasets.frame_folder import SEQUENCE_FILE, FrameFolder
+from arbiview_aug.datasets.nuscenes import NuScenesDataset
+from arbiview_aug.datasets.opening import open_data
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.errors import TrainingError
+from arbiview_aug.held import Held
+from arbiview_aug.rig import Rig
+from arbiview_aug.tensors import resized
+
+SHARES = (0.6, 0.2)
+"""Of the scenes, for training and for validation; the rest are held out (Sec. Dataset)."""
+
+_BLOCKS = 10
+"""Scenes that one drive without scenes is cut into."""
+
+HELD_BYTES = 4 * 2**30
+"""Memory for frames: 46 000 of six 128 x 224 images."""
+
+
+class Frame(NamedTuple):
+    """The images of one moment.
+
+    Attributes:
+        images: N tensors (3, h, w) uint8, at the training size.
+        rig: Their N cameras at that size, with masks of the own car.
+        token: Names it.
+    """
+
+    images: list[torch.Tensor]
+    rig: Rig
+    token: str
+
+
+class Split(NamedTuple):
+    """Indices of frames."""
+
+    training: list[int]
+    validation: list[int]
+    held_out: list[int]
+
+
+class Frames:
+    """Frames of a data set at the training size, held in memory once they are read.
+
+    Args:
+        dataset: A map-style data set of this package.
+        size: (h, w).
+        scenes: For each frame the name of its scene.
+    """
+
+    def __init__(self, dataset: Dataset[dict[str, Any]], size: tuple[int, int], scenes: Sequence[str]) -> None:
+        self.dataset, self.size, self.scenes = dataset, size, list(scenes)
+        self._held: Held[int, Frame] = Held(HELD_BYTES, lambda f: sum(i.nbytes for i in f.images))
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def __getitem__(self, index: int) -> Frame:
+        return self._held.get(index, lambda: self._read(index))
+
+    def _read(self, index: int) -> Frame:
+        sample = self.dataset[index]
+        rig: Rig = sample["rig"].resized(self.size)
+        return Frame([resized(image, self.size) for image in sample["images"]], rig, str(sample["token"]))
+
+    def prepare(self, indices: Sequence[int], *, workers: int = 0, show: bool = True) -> None:
+        """Read frames before workers fork: they share the memory.
+
+        Args:
+            indices: Which.
+            workers: Processes that read; 0 reads here.
+            show: Progress bar.
+        """
+        read: DataLoader[Frame] = DataLoader(
+            self,  # type: ignore[arg-type]
+            batch_size=None,
+            sampler=indices,
+            num_workers=workers,
+            multiprocessing_context=forked(workers),
+            collate_fn=_as_it_is,
+        )
+        for index, frame in zip(indices, tqdm(read, desc="frames", unit="frame", disable=not show), strict=True):
+            if workers:  # out of the memory that processes share: each tensor there keeps a file open
+                frame = frame._replace(images=[image.clone() for image in frame.images])
+            self._held.get(index, partial(_as_it_is, frame))
+
+    def split(self, seed: int = 0) -> Split:
+        """60/20/20 by scenes: no scene is in two parts. Depends on the seed and the scenes' names alone.
+
+        A data set of one or two scenes has no held-out ones.
+        """
+        names = sorted(set(self.scenes))
+        order = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed)).tolist()
+        first = max(1, round(SHARES[0] * len(names)))
+        second = first + round(SHARES[1] * len(names))
+        part = {names[k]: (place >= first) + (place >= second) for place, k in enumerate(order)}
+        parts: tuple[list[int], list[int], list[int]] = ([], [], [])
+        for index, scene in enumerate(self.scenes):
+            parts[part[scene]].append(index)
+        return Split(*parts)
+
+
+def forked(workers: int) -> str | None:
+    """How workers start: as copies of this process, which share the frames it holds; newer Pythons would not."""
+    return "fork" if workers else None
+
+
+def _as_it_is(value: Any) -> Any:
+    return value
+
+
+def open_frames(
+    data: str, size: tuple[int, int], *, scenes: int, seed: int = 0, device: torch.device | str = "cpu"
+) -> Frames:
+    """The frames that ``--data`` names.
+
+    Args:
+        data: ``synthetic``, ``nuscenes:ROOT`` or ``frames:DIR``.
+        size: (h, w) of the images.
+        scenes: How many synthetic streets.
+        seed: Of the streets.
+        device: Where streets are rendered; on a GPU prepare the frames, since workers cannot render there.
+
+    Raises:
+        TrainingError: None of these.
+        DataError: The folder holds no such data.
+    """
+    kind, _, folder = data.partition(":")
+    if data == "synthetic":
+        drive = SyntheticDrive(demo_source_rig(size), num_frames=scenes, seed=seed, lidar=False, device=device)
+        return Frames(drive, size, [str(k) for k in range(scenes)])
+    if kind not in ("nuscenes", "frames") or not folder:
+        raise TrainingError(f"--data {data}: expected synthetic, nuscenes:ROOT or frames:DIR")
+    found = open_data(Path(folder))
+    found.load_points = False
+    if isinstance(found, NuScenesDataset):
+        return Frames(found, size, found.scene_tokens)
+    assert isinstance(found, FrameFolder)
+    if not (found.root / SEQUENCE_FILE).is_file():
+        return Frames(found, size, found.tokens)
+    # A drive is cut into blocks: frames next to each other show the same street.
+    return Frames(found, size, [f"block {_BLOCKS * k // len(found)}" for k in range(len(found))])

@@ -1,0 +1,58 @@
+"""The weights in the package: small, loadable, used by default, and better than inpainting on streets never seen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import arbiview_aug.generator
+from arbiview_aug import RigRetarget
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.evaluate.targets import named_targets
+from arbiview_aug.generator import Generator, compact
+from arbiview_aug.generator.checkpoint import read_checkpoint
+from arbiview_aug.train.data import open_frames
+from arbiview_aug.train.held_out import gains, held_out_scores
+
+FOLDER = Path(arbiview_aug.generator.__file__).with_name("weights")
+SEED = 77
+"""Of streets that training never saw: its own come from seed 0."""
+
+
+def test_they_are_small_and_in_half_precision() -> None:
+    files = list(FOLDER.iterdir())
+    assert sum(file.stat().st_size for file in files) <= 16e6
+    assert {"config.json", "README.md"} < {file.name for file in files}
+    _, tensors = read_checkpoint(FOLDER)
+    assert all(t.dtype == torch.float16 for t in tensors.values() if t.is_floating_point())
+    assert all(t.isfinite().all() for t in tensors.values())
+
+
+def test_they_are_those_of_compact() -> None:
+    made = Generator.shipped()
+    assert made.config == compact() and not made.training
+    assert all(p.dtype == torch.float32 for p in made.parameters())
+
+
+def test_diffusion_works_out_of_the_box() -> None:
+    sample = SyntheticDrive(demo_source_rig((48, 84)), num_frames=1, lidar=False)[0]
+    target = named_targets("yaw", sample["rig"])["yaw +22"]
+    seen = RigRetarget(target)(sample)
+    made = RigRetarget(target, path="diffusion", steps=2)(sample)
+    holes = ~seen["coverage"]
+    assert holes.any() and torch.equal(made["generated"], holes)
+    assert torch.equal(made["images"].movedim(1, -1)[~holes], seen["images"].movedim(1, -1)[~holes])
+    assert made["images"].movedim(1, -1)[holes].float().std() > 5
+
+
+@pytest.mark.truth
+@pytest.mark.timeout(600)
+def test_they_beat_inpainting_on_streets_never_seen() -> None:
+    generator = Generator.shipped()
+    frames = open_frames("synthetic", generator.config.image_size, scenes=24, seed=SEED)
+    gain = gains(held_out_scores(generator, frames, range(24), mean_of=0, show=False))
+    print({name: str(interval) for name, interval in gain.items()})
+    assert gain["one_step"].low > 0
+    assert gain["sample"].mean >= -0.5
