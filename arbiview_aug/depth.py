@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch.utils.data import DataLoader, Dataset
-from tqdm import tqdm
+from torch.utils.data import Dataset
 
 from arbiview_aug.command_line import count, gathered_warnings, writable_folder
 from arbiview_aug.datasets.motion_depth import FOLDER, WANTED, DepthFolder
@@ -18,6 +17,7 @@ from arbiview_aug.datasets.opening import open_data
 from arbiview_aug.errors import ArbiviewError
 from arbiview_aug.motion.depth import motion_depth
 from arbiview_aug.neighbours import Neighbour, neighbours_of_frames, warn_lost
+from arbiview_aug.offline import results
 from arbiview_aug.sample import check_inputs
 from arbiview_aug.stitching import WarnOnce
 
@@ -102,21 +102,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     data: Any = open_data(arguments.data, neighbours=WANTED)
     depths = DepthFolder(writable_folder(Path(asked), asked))
     frames = _Frames(data, data.tokens, depths, arguments.device)
-    # On a GPU one process keeps it busy, and CUDA must not be forked.
-    workers = arguments.workers if arguments.device == "cpu" and arguments.workers > 1 else 0
-    loader = DataLoader(frames, batch_size=None, num_workers=workers, collate_fn=_as_it_is)
-    done: list[Done] = []
+    workers = arguments.workers if arguments.device == "cpu" else 1  # one process keeps a GPU busy
     warned: list[str] = []
     with gathered_warnings(warned):
-        for one in tqdm(loader, total=len(frames), unit="frame", desc="depth from motion"):
-            done.append(one)
+        done = list(results(frames, workers, "depth from motion"))
     for line in warned:
         print(line, file=sys.stderr)
     return _summary(done, depths)
-
-
-def _as_it_is(value: Any) -> Any:
-    return value
 
 
 def _summary(done: Sequence[Done], depths: DepthFolder) -> int:

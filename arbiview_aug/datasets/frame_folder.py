@@ -114,6 +114,16 @@ class FrameFolder(Dataset[dict[str, Any]]):
             raise DataError(f"{self.root}: expected the name of a frame, got {token!r}; the frames are {some} …")
         return self[self._index[token]]
 
+    def files(self, index: int) -> list[Path]:
+        """What a frame is read from: its calibration, images, masks and points."""
+        folder = self._frames[index]
+        calib = _read_calibration(folder)
+        where = str(folder / CALIBRATION_FILE)
+        found = [folder / CALIBRATION_FILE, *(_image_file(entry, folder, where) for entry in calib["cameras"])]
+        found += [folder / entry["mask"] for entry in calib["cameras"] if entry.get("mask") is not None]
+        points = _points_file(calib, folder, where) if self.load_points else None
+        return found if points is None else [*found, points]
+
     def __getitem__(self, index: int) -> dict[str, Any]:
         folder = self._frames[index]
         calib = _read_calibration(folder)
@@ -278,7 +288,7 @@ def _cached_mask(path: str) -> BoolArray:
     return read_mask(path, Path(path).parent, "rig")
 
 
-def _read_points(calib: Mapping[str, Any], folder: Path, where: str) -> torch.Tensor | None:
+def _points_file(calib: Mapping[str, Any], folder: Path, where: str) -> Path | None:
     entry = calib.get("lidar")
     named = entry.get("file") if isinstance(entry, Mapping) else entry
     if named is not None and not isinstance(named, str):
@@ -295,6 +305,13 @@ def _read_points(calib: Mapping[str, Any], folder: Path, where: str) -> torch.Te
             f"{where}: lidar: expected the points {path}, found no file; copy it, remove the key 'lidar', "
             "or pass load_points=False"
         )
+    return path
+
+
+def _read_points(calib: Mapping[str, Any], folder: Path, where: str) -> torch.Tensor | None:
+    path = _points_file(calib, folder, where)
+    if path is None:
+        return None
     try:
         array = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +15,7 @@ from torch.utils.data import Dataset
 from arbiview_aug.datasets.sequence import Neighbours
 from arbiview_aug.dense import Layer
 from arbiview_aug.errors import DataError, SampleError
+from arbiview_aug.files import whole_file
 from arbiview_aug.motion.depth import BEST_TRAVEL_M, MotionDepth
 from arbiview_aug.motion.sweep import reduced_camera
 from arbiview_aug.rig import Rig
@@ -51,23 +51,17 @@ class DepthFolder:
         """Write a frame's depth: all of the file or nothing.
 
         Raises:
-            OSError: It cannot be written.
+            OutputError: It cannot be written.
         """
-        self.root.mkdir(parents=True, exist_ok=True)
         maps = {f"depth_{k:02}": one.astype(np.float16) for k, one in enumerate(depth.depth_m)}
-        part = self.root / f".{os.getpid()}.part"
-        try:
-            with part.open("wb") as file:
-                np.savez_compressed(
-                    file,
-                    format=_FORMAT,
-                    words=np.array(depth.words),
-                    **_calibration(rig),
-                    **maps,  # type: ignore[arg-type]
-                )
-            part.replace(self.path(token))
-        finally:
-            part.unlink(missing_ok=True)
+        with whole_file(self.path(token)) as file:
+            np.savez_compressed(
+                file,
+                format=_FORMAT,
+                words=np.array(depth.words),
+                **_calibration(rig),
+                **maps,  # type: ignore[arg-type]
+            )
 
     def read(self, token: str, rig: Rig) -> MotionDepth:
         """A frame's depth.

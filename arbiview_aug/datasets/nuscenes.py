@@ -95,18 +95,19 @@ class NuScenesDataset(Dataset[dict[str, Any]]):
         check_reduce(reduce)
         check_neighbours(neighbours)
         tables = Tables(root, version, nusc)
-        self.root = tables.root
+        self.root, self.version = tables.root, tables.version
         self.compensate_ego_motion = compensate_ego_motion
         self.load_points = load_points
         self.reduce = reduce
         self.neighbours = neighbours
         samples = _chosen_samples(tables, split_scenes)
         self.tokens: list[str] = [row["token"] for row in samples]
-        self._scene_tokens: list[str] = [row["scene_token"] for row in samples]
+        self.scene_tokens: list[str] = [row["scene_token"] for row in samples]
         self._index = {token: k for k, token in enumerate(self.tokens)}
-        scene = {token: k for k, token in enumerate(dict.fromkeys(self._scene_tokens))}
-        scenes = [scene[token] for token in self._scene_tokens]
+        scene = {token: k for k, token in enumerate(dict.fromkeys(self.scene_tokens))}
+        scenes = [scene[token] for token in self.scene_tokens]
         self.channels = _chosen_channels(tables, channels)
+        self.other_channels = [row["channel"] for row in tables.rows("sensor") if row.get("modality") != "camera"]
         self._recordings = read_recordings(tables, self._index, scenes, self.channels, neighbours is not None)
         times_s = self._recordings.time_s(self._recordings.keyframes[:, -1])
         self._annotations = read_annotations(tables, self._index, times_s, np.array(scenes)) if load_boxes else None
@@ -130,6 +131,10 @@ class NuScenesDataset(Dataset[dict[str, Any]]):
             )
         return self[self._index[token]]
 
+    def files(self, index: int) -> list[Path]:
+        """What a sample is read from: each camera's image, then the LiDAR's points."""
+        return [self.root / self._recordings.file(row) for row in self._recordings.keyframes[index]]
+
     def __getitem__(self, index: int) -> dict[str, Any]:
         index = range(len(self))[index]  # IndexError, and negative indices
         recordings = self._recordings
@@ -144,7 +149,7 @@ class NuScenesDataset(Dataset[dict[str, Any]]):
             "ego2world": torch.from_numpy(ego2global),
             "time_s": float(recordings.time_s(lidar)),
             "token": self.tokens[index],
-            "scene_token": self._scene_tokens[index],
+            "scene_token": self.scene_tokens[index],
         }
         if self.load_points:
             sensor2ego = recordings.sensor2ego[recordings.rows["sensor"][lidar]]

@@ -172,6 +172,19 @@ def rotation_from_quaternion(wxyz: Any) -> FloatArray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def quaternion_from_rotation(R: FloatArray) -> FloatArray:
+    """(4,) quaternion w x y z of a rotation (3, 3), w not below 0.
+
+    The largest eigenvalue's eigenvector of a symmetric matrix: right for every rotation (Bar-Itzhack 2000).
+    """
+    S = np.zeros((4, 4))
+    S[1:, 1:] = R + R.T - np.trace(R) * np.eye(3)
+    S[0, 1:] = S[1:, 0] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    S[0, 0] = np.trace(R)
+    q = np.linalg.eigh(S)[1][:, -1]
+    return q if q[0] >= 0 else -q
+
+
 class _NoListError(ValueError):
     """A file holds JSON, but no list; it says what."""
 

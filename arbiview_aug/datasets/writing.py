@@ -9,11 +9,35 @@ from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
+import torch
 
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, POINTS_FILE, SEQUENCE_FILE
 from arbiview_aug.rig import Rig
 
-JPEG_QUALITY = 95
+JPEG_QUALITY = 96
+"""With chroma at full resolution (4:4:4). A nuScenes frame as three other rigs see it loses 0.01, 0.03 and 0.08 dB,
+scored against LiDAR points (``pytest -m acceptance tests/acceptance/test_converted.py``); at 95 with OpenCV's halved
+chroma 0.03, 0.07 and 0.21 dB, in files a quarter smaller."""
+
+_JPEG = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111)
+
+
+def encoded_image(image: torch.Tensor, suffix: str = ".jpg") -> bytes:
+    """An RGB image as a file's bytes.
+
+    Args:
+        image: (3, h, w) uint8.
+        suffix: ``.jpg``, at ``JPEG_QUALITY``, or ``.png``, which loses nothing.
+    """
+    planes = [np.ascontiguousarray(image[channel].numpy()) for channel in (2, 1, 0)]
+    return encoded(np.asarray(cv2.merge(planes), np.uint8), suffix)
+
+
+def encoded(picture: npt.NDArray[np.uint8], suffix: str) -> bytes:
+    """A picture (h, w) or, with the channels blue, green and red, (h, w, 3) as a file's bytes."""
+    _, coded = cv2.imencode(suffix, picture, _JPEG if suffix == ".jpg" else [])
+    return coded.tobytes()
 
 
 def write_frame(folder: Path, sample: Mapping[str, Any]) -> None:
@@ -28,8 +52,7 @@ def write_frame(folder: Path, sample: Mapping[str, Any]) -> None:
     calib = rig.to_dict()
     for k, (entry, image) in enumerate(zip(calib["cameras"], sample["images"], strict=True)):
         entry["file"] = f"{k:02}.jpg"
-        picture = np.ascontiguousarray(image.permute(1, 2, 0).numpy()[..., ::-1])
-        cv2.imwrite(str(folder / entry["file"]), picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        (folder / entry["file"]).write_bytes(encoded_image(image))
     if "boxes_3d" in sample:
         calib["boxes_3d"] = sample["boxes_3d"].tolist()
     if "ego2world" in sample:

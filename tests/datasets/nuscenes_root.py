@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from arbiview_aug.camera import FloatArray
+from arbiview_aug.datasets.nuscenes_tables import quaternion_from_rotation
 from arbiview_aug.datasets.synthetic import Scene, make_scene
 from arbiview_aug.datasets.synthetic.render import Renderer
 from arbiview_aug.rig import Rig
@@ -174,10 +175,4 @@ def _us(time_s: float) -> int:
 
 def _pose(pose: FloatArray) -> dict[str, list[float]]:
     """Translation and quaternion w x y z of a pose (4, 4)."""
-    R = pose[:3, :3]
-    # The eigenvector of a symmetric matrix (Bar-Itzhack 2000): right for every rotation.
-    S = np.zeros((4, 4))
-    S[1:, 1:] = R + R.T - np.trace(R) * np.eye(3)
-    S[0, 1:] = S[1:, 0] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-    S[0, 0] = np.trace(R)
-    return {"translation": pose[:3, 3].tolist(), "rotation": np.linalg.eigh(S)[1][:, -1].tolist()}
+    return {"translation": pose[:3, 3].tolist(), "rotation": quaternion_from_rotation(pose[:3, :3]).tolist()}

@@ -1,0 +1,155 @@
+"""One sample: read, retargeted, written, recorded. The same function for every runner."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from torch.utils.data import Dataset
+
+from arbiview_aug.command_line import gathered_warnings
+from arbiview_aug.convert.frame_folders import FrameFolders
+from arbiview_aug.convert.manifest import Manifest
+from arbiview_aug.convert.nuscenes import NuScenes
+from arbiview_aug.convert.settings import Data, Settings
+from arbiview_aug.convert.views import coded_views, rig_of
+from arbiview_aug.datasets.motion_depth import WithMotionDepth
+from arbiview_aug.datasets.nuscenes import NuScenesDataset
+from arbiview_aug.environment import repeatable_opencv
+from arbiview_aug.errors import ArbiviewError, OutputError
+from arbiview_aug.files import checksum, write_whole
+from arbiview_aug.transforms import RigRetarget
+
+OnError = Literal["report", "skip", "fatal"]
+"""What becomes of a sample that cannot be read or rendered: ``report``: the others are converted, the output is not
+finished; ``skip``: it is left out, and said so; ``fatal``: all stops."""
+
+State = Literal["made", "kept", "skipped", "failed", "stopped"]
+
+
+class Done(NamedTuple):
+    """What became of a sample.
+
+    Attributes:
+        token: Of the sample.
+        state: ``made``; ``kept``: it was there before; ``skipped`` or ``failed``: it could not be read or rendered;
+            ``stopped``: it could not be written.
+        coverage: Share of its pixels that some source saw.
+        seconds: Reading, retargeting, writing.
+        words: Warnings, or what failed.
+    """
+
+    token: str
+    state: State
+    coverage: float = 0.0
+    seconds: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    words: tuple[str, ...] = ()
+
+
+def format_of(settings: Settings, data: Data) -> NuScenes | FrameFolders:
+    """What writes the source's format."""
+    return NuScenes(settings, data) if isinstance(data, NuScenesDataset) else FrameFolders(settings, data)
+
+
+class Jobs(Dataset[Done]):
+    """Samples that are converted where they are asked for.
+
+    Args:
+        settings: Of the conversion.
+        data: The source.
+        indices: The samples of this shard.
+        on_error: What becomes of samples that cannot be read or rendered.
+    """
+
+    def __init__(self, settings: Settings, data: Data, indices: Sequence[int], on_error: OnError) -> None:
+        self.settings, self.data, self.indices, self.on_error = settings, data, indices, on_error
+        self.samples = settings.samples(data)
+        self.format, self.manifest = format_of(settings, data), Manifest(settings.output)
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in self.__dict__.items() if key != "retarget"}
+
+    @cached_property
+    def retarget(self) -> RigRetarget:
+        """The transform, one for each process: plans, and whatever it generates with, are held once."""
+        return self.settings.retarget()
+
+    def __getitem__(self, number: int) -> Done:
+        index = self.indices[number]
+        token = self.data.tokens[index]
+        held = self.manifest.holds(token)
+        if held is not None:
+            return Done(token, "kept", float(np.mean(held["coverage"])))
+        warned: list[str] = []
+        started = time.perf_counter()
+        try:
+            with gathered_warnings(warned), repeatable_opencv():
+                sample = self.samples[index]
+                read = time.perf_counter()
+                out = self.retarget(sample)
+                made = time.perf_counter()
+                coverage = self._written(index, sample, out)
+        except OutputError as error:
+            return Done(token, "stopped", words=(str(error),))
+        except (ArbiviewError, OSError) as error:
+            return self._failed(token, index, error)
+        seconds = read - started, made - read, time.perf_counter() - made
+        return Done(token, "made", coverage, seconds, tuple(warned))
+
+    def _failed(self, token: str, index: int, error: Exception) -> Done:
+        if self.on_error != "skip":
+            return Done(token, "failed", words=(str(error),))
+        try:
+            self.manifest.write({"token": token, "skipped": str(error)}, owner=str(index))
+        except OutputError as full:
+            return Done(token, "stopped", words=(str(full),))
+        return Done(token, "skipped", words=(str(error),))
+
+    def _written(self, index: int, sample: Mapping[str, Any], out: Mapping[str, Any]) -> float:
+        """Write a sample's files, then its record; gives the share of pixels that some source saw."""
+        output, rig = self.settings.output, rig_of(self.settings.sized_target, out)
+        files: dict[str, bytes] = {}
+        names: list[dict[str, str]] = []
+        for k, (camera, view) in enumerate(zip(rig, coded_views(out, self.settings.suffix), strict=True)):
+            stem = self.format.stem(index, k, camera.name)
+            names.append({suffix: stem + suffix for suffix in view})
+            files |= {stem + suffix: coded for suffix, coded in view.items()}
+        rest, facts = self.format.rest(index, sample, out, rig, names)
+        files |= rest
+        write_whole({output / name: content for name, content in files.items()}, owner=str(index))
+        cameras = rig.to_dict()["cameras"]
+        for camera, of_camera in zip(cameras, names, strict=True):
+            camera["file"] = of_camera[self.settings.suffix]
+        coverage = [round(float(mask.float().mean()), 6) for mask in out["coverage"]]
+        record = {
+            "token": self.data.tokens[index],
+            "ground_z_m": rig.ground_z_m,
+            "cameras": cameras,
+            "coverage": coverage,
+            "files": {name: len(content) for name, content in files.items()},
+            "sources": {_below(path, self.data.root): checksum(path) for path in self._read(index)},
+            **facts,
+        }
+        self.manifest.write(record, owner=str(index))
+        return float(np.mean(coverage))
+
+    def _read(self, index: int) -> list[Path]:
+        """What a sample was made from."""
+        files = self.data.files(index)
+        if isinstance(self.samples, WithMotionDepth):
+            files.append(self.samples.depths.path(self.data.tokens[index]))
+        return files
+
+
+def _below(path: Path, root: Path) -> str:
+    try:
+        return path.relative_to(root).as_posix()
+    except ValueError:  # a frame that is its own root, or a file beside it
+        return path.name

@@ -1,0 +1,181 @@
+"""nuScenes v1.0 out of nuScenes v1.0: new cameras at the LiDAR's times, everything else kept or linked.
+
+Keyframes are converted; what the source's cameras recorded between them is left out. A new camera recorded when the
+LiDAR did, from the LiDAR's ego pose: that is where its views are rendered, whenever the source's cameras exposed.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from arbiview_aug.convert.manifest import Record
+from arbiview_aug.convert.nuscenes_rows import NewCameras, Remaining, view_stem
+from arbiview_aug.convert.settings import Settings
+from arbiview_aug.convert.visibility import visible_shares
+from arbiview_aug.datasets.nuscenes import NuScenesDataset
+from arbiview_aug.datasets.nuscenes_tables import Row, Tables
+from arbiview_aug.files import checksum, link_whole, whole_file
+from arbiview_aug.rig import Rig
+
+_TABLES = (
+    *("attribute", "category", "log", "map", "visibility", "sensor", "calibrated_sensor", "ego_pose", "scene"),
+    *("instance", "sample_annotation", "sample_data", "lidarseg", "panoptic", "sample"),
+)
+"""In the order in which they are written: while ``sample`` is missing, nobody takes the root for a whole one."""
+
+_REFERENCES = (
+    ("sample", "scene_token", "scene"),
+    ("scene", "log_token", "log"),
+    ("instance", "category_token", "category"),
+    ("calibrated_sensor", "sensor_token", "sensor"),
+    ("sample_annotation", "sample_token", "sample"),
+    ("sample_annotation", "instance_token", "instance"),
+    ("sample_annotation", "visibility_token", "visibility"),
+    ("sample_data", "sample_token", "sample"),
+    ("sample_data", "ego_pose_token", "ego_pose"),
+    ("sample_data", "calibrated_sensor_token", "calibrated_sensor"),
+)
+
+
+class NuScenes:
+    """Tables, images and masks of the new cameras.
+
+    Args:
+        settings: Of the conversion.
+        data: The source.
+    """
+
+    def __init__(self, settings: Settings, data: NuScenesDataset) -> None:
+        self.output, self.data, self.suffix = settings.output, data, settings.suffix
+
+    def facts(self) -> dict[str, Any]:
+        """What the source is, as plain data."""
+        folder = self.data.root / self.data.version
+        tables = {name: checksum(folder / f"{name}.json") for name in self._tables()}
+        return {
+            "kind": "nuscenes",
+            "root": self.data.root.resolve().name,
+            "version": self.data.version,
+            "tables": tables,
+        }
+
+    def check(self) -> None:
+        """Look for tokens that lead nowhere, before hours of work end with them.
+
+        Raises:
+            DataError: A row names another one that is not there.
+        """
+        tables, there = self._opened(), self._tables()
+        references = [(table, key, of) for table, key, of in _REFERENCES if table in there and of in there]
+        known = {
+            of: dict.fromkeys(row["token"] for batch in tables.batches(of) for row in batch)
+            for of in dict.fromkeys(of for _, _, of in references)
+        }
+        for table in dict.fromkeys(table for table, _, _ in references):
+            keys = [(key, of) for referring, key, of in references if referring == table]
+            for row in (row for batch in tables.batches(table) for row in batch):
+                for key, of in keys:
+                    if row.get(key):  # unknown is an empty token; some sources have fewer columns
+                        tables.follow(table, row, key, of, known[of])
+
+    def stem(self, index: int, camera: int, name: str) -> str:
+        """The path of a view below the output, without its suffix."""
+        return view_stem(self.data.files(index)[-1].name, name)
+
+    def rest(
+        self,
+        index: int,
+        sample: Mapping[str, Any],
+        out: Mapping[str, Any],
+        rig: Rig,
+        views: Sequence[Mapping[str, str]],
+    ) -> tuple[dict[str, bytes], dict[str, Any]]:
+        """No more files; the share of each annotation's box that the new cameras show.
+
+        Args:
+            index: Of the sample.
+            sample: As it was read.
+            out: The same, retargeted.
+            rig: Its cameras.
+            views: Of each camera the files' names, by what follows their stem.
+        """
+        boxes, coverage = sample["boxes_3d"].numpy(), [mask.numpy() for mask in out["coverage"]]
+        shares = np.round(visible_shares(rig, coverage, boxes), 3).tolist()
+        return {}, {"visible": dict(zip(sample["box_tokens"], shares, strict=True))}
+
+    def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
+        """Write the tables and link the files of the sensors that stay.
+
+        Args:
+            records: Of the converted samples.
+            left_out: Tokens of the others.
+
+        Returns:
+            Notes for people.
+        """
+        source, there = self._opened(), self._tables()
+        remaining = Remaining(source, left_out)
+        cameras = NewCameras(records, self.suffix)
+        keyframes, poses = remaining.moments()
+        self._missing = 0
+        rows: dict[str, Callable[[], Iterable[Row]]] = {
+            "sensor": lambda: chain(remaining.sensor(), cameras.sensor()),
+            "calibrated_sensor": lambda: chain(remaining.calibrated_sensor(), cameras.calibrated_sensor()),
+            "ego_pose": lambda: remaining.ego_pose(poses),
+            "scene": remaining.scene,
+            "instance": remaining.instance,
+            "sample_annotation": lambda: remaining.sample_annotation(cameras.visible),
+            "sample_data": lambda: chain(
+                self._linked(remaining.sample_data()), cameras.sample_data(remaining.drives, keyframes)
+            ),
+            "lidarseg": lambda: self._linked(source.rows("lidarseg")),
+            "panoptic": lambda: self._linked(source.rows("panoptic")),
+            "sample": remaining.sample,
+        }
+        for path in sorted((self.data.root / "maps").rglob("*")):
+            if path.is_file():
+                link_whole(path, self.output / path.relative_to(self.data.root))
+        for name in there:
+            _write_table(self.output / self.data.version / f"{name}.json", rows.get(name, partial(source.rows, name))())
+        return self._notes()
+
+    def _notes(self) -> list[str]:
+        notes = []
+        if self._missing:
+            notes.append(f"{self._missing} files that sample_data names are not in the source: were sweeps not copied?")
+        known = {*_TABLES}
+        left = sorted({path.stem for path in (self.data.root / self.data.version).glob("*.json")} - known)
+        if left:
+            notes.append(f"left out, since they may speak of the source's images: tables {', '.join(left)}")
+        return notes
+
+    def _linked(self, rows: Iterable[Row]) -> Iterator[Row]:
+        """Rows, whose files are linked on the way."""
+        for row in rows:
+            try:
+                link_whole(self.data.root / row["filename"], self.output / row["filename"])
+            except FileNotFoundError:
+                self._missing += 1
+            yield row
+
+    def _opened(self) -> Tables:
+        return Tables(self.data.root, self.data.version, None)
+
+    def _tables(self) -> list[str]:
+        """The tables that there are, in the order in which they are written."""
+        return [name for name in _TABLES if (self.data.root / self.data.version / f"{name}.json").is_file()]
+
+
+def _write_table(path: Path, rows: Iterable[Row]) -> None:
+    with whole_file(path) as file:
+        file.write(b"[")
+        for k, row in enumerate(rows):
+            file.write((b",\n" if k else b"\n") + json.dumps(row).encode())
+        file.write(b"\n]\n")

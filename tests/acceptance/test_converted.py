@@ -1,0 +1,57 @@
+"""Converted, read again and scored: the same as rendered on the fly, but for JPEG. Run with -m acceptance -s."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from arbiview_aug import Rig, RigRetarget, load_rig
+from arbiview_aug.__main__ import main
+from arbiview_aug.convert.report import converted
+from arbiview_aug.convert.settings import Settings
+from arbiview_aug.evaluate.frames import make_frame, scores
+from arbiview_aug.evaluate.images import View
+from arbiview_aug.evaluate.methods import views_of
+
+MOST_DB = 0.1
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize(
+    ("name", "target"),
+    [
+        ("nuscenes", load_rig("waymo").undistorted()),
+        ("nuscenes", load_rig("argoverse2")),
+        ("frames", load_rig("fisheye_surround")),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value.name,
+)
+def test_it_scores_as_on_the_fly(name: Any, target: Rig, nuscenes_root: Path, tmp_path: Path) -> None:
+    """Against LiDAR points at the exposures that were recorded; the points made the views, here as there."""
+    file = target.save(tmp_path / "rig.yaml")
+    output = tmp_path / "new"
+    asked = ["convert", "--data", f"{name}:{nuscenes_root}", "--target", str(file), "--output", str(output)]
+    assert main([*asked, "--workers", "1", "--report", "1"]) == 0
+    settings = Settings(root=nuscenes_root, kind=name, target=load_rig(file), output=output)
+    sample = settings.open()[0]
+    retarget = RigRetarget(settings.target)
+
+    def on_the_fly(_: Mapping[str, Any], __: Rig) -> list[View]:
+        return views_of(retarget(sample))
+
+    frame = make_frame(sample, exposures=("raw",))
+    found = {}
+    for label, render in (("on the fly", on_the_fly), ("converted", converted(settings).render)):
+        _, rows = scores(frame, render, settings.target)
+        keys = ("raw_psnr_db", "raw_covered_psnr_db", "seen")
+        found[label] = {key: float(np.mean([row[key] for row in rows if key in row])) for key in keys}
+        print(f"{name} as {target.name}, {label}: {found[label]}")
+    assert found["converted"]["seen"] == pytest.approx(found["on the fly"]["seen"], abs=1e-6)
+    for key in ("raw_psnr_db", "raw_covered_psnr_db"):
+        assert abs(found["converted"][key] - found["on the fly"][key]) <= MOST_DB
+    page = (output / "conversion" / "report.html").read_text()
+    assert page.count('<div class="slider"') == len(target)
