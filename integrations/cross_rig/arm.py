@@ -28,7 +28,7 @@ class Arm:
             and after it, with boxes where it reads boxes.
         mixed: Half of the frames drawn are raw ones.
         augmented: Frames are scaled and cropped at random as they are drawn.
-        filled: What no camera saw is inpainted, and counts as seen.
+        filled: What no camera saw is inpainted, or made up by the package's generator, and counts as seen.
         random: Targets are drawn around B, one for each frame.
         stays: B's cameras stay in the very centres of those of A that look most alike, or at their heights.
         truth: To find out where the rest is lost: B's true pixels where something is covered, or where nothing is
@@ -42,7 +42,7 @@ class Arm:
     reads: tuple[Geometry, ...] = ()
     mixed: bool = False
     augmented: bool = False
-    filled: bool = False
+    filled: Literal["telea", "generator"] | None = None
     random: bool = False
     stays: Literal["centre", "height"] | None = None
     truth: Literal["covered", "holes"] | None = None

@@ -40,8 +40,16 @@ ARMS: dict[str, Arm] = {
             mixed=True,
         ),
         Arm(name="auto_mixed", title="auto + raw", kind="retarget", reads=_ALL, mixed=True),
-        Arm(name="auto_filled", title="auto, Telea", kind="retarget", reads=_ALL, filled=True),
-        Arm(name="auto_filled_mixed", title="auto, Telea, + raw", kind="retarget", reads=_ALL, filled=True, mixed=True),
+        Arm(name="auto_filled", title="auto, Telea", kind="retarget", reads=_ALL, filled="telea"),
+        Arm(
+            name="auto_filled_mixed",
+            title="auto, Telea, + raw",
+            kind="retarget",
+            reads=_ALL,
+            filled="telea",
+            mixed=True,
+        ),
+        Arm(name="auto_generated", title="auto, generator", kind="retarget", reads=_ALL, filled="generator"),
         Arm(name="true_covered", title="auto's holes in B's own frames", kind="retarget", reads=_ALL, truth="covered"),
         Arm(name="true_holes", title="auto, holes filled with the truth", kind="retarget", reads=_ALL, truth="holes"),
         Arm(

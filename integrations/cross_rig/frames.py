@@ -15,13 +15,16 @@ import cv2
 import numpy as np
 import torch
 
-from arbiview_aug import Rig
+from arbiview_aug import Camera, Rig
 from arbiview_aug.datasets import LazyFrame, Neighbours
 from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive
+from arbiview_aug.generator import Generator
+from arbiview_aug.generator.completion import inpainted
+from arbiview_aug.generator.model import shipped_weights
 from integrations.cross_rig.arm import Arm
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, fill
 from integrations.cross_rig.labels import Grid, box_cells, visible_objects
-from integrations.cross_rig.views import ViewMaker, filled
+from integrations.cross_rig.views import ViewMaker
 from integrations.cross_rig.worlds import CHANGES, STREET_SEEDS, Size, Split, source_rig
 
 _WORLD = "arbiview_aug.datasets.synthetic"
@@ -29,6 +32,9 @@ _FORMAT = 1
 """Part of every set's name: raise it when this file stores something else."""
 NEIGHBOURS = Neighbours()
 """One frame before and one after, 1.2 m away."""
+
+_FILLING = ("arbiview_aug.generator", "arbiview_aug.generator.batches", "arbiview_aug.transform_settings")
+"""What ``RigRetarget`` asks to fill holes."""
 
 _MAX_FRAMES = 1 << 20
 """Length of the streets' datasets: a set of frames grows without becoming another."""
@@ -71,13 +77,17 @@ class Source:
         if self.arm is not None:
             arm = self.arm
             renderer = "transforms" if arm.kind == "retarget" else "evaluate.baselines"
+            # What fills holes changes no pixel that a camera saw.
+            unused = () if arm.filled == "generator" else _FILLING
             spec |= {
                 "source": source_rig(self.size).content_key.hex(),
                 "arm": arm.views_spec(),
-                "renderer": code_hash(f"arbiview_aug.{renderer}"),
+                "renderer": code_hash(f"arbiview_aug.{renderer}", without=unused),
                 # What an arm says of its views is in ``arm``; another arm's needs may change without it.
                 "views": code_hash("integrations.cross_rig.views", without=("integrations.cross_rig.arm",)),
             }
+            if arm.filled == "generator":
+                spec["weights"] = shipped_weights()
         return FrameStore(self.root, spec)
 
     def original(self) -> Source:
@@ -87,7 +97,7 @@ class Source:
     def rendered(self) -> Source:
         """The same views as they were rendered: without what is put into their holes, or over them."""
         assert self.arm is not None
-        return replace(self, arm=replace(self.arm, filled=False, truth=None))
+        return replace(self, arm=replace(self.arm, filled=None, truth=None))
 
     def needs(self) -> list[Source]:
         """The sets that must be there before this one can be made."""
@@ -221,8 +231,10 @@ class _ChangedFrames:
 
     def __init__(self, source: Source) -> None:
         assert source.arm is not None
-        self.arm, self.width = source.arm, source.size[1]
+        self.arm, self.width, self.rig = source.arm, source.size[1], source.original().rig
         self.store, self.truth = source.rendered().store(), source.true().store()
+        self.original = source.original().store()
+        self.generator = Generator.shipped() if self.arm.filled == "generator" else None
 
     def __call__(self, index: int) -> Arrays:
         start = time.process_time()
@@ -233,8 +245,27 @@ class _ChangedFrames:
             arrays["images"] = np.where(shown[:, None], self.truth.read(index, "images"), arrays["images"])
             covered = covered | shown
         if self.arm.filled:
-            arrays["images"] = np.stack([filled(*view) for view in zip(arrays["images"], covered, strict=True)])
+            arrays["images"] = self._filled(index, arrays, covered)
             covered = np.ones_like(covered)
         arrays["coverage"] = np.packbits(covered, axis=-1)
         arrays["cpu_s"] = (arrays["cpu_s"] + time.process_time() - start).astype(np.float32)
         return arrays
+
+    def _filled(self, index: int, arrays: Arrays, covered: np.ndarray) -> np.ndarray:
+        """(M, 3, h, w) uint8 views with their holes filled."""
+        h, w = covered.shape[-2:]
+        poses = zip(arrays["K"], arrays["cam2ego"], strict=True)
+        target = Rig(
+            [
+                Camera(name=str(k), width_px=w, height_px=h, K=K.astype(np.float64), cam2ego=pose.astype(np.float64))
+                for k, (K, pose) in enumerate(poses)
+            ],
+            ground_z_m=self.rig.ground_z_m,
+        )
+        views, seen = torch.from_numpy(arrays["images"].copy()), torch.from_numpy(covered)
+        if self.generator is None:
+            done = inpainted(views, seen, target)
+        else:
+            images = torch.from_numpy(self.original.read(index, "images").copy())
+            done = self.generator.complete_views(views, seen, target, images, self.rig, steps=1, frame=index)
+        return np.stack([view.numpy() for view in done.images])

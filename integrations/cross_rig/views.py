@@ -6,7 +6,6 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 
@@ -19,9 +18,6 @@ from integrations.cross_rig.arm import RANDOM, Arm
 from integrations.cross_rig.cache import Arrays
 
 _POSE = ("ego2world", "time_s")  # where neighbours are read
-
-_TELEA_RADIUS_PX = 3
-"""OpenCV's own example; holes are filled from their border inwards whatever it is."""
 
 
 class ViewMaker:
@@ -81,12 +77,3 @@ def at_source_centres(source: Rig, target: Rig) -> Rig:
     """The target rig, in the source's ego frame, with each camera in the centre of the source camera most like it."""
     moves = (most_alike(source, camera).center_m - camera.center_m for camera in target)
     return target.with_cameras([camera.shifted(*move) for camera, move in zip(target, moves, strict=True)])
-
-
-def filled(image: np.ndarray, coverage: np.ndarray) -> np.ndarray:
-    """(3, h, w) with what is not covered inpainted (Telea)."""
-    if not coverage.any():  # nothing to start from
-        return image
-    picture = np.ascontiguousarray(image.transpose(1, 2, 0))
-    done = cv2.inpaint(picture, (~coverage).astype(np.uint8), _TELEA_RADIUS_PX, cv2.INPAINT_TELEA)
-    return np.asarray(done).transpose(2, 0, 1)

@@ -149,7 +149,7 @@ def test_presets():
     # Raw and scale/crop once for each seed, five arms for each change: 3 * (2 + 3 * 5).
     assert len(jobs(pilot())) == 51
     names = [job.name for job in jobs(full())]
-    assert len(names) == len(set(names)) == 3 * (2 + 6 * 23)
+    assert len(names) == len(set(names)) == 3 * (2 + 6 * 24)
 
 
 def test_keys_follow_what_matters(done):

@@ -1,0 +1,93 @@
+"""Photometric transforms after ours: colours change, geometry, calibration and holes do not."""
+
+from __future__ import annotations
+
+import kornia.augmentation as K
+import pytest
+import torch
+from torchvision import tv_tensors
+from torchvision.transforms import v2
+
+from arbiview_aug import CropRig, ResizeRig, RigRetarget
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from integrations.kornia.example import main
+from integrations.kornia.pipeline import OnImages, check_photometric
+
+SOURCE = demo_source_rig((64, 176))
+TARGET = SOURCE.turned(pitch_deg=-12)
+
+
+@pytest.fixture(scope="module")
+def sample() -> dict:
+    sample = SyntheticDrive(SOURCE, num_frames=1, lidar=False)[0]
+    return {**sample, "images": tv_tensors.Image(sample["images"])}
+
+
+def test_inside_v2_compose(sample: dict) -> None:
+    """A solarising curve is known for each pixel: each image is ours with that curve, K and boxes are ours."""
+    ours = RigRetarget(TARGET, surface="far")
+    out = v2.Compose([ours, v2.RandomSolarize(threshold=0, p=1.0)])(sample)
+    expected = ours(sample)
+    assert type(out["images"]) is tv_tensors.Image and torch.equal(out["images"], 255 - expected["images"])
+    for key in ("K", "cam2ego", "coverage", "boxes_3d"):
+        assert torch.equal(out[key], expected[key])
+    cropped = v2.Compose([ours, CropRig(8, 16, (40, 120)), ResizeRig((20, 60)), v2.ColorJitter(0.2)])(sample)
+    assert torch.allclose(cropped["K"], torch.from_numpy(_known(SOURCE).K)) and cropped["coverage"].shape == (6, 20, 60)
+
+
+def _known(rig):
+    return rig.with_cameras([camera.crop(8, 16, (40, 120)).resize((20, 60)) for camera in rig])
+
+
+def test_v2s_own_resize_leaves_k_wrong(sample: dict) -> None:
+    """The trap: nothing fails."""
+    out = v2.Compose([RigRetarget(TARGET, surface="far"), v2.Resize((32, 88))])(sample)
+    assert out["images"].shape[-2:] == (32, 88) and torch.allclose(out["K"], torch.from_numpy(TARGET.K))
+    right = v2.Compose([RigRetarget(TARGET, surface="far"), ResizeRig((32, 88))])(sample)
+    assert torch.allclose(right["K"], torch.from_numpy(TARGET.resized((32, 88)).K))
+
+
+def test_kornias_image_sequential(sample: dict) -> None:
+    """Known again by inverting; holes stay black; one draw for all cameras where it is asked for."""
+    expected = RigRetarget(TARGET, surface="far")(sample)
+    invert = torch.nn.Sequential(RigRetarget(TARGET, surface="far"), OnImages(K.ImageSequential(K.RandomInvert(p=1.0))))
+    out = invert(sample)
+    seen = out["coverage"].unsqueeze(1).expand_as(out["images"])
+    assert 0.1 < (~seen).float().mean() < 0.9
+    assert torch.equal(out["images"][seen], 255 - expected["images"].as_subclass(torch.Tensor)[seen])
+    assert not out["images"][~seen].any() and torch.equal(out["K"], expected["K"])
+    jiggle = OnImages(K.ImageSequential(K.RandomBrightness((0.4, 0.9), p=1.0, same_on_batch=True)))
+    flat = jiggle({"images": torch.full((2, 3, 3, 8, 8), 0.5)})["images"]
+    assert flat.shape == (2, 3, 3, 8, 8) and flat.unique().numel() == 1
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        K.RandomAffine(5.0),
+        K.ImageSequential(K.ColorJiggle(), K.RandomHorizontalFlip()),
+        K.RandomResizedCrop((8, 8)),
+        K.RandomPerspective(),
+        v2.RandomCrop(8),
+        v2.Compose([v2.ColorJitter(), v2.Resize(8)]),
+    ],
+    ids=lambda module: type(module).__name__,
+)
+def test_what_moves_pixels_is_refused(module: torch.nn.Module) -> None:
+    with pytest.raises(ValueError, match=r"moves pixels and leaves K as it was; .* ResizeRig and CropRig"):
+        OnImages(module)
+
+
+def test_photometric_ones_pass() -> None:
+    for module in (K.ColorJiggle(), K.RandomGaussianBlur((3, 3), (0.1, 1.0)), v2.ColorJitter(), v2.GaussianBlur(3)):
+        check_photometric(module)
+
+
+def test_lists_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"got a list; pass size=\(h, w\)"):
+        OnImages(K.ColorJiggle())({"images": [torch.zeros(3, 4, 4)]})
+
+
+def test_example(tmp_path, capsys) -> None:
+    assert main(["--output", str(tmp_path / "out.png")]) == 0
+    assert "(5, 3, 128, 352) torch.float32" in capsys.readouterr().out and (tmp_path / "out.png").is_file()

@@ -1,0 +1,62 @@
+"""Batches of samples for retargeting on the device: cameras stacked, points and boxes in lists."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+
+from arbiview_aug.errors import SampleError
+
+STACKED = ("images", "K", "cam2ego", "coverage", "ignore", "distortion", "ego2world")
+"""What has one shape in all frames of a rig. All else is a list: of points and boxes each frame has its own number."""
+
+
+def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """A batch that ``RigRetarget`` takes, of samples that it takes.
+
+    Frames of one rig keep it. Where each has its own (nuScenes: cameras and LiDAR expose at different times), ``K`` and
+    ``cam2ego`` say so.
+
+    Args:
+        samples: At least one; with equal keys.
+
+    Raises:
+        SampleError: Different keys, or rigs that differ and have lenses or masks, which tensors do not carry.
+    """
+    first = samples[0]
+    if any(set(sample) != set(first) for sample in samples):
+        odd = sorted({str(key) for sample in samples for key in set(sample) ^ set(first)})
+        raise SampleError(f"collate: expected equal keys in all samples, got {', '.join(odd)} in some")
+    batch: dict[str, Any] = {}
+    for key in first:
+        values = [sample[key] for sample in samples]
+        if key == "rig":
+            batch |= _rigs(values)
+        elif key in STACKED and all(isinstance(value, torch.Tensor) for value in values):
+            batch[key] = torch.stack(values)
+        elif key == "images":  # lists: a tensor for each camera
+            batch[key] = [torch.stack(of_camera) for of_camera in zip(*values, strict=True)]
+        elif key == "ground_z_m":
+            batch[key] = torch.tensor([float(value) for value in values], dtype=torch.float64)
+        else:
+            batch[key] = values
+    return batch
+
+
+def _rigs(rigs: Sequence[Any]) -> dict[str, Any]:
+    if all(rig == rigs[0] for rig in rigs):
+        return {"rig": rigs[0]}
+    for rig in rigs:
+        for camera in rig:
+            if camera.lens != "pinhole" or camera.mask is not None:
+                raise SampleError(
+                    f"collate: camera {camera.name!r}: rigs that differ within a batch must be of pinhole cameras "
+                    "without masks; retarget in the dataset (RetargetedDataset) instead"
+                )
+    return {
+        "K": torch.stack([torch.from_numpy(rig.K) for rig in rigs]),
+        "cam2ego": torch.stack([torch.from_numpy(rig.cam2ego) for rig in rigs]),
+        "ground_z_m": torch.tensor([rig.ground_z_m for rig in rigs], dtype=torch.float64),
+    }

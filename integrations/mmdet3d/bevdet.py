@@ -1,0 +1,167 @@
+"""BEVDet's form: ``img_inputs``, whose images are resized, cropped, perhaps flipped, turned, and normalised already."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from arbiview_aug.camera import FloatArray
+from arbiview_aug.errors import SampleError
+from integrations.mmdet3d.matrices import Views, padded, upper_triangular
+from integrations.mmdet3d.results import Retarget, source_rig, target_outputs, target_views
+
+MEAN_STD = ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375))
+"""What BEVDet's ``mmlabNormalize`` subtracts and divides by, in the order of the channels it leaves."""
+
+_KEY_CAMERA = "CAM_FRONT"
+_FORM = "(imgs, sensor2egos, ego2globals, intrins, post_rots, post_trans[, bda])"
+_ROUNDING = 0.01
+"""Grey levels of 255 by which a pixel that was normalised in float32 may miss a whole number."""
+
+
+def retarget_img_inputs(
+    results: Mapping[str, Any],
+    retarget: Retarget,
+    *,
+    names: Sequence[str],
+    ground_z_m: float = 0.0,
+    mean_std: tuple[Sequence[float], Sequence[float]] = MEAN_STD,
+) -> dict[str, Any]:
+    """Re-render ``img_inputs`` of one frame, and what goes with it.
+
+    The source cameras are those of the images as they are: their resizing, cropping, flipping and turning is a part of
+    their K and pose. The target's images are not augmented: ``post_rots`` are ones, ``post_trans`` zeros.
+
+    All target cameras stand where they are at ``CAM_FRONT``'s time (the first camera's, without one of that name):
+    that is the ego frame of BEVDet's boxes, and what it then takes, ``ego2globals[0]``, for its key ego frame. With the
+    LiDAR's pose there the boxes would be 0.33 m off at 9 m/s; BEVDet's own frames, whose first camera is
+    ``CAM_FRONT_LEFT``, are 0.07 m off.
+
+    Args:
+        results: As ``PrepareImageInputs`` leaves it; it is not changed. ``ann_infos``, BEVDet's boxes, are read as
+            geometry and stay.
+        retarget: A ``RigRetarget``, or what calls one.
+        names: Of the target's cameras.
+        ground_z_m: Height of the road in the source's ego frame.
+        mean_std: Three numbers each, by which the images are normalised: (grey level − mean) / std.
+
+    Raises:
+        SampleError: Another form, several frames (BEVDet4D), images that were normalised by other numbers.
+        CalibrationError: A target with lenses.
+    """
+    given = results["img_inputs"]
+    images, sensor2egos, ego2globals, intrins, post_rots, post_trans = _checked(given)
+    size = images.shape[-2], images.shape[-1]
+    in_source = list(results.get("cam_names", [f"camera {k}" for k in range(len(images))]))
+    key = in_source.index(_KEY_CAMERA) if _KEY_CAMERA in in_source else 0
+    key2global = ego2globals[key].double().numpy()
+    mounted = (np.linalg.inv(key2global) @ ego2globals.double().numpy()) @ sensor2egos.double().numpy()
+    mirrored, K, cam2ego = _as_recorded(intrins, post_rots, post_trans, mounted, size)
+    levels = _levels(images, mean_std)
+    views = [image.flip(-1) if flip else image for image, flip in zip(levels, mirrored, strict=True)]
+    source = Views(in_source, K, cam2ego, np.eye(4), key2global)
+    out = retarget({"images": torch.stack(views), "rig": source_rig(source, views, ground_z_m), **_boxes(results)})
+    target = target_views(out, source, names)
+    count = len(target.names)
+    made: list[Any] = [
+        _normalised(out["images"], mean_std).to(images.dtype),
+        torch.from_numpy(target.cam2ego).to(sensor2egos),
+        ego2globals[key].expand(count, -1, -1).clone(),
+        torch.from_numpy(target.K).to(intrins),
+        torch.eye(3).to(post_rots).expand(count, -1, -1).clone(),
+        torch.zeros(count, 3).to(post_trans),
+    ]
+    changed = {key: value for key, value in results.items() if key != "canvas"}
+    changed["img_inputs"] = type(given)([*made, *given[6:]])
+    if "cam_names" in results:
+        changed["cam_names"] = list(target.names)
+    if isinstance(results.get("curr"), Mapping) and "cams" in results["curr"]:
+        changed["curr"] = {**results["curr"], "cams": _infos(target, key2global)}
+    return changed | target_outputs(out)
+
+
+def _checked(given: Any) -> list[torch.Tensor]:
+    if not isinstance(given, list | tuple) or len(given) not in (6, 7):
+        got = len(given) if isinstance(given, list | tuple) else type(given).__name__
+        raise SampleError(f"img_inputs: expected {_FORM}, got {got} entries")
+    tensors = list(given[:6])
+    count = len(tensors[0])
+    shapes = [tuple(tensor.shape[1:]) for tensor in tensors]
+    if shapes[1:] != [(4, 4), (4, 4), (3, 3), (3, 3), (3,)] or len(shapes[0]) != 3:
+        raise SampleError(f"img_inputs: expected {_FORM} for each camera, got shapes {shapes}")
+    if any(len(tensor) != count for tensor in tensors):
+        raise SampleError(f"img_inputs: expected {count} cameras in each entry, got {[len(t) for t in tensors]}")
+    return tensors
+
+
+def _as_recorded(
+    intrins: torch.Tensor,
+    post_rots: torch.Tensor,
+    post_trans: torch.Tensor,
+    mounted: FloatArray,
+    size: tuple[int, int],
+) -> tuple[list[bool], FloatArray, FloatArray]:
+    """Which images are mirrored; K and cam2ego of the others as they are, and of those when mirrored back."""
+    count = len(intrins)
+    moved = np.tile(np.eye(3), (count, 1, 1))
+    moved[:, :2, :2] = post_rots.double().numpy()[:, :2, :2]
+    moved[:, :2, 2] = post_trans.double().numpy()[:, :2]
+    # They move pixels as PIL does, whose outer edges are 0 and w; those of ``Camera`` are -0.5 and w - 0.5.
+    half = np.eye(3)
+    half[:2, 2] = 0.5
+    moved = np.linalg.inv(half) @ moved @ half
+    mirrored = np.linalg.det(moved[:, :2, :2]) < 0
+    back = np.array([[-1.0, 0, size[1] - 1], [0, 1, 0], [0, 0, 1]])
+    moved[mirrored] = back @ moved[mirrored]
+    K, turned = upper_triangular(moved @ intrins.double().numpy())
+    return mirrored.tolist(), K / K[:, 2:, 2:], mounted @ np.linalg.inv(padded(turned))
+
+
+def _levels(images: torch.Tensor, mean_std: tuple[Sequence[float], Sequence[float]]) -> torch.Tensor:
+    """Normalised images (N, 3, h, w) as uint8."""
+    mean, std = (torch.tensor(numbers, dtype=torch.float64)[:, None, None] for numbers in mean_std)
+    levels = images.double() * std + mean
+    whole = levels.round()
+    off = float((levels - whole).abs().max())
+    if off > _ROUNDING or whole.min() < 0 or whole.max() > 255:
+        raise SampleError(
+            f"img_inputs: expected 8 bit images normalised by mean and std {mean_std}, got grey levels {off:.2g} off "
+            f"whole numbers, from {levels.min():.1f} to {levels.max():.1f}; pass img_norm=(mean, std)"
+        )
+    return whole.to(torch.uint8)
+
+
+def _normalised(images: torch.Tensor, mean_std: tuple[Sequence[float], Sequence[float]]) -> torch.Tensor:
+    mean, std = (torch.tensor(numbers)[:, None, None] for numbers in mean_std)
+    return (images.float() - mean) / std
+
+
+def _boxes(results: Mapping[str, Any]) -> dict[str, torch.Tensor]:
+    """``boxes_3d`` of ``ann_infos``, (B, 9): gravity centre, length, width, height, yaw, in the key ego frame."""
+    annotated = results.get("ann_infos")
+    if not isinstance(annotated, list | tuple) or len(annotated) != 2:
+        return {}
+    boxes = np.asarray(annotated[0], np.float64).reshape(len(annotated[0]), -1)[:, :7]
+    return {"boxes_3d": torch.from_numpy(boxes.reshape(-1, 7)).float()}
+
+
+def _infos(target: Views, key2global: FloatArray) -> dict[str, dict[str, Any]]:
+    """``curr["cams"]``: what ``PointToMultiViewDepth`` reads."""
+    from kornia.geometry.conversions import rotation_matrix_to_quaternion
+
+    def pose(prefix: str, matrix: FloatArray) -> dict[str, Any]:
+        quaternion = rotation_matrix_to_quaternion(torch.from_numpy(matrix[:3, :3].copy()))
+        return {f"{prefix}_rotation": quaternion.tolist(), f"{prefix}_translation": matrix[:3, 3].tolist()}
+
+    return {
+        name: {
+            "data_path": name,
+            "cam_intrinsic": K,
+            **pose("sensor2ego", cam2ego),
+            **pose("ego2global", key2global),
+        }
+        for name, K, cam2ego in zip(target.names, target.K, target.cam2ego, strict=True)
+    }

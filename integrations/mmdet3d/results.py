@@ -1,0 +1,282 @@
+"""The core: a ``results`` dict of mmdet3d, BEVFusion, DETR3D or PETR in, the same dict of the target's cameras out."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from arbiview_aug.camera import Camera, FloatArray
+from arbiview_aug.errors import CalibrationError, SampleError
+from arbiview_aug.rig import Rig
+from integrations.mmdet3d.images import like_given as images_like
+from integrations.mmdet3d.images import to_tensors
+from integrations.mmdet3d.matrices import MATRICES, Views, is_transposed, like_given, read_views, stacked
+
+Retarget = Callable[[dict[str, Any]], dict[str, Any]]
+
+STALE_KEYS = (
+    "cam_instances",
+    "gt_bboxes",
+    "gt_bboxes_labels",
+    "bboxes",
+    "bboxes_ignore",
+    "bboxes2d",
+    "labels2d",
+    "centers_2d",
+    "centers2d",
+    "depths",
+    "depth_map",
+    "gt_depth",
+    "canvas",
+)
+"""Keys, also in ``ann_info``, that speak of the source's pixels: dropped (``project_boxes_3d`` makes 2D boxes anew)."""
+
+FILE_KEYS = ("filename", "img_path", "img_filename", "image_paths")
+"""Lists of image files: no file holds the new images, so they become the cameras' names."""
+
+SHAPE_KEYS = ("img_shape", "ori_shape", "pad_shape")
+TARGET_OUTPUTS = ("coverage", "ignore", "confidence", "generated", "source_camera", "source_frame", "retarget_params")
+"""Entries of a retargeted sample that the results get besides, as arrays."""
+
+
+def retarget_results(
+    results: Mapping[str, Any],
+    retarget: Retarget,
+    *,
+    names: Sequence[str],
+    lidar2ego: Any = None,
+    ground_z_m: float = 0.0,
+) -> dict[str, Any]:
+    """Re-render the images of a ``results`` dict, and rewrite every key that describes them.
+
+    Whatever keys of ``MATRICES`` the dict has are rewritten in their container, type and shape, at the top and in
+    ``images``: the form is never guessed. All target cameras stand where they are at the LiDAR's time. ``points``
+    (LiDAR frame) and ``gt_bboxes_3d`` are read as geometry, where there are any, and stay.
+
+    Args:
+        results: As the loading transforms leave it; it is not changed.
+        retarget: A ``RigRetarget``, or what calls one.
+        names: Of the target's cameras.
+        lidar2ego: (4, 4), where the dict does not tell it.
+        ground_z_m: Height of the road in the source's ego frame.
+
+    Raises:
+        SampleError: Matrices that are missing, contradictory or already augmented; target images of several sizes.
+        CalibrationError: A target with lenses.
+    """
+    if results.get("img") is None:
+        raise SampleError(f"results: expected 'img', loaded images, got {', '.join(map(str, results))}")
+    images = to_tensors(results["img"])
+    _check_not_augmented(results)
+    infos = results.get("images")
+    source = read_views(
+        _given(results, len(images)), len(images), _names(infos, len(images)), _lidar2ego(results, lidar2ego)
+    )
+    if isinstance(infos, Mapping) and len(infos) == len(images):
+        images = [_without_padding(image, info) for image, info in zip(images, infos.values(), strict=True)]
+    out = retarget(
+        {"images": images, "rig": source_rig(source, images, ground_z_m), **geometry(results, source.lidar2ego)}
+    )
+    views = target_views(out, source, names)
+    made = {key: value for key, value in results.items() if key not in STALE_KEYS}
+    if isinstance(made.get("ann_info"), Mapping):
+        made["ann_info"] = {key: value for key, value in made["ann_info"].items() if key not in STALE_KEYS}
+    _warn_of_dropped(results)
+    made["img"] = images_like(results["img"], out["images"])
+    _write_matrices(made, views)
+    if isinstance(infos, Mapping):
+        made["images"] = _infos(infos, views, out["images"])
+    _write_sizes(made, out["images"])
+    for key in FILE_KEYS:
+        if isinstance(made.get(key), list | tuple):
+            made[key] = list(views.names)
+    if isinstance(made.get("img_timestamp"), list | tuple):  # PETR's: all views are of the LiDAR's time
+        time_s = made.get("timestamp", float(np.mean(made["img_timestamp"])))
+        made["img_timestamp"] = [time_s] * len(views.names)
+    if "num_views" in made:
+        made["num_views"] = len(views.names)
+    return made | target_outputs(out)
+
+
+# --- source -----------------------------------------------------------------------------------------------------------
+def _given(results: Mapping[str, Any], count: int) -> dict[str, Any]:
+    """The matrices of all cameras: at the top, else gathered from ``images``."""
+    found = {key: results[key] for key in MATRICES if results.get(key) is not None and _is_per_camera(results[key])}
+    infos = results.get("images")
+    if isinstance(infos, Mapping) and len(infos) == count:
+        for key in MATRICES:
+            if key not in found and all(isinstance(info, Mapping) and key in info for info in infos.values()):
+                found[key] = [info[key] for info in infos.values()]
+    return found
+
+
+def _is_per_camera(value: Any) -> bool:
+    """Not the one matrix that mmdet3d's datasets keep of their ``default_cam_key``."""
+    return len(value) > 0 and np.ndim(value[0]) == 2
+
+
+def _names(infos: Any, count: int) -> list[str]:
+    if isinstance(infos, Mapping) and len(infos) == count:
+        return [str(name) for name in infos]
+    return [f"camera {k}" for k in range(count)]
+
+
+def _lidar2ego(results: Mapping[str, Any], given: Any) -> FloatArray:
+    points = results.get("lidar_points")
+    for holder in (points, results):
+        if isinstance(holder, Mapping) and holder.get("lidar2ego") is not None:
+            return stacked("lidar2ego", [holder["lidar2ego"]], 1)[0]
+    if given is None:
+        raise SampleError(
+            "lidar2ego: expected the LiDAR's pose (4, 4) in results['lidar_points'] or results['lidar2ego'], found "
+            "none; pass lidar2ego= to the transform"
+        )
+    return stacked("lidar2ego", [given], 1)[0]
+
+
+def _check_not_augmented(results: Mapping[str, Any]) -> None:
+    for key in ("img_aug_matrix", "lidar_aug_matrix"):
+        value = results.get(key)
+        if value is not None and np.abs(np.asarray(value, np.float64) - np.eye(4)).max() > 1e-6:
+            raise SampleError(f"{key}: expected none yet, got one; retarget right after loading, before augmentations")
+
+
+def _without_padding(image: torch.Tensor, info: Any) -> torch.Tensor:
+    """An image as recorded: mmdet3d pads those of several sizes to the largest."""
+    if not isinstance(info, Mapping) or "height" not in info or "width" not in info:
+        return image
+    return image[:, : int(info["height"]), : int(info["width"])]
+
+
+def source_rig(views: Views, images: Sequence[torch.Tensor], ground_z_m: float) -> Rig:
+    """The cameras of images (3, H, W)."""
+    cameras = [
+        Camera(name=name, width_px=image.shape[2], height_px=image.shape[1], K=K, cam2ego=cam2ego)
+        for name, K, cam2ego, image in zip(views.names, views.K, views.cam2ego, images, strict=True)
+    ]
+    return Rig(cameras, ground_z_m=ground_z_m)
+
+
+def geometry(results: Mapping[str, Any], lidar2ego: FloatArray) -> dict[str, torch.Tensor]:
+    """The sample's ``points`` and ``boxes_3d`` in the ego frame, of what the results hold in the LiDAR's.
+
+    Boxes are taken by their corners: what their numbers mean differs between mmdet3d's versions.
+    """
+    found = {}
+    points = results.get("points")
+    points = getattr(points, "tensor", points)
+    if isinstance(points, torch.Tensor | np.ndarray) and points.ndim == 2:
+        xyz = np.asarray(points[:, :3], np.float64)
+        found["points"] = torch.from_numpy(xyz @ lidar2ego[:3, :3].T + lidar2ego[:3, 3]).float()
+    annotated = results.get("ann_info")
+    boxes = results.get("gt_bboxes_3d", annotated.get("gt_bboxes_3d") if isinstance(annotated, Mapping) else None)
+    corners = getattr(boxes, "corners", None)
+    if corners is not None:
+        # Of both conventions: 1 is above 0, 3 beside it, 4 at the other end.
+        x = np.asarray(corners, np.float64).reshape(-1, 8, 3) @ lidar2ego[:3, :3].T + lidar2ego[:3, 3]
+        along, across, up = x[:, 4] - x[:, 0], x[:, 3] - x[:, 0], x[:, 1] - x[:, 0]
+        sizes = [np.linalg.norm(side, axis=1) for side in (along, across, up)]
+        columns = [*x.mean(axis=1).T, *sizes, np.arctan2(along[:, 1], along[:, 0])]
+        found["boxes_3d"] = torch.from_numpy(np.stack(columns, axis=1)).float()
+    return found
+
+
+# --- target -----------------------------------------------------------------------------------------------------------
+def target_views(out: Mapping[str, Any], source: Views, names: Sequence[str]) -> Views:
+    """The cameras of a retargeted sample.
+
+    Raises:
+        SampleError: Images of several sizes, or poses in the target's ego frame.
+        CalibrationError: Lenses.
+    """
+    if not isinstance(out["images"], torch.Tensor):
+        raise SampleError("target: expected images of one size, got several; pass size=(h, w) to the transform")
+    if "ego2ego" in out:
+        raise SampleError("label_frame: expected 'source', since points and boxes stay in the LiDAR's frame")
+    check_no_lenses(out.get("lens", ()))
+    skipped = out.get("retarget_params", {}).get("skipped")
+    return Views(
+        list(source.names if skipped else names),
+        out["K"].double().numpy(),
+        out["cam2ego"].double().numpy(),
+        source.lidar2ego,
+        source.ego2global,
+    )
+
+
+def check_no_lenses(lenses: Sequence[str]) -> None:
+    """Refuse what the frameworks' matrices cannot say.
+
+    Raises:
+        CalibrationError: Lenses.
+    """
+    if any(lens != "pinhole" for lens in lenses):
+        raise CalibrationError(
+            f"target: expected pinhole cameras, which is all that these frameworks know, got {', '.join(lenses)}; "
+            "pass load_rig(...).undistorted(), or a file that it was saved to"
+        )
+
+
+def target_outputs(out: Mapping[str, Any]) -> dict[str, Any]:
+    """Coverage, and what else was asked for, as arrays."""
+    found = {key: out[key] for key in TARGET_OUTPUTS if key in out}
+    return {key: value.numpy() if isinstance(value, torch.Tensor) else value for key, value in found.items()}
+
+
+def _write_matrices(made: dict[str, Any], views: Views) -> None:
+    for key, kind in MATRICES.items():
+        if made.get(key) is None:
+            continue
+        if not _is_per_camera(made[key]):
+            del made[key]
+            continue
+        made[key] = _as_written(made[key], views.matrices(kind))
+
+
+def _as_written(given: Any, matrices: FloatArray) -> Any:
+    """The matrices as the given ones are; transposed where they are."""
+    if np.shape(given[0]) == (4, 4) and is_transposed(np.stack([np.asarray(m, np.float64) for m in given])):
+        matrices = matrices.transpose(0, 2, 1)
+    return like_given(given, matrices)
+
+
+def _infos(infos: Mapping[str, Any], views: Views, images: torch.Tensor) -> dict[str, Any]:
+    """``images``: an entry for each target camera with the keys of the source's that can be told of it."""
+    first: Mapping[str, Any] = next(iter(infos.values()), {})
+    columns = {
+        key: _as_written([first[key]], views.matrices(kind))
+        for key, kind in MATRICES.items()
+        if key in first and (kind != "cam2global" or views.ego2global is not None)
+    }
+    made = {}
+    for k, name in enumerate(views.names):
+        made[name] = {key: column[k] for key, column in columns.items()}
+        if "img_path" in first:
+            made[name]["img_path"] = name
+        if "height" in first and "width" in first:
+            made[name] |= {"height": images.shape[-2], "width": images.shape[-1]}
+    return made
+
+
+def _write_sizes(made: dict[str, Any], images: torch.Tensor) -> None:
+    """(h, w), (h, w, 3), (h, w, 3, views) as given; (w, h) where images are PIL's."""
+    h, w = images.shape[-2:]
+    is_array = isinstance(made["img"][0], np.ndarray)
+    full = (h, w, 3, len(images)) if is_array else (w, h)
+    for key in SHAPE_KEYS:
+        if isinstance(made.get(key), tuple | list):
+            given = made[key]
+            one = given[0] if isinstance(given[0], tuple | list) else None
+            made[key] = full[: len(given)] if one is None else [full[: len(one)]] * len(images)
+
+
+def _warn_of_dropped(results: Mapping[str, Any]) -> None:
+    annotated = results.get("ann_info")
+    held = [*results, *(annotated if isinstance(annotated, Mapping) else ())]
+    dropped = sorted({key for key in held if key in STALE_KEYS})
+    if dropped:
+        warnings.warn(f"retarget: drops {', '.join(dropped)}: they speak of the source's pixels", stacklevel=4)

@@ -1,0 +1,248 @@
+"""Each framework's ``results`` dict: every key speaks of the target's cameras, and the images are theirs."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import CalibrationError, CropRig, ResizeRig, Rig, RigRetarget, SampleError, SampleTypeError, load_rig
+from arbiview_aug.datasets.synthetic import SyntheticDrive
+from integrations.mmdet3d.bevdet import MEAN_STD
+from integrations.mmdet3d.made import EGO2GLOBAL, FORMS, LIDAR2EGO, Recording, recording, source_rig
+from integrations.mmdet3d.matrices import MATRICES, decomposed, upper_triangular
+from integrations.mmdet3d.measure import worst_error_px
+from integrations.mmdet3d.transform import RigRetargetMultiView
+
+README = (Path(__file__).parents[1] / "README.md").read_text()
+SIZE = (48, 136)
+SOURCE = source_rig((64, 176))
+TARGET = load_rig("waymo").undistorted().resized(SIZE)
+LIDAR_FORMS = [name for name in FORMS if name != "BEVDet"]
+
+
+@pytest.fixture(scope="module")
+def given() -> Recording:
+    return recording(SyntheticDrive(SOURCE, num_frames=1)[0])
+
+
+def step(target: Rig = TARGET, **settings: Any) -> RigRetargetMultiView:
+    return RigRetargetMultiView(target, lidar2ego=LIDAR2EGO, **{"surface": "street", **settings})
+
+
+def pixels(results: dict) -> np.ndarray:
+    """(M, h, w, 3) RGB levels of any form."""
+    if "img_inputs" in results:
+        mean, std = (np.array(numbers)[:, None, None] for numbers in MEAN_STD)
+        return (results["img_inputs"][0].numpy() * std + mean).transpose(0, 2, 3, 1)[..., ::-1]
+    arrays = np.stack([np.asarray(image, np.float64) for image in results["img"]])
+    is_rgb = "camera_intrinsics" in results or "cam2lidar" in results
+    return arrays if is_rgb else arrays[..., ::-1]
+
+
+def in_key_frame(given: Recording) -> dict:
+    """The sample in the ego frame of BEVDet's boxes, that of CAM_FRONT's time."""
+    to_key = np.linalg.inv(given.moved[1])
+    boxes = given.sample["boxes_3d"].clone()
+    boxes[:, 0] += to_key[0, 3]
+    rig = SOURCE.with_cameras([camera.moved(to_key) for camera in SOURCE])
+    return {"images": given.sample["images"], "rig": rig, "boxes_3d": boxes}
+
+
+def psnr(one: np.ndarray, two: np.ndarray) -> float:
+    return float(10 * np.log10(255**2 / max(np.mean((one - two) ** 2), 1e-9)))
+
+
+@pytest.mark.filterwarnings("ignore:retarget. drops")
+@pytest.mark.parametrize("form", FORMS)
+def test_projection_is_the_new_rigs(given: Recording, form: str) -> None:
+    results = FORMS[form](given)
+    before = deepcopy({key: value for key, value in results.items() if key not in ("img", "gt_bboxes_3d", "ann_info")})
+    after = step()(results)
+    error_px = worst_error_px(after, TARGET.in_frame_of(SOURCE))
+    print(f"{form}: {error_px:.1e} px")
+    assert error_px <= 1e-3
+    assert worst_error_px(results, SOURCE) <= 1e-3 or form == "BEVDet"  # as given: BEVDet's images are augmented
+    assert str({k: v for k, v in results.items() if k in before}) == str(before)  # the input is as it was
+    assert after["coverage"].shape == (5, *SIZE)
+    for key in ("points", "gt_bboxes_3d"):
+        assert after.get(key) is results.get(key)
+
+
+@pytest.mark.filterwarnings("ignore:retarget. drops")
+@pytest.mark.parametrize("form", FORMS)
+def test_images_are_those_of_the_true_poses(given: Recording, form: str) -> None:
+    """Not of the mounting alone, with which a camera is up to 0.36 m off; of geometry in the LiDAR's frame, moved."""
+    sample = in_key_frame(given) if form == "BEVDet" else given.sample
+    after = step(surface="objects")(FORMS[form](given))
+    expected = RigRetarget(TARGET, surface="objects")(sample)
+    same = after["coverage"] & expected["coverage"].numpy()
+    level = psnr(pixels(after)[same], expected["images"].permute(0, 2, 3, 1).numpy()[same])
+    print(f"{form}: {level:.1f} dB")
+    # BEVDet's images were resized by PIL and cropped before, which nothing brings back.
+    assert level > (27 if form == "BEVDet" else 45)
+
+
+@pytest.mark.filterwarnings("ignore:retarget. drops")
+@pytest.mark.parametrize("form", FORMS)
+def test_what_the_retargeting_is_given(given: Recording, form: str) -> None:
+    """Cameras where they were when they exposed, points and boxes, all in one ego frame: that of the LiDAR's time, or
+    BEVDet's."""
+    held: dict[str, Any] = {}
+    one = step()
+    retarget = one.retarget
+    one.retarget = lambda sample: held.update(sample) or retarget(sample)
+    results = FORMS[form](given)
+    one(results)
+    expected = in_key_frame(given) if form == "BEVDet" else given.sample
+    boxes, true_boxes = held["boxes_3d"].numpy(), expected["boxes_3d"].numpy()
+    assert np.allclose(boxes[:, :6], true_boxes[:, :6], atol=1e-4)
+    assert np.allclose(np.exp(1j * boxes[:, 6]), np.exp(1j * true_boxes[:, 6]), atol=1e-5)
+    if "points" in results:
+        assert np.allclose(held["points"], expected["points"][:, :3], atol=1e-4)
+    if form != "BEVDet":  # whose images are augmented: their cameras are compared by their images
+        assert np.allclose(held["rig"].cam2ego, expected["rig"].cam2ego, atol=1e-5)
+        assert np.abs(held["rig"].cam2ego - given.mounted).max() > 0.3
+        assert np.allclose(held["rig"].K, expected["rig"].K, atol=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore:retarget. drops")
+@pytest.mark.parametrize("form", LIDAR_FORMS)
+def test_the_own_rig_gives_everything_back(given: Recording, form: str) -> None:
+    results = FORMS[form](given)
+    after = step(SOURCE)(results)
+    assert np.abs(pixels(after) - pixels(results)).max() <= 1  # float32 poses: 1e-4 px
+    for key, kind in MATRICES.items():
+        if key in results and kind != "cam2ego":
+            assert type(after[key]) is type(results[key]) and type(after[key][0]) is type(results[key][0])
+            assert np.allclose(after[key], results[key], rtol=1e-4, atol=1e-4)
+            assert np.asarray(after[key]).dtype == np.asarray(results[key]).dtype
+
+
+@pytest.mark.filterwarnings("ignore:retarget. drops")
+def test_every_key_of_mmdet3d(given: Recording) -> None:
+    results = FORMS["mmdet3d"](given)
+    results["lidar2img"], single = list(results["lidar2img"]), results["lidar2img"][0]
+    after = step()(results)
+    target = TARGET.in_frame_of(SOURCE)
+    assert list(after["images"]) == after["filename"] == TARGET.names and after["num_views"] == 5
+    for name, info in after["images"].items():
+        assert np.allclose(info["cam2ego"], target[name].cam2ego) and isinstance(info["cam2img"], list)
+        assert np.allclose(info["cam2img"], target[name].K)
+        assert np.allclose(info["lidar2cam"], np.linalg.inv(target[name].cam2ego) @ LIDAR2EGO)
+    assert np.allclose(after["cam2global"], EGO2GLOBAL @ target.cam2ego)
+    assert after["img_shape"] == after["ori_shape"] == after["pad_shape"] == SIZE
+    assert "cam_instances" not in after
+    assert "lidar2img" not in step()({**results, "lidar2img": single})  # one camera's, which may be gone
+    # Only the nested infos: what is missing at the top is not invented.
+    nested = {key: results[key] for key in ("images", "img", "lidar_points")}
+    assert set(step()(nested)) == {*nested, "coverage"}
+
+
+@pytest.mark.filterwarnings("ignore:retarget. drops")
+def test_shapes_and_types_of_the_others(given: Recording) -> None:
+    mit, petr = step()(FORMS["mit-han-lab BEVFusion"](given)), step()(FORMS["PETR"](given))
+    assert mit["img"][0].size == mit["ori_shape"] == SIZE[::-1] and mit["image_paths"] == TARGET.names
+    assert np.allclose(mit["camera2ego"], TARGET.in_frame_of(SOURCE).cam2ego, atol=1e-6)
+    assert petr["img"][0].dtype == np.float32 and petr["img_shape"] == (*SIZE, 3, 5)
+    assert np.allclose(np.array(petr["extrinsics"])[:, :3, 3], 0) and "bboxes" not in petr["ann_info"]
+    assert petr["img_timestamp"] == [1.5] * 5
+    stream = FORMS["PETR"](given)  # StreamPETR's are not transposed
+    stream["extrinsics"] = [pose.T for pose in stream["extrinsics"]]
+    upright = step()(stream)["extrinsics"]
+    assert np.allclose([pose.T for pose in upright], petr["extrinsics"])
+    alone = {key: value for key, value in stream.items() if key not in ("intrinsics", "extrinsics")}
+    assert worst_error_px(step()(alone), TARGET.in_frame_of(SOURCE)) <= 1e-3  # lidar2img says it all
+
+
+def test_bevdet_takes_augmented_images_and_gives_untouched_ones(given: Recording) -> None:
+    """As of images that were resized and cropped with their calibration: half pixels, the flipped view and all."""
+    results = FORMS["BEVDet"](given)
+    results["curr"] = {"cams": {name: {} for name in SOURCE.names}, "lidar2ego_rotation": [1, 0, 0, 0]}
+    after = step(SOURCE)(results)
+    images, _, ego2globals, _, post_rots, post_trans, bda = after["img_inputs"]
+    assert type(after["img_inputs"]) is tuple and bda is results["img_inputs"][6] and images.dtype == torch.float32
+    assert torch.equal(post_rots, torch.eye(3).expand(6, 3, 3)) and not post_trans.any()
+    assert torch.equal(ego2globals, results["img_inputs"][2][1].expand(6, 4, 4))
+    size = tuple(results["img_inputs"][0].shape[-2:])
+    known = CropRig(12, 0, size)(ResizeRig((48, 132))(in_key_frame(given)))
+    expected = RigRetarget(SOURCE, surface="street")(known)
+    assert np.mean(after["coverage"] == expected["coverage"].numpy()) > 0.999
+    views = zip(pixels(after), expected["images"].permute(0, 2, 3, 1).numpy(), after["coverage"], strict=True)
+    levels = [psnr(one[seen], two[seen]) for one, two, seen in views]
+    print("dB of each view", np.round(levels, 1))
+    assert min(levels) > 38
+    assert "canvas" not in after and after["curr"]["lidar2ego_rotation"] == [1, 0, 0, 0]
+    front = after["curr"]["cams"]["CAM_FRONT"]
+    assert np.allclose(np.linalg.norm(front["sensor2ego_rotation"]), 1) and front["data_path"] == "CAM_FRONT"
+
+
+@pytest.mark.filterwarnings("ignore:retarget. drops")
+def test_skipped_frames_keep_their_cameras(given: Recording) -> None:
+    target = SOURCE.turned(yaw_deg=10)
+    skipping = step(target, p=0.01, size=SIZE, outputs=("confidence",))
+    torch.manual_seed(1)
+    after = skipping(FORMS["mmdet3d"](given))
+    assert after["retarget_params"]["skipped"] and after["filename"] == SOURCE.names and after["confidence"].all()
+    assert worst_error_px(after, SOURCE.resized(SIZE)) <= 1e-3
+
+
+@pytest.mark.filterwarnings("ignore:retarget. drops")
+def test_messages(given: Recording) -> None:
+    results = FORMS["DETR3D"](given)
+    with pytest.raises(CalibrationError, match=r"pinhole cameras.*got radtan.*undistorted\(\)"):
+        RigRetargetMultiView("waymo")
+    with pytest.raises(SampleError, match="lidar2ego: expected the LiDAR's pose"):
+        RigRetargetMultiView(TARGET)(results)
+    with pytest.raises(SampleError, match=r"lidar2ego: expected 1 matrices.*got shape \(1, 2, 2\)"):
+        RigRetargetMultiView(TARGET, lidar2ego=np.eye(2))(results)
+    with pytest.raises(SampleError, match="lidar2img: expected K @ lidar2cam, got matrices that differ by"):
+        step()({**results, "lidar2img": [np.diag([0.5, 0.5, 1, 1]) @ m for m in results["lidar2img"]]})
+    with pytest.raises(SampleError, match="cam_intrinsic: expected 6 matrices, 3×3 or 4×4"):
+        step()({**results, "cam_intrinsic": results["cam_intrinsic"][:5]})
+    with pytest.raises(SampleError, match="expected the cameras' matrices"):
+        step()({"img": results["img"]})
+    with pytest.raises(SampleError, match="expected 'img', loaded images"):
+        step()({"filename": []})
+    with pytest.raises(SampleError, match="img_aug_matrix: expected none yet"):
+        step()({**results, "img_aug_matrix": [np.diag([0.5, 0.5, 1, 1])] * 6})
+    with pytest.raises(SampleError, match=r"img\[0\]: expected grey levels from 0 to 255, got -"):
+        step()({**results, "img": [image / 58 - 2 for image in results["img"]]})
+    with pytest.raises(SampleTypeError, match=r"img\[0\]: expected \(H, W, 3\)"):
+        step()({**results, "img": [image[..., 0] for image in results["img"]]})
+    mixed = Rig([TARGET[0], *(camera.resize((40, 60)) for camera in TARGET.cameras[1:])])
+    with pytest.raises(SampleError, match="images of one size"):
+        step(mixed)(results)
+    with pytest.raises(SampleError, match="label_frame: expected 'source'"):
+        step(label_frame="target")(results)
+    entries = FORMS["BEVDet"](given)["img_inputs"]
+    with pytest.raises(SampleError, match=r"whole numbers.*img_norm"):
+        step(img_norm=((0, 0, 0), (1, 1, 1)))({"img_inputs": entries})
+    with pytest.raises(SampleError, match=r"img_inputs: expected .* got 5 entries"):
+        step()({"img_inputs": entries[:5]})
+    several = (entries[0].repeat(2, 1, 1, 1), *entries[1:])
+    with pytest.raises(SampleError, match=r"expected 12 cameras in each entry"):
+        step()({"img_inputs": several})
+
+
+def test_upper_triangular_times_rotation() -> None:
+    rng = np.random.default_rng(0)
+    M = rng.normal(size=(50, 3, 3))
+    M[np.linalg.det(M) < 0] *= -1
+    K, R = upper_triangular(M)
+    assert np.allclose(K @ R, M) and np.allclose(np.tril(K, -1), 0) and (np.diagonal(K, axis1=1, axis2=2) > 0).all()
+    assert np.allclose(R @ R.transpose(0, 2, 1), np.eye(3)) and np.allclose(np.linalg.det(R), 1)
+    P = np.tile(np.eye(4), (2, 1, 1))
+    P[:, :3] = [[700, 0, 600, 45], [0, 700, 180, -0.3], [0, 0, 1, 0.005]]  # KITTI's P2: a place in its last column
+    K, lidar2cam = decomposed(P)
+    full = np.tile(np.eye(4), (2, 1, 1))
+    full[:, :3, :3] = K
+    assert np.allclose(full @ lidar2cam, P) and np.allclose(K[:, 0, 0], 700)
+
+
+def test_readme_names_every_key_and_form() -> None:
+    assert all(f"`{key}`" in README for key in MATRICES) and all(name in README for name in FORMS)

@@ -1,0 +1,71 @@
+"""Every integration where its framework is: tests and examples in the environments of ``integrations.environments``."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from integrations.environments import python_of
+
+ROOT = Path(__file__).parents[2]
+FRAMEWORK_TESTS = {
+    "mmdet3d": "test_compose.py",
+    "lightning": "test_datamodule.py",
+    "webdataset": "test_stream.py",
+}
+EXAMPLES = ("kornia", "lightning", "mmdet3d", "nuscenes", "webdataset")
+
+
+def run(*arguments: str) -> str:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run(
+        [str(python_of("pipelines")), *arguments],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=280,
+    )
+    print(done.stdout[-4000:])
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
+    return done.stdout
+
+
+def test_every_folder_has_readme_example_and_tests() -> None:
+    for name in EXAMPLES:
+        folder = ROOT / "integrations" / name
+        assert f"integrations.{name}.example" in (folder / "README.md").read_text()
+        assert (folder / "example.py").is_file() and list((folder / "tests").glob("test_*.py"))
+
+
+@pytest.mark.integrations
+def test_frameworks_are_no_dependencies() -> None:
+    """The package and the pure parts import none of them."""
+    code = (
+        "import sys, arbiview_aug, integrations.mmdet3d.transform, integrations.lightning.batches\n"
+        "import integrations.webdataset.shards\n"
+        "print([m for m in ('mmengine', 'lightning', 'webdataset', 'nuscenes') if m in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120, check=True
+    )
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.integrations
+@pytest.mark.parametrize("name", FRAMEWORK_TESTS)
+def test_with_its_framework(name: str) -> None:
+    file = f"integrations/{name}/tests/{FRAMEWORK_TESTS[name]}"
+    out = run("-m", "pytest", "-q", "-p", "no:cacheprovider", file)
+    assert " passed" in out and "skipped" not in out
+
+
+@pytest.mark.integrations
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_example(name: str) -> None:
+    out = run("-m", f"integrations.{name}.example")
+    assert name != "mmdet3d" or out.startswith("mmengine.dataset.Compose")

@@ -1,0 +1,72 @@
+"""The code of the integrations' READMEs runs as it stands; lightning's and webdataset's where these are installed."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from integrations.mmdet3d.made import FORMS, recording, source_rig
+from integrations.mmdet3d.transform import RigRetargetMultiView
+from integrations.nuscenes.made import VERSION, made_root
+from integrations.snippets import snippets
+
+
+class Registry:
+    """The face of mmdet 2's."""
+
+    def __init__(self) -> None:
+        self.held: dict[str, Any] = {}
+
+    def register_module(self, *, name: str, module: Any, force: bool) -> None:
+        self.held[name] = module
+
+
+def test_kornia() -> None:
+    (code,) = snippets("kornia")
+    names: dict[str, Any] = {"sample": SyntheticDrive(demo_source_rig((72, 128)), num_frames=1, lidar=False)[0]}
+    exec(code, names)
+    for pipeline in ("by_torchvision", "by_kornia"):
+        out = names[pipeline](names["sample"])
+        assert out["images"].shape == (5, 3, 128, 352) and out["images"].dtype == torch.uint8
+
+
+def test_nuscenes(tmp_path: Path) -> None:
+    root = made_root(tmp_path / "root")
+    (code,) = snippets("nuscenes", {"data/nuscenes": str(root), "v1.0-trainval": VERSION, "num_workers=8": ""})
+    names: dict[str, Any] = {"train_scenes": None}
+    exec(code, names)
+    assert names["views"].shape == (5, 3, 256, 704)
+    assert len(names["labels_2d"]) == 5
+
+
+def test_mmdet3d(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rig file, then each framework's step on its own form; mmdet 2 is not to be had, only its registry's face."""
+    monkeypatch.chdir(tmp_path)
+    rig_file, new, old, others = snippets("mmdet3d")
+    exec(rig_file, {})
+    registry = Registry()
+    module = ModuleType("mmdet.datasets.builder")
+    module.PIPELINES = registry  # type: ignore[attr-defined]
+    for name in ("mmdet", "mmdet.datasets"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    exec(old, {})
+    assert registry.held == {"RigRetargetMultiView": RigRetargetMultiView}
+    steps: list[dict[str, Any]] = []
+    names = {"dict": lambda **entries: steps.append(entries) or entries}
+    for code in (new, others):
+        exec(code, names)
+    steps = [step for step in steps if step.get("type") == "RigRetargetMultiView"]
+    forms = ("mmdet3d", "mit-han-lab BEVFusion", "BEVDet", "PETR")
+    assert len(steps) == len(forms)
+    sample = recording(SyntheticDrive(source_rig((64, 176)), num_frames=1)[0])
+    for step, form in zip(steps, forms, strict=True):
+        kind = step.pop("type")
+        out = registry.held[kind](**step)(FORMS[form](sample))
+        assert out["coverage"].shape == (5, *step["size"])

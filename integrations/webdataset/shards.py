@@ -1,0 +1,127 @@
+"""Samples as entries of WebDataset shards (tar files), and back: what a ``map`` needs before ``RigRetarget``."""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from arbiview_aug.datasets.writing import JPEG_QUALITY
+from arbiview_aug.errors import DataError
+from arbiview_aug.rig import Rig
+
+ARRAYS = ("points", "boxes_3d", "ego2world")
+"""Entries that are stored as .npy files."""
+
+Entry = dict[str, Any]
+
+
+def to_entry(sample: Mapping[str, Any], key: str) -> Entry:
+    """A sample's files by their endings, as WebDataset's writers take them.
+
+    Args:
+        sample: With ``images``, uint8 (3, h, w) for each camera of ``rig``; ``ARRAYS`` and ``token`` where present.
+        key: Unique, without dots.
+    """
+    rig: Rig = sample["rig"]
+    entry: Entry = {"__key__": key, "rig.json": json.dumps({**rig.to_dict(), "token": str(sample.get("token", key))})}
+    for k, (camera, image) in enumerate(zip(rig, sample["images"], strict=True)):
+        picture = np.ascontiguousarray(image.permute(1, 2, 0).numpy()[..., ::-1])
+        entry[f"{k:02}.jpg"] = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+        if camera.mask is not None:
+            entry[f"{k:02}.mask.png"] = cv2.imencode(".png", camera.mask.astype(np.uint8) * 255)[1].tobytes()
+    for name in ARRAYS:
+        if sample.get(name) is not None:
+            file = io.BytesIO()
+            np.save(file, np.asarray(sample[name]))
+            entry[f"{name}.npy"] = file.getvalue()
+    return entry
+
+
+def to_sample(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """The sample of an entry as WebDataset reads it, undecoded: bytes by their endings.
+
+    Returns:
+        ``images`` (N, 3, h, w) uint8 (a list where sizes differ), ``rig``, ``K``, ``cam2ego``, ``token``, ``ARRAYS``.
+
+    Raises:
+        DataError: No ``rig.json``, a missing or broken image.
+    """
+    where = f"shard entry {entry.get('__key__')!r}"
+    if "rig.json" not in entry:
+        raise DataError(f"{where}: expected rig.json, got {', '.join(map(str, entry))}; write shards with to_entry")
+    described = json.loads(entry["rig.json"])
+    rig = Rig.from_dict(described, where=where)
+    images, cameras = [], []
+    for k, camera in enumerate(rig):
+        image = _decoded(entry, f"{k:02}.jpg", where, cv2.IMREAD_COLOR)
+        if image.shape[:2] != camera.size:
+            raise DataError(
+                f"{where}: {k:02}.jpg: expected (h, w) = {camera.size}, as in rig.json, got {image.shape[:2]}"
+            )
+        images.append(torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)).permute(2, 0, 1))
+        if f"{k:02}.mask.png" in entry:
+            camera = replace(camera, mask=_decoded(entry, f"{k:02}.mask.png", where, cv2.IMREAD_GRAYSCALE) > 0)
+        cameras.append(camera)
+    rig = rig.with_cameras(cameras)
+    sample = {
+        "images": torch.stack(images) if len(set(rig.sizes)) == 1 else images,
+        "rig": rig,
+        "K": torch.from_numpy(rig.K),
+        "cam2ego": torch.from_numpy(rig.cam2ego),
+        "token": described["token"],
+    }
+    for name in ARRAYS:
+        if f"{name}.npy" in entry:
+            sample[name] = torch.from_numpy(np.load(io.BytesIO(entry[f"{name}.npy"])))
+    return sample
+
+
+def _decoded(entry: Mapping[str, Any], name: str, where: str, flags: int) -> np.ndarray:
+    if name not in entry:
+        raise DataError(f"{where}: expected {name}, found none")
+    image = cv2.imdecode(np.frombuffer(entry[name], np.uint8), flags)
+    if image is None:
+        raise DataError(f"{where}: {name}: expected an image, got {len(entry[name])} bytes that are none (truncated?)")
+    return np.asarray(image)
+
+
+def write_shard(path: Path, samples: Iterable[Mapping[str, Any]]) -> Path:
+    """Write samples as one shard; webdataset itself is not needed. Returns the path."""
+    with tarfile.open(path, "w") as tar:
+        for k, sample in enumerate(samples):
+            entry = to_entry(sample, f"{path.stem}-{k:06}")
+            key = entry.pop("__key__")
+            for ending, content in entry.items():
+                data = content.encode() if isinstance(content, str) else content
+                info = tarfile.TarInfo(f"{key}.{ending}")
+                info.size = len(data)
+                tar.addfile(info, io.BytesIO(data))
+    return path
+
+
+def stream(urls: str | Sequence[str], retarget: Callable[[dict[str, Any]], dict[str, Any]], *, shuffle: int = 0) -> Any:
+    """A ``wds.WebDataset`` of retargeted samples: shards are shared out among DataLoader workers, never repeated.
+
+    Args:
+        urls: Shards, as webdataset takes them: paths, ``{000..041}`` braces, ``pipe:`` commands.
+        retarget: A ``RigRetarget``, or a composition around one.
+        shuffle: Entries held back to shuffle among, as bytes: decoding comes after. 0 keeps the order.
+
+    Raises:
+        ImportError: webdataset is not installed.
+    """
+    try:
+        import webdataset as wds
+    except ImportError:
+        raise ImportError("webdataset: not installed; pip install webdataset") from None
+    shards = wds.WebDataset(urls, shardshuffle=100 if shuffle else False, empty_check=False)
+    return (shards.shuffle(shuffle) if shuffle else shards).map(to_sample).map(retarget)

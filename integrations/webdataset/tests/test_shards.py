@@ -1,0 +1,91 @@
+"""Entries of shards: a sample comes back as it was, but for JPEG; what is broken is named."""
+
+from __future__ import annotations
+
+import sys
+import tarfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import Camera, DataError, Rig, RigRetarget
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from integrations.webdataset.shards import ARRAYS, stream, to_entry, to_sample, write_shard
+
+
+@pytest.fixture(scope="module")
+def sample() -> dict:
+    rig = demo_source_rig((64, 176))
+    masked = replace(rig[0], mask=np.arange(64)[:, None].repeat(176, 1) < 60)
+    drive = SyntheticDrive(rig.with_cameras([masked, *rig.cameras[1:]]), num_frames=1)
+    return {**drive[0], "ego2world": torch.eye(4, dtype=torch.float64)}
+
+
+def test_there_and_back(sample: dict) -> None:
+    again = to_sample(to_entry(sample, "a"))
+    assert again["rig"] == sample["rig"] and again["token"] == sample["token"]  # masks too
+    assert (again["images"].float() - sample["images"].float()).abs().mean() < 3
+    for key in (*ARRAYS, "K", "cam2ego"):
+        assert torch.equal(again[key], sample[key])
+
+
+def test_lenses_and_sizes() -> None:
+    fisheye = Camera.looking(
+        name="a",
+        azimuth_deg=0,
+        width_px=40,
+        height_px=30,
+        horizontal_fov_deg=150,
+        lens="fisheye",
+        distortion=(0.1, 0, 0, 0),
+    )
+    rig = Rig([fisheye, replace(fisheye.resize((60, 80)), name="b")], ground_z_m=-0.3)
+    again = to_sample(
+        to_entry({"rig": rig, "images": [torch.zeros(3, *size, dtype=torch.uint8) for size in rig.sizes]}, "k")
+    )
+    assert again["rig"] == rig and [tuple(i.shape[1:]) for i in again["images"]] == rig.sizes and again["token"] == "k"
+
+
+def test_a_shard_read_by_hand_retargets_as_the_sample(sample: dict, tmp_path) -> None:
+    """Names are key, dot, ending: as WebDataset splits them."""
+    with tarfile.open(write_shard(tmp_path / "000.tar", [sample, sample])) as tar:
+        entries: dict[str, dict] = {}
+        for member in tar:
+            key, ending = member.name.split(".", 1)
+            file = tar.extractfile(member)
+            assert file is not None
+            entries.setdefault(key, {"__key__": key})[ending] = file.read()
+    assert list(entries) == ["000-000000", "000-000001"]
+    target = sample["rig"].turned(yaw_deg=15).undistorted()
+    one, two = (RigRetarget(target, surface="objects")(s) for s in (to_sample(entries["000-000001"]), sample))
+    assert torch.equal(one["coverage"], two["coverage"])
+    assert (one["images"].float() - two["images"].float()).abs().mean() < 2
+
+
+def test_messages(sample: dict, monkeypatch) -> None:
+    entry = to_entry(sample, "a")
+    with pytest.raises(DataError, match=r"shard entry 'a': expected rig.json"):
+        to_sample({"__key__": "a", "jpg": b""})
+    with pytest.raises(DataError, match=r"'a': 03.jpg: expected an image, got 5 bytes .*truncated"):
+        to_sample({**entry, "03.jpg": b"short"})
+    with pytest.raises(DataError, match=r"'a': expected 05.jpg, found none"):
+        to_sample({key: value for key, value in entry.items() if key != "05.jpg"})
+    with pytest.raises(DataError, match=r"01.jpg: expected \(h, w\) = \(64, 176\)"):
+        to_sample(
+            {
+                **entry,
+                "01.jpg": to_entry(
+                    {
+                        **sample,
+                        "rig": Rig([sample["rig"][0].resize((8, 9))]),
+                        "images": [torch.zeros(3, 8, 9, dtype=torch.uint8)],
+                    },
+                    "b",
+                )["00.jpg"],
+            }
+        )
+    monkeypatch.setitem(sys.modules, "webdataset", None)
+    with pytest.raises(ImportError, match="pip install webdataset"):
+        stream("x.tar", RigRetarget(sample["rig"]))

@@ -1,0 +1,112 @@
+"""ResizeRig and CropRig: what a pixel shows is where K says, before and after."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import Camera, CropRig, ResizeRig, Rig, RigRetarget, SampleError
+
+SIZE = (60, 100)
+RIG = Rig(
+    [
+        Camera.looking(name="a", azimuth_deg=0, width_px=100, height_px=60, horizontal_fov_deg=80),
+        Camera.looking(
+            name="b",
+            azimuth_deg=70,
+            width_px=100,
+            height_px=60,
+            horizontal_fov_deg=80,
+            lens="radtan",
+            distortion=(-0.05, 0.01, 0.0, 0.0),
+            mask=np.arange(60)[:, None].repeat(100, 1) < 48,
+        ),
+    ]
+)
+TRANSFORMS = [ResizeRig((30, 50)), ResizeRig((90, 110)), CropRig(10, 20, (40, 70))]
+
+
+def sample_of(rig: Rig = RIG, **entries: object) -> dict:
+    """A bright blob 9 px wide in every image, at the pixel of one point of the scene."""
+    v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float32) for n in SIZE), indexing="ij")
+    images = [torch.exp(-((u - x) ** 2 + (v - y) ** 2) / 18).expand(3, *SIZE) for x, y in _pixels(rig)]
+    return {"images": torch.stack(images), "K": torch.from_numpy(rig.K), "rig": rig, **entries}
+
+
+def _points(rig: Rig) -> list[np.ndarray]:
+    """Of each camera a point 10 m away, near the middle of its image."""
+    return [camera.center_m + 10 * camera.unproject([52.0, 33.0]).directions for camera in rig]
+
+
+def _pixels(rig: Rig) -> list[np.ndarray]:
+    return [camera.project(point).uv for camera, point in zip(rig, _points(RIG), strict=True)]
+
+
+@pytest.mark.parametrize("transform", TRANSFORMS, ids=str)
+def test_the_point_is_where_the_calibration_says(transform: torch.nn.Module) -> None:
+    out = transform(sample_of())
+    h, w = transform.size
+    assert out["images"].shape == (2, 3, h, w) and out["rig"].sizes == [(h, w)] * 2
+    assert np.allclose(out["K"].numpy(), out["rig"].K, atol=1e-12)
+    v, u = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
+    for image, uv in zip(out["images"], _pixels(out["rig"]), strict=True):
+        weight = image[0] / image[0].sum()
+        assert np.allclose([(weight * u).sum(), (weight * v).sum()], uv, atol=0.02)
+
+
+@pytest.mark.parametrize("transform", TRANSFORMS, ids=str)
+def test_maps_and_masks_follow(transform: torch.nn.Module) -> None:
+    """Each row of a map holds its own number: after, the row of the image that the camera's mask of it comes from."""
+    rows = torch.arange(60)[:, None].expand(2, 60, 100)
+    sample = sample_of(coverage=rows < 50, labels=rows.to(torch.uint8), token="x")
+    transform.label_keys = ("labels",)
+    out = transform(sample)
+    transform.label_keys = ()
+    assert torch.equal(out["coverage"], out["labels"] < 50) and out["token"] == "x"
+    assert np.array_equal(out["rig"]["b"].mask, (out["labels"][1] < 48).numpy())
+    assert out["coverage"].dtype == torch.bool and out["labels"].dtype == torch.uint8
+    assert sample["images"].shape[-2:] == SIZE  # the input is as it was
+
+
+def test_resizing_before_or_after_is_the_same_calibration() -> None:
+    target = RIG.turned(yaw_deg=12).undistorted()
+    before = RigRetarget(target.resized((30, 50)), surface="far")(sample_of())
+    after = ResizeRig((30, 50))(RigRetarget(target, surface="far")(sample_of()))
+    assert torch.allclose(before["K"], after["K"]) and after["coverage"].shape == (2, 30, 50)
+    both = before["coverage"] & after["coverage"]
+    assert (before["images"] - after["images"]).abs().mean(1)[both].mean() < 0.005
+    again = RigRetarget(target.resized((30, 50)), surface="far")(after)  # an output is an input again
+    assert torch.allclose(again["images"], after["images"], atol=0.02)
+
+
+def test_batches_lists_and_other_types() -> None:
+    sample = sample_of()
+    batch = {"images": sample["images"].expand(3, -1, -1, -1, -1), "rig": RIG, "coverage": torch.ones(3, 2, *SIZE) > 0}
+    out = CropRig(1, 2, (20, 30))(batch)
+    assert out["images"].shape == (3, 2, 3, 20, 30) and out["coverage"].shape == (3, 2, 20, 30)
+    lists = {**batch, "images": list(batch["images"].unbind(1))}
+    assert torch.equal(CropRig(1, 2, (20, 30))(lists)["images"], out["images"])
+    mixed = Rig([RIG["a"], RIG["b"].resize((30, 50))])
+    parts = {"images": [torch.rand(3, 60, 100), torch.rand(3, 30, 50)], "rig": mixed, "K": mixed.K}
+    out = ResizeRig((30, 50))(parts)
+    assert out["images"].shape == (2, 3, 30, 50) and np.allclose(out["K"].numpy(), out["rig"].K)
+    assert pickle.loads(pickle.dumps(CropRig(1, 2, (20, 30)))).size == (20, 30)
+
+
+def test_what_cannot_follow_is_dropped_and_misuse_is_named() -> None:
+    with pytest.warns(UserWarning, match="ResizeRig drops boxes_2d: it speaks of pixels that have moved"):
+        assert "boxes_2d" not in ResizeRig((30, 50))(sample_of(boxes_2d=torch.zeros(1, 4)))
+    with pytest.raises(SampleError, match=r"within the image of \(h, w\) = \(60, 100\), got rows 30 to 70"):
+        CropRig(30, 0, (40, 10))(sample_of())
+    with pytest.raises(SampleError, match="looks like a map"):
+        ResizeRig((30, 50))(sample_of(classes=torch.zeros(2, *SIZE)))
+    with pytest.raises(SampleError, match="missing K, cam2ego"):
+        ResizeRig((30, 50))({"images": torch.zeros(1, 3, 4, 4)})
+    for size in ((0, 5), (2.5, 5), 7, "ab"):
+        with pytest.raises(ValueError, match="size: expected two whole numbers of pixels from 1"):
+            ResizeRig(size)
+    with pytest.raises(ValueError, match="top, left: expected two whole numbers of pixels from 0"):
+        CropRig(-1, 0, (4, 4))
