@@ -12,6 +12,8 @@ half then has 1/1.4 of the mean error over the street, 1/1.8 with boxes; with th
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -62,10 +64,10 @@ def confidence(
     """
     levels = 1.0 if view.dtype == torch.uint8 else 255.0
     with torch.no_grad():
-        doubt = 1 - torch.from_numpy(certain).to(view.device).float() / 255
-        contrast = _contrast(view.detach(), levels, covered)
-        error = _ERROR_PER_CONTRAST * (doubt * (contrast + _LEAST_CONTRAST) + levels * seam)
-        return torch.exp(-error / EXPECTED_ERROR_LEVELS) * covered
+        # In place: fresh memory for each term takes three times as long.
+        doubt = torch.from_numpy(certain).to(view.device).float().div_(-255).add_(1)
+        error = _contrast(view.detach(), levels, covered).add_(_LEAST_CONTRAST).mul_(doubt).add_(seam, alpha=levels)
+        return error.mul_(-_ERROR_PER_CONTRAST / EXPECTED_ERROR_LEVELS).exp_().mul_(covered)
 
 
 def _contrast(view: torch.Tensor, levels: float, covered: torch.Tensor) -> torch.Tensor:
@@ -84,11 +86,17 @@ def _contrast(view: torch.Tensor, levels: float, covered: torch.Tensor) -> torch
     cells = torch.nn.functional.avg_pool2d(padded, side, divisor_override=1)
     spread = torch.zeros_like(cells[:, :1])
     for window in _WINDOWS:
-        across = torch.nn.functional.avg_pool2d(cells, (1, window), 1, (0, window // 2))
-        around = torch.nn.functional.avg_pool2d(across, (window, 1), 1, (window // 2, 0))
-        count, total, squares = around.split(1, 1)
+        count, total, squares = _around(cells, window).split(1, 1)
         count = count.clamp(min=1e-6)
         spread += (squares / count - (total / count) ** 2).clamp(min=0).sqrt() / len(_WINDOWS)
     size = [n * cell for n in spread.shape[-2:]]
     smooth = torch.nn.functional.interpolate(spread, size=size, mode="bilinear", align_corners=False)
     return smooth[:, 0, :h, :w].reshape(*view.shape[:-3], h, w)
+
+
+def _around(cells: torch.Tensor, window: int) -> torch.Tensor:
+    """Sums (..., h, w) over windows of ``window`` cells a side, none beyond the border: a fifth of a pooling's time."""
+    h, w = cells.shape[-2:]
+    padded = torch.nn.functional.pad(cells, [window // 2] * 4)
+    across = functools.reduce(torch.add, (padded[..., k : k + w] for k in range(window)))
+    return functools.reduce(torch.add, (across[..., k : k + h, :] for k in range(window)))

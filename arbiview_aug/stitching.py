@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,6 +30,7 @@ from arbiview_aug.sample import MOTION_KEY, SourceFrame, names_of_frames, scenes
 from arbiview_aug.sampling import Scratch
 from arbiview_aug.scene import Scene
 from arbiview_aug.surface import SurfaceName
+from arbiview_aug.tone import ToneCurve
 
 Execution = Literal["auto", "opencv", "torch"]
 
@@ -48,7 +50,18 @@ class WarnOnce:
         """Say it, if nothing was said on this topic before."""
         if topic not in self._said:
             self._said.add(topic)
-            warnings.warn(message, stacklevel=5)
+            warnings.warn(message, stacklevel=_callers_level())
+
+
+def _callers_level() -> int:
+    """``stacklevel`` of the nearest line that is neither this package's nor torch's, as seen from our caller."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _INSIDE:
+        level, frame = level + 1, frame.f_back
+    return level
+
+
+_INSIDE = (__name__.partition(".")[0], "torch", "torchvision")
 
 
 @dataclass(frozen=True)
@@ -60,12 +73,14 @@ class View:
         depth: What became of its overlaps, where depth from overlap was asked for and matters.
         motion: What motion said of its distances, where it was asked here and not offline.
         fills: How its holes are filled from neighbouring frames, where those show any of them.
+        curves: A tone curve for each source, where they are harmonised.
     """
 
     made: RenderPlan | PaperRendering
     depth: OverlapDepth | None = None
     motion: MotionDepth | None = None
     fills: Fills | None = None
+    curves: tuple[ToneCurve, ...] | None = None
 
 
 class Stitcher:
@@ -147,7 +162,7 @@ class Stitcher:
             if neighbours and self.reach is not None:
                 surface = known.best if self.surface == "auto" else self.surface
                 fills = plan_fills(plan, neighbours, known, surface, self.config, self.reach)
-            views.append(View(plan, depth, motion, fills))
+            views.append(View(plan, depth, motion, fills, self.harmoniser.curves(frame.rig, frame.images)))
         return views
 
     def _published(
@@ -268,14 +283,13 @@ class Stitcher:
             elif self._uses_torch(frame):
                 together.setdefault(id(view.made), []).append(b)
             else:
-                curves = self.harmoniser.curves(frame.rig, frame.images)
                 wanted = None if seams is None else changes[b]
-                done[b] = render_opencv(view.made, frame.images, self._scratch, curves, wanted)
+                done[b] = render_opencv(view.made, frame.images, self._scratch, view.curves, wanted)
         for members in together.values():
             plan = views[members[0]].made
             assert isinstance(plan, RenderPlan)
             sources = zip(*(frames[b].images for b in members), strict=True)
-            toned = [self.harmoniser.curves(frames[b].rig, frames[b].images) for b in members]
+            toned = [views[b].curves for b in members]
             batched: list[torch.Tensor] | None = None if seams is None else []
             rendered = render_torch(plan, [torch.stack(images) for images in sources], toned, batched)
             for k, b in enumerate(members):
@@ -291,18 +305,17 @@ class Stitcher:
         """The target images of one frame with their holes filled from its neighbours, and what was filled in."""
         if view.fills is None:
             return images, []
-        curves = self.harmoniser.curves(frame.rig, frame.images)
         rendered = []
         for fill in view.fills.fills:
             sources = self._images(fill.neighbour, frame)
             if sources is None:
                 continue
             if self._uses_torch(frame):
-                batches = render_torch(fill.plan, [image[None] for image in sources], [curves])
+                batches = render_torch(fill.plan, [image[None] for image in sources], [view.curves])
                 rendered.append((fill, [batch[0] for batch in batches]))
             else:
                 # A camera's exposure is that of the same camera now: fills overlap the current views too little.
-                rendered.append((fill, render_opencv(fill.plan, sources, self._scratch, curves)))
+                rendered.append((fill, render_opencv(fill.plan, sources, self._scratch, view.curves)))
         return fill_views(images, view.fills, rendered) if rendered else (images, [])
 
     def _uses_torch(self, frame: SourceFrame) -> bool:

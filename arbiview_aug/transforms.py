@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import operator
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import cv2
-import numpy as np
 import torch
 
-from arbiview_aug.calibration import MAX_SIZE_PX
-from arbiview_aug.confidence import confidence
-from arbiview_aug.device_maps import maps_on
 from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError
 from arbiview_aug.explain import Explanation, PaperExplanation
@@ -24,7 +18,9 @@ from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_conf
 from arbiview_aug.favs.paper import PaperRendering, check_pinhole
 from arbiview_aug.favs.photometric import Harmonise, Harmoniser, PhotometricReport
 from arbiview_aug.favs.refinement import RefinementCache
-from arbiview_aug.fills import Patch, Reach
+from arbiview_aug.fills import Reach
+from arbiview_aug.generator import Generator
+from arbiview_aug.generator.batches import SOURCES_KEY, complete_frame, frame_names
 from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_target, target_labels
 from arbiview_aug.plan import PlanCache, RenderPlan
 from arbiview_aug.random_rig import RandomRig
@@ -33,13 +29,21 @@ from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame, check_inputs
 from arbiview_aug.scene import Scene
 from arbiview_aug.stitching import Execution, Stitcher, WarnOnce
 from arbiview_aug.surface import SurfaceName
-from arbiview_aug.tensors import covered, gathered, leading_shape, lens_names, like, resized, rewrapped, stacked
+from arbiview_aug.tensors import gathered, leading_shape, lens_names, like, resized, rewrapped, stacked
+from arbiview_aug.transform_settings import (
+    OUTPUTS,
+    RenderPath,
+    checked_names,
+    checked_params,
+    checked_size,
+    completion_of,
+    is_number,
+    one_of,
+)
+from arbiview_aug.view_entries import calibration_entries, seen_entries, source_sample, untouched_entries
 
 Made = RenderPlan | PaperRendering | tuple[int, int]
 """What a frame's views are made by: a plan, the published stages; or it is only resized, to this size."""
-
-OUTPUTS = ("source_camera", "source_frame", "confidence")
-"""What a sample can hold besides, on request."""
 
 _MIXED_P = 0.5
 """With half of the samples untouched or more, views over a static street alone help a detector instead of harming it:
@@ -68,7 +72,17 @@ class RigRetarget(torch.nn.Module):
     Args:
         target_rig: A ``Rig``, the name of a shipped one, a rig file, or a ``RandomRig``.
         source_rig: The rig of every sample that carries none.
-        path: ``favs``: stitching.
+        path: ``favs``: stitching; what no source sees stays black. ``inpaint``: that is filled by Telea's inpainting.
+            ``diffusion``: by a generator (``arbiview_aug.generator``); targets that are whole never ask it. With both,
+            the output has ``generated`` (..., M, h, w) bool, True where a pixel was made up; what sources see stays as
+            it is, bit for bit, and ``coverage`` says no more than that.
+        generator: For ``diffusion``: ``Generator.from_pretrained(DIR)``; None loads the weights that ship with the
+            package, trained on synthetic streets alone. On a GPU it needs ``num_workers=0``, or
+            ``generator.complete_batch`` after collating.
+        steps: Of the generator: 1 (regression), 4, 10, 50; its own number where None.
+        guidance: Classifier-free guidance; the generator's own where None, 1 is none.
+        min_confidence: τ: pixels that are seen with less confidence are made up as well.
+        seed: Of what is made up, beside the frame (its ``token``, else its images) and the camera.
         quality: ``draft``, ``fast``, ``accurate``, or a ``FavsConfig``; ``paper`` or a ``PaperConfig``: stages 1 to 4
             as published, on the CPU, for pinhole cameras. Its objects take their types from the sample, where it has
             ``detections`` (for each camera ``{"boxes": (n, 4), "labels": [n names]}`` in source pixels, as
@@ -100,12 +114,14 @@ class RigRetarget(torch.nn.Module):
         label_frame: ``source``: output poses, points and boxes are in the source's ego frame. ``target``: they (and
             ``ego2world``) are moved into the target's, and ``ego2ego`` (..., 4, 4) is returned.
         label_keys: Keys that hold label maps (..., N, H, W) or lists of them, besides ``tv_tensors.Mask``.
-        label_fill: Value of label pixels that no source sees (False for bool maps).
+        label_fill: Value of label pixels that no source sees now (False for bool maps); images of neighbouring frames
+            and of generators bring no labels.
         pass_keys: Keys to keep although they look bound to the source's pixels.
         outputs: Further outputs: ``source_camera`` (..., M, h, w) int8, -1 where uncovered; ``source_frame`` (..., M,
             h, w) int8, 0 for the current frame, n + 1 for number n of the neighbours, -1 where uncovered;
             ``confidence`` (..., M, h, w) float32 in [0, 1], exp(-e / 10) for an expected error of e grey levels of
-            255: 1 where the source is exact, 0 where uncovered (``arbiview_aug.confidence``; not with ``paper``).
+            255: 1 where the source is exact, 0 where uncovered (``arbiview_aug.confidence``; not with ``paper``);
+            ``sources``, what the frame was rendered from, as a sample, for ``Generator.complete_batch``.
         execution: ``opencv`` (CPU), ``torch`` (any device, differentiable); ``auto`` takes OpenCV for CPU images that
             need no gradient.
         cache_bytes: Memory for plans; the least recently used go first.
@@ -120,7 +136,12 @@ class RigRetarget(torch.nn.Module):
         target_rig: Rig | RandomRig | str | Path,
         *,
         source_rig: Rig | str | Path | None = None,
-        path: Literal["favs"] = "favs",
+        path: RenderPath = "favs",
+        generator: Generator | None = None,
+        steps: int | None = None,
+        guidance: float | None = None,
+        min_confidence: float = 0.0,
+        seed: int = 0,
         quality: Quality | FavsConfig | PaperConfig = "fast",
         surface: SurfaceName = "auto",
         harmonise: Harmonise = None,
@@ -139,21 +160,21 @@ class RigRetarget(torch.nn.Module):
     ) -> None:
         super().__init__()
         warn_about_cv2_wheels()
-        _one_of("path", path, ("favs",))
-        _one_of("surface", surface, get_args(SurfaceName))
-        _one_of("label_frame", label_frame, ("source", "target"))
-        _one_of("execution", execution, get_args(Execution))
+        one_of("path", path, get_args(RenderPath))
+        one_of("surface", surface, get_args(SurfaceName))
+        one_of("label_frame", label_frame, ("source", "target"))
+        one_of("execution", execution, get_args(Execution))
         if neighbours is not None:
-            _one_of("neighbours", neighbours, get_args(Reach))
-        for name in _checked_names("outputs", outputs):
-            _one_of("outputs", name, OUTPUTS)
-        if not _is_number(p) or not 0 <= p <= 1:
+            one_of("neighbours", neighbours, get_args(Reach))
+        for name in checked_names("outputs", outputs):
+            one_of("outputs", name, OUTPUTS)
+        if not is_number(p) or not 0 <= p <= 1:
             raise ValueError(f"p: expected a probability from 0 to 1, got {p!r}")
         if p < 1 and size is None:
             raise ValueError("p < 1: expected size=(h, w), so that skipped samples collate with retargeted ones")
-        if not _is_number(label_fill):
+        if not is_number(label_fill):
             raise ValueError(f"label_fill: expected a number, got {label_fill!r}")
-        if not _is_number(cache_bytes) or not cache_bytes >= 0:
+        if not is_number(cache_bytes) or not cache_bytes >= 0:
             raise ValueError(f"cache_bytes: expected a number of bytes from 0, got {cache_bytes!r}")
         if rng is not None and not isinstance(rng, torch.Generator):
             raise ValueError(f"rng: expected a torch.Generator or None, got {type(rng).__name__}")
@@ -166,17 +187,22 @@ class RigRetarget(torch.nn.Module):
             self.target = load_rig(target_rig)
         self.source_rig = source_rig if isinstance(source_rig, Rig) or source_rig is None else load_rig(source_rig)
         self.config = favs_config(quality)
+        self._trusts = False
         if isinstance(self.config, PaperConfig):
             check_pinhole(self.target if isinstance(self.target, Rig) else self.target.base)
             if "confidence" in outputs:
                 raise ValueError("outputs: quality='paper' has no 'confidence': it moves pixels by what it matches")
-        elif "confidence" in outputs:
-            self.config = replace(self.config, certainty=True)
+            if min_confidence:
+                raise ValueError("min_confidence: quality='paper' has no confidence, expected 0")
+        elif "confidence" in outputs or min_confidence or path == "diffusion":  # the generator is told of it
+            self._trusts, self.config = True, replace(self.config, certainty=True)
         self.path, self.p, self.rng = path, float(p), rng
-        self.size = None if size is None else _checked_size(size)
+        self.completion = completion_of(path, generator, steps, guidance, min_confidence, seed)
+        self.generator = None if self.completion is None else self.completion.generator  # moves with this module
+        self.size = None if size is None else checked_size(size)
         self.label_frame, self.label_fill = label_frame, label_fill
-        self.label_keys = _checked_names("label_keys", label_keys)
-        self.pass_keys, self.outputs = _checked_names("pass_keys", pass_keys), tuple(outputs)
+        self.label_keys = checked_names("label_keys", label_keys)
+        self.pass_keys, self.outputs = checked_names("pass_keys", pass_keys), tuple(outputs)
         self._warn = WarnOnce()
         # Rigs drawn for each sample never come back: only the last plan is kept.
         once = isinstance(self.target, RandomRig) and self.target.per == "sample"
@@ -198,7 +224,9 @@ class RigRetarget(torch.nn.Module):
         """Target and settings, for ``repr``."""
         target = self.target if isinstance(self.target, RandomRig) else (self.target.name or "unnamed rig")
         how = self.stitcher
-        settings = f"surface={how.surface}, harmonise={how.harmoniser}, size={self.size}, p={self.p:g}"
+        settings = (
+            f"path={self.path}, surface={how.surface}, harmonise={how.harmoniser}, size={self.size}, p={self.p:g}"
+        )
         held = "" if how.refinement is None else f"refinement={how.refinement!r}, "
         return f"target={target}, {settings}, {held}{self.config}"
 
@@ -226,9 +254,11 @@ class RigRetarget(torch.nn.Module):
             out[key] = like(gathered([part[key] for part in parts], lead), sample.get(key))
         grounds = [part["ground_z_m"] for part in parts]
         out["ground_z_m"] = torch.tensor(grounds, dtype=torch.float64).reshape(lead) if lead else grounds[0]
-        for key in ("coverage", "ignore", "distortion", *self.outputs):
+        for key in ("coverage", "ignore", "distortion", "generated", *self.outputs):
             if key in parts[0]:
                 out[key] = gathered([part[key] for part in parts], lead)
+        if SOURCES_KEY in self.outputs:
+            out[SOURCES_KEY] = source_sample(sample["images"], frames, lead)
         if "lens" in parts[0]:
             out["lens"] = lens_names([part["lens"] for part in parts], lead)
         for key in labels:
@@ -247,7 +277,7 @@ class RigRetarget(torch.nn.Module):
         """All randomness of a call: the target rig, whether to skip, and the parameters that say so."""
         if self.rng is not None and torch.utils.data.get_worker_info() is not None:
             raise SampleError("rng: a generator repeats itself in every DataLoader worker; leave rng=None there")
-        given = None if params is None else _checked_params(params)
+        given = None if params is None else checked_params(params)
         drawn: dict[str, float] = {}
         if self.p < 1:
             if given is None:
@@ -292,29 +322,17 @@ class RigRetarget(torch.nn.Module):
         if skip and self.size:
             return [self._resized(frame, self.size) for frame in frames], [self.size] * len(frames)
         views = self.stitcher.views(sample, frames, lead, target)
-        seams: list[list[torch.Tensor]] | None = [] if "confidence" in self.outputs else None
+        seams: list[list[torch.Tensor]] | None = [] if self._trusts else None
+        names = [] if self.completion is None else frame_names(sample, frames, lead, self.completion)
         parts = []
         for b, images in enumerate(self.stitcher.render(frames, views, seams)):
-            made, device = views[b].made, images[0].device
+            made = views[b].made
             filled, patches = self.stitcher.filled(frames[b], views[b], images)
-            part = self._described(made.target, device)
+            part = self._described(made.target, images[0].device)
             part["images"] = stacked(filled)
-            winners = _winners(made, device)
-            part["coverage"] = covered(winners)
-            _put(patches, part["coverage"], lambda patch: patch.frame >= 0)
-            if seams is not None and isinstance(made, RenderPlan):
-                certain = [view.certainty for view in made.targets if view.certainty is not None]
-                if patches:
-                    certain = [of_view.copy() for of_view in certain]  # the plan's own are kept
-                    _put(patches, [torch.from_numpy(of_view) for of_view in certain], lambda patch: patch.certainty)
-                of_views = zip(filled, certain, part["coverage"], seams[b], strict=True)
-                part["confidence"] = stacked([confidence(*of_view) for of_view in of_views])
-            if "source_camera" in self.outputs:
-                part["source_camera"] = stacked([winner.clone() for winner in winners])
-                _put(patches, part["source_camera"], lambda patch: patch.camera)
-            if "source_frame" in self.outputs:
-                part["source_frame"] = stacked([winner.clamp(max=0) for winner in winners])
-                _put(patches, part["source_frame"], lambda patch: patch.frame + 1)
+            part.update(seen_entries(made, filled, patches, None if seams is None else seams[b], self.outputs))
+            if self.completion is not None:
+                complete_frame(part, made.target, frames[b], names[b], self.completion)
             parts.append(part)
         return parts, [view.made for view in views]
 
@@ -323,33 +341,17 @@ class RigRetarget(torch.nn.Module):
         device = frame.images[0].device
         part = self._described(frame.rig.resized(size), device)
         part["images"] = stacked([resized(image, size) for image in frame.images])
-        part["coverage"] = torch.ones((len(frame.rig), *size), dtype=torch.bool, device=device)
-        if "confidence" in self.outputs:
-            part["confidence"] = part["coverage"].float()
-        if "source_camera" in self.outputs:
-            part["source_camera"] = stacked(
-                [torch.full(size, k, dtype=torch.int8, device=device) for k in range(len(frame.rig))]
-            )
-        if "source_frame" in self.outputs:
-            part["source_frame"] = stacked([torch.zeros(size, dtype=torch.int8, device=device) for _ in frame.rig])
+        part.update(untouched_entries(len(frame.rig), size, device, self.outputs))
+        if self.completion is not None:
+            part["generated"] = torch.zeros_like(part["coverage"])
         return part
 
     def _described(self, rig: Rig, device: torch.device) -> dict[str, Any]:
         """The calibration that goes with a frame's images; which keys there are depends on the settings alone."""
         base = self.target.base if isinstance(self.target, RandomRig) else self.target
-        part: dict[str, Any] = {
-            "K": torch.from_numpy(rig.K),
-            "cam2ego": torch.from_numpy(rig.cam2ego),
-            "ground_z_m": rig.ground_z_m,
-        }
-        if self.p < 1 or any(c.lens != "pinhole" for c in base):
-            padded = [(*c.distortion, *(0.0,) * (8 - len(c.distortion))) for c in rig]
-            part["distortion"] = torch.tensor(padded, dtype=torch.float64)
-            part["lens"] = [c.lens for c in rig]
-        if self.p < 1 or any(c.mask is not None for c in base):
-            masks = [np.ones(c.size, bool) if c.mask is None else c.mask for c in rig]
-            part["ignore"] = stacked([torch.from_numpy(~m).to(device) for m in masks])
-        return part
+        lenses = self.p < 1 or any(c.lens != "pinhole" for c in base)
+        masks = self.p < 1 or any(c.mask is not None for c in base)
+        return calibration_entries(rig, device, lenses=lenses, masks=masks)
 
     @property
     def plans(self) -> PlanCache:
@@ -405,54 +407,3 @@ class RigRetarget(torch.nn.Module):
         if self._limited_process != os.getpid() and torch.utils.data.get_worker_info() is not None:
             cv2.setNumThreads(0)
             self._limited_process = os.getpid()
-
-
-def _winners(made: RenderPlan | PaperRendering, device: torch.device) -> list[torch.Tensor]:
-    """(h, w) int8 of each view, which source won; a GPU holds them with the plan."""
-    if isinstance(made, RenderPlan) and device.type != "cpu":
-        return [view.source for view in maps_on(made, device)]
-    return [torch.from_numpy(view.source_camera) for view in made.targets]
-
-
-def _put(
-    patches: Sequence[Patch], maps: torch.Tensor | list[torch.Tensor], value: Callable[[Patch], torch.Tensor | None]
-) -> None:
-    """Write what was filled in into maps (M, h, w) of a frame's views, where there is such a value."""
-    for patch in patches:
-        place, values = maps[patch.target][patch.rows, patch.columns], value(patch)
-        if values is not None:
-            there = patch.frame >= 0
-            place[there.to(place.device)] = values[there].to(place.device)
-
-
-def _one_of(name: str, value: Any, choices: Sequence[str]) -> None:
-    if not isinstance(value, str) or value not in choices:
-        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
-
-
-def _checked_names(name: str, value: Any) -> tuple[str, ...]:
-    if not isinstance(value, list | tuple) or not all(isinstance(entry, str) for entry in value):
-        raise ValueError(f"{name}: expected names in a list or tuple, got {value!r}")
-    return tuple(value)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool)
-
-
-def _checked_params(params: Any) -> dict[str, float]:
-    try:
-        return {name: float(value) for name, value in params.items()}  # of a collated batch: tensors
-    except (AttributeError, TypeError, ValueError, RuntimeError):
-        got = repr(params)
-    raise SampleError(f"params: expected the 'retarget_params' of an output, names and numbers, got {got}")
-
-
-def _checked_size(size: Any) -> tuple[int, int]:
-    try:
-        h, w = (operator.index(side) for side in size)  # 10.5 is refused, not cut
-    except (TypeError, ValueError):
-        h, w = 0, 0
-    if not 1 <= min(h, w) <= max(h, w) <= MAX_SIZE_PX:
-        raise ValueError(f"size: expected (h, w) in pixels, got {size!r}; whole numbers from 1 to {MAX_SIZE_PX}")
-    return h, w

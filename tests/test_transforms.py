@@ -657,12 +657,15 @@ def test_prepare_builds_the_plan_that_samples_use() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"path": "magic"}, "path: expected one of favs, got 'magic'"),
+        ({"path": "magic"}, "path: expected one of favs, inpaint, diffusion, got 'magic'"),
         ({"quality": "best"}, "quality: expected one of draft, fast"),
         ({"surface": "sphere"}, "surface: expected one of .*far.* got 'sphere'"),
         ({"label_frame": "world"}, "label_frame: expected one of source, target, got 'world'"),
         ({"execution": "jax"}, "execution: expected one of auto, opencv, torch, got 'jax'"),
-        ({"outputs": ["depth"]}, "outputs: expected one of source_camera, source_frame, confidence, got 'depth'"),
+        (
+            {"outputs": ["depth"]},
+            "outputs: expected one of source_camera, source_frame, confidence, sources, got 'depth'",
+        ),
         ({"p": 1.5}, "p: expected a probability from 0 to 1, got 1.5"),
         ({"p": float("nan")}, "p: expected a probability"),
         ({"size": 256}, r"size: expected \(h, w\) in pixels, got 256"),

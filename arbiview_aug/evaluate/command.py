@@ -11,6 +11,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, get_args
 
@@ -39,31 +40,20 @@ from arbiview_aug.evaluate.pictures import save_picture
 from arbiview_aug.evaluate.report import html_report
 from arbiview_aug.evaluate.run import Evaluation, evaluate
 from arbiview_aug.evaluate.sheet import frame_sheet
-from arbiview_aug.evaluate.tables import (
-    OVERLAP_COLUMNS,
-    OVERLAP_NOTES,
-    SEEN,
-    SPARSE_COLUMNS,
-    SPARSE_NOTES,
-    TRUTH_COLUMNS,
-    TRUTH_NOTES,
-    Column,
-    text_table,
-)
+from arbiview_aug.evaluate.tables import Table, evaluation_tables, text_table
 from arbiview_aug.evaluate.targets import named_targets, without_masks
 from arbiview_aug.favs.config import Quality
+from arbiview_aug.generator import Generator
 from arbiview_aug.rig import Rig, load_rig
 from arbiview_aug.surface import SurfaceName
-from arbiview_aug.transforms import OUTPUTS
+from arbiview_aug.transform_settings import RenderPath
 
 TARGET_SETS = ("paper", "yaw", "vehicles", "truck")
 _OWN = {
-    "paper": ("target", "yaws", "quality", "surface", "seed", "reduce"),
-    "figure": ("target", "yaws", "quality", "surface", "frames"),
+    "paper": ("target", "yaws", "quality", "surface", "path", "generator", "steps", "seed", "reduce"),
+    "figure": ("target", "yaws", "quality", "surface", "path", "generator", "steps", "frames"),
 }
 """What the two modes fix themselves."""
-
-Table = tuple[str, Mapping[str, Mapping[str, float]], Sequence[Column], Sequence[str]]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -107,6 +97,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--quality", nargs="+", choices=get_args(Quality), default=["fast"], help="(default: fast)")
     parser.add_argument("--surface", nargs="+", choices=get_args(SurfaceName), default=["auto"], help="(default: auto)")
+    parser.add_argument(
+        "--path", nargs="+", choices=get_args(RenderPath), default=["favs"], help="what fills holes (default: favs)"
+    )
+    parser.add_argument("--generator", metavar="DIR", help="of --path diffusion (default: the package's own)")
+    parser.add_argument("--steps", nargs="+", type=count, default=[4], metavar="N", help="of it (default: 4)")
     parser.add_argument("--frames", type=count, metavar="N", help="how many (default: 1; --paper: 3 synthetic ones)")
     parser.add_argument("--seed", type=seed, default=0, help="of the synthetic streets (default: %(default)s)")
     parser.add_argument("--reduce", type=int, choices=(1, 2, 4), default=1, help="decode images at 1, 1/2 or 1/4 size")
@@ -138,7 +133,7 @@ def _yaws(text: str) -> str | list[float]:
 
 # --- the work ---------------------------------------------------------------------------------------------------------
 def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> str:
-    methods = [_method(quality, surface) for quality in arguments.quality for surface in arguments.surface]
+    methods = _methods(arguments)
     asked = None if arguments.target is None else load_rig(arguments.target)
     data, targets = _data(arguments), partial(_targets, arguments, asked)
     frames = min(arguments.frames or 1, len(data))
@@ -154,7 +149,7 @@ def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> 
     if not done.views:
         raise DataError("; ".join(done.declined.values()))
     notes.extend(f"{name}: {why}" for name, why in done.declined.items())
-    tables = _tables(done, methods)
+    tables = evaluation_tables(done, [method.name for method in methods])
     title = f"{arguments.data or f'Synthetic streets, seed {arguments.seed}'}: {frames} frame{'s' * (frames > 1)}"
     written = _write(folder, title, done, methods, tables, _facts(arguments, done), notes)
     if arguments.json:
@@ -163,10 +158,22 @@ def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> 
     return f"{title}\n\n{text}\n\nreport: {folder / 'report.html'}\nnumbers: {folder / 'evaluate.json'}"
 
 
-def _method(quality: Quality, surface: SurfaceName) -> Method:
-    """With its confidence to show, where it has one."""
-    published = quality == "paper"
-    return retargeting(quality, surface, outputs=[o for o in OUTPUTS if o == "confidence" and not published])
+def _methods(arguments: argparse.Namespace) -> list[Method]:
+    """All settings asked for, with their confidence to show, where they have one."""
+    generator = None
+    if "diffusion" in arguments.path:
+        generator = (
+            Generator.shipped() if arguments.generator is None else Generator.from_pretrained(arguments.generator)
+        )
+    found = []
+    for quality, surface, path in product(arguments.quality, arguments.surface, arguments.path):
+        outputs = () if quality == "paper" else ("confidence",)
+        make = partial(retargeting, quality, surface, outputs=outputs, path=path)
+        if path == "diffusion":
+            found += [make(generator=generator, steps=steps) for steps in arguments.steps]
+        else:
+            found.append(make())
+    return found
 
 
 def _data(arguments: argparse.Namespace) -> Any:
@@ -205,31 +212,6 @@ def _frames(data: Any, frames: int, hand_over_points: bool) -> Iterator[tuple[st
 
 
 # --- what is shown ----------------------------------------------------------------------------------------------------
-def _tables(done: Evaluation, methods: Sequence[Method]) -> list[Table]:
-    """Views against their reference, a row for each method and target; and agreement, a row for each method."""
-    assert done.first is not None
-    names = [method.name for method in methods if method.name not in done.declined]
-    rows: dict[str, dict[str, float]] = {}
-    for name in names:
-        if len(done.targets) > 1:
-            rows |= {f"{name}: {target}": done.means(name, target) for target in done.targets}
-        rows[f"{name}: all" if len(done.targets) > 1 else name] = done.means(name)
-    table: Table = ("Views, no truth and no LiDAR points to compare with", rows, (SEEN,), ())
-    if done.first.truth is not None:
-        table = ("Against the true views, where some source camera saw", rows, TRUTH_COLUMNS, TRUTH_NOTES)
-    elif done.first.lidar:
-        points = len(done.first.lidar["raw"].points)
-        split = ("Methods get the points of every other degree of azimuth; those between score (the count above).",)
-        table = (
-            f"Against {points} LiDAR points with the colours that the source cameras saw",
-            rows,
-            SPARSE_COLUMNS,
-            (*SPARSE_NOTES, *split) if done.first.held_out else SPARSE_NOTES,
-        )
-    agreement = {name: done.agreement(name) for name in names}
-    return [table, ("Agreement of neighbours", agreement, OVERLAP_COLUMNS, OVERLAP_NOTES)]
-
-
 def _facts(arguments: argparse.Namespace, done: Evaluation) -> dict[str, Any]:
     asked = {key: value for key, value in vars(arguments).items() if key not in ("json", "paper", "figure")}
     assert done.first is not None

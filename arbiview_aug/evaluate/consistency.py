@@ -34,8 +34,8 @@ def source_overlap(
     def from_one(view: Camera, k: int) -> tuple[Image, BoolArray]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of views that one camera cannot cover: it need not
-            image, coverage, _ = method.alone(sample, k, rig.with_cameras([view]))
-        return image, coverage
+            alone = method.alone(sample, k, rig.with_cameras([view]))
+        return alone.image, alone.coverage
 
     return overlap_scores(rig, from_one, size=size)
 
@@ -43,7 +43,7 @@ def source_overlap(
 def target_consistency(rig: Rig, views: Sequence[View], *, size: tuple[int, int] = VIEW_SIZE) -> list[OverlapScore]:
     """Do neighbouring rendered views show the same scene? Overlap metrics of the rendered views themselves.
 
-    Each view, where it is covered, is resampled to the half-way view over the street surface. Views rendered over
+    Each view, where it shows anything, is resampled to the half-way view over the street surface. Views rendered over
     that same surface agree even where it is wrong, and views that are right about objects disagree there: compare
     methods of one surface. On nuScenes' frame 1 m higher, where LiDAR is 10 dB nearer to the points than the street,
     its views score 10 dB lower here.
@@ -55,7 +55,7 @@ def target_consistency(rig: Rig, views: Sequence[View], *, size: tuple[int, int]
     """
 
     def from_one(view: Camera, k: int) -> tuple[Image, BoolArray]:
-        seen = views[k].coverage
+        seen = views[k].shown
         if not seen.any():
             return np.zeros((*view.size, 3), np.uint8), np.zeros(view.size, bool)
         plan = build_plan(rig.with_cameras([replace(rig[k], mask=seen)]), rig.with_cameras([view]), surface="street")

@@ -8,7 +8,7 @@ from typing import Any
 
 from arbiview_aug.errors import CalibrationError, SampleError
 from arbiview_aug.evaluate.images import Image, as_arrays
-from arbiview_aug.evaluate.methods import Method, baseline, retargeting
+from arbiview_aug.evaluate.methods import Method, baseline, has_generator, retargeting
 from arbiview_aug.evaluate.pictures import contact_sheet, save_picture
 from arbiview_aug.evaluate.sheet import left_to_right
 from arbiview_aug.evaluate.targets import paper_target, spacing_deg
@@ -22,12 +22,15 @@ _WIDTH_PX = 1800
 
 def figure_methods() -> dict[str, Method]:
     """The paper's rows by their caption, and ours."""
-    return {
+    methods = {
         "DriveSuprim: crop and slide": baseline("crop and slide"),
         "geometric: own camera, no fusion": baseline("own camera"),
         "FAVS as published": retargeting("paper"),
         "fast, street": retargeting("fast", "street"),
     }
+    if has_generator():
+        methods["fast, street, holes generated"] = retargeting("fast", "street", path="diffusion")
+    return methods
 
 
 def draw_figures(sample: Mapping[str, Any], folder: Path) -> list[Path]:

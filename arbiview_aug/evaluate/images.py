@@ -25,11 +25,18 @@ class View(NamedTuple):
         image: (h, w, 3), black where nothing covers it.
         coverage: (h, w) bool, where some source saw it.
         confidence: (h, w) in [0, 1], where the renderer tells it.
+        generated: (h, w) bool, what was made up; None where nothing is.
     """
 
     image: Image
     coverage: BoolArray
     confidence: npt.NDArray[np.float32] | None = None
+    generated: BoolArray | None = None
+
+    @property
+    def shown(self) -> BoolArray:
+        """(h, w) bool, where it shows anything, seen or made up."""
+        return self.coverage if self.generated is None else self.coverage | self.generated
 
 
 def as_arrays(images: torch.Tensor | Sequence[torch.Tensor]) -> list[Image]:

@@ -5,6 +5,7 @@ A method gets the whole sample and may use what is in it; what it must not see i
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -18,9 +19,12 @@ from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_conf
 from arbiview_aug.favs.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.favs.photometric import Harmonise, Harmoniser
 from arbiview_aug.favs.refinement import RefinementCache
+from arbiview_aug.generator import Generator
+from arbiview_aug.generator.model import has_shipped
 from arbiview_aug.rig import Rig
 from arbiview_aug.sample import check_inputs, scenes_of_frames
 from arbiview_aug.surface import SurfaceName
+from arbiview_aug.transform_settings import RenderPath
 from arbiview_aug.transforms import RigRetarget
 
 Sample = Mapping[str, Any]
@@ -30,6 +34,9 @@ READS_POINTS = ("auto", "lidar")
 
 OURS: tuple[Quality, ...] = ("draft", "fast", "accurate")
 """The presets that are not the published method."""
+
+INPAINTED, GENERATED = "fast, inpainted", "generator"
+"""Rows of ``fast`` with its holes filled: by Telea's inpainting, and by the weights that ship with the package."""
 
 _HELD_TRANSFORMS = 8  # as many as a set of targets has; full-size plans take 50 MB each
 
@@ -67,6 +74,9 @@ def retargeting(
     outputs: Sequence[str] = (),
     harmonise: Harmonise = None,
     refinement: RefinementCache | None = None,
+    path: RenderPath = "favs",
+    generator: Generator | None = None,
+    steps: int | None = None,
 ) -> Method:
     """``RigRetarget`` as a method; a transform, with its last plan, for each of the last target rigs.
 
@@ -77,7 +87,12 @@ def retargeting(
         outputs: Further outputs, ``confidence`` where there is to be one.
         harmonise: As for ``RigRetarget``.
         refinement: As for ``RigRetarget``.
+        path: As for ``RigRetarget``; a source camera alone is never completed.
+        generator: As for ``RigRetarget``.
+        steps: As for ``RigRetarget``.
     """
+    if path == "diffusion" and generator is None:
+        generator = Generator.shipped()  # once, not for each target
 
     @lru_cache(_HELD_TRANSFORMS)
     def transform(target: Rig) -> RigRetarget:
@@ -88,6 +103,9 @@ def retargeting(
             outputs=outputs,
             harmonise=harmonise,
             refinement=refinement,
+            path=path,
+            generator=generator,
+            steps=steps,
             cache_bytes=0,
         )
 
@@ -108,10 +126,13 @@ def retargeting(
 
     config = favs_config(quality)
     label = name or (f"{quality}, {surface}" if isinstance(quality, str) else f"{type(quality).__name__}, {surface}")
+    if not name and path != "favs":
+        label += f", {path}" + (f" {steps}" if steps else "")
     learns = isinstance(config, FavsConfig) and config.overlap_depth
     overlaps = _LastOverlaps(surface if learns else None, Harmoniser(harmonise))
     reads_points = surface in READS_POINTS and not isinstance(config, PaperConfig)
-    return Method(label, render, reads_points, render_alone if overlaps.tell else None)
+    completes = path != "favs"
+    return Method(label, render, reads_points, render_alone if overlaps.tell or completes else None)
 
 
 class _LastOverlaps:
@@ -158,7 +179,8 @@ def views_of(out: Sample) -> list[View]:
     """A retargeted sample's views."""
     images, coverage = as_arrays(out["images"]), [mask.cpu().numpy() for mask in out["coverage"]]
     confidence = [c.float().cpu().numpy() for c in out["confidence"]] if "confidence" in out else [None] * len(images)
-    return [View(*parts) for parts in zip(images, coverage, confidence, strict=True)]
+    generated = [g.cpu().numpy() for g in out["generated"]] if "generated" in out else [None] * len(images)
+    return [View(*parts) for parts in zip(images, coverage, confidence, generated, strict=True)]
 
 
 def baseline(name: str) -> Method:
@@ -195,10 +217,20 @@ def paper_stages() -> dict[str, PaperConfig]:
 
 
 def study_methods() -> list[Method]:
-    """The rows of the paper's tables and ours, from images and poses alone: no LiDAR, no boxes."""
+    """The rows of the paper's tables and ours, from images and poses alone: no LiDAR, no boxes.
+
+    The generator's is there where diffusers is: ``fast``, its holes by the weights that ship with the package.
+    """
     published = [retargeting(config, "auto", name) for name, config in paper_stages().items()]
     return [
         *map(baseline, BASELINES),
         *published,
         *(retargeting(quality, "street", quality) for quality in OURS),
+        retargeting("fast", "street", INPAINTED, path="inpaint"),
+        *([retargeting("fast", "street", GENERATED, path="diffusion")] if has_generator() else []),
     ]
+
+
+def has_generator() -> bool:
+    """Whether the weights of the package are there, and the packages that they need."""
+    return importlib.util.find_spec("diffusers") is not None and has_shipped()

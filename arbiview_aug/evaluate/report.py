@@ -18,7 +18,7 @@ from arbiview_aug.evaluate.pictures import Picture, overlay_confidence
 from arbiview_aug.evaluate.rig_picture import draw_rigs
 from arbiview_aug.evaluate.run import Evaluation
 from arbiview_aug.evaluate.sheet import hatched_view, left_to_right, shrunk
-from arbiview_aug.evaluate.tables import Column, cell
+from arbiview_aug.evaluate.tables import Column, Table, cell
 from arbiview_aug.rig import Rig
 
 SOURCE_LAYER = "nearest source camera"
@@ -32,7 +32,7 @@ def html_report(
     title: str,
     done: Evaluation,
     methods: Sequence[str],
-    tables: Sequence[tuple[str, Mapping[str, Mapping[str, float]], Sequence[Column], Sequence[str]]],
+    tables: Sequence[Table],
     notes: Sequence[str] = (),
 ) -> str:
     """The page.

@@ -79,3 +79,19 @@ def flat(name: str, e: Errors | None) -> dict[str, float]:
     """``{name_psnr_db: ..., name_mae: ..., name_rmse: ...}``, without the prefix for an empty name."""
     prefix = f"{name}_" if name else ""
     return {} if e is None else {f"{prefix}{field}": float(getattr(e, field)) for field in ("psnr_db", "mae", "rmse")}
+
+
+def gradient_energy_ratio(got: npt.NDArray[Any], want: npt.NDArray[Any], region: npt.NDArray[np.bool_]) -> float | None:
+    """Squared differences of neighbouring pixels inside a region, got over wanted: below 1 is blurred.
+
+    Args:
+        got: (h, w, 3).
+        want: (h, w, 3) on the same scale.
+        region: (h, w) bool.
+
+    Returns:
+        None where the region has no two neighbours, or the truth no gradient.
+    """
+    pairs = region[:, 1:] & region[:, :-1]
+    energy = [float((np.diff(image.astype(np.float64), axis=1)[pairs] ** 2).sum()) for image in (got, want)]
+    return energy[0] / energy[1] if energy[1] > 0 else None

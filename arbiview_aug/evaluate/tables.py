@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from arbiview_aug.evaluate.run import Evaluation
 
 
 class Column(NamedTuple):
@@ -25,11 +28,14 @@ TRUTH_COLUMNS = (
     Column("MAE", "true_covered_mae"),
     Column("SSIM", "true_covered_ssim", 4),
     Column("holes", "true_hole_psnr_db"),
+    Column("hole MAE", "true_hole_mae"),
+    Column("sharp", "true_hole_gradient_ratio"),
     Column("whole view", "true_psnr_db"),
 )
 TRUTH_NOTES: tuple[str, ...] = (
     "seen: share of the target's pixels. ground, objects, sky: PSNR there. MAE in grey levels of 255.",
-    "holes: PSNR where no source saw. whole view: PSNR with the holes as they are, black.",
+    "holes, hole MAE: where no source saw; sharp: gradient energy there against the truth. whole view: PSNR of all",
+    "pixels; holes are black unless a path fills them.",
 )
 SPARSE_COLUMNS = (
     SEEN,
@@ -62,6 +68,40 @@ OVERLAP_NOTES: tuple[str, ...] = (
     "to their half-way view over the street's surface: do they show the same scene? Compare methods of one surface:",
     "what is rendered over the street agrees there even where the street is wrong.",
 )
+
+
+Table = tuple[str, Mapping[str, Mapping[str, float]], Sequence[Column], Sequence[str]]
+"""Title, rows, columns and notes."""
+
+
+def evaluation_tables(done: Evaluation, methods: Sequence[str]) -> list[Table]:
+    """Views against their reference, a row for each method and target; and agreement, a row for each method.
+
+    Args:
+        done: What was measured.
+        methods: Names, in the order of the rows.
+    """
+    assert done.first is not None
+    names = [name for name in methods if name not in done.declined]
+    rows: dict[str, dict[str, float]] = {}
+    for name in names:
+        if len(done.targets) > 1:
+            rows |= {f"{name}: {target}": done.means(name, target) for target in done.targets}
+        rows[f"{name}: all" if len(done.targets) > 1 else name] = done.means(name)
+    table: Table = ("Views, no truth and no LiDAR points to compare with", rows, (SEEN,), ())
+    if done.first.truth is not None:
+        table = ("Against the true views, where some source camera saw", rows, TRUTH_COLUMNS, TRUTH_NOTES)
+    elif done.first.lidar:
+        points = len(done.first.lidar["raw"].points)
+        split = ("Methods get the points of every other degree of azimuth; those between score (the count above).",)
+        table = (
+            f"Against {points} LiDAR points with the colours that the source cameras saw",
+            rows,
+            SPARSE_COLUMNS,
+            (*SPARSE_NOTES, *split) if done.first.held_out else SPARSE_NOTES,
+        )
+    agreement = {name: done.agreement(name) for name in names}
+    return [table, ("Agreement of neighbours", agreement, OVERLAP_COLUMNS, OVERLAP_NOTES)]
 
 
 def text_table(

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from arbiview_aug.camera import BoolArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.images import Image
-from arbiview_aug.evaluate.scores import errors, flat, ssim_map
+from arbiview_aug.evaluate.scores import errors, flat, gradient_energy_ratio, ssim_map
 
 CLASSES = ("ground", "object", "sky")
 """The classes that synthetic scenes are split into."""
@@ -25,7 +25,7 @@ def truth_metrics(
     classes: Mapping[str, BoolArray] | None = None,
     valid: BoolArray | None = None,
 ) -> dict[str, float]:
-    """PSNR, MAE, RMSE and SSIM against the true view: over all pixels, and split by coverage and by class.
+    """PSNR, MAE, RMSE, SSIM and sharpness against the true view: over all pixels, split by coverage and by class.
 
     SSIM of a region is the mean of the SSIM map over its pixels; its windows reach 5 pixels past the region's border.
 
@@ -37,9 +37,9 @@ def truth_metrics(
         valid: (h, w) bool, where the truth is known and counts (the target's own car body excluded).
 
     Returns:
-        ``psnr_db, mae, rmse, ssim, share`` over all valid pixels, and the same with the prefixes ``covered_``,
-        ``hole_``, ``<class>_``, ``covered_<class>_``, ``hole_<class>_``. ``share`` is the region's part of the valid
-        pixels. A region without pixels has a share of 0 and no other entries.
+        ``psnr_db, mae, rmse, ssim, gradient_ratio, share`` over all valid pixels, and the same with the prefixes
+        ``covered_``, ``hole_``, ``<class>_``, ``covered_<class>_``, ``hole_<class>_``. ``share`` is the region's part
+        of the valid pixels. A region without pixels has a share of 0 and no other entries.
     """
     shape = image.shape[:2]
     if image.shape != truth.shape:
@@ -77,4 +77,7 @@ def _region(
     if count:
         row |= flat(name, errors(image[region], truth[region]))
         row[f"{prefix}ssim"] = float(similarity[region].mean())
+        ratio = gradient_energy_ratio(image, truth, region)
+        if ratio is not None:
+            row[f"{prefix}gradient_ratio"] = ratio
     return row
