@@ -1,11 +1,13 @@
 """Re-render the labelled camera samples of one vehicle as the cameras of another would have seen them."""
 
+from arbiview_aug.boxes_2d import ImageBoxes, project_boxes_3d
 from arbiview_aug.camera import Camera
 from arbiview_aug.datasets.wrappers import RetargetedDataset, RetargetedIterable
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, SampleTypeError
 from arbiview_aug.favs.config import FavsConfig, PaperConfig
 from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.random_rig import RandomRig
+from arbiview_aug.resizing import CropRig, ResizeRig
 from arbiview_aug.rig import Rig, load_rig, shipped_rigs
 from arbiview_aug.transforms import RigRetarget
 
@@ -13,11 +15,14 @@ __all__ = [
     "ArbiviewError",
     "CalibrationError",
     "Camera",
+    "CropRig",
     "DataError",
     "FavsConfig",
+    "ImageBoxes",
     "PaperConfig",
     "RandomRig",
     "RefinementCache",
+    "ResizeRig",
     "RetargetedDataset",
     "RetargetedIterable",
     "Rig",
@@ -25,5 +30,6 @@ __all__ = [
     "SampleError",
     "SampleTypeError",
     "load_rig",
+    "project_boxes_3d",
     "shipped_rigs",
 ]

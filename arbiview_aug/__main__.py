@@ -11,10 +11,12 @@ from arbiview_aug.errors import ArbiviewError
 
 COMMANDS = {
     "bench": ("arbiview_aug.bench", "measure speed, on your own data too"),
+    "convert": ("arbiview_aug.convert.command", "write a data set as another vehicle's cameras would have seen it"),
     "demo": ("arbiview_aug.demo", "the main job on a synthetic street or on real frames, with numbers and a picture"),
     "depth": ("arbiview_aug.depth", "depth from motion of a drive's frames, for surface='motion'"),
     "evaluate": ("arbiview_aug.evaluate.command", "how good are the views: metrics, pictures, a report in HTML"),
     "inspect": ("arbiview_aug.inspect", "show rigs: tables, differences, a picture"),
+    "train": ("arbiview_aug.train.__main__", "train the generator that completes what no camera saw"),
 }
 """Module and one-line help of each command."""
 

@@ -42,6 +42,7 @@ from arbiview_aug.evaluate.tables import SEEN, SPARSE_COLUMNS, SPARSE_NOTES, TRU
 from arbiview_aug.favs.config import Quality
 from arbiview_aug.rig import Rig, load_rig
 from arbiview_aug.surface import SurfaceName
+from arbiview_aug.transform_settings import RenderPath
 from arbiview_aug.transforms import RigRetarget
 
 PICTURE_FILE = "demo.png"
@@ -67,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     picture_path = _picture_path(arguments.output)
     data = _load(arguments)
     frames = min(arguments.frames, len(data.samples))
-    methods = _compared(arguments.quality, arguments.surface)
+    methods = _compared(arguments.quality, arguments.surface, arguments.path)
     reads_points = any(method.reads_points for method in methods)
     rows: dict[str, list[dict[str, float]]] = {method.name: [] for method in methods}
     plan_ms: list[float] = []
@@ -75,7 +76,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     first: tuple[dict[str, Any], Frame, list[View]] | None = None
     notes: list[str] = []
     with gathered_warnings(notes), tqdm(total=frames * (2 + len(methods)), unit="step", leave=False) as progress:
-        chosen = RigRetarget(data.target, quality=arguments.quality, surface=arguments.surface)
+        asked = {"quality": arguments.quality, "surface": arguments.surface, "path": arguments.path}
+        chosen = RigRetarget(data.target, **asked)
         for index in range(frames):
             progress.set_description(f"frame {index + 1}/{frames}: source views")
             sample = data.samples[index]
@@ -134,6 +136,9 @@ def _parser() -> argparse.ArgumentParser:
         help="(default: %(default)s); paper: the published method, beside fast on the other surfaces, without lenses",
     )
     parser.add_argument("--surface", choices=get_args(SurfaceName), default="auto", help="(default: %(default)s)")
+    parser.add_argument(
+        "--path", choices=get_args(RenderPath), default="favs", help="what fills holes: nothing (default), see README"
+    )
     parser.add_argument("--frames", type=count, default=1, metavar="N", help="how many (default: %(default)s)")
     parser.add_argument("--seed", type=seed, default=0, help="of the synthetic streets (default: %(default)s)")
     parser.add_argument(
@@ -173,11 +178,16 @@ def _load(arguments: argparse.Namespace) -> _Data:
     return _Data(drive, target, drive.render)
 
 
-def _compared(quality: Quality, surface: SurfaceName) -> list[Method]:
-    """What was asked for, and the surfaces that it is compared with."""
+def _compared(quality: Quality, surface: SurfaceName, path: RenderPath) -> list[Method]:
+    """What was asked for, and the surfaces and fills that it is compared with."""
+    fills: dict[str, RenderPath] = {} if path == "favs" else {"inpainted": "inpaint"}
+    if path == "diffusion":
+        fills["generated"] = path
     if quality == "paper":
-        return [retargeting("paper", surface, "paper"), *(retargeting("fast", s, s) for s in _COMPARED)]
-    return [retargeting(quality, s, s) for s in dict.fromkeys((surface, *_COMPARED))]
+        filled = [retargeting("paper", surface, f"paper, {name}", path=fill) for name, fill in fills.items()]
+        return [retargeting("paper", surface, "paper"), *filled, *(retargeting("fast", s, s) for s in _COMPARED)]
+    filled = [retargeting(quality, surface, f"{surface}, {name}", path=fill) for name, fill in fills.items()]
+    return [*(retargeting(quality, s, s) for s in dict.fromkeys((surface, *_COMPARED))), *filled]
 
 
 def _resized(rig: Rig, to: tuple[int, int] | None) -> Rig:

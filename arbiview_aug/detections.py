@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import product
 from typing import Any
 
 import numpy as np
 
+from arbiview_aug.boxes_2d import outline
 from arbiview_aug.camera import Camera, FloatArray
 from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.favs.object_alignment import Detection
@@ -15,10 +15,6 @@ from arbiview_aug.sample import SourceFrame, numbers, scenes_of_frames
 
 UNNAMED_TYPE = "upright"
 """Type of labelled boxes without names: they stand on the road, which is all that stage 3 asks for."""
-
-_NEAR_M = 0.1  # boxes are cut off here: what lies behind a camera has no pixels
-_CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))  # [8, 3]
-_EDGES = np.array([(a, b) for a in range(8) for b in range(a) if (_CORNERS[a] != _CORNERS[b]).sum() == 1])  # [12, 2]
 
 OfCameras = Mapping[int, Sequence[Detection]]
 """The detections of a frame, by the index of its camera."""
@@ -97,22 +93,8 @@ def _names(key: str, value: Any, count: int) -> list[str]:
 def _projected(camera: Camera, boxes: FloatArray, kinds: Sequence[str]) -> list[Detection]:
     """Image boxes of (B, 7) boxes in the ego frame, cut at the image's border; those in front of others too."""
     found = []
-    ego2cam = np.linalg.inv(camera.cam2ego)
     for box, kind in zip(boxes, kinds, strict=True):
-        c, s = np.cos(box[6]), np.sin(box[6])
-        corners = (_CORNERS * box[3:6]) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + box[:3]
-        x = corners @ ego2cam[:3, :3].T + ego2cam[:3, 3]
-        one, two = x[_EDGES[:, 0]], x[_EDGES[:, 1]]
-        crossing = (one[:, 2] - _NEAR_M) * (two[:, 2] - _NEAR_M) < 0
-        one, two = one[crossing], two[crossing]
-        share = ((_NEAR_M - one[:, 2]) / (two[:, 2] - one[:, 2]))[:, None]
-        ahead = np.concatenate([x[x[:, 2] >= _NEAR_M], one + share * (two - one)])
-        if not len(ahead):
-            continue
-        pixels = ahead @ camera.K.T
-        pixels = pixels[:, :2] / pixels[:, 2:]
-        limits = np.array([camera.width_px, camera.height_px]) - 1.0
-        (x0, y0), (x1, y1) = (p.tolist() for p in (np.maximum(pixels.min(0), 0), np.minimum(pixels.max(0), limits)))
-        if x0 < x1 and y0 < y1:
+        if (seen := outline(camera, box)) is not None:
+            x0, y0, x1, y1 = seen.inside.tolist()
             found.append(Detection((x0, y0, x1, y1), kind))
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,6 +18,8 @@ CV2_WHEELS = (
     "opencv-contrib-python-headless",
 )
 """Distributions that all install the package ``cv2``."""
+
+_DISTRIBUTIONS = ("arbiview_aug", "torch", "numpy", "kornia")
 
 _warned = False
 
@@ -81,3 +84,31 @@ def repeatable_opencv() -> Iterator[None]:
     finally:
         cv2.ipp.setUseIPP(ipp)
         cv2.setNumThreads(threads)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """OpenCV, torch and the linear algebra behind numpy on one thread; as before afterwards."""
+    import torch
+    from threadpoolctl import threadpool_limits  # a dependency of scikit-learn
+
+    before = cv2.getNumThreads(), torch.get_num_threads()
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1, user_api="blas"):
+            yield
+    finally:
+        cv2.setNumThreads(before[0])
+        torch.set_num_threads(before[1])
+
+
+def versions() -> dict[str, str]:
+    """Of what results and times depend on."""
+    found = {"python": platform.python_version(), "opencv": cv2.__version__}
+    for name in _DISTRIBUTIONS:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found

@@ -23,3 +23,11 @@ class DataError(ArbiviewError, ValueError):
 
 class GeneratorError(ArbiviewError, ValueError):
     """A generator whose settings, weights and inputs do not fit together."""
+
+
+class OutputError(ArbiviewError, RuntimeError):
+    """A file that cannot be written: the disk is full, or it may not be."""
+
+
+class TrainingError(ArbiviewError, RuntimeError):
+    """A training run with impossible settings or data, or one that cannot go on."""

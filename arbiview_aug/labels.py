@@ -29,6 +29,7 @@ PIXEL_BOUND_KEYS = (
     "source_frame",
     "confidence",
     "generated",
+    "sources",
 )
 """Keys known to speak of the source's pixels: dropped, because they would be stale in the target's views."""
 

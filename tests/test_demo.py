@@ -25,7 +25,7 @@ def test_synthetic_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert "sedan -> van: 6 cameras to 5" in printed and "over the objects surface" in printed
     assert "Against the true views (5 cameras, 1 frame)" in printed and "ms a frame" in printed
     auto, far = numbers(printed, "auto"), numbers(printed, "far")
-    seen, psnr, ground, _, _, mae, ssim, _, whole = auto
+    seen, psnr, ground, _, _, mae, ssim, *_, whole = auto
     assert 80 < seen < 100 and whole < psnr and 0 < mae < 50 and 0.2 < ssim < 1
     # 0.6 m higher, the road is where a plane says it is and not infinitely far away.
     assert ground > far[2] + 3
@@ -33,6 +33,16 @@ def test_synthetic_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert sheet is not None and sheet.shape[1] == 900 and 200 < sheet.shape[0] < 900
     assert sheet.std() > 20
     assert f"picture: {tmp_path / 'demo.png'}" in printed
+
+
+def test_holes_filled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["demo", "--size", "40x104", "--output", str(tmp_path), "--width", "600", "--path", "inpaint"]) == 0
+    printed = capsys.readouterr().out
+    plain, filled = (
+        next(line.split()[-1] for line in printed.splitlines() if line.strip().startswith(name))
+        for name in ("auto  ", "auto, inpainted")
+    )
+    assert float(filled) > float(plain) + 1, "whole views, holes and all"
 
 
 @pytest.mark.parametrize("reader", ["frame folder", "tables"])

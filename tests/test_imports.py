@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +13,7 @@ PACKAGE = Path(__file__).parents[1] / "arbiview_aug"
 
 LAYERS: list[tuple[str, ...]] = [
     ("errors", "environment", "held"),
+    ("files", "offline"),
     ("lens",),
     ("rotations",),
     ("calibration",),
@@ -47,14 +47,16 @@ LAYERS: list[tuple[str, ...]] = [
     ("motion.poses",),
     ("tensors", "sample_images", "random_rig", "inpainting"),
     ("sample",),
+    ("boxes_2d",),
     ("labels", "detections", "neighbours"),
     ("fills", "motion.depth"),
-    ("explain",),
+    ("explain", "view_entries"),
     ("stitching",),
     ("generator",),
-    ("datasets", "transforms"),
+    ("transform_settings",),
+    ("datasets", "resizing", "transforms"),
     ("evaluate",),
-    ("bench", "convert", "demo", "depth", "inspect"),
+    ("bench", "convert", "demo", "depth", "inspect", "train"),
     ("__main__",),
 ]
 """From the ground up: a module imports from layers below its own; the modules of one name, or folder, among themselves.
@@ -147,7 +149,7 @@ def test_imports_point_upward_only() -> None:
 def test_every_layer_is_in_order_of_use() -> None:
     """The list says no more than there is, but for the parts that are to come."""
     known = modules()
-    to_come = {"convert", "demo", "grid"}
+    to_come = {"demo", "grid"}
     for names in LAYERS:
         for name in names:
             assert name in known or name in to_come, name
@@ -155,25 +157,21 @@ def test_every_layer_is_in_order_of_use() -> None:
 
 def test_importing_loads_nothing_heavy() -> None:
     code = (
-        "import sys, torch; had = set(sys.modules); import arbiview_aug, arbiview_aug.generator\n"
+        "import sys, torch; had = set(sys.modules)\n"
+        "import arbiview_aug, arbiview_aug.generator, arbiview_aug.train.command\n"
         f"print([m for m in {HEAVY} if m in sys.modules and m not in had])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.strip() == "[]"
 
 
-def seconds(code: str) -> float:
-    """Processor time: on a busy machine the clock on the wall says nothing."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([sys.executable, "-c", code], timeout=120, check=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-
-
-@pytest.mark.slow
+@pytest.mark.bench
 def test_importing_costs_little_more_than_torch() -> None:
-    """Pairs in turn, so that a busy machine slows both; the best of three of each."""
-    pairs = [(seconds("import torch"), seconds("import torch; import arbiview_aug")) for _ in range(3)]
-    torch_s, both_s = (min(times) for times in zip(*pairs, strict=True))
-    print(f"import torch {torch_s:.2f} s, with arbiview_aug {both_s:.2f} s: {both_s - torch_s:+.2f} s")
-    assert both_s - torch_s <= LIMIT_S
+    """Processor time after ``import torch``, the best of five: a busy machine only adds to it."""
+    code = "import time, torch; start = time.process_time(); import arbiview_aug; print(time.process_time() - start)"
+    runs = [
+        subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=120, check=True) for _ in range(5)
+    ]
+    best_s = min(float(run.stdout) for run in runs)
+    print(f"import arbiview_aug after torch: {best_s:.2f} s")
+    assert best_s <= LIMIT_S

@@ -243,8 +243,9 @@ def test_auto_takes_boxes_where_there_are_some_and_warns_where_cameras_move_with
         RigRetarget(rig.shifted(z_m=0.1))(sample)  # little harm
         RigRetarget(rig.shifted(z_m=0.5), surface="street")(sample)  # asked for
     ahead = RigRetarget(rig.shifted(x_m=0.5))
-    with pytest.warns(UserWarning, match=r"target cameras stand up to 0\.50 m from the nearest source camera"):
+    with pytest.warns(UserWarning, match=r"target cameras stand up to 0\.50 m from the nearest source camera") as said:
         bare = ahead(sample)
+    assert said[0].filename == __file__  # the user's line, not one of ours
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         ahead(sample)  # said once

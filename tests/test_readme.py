@@ -13,7 +13,7 @@ from typing import get_args
 import pytest
 
 from arbiview_aug.__main__ import main
-from arbiview_aug.bench import neighbours, trade
+from arbiview_aug.bench import generator, neighbours, trade
 from arbiview_aug.bench.ablation import NOTES, ROWS, STEPS, markdown
 from arbiview_aug.bench.sweep import settings
 from arbiview_aug.evaluate import paper_tables
@@ -49,10 +49,14 @@ TINY = {
         *["--frames", "2", "--epochs", "1"],
     ],
     "bench scene --data FOLDER": ["--reduce", "4", "--repeats", "1", "--only", "p skips"],
+    "bench generator": ["--size", "32x56", "--steps", "1", "--frames", "1", "--repeats", "1"],
     "bench neighbours": ["--size", "32x88", "--repeats", "1", "--counts", "0", "1", "--surface", "street"],
     "bench device": ["--device", "cpu", "--sizes", "32x88", "--repeats", "1"],
     "bench speed --data FOLDER": ["--repeats", "1"],
     "bench speed": ["--repeats", "1"],
+    "convert --data FOLDER --target argoverse2 --output converted --size 256x704": [
+        *("--size", "24x40", "--reduce", "4", "--workers", "1", "--surface", "street", "--report", "0")
+    ],
     "depth --data FOLDER": ["--output", "depth"],
     "bench ablation --data FOLDER": ["--reduce", "4", "--only", "street, not far"],
 }
@@ -93,17 +97,22 @@ def test_the_code_runs() -> None:
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
         assert done.returncode == 0, done.stderr
         printed.append(done.stdout)
-    retargeted, filled = printed
+    retargeted, filled, completed = printed
     assert "sedan -> waymo: 6 cameras to 5" in retargeted
     assert retargeted.count("(5, 3, 128, 352)") == 2 and "% seen by some camera" in retargeted
     assert float(filled.split("%")[0]) > 3 and "from other frames" in filled
+    assert 0.05 < float(completed.split("(")[1].split(")")[0]) < 0.5 and "[6, 3, 96, 168]" in completed
 
 
 def test_every_command_is_known_here() -> None:
     assert commands() == set(TINY)
 
 
-@pytest.mark.parametrize("command", sorted(TINY))
+@pytest.mark.parametrize(
+    "command",
+    # Benchmarks take as long as all the others together.
+    [pytest.param(c, marks=pytest.mark.bench) if c.startswith("bench") else c for c in sorted(TINY)],
+)
 def test_the_commands_run(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
@@ -152,6 +161,14 @@ def test_the_neighbours_table_is_the_commands() -> None:
     assert neighbours.NOTES in measured("neighbours")
 
 
+def test_the_generators_table_is_the_commands() -> None:
+    (table,) = tables(measured("generator"))
+    assert table[0] == ["", *(heading for heading, *_ in generator.COLUMNS)]
+    assert [row[0] for row in table[2:]] == ["holes black", "inpainted", *map(generator.row_name, generator.STEPS)]
+    assert all(re.fullmatch(r"[\d.]+", cell) for row in table[2:] for cell in row[1:])
+    assert generator.NOTES in measured("generator")
+
+
 def test_the_papers_tables_are_the_commands() -> None:
     """``evaluate --paper``: headings, methods, the paper's own numbers and the words between."""
     metrics = ("raw_psnr_db", "raw_ssim", "raw_mae", "raw_rmse")
@@ -189,7 +206,8 @@ def test_pictures_and_files_exist() -> None:
 def test_install_lines() -> None:
     demo, tests, *_ = blocks("bash")
     assert demo.startswith("python -m venv .venv && .venv/bin/pip install . &&")
-    assert tests.strip() == "python -m venv .venv && .venv/bin/pip install -e '.[dev]' && .venv/bin/python -m pytest"
+    installed = "python -m venv .venv && .venv/bin/pip install -e '.[dev]'"
+    assert tests.strip() == f"{installed} && .venv/bin/python -m pytest -n 2"
 
 
 def test_names_are_complete() -> None:

@@ -4,7 +4,8 @@
 ``cv2.remap`` calls (``bench.speed``). ``ablation``: each stage and setting on and off, dB and milliseconds
 (``bench.ablation``). ``device``: batches by torch, on a GPU where there is one (``bench.device``). ``loader``: frames
 per second out of a ``DataLoader`` (``bench.loader``). ``scene``: what is not done where a scene does not require it
-(``bench.scene``). ``neighbours``: what other frames of the drive cost (``bench.neighbours``).
+(``bench.scene``). ``neighbours``: what other frames of the drive cost (``bench.neighbours``). ``generator``: what
+made-up pixels cost, and how true they are (``bench.generator``).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ BENCHMARKS = {
     "loader": "frames per second of a DataLoader, memory per worker",
     "scene": "only what a scene requires is done: counters and milliseconds",
     "neighbours": "what other frames of the drive cost, and what they fill",
+    "generator": "holes left black, inpainted, generated: milliseconds and PSNR",
 }
 
 

@@ -24,6 +24,9 @@ from arbiview_aug.rig import Rig, load_rig
 
 REDUCES: tuple[Reduce, ...] = get_args(Reduce)
 
+SOURCES_OVER_VIEWS = 2
+"""Synthetic images are as much larger than the views: so decoding at half size has something to save."""
+
 
 @dataclass(frozen=True)
 class Recorded:

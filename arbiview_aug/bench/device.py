@@ -21,19 +21,10 @@ from typing import Any
 import torch
 
 from arbiview_aug.bench.data import recorded
-from arbiview_aug.bench.timing import (
-    cuda_ms,
-    machine,
-    machine_line,
-    one_thread,
-    process_ms,
-    quartiles,
-    show,
-    timed_rounds,
-    versions,
-)
+from arbiview_aug.bench.timing import cuda_ms, machine, machine_line, process_ms, quartiles, show, timed_rounds
 from arbiview_aug.command_line import add_data, count, size
 from arbiview_aug.device_maps import maps_on
+from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.favs.synthesis import render_torch

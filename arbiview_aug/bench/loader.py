@@ -28,11 +28,12 @@ import numpy as np
 from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
-from arbiview_aug.bench.data import REDUCES, Recorded, recorded
-from arbiview_aug.bench.timing import Quartiles, machine, machine_line, one_thread, quartiles, show, versions
+from arbiview_aug.bench.data import REDUCES, SOURCES_OVER_VIEWS, Recorded, recorded
+from arbiview_aug.bench.timing import Quartiles, machine, machine_line, quartiles, show
 from arbiview_aug.command_line import add_data, add_target, count, size
 from arbiview_aug.datasets import RetargetedDataset, open_data
 from arbiview_aug.datasets.images import Reduce
+from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.rig import Rig
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.transforms import RigRetarget
@@ -41,7 +42,6 @@ WORKERS = (0, 1, 2)
 SIZE = (256, 704)
 FRAMES, EPOCHS = 48, 3
 PLAIN = "read only"
-_SOURCES_OVER_VIEWS = 2  # of synthetic images: decoding at half size has something to save
 _APART_M = 1e-4
 _MIB = 2**20
 
@@ -124,7 +124,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     if min(arguments.workers) < 0:
         parser.error(f"argument --workers: expected whole numbers from 0, got {min(arguments.workers)}")
-    h, w = (_SOURCES_OVER_VIEWS * side for side in arguments.size)
+    h, w = (SOURCES_OVER_VIEWS * side for side in arguments.size)
     with recorded(arguments.data, size=(h, w)) as data:
         report = measure(
             data,

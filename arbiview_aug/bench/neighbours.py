@@ -22,20 +22,11 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.bench.data import REDUCES, as_of_another_frame, recorded_drive
-from arbiview_aug.bench.timing import (
-    Quartiles,
-    machine,
-    machine_line,
-    one_thread,
-    peak_mib,
-    quartiles,
-    show,
-    timed_rounds,
-    versions,
-)
+from arbiview_aug.bench.timing import Quartiles, machine, machine_line, peak_mib, quartiles, show, timed_rounds
 from arbiview_aug.camera import Camera
 from arbiview_aug.command_line import add_data, count, seed, size
 from arbiview_aug.datasets import Neighbours, open_data
+from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.tables import markdown_table
 from arbiview_aug.rig import Rig

@@ -47,15 +47,18 @@ def save_plot(rows: Sequence[Mapping[str, Any]], steps: Sequence[str], title: st
     axes.step(*zip(*front, strict=True), where="post", color="black", linewidth=0.8, alpha=0.6)
     named = sorted((row for row in rows if row["name"] in steps), key=lambda row: row["median_ms"])
     middle = math.sqrt(front[0][0] * max(row["median_ms"] for row in rows))
+    left = sum(row["median_ms"] <= middle for row in named)
     for k, row in enumerate(named):
-        right = row["median_ms"] > middle
+        on_left = k < left
         axes.annotate(
             row["name"],
             (row["median_ms"], row["psnr_db"]),
-            xytext=(-8 if right else 8, 8 if k % 2 else -14),
+            # Below and above the front, a line apart: steps may lie beside each other.
+            xytext=(14, -14 - 12 * (left - k)) if on_left else (-14, 6 + 12 * (k - left)),
             textcoords="offset points",
             fontsize=8,
-            ha="right" if right else "left",
+            ha="left" if on_left else "right",
+            arrowprops={"arrowstyle": "-", "linewidth": 0.5, "alpha": 0.6},
         )
     axes.set_xscale("log")
     axes.set_xlabel("CPU milliseconds a frame, one thread (median, quartiles)")

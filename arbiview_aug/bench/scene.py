@@ -16,15 +16,15 @@ import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from arbiview_aug.bench.data import REDUCES, as_of_another_frame, recorded
-from arbiview_aug.bench.timing import machine, machine_line, one_thread, quartiles, show, timed_rounds, versions
+from arbiview_aug.bench.timing import machine, machine_line, quartiles, show, timed_rounds
 from arbiview_aug.command_line import add_data, count
+from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.explain import Explanation
 from arbiview_aug.favs.config import FavsConfig, accurate
@@ -341,7 +341,8 @@ def _plan(case: Case) -> Callable[[], Any]:
     (frame,) = check_inputs(case.sample, None)
     (scene,) = scenes_of_frames(case.sample, [frame], (), surface)
     target = case.target if retarget.size is None else case.target.resized(retarget.size)
-    return partial(build_plan, frame.rig, target, surface=surface, config=config, scene=scene)
+    # A scene keeps what it made of its points: each plan gets one that was not asked before.
+    return lambda: build_plan(frame.rig, target, surface=surface, config=config, scene=replace(scene))
 
 
 def _done(case: Case, plan_ms: float | None, frame_ms: float) -> Done:

@@ -33,8 +33,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from arbiview_aug.bench.timing import machine, machine_line, one_thread, quartiles, show, timed_rounds, versions
+from arbiview_aug.bench.timing import machine, machine_line, quartiles, show, timed_rounds
 from arbiview_aug.datasets import FrameFolder, reduced_rig
+from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.favs.synthesis import render_opencv

@@ -15,13 +15,11 @@ import os
 import platform
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
-from importlib import metadata
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -29,7 +27,6 @@ from tqdm import tqdm
 
 from arbiview_aug.errors import DataError
 
-_DISTRIBUTIONS = ("arbiview_aug", "torch", "numpy", "kornia")
 _MIB = 2**20
 _LEAST_ROUNDS = 3  # a median of fewer is a single time
 
@@ -99,22 +96,6 @@ def timed_rounds(
     return {name: np.array(taken) for name, taken in times.items()}
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """OpenCV, torch and the linear algebra behind numpy on one thread; as before afterwards."""
-    from threadpoolctl import threadpool_limits  # a dependency of scikit-learn
-
-    before = cv2.getNumThreads(), torch.get_num_threads()
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
-    try:
-        with threadpool_limits(1, user_api="blas"):
-            yield
-    finally:
-        cv2.setNumThreads(before[0])
-        torch.set_num_threads(before[1])
-
-
 def peak_mib(run: Callable[[], Any]) -> float | None:
     """How much the process grows at most while ``run`` runs, in MiB; None where the system does not tell (no Linux)."""
     gc.collect()
@@ -149,17 +130,6 @@ def cpu_model() -> str:
         text = ""
     names = [line.partition(":")[2].strip() for line in text.splitlines() if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()
-
-
-def versions() -> dict[str, str]:
-    """Of what the times depend on."""
-    found = {"python": platform.python_version(), "opencv": cv2.__version__}
-    for name in _DISTRIBUTIONS:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
 
 
 def machine_line(report: Mapping[str, Any]) -> str:

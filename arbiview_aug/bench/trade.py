@@ -17,13 +17,14 @@ from typing import Any, get_args
 
 import torch
 
-from arbiview_aug.bench.data import REDUCES, Recorded, recorded
+from arbiview_aug.bench.data import REDUCES, SOURCES_OVER_VIEWS, Recorded, recorded
 from arbiview_aug.bench.front import LEAST_GAIN_DB, Advice, Point, at_least, distinct_steps, pareto_front, within_budget
 from arbiview_aug.bench.others import OURS, ROW_SPLIT, STITCHING, every_move, lost_moves, same_rotation
 from arbiview_aug.bench.plot import save_plot
 from arbiview_aug.bench.sweep import REFERENCE, REPEATS, Execution, Sweep, settings
-from arbiview_aug.bench.timing import Quartiles, machine, machine_line, one_thread, versions, write_json
+from arbiview_aug.bench.timing import Quartiles, machine, machine_line, write_json
 from arbiview_aug.command_line import add_data, add_target, count, size, writable_folder
+from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.tables import markdown_table
 from arbiview_aug.favs.config import Quality
@@ -33,8 +34,6 @@ from arbiview_aug.surface import SurfaceName
 SIZE = (256, 704)
 MOVES = ("paper", "yaw", "vehicles", "truck")
 """Sets of targets (``evaluate.targets.named_targets``) for ``--moves``."""
-_SOURCES_OVER_VIEWS = 2
-"""Synthetic images are as much larger than the views: so decoding at half size has something to save."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = _parser()
     arguments = parser.parse_args(argv)
     folder = writable_folder(Path(arguments.output), arguments.output)
-    sources = tuple(_SOURCES_OVER_VIEWS * side for side in arguments.size)
+    sources = tuple(SOURCES_OVER_VIEWS * side for side in arguments.size)
     with (
         one_thread(),
         warnings.catch_warnings(),

@@ -16,8 +16,8 @@ from typing import Any
 
 import pytest
 
-from arbiview_aug.bench.timing import one_thread
 from arbiview_aug.camera import Camera
+from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
 from arbiview_aug.evaluate.sparse import coloured_points, equalised, score_targets
 from arbiview_aug.evaluate.targets import UP_M, YAWS_DEG

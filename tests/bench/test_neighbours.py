@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import statistics
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,14 @@ import pytest
 from arbiview_aug import RigRetarget, fills, stitching
 from arbiview_aug.__main__ import main
 from arbiview_aug.bench.neighbours import COLUMNS, lowered, measure, nearest, travel_m
-from arbiview_aug.bench.timing import one_thread, timed_rounds
+from arbiview_aug.bench.timing import timed_rounds
 from arbiview_aug.datasets import FrameFolder, Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.datasets.writing import write_drive
+from arbiview_aug.environment import one_thread
 
 TOLERANCE = 0.02
-ATTEMPTS, ROUNDS = 3, 41
+ROUNDS = 121
 QUICK = ["--size", "32x88", "--reduce", "1", "--repeats", "1"]
 
 
@@ -112,23 +114,20 @@ def test_without_neighbours_nothing_of_fills_is_built_or_called(
 @pytest.mark.filterwarnings("ignore:target cameras")
 @pytest.mark.xfail("CI" in os.environ, reason="on shared machines ratios are reported, not asserted", strict=False)
 def test_fast_costs_the_same_without_neighbours(capsys: pytest.CaptureFixture[str]) -> None:
-    """Settings that would read neighbours against those that do not, on a sample that has none: the median of pairs of
-    CPU times, in turn, is 1 to 2 % in the best of three attempts."""
+    """A transform that would read neighbours against itself told not to, on a sample that has none: the median of pairs
+    of CPU times, in turn. Of two transforms one may be 7 % the slower, by where its memory lies."""
     sample = SyntheticDrive(demo_source_rig((450, 800)), num_frames=1, lidar=False)[0]
     del sample["boxes_3d"]
-    reading, not_reading = (
-        RigRetarget(sample["rig"].turned(yaw_deg=22), neighbours=reach) for reach in ("ground", None)
-    )
-    ratios = []
+    retarget = RigRetarget(sample["rig"].turned(yaw_deg=22))
+
+    def frame(reach: Any) -> None:
+        retarget.stitcher.reach = reach
+        retarget(sample)
+
+    work = {"reading": partial(frame, "ground"), "not": partial(frame, None)}
     with one_thread():
-        for _ in range(ATTEMPTS):
-            times = timed_rounds(
-                {"reading": lambda: reading(sample), "not": lambda: not_reading(sample)}, ROUNDS, "without neighbours"
-            )
-            ratios.append(statistics.median((times["reading"] / times["not"]).tolist()))
-            if abs(ratios[-1] - 1) <= TOLERANCE:
-                break
+        times = timed_rounds(work, ROUNDS, "without neighbours")
+    ratio, ms = (statistics.median(of.tolist()) for of in (times["reading"] / times["not"], times["reading"]))
     with capsys.disabled():
-        ms = statistics.median(times["reading"].tolist())
-        print(f"\nfast, {ms:.1f} ms a frame: {', '.join(f'{ratio:.3f}' for ratio in ratios)} of neighbours=None")
-    assert min(abs(ratio - 1) for ratio in ratios) <= TOLERANCE
+        print(f"\nfast, {ms:.1f} ms a frame: {ratio:.3f} of neighbours=None")
+    assert abs(ratio - 1) <= TOLERANCE
