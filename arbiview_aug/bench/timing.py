@@ -27,6 +27,9 @@ from tqdm import tqdm
 
 from arbiview_aug.errors import DataError
 
+Clock = Callable[[Callable[[], Any]], float]
+"""Milliseconds of a call."""
+
 _MIB = 2**20
 _LEAST_ROUNDS = 3  # a median of fewer is a single time
 
@@ -52,7 +55,7 @@ def process_ms(run: Callable[[], Any]) -> float:
     return 1e3 * (time.process_time() - start)
 
 
-def cuda_ms(device: torch.device) -> Callable[[Callable[[], Any]], float]:
+def cuda_ms(device: torch.device) -> Clock:
     """A clock for ``timed_rounds``: milliseconds between two events of a GPU's stream, which is empty before."""
 
     def clock(run: Callable[[], Any]) -> float:
@@ -74,7 +77,7 @@ def timed_rounds(
     label: str,
     *,
     enough_ms: float = math.inf,
-    clock: Callable[[Callable[[], Any]], float] = process_ms,
+    clock: Clock = process_ms,
 ) -> dict[str, npt.NDArray[np.float64]]:
     """Milliseconds of each candidate, in every round.
 

@@ -183,7 +183,8 @@ class CrossViewAttention(nn.Module):
         """The reference: Σ_taps softmax(logits) v of each valid place, gathered; (B, Q, T, width)."""
         share = torch.softmax(logits.float(), -1) * weight.reshape(-1, self.heads)[at.place][..., None]
         read = self._taken(values, at.tap)  # [E, 9, heads, 32]
-        of_place = (share.to(values.dtype).transpose(1, 2)[..., None] * read).sum(1).flatten(1)
+        # Autocast sums in float32 on GPUs, in the values' type on CPUs; index_add takes one type.
+        of_place = (share.to(values.dtype).transpose(1, 2)[..., None] * read).sum(1).flatten(1).to(values.dtype)
         B, Q, T = at.read.shape
         return values.new_zeros(B * Q * T, values.shape[-1]).index_add(0, at.token, of_place).view(B, Q, T, -1)
 

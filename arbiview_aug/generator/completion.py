@@ -16,6 +16,7 @@ from torch.nn import functional
 from arbiview_aug.camera import Camera
 from arbiview_aug.errors import GeneratorError, SampleError
 from arbiview_aug.generator.conditioning import Views
+from arbiview_aug.generator.config import GeneratorConfig
 from arbiview_aug.generator.correspondence import Window
 from arbiview_aug.generator.denoiser import REGRESSION
 from arbiview_aug.generator.geometry import FrameGeometry, frame_geometry
@@ -98,7 +99,8 @@ def complete(
 
     Raises:
         SampleError: Views, coverage and cameras that do not fit together.
-        GeneratorError: Impossible settings, or a generator on a GPU in a DataLoader worker.
+        GeneratorError: Impossible settings, one step of a generator that was not trained for it, or a generator on a
+            GPU in a DataLoader worker.
     """
     config = generator.config
     how = Sampling(
@@ -110,6 +112,11 @@ def complete(
     if how.steps < 1 or not 0 < how.strength <= 1:
         got = f"{how.steps} and {how.strength}"
         raise GeneratorError(f"complete: expected steps >= 1 and strength in (0, 1], got {got}")
+    if how.steps == 1 and not config.one_step:
+        raise GeneratorError(
+            f"complete: expected steps >= 2, got 1: the one-step regression of generator {config.name!r} was not "
+            "trained (loss.regression=0)"
+        )
     device = generator.denoiser.regression.weight.device
     if device.type == "cuda" and torch.utils.data.get_worker_info() is not None:
         raise GeneratorError(
@@ -231,7 +238,7 @@ def denoised(
         how: Settings.
     """
     config, denoiser, autoencoder = generator.config, generator.denoiser, generator.autoencoder
-    latent = autoencoder.encode(prefilled).float()
+    latent = autoencoder.encode(shown_condition(config, prefilled, known)).float()
     views, windows = geometry.target_views(latent, known, confidence), geometry.target_windows()
     source_views = geometry.source_views(autoencoder.encode(images).float(), seen, seen)
     read = denoiser.read_sources(source_views, geometry.source_windows())
@@ -250,9 +257,10 @@ def denoised(
         return guided(conditional, run(*unconditional), how.guidance, config.guidance_rescale)
 
     schedule = noise_schedule(prediction=config.prediction, zero_snr=config.zero_snr, solver=how.solver)
+    begins_inpainted = not (config.prefilled or config.residual or how.steps == 1)
     x0 = sample(
         predict,
-        latent,
+        autoencoder.encode(prefilled) if begins_inpainted else latent,
         noise,
         schedule,
         steps=how.steps,
@@ -261,6 +269,17 @@ def denoised(
         warm=config.residual,
     )
     return autoencoder.decode(x0).float().clamp(0, 1)
+
+
+def shown_condition(config: GeneratorConfig, prefilled: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
+    """The condition as a generator knows it from its training.
+
+    Args:
+        config: Settings.
+        prefilled: (..., 3, H, W) in [0, 1], holes inpainted.
+        known: (..., H, W) bool, or shares in [0, 1].
+    """
+    return prefilled if config.prefilled else torch.where(known[..., None, :, :] >= 0.5, prefilled, 0.5)
 
 
 def nearest_sources(target: Camera, sources: Rig) -> list[int]:

@@ -139,6 +139,12 @@ class GeneratorConfig:
     """What is diffused is what the pre-filled condition lacks of the image, see ``Denoiser``; never with ε. The first
     of several steps is then the regression, whose result is put back into noise."""
 
+    prefilled: bool = True
+    """Holes of the condition are filled by Telea's inpainting; else they are mid-grey, as Algorithm 1 has them."""
+
+    one_step: bool = True
+    """Whether the one-step regression was trained."""
+
     frozen_unet: bool = False
     """Train only attention, pose, the one-step head and the widened ``conv_in``."""
 
@@ -239,6 +245,8 @@ def paper() -> GeneratorConfig:
         prediction="epsilon",
         zero_snr=False,
         residual=False,
+        prefilled=False,
+        one_step=False,
         strength=0.6,
         temperature=1.0,
         frozen_unet=True,

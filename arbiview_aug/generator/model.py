@@ -127,7 +127,7 @@ class Generator(nn.Module):
     # --- folders ------------------------------------------------------------------------------------------------------
     @classmethod
     def from_pretrained(cls, folder: str | Path) -> Generator:
-        """The generator of a folder by ``save_pretrained``, in float32 on the CPU, ready to run.
+        """The generator of a folder by ``save_pretrained``, in float32 on the CPU, ready to run, its weights frozen.
 
         Raises:
             GeneratorError: No such folder; settings or weights that are missing, extra or of another shape.
@@ -140,7 +140,8 @@ class Generator(nn.Module):
         made.load_state_dict(
             {name: t.float() if t.is_floating_point() else t for name, t in tensors.items()}, assign=True
         )
-        return made.eval()
+        # As a part of a user's module they must not be found by its optimiser, or waited for by DDP.
+        return made.eval().requires_grad_(False)
 
     @classmethod
     def shipped(cls) -> Generator:

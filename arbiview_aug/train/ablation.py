@@ -10,11 +10,13 @@ from typing import Any
 import torch
 
 from arbiview_aug.generator import Generator
+from arbiview_aug.generator.completion import shown_condition
 from arbiview_aug.generator.denoiser import REGRESSION, Rows
 from arbiview_aug.generator.geometry import FrameGeometry
 from arbiview_aug.train.config import PseudoViewConfig, TrainConfig, overridden
 from arbiview_aug.train.data import Frames
 from arbiview_aug.train.held_out import gains, held_out_scores
+from arbiview_aug.train.losses import Perceptual
 from arbiview_aug.train.measure import hole_psnr, sampled
 from arbiview_aug.train.pseudo_views import Batch, PseudoViews, collate
 from arbiview_aug.train.step import without_attention
@@ -25,7 +27,7 @@ _AS_WRITTEN = (
     "pseudo_views.leave_one_out=0",
     "pseudo_views.virtual=0",
     "pseudo_views.real_sources=0",
-    "pseudo_views.prefilled=false",
+    "generator.prefilled=false",
 )
 
 ARMS: dict[str, tuple[str, ...]] = {
@@ -52,7 +54,7 @@ def wrong_rig(geometry: FrameGeometry) -> FrameGeometry:
 def correct_correspondences(generator: Generator, batch: Batch) -> float:
     """Share of the attention's rows whose largest weight lies on the tap nearest to H p_i."""
     encode = generator.autoencoder.encode
-    condition = encode(batch.condition).float()
+    condition = encode(shown_condition(generator.config, batch.condition, batch.known)).float()
     sources = batch.geometry.source_views(encode(batch.sources).float(), batch.seen, batch.seen)
     read = generator.denoiser.read_sources(sources, batch.geometry.source_windows())
     rows: list[Rows] = []
@@ -96,10 +98,13 @@ def ablate(
     *,
     arms: Sequence[str] = tuple(ARMS),
     views: int = 64,
+    perceptual: Perceptual | None = None,
     show: bool = True,
     say: Callable[[str], None] = print,
 ) -> dict[str, dict[str, Any]]:
     """Train and score each arm; what is done already is not done again. Writes ``ablation.json``.
+
+    SIGTERM and SIGINT end it: the arm that is trained goes on from there.
 
     Args:
         config: Of the run that the arms change.
@@ -108,6 +113,7 @@ def ablate(
         output: A folder with one for each arm.
         arms: Of ``ARMS``.
         views: Held-out views for the scores.
+        perceptual: As for ``Trainer``.
         show: Progress bars.
         say: Gets the table.
     """
@@ -117,11 +123,14 @@ def ablate(
     for arm in arms:
         changed = overridden(config, ARMS[arm])
         folder = output / arm.replace(" ", "_").replace("+", "with")
-        trainer = Trainer(changed, frames, make(), folder, show=show, say=say)
-        trainer.train()
-        generator = Generator.from_pretrained(folder / "generator")
-        masks = trainer.items.masks
-        batch = seen_batch(frames, indices, config, masks)
+        trainer = Trainer(changed, frames, make(), folder, perceptual=perceptual, show=show, say=say)
+        if not trainer.train():
+            return table  # stopped: an arm half trained is not scored
+        if not trainer.is_main:
+            trainer.accelerator.wait_for_everyone()
+            continue
+        generator = Generator.from_pretrained(folder / "generator").to(trainer.device)
+        batch = seen_batch(frames, indices, changed, trainer.items.masks).to(trainer.device)
         scores = held_out_scores(generator, frames, indices, steps=config.generator.steps, mean_of=0, show=show)
         table[arm] = {
             "against Telea": {name: gain._asdict() for name, gain in gains(scores).items()},
@@ -131,6 +140,7 @@ def ablate(
         output.mkdir(parents=True, exist_ok=True)
         (output / "ablation.json").write_text(json.dumps(table, indent=1) + "\n")
         say(f"{arm}: {json.dumps(table[arm])}")
+        trainer.accelerator.wait_for_everyone()
     say(text_of(table))
     return table
 

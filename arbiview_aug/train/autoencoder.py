@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 from arbiview_aug.errors import GeneratorError, TrainingError
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.checkpoint import CONFIG_FILE, check_tensors, read_checkpoint, write_checkpoint
 from arbiview_aug.train.config import AutoencoderTraining, TrainConfig
-from arbiview_aug.train.data import Frames
+from arbiview_aug.train.data import Frames, forked, one_thread_worker
 from arbiview_aug.train.losses import Perceptual
 from arbiview_aug.train.masks import one_of
 from arbiview_aug.train.state import Average, has_state, load_state, save_state
@@ -42,7 +43,7 @@ def train_autoencoder(
     """Give a generator a trained autoencoder: that of ``output``, or one that is trained and saved there.
 
     L1 + KL, and VGG's distance where there are weights (Rombach et al. 2022, without their discriminator). Afterwards
-    latents are scaled to unit variance, as the diffusion expects. Resumed as the run itself.
+    latents are scaled to unit variance, as the diffusion expects. Saved and resumed as the run itself.
 
     Args:
         config: Settings; does nothing where latents are pixels.
@@ -75,11 +76,20 @@ def train_autoencoder(
     average = Average(vae, 0.0)  # of the state's format: the weights themselves
     done = load_state(unfinished, config, vae, average, optimiser) if has_state(unfinished) else 0
     vae.train()
-    bar = tqdm(range(done, stage.steps), desc="autoencoder", unit="step", disable=not show)
+    batches = _Batches(frames, training, stage.batch, config.seed)
+    loader: DataLoader[torch.Tensor] = DataLoader(
+        batches,
+        batch_size=None,
+        sampler=range(done, stage.steps),
+        num_workers=config.workers,
+        multiprocessing_context=forked(config.workers),
+        worker_init_fn=one_thread_worker if config.workers else None,
+    )
+    bar = tqdm(loader, desc="autoencoder", unit="step", initial=done, total=stage.steps, disable=not show)
     with StopRequests() as stop:
-        for step in bar:
-            rng = torch.Generator().manual_seed(config.seed * 2**32 + step)
-            images = _images(frames, training, stage.batch, rng).to(device)
+        for step, on_cpu in enumerate(bar, done):
+            rng = torch.Generator().manual_seed((2 * config.seed + 1) * 2**32 + step)
+            images = on_cpu.to(device).float() / 255
             terms = _terms(vae, images, stage, perceptual, rng, bf16=config.precision == "bf16")
             numbers = torch.stack(list(terms.values())).detach().tolist()
             values = dict(zip(terms, numbers, strict=True))
@@ -95,15 +105,15 @@ def train_autoencoder(
             bar.set_postfix({name: f"{value:.4f}" for name, value in values.items()})
             if step % _MESSAGE_EVERY == 0:
                 say(f"autoencoder, step {step}: L1 {255 * values['l1']:.2f} grey levels")
-            if stop.asked:
+            if stop.asked or (step + 1) % config.save_every == 0:
                 average.update(vae, step)
                 save_state(unfinished, config, step + 1, vae, average, optimiser)
+            if stop.asked:
                 say(f"stopped after step {step + 1} of the autoencoder; saved: the same command goes on from there")
                 return False
     vae.eval()
-    rng = torch.Generator().manual_seed(config.seed)
     with torch.no_grad():
-        images = _images(frames, training, _SCALE_IMAGES, rng).to(device)
+        images = _Batches(frames, training, _SCALE_IMAGES, config.seed)[stage.steps].to(device).float() / 255
         deviation = torch.cat([vae.encode(part * 2 - 1).latent_dist.mode() for part in images.split(8)]).std()
     generator.autoencoder.scale = float(1 / deviation)
     write_checkpoint(folder, {"scale": generator.autoencoder.scale, "training": asdict(stage)}, vae.state_dict())
@@ -143,11 +153,19 @@ def _load(generator: Generator, folder: Path) -> None:
     generator.autoencoder.scale = float(data["scale"])
 
 
-def _images(frames: Frames, indices: list[int], count: int, rng: torch.Generator) -> torch.Tensor:
-    """(count, 3, H, W) float32 in [0, 1], drawn; half of them mirrored."""
-    images = []
-    for _ in range(count):
-        frame = frames[indices[one_of(rng, len(indices))]]
-        image = frame.images[one_of(rng, len(frame.images))]
-        images.append(image.flip(-1) if one_of(rng, 2) else image)
-    return torch.stack(images).float() / 255
+class _Batches(Dataset[torch.Tensor]):
+    """Batch k, from (seed, k) alone: (count, 3, H, W) uint8, half of them mirrored.
+
+    All images of a frame that is drawn: its files are decoded together.
+    """
+
+    def __init__(self, frames: Frames, indices: list[int], count: int, seed: int) -> None:
+        self.frames, self.indices, self.count, self.seed = frames, indices, count, seed
+
+    def __getitem__(self, step: int) -> torch.Tensor:
+        rng = torch.Generator().manual_seed(2 * self.seed * 2**32 + step)
+        images: list[torch.Tensor] = []
+        while len(images) < self.count:
+            drawn = self.frames[self.indices[one_of(rng, len(self.indices))]].images
+            images += [image.flip(-1) if one_of(rng, 2) else image for image in drawn]
+        return torch.stack(images[: self.count]).cpu()

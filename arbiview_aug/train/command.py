@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Callable
+from datetime import timedelta
 from pathlib import Path
 
 import torch
@@ -19,9 +20,12 @@ from arbiview_aug.train.config import CONFIGS, TrainConfig, overridden
 from arbiview_aug.train.data import Frames, Split, open_frames
 from arbiview_aug.train.held_out import held_out_scores, report
 from arbiview_aug.train.losses import Perceptual, load_perceptual
+from arbiview_aug.train.state import saved_config
 from arbiview_aug.train.trainer import Trainer
 
 COMMANDS = ("train", "ablate", "evaluate")
+
+_LONGEST_WAIT = timedelta(hours=24)
 
 
 def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> int:
@@ -32,7 +36,12 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
     """
     config = overridden(CONFIGS[arguments.config](), arguments.set)
     output = writable_folder(Path(arguments.output), arguments.output)
-    processes = optional_package("accelerate", "generator").PartialState(cpu=not torch.cuda.is_available())
+    if arguments.command == "evaluate":
+        config = saved_config(output / "state", config)
+    processes = optional_package("accelerate", "generator").PartialState(
+        cpu=not torch.cuda.is_available(),
+        timeout=_LONGEST_WAIT,  # the others wait while one trains the autoencoder, or scores
+    )
     say, show = (say if processes.is_main_process else _nothing), processes.is_main_process and not arguments.quiet
     device = processes.device
     size, seed = config.generator.image_size, config.seed
@@ -45,6 +54,8 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
     check_weights(config, arguments.weights)
     if arguments.data == "synthetic":
         used = [*split.training, *split.validation]
+        if device.type != "cpu" and config.workers:
+            frames.check_fits(used)  # workers cannot render there what is not held
         frames.prepare(used, workers=_readers(len(used)) if device.type == "cpu" else 0, show=show)
     perceptual = _perceptual(config, arguments.vgg_weights, say)
 
@@ -58,7 +69,9 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
     if not ready:
         return 0
     if arguments.command == "ablate":
-        ablate(config, frames, lambda: made()[0], output, views=arguments.views, show=show, say=say)
+        ablate(
+            config, frames, lambda: made()[0], output, views=arguments.views, perceptual=perceptual, show=show, say=say
+        )
         return 0
     if arguments.stage == "autoencoder":
         say(f"the autoencoder is in {output / 'autoencoder'}")

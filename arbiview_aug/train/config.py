@@ -51,9 +51,6 @@ class PseudoViewConfig:
     real_sources: float = 0.3
     """Probability that the source branches are the nearest real cameras, as at inference."""
 
-    prefilled: bool = True
-    """Holes of the condition are filled by Telea's inpainting; else they are mid-grey."""
-
     mask_bank: int = 128
     """Coverage masks drawn from the retarget distribution at the start."""
 
@@ -162,6 +159,8 @@ class TrainConfig:
     """Synthetic streets, where the data are those."""
 
     workers: int = 0
+    """Processes that make items, on the CPU; 0 makes them in this one, on the GPU where there is one."""
+
     seed: int = 0
     save_every: int = 500
     validate_every: int = 500
@@ -264,12 +263,14 @@ def _put(data: dict[str, Any], path: Sequence[str], value: Any, setting: str) ->
 
 # --- configurations ---------------------------------------------------------------------------------------------------
 def paper() -> TrainConfig:
-    """Algorithm 1 and the losses as published, on Stable Diffusion's frozen weights (Sec. Training Parameters)."""
+    """Algorithm 1 as published, on Stable Diffusion's frozen weights (Sec. Training Parameters).
+
+    Not to the letter: L_geo is normalised, since as printed it outgrows L_main (``loss.geo_mode="frobenius_sum"``), and
+    L_perceptual compares crops at early times.
+    """
     return TrainConfig(
         generator=generators.paper(),
-        pseudo_views=PseudoViewConfig(
-            moved=1.0, transplanted=0.0, leave_one_out=0.0, virtual=0.0, real_sources=0.0, prefilled=False
-        ),
+        pseudo_views=PseudoViewConfig(moved=1.0, transplanted=0.0, leave_one_out=0.0, virtual=0.0, real_sources=0.0),
         loss=LossConfig(snr_limit=0.0, known=1.0, regression=0.0),
         steps=100_000,
         batch=8,

@@ -7,8 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import torch
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, get_worker_info
 from tqdm import tqdm
 
 from arbiview_aug.datasets.frame_folder import SEQUENCE_FILE, FrameFolder
@@ -19,6 +20,7 @@ from arbiview_aug.errors import TrainingError
 from arbiview_aug.held import Held
 from arbiview_aug.rig import Rig
 from arbiview_aug.tensors import resized
+from arbiview_aug.train.stopping import ignore_stop_requests
 
 SHARES = (0.6, 0.2)
 """Of the scenes, for training and for validation; the rest are held out (Sec. Dataset)."""
@@ -27,7 +29,7 @@ _BLOCKS = 10
 """Scenes that one drive without scenes is cut into."""
 
 HELD_BYTES = 4 * 2**30
-"""Memory for frames: 46 000 of six 128 x 224 images."""
+"""Memory for frames, of all workers together: 8 000 of six 128 x 224 images."""
 
 
 class Frame(NamedTuple):
@@ -63,12 +65,15 @@ class Frames:
 
     def __init__(self, dataset: Dataset[dict[str, Any]], size: tuple[int, int], scenes: Sequence[str]) -> None:
         self.dataset, self.size, self.scenes = dataset, size, list(scenes)
-        self._held: Held[int, Frame] = Held(HELD_BYTES, lambda f: sum(i.nbytes for i in f.images))
+        self._held: Held[int, Frame] = Held(HELD_BYTES, _bytes_of)
 
     def __len__(self) -> int:
         return len(self.scenes)
 
     def __getitem__(self, index: int) -> Frame:
+        worker = get_worker_info()
+        if worker is not None:
+            self._held.limit = HELD_BYTES // worker.num_workers
         return self._held.get(index, lambda: self._read(index))
 
     def _read(self, index: int) -> Frame:
@@ -97,6 +102,19 @@ class Frames:
                 frame = frame._replace(images=[image.clone() for image in frame.images])
             self._held.get(index, partial(_as_it_is, frame))
 
+    def check_fits(self, indices: Sequence[int]) -> None:
+        """Refuse frames that cannot all be held.
+
+        Raises:
+            TrainingError: With the fix.
+        """
+        needed = len(indices) * _bytes_of(self[indices[0]])
+        if needed > HELD_BYTES:
+            raise TrainingError(
+                f"scenes: expected frames of at most {HELD_BYTES / 2**30:g} GiB together, since workers cannot render "
+                f"on a GPU, got {needed / 2**30:.1f} GiB; take fewer, or workers=0"
+            )
+
     def split(self, seed: int = 0) -> Split:
         """60/20/20 by scenes: no scene is in two parts. Depends on the seed and the scenes' names alone.
 
@@ -113,9 +131,20 @@ class Frames:
         return Split(*parts)
 
 
+def _bytes_of(frame: Frame) -> int:
+    return sum(image.nbytes for image in frame.images)
+
+
 def forked(workers: int) -> str | None:
     """How workers start: as copies of this process, which share the frames it holds; newer Pythons would not."""
     return "fork" if workers else None
+
+
+def one_thread_worker(worker: int) -> None:
+    """Starts a worker: one thread, and signals are the parent's to answer."""
+    cv2.setNumThreads(0)
+    torch.set_num_threads(1)
+    ignore_stop_requests()
 
 
 def _as_it_is(value: Any) -> Any:

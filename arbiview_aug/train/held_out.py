@@ -53,7 +53,8 @@ def held_out_scores(
         show: Progress bar.
 
     Returns:
-        ``telea``, ``one_step``, ``sample``, ``mean``; and ``sample_energy``, gradient energy against the truth.
+        ``telea``, ``one_step`` where that was trained, ``sample``, ``mean``; and ``sample_energy``, gradient energy
+        against the truth.
 
     Raises:
         TrainingError: Frames without truth.
@@ -70,7 +71,9 @@ def held_out_scores(
         truth = drive.render(index, rig).images[0].float()[None, None] / 255
         holes = ~covered[None, None]
         completed = partial(_completed, generator, frame, rig, shown, covered, trust)
-        ways = {"telea": telea(shown, ~covered)[None, None], "one_step": completed(1, 0)}
+        ways = {"telea": telea(shown, ~covered)[None, None]}
+        if generator.config.one_step:
+            ways["one_step"] = completed(1, 0)
         ways["sample"] = completed(steps, seed)
         if mean_of:
             others = [completed(steps, 1000 * (seed + 1) + k) for k in range(mean_of)]

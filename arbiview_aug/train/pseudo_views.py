@@ -48,7 +48,7 @@ class Batch(NamedTuple):
         truth: (B, N, 3, H, W) the real view.
         valid: (B, N, H, W) bool, where it is known.
         favs: (B, N, 3, H, W) FAVS of the pair at the target pose, black where it shows nothing.
-        condition: (B, N, 3, H, W) the same, its holes filled.
+        condition: (B, N, 3, H, W) the same, its holes inpainted.
         known: (B, N, H, W) bool, what it shows.
         confidence: (B, N, H, W) in [0, 1].
         sources: (B, S, 3, H, W).
@@ -145,6 +145,7 @@ class PseudoViews(Dataset[Batch]):
         generator: Of the generator: sizes and depth levels.
         masks: (n, h, w) bool to transplant.
         seed: Of all draws.
+        device: Where FAVS renders: workers cannot use a GPU.
     """
 
     def __init__(
@@ -155,7 +156,9 @@ class PseudoViews(Dataset[Batch]):
         generator: GeneratorConfig,
         masks: torch.Tensor,
         seed: int,
+        device: torch.device | str = "cpu",
     ) -> None:
+        self.device = device
         self.frames, self.indices, self.config = frames, list(indices), config
         self.generator, self.masks, self.seed = generator, masks, seed
 
@@ -163,6 +166,7 @@ class PseudoViews(Dataset[Batch]):
         config, view = self.config, k // self.config.pairs
         rng = self._rng("view", view)
         frame = self.frames[self.indices[one_of(rng, len(self.indices))]]
+        frame = frame._replace(images=[image.to(self.device) for image in frame.images])
         i = one_of(rng, len(frame.rig))
         target, truth, valid = self._target(frame.images[i], frame.rig[i], rng)
         rng = self._rng("pair", k)
@@ -189,7 +193,7 @@ class PseudoViews(Dataset[Batch]):
         if transplanted and not hidden:
             known = known & mask.to(known.device)
         shown = at_target.images[0] * known
-        filled = telea(shown, ~known) if config.prefilled else torch.where(known, shown, 0.5)
+        filled = telea(shown, ~known)
         # --- the source branches
         sources, seen, branches = pseudo.images, pseudo.covered, list(pair)
         real = uniform(rng, 0, 1) < config.real_sources

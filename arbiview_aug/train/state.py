@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from arbiview_aug.errors import GeneratorError, TrainingError
-from arbiview_aug.generator.checkpoint import CONFIG_FILE, read_checkpoint, write_checkpoint
+from arbiview_aug.generator.checkpoint import CONFIG_FILE, read_checkpoint, read_config, write_checkpoint
 from arbiview_aug.train.config import TrainConfig
 
 
@@ -67,6 +67,20 @@ def save_state(
         for key, value in optimiser.state[parameter].items():
             tensors[f"optimiser.{k}.{key}"] = torch.as_tensor(value)
     write_checkpoint(folder, {"step": step, "training": config.to_dict()}, tensors)
+
+
+def saved_config(folder: Path, otherwise: TrainConfig) -> TrainConfig:
+    """The settings of the run whose state a folder holds: its scenes, sizes and split; others where it holds none.
+
+    Raises:
+        TrainingError: The state is broken.
+    """
+    if not has_state(folder):
+        return otherwise
+    try:
+        return TrainConfig.from_dict(read_config(folder)[0]["training"])
+    except (GeneratorError, KeyError) as error:
+        raise TrainingError(f"{folder}: expected the state of a training run: {error}") from None
 
 
 def load_state(

@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from arbiview_aug.generator.autoencoder import Autoencoder
+from arbiview_aug.generator.completion import shown_condition
 from arbiview_aug.generator.conditioning import pooled
 from arbiview_aug.generator.denoiser import REGRESSION, TIMESTEPS, Denoiser, Rows
 from arbiview_aug.generator.geometry import FrameGeometry
@@ -80,9 +81,10 @@ class Step(nn.Module):
         autoencoder, vgg = self._frozen
         if not config.attention:
             batch = batch._replace(geometry=without_attention(batch.geometry))
+        shown = shown_condition(config.generator, batch.condition, batch.known)
         with torch.no_grad():
             x0, condition, sources = (
-                autoencoder.encode(images).float() for images in (batch.truth, batch.condition, batch.sources)
+                autoencoder.encode(images).float() for images in (batch.truth, shown, batch.sources)
             )
         size = (x0.shape[-2], x0.shape[-1])
         valid = (pooled(batch.valid, size) > 0.99).float()[:, :, None]

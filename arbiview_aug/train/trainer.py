@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +15,17 @@ from tqdm import tqdm
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator import Generator
+from arbiview_aug.generator.completion import shown_condition
 from arbiview_aug.generator.conditioning import pooled
 from arbiview_aug.train.config import TrainConfig
-from arbiview_aug.train.data import Frames, forked
+from arbiview_aug.train.data import Frames, forked, one_thread_worker
 from arbiview_aug.train.losses import Perceptual
 from arbiview_aug.train.masks import mask_bank
 from arbiview_aug.train.measure import hole_psnr, picture, sampled, save_png
 from arbiview_aug.train.pseudo_views import Batch, PseudoViews, collate
 from arbiview_aug.train.state import Average, has_state, load_state, put_back, save_state
 from arbiview_aug.train.step import Step, draw
-from arbiview_aug.train.stopping import StopRequests, ignore_stop_requests
+from arbiview_aug.train.stopping import StopRequests
 
 _LOG_EVERY = 10
 _DEVIATION_ITEMS = 32
@@ -72,6 +74,7 @@ class Trainer:
         self.show, self._say = show and self.is_main, say
         self.device = self.accelerator.device
         self.generator = generator.to(self.device)
+        generator.config = replace(generator.config, one_step=config.loss.regression > 0)
         generator.autoencoder.requires_grad_(False)
         generator.denoiser.gradient_checkpointing = config.checkpointing
         self.split = frames.split(config.seed)
@@ -85,7 +88,9 @@ class Trainer:
         if has_state(self.state_folder):
             self.done = load_state(self.state_folder, config, generator.denoiser, self.average, self.optimiser)
             self.say(f"going on after step {self.done} of {self.state_folder}")
-        self.model, self._optimiser = self.accelerator.prepare(step, self.optimiser)
+        # Not placed: AdamW's step counters belong on the CPU, else each is waited for.
+        placed = [True, False]
+        self.model, self._optimiser = self.accelerator.prepare(step, self.optimiser, device_placement=placed)
         self.step = step
         self._stop = StopRequests()
         masks = mask_bank(
@@ -110,9 +115,9 @@ class Trainer:
 
     def _items(self, indices: list[int], masks: torch.Tensor, what: str) -> PseudoViews:
         config = self.config
-        return PseudoViews(
-            self.frames, indices, config.pseudo_views, config.generator, masks, 10 * config.seed + _SEEDS[what]
-        )
+        device = "cpu" if config.workers else self.device
+        seed = 10 * config.seed + _SEEDS[what]
+        return PseudoViews(self.frames, indices, config.pseudo_views, config.generator, masks, seed, device)
 
     @torch.no_grad()
     def _measure_deviation(self) -> None:
@@ -121,7 +126,8 @@ class Trainer:
         sums = torch.zeros(2, 2, dtype=torch.float64)
         for k in range(_DEVIATION_ITEMS):
             batch = self.items[k].to(self.device)
-            lacks = (encode(batch.truth) - encode(batch.condition)).float().square().mean(2)
+            shown = shown_condition(self.config.generator, batch.condition, batch.known)
+            lacks = (encode(batch.truth) - encode(shown)).float().square().mean(2)
             known, valid = (pooled(m, (lacks.shape[-2], lacks.shape[-1])) > 0.99 for m in (batch.known, batch.valid))
             for row, where in enumerate((valid & ~known, valid & known)):
                 sums[row] += torch.stack([lacks[where].sum(), where.sum()]).cpu()
@@ -212,7 +218,7 @@ class Trainer:
                 collate_fn=collate,
                 num_workers=config.workers,
                 multiprocessing_context=forked(config.workers),
-                worker_init_fn=_one_thread if config.workers else None,
+                worker_init_fn=one_thread_worker if config.workers else None,
             )
         )
 
@@ -229,15 +235,17 @@ class Trainer:
         Raises:
             OSError: One could not be written; what was there is as it was.
         """
-        if self.is_main:
-            denoiser = self.generator.denoiser
-            save_state(self.state_folder, self.config, self.done, denoiser, self.average, self.optimiser)
-            with_average = self.average.put_into(denoiser)
-            try:
-                self.generator.save_pretrained(self.output / "generator")
-            finally:
-                put_back(denoiser, with_average)
-        self.accelerator.wait_for_everyone()
+        try:
+            if self.is_main:
+                denoiser = self.generator.denoiser
+                save_state(self.state_folder, self.config, self.done, denoiser, self.average, self.optimiser)
+                with_average = self.average.put_into(denoiser)
+                try:
+                    self.generator.save_pretrained(self.output / "generator")
+                finally:
+                    put_back(denoiser, with_average)
+        finally:  # the others wait, whatever became of it
+            self.accelerator.wait_for_everyone()
 
     def _save_or_warn(self) -> None:
         try:
@@ -294,11 +302,3 @@ def learning_rate(config: TrainConfig, step: int) -> float:
         return config.lr * (step + 1) / config.warmup
     done = (step - config.warmup) / max(1, config.steps - config.warmup)
     return config.lr * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
-
-
-def _one_thread(worker: int) -> None:
-    import cv2
-
-    cv2.setNumThreads(0)
-    torch.set_num_threads(1)
-    ignore_stop_requests()

@@ -47,8 +47,9 @@ def test_with_an_autoencoder_frozen_or_in_half_precision(tmp_path: Path) -> None
     for name, value in made.state_dict().items():
         found = loaded.state_dict()[name]
         assert found.dtype == value.dtype == torch.float32 and torch.allclose(found, value, atol=1e-3), name
-    own = {id(p) for p in loaded.denoiser.own_parameters()}
-    assert all(p.requires_grad == (id(p) in own) for p in loaded.parameters())
+    own = {id(p) for p in made.denoiser.own_parameters()}
+    assert all(p.requires_grad == (id(p) in own) for p in made.parameters())
+    assert not any(p.requires_grad for p in loaded.parameters())  # to be used, not trained
     size = weights(tmp_path).stat().st_size
     assert size < 2.1 * sum(p.numel() for p in made.parameters()) + 1e5
 

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
 import torch
 
-from arbiview_aug.errors import TrainingError
+from arbiview_aug.errors import GeneratorError, TrainingError
 from arbiview_aug.generator import Generator
+from arbiview_aug.generator.completion import shown_condition
 from arbiview_aug.train.ablation import correct_correspondences, seen_scores, text_of, wrong_rig
 from arbiview_aug.train.data import open_frames
 from arbiview_aug.train.held_out import gains, held_out_scores
 from arbiview_aug.train.measure import bootstrap, hole_psnr, picture, sampled, save_png
 from arbiview_aug.train.pseudo_views import Batch, PseudoViews, collate
 from arbiview_aug.train.step import without_attention
-from tests.generator.small import stirred
+from tests.generator.small import ring, stirred
 from tests.train.small import config, frames
 from tests.train.test_pseudo_views import HOLE
 
@@ -115,3 +118,42 @@ def test_the_table_names_every_arm() -> None:
     row = {"against Telea": {"one_step": gain, "sample": gain}, "seen by a source": seen, "top-1": 0.5}
     text = text_of({"as written": row, "all additions": row})
     assert "as written" in text and "all additions" in text and "+1.00" in text and "50%" in text
+
+
+def test_an_ablation_that_is_stopped_scores_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from arbiview_aug.train import ablation
+
+    monkeypatch.setattr(ablation.Trainer, "train", lambda self: False)
+    settings = config()
+    made = ablation.ablate(
+        settings, frames(), lambda: Generator.from_config(settings.generator), tmp_path, show=False, say=print
+    )
+    assert made == {} and not (tmp_path / "ablation.json").exists()
+
+
+def test_holes_of_the_condition_as_they_were_in_training(batch: Batch) -> None:
+    """Grey for a generator of Algorithm 1 as written, inpainted for the others; what is known stays."""
+    settings = config().generator
+    grey = shown_condition(replace(settings, prefilled=False), batch.condition, batch.known)
+    known = batch.known[:, :, None].expand_as(grey)
+    assert bool((~batch.known).any()) and bool((grey[~known] == 0.5).all())
+    assert torch.equal(grey[known], batch.condition[known])
+    assert shown_condition(settings, batch.condition, batch.known) is batch.condition
+    made = []
+    for prefilled in (False, True):
+        torch.manual_seed(0)
+        generator = stirred(Generator.from_config(replace(settings, prefilled=prefilled)))
+        made.append(sampled(generator, batch, steps=2, seed=0))
+    assert not torch.equal(*made)
+
+
+def test_one_step_of_a_generator_that_was_not_trained_for_it() -> None:
+    settings = replace(config().generator, one_step=False, name="of samples")
+    generator = Generator.from_config(settings)
+    rig = ring(3)
+    black = torch.zeros(3, 3, *rig[0].size)
+    asked: dict[str, Any] = {"coverage": torch.zeros(3, *rig[0].size, dtype=torch.bool), "targets": rig}
+    with pytest.raises(GeneratorError, match="the one-step regression of generator 'of samples' was not trained"):
+        generator.complete_views(black, source_images=black, sources=rig, steps=1, **asked)
+    done = generator.complete_views(black, source_images=black, sources=rig, steps=2, **asked)
+    assert done.denoised == [0, 1, 2]

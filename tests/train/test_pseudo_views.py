@@ -22,7 +22,6 @@ AS_WRITTEN: Mapping[str, Any] = {
     "leave_one_out": 0.0,
     "virtual": 0.0,
     "real_sources": 0.0,
-    "prefilled": False,
     "moved": 0.0,
     "mask_bank": 4,
 }
@@ -59,9 +58,7 @@ def test_an_item_is_its_number() -> None:
 
 
 def test_shapes_and_ranges() -> None:
-    made = items(
-        transplanted=0.8, hidden=0.5, leave_one_out=0.2, virtual=0.4, real_sources=0.4, moved=0.5, prefilled=True
-    )
+    made = items(transplanted=0.8, hidden=0.5, leave_one_out=0.2, virtual=0.4, real_sources=0.4, moved=0.5)
     batch = collate([made[k] for k in range(12)])
     h, w = SIZE
     assert batch.truth.shape == batch.favs.shape == batch.condition.shape == (12, 1, 3, h, w)

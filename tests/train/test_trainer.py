@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import signal
 from dataclasses import replace
@@ -11,13 +12,15 @@ from typing import Any
 
 import pytest
 import torch
+from torch.overrides import TorchFunctionMode
 
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.checkpoint import read_checkpoint
 from arbiview_aug.generator.denoiser import REGRESSION
-from arbiview_aug.train import state, trainer
-from arbiview_aug.train.config import LossConfig
+from arbiview_aug.train import state
+from arbiview_aug.train.config import LossConfig, tiny
+from arbiview_aug.train.data import one_thread_worker
 from arbiview_aug.train.losses import Perceptual
 from arbiview_aug.train.pseudo_views import collate
 from arbiview_aug.train.trainer import Trainer, learning_rate
@@ -150,7 +153,7 @@ def test_signals_of_workers_are_left_to_the_trainer() -> None:
     before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
     threads = torch.get_num_threads()
     try:
-        trainer._one_thread(0)
+        one_thread_worker(0)
         assert signal.getsignal(signal.SIGTERM) == signal.SIG_IGN
     finally:
         torch.set_num_threads(threads)
@@ -183,6 +186,59 @@ def test_bfloat16_and_recomputed_blocks_train(tmp_path: Path, checkpointing: boo
         AcceleratorState._reset_state(reset_partial_state=True)
     assert all(value.dtype == torch.float32 for name, value in tensors(tmp_path).items())
     assert all(bool(torch.isfinite(value).all()) for value in tensors(tmp_path).values())
+
+
+class GpuAutocast(TorchFunctionMode):
+    """What CUDA's autocast does in float32 and the CPU's does not, after its list of ops."""
+
+    WIDE = ("sum", "prod", "cumsum", "norm", "pow", "softmax", "layer_norm", "group_norm", "exp", "log", "rsqrt")
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        is_half = isinstance(out, torch.Tensor) and out.dtype == torch.bfloat16
+        return out.float() if is_half and getattr(func, "__name__", "") in self.WIDE else out
+
+
+@pytest.mark.parametrize("dense", [False, True])
+def test_bfloat16_as_on_a_gpu_trains(tmp_path: Path, dense: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sums come back in float32 there, and go into ops that take one type."""
+    monkeypatch.setattr("arbiview_aug.generator.attention.pays_dense", lambda at: dense)
+    settings = config(steps=1, checkpointing=False)
+    torch.manual_seed(0)
+    generator = Generator.from_config(settings.generator)
+    made = Trainer(settings, frames(), generator, tmp_path, show=False, say=lambda _: None)
+    with GpuAutocast(), torch.autocast("cpu", torch.bfloat16):
+        assert all(math.isfinite(value) for value in made.train_step(next(made._batches())).values())
+
+
+def test_what_was_trained_is_said_to_whoever_loads_it(tmp_path: Path) -> None:
+    for share in (0.0, 0.3):
+        made = run(tmp_path / str(share), steps=1, loss=LossConfig(perceptual=0.0, regression=share))
+        made.save()
+        loaded = Generator.from_pretrained(tmp_path / str(share) / "generator")
+        assert loaded.config.one_step == (share > 0)
+        assert not any(parameter.requires_grad for parameter in loaded.parameters())
+
+
+def test_the_settings_of_a_run_are_found_again(tmp_path: Path) -> None:
+    """``evaluate`` must not score a run on the streets of another split or size."""
+    assert state.saved_config(tmp_path / "state", tiny()) == tiny()
+    made = run(tmp_path, seed=7)
+    made.save()
+    assert state.saved_config(tmp_path / "state", tiny()) == made.config
+
+
+def test_others_are_not_left_waiting_where_saving_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = run(tmp_path)
+    waited: list[int] = []
+    monkeypatch.setattr(made.accelerator, "wait_for_everyone", lambda: waited.append(1))
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("arbiview_aug.train.trainer.save_state", full)
+    made._save_or_warn()
+    assert waited == [1]
 
 
 def test_recomputing_blocks_changes_no_step(tmp_path: Path) -> None:
