@@ -8,6 +8,8 @@ import os
 import re
 import secrets
 import socket
+import tokenize
+import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +18,12 @@ from pathlib import Path
 from typing import BinaryIO
 
 from arbiview_aug.errors import OutputError
+
+BROKEN_ARRAY = (
+    *(OSError, ValueError, EOFError, SyntaxError, RuntimeError, MemoryError),
+    *(tokenize.TokenError, zipfile.BadZipFile, zlib.error),
+)
+"""What ``numpy.load`` raises for files that are damaged, here and there a byte: nine kinds."""
 
 _PART = ".part"
 _IS_PART = re.compile(r"\..+\.\w*-[0-9a-f]{8}-\d+-[0-9a-f]{8}\.part")
@@ -77,6 +85,8 @@ def write_whole(files: Mapping[Path, bytes], owner: str = "") -> None:
 def link_whole(source: Path, path: Path, owner: str = "") -> None:
     """A hard link to a file, or a copy on another file system; one that is there with the same size stays.
 
+    Of a symbolic link: to what it leads to, since a relative one would lead nowhere from elsewhere.
+
     Raises:
         FileNotFoundError: There is no such source.
         OutputError: The link cannot be made.
@@ -88,7 +98,7 @@ def link_whole(source: Path, path: Path, owner: str = "") -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
         try:
-            os.link(source, path)
+            os.link(source.resolve() if source.is_symlink() else source, path)
             return
         except FileExistsError:  # another process was faster
             return

@@ -20,7 +20,7 @@ from arbiview_aug.convert.report import write_report
 from arbiview_aug.convert.settings import FOLDER, Data, Settings, check_output, check_target
 from arbiview_aug.datasets.motion_depth import FOLDER as DEPTH_FOLDER
 from arbiview_aug.environment import one_thread, versions
-from arbiview_aug.errors import ArbiviewError, DataError
+from arbiview_aug.errors import ArbiviewError, DataError, OutputError
 from arbiview_aug.favs.config import Quality
 from arbiview_aug.files import remove_parts
 from arbiview_aug.offline import results
@@ -65,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"  {one.token}: {one.state}: {'; '.join(one.words)}", file=sys.stderr)
     if tally.states["stopped"] or tally.states["failed"]:
         return 1
-    _finish(jobs, facts, arguments.report)
+    _finish(jobs, facts, arguments.report, arguments.num_shards)
     return 0
 
 
@@ -129,6 +129,7 @@ def _data(text: str) -> tuple[str | None, Path]:
 
 def _settings(arguments: argparse.Namespace) -> Settings:
     kind, root = arguments.data
+    root = root.absolute()  # Ray's actors have a working directory of their own
     depth, beside = arguments.motion_depth, root / DEPTH_FOLDER
     if depth is None and arguments.surface == "motion" and beside.is_dir():
         depth = beside
@@ -143,16 +144,16 @@ def _settings(arguments: argparse.Namespace) -> Settings:
         kind=kind,
         version=arguments.version,
         target=load_rig(arguments.target),
-        output=Path(arguments.output),
+        output=Path(arguments.output).absolute(),
         path=arguments.path,
-        generator=arguments.generator,
+        generator=None if arguments.generator is None else arguments.generator.absolute(),
         steps=arguments.steps,
         quality=arguments.quality,
         surface=arguments.surface,
         size=arguments.size,
         reduce=arguments.reduce,
         neighbours=arguments.neighbours,
-        motion_depth=depth,
+        motion_depth=None if depth is None else depth.absolute(),
         suffix=f".{arguments.images}",  # type: ignore[arg-type]
     )
 
@@ -232,7 +233,7 @@ class _Tally:
         return "\n".join(lines)
 
 
-def _finish(jobs: Jobs, facts: Mapping[str, Any], report_frames: int) -> None:
+def _finish(jobs: Jobs, facts: Mapping[str, Any], report_frames: int, shards: int) -> None:
     """Tables, provenance and report, where all samples of all shards are there."""
     settings, tokens = jobs.settings, jobs.data.tokens
     converted, left_out = [], set()
@@ -242,6 +243,11 @@ def _finish(jobs: Jobs, facts: Mapping[str, Any], report_frames: int) -> None:
         else:
             converted.append(record["token"])
     missing = len(tokens) - len(converted) - len(left_out)
+    if missing and shards == 1:
+        raise OutputError(
+            f"{settings.output}: expected the records of all {len(tokens)} samples, found {missing} missing; do all "
+            "machines see this folder under this path?"
+        )
     if missing:
         print(f"{missing} samples of other shards are not there yet; the last shard writes what belongs to all")
         return

@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.command_line import gathered_warnings
 from arbiview_aug.convert.frame_folders import FrameFolders
-from arbiview_aug.convert.manifest import Manifest
+from arbiview_aug.convert.manifest import Manifest, Record
 from arbiview_aug.convert.nuscenes import NuScenes
 from arbiview_aug.convert.settings import Data, Settings
 from arbiview_aug.convert.views import coded_views, rig_of
@@ -85,7 +85,7 @@ class Jobs(Dataset[Done]):
         index = self.indices[number]
         token = self.data.tokens[index]
         held = self.manifest.holds(token)
-        if held is not None:
+        if held is not None and self._is_current(index, held):
             return Done(token, "kept", float(np.mean(held["coverage"])))
         warned: list[str] = []
         started = time.perf_counter()
@@ -128,17 +128,39 @@ class Jobs(Dataset[Done]):
         for camera, of_camera in zip(cameras, names, strict=True):
             camera["file"] = of_camera[self.settings.suffix]
         coverage = [round(float(mask.float().mean()), 6) for mask in out["coverage"]]
-        record = {
+        read = self._read(index)
+        record: dict[str, Any] = {
             "token": self.data.tokens[index],
             "ground_z_m": rig.ground_z_m,
             "cameras": cameras,
             "coverage": coverage,
             "files": {name: len(content) for name, content in files.items()},
-            "sources": {_below(path, self.data.root): checksum(path) for path in self._read(index)},
+            "sources": {_below(path, self.data.root): checksum(path) for path in read},
+            "source_bytes": _total_bytes(read),
             **facts,
         }
+        without = [frame["token"] for frame in sample.get("neighbours", ()) if frame.is_broken]
+        if without:
+            record["without"] = without
         self.manifest.write(record, owner=str(index))
         return float(np.mean(coverage))
+
+    def _is_current(self, index: int, record: Record) -> bool:
+        """Whether a sample would be made of the same again, without reading images: by sizes and calibration.
+
+        One that was made while a neighbour could not be read is made again: that may have been mended.
+        """
+        try:
+            files = self._read(index)
+            read = {_below(path, self.data.root): path for path in files}
+            return (
+                not record.get("without")
+                and read.keys() == record["sources"].keys()
+                and _total_bytes(files) == record["source_bytes"]
+                and all(checksum(path) == record["sources"][n] for n, path in read.items() if path.suffix == ".json")
+            )
+        except (ArbiviewError, OSError):
+            return False
 
     def _read(self, index: int) -> list[Path]:
         """What a sample was made from."""
@@ -146,6 +168,10 @@ class Jobs(Dataset[Done]):
         if isinstance(self.samples, WithMotionDepth):
             files.append(self.samples.depths.path(self.data.tokens[index]))
         return files
+
+
+def _total_bytes(files: Sequence[Path]) -> int:
+    return sum(path.stat().st_size for path in files)
 
 
 def _below(path: Path, root: Path) -> str:

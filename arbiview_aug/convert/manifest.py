@@ -18,7 +18,8 @@ from arbiview_aug.files import write_whole
 
 Record = Mapping[str, Any]
 """``token``, and of a converted sample ``cameras``, ``ground_z_m``, ``files`` (bytes by path), ``sources`` (SHA-256 by
-path), ``coverage`` and what the format adds; of one that was left out ``skipped``, the reason."""
+path) and ``source_bytes``, ``coverage``, ``without`` (neighbours that could not be read) where there are any, and what
+the format adds; of one that was left out ``skipped``, the reason."""
 
 
 class Manifest:

@@ -7,6 +7,7 @@ LiDAR did, from the LiDAR's ego pose: that is where its views are rendered, when
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import chain
@@ -21,6 +22,7 @@ from arbiview_aug.convert.settings import Settings
 from arbiview_aug.convert.visibility import visible_shares
 from arbiview_aug.datasets.nuscenes import NuScenesDataset
 from arbiview_aug.datasets.nuscenes_tables import Row, Tables
+from arbiview_aug.errors import DataError
 from arbiview_aug.files import checksum, link_whole, whole_file
 from arbiview_aug.rig import Rig
 
@@ -42,6 +44,9 @@ _REFERENCES = (
     ("sample_data", "ego_pose_token", "ego_pose"),
     ("sample_data", "calibrated_sensor_token", "calibrated_sensor"),
 )
+
+_NEEDED = ("sample_token", "ego_pose_token", "calibrated_sensor_token", "is_key_frame", "filename")
+"""Columns of ``sample_data`` without which its rows cannot be kept."""
 
 
 class NuScenes:
@@ -67,11 +72,20 @@ class NuScenes:
         }
 
     def check(self) -> None:
-        """Look for tokens that lead nowhere, before hours of work end with them.
+        """Look for tokens that lead nowhere and names that are not unique, before hours of work end with them.
 
         Raises:
-            DataError: A row names another one that is not there.
+            DataError: A row names another one that is not there, or has no column that is needed; two samples would
+                write images of one name.
         """
+        names = [self.data.files(index)[-1].name for index in range(len(self.data))]
+        (stem, times), *_ = Counter(view_stem(name, "") for name in names).most_common(1)
+        if times > 1:
+            name = next(name for name in names if view_stem(name, "") == stem)
+            raise DataError(
+                f"nuScenes {self.data.root}: expected LiDAR files of different names, after which the new images are "
+                f"named, got {times} of the name {name}; rename them"
+            )
         tables, there = self._opened(), self._tables()
         references = [(table, key, of) for table, key, of in _REFERENCES if table in there and of in there]
         known = {
@@ -80,9 +94,13 @@ class NuScenes:
         }
         for table in dict.fromkeys(table for table, _, _ in references):
             keys = [(key, of) for referring, key, of in references if referring == table]
+            needed = _NEEDED if table == "sample_data" else ()
             for row in (row for batch in tables.batches(table) for row in batch):
+                for key in needed:
+                    tables.value(table, row, key)
                 for key, of in keys:
-                    if row.get(key):  # unknown is an empty token; some sources have fewer columns
+                    # Unknown is an empty token; some sources have fewer columns.
+                    if row.get(key) or key in needed:
                         tables.follow(table, row, key, of, known[of])
 
     def stem(self, index: int, camera: int, name: str) -> str:

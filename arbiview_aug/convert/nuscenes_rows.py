@@ -217,10 +217,10 @@ def view_stem(lidar: str, name: str) -> str:
     """Where a camera's image lies, below the root, without its suffix.
 
     Args:
-        lidar: The name of the LiDAR's file of the same sample: no other sample's is the same.
+        lidar: The name of the LiDAR's file of the same sample.
         name: Of the camera.
     """
-    channel, stem = quote(name, safe=""), lidar.split(".")[0]
+    channel, stem = quote(name, safe=""), lidar.removesuffix(".bin").removesuffix(".pcd")
     return f"samples/{channel}/{stem.replace(LIDAR, channel) if LIDAR in stem else f'{stem}__{channel}'}"
 
 

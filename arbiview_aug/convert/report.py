@@ -26,7 +26,8 @@ CONVERTED = "converted"
 
 def converted(settings: Settings) -> Method:
     """The views that a conversion wrote, as a method: of its own target; others are rendered as it rendered that."""
-    anew = retargeting(settings.quality, settings.surface)
+    # The frame that scores holds its points back, and depth from motion is not read again.
+    anew = retargeting(settings.quality, "auto" if settings.surface in ("lidar", "motion") else settings.surface)
     manifest, target = Manifest(settings.output), settings.sized_target
     written = open_data(settings.output, kind=settings.kind, version=settings.version)
 
@@ -61,6 +62,7 @@ def write_report(settings: Settings, data: Data, tokens: Sequence[str], count: i
     notes = [f"{len(picked)} of {len(tokens)} frames, as they were written to {settings.output}."]
     if settings.surface in READS_POINTS:
         notes.append("LiDAR points score views that were made with them: evaluate holds half of them out.")
+    notes += [f"Not everything could be scored: {words}." for words in done.declined.values()]
     page = html_report(title, done, [CONVERTED], evaluation_tables(done, [CONVERTED]), notes)
     write_whole({settings.output / FOLDER / "report.html": page.encode()})
     return done

@@ -17,6 +17,7 @@ from arbiview_aug.camera import BoolArray, Camera
 from arbiview_aug.datasets.images import Reduce, check_reduce, decode_images, reduced_rig
 from arbiview_aug.datasets.sequence import Drive, LazyFrame, Neighbours, Unreadable, check_neighbours, parts_of_clock
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError
+from arbiview_aug.files import BROKEN_ARRAY
 from arbiview_aug.rig import Rig, read_mask
 
 CALIBRATION_FILE = "calib.json"
@@ -314,7 +315,7 @@ def _read_points(calib: Mapping[str, Any], folder: Path, where: str) -> torch.Te
         return None
     try:
         array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except BROKEN_ARRAY as error:
         raise DataError(f"points {path}: expected a .npy array of numbers, got {error}") from None
     return checked_points(array, str(path))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from torch.utils.data import Dataset
 from arbiview_aug.datasets.sequence import Neighbours
 from arbiview_aug.dense import Layer
 from arbiview_aug.errors import DataError, SampleError
-from arbiview_aug.files import whole_file
+from arbiview_aug.files import BROKEN_ARRAY, whole_file
 from arbiview_aug.motion.depth import BEST_TRAVEL_M, MotionDepth
 from arbiview_aug.motion.sweep import reduced_camera
 from arbiview_aug.rig import Rig
@@ -84,7 +83,7 @@ class DepthFolder:
                 held: dict[str, Any] = {name: file[name] for name in file.files}
             depth = tuple(held[f"depth_{k:02}"].astype(np.float32) for k in range(len(held["K"])))
             found = MotionDepth(depth, str(held["words"]))
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except (*BROKEN_ARRAY, KeyError) as error:
             raise DataError(f"{path}: expected depth from motion, got {type(error).__name__}; delete it") from None
         if int(held["format"]) != _FORMAT or not _same(held, rig, depth):
             raise DataError(

@@ -138,10 +138,16 @@ class LazyFrame(Mapping[str, Any]):
 
     def __init__(self, known: Mapping[str, Any], load: Callable[[], Any]) -> None:
         self._known, self._load = dict(known), load
+        self.is_broken = False
+        """Whether something was asked for that could not be had."""
 
     def __getitem__(self, key: str) -> Any:
         if key == "images" and key not in self._known:
-            self._known[key] = self._load()
+            try:
+                self._known[key] = self._load()
+            except (ArbiviewError, OSError):
+                self.is_broken = True
+                raise
         return self._known[key]
 
     def __iter__(self) -> Iterator[str]:
@@ -170,4 +176,5 @@ class Unreadable(LazyFrame):
         return super().__getitem__(key) if key == "token" else self._refuse()
 
     def _refuse(self) -> Any:
+        self.is_broken = True
         raise self._error

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import torch
 
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, POINTS_FILE, SEQUENCE_FILE
+from arbiview_aug.errors import SampleTypeError
 from arbiview_aug.rig import Rig
 
 JPEG_QUALITY = 96
@@ -29,7 +30,14 @@ def encoded_image(image: torch.Tensor, suffix: str = ".jpg") -> bytes:
     Args:
         image: (3, h, w) uint8.
         suffix: ``.jpg``, at ``JPEG_QUALITY``, or ``.png``, which loses nothing.
+
+    Raises:
+        SampleTypeError: The image is of another type.
     """
+    if image.dtype != torch.uint8:
+        raise SampleTypeError(
+            f"images: expected uint8 to write, got {image.dtype}; convert [0, 1] by (images * 255).round().byte()"
+        )
     planes = [np.ascontiguousarray(image[channel].numpy()) for channel in (2, 1, 0)]
     return encoded(np.asarray(cv2.merge(planes), np.uint8), suffix)
 

@@ -15,6 +15,7 @@ import torch
 
 from arbiview_aug import RigRetarget, load_rig
 from arbiview_aug.__main__ import main
+from arbiview_aug.convert import command as command_module
 from arbiview_aug.convert.views import coverage_of
 from arbiview_aug.datasets import FrameFolder, WithMotionDepth
 from arbiview_aug.datasets.motion_depth import DepthFolder
@@ -200,3 +201,83 @@ def test_a_frame_must_not_be_called_as_the_conversions_folder(source: Path, tmp_
     assert not (tmp_path / "new").exists()
     with pytest.raises(DataError):
         FrameFolder(tmp_path / "new")
+
+
+def test_points_that_are_links_are_followed(source: Path, tmp_path: Path) -> None:
+    """As caches of downloads have them: relative links, which lead nowhere from elsewhere."""
+    shutil.copytree(source, tmp_path / "drive")
+    (tmp_path / "blobs").mkdir()
+    for folder in sorted((tmp_path / "drive").glob("0*")):
+        (folder / "lidar.npy").rename(tmp_path / "blobs" / folder.name)
+        (folder / "lidar.npy").symlink_to(Path("..", "..", "blobs", folder.name))
+    assert main(command(tmp_path / "drive", tmp_path / "new")) == 0
+    linked = tmp_path / "new" / "0001" / "lidar.npy"
+    assert not linked.is_symlink() and linked.samefile(tmp_path / "blobs" / "0001")
+
+
+@pytest.mark.parametrize("surface", ["lidar", "motion"])
+def test_a_report_of_surfaces_that_read_what_scores(source: Path, tmp_path: Path, surface: str) -> None:
+    shutil.copytree(source, tmp_path / "drive")
+    old = FrameFolder(source)
+    for k, token in enumerate(old.tokens):
+        rig = old[k]["rig"]
+        depth = MotionDepth(tuple(np.full(c.size, 6.0, np.float32) for c in rig), "made")
+        DepthFolder(tmp_path / "drive" / "motion_depth").write(token, rig, depth)
+    asked = command(tmp_path / "drive", tmp_path / "new", "--surface", surface, "--report", "1")
+    assert main(asked) == 0
+    page = (tmp_path / "new" / "conversion" / "report.html").read_text()
+    assert "ring_front_center" in page and "Not everything could be scored" not in page
+
+
+def test_a_source_that_changed_is_converted_again(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Another drive of the same name, a corrected calibration: sizes and calibrations tell."""
+    shutil.copytree(source, tmp_path / "drive")
+    asked = command(tmp_path / "drive", tmp_path / "new")
+    assert main(asked) == 0
+    calib = tmp_path / "drive" / "0000" / "calib.json"
+    calib.write_text(calib.read_text().replace('"cam2ego": [', '"cam2ego":  [', 1))
+    shutil.copy(source / "0000" / "00.jpg", tmp_path / "drive" / "0001" / "00.jpg")
+    capsys.readouterr()
+    assert main(asked) == 0
+    assert "2 samples converted, 1 there before" in capsys.readouterr().out
+    assert main(command(tmp_path / "drive", tmp_path / "whole")) == 0
+    assert tree(tmp_path / "new") == tree(tmp_path / "whole")
+
+
+def test_a_neighbour_that_was_mended_fills_again(source: Path, tmp_path: Path) -> None:
+    """What was converted while it could not be read is made anew: the same bytes as undisturbed."""
+    asked = ("--neighbours", "1", "--on-error", "skip")
+    assert main(command(source, tmp_path / "whole", *asked)) == 0
+    shutil.copytree(source, tmp_path / "drive")
+    image = tmp_path / "drive" / "0000" / "00.jpg"
+    sound = image.read_bytes()
+    image.write_bytes(b"cut")
+    assert main(command(tmp_path / "drive", tmp_path / "new", *asked)) == 0
+    record = tmp_path / "new" / "conversion" / "samples" / "0001.json"
+    assert json.loads(record.read_text())["without"] == ["0000"]
+    image.write_bytes(sound)
+    assert main(command(tmp_path / "drive", tmp_path / "new", *asked)) == 0
+    assert "without" not in json.loads(record.read_text())
+    assert tree(tmp_path / "new") == tree(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("content", [b"PK\x03\x04 no array", b"\x93NUMPY\x01\x00\x06\x00(((((\n", b""])
+def test_broken_points_are_one_frames_error(
+    source: Path, tmp_path: Path, content: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(source, tmp_path / "drive")
+    (tmp_path / "drive" / "0001" / "lidar.npy").write_bytes(content)
+    assert main(command(tmp_path / "drive", tmp_path / "new", "--on-error", "skip")) == 0
+    said = capsys.readouterr()
+    assert "2 samples converted, 1 skipped" in said.out and "0001: skipped: points " in said.err
+
+
+def test_records_that_nobody_wrote_here(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As where actors see another folder under the output's path."""
+    monkeypatch.setattr(command_module, "_run", lambda *_: iter(()))
+    assert main(command(source, tmp_path / "new")) == 2
+    assert "expected the records of all 3 samples, found 3 missing" in capsys.readouterr().err

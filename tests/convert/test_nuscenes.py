@@ -103,6 +103,41 @@ def test_visibility_is_at_most_what_people_saw(source: Path, output: Path) -> No
 def test_names_that_are_no_file_names() -> None:
     assert view_stem("a__LIDAR_TOP__12.pcd.bin", "CAM") == "samples/CAM/a__CAM__12"
     assert view_stem("000012.bin", "/camera/front") == "samples/%2Fcamera%2Ffront/000012__%2Fcamera%2Ffront"
+    assert view_stem("1532402927.147951.bin", "CAM") == "samples/CAM/1532402927.147951__CAM"
+
+
+def test_lidar_files_of_one_name(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Samples would write over each other's images."""
+    files = [path.relative_to(source) for path in (files[-1] for files in map(NuScenesDataset(source).files, (1, 4)))]
+    moved = [path.parent / f"scene-{k}" / "000012.bin" for k, path in enumerate(files)]
+    names = {str(path): str(new) for path, new in zip(files, moved, strict=True)}
+
+    def change(rows: list[dict]) -> None:
+        for row in rows:
+            row["filename"] = names.get(row["filename"], row["filename"])
+
+    root = _changed(source, tmp_path / "source", "sample_data", change)
+    for path, new in zip(files, moved, strict=True):
+        (root / new).parent.mkdir()
+        (root / path).rename(root / new)
+    assert main(command(root, tmp_path / "new")) == 2
+    assert "got 2 of the name 000012.bin" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("key", ["ego_pose_token", "filename", "is_key_frame"])
+def test_rows_without_what_is_needed(
+    source: Path, tmp_path: Path, key: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a radar, which nothing reads before the tables are written."""
+
+    def change(rows: list[dict]) -> None:
+        del next(row for row in rows if "RADAR" in row["filename"])[key]
+
+    root = _changed(source, tmp_path / "source", "sample_data", change)
+    assert main(command(root, tmp_path / "new")) == 2
+    assert f"key '{key}'" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_sample_that_is_left_out_leaves_no_trace(
@@ -154,6 +189,7 @@ def test_a_mended_sample_comes_back(source: Path, output: Path, tmp_path: Path) 
     ("table", "key", "message"),
     [
         ("sample_data", "sample_token", "table sample: expected the token 'nobody' that row"),
+        ("sample_data", "sample_token", "table sample: expected the token '' that row"),
         ("sample_data", "ego_pose_token", "table ego_pose: expected the token 'nobody' that"),
         ("sample_data", "calibrated_sensor_token", "table calibrated_sensor: expected the token 'nobody' that"),
         ("sample_annotation", "visibility_token", "table visibility: expected the token 'nobody' that"),
@@ -168,7 +204,7 @@ def test_a_token_that_leads_nowhere(
 
     def change(rows: list[dict]) -> None:
         row = next(row for row in rows if not row.get("is_key_frame") or table != "sample_data")
-        row[key] = "nobody"
+        row[key] = "" if "''" in message else "nobody"
 
     root = _changed(source, tmp_path / "source", table, change)
     assert main(command(root, tmp_path / "new")) == 2

@@ -41,6 +41,7 @@ class Timed(Jobs):
 
 
 @pytest.mark.bench
+@pytest.mark.xfail("CI" in os.environ, reason="on shared machines times are reported, not asserted", strict=False)
 def test_two_processes_and_the_share_of_retargeting(nuscenes_root: Path, tmp_path: Path) -> None:
     """One real frame again and again, decoded and encoded each time; one calibration, so its plan is held.
 
