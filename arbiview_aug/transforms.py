@@ -252,11 +252,17 @@ class RigRetarget(torch.nn.Module):
         out["images"] = rewrapped(gathered([part["images"] for part in parts], lead), sample["images"])
         for key in ("K", "cam2ego"):
             out[key] = like(gathered([part[key] for part in parts], lead), sample.get(key))
+        beside = out["K"].device if isinstance(out["K"], torch.Tensor) else None
         grounds = [part["ground_z_m"] for part in parts]
-        out["ground_z_m"] = torch.tensor(grounds, dtype=torch.float64).reshape(lead) if lead else grounds[0]
+        if lead:
+            out["ground_z_m"] = torch.tensor(grounds, dtype=torch.float64, device=beside).reshape(lead)
+        else:
+            out["ground_z_m"] = grounds[0]
         for key in ("coverage", "ignore", "distortion", "generated", *self.outputs):
             if key in parts[0]:
                 out[key] = gathered([part[key] for part in parts], lead)
+        if "distortion" in out:
+            out["distortion"] = out["distortion"].to(beside or "cpu")
         if SOURCES_KEY in self.outputs:
             out[SOURCES_KEY] = source_sample(sample["images"], frames, lead)
         if "lens" in parts[0]:

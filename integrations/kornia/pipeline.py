@@ -11,8 +11,8 @@ import torch
 class OnImages(torch.nn.Module):
     """Runs a photometric module on a sample's images alone, all cameras (of all frames) as one batch.
 
-    kornia's modules want float images (B, 3, H, W) in [0, 1]; uint8 images come back as uint8. What no source saw
-    stays black: changed with the rest, holes would look like something that was seen.
+    kornia's modules want float images (B, 3, H, W) in [0, 1]; uint8 images come back as uint8. What no source saw and
+    nothing filled stays black: changed with the rest, holes would look like something that was seen.
 
     Args:
         module: An ``ImageSequential``, or any module from a batch of images to a batch of images.
@@ -38,7 +38,8 @@ class OnImages(torch.nn.Module):
             changed = (changed * 255).round().to(torch.uint8)
         changed = changed.reshape(images.shape)
         if "coverage" in sample:
-            changed = changed * sample["coverage"].unsqueeze(-3)
+            shown = sample["coverage"] | sample["generated"] if "generated" in sample else sample["coverage"]
+            changed = changed * shown.unsqueeze(-3)
         return {**sample, "images": changed}
 
 

@@ -8,9 +8,15 @@ from typing import Any
 import torch
 
 from arbiview_aug.errors import SampleError
+from arbiview_aug.sample import MOTION_KEY
+from arbiview_aug.tensors import rewrapped
 
-STACKED = ("images", "K", "cam2ego", "coverage", "ignore", "distortion", "ego2world")
-"""What has one shape in all frames of a rig. All else is a list: of points and boxes each frame has its own number."""
+STACKED = (
+    *("images", "K", "cam2ego", "coverage", "ignore", "distortion", "ego2world"),
+    *("depth_m", MOTION_KEY),
+)
+"""What has one shape in all frames of a rig, and so have maps over the images. All else is a list: of points and boxes
+each frame has its own number."""
 
 
 def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -34,15 +40,37 @@ def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         values = [sample[key] for sample in samples]
         if key == "rig":
             batch |= _rigs(values)
-        elif key in STACKED and all(isinstance(value, torch.Tensor) for value in values):
-            batch[key] = torch.stack(values)
-        elif key == "images":  # lists: a tensor for each camera
-            batch[key] = [torch.stack(of_camera) for of_camera in zip(*values, strict=True)]
+        elif key in STACKED or _are_maps(values, first["images"]):
+            batch[key] = _stacked(key, values)
+        elif key == "lens":  # a name for each camera, or one for each of its frames
+            batch[key] = [list(of_camera) for of_camera in zip(*values, strict=True)]
         elif key == "ground_z_m":
             batch[key] = torch.tensor([float(value) for value in values], dtype=torch.float64)
         else:
             batch[key] = values
     return batch
+
+
+def _are_maps(values: Sequence[Any], images: Any) -> bool:
+    """Whether all values are maps over all images: label maps, masks."""
+    sizes = [image.shape[-2:] for image in images]
+    return all(
+        isinstance(value, torch.Tensor | list | tuple)
+        and len(value) == len(sizes)
+        and all(isinstance(m, torch.Tensor) and m.shape[-2:] == size for m, size in zip(value, sizes, strict=True))
+        for value in values
+    )
+
+
+def _stacked(key: str, values: Sequence[Any]) -> Any:
+    """One tensor, or where cameras have tensors of their own a list of one for each camera; tv_tensors stay such."""
+    try:
+        if all(isinstance(value, torch.Tensor) for value in values):
+            return rewrapped(torch.stack(list(values)), values[0])
+        cameras = [torch.stack(list(of_camera)) for of_camera in zip(*values, strict=True)]
+        return rewrapped(cameras, values[0])
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise SampleError(f"collate: {key}: expected equal shapes in all samples: {error}") from None
 
 
 def _rigs(rigs: Sequence[Any]) -> dict[str, Any]:

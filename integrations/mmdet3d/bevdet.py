@@ -11,10 +11,20 @@ import torch
 from arbiview_aug.camera import FloatArray
 from arbiview_aug.errors import SampleError
 from integrations.mmdet3d.matrices import Views, padded, upper_triangular
-from integrations.mmdet3d.results import Retarget, source_rig, target_outputs, target_views
+from integrations.mmdet3d.results import (
+    STALE_KEYS,
+    Retarget,
+    source_rig,
+    target_outputs,
+    target_views,
+    warn_of_dropped,
+)
 
 MEAN_STD = ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375))
 """What BEVDet's ``mmlabNormalize`` subtracts and divides by, in the order of the channels it leaves."""
+
+_PICTURES = "canvas"
+"""The images before BEVDet normalised them, for people: dropped silently."""
 
 _KEY_CAMERA = "CAM_FRONT"
 _FORM = "(imgs, sensor2egos, ego2globals, intrins, post_rots, post_trans[, bda])"
@@ -74,7 +84,8 @@ def retarget_img_inputs(
         torch.eye(3).to(post_rots).expand(count, -1, -1).clone(),
         torch.zeros(count, 3).to(post_trans),
     ]
-    changed = {key: value for key, value in results.items() if key != "canvas"}
+    warn_of_dropped({key: value for key, value in results.items() if key != _PICTURES})
+    changed = {key: value for key, value in results.items() if key not in STALE_KEYS}
     changed["img_inputs"] = type(given)([*made, *given[6:]])
     if "cam_names" in results:
         changed["cam_names"] = list(target.names)

@@ -85,7 +85,7 @@ def retarget_results(
     made = {key: value for key, value in results.items() if key not in STALE_KEYS}
     if isinstance(made.get("ann_info"), Mapping):
         made["ann_info"] = {key: value for key, value in made["ann_info"].items() if key not in STALE_KEYS}
-    _warn_of_dropped(results)
+    warn_of_dropped(results)
     made["img"] = images_like(results["img"], out["images"])
     _write_matrices(made, views)
     if isinstance(infos, Mapping):
@@ -274,7 +274,8 @@ def _write_sizes(made: dict[str, Any], images: torch.Tensor) -> None:
             made[key] = full[: len(given)] if one is None else [full[: len(one)]] * len(images)
 
 
-def _warn_of_dropped(results: Mapping[str, Any]) -> None:
+def warn_of_dropped(results: Mapping[str, Any]) -> None:
+    """Name what is dropped, at the line of whoever called the retargeting."""
     annotated = results.get("ann_info")
     held = [*results, *(annotated if isinstance(annotated, Mapping) else ())]
     dropped = sorted({key for key in held if key in STALE_KEYS})

@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 import torch
 
-from arbiview_aug.datasets.writing import JPEG_QUALITY
+from arbiview_aug.datasets.writing import encoded, encoded_image
 from arbiview_aug.errors import DataError
+from arbiview_aug.files import BROKEN_ARRAY
 from arbiview_aug.rig import Rig
 
 ARRAYS = ("points", "boxes_3d", "ego2world")
@@ -30,14 +31,16 @@ def to_entry(sample: Mapping[str, Any], key: str) -> Entry:
     Args:
         sample: With ``images``, uint8 (3, h, w) for each camera of ``rig``; ``ARRAYS`` and ``token`` where present.
         key: Unique, without dots.
+
+    Raises:
+        SampleTypeError: Images of another type.
     """
     rig: Rig = sample["rig"]
     entry: Entry = {"__key__": key, "rig.json": json.dumps({**rig.to_dict(), "token": str(sample.get("token", key))})}
     for k, (camera, image) in enumerate(zip(rig, sample["images"], strict=True)):
-        picture = np.ascontiguousarray(image.permute(1, 2, 0).numpy()[..., ::-1])
-        entry[f"{k:02}.jpg"] = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+        entry[f"{k:02}.jpg"] = encoded_image(image)
         if camera.mask is not None:
-            entry[f"{k:02}.mask.png"] = cv2.imencode(".png", camera.mask.astype(np.uint8) * 255)[1].tobytes()
+            entry[f"{k:02}.mask.png"] = encoded(camera.mask.astype(np.uint8) * 255, ".png")
     for name in ARRAYS:
         if sample.get(name) is not None:
             file = io.BytesIO()
@@ -53,12 +56,19 @@ def to_sample(entry: Mapping[str, Any]) -> dict[str, Any]:
         ``images`` (N, 3, h, w) uint8 (a list where sizes differ), ``rig``, ``K``, ``cam2ego``, ``token``, ``ARRAYS``.
 
     Raises:
-        DataError: No ``rig.json``, a missing or broken image.
+        DataError: No ``rig.json``; that, an image or an array is missing or broken.
+        CalibrationError: An impossible calibration.
     """
     where = f"shard entry {entry.get('__key__')!r}"
     if "rig.json" not in entry:
         raise DataError(f"{where}: expected rig.json, got {', '.join(map(str, entry))}; write shards with to_entry")
-    described = json.loads(entry["rig.json"])
+    try:
+        described = json.loads(entry["rig.json"])
+        token = described["token"]
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise DataError(
+            f"{where}: rig.json: expected a rig with its token, got {type(error).__name__}: {error}"
+        ) from None
     rig = Rig.from_dict(described, where=where)
     images, cameras = [], []
     for k, camera in enumerate(rig):
@@ -77,12 +87,19 @@ def to_sample(entry: Mapping[str, Any]) -> dict[str, Any]:
         "rig": rig,
         "K": torch.from_numpy(rig.K),
         "cam2ego": torch.from_numpy(rig.cam2ego),
-        "token": described["token"],
+        "token": token,
     }
     for name in ARRAYS:
         if f"{name}.npy" in entry:
-            sample[name] = torch.from_numpy(np.load(io.BytesIO(entry[f"{name}.npy"])))
+            sample[name] = _array(entry[f"{name}.npy"], f"{where}: {name}.npy")
     return sample
+
+
+def _array(content: bytes, where: str) -> torch.Tensor:
+    try:
+        return torch.from_numpy(np.load(io.BytesIO(content), allow_pickle=False))
+    except (*BROKEN_ARRAY, TypeError) as error:  # types that torch has not
+        raise DataError(f"{where}: expected a .npy array of numbers, got {type(error).__name__}: {error}") from None
 
 
 def _decoded(entry: Mapping[str, Any], name: str, where: str, flags: int) -> np.ndarray:

@@ -91,3 +91,12 @@ def test_lists_are_refused() -> None:
 def test_example(tmp_path, capsys) -> None:
     assert main(["--output", str(tmp_path / "out.png")]) == 0
     assert "(5, 3, 128, 352) torch.float32" in capsys.readouterr().out and (tmp_path / "out.png").is_file()
+
+
+def test_what_was_filled_stays(sample: dict) -> None:
+    filled = RigRetarget(TARGET, surface="far", path="inpaint")(sample)
+    out = OnImages(K.ImageSequential(K.RandomInvert(p=1.0)))(filled)
+    shown = (out["coverage"] | out["generated"]).unsqueeze(1).expand_as(out["images"])
+    assert out["generated"].any()
+    before = filled["images"].as_subclass(torch.Tensor)
+    assert torch.equal(out["images"].as_subclass(torch.Tensor)[shown], 255 - before[shown])

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torchvision import tv_tensors
 
 from arbiview_aug import RigRetarget, SampleError
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
@@ -51,3 +52,40 @@ def test_lists_of_images_and_keys(samples: list[dict]) -> None:
     assert [tuple(image.shape) for image in collate(lists)["images"]] == [(2, 3, 48, 128)] * 6
     with pytest.raises(SampleError, match="expected equal keys in all samples, got points in some"):
         collate([samples[0], {key: value for key, value in samples[1].items() if key != "points"}])
+
+
+@pytest.mark.parametrize("count", [2, 6])
+def test_maps_over_the_images_stay_with_their_frames(samples: list[dict], count: int) -> None:
+    """Of six frames of six cameras, too: frames and cameras are easily mistaken for each other there."""
+    rng = torch.Generator().manual_seed(0)
+    frames = []
+    for k in range(count):
+        labels = torch.randint(0, 9, (6, 48, 128), generator=rng, dtype=torch.uint8)
+        depth_m = torch.rand(6, 48, 128, generator=rng) * 50 + 1
+        more = {"labels": tv_tensors.Mask(labels), "classes": labels + 1, "depth_m": depth_m}
+        frames.append({**{key: value for key, value in samples[k % 2].items() if key != "points"}, **more})
+    retarget = RigRetarget(TARGET, surface="lidar", label_keys=("classes",))
+    out = retarget(collate(frames))
+    for k, frame in enumerate(frames):
+        alone = retarget(frame)
+        for key in ("images", "coverage", "labels", "classes"):
+            assert torch.equal(out[key][k], alone[key]), key
+    assert isinstance(out["labels"], tv_tensors.Mask)
+    lists = collate([{**frame, "labels": list(frame["labels"])} for frame in frames])
+    assert [tuple(m.shape) for m in lists["labels"]] == [(count, 48, 128)] * 6
+    with pytest.raises(SampleError, match="collate: K: expected equal shapes in all samples"):
+        collate([samples[0], {**samples[1], "K": samples[1]["K"][:5]}])
+
+
+def test_lenses_without_a_rig(samples: list[dict]) -> None:
+    names = ["fisheye", *["pinhole"] * 5]
+    distortion = torch.zeros(6, 4, dtype=torch.float64)
+    distortion[0] = torch.tensor([0.05, -0.01, 0, 0])
+    frames = []
+    for sample in samples:
+        bare = {key: value for key, value in sample.items() if key != "rig"}
+        frames.append({**bare, "lens": names, "distortion": distortion})
+    retarget = RigRetarget(TARGET, surface="street")
+    out = retarget(collate(frames))
+    for k, frame in enumerate(frames):
+        assert torch.equal(out["images"][k], retarget(frame)["images"])

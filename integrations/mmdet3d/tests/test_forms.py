@@ -176,6 +176,9 @@ def test_bevdet_takes_augmented_images_and_gives_untouched_ones(given: Recording
     levels = [psnr(one[seen], two[seen]) for one, two, seen in views]
     print("dB of each view", np.round(levels, 1))
     assert min(levels) > 38
+    late = {**results, "gt_depth": torch.ones(6, 4, 4)}
+    with pytest.warns(UserWarning, match="retarget: drops gt_depth"):
+        assert "gt_depth" not in step()(late)
     assert "canvas" not in after and after["curr"]["lidar2ego_rotation"] == [1, 0, 0, 0]
     front = after["curr"]["cams"]["CAM_FRONT"]
     assert np.allclose(np.linalg.norm(front["sensor2ego_rotation"]), 1) and front["data_path"] == "CAM_FRONT"

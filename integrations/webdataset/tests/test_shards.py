@@ -12,6 +12,7 @@ import torch
 
 from arbiview_aug import Camera, DataError, Rig, RigRetarget
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.errors import SampleTypeError
 from integrations.webdataset.shards import ARRAYS, stream, to_entry, to_sample, write_shard
 
 
@@ -89,3 +90,23 @@ def test_messages(sample: dict, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "webdataset", None)
     with pytest.raises(ImportError, match="pip install webdataset"):
         stream("x.tar", RigRetarget(sample["rig"]))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("rig.json", "{", "rig.json: expected a rig with its token"),
+        ("rig.json", "[]", "rig.json: expected a rig with its token"),
+        ("points.npy", b"PK\x03\x04 no array", "points.npy: expected a .npy array of numbers"),
+        ("boxes_3d.npy", b"", "boxes_3d.npy: expected a .npy array of numbers"),
+    ],
+)
+def test_what_is_broken_is_named(sample: dict, name: str, content: str | bytes, message: str) -> None:
+    with pytest.raises(DataError, match=f"shard entry 'a': {message}"):
+        to_sample({**to_entry(sample, "a"), name: content})
+
+
+def test_images_of_another_type_are_refused(sample: dict) -> None:
+    """Encoded as they are they would be black."""
+    with pytest.raises(SampleTypeError, match=r"images: expected uint8 to write, got torch\.float32"):
+        to_entry({**sample, "images": sample["images"] / 255}, "a")
