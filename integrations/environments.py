@@ -60,7 +60,7 @@ def python_of(name: Literal["pipelines", "nuscenes"]) -> Path:
     if (folder / _MADE).is_file():
         return python
     subprocess.run([sys.executable, "-m", "venv", "--clear", str(folder)], check=True)
-    pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    pip = [str(python), "-m", "pip", "install", "--quiet", "--retries", "10", "--disable-pip-version-check"]
     subprocess.run([*pip, *(["--no-deps"] if family.borrows else []), *family.requirements], check=True)
     if family.borrows:
         (site,) = folder.glob("lib/python*/site-packages")

@@ -85,6 +85,7 @@ def test_opencv_is_left_as_it_was() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_a_street_in_two_processes() -> None:
     one, two = (in_another_process(seed) for seed in (1, 2))
     assert one == two and len(set(one)) == 2 * len(SETTINGS)

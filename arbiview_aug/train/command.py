@@ -25,7 +25,7 @@ from arbiview_aug.train.trainer import Trainer
 
 COMMANDS = ("train", "ablate", "evaluate")
 
-_LONGEST_WAIT = timedelta(hours=24)
+_LONGEST_WAIT = timedelta(hours=3)
 
 
 def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> int:

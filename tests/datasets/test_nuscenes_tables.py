@@ -135,16 +135,17 @@ def test_large_tables_take_little_memory(tmp_path: Path) -> None:
     """200,000 rows of two tables, sweeps and all, against each table's rows as objects."""
     rows = write_large(tmp_path, 140, 240)
     assert rows > 200_000
-    found = []
-    for what in ("objects", "columns"):
+    found: dict[str, list[tuple[float, float]]] = {"objects": [], "columns": []}
+    for what in 3 * [*found]:
         command = [sys.executable, "-c", GROWTH, str(tmp_path), what]
-        found.append(json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout))
-    if found[0][0] is None:
+        found[what].append(json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout))
+    if found["objects"][0][0] is None:
         pytest.skip("this system does not tell the peak of a process")
-    objects, columns = found
+    # The least of three, taken in turns: what else runs only adds.
+    objects, columns = (tuple(map(min, zip(*runs, strict=True))) for runs in found.values())
     words = [
         f"{name} {mib:.0f} MiB, {1e6 * s / rows:.0f} us of CPU a row"
-        for name, (mib, s) in zip(("objects", "columns"), found, strict=True)
+        for name, (mib, s) in zip(found, (objects, columns), strict=True)
     ]
     print(f"\n{rows} rows: {'; '.join(words)}")
     assert columns[0] < 0.4 * objects[0]

@@ -105,6 +105,7 @@ def test_mutated_inputs(frame_folder: Path, worst: Worst) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_ten_thousand_mutated_inputs(frame_folder: Path, worst: Worst) -> None:
     check(range(300, 5800), range(200, 4700), frame_folder, worst)
 
