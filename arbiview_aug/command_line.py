@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import torch
+
 from arbiview_aug.errors import DataError
 from arbiview_aug.rig import shipped_rigs
 
@@ -49,6 +51,24 @@ def seed(text: str) -> int:
     if value < 0:
         raise argparse.ArgumentTypeError(f"expected a whole number from 0, got {text!r}")
     return value
+
+
+def device_named(name: str | None) -> torch.device:
+    """A device that is there: the one that is named, else a GPU where there is one.
+
+    Raises:
+        DataError: There is no such device.
+    """
+    if name is None:
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise DataError(f"--device: expected cpu, cuda, cuda:1, ..., got {name!r}") from None
+    is_there = device.type == "cpu" or (device.type == "cuda" and (device.index or 0) < torch.cuda.device_count())
+    if not is_there:
+        raise DataError(f"--device: expected cpu or a CUDA device that is there, got {name!r}")
+    return device
 
 
 def size(text: str) -> tuple[int, int]:

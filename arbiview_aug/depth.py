@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch.utils.data import Dataset
 
-from arbiview_aug.command_line import count, gathered_warnings, writable_folder
+from arbiview_aug.command_line import count, device_named, gathered_warnings, writable_folder
 from arbiview_aug.datasets.motion_depth import FOLDER, WANTED, DepthFolder
 from arbiview_aug.datasets.opening import open_data
 from arbiview_aug.errors import ArbiviewError
@@ -58,11 +58,13 @@ class _Frames(Dataset[Done]):
 
     def _done(self, token: str, sample: dict[str, Any]) -> Done:
         rig = sample["rig"]
-        if self.depths.holds(token, rig):
-            return Done(token, self.depths.read(token, rig).density, "", kept=True)
         (frame,) = check_inputs(sample, None)
         warn = WarnOnce()
         (neighbours,) = neighbours_of_frames(sample, [frame], (), warn)
+        used = [neighbour.name for neighbour in neighbours]
+        held = self.depths.held(token, rig, used)
+        if held is not None:
+            return Done(token, held.density, "", kept=True)
         boxes = None if sample.get("boxes_3d") is None else sample["boxes_3d"].numpy().astype(float)
 
         def load(neighbour: Neighbour) -> Sequence[torch.Tensor] | None:
@@ -70,10 +72,11 @@ class _Frames(Dataset[Done]):
                 return neighbour.images(frame.images)
             except (ArbiviewError, OSError) as error:
                 warn_lost(warn, neighbour.name, error)
+                used.remove(neighbour.name)  # once it is mended, the frame is done again
                 return None
 
         found = motion_depth(frame.rig, frame.images, neighbours, boxes, load, self.device)
-        self.depths.write(token, rig, found)
+        self.depths.write(token, rig, found, used)
         return Done(token, found.density, str(found))
 
 
@@ -85,8 +88,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     parser = argparse.ArgumentParser(
         prog="python -m arbiview_aug depth",
-        description="Depth from motion of every frame of a drive, for surface='motion'. Frames that have theirs are "
-        "left as they are: run it again to go on.",
+        description="Depth from motion of every frame of a drive, for surface='motion'. Frames that have theirs, from "
+        "the frames that are their neighbours now, are left as they are: run it again to go on.",
     )
     parser.add_argument(
         "--data",
@@ -95,14 +98,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="a folder of frame folders with a sequence.json, or a nuScenes root",
     )
     parser.add_argument("--output", metavar="FOLDER", help=f"where to write (default: {FOLDER} in the data's folder)")
-    parser.add_argument("--device", default="cpu", help="where to compute, such as cuda (default: %(default)s)")
+    parser.add_argument("--device", default="cpu", help="where to compute: cpu, cuda, cuda:1 (default: %(default)s)")
     parser.add_argument("--workers", type=count, default=1, help="processes, on the CPU (default: %(default)s)")
     arguments = parser.parse_args(argv)
+    device = device_named(arguments.device)
     asked = arguments.output or str(Path(arguments.data) / FOLDER)
     data: Any = open_data(arguments.data, neighbours=WANTED)
     depths = DepthFolder(writable_folder(Path(asked), asked))
-    frames = _Frames(data, data.tokens, depths, arguments.device)
-    workers = arguments.workers if arguments.device == "cpu" else 1  # one process keeps a GPU busy
+    frames = _Frames(data, data.tokens, depths, str(device))
+    workers = arguments.workers if device.type == "cpu" else 1  # one process keeps a GPU busy
     warned: list[str] = []
     with gathered_warnings(warned):
         done = list(results(frames, workers, "depth from motion"))

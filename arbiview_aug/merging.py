@@ -3,8 +3,9 @@
 Where labels say that nothing moved, a frame is believed unless most others contradict it; where the shadow of what
 moved may fall, unless any other does; right beside it, if another confirms it. Where nobody says what moved, two rules
 tell what stood still. What the nearest frames before and after the current one both show has not moved in between; seen
-from one side only, at least three frames must agree. And what the current frame shows next to the hole goes on into it:
-where all others show the road there and it does not, something has come.
+from one side only, at least three frames must agree; where there are no more than two frames, one is believed that the
+other does not contradict. And what the current frame shows next to the hole goes on into it: where all others show the
+road there and it does not, something has come.
 """
 
 from __future__ import annotations
@@ -236,7 +237,8 @@ def _exposure(
     if count < _LEAST_SEAM_PX:
         return None
     pairs = [part.detach()[:, where] + _DARK_LEVELS for part in (reference, image)]
-    logs = torch.log(pairs[0] / pairs[1]).median(1).values
+    # The lower median by sorting: that of CUDA refuses deterministic algorithms.
+    logs = torch.log(pairs[0] / pairs[1]).sort(1).values[:, (count - 1) // 2]
     if float(logs.mean().abs()) > _MOST_EXPOSURE or float(logs.max() - logs.min()) > _MOST_TINT:
         return None
     gain = logs.exp()[:, None, None]

@@ -6,7 +6,7 @@ A drive is seen again and again: what no camera sees now, one often saw a metre 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,7 +18,7 @@ from arbiview_aug.errors import ArbiviewError, SampleError, SampleTypeError
 from arbiview_aug.moved import moved_boxes
 from arbiview_aug.objects import checked_boxes
 from arbiview_aug.rig import Rig
-from arbiview_aug.sample import SourceFrame, frame_from, numbers
+from arbiview_aug.sample import Points, SourceFrame, frame_from, numbers, of_frames
 from arbiview_aug.sample_images import check_container, checked_images
 
 MAX_NEIGHBOURS = 120
@@ -113,8 +113,9 @@ def neighbours_of_frames(
     ``neighbours`` is a list of mappings, each another frame of the same rig: ``images``; ``ego2ego`` (4, 4), its ego
     frame to the current one, or ``ego2world`` beside the sample's own; its calibration as a sample has it, where it
     differs from the current frame's; and, where there are any, ``boxes_3d`` in its own ego frame, ``time_s`` and
-    ``token``. Without boxes of its own, those of the sample are moved by their velocities (columns 7 and 8, m/s in the
-    ego frame), where both frames have a time. Of a batch: a list of such lists.
+    ``token``. Calibration that is K and cam2ego alone has the current frame's lenses and masks. Without boxes of its
+    own, those of the sample are moved by their velocities (columns 7 and 8, m/s in the ego frame), where both frames
+    have a time and all velocities are known. Of a batch: a list of such lists.
 
     Frames at the very same place are left out silently; impossible ones with a warning that names them.
 
@@ -138,13 +139,15 @@ def neighbours_of_frames(
     most = max(map(len, lists))
     if most > MAX_NEIGHBOURS:
         raise SampleError(f"neighbours: expected at most {MAX_NEIGHBOURS} for a frame, got {most}")
+    boxes = sample.get("boxes_3d")
+    current = [None] * len(frames) if boxes is None else of_frames("boxes_3d", boxes, len(frames), lead)
     found = []
-    for b, (frame, entries) in enumerate(zip(frames, lists, strict=True)):
+    for index, frame, now, entries in zip(np.ndindex(*lead), frames, current, lists, strict=True):
         of_frame = []
         for number, entry in enumerate(entries):
             name = _name(entry, number)
             try:
-                neighbour = _neighbour(sample, (b,) if lead else (), frame, entry, number, name)
+                neighbour = _neighbour(sample, index, frame, now, entry, number, name)
             except (ArbiviewError, OSError) as error:
                 warn_lost(warn, name, error)
                 continue
@@ -165,7 +168,13 @@ def _name(entry: Any, number: int) -> str:
 
 
 def _neighbour(
-    sample: Mapping[str, Any], index: tuple[int, ...], frame: SourceFrame, entry: Any, number: int, name: str
+    sample: Mapping[str, Any],
+    index: tuple[int, ...],
+    frame: SourceFrame,
+    current: Points | None,
+    entry: Any,
+    number: int,
+    name: str,
 ) -> Neighbour | None:
     if not isinstance(entry, Mapping):
         raise SampleTypeError(f"expected a mapping with images and a pose, got {type(entry).__name__}")
@@ -175,13 +184,27 @@ def _neighbour(
     _check_motion(ego2ego, travel_m, seconds)
     if travel_m < STILL_M and turned_deg < STILL_DEG:
         return None
-    # Its images are not read before it is known that they are needed; the rig's are of the same sizes.
-    own = frame_from(frame.images, entry, None if entry.get("K") is not None else frame.rig).rig
+    own = _own_rig(frame, entry)
     _check_same_vehicle(frame.rig, own)
     cameras = [camera.moved(ego2ego) for camera in own]
     rig = Rig(cameras, ground_z_m=frame.rig.ground_z_m, name=f"{frame.rig.name} {name}".strip())
-    now, then = _boxes(sample, index, entry, ego2ego, seconds)
+    now, then = _boxes(current, entry, ego2ego, seconds)
     return Neighbour(number, name, rig, travel_m, float(ego2ego[0, 3]), seconds, then, now, entry)
+
+
+def _own_rig(frame: SourceFrame, entry: Mapping[str, Any]) -> Rig:
+    """Its cameras in its own ego frame.
+
+    Its images are not read before it is known that they are needed; the current frame's are of the same sizes.
+    """
+    if entry.get("rig") is not None or entry.get("K") is None:
+        return frame_from(frame.images, entry, frame.rig).rig
+    cameras = []
+    for camera, now in zip(frame_from(frame.images, entry, None).rig, frame.rig, strict=True):
+        of_lens = camera if entry.get("lens") is not None else now
+        mask = now.mask if camera.mask is None else camera.mask
+        cameras.append(replace(camera, name=now.name, lens=of_lens.lens, distortion=of_lens.distortion, mask=mask))
+    return frame.rig.with_cameras(cameras)
 
 
 def _ego2ego(sample: Mapping[str, Any], index: tuple[int, ...], entry: Mapping[str, Any]) -> FloatArray:
@@ -197,6 +220,8 @@ def _ego2ego(sample: Mapping[str, Any], index: tuple[int, ...], entry: Mapping[s
             raise SampleError(f"ego2world: expected (4, 4) finite numbers, got shapes {here.shape} and {there.shape}")
         if abs(np.linalg.det(here[:3, :3])) < 0.5:
             raise SampleError("ego2world: expected a pose, got a matrix without a rotation")
+        if not all(np.allclose(matrix[3], (0, 0, 0, 1)) for matrix in (here, there)):
+            raise SampleError("ego2world: expected a pose, got a last row that is not 0 0 0 1")
         pose = np.linalg.solve(here, there)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise SampleError(f"ego2ego: expected (4, 4) finite numbers, got shape {pose.shape}")
@@ -257,26 +282,21 @@ def _angle_deg(R: FloatArray) -> float:
 
 
 def _boxes(
-    sample: Mapping[str, Any],
-    index: tuple[int, ...],
-    entry: Mapping[str, Any],
-    ego2ego: FloatArray,
-    seconds: float | None,
+    current: Points | None, entry: Mapping[str, Any], ego2ego: FloatArray, seconds: float | None
 ) -> tuple[FloatArray | None, FloatArray | None]:
-    """Where labelled objects are, and where they were, in the current ego frame."""
-    current = sample.get("boxes_3d")
-    given = None if current is None else current[index[0]] if index else current
-    now = None if given is None else checked_boxes(given)
+    """Where labelled objects are, and where they were, in the current ego frame; None where nobody said."""
+    now = None if current is None else checked_boxes(current)
     if entry.get("boxes_3d") is not None:
-        boxes = checked_boxes(entry["boxes_3d"])
+        boxes = checked_boxes(numbers("boxes_3d", entry["boxes_3d"]))
         moved = boxes.copy()
         moved[:, :3] = boxes[:, :3] @ ego2ego[:3, :3].T + ego2ego[:3, 3]
         moved[:, 6] += np.arctan2(ego2ego[1, 0], ego2ego[0, 0])
         return now, moved
-    columns = 0 if given is None else numbers("boxes_3d", given).shape[-1]
-    if now is None or seconds is None or columns < 9:
+    if now is None or current is None or seconds is None or current.shape[-1] < 9:
+        return now, None
+    velocity_mps = current.reshape(-1, current.shape[-1])[:, 7:9]
+    if not np.isfinite(velocity_mps).all():  # NaN in nuScenes: one that nobody knows may have driven anywhere
         return now, None
     moved = now.copy()
-    # Velocities that nobody knows are NaN in nuScenes.
-    moved[:, :2] += np.nan_to_num(numbers("boxes_3d", given)[:, 7:9]) * seconds
+    moved[:, :2] += velocity_mps * seconds
     return now, moved

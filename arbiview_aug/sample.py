@@ -122,7 +122,7 @@ def scenes_of_frames(
         return [Scene()] * count
     solid: list[FloatArray | None] = [None] * count
     if boxes is not None:
-        solid = [checked_boxes(of_frame) for of_frame in _of_frames("boxes_3d", boxes, count, lead)]
+        solid = [checked_boxes(of_frame) for of_frame in of_frames("boxes_3d", boxes, count, lead)]
     measured, moved = ([None] * count if found is None else found for found in (points, motion))
     return [Scene(b, p, m) for b, p, m in zip(solid, measured, moved, strict=True)]
 
@@ -136,7 +136,7 @@ def _points_of_frames(
         return None
     parts: list[list[np.ndarray]] = [[] for _ in frames]
     if points is not None:
-        for part, of_frame in zip(parts, _of_frames("points", points, len(frames), lead), strict=True):
+        for part, of_frame in zip(parts, of_frames("points", points, len(frames), lead), strict=True):
             part.append(checked_points(of_frame))
     if depth_m is not None:
         for part, of_frame in zip(parts, _points_of_maps("depth_m", depth_m, frames, lead, lambda c: c), strict=True):
@@ -182,8 +182,13 @@ def names_of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> 
     return [str(v.tolist()) if isinstance(v, torch.Tensor) else str(v) for v in values]
 
 
-def _of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[Points]:
-    """Numbers of each frame: a tensor with the images' leading dimensions, or a list with an entry for each frame."""
+def of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[Points]:
+    """Numbers of each frame: a tensor with the images' leading dimensions, or a list with an entry for each frame.
+
+    Raises:
+        SampleError: Another number of frames.
+        SampleTypeError: No numbers.
+    """
     if not lead:
         return [_recorded(key, value)]
     try:

@@ -1,6 +1,7 @@
 """``python -m arbiview_aug depth``: files beside the data, resumed, and read again by a dataset."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -107,3 +108,39 @@ def test_files_that_do_not_fit_are_named(made: Path, recorded: Path, tmp_path: P
     assert DepthFolder(tmp_path).path("a/b").parent == tmp_path
     with pytest.raises(SampleError, match="expected 'rig' and 'token'"):
         WithMotionDepth([{"images": 0}], made)[0]
+
+
+def test_what_was_found_from_less_is_found_again(recorded: Path, tmp_path: Path, capsys) -> None:
+    """A neighbour that could not be read, a drive without its sequence: once mended, the next run does them again."""
+    root = tmp_path / "drive"
+    shutil.copytree(recorded, root)
+    sequence = (root / "sequence.json").read_text()
+    (root / "sequence.json").unlink()
+    asked = ["depth", "--data", str(root)]
+    assert main(asked) == 0 and "0 of 4 frames have depth" in capsys.readouterr().out
+    (root / "sequence.json").write_text(sequence)
+    image = sorted((root / "002").glob("*.jpg"))[0]
+    sound = image.read_bytes()
+    image.write_bytes(b"no picture")
+    assert main(asked) == 1 and "1 were there before" in capsys.readouterr().out
+    image.write_bytes(sound)
+    assert main(asked) == 0
+    kept = capsys.readouterr().out.partition(" were there before")[0]
+    assert int(kept.split()[-1]) < 3, "those that had lost their neighbour, and the one that could not be read"
+    assert main(asked) == 0 and "4 were there before" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("device", ["gpu", "cuda:99", "meta"])
+def test_devices_that_are_not_there(recorded: Path, device: str, capsys) -> None:
+    assert main(["depth", "--data", str(recorded), "--device", device]) == 2
+    assert "--device: expected cpu" in capsys.readouterr().err
+
+
+def test_a_broken_frame_is_no_neighbour(recorded: Path, tmp_path: Path) -> None:
+    shutil.copytree(recorded, tmp_path / "drive")
+    (tmp_path / "drive" / "002" / "calib.json").write_text("{")
+    with pytest.warns(UserWarning, match="002.*this frame is no neighbour"):
+        drive = FrameFolder(tmp_path / "drive", neighbours=Neighbours())
+    assert drive[1]["neighbours"] and all(frame["token"] != "002" for frame in drive[1]["neighbours"])
+    with pytest.raises(DataError, match="002"):
+        drive[2]

@@ -1,6 +1,7 @@
 """What a sample says of other frames of its drive: good ones in their places, bad ones named and left out."""
 
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -73,9 +74,7 @@ def test_velocities_stand_in_for_missing_boxes(sample: dict[str, Any]) -> None:
     for neighbour in sample["neighbours"]:
         del neighbour["boxes_3d"]
     assert all(n.boxes is None for n in read(sample)[0])
-    boxes = torch.tensor(
-        [[10.0, 2.0, 0.8, 4.0, 1.8, 1.6, 0.0, 8.0, -1.0], [20.0, 2.0, 0.8, 4.0, 1.8, 1.6, 0, np.nan, 0]]
-    )
+    boxes = torch.tensor([[10.0, 2.0, 0.8, 4.0, 1.8, 1.6, 0.0, 8.0, -1.0], [20.0, 2.0, 0.8, 4.0, 1.8, 1.6, 0, 0, 0]])
     found, _ = read(sample | {"boxes_3d": boxes})
     seconds = first["time_s"]
     assert seconds < 0
@@ -154,3 +153,60 @@ def test_a_batch_has_a_list_for_each_frame(sample: dict[str, Any]) -> None:
     assert (one["source_frame"] > 0).any()
     with pytest.raises(SampleTypeError, match="a list of 2 lists"):
         retarget(batch | {"neighbours": sample["neighbours"]})
+
+
+def test_lenses_and_masks_of_the_rig_that_all_samples_share(sample: dict[str, Any]) -> None:
+    """K and cam2ego say nothing of them: without its mask the own bonnet would be read as road."""
+    mask = np.ones((64, 176), bool)
+    mask[50:] = False
+    lens = {"lens": "radtan", "distortion": (0.05, 0.0, 0.0, 0.0)}
+    rig = RIG.with_cameras([replace(camera, mask=mask, **lens) for camera in RIG])
+    bare = {key: value for key, value in sample.items() if key not in ("rig", "K", "cam2ego")}
+    for neighbour in bare["neighbours"]:
+        neighbour.pop("rig", None)
+        neighbour |= {"K": rig.K, "cam2ego": rig.cam2ego}
+    said: list[str] = []
+    (found,) = neighbours_of_frames(bare, check_inputs(bare, rig), (), lambda _, message: said.append(message))
+    assert not said and len(found) == 2
+    for camera in found[0].rig:
+        assert camera.lens == "radtan" and np.array_equal(camera.mask, mask)
+
+
+def test_a_box_whose_velocity_nobody_knows(sample: dict[str, Any]) -> None:
+    """It may have driven anywhere: as if nobody had labelled the other frame."""
+    boxes = torch.zeros(2, 9)
+    boxes[:, 3:6], boxes[1, 0] = 2, 20
+    for unknown in (False, True):
+        boxes[1, 7] = float("nan") if unknown else 1
+        given = sample | {"boxes_3d": boxes}
+        for neighbour in given["neighbours"]:
+            neighbour.pop("boxes_3d", None)
+        (found, *_), _ = read(given)
+        assert (found.boxes is None) == (found.moved is None) == unknown
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "why"),
+    [
+        ("ego2world", np.zeros((4, 4)), "expected a pose, got a last row"),
+        ("boxes_3d", [[1.0, 2.0], [3.0]], "boxes_3d: expected"),
+        ("boxes_3d", "cars", "boxes_3d: expected"),
+    ],
+)
+def test_what_numpy_would_trip_over_is_named(sample: dict[str, Any], key: str, value: Any, why: str) -> None:
+    sample["neighbours"][0].pop("ego2ego", None)
+    sample["neighbours"][0][key] = value
+    found, said = read(sample)
+    assert [n.number for n in found] == [1] and why in said[0]
+
+
+def test_frames_of_two_leading_dimensions(sample: dict[str, Any]) -> None:
+    retarget = RigRetarget(demo_target_rig((64, 176)), surface="street", outputs=("source_frame",))
+    alone = retarget(sample)
+    batch = {key: sample[key].expand(2, 3, *sample[key].shape) for key in ("images", "ego2world")}
+    batch |= {"rig": RIG, "time_s": torch.full((2, 3), float(sample["time_s"]))}
+    batch |= {"boxes_3d": [sample["boxes_3d"]] * 6, "neighbours": [sample["neighbours"]] * 6}
+    both = retarget(batch)
+    for b in np.ndindex(2, 3):
+        assert torch.equal(both["source_frame"][b], alone["source_frame"])
+        assert torch.equal(both["images"][b], alone["images"])

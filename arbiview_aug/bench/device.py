@@ -22,10 +22,9 @@ import torch
 
 from arbiview_aug.bench.data import recorded
 from arbiview_aug.bench.timing import cuda_ms, machine, machine_line, process_ms, quartiles, show, timed_rounds
-from arbiview_aug.command_line import add_data, count, size
+from arbiview_aug.command_line import add_data, count, device_named, size
 from arbiview_aug.device_maps import maps_on
 from arbiview_aug.environment import one_thread, versions
-from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.favs.synthesis import render_torch
 from arbiview_aug.plan import RenderPlan, build_plan
@@ -60,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--repeats", type=count, default=REPEATS, metavar="N", help="rounds (default: %(default)s)")
     parser.add_argument("--output", default="output/device.json", metavar="FILE", help="(default: %(default)s)")
     arguments = parser.parse_args(argv)
-    device = _device(arguments.device)
+    device = device_named(arguments.device)
     with one_thread(), recorded(arguments.data) as data:
         report = measure(
             data.sample(0),
@@ -192,15 +191,3 @@ def _copies(half: int, device: torch.device) -> Callable[[], Any]:
     """A copy that reads ``half`` bytes and writes as many."""
     source, target = (torch.zeros(half, dtype=torch.uint8, device=device) for _ in range(2))
     return lambda: target.copy_(source)
-
-
-def _device(name: str | None) -> torch.device:
-    if name is None:
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise DataError(f"--device: expected cpu, cuda, cuda:1, ..., got {name!r}") from None
-    if device.type not in BATCH or (device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count()):
-        raise DataError(f"--device: expected cpu or a CUDA device that is there, got {name!r}")
-    return device

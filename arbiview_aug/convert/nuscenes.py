@@ -124,6 +124,8 @@ class NuScenes:
             rig: Its cameras.
             views: Of each camera the files' names, by what follows their stem.
         """
+        if "boxes_3d" not in sample:  # nothing is annotated
+            return {}, {"visible": {}}
         boxes, coverage = sample["boxes_3d"].numpy(), [mask.numpy() for mask in out["coverage"]]
         shares = np.round(visible_shares(rig, coverage, boxes), 3).tolist()
         return {}, {"visible": dict(zip(sample["box_tokens"], shares, strict=True))}

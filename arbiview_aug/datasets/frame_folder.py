@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -164,13 +165,16 @@ class FrameFolder(Dataset[dict[str, Any]]):
         return decode_images(files, names=rig.names, sizes=sizes, reduce=self.reduce)
 
     def _find_drive(self, order: Sequence[str]) -> Drive:
-        """The frames of ``sequence.json`` that have a pose."""
+        """The frames of ``sequence.json`` that have a pose; broken ones are named, and raise when they are read."""
         positions_m = {}
         for name in order:
             folder = self._frames[self._index[name]]
-            pose = _read_calibration(folder).get("ego2world")
-            if pose is not None:
-                positions_m[name] = _pose(pose, str(folder / CALIBRATION_FILE)).numpy()[:3, 3]
+            try:
+                pose = _read_calibration(folder).get("ego2world")
+                if pose is not None:
+                    positions_m[name] = _pose(pose, str(folder / CALIBRATION_FILE)).numpy()[:3, 3]
+            except ArbiviewError as error:
+                warnings.warn(f"{error}; this frame is no neighbour", stacklevel=3)
         self._driven = list(positions_m)
         timed = all(name in self._times_s for name in self._driven)
         parts = parts_of_clock(self._driven, self._times_s if timed else None, str(self.root / SEQUENCE_FILE))
@@ -199,11 +203,12 @@ class FrameFolder(Dataset[dict[str, Any]]):
         data = {"name": calib.get("name", calib.get("dataset", "")), "cameras": bare}
         data["ground_z_m"] = calib.get("ground_z_m", 0.0)
         key = json.dumps([data, [mask and str((folder / str(mask)).resolve()) for mask in masks]])
-        if self._last_rig is None or self._last_rig[0] != key:
+        last = self._last_rig  # another thread may read another frame
+        if last is None or last[0] != key:
             rig = Rig.from_dict(data, where=where)
             cameras = [_with_mask(camera, file, folder, where) for camera, file in zip(rig, masks, strict=True)]
-            self._last_rig = key, reduced_rig(rig.with_cameras(cameras), self.reduce)
-        return self._last_rig[1]
+            last = self._last_rig = key, reduced_rig(rig.with_cameras(cameras), self.reduce)
+        return last[1]
 
 
 def _find_frames(root: Path) -> list[Path]:

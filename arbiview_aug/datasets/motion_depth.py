@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -27,7 +27,7 @@ WANTED = Neighbours(count=2, step_m=BEST_TRAVEL_M / 2)
 """The neighbours to open a data set with: at half the best travel and at all of it; what the recording comes nearer to
 is taken."""
 
-_FORMAT = 1
+_FORMAT = 2
 _SAME_PX, _SAME_POSE = 0.05, 1e-3
 """By how much calibrations may differ: images decoded at half their size give the same maps."""
 
@@ -46,8 +46,14 @@ class DepthFolder:
         """Of a frame; what a file system would not have in a name is escaped."""
         return self.root / f"{quote(token, safe='')}.npz"
 
-    def write(self, token: str, rig: Rig, depth: MotionDepth) -> None:
+    def write(self, token: str, rig: Rig, depth: MotionDepth, neighbours: Sequence[str] = ()) -> None:
         """Write a frame's depth: all of the file or nothing.
+
+        Args:
+            token: Of the frame.
+            rig: Its rig.
+            depth: What was found.
+            neighbours: Names of the frames that it was found from.
 
         Raises:
             OutputError: It cannot be written.
@@ -58,6 +64,7 @@ class DepthFolder:
                 file,
                 format=_FORMAT,
                 words=np.array(depth.words),
+                neighbours=np.array(list(neighbours), dtype=np.str_),
                 **_calibration(rig),
                 **maps,  # type: ignore[arg-type]
             )
@@ -91,13 +98,14 @@ class DepthFolder:
             )
         return found
 
-    def holds(self, token: str, rig: Rig) -> bool:
-        """Whether a frame's depth is there and fits."""
+    def held(self, token: str, rig: Rig, neighbours: Sequence[str]) -> MotionDepth | None:
+        """A frame's depth where it is there, fits, and was found from these frames; None otherwise."""
         try:
-            self.read(token, rig)
+            depth = self.read(token, rig)
         except DataError:
-            return False
-        return True
+            return None
+        with np.load(self.path(token), allow_pickle=False) as file:
+            return depth if file["neighbours"].tolist() == list(neighbours) else None
 
 
 class WithMotionDepth(Dataset[dict[str, Any]]):

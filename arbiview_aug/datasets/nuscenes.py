@@ -43,7 +43,8 @@ class NuScenesDataset(Dataset[dict[str, Any]]):
     ``time_s``; with ``load_points`` the ``points`` (P, 5) float32: x y z intensity ring; with ``load_boxes`` the
     ``boxes_3d`` (B, 9) float32: centre, length, width, height in metres, yaw in radians, velocity x y in m/s over the
     ground (NaN where nobody knows), with ``box_names`` (categories) and ``box_tokens``. The numbers of points and boxes
-    vary: batch with ``batch_size=None`` or a ``collate_fn`` that keeps them as lists.
+    vary: batch with ``batch_size=None`` or a ``collate_fn`` that keeps them as lists. Samples of which no annotation is
+    there at all have no boxes, with a warning.
 
     Cameras and LiDAR record at different times. With ``compensate_ego_motion`` a camera's pose is where the camera was
     when it recorded, seen from the ego at the LiDAR's time: inv(ego2global at LiDAR time) @ ego2global at camera time
@@ -111,6 +112,13 @@ class NuScenesDataset(Dataset[dict[str, Any]]):
         self._recordings = read_recordings(tables, self._index, scenes, self.channels, neighbours is not None)
         times_s = self._recordings.time_s(self._recordings.keyframes[:, -1])
         self._annotations = read_annotations(tables, self._index, times_s, np.array(scenes)) if load_boxes else None
+        if self._annotations is not None and self.tokens and not len(self._annotations.tokens):
+            self._annotations = None  # boxes of nothing would say that nothing stands or moves anywhere
+            warnings.warn(
+                f"nuScenes {self.root}: sample_annotation has no rows of these samples (a test split?): they come "
+                "without boxes_3d",
+                stacklevel=2,
+            )
         self._driven = np.empty(0, np.int64) if neighbours is None else self._with_files()
         positions_m = self._recordings.ego2global(self._driven)[:, :3, 3]
         self._drive = Drive(positions_m, self._recordings.parts[self._driven])
