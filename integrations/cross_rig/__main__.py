@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from arbiview_aug.command_line import device_named
 from integrations.cross_rig.arms import ARMS
 from integrations.cross_rig.experiment import Run, run
 from integrations.cross_rig.report import markdown, write_report
@@ -25,6 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     settings = _settings(arguments)
     setup = Run(settings=settings, output=arguments.output)
+    device_named(settings.schedule.device)  # before hours of rendering
     missing = setup.missing()
     if arguments.list:
         waiting = {job.name for job in missing}

@@ -88,6 +88,10 @@ class Source:
             }
             if arm.filled == "generator":
                 spec["weights"] = shipped_weights()
+            elif arm.filled is not None:
+                spec["filling"] = code_hash("arbiview_aug.inpainting") + code_hash("arbiview_aug.generator.completion")
+            if "neighbours" in arm.reads:
+                spec["neighbours"] = vars(NEIGHBOURS)
         return FrameStore(self.root, spec)
 
     def original(self) -> Source:

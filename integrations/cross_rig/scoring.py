@@ -26,8 +26,9 @@ class Interval:
 
 
 def bootstrap_ious(counts: Mapping[str, Counts], *, seed: int = 0, draws: int = _DRAWS) -> dict[str, Floats]:
-    """IoUs of resampled experiments: seeds drawn with replacement, then, for each, frames.
+    """IoUs of resampled experiments: seeds drawn with replacement, then frames, the same ones for all of them.
 
+    All seeds are tested on the same frames, so that what is easy or hard about these does not average out over seeds.
     All arms share the draws: seeds and frames are paired, so differences of arms have their own, smaller intervals.
 
     Args:
@@ -49,8 +50,8 @@ def bootstrap_ious(counts: Mapping[str, Counts], *, seed: int = 0, draws: int = 
     for start in range(0, draws, _BLOCK):
         block = min(_BLOCK, draws - start)
         drawn = rng.integers(num_seeds, size=(block, num_seeds))
+        weights = rng.multinomial(num_frames, np.full(num_frames, 1 / num_frames), size=block).astype(np.float64)
         for slot in range(num_seeds):
-            weights = rng.multinomial(num_frames, np.full(num_frames, 1 / num_frames), size=block).astype(np.float64)
             for s in range(num_seeds):
                 rows = np.flatnonzero(drawn[:, slot] == s)
                 sums[start + rows] += np.einsum("rf,fac->rac", weights[rows], columns[s], optimize=True)

@@ -51,6 +51,10 @@ class ViewMaker:
             ``images`` (M, 3, h, w), ``coverage`` (M, h, w / 8) packed bits, ``K``, ``cam2ego`` float32 and ``cpu_s``:
             CPU seconds that the arm's work took.
         """
+        for neighbour in frame.get(
+            "neighbours", ()
+        ):  # rendered when they are asked for: the world's time, not the arm's
+            neighbour["images"]
         start = time.process_time()
         if self.arm.kind == "row_split":
             views = row_split(self.source, as_arrays(frame["images"]), self.target)

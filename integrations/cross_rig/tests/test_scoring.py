@@ -29,9 +29,16 @@ def test_frame_interval_is_the_binomial_one():
 def test_seeds_widen_the_interval():
     seeds = np.concatenate([share(0.2), share(0.3), share(0.4)])
     draws = bootstrap_ious({"arm": frames(seeds)})["arm"]
-    # The mean of three draws of three seeds, and of the frames of each.
+    # The mean of three draws of three seeds, and of the frames of each, which err alone here.
     between, within = np.var([0.2, 0.3, 0.4]) / 3, np.mean([0.16, 0.21, 0.24]) / 1000 / 3
     assert draws.std() == pytest.approx(np.sqrt(between + within), rel=0.05)
+
+
+def test_frames_are_hard_for_all_seeds_alike():
+    """Three seeds that are right on the very same frames say no more of other frames than one does."""
+    one = share(0.3)
+    alone, three = (bootstrap_ious({"arm": frames(hits)})["arm"] for hits in (one, np.repeat(one, 3, axis=0)))
+    assert three.std() == pytest.approx(alone.std(), rel=0.1)
 
 
 def test_arms_are_paired():
