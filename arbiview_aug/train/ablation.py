@@ -93,7 +93,7 @@ def seen_batch(frames: Frames, indices: Sequence[int], config: TrainConfig, mask
 def ablate(
     config: TrainConfig,
     frames: Frames,
-    make: Callable[[], Generator],
+    make: Callable[[TrainConfig], Generator],
     output: Path,
     *,
     arms: Sequence[str] = tuple(ARMS),
@@ -109,7 +109,7 @@ def ablate(
     Args:
         config: Of the run that the arms change.
         frames: Synthetic streets.
-        make: Gives a fresh generator, the same each time.
+        make: Gives a fresh generator of an arm's settings, the same each time.
         output: A folder with one for each arm.
         arms: Of ``ARMS``.
         views: Held-out views for the scores.
@@ -123,7 +123,7 @@ def ablate(
     for arm in arms:
         changed = overridden(config, ARMS[arm])
         folder = output / arm.replace(" ", "_").replace("+", "with")
-        trainer = Trainer(changed, frames, make(), folder, perceptual=perceptual, show=show, say=say)
+        trainer = Trainer(changed, frames, make(changed), folder, perceptual=perceptual, show=show, say=say)
         if not trainer.train():
             return table  # stopped: an arm half trained is not scored
         if not trainer.is_main:

@@ -59,18 +59,25 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
         frames.prepare(used, workers=_readers(len(used)) if device.type == "cpu" else 0, show=show)
     perceptual = _perceptual(config, arguments.vgg_weights, say)
 
-    def made() -> tuple[Generator, bool]:
+    def made(config: TrainConfig) -> tuple[Generator, bool]:
         generator = fresh(config, arguments.weights).to(device)
         with processes.main_process_first():  # the others load what the first one saved
             ready = train_autoencoder(config, frames, generator, output, perceptual=perceptual, show=show, say=say)
         return generator, ready
 
-    generator, ready = made()
+    generator, ready = made(config)
     if not ready:
         return 0
     if arguments.command == "ablate":
         ablate(
-            config, frames, lambda: made()[0], output, views=arguments.views, perceptual=perceptual, show=show, say=say
+            config,
+            frames,
+            lambda arm: made(arm)[0],
+            output,
+            views=arguments.views,
+            perceptual=perceptual,
+            show=show,
+            say=say,
         )
         return 0
     if arguments.stage == "autoencoder":

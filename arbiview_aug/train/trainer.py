@@ -52,7 +52,7 @@ class Trainer:
         say: Gets messages for people.
 
     Raises:
-        TrainingError: The output holds a run with other settings.
+        TrainingError: The output holds a run with other settings, or the generator was made by others.
         ImportError: accelerate or tensorboard is not installed.
     """
 
@@ -73,6 +73,9 @@ class Trainer:
         self.is_main: bool = self.accelerator.is_main_process
         self.show, self._say = show and self.is_main, say
         self.device = self.accelerator.device
+        scaled = replace(config.generator.autoencoder, scale=generator.config.autoencoder.scale)
+        if generator.config != replace(config.generator, autoencoder=scaled, one_step=generator.config.one_step):
+            raise TrainingError("Trainer: expected a generator of the run's own settings, got another's")
         self.generator = generator.to(self.device)
         generator.config = replace(generator.config, one_step=config.loss.regression > 0)
         generator.autoencoder.requires_grad_(False)

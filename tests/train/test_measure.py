@@ -126,7 +126,7 @@ def test_an_ablation_that_is_stopped_scores_nothing(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(ablation.Trainer, "train", lambda self: False)
     settings = config()
     made = ablation.ablate(
-        settings, frames(), lambda: Generator.from_config(settings.generator), tmp_path, show=False, say=print
+        settings, frames(), lambda arm: Generator.from_config(arm.generator), tmp_path, show=False, say=print
     )
     assert made == {} and not (tmp_path / "ablation.json").exists()
 

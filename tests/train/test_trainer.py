@@ -220,6 +220,14 @@ def test_what_was_trained_is_said_to_whoever_loads_it(tmp_path: Path) -> None:
         assert not any(parameter.requires_grad for parameter in loaded.parameters())
 
 
+def test_a_generator_of_other_settings_is_refused(tmp_path: Path) -> None:
+    """It would say that it was trained as it was not: with inpainted conditions, say."""
+    settings = config()
+    other = Generator.from_config(replace(settings.generator, prefilled=False))
+    with pytest.raises(TrainingError, match="expected a generator of the run's own settings"):
+        Trainer(settings, frames(), other, tmp_path, show=False)
+
+
 def test_the_settings_of_a_run_are_found_again(tmp_path: Path) -> None:
     """``evaluate`` must not score a run on the streets of another split or size."""
     assert state.saved_config(tmp_path / "state", tiny()) == tiny()
