@@ -174,20 +174,23 @@ def move_to_target(out: dict[str, Any], ego2ego: torch.Tensor, lead: tuple[int, 
         ego2ego: (*lead, 4, 4) source's ego frame to target's.
         lead: Leading dimensions.
     """
-    out["ego2ego"] = ego2ego
-    out["cam2ego"] = ego2ego[..., None, :, :].to(out["cam2ego"]) @ out["cam2ego"]
+    # Sums, no products of matrices: those autocast, or TF32, would round to bfloat16's metres in a thousand.
+    out["ego2ego"], offset_m = ego2ego.to(out["cam2ego"].device), ego2ego[..., :3, 3]
+    out["cam2ego"] = out["cam2ego"].clone()
+    out["cam2ego"][..., :3, 3] += offset_m[..., None, :].to(out["cam2ego"])
     for key in ("points", "boxes_3d"):
         if out.get(key) is not None:
-            out[key] = _translated(key, out[key], ego2ego[..., :3, 3], lead)
+            out[key] = _translated(key, out[key], offset_m, lead)
     if out.get("ego2world") is not None:
         pose = out["ego2world"]
         if tuple(getattr(pose, "shape", (4, 4)))[-2:] != (4, 4):
             raise SampleError(f"ego2world: label_frame='target': expected shape (..., 4, 4), got {pose.shape}")
-        inverse = torch.linalg.inv(ego2ego)
         if isinstance(pose, np.ndarray):
-            out["ego2world"] = pose @ inverse.numpy()
+            out["ego2world"] = pose.copy()
+            out["ego2world"][..., :3, 3] -= (pose[..., :3, :3] * offset_m.numpy()[..., None, :]).sum(-1)
         elif isinstance(pose, torch.Tensor) and pose.is_floating_point():
-            out["ego2world"] = pose @ inverse.to(pose)
+            out["ego2world"] = pose.clone()
+            out["ego2world"][..., :3, 3] -= (pose[..., :3, :3] * offset_m[..., None, :].to(pose)).sum(-1)
         else:
             kind = pose.dtype if isinstance(pose, torch.Tensor) else type(pose).__name__
             raise SampleTypeError(f"ego2world: label_frame='target': expected a float tensor, got {kind}")

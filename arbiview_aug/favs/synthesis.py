@@ -107,7 +107,9 @@ def render_torch(
     dtype, device = images[0].dtype, images[0].device
     whole = dtype == torch.uint8
     atlas = sampling.torch_atlas(plan.layout, images)
-    tones = None if curves is None else _Tones.of(curves, len(images), device, 255.0 if whole else 1.0)
+    tones = (
+        None if curves is None or not any(curves) else _Tones.of(curves, len(images), device, 255.0 if whole else 1.0)
+    )
     views = []
     for target, maps in zip(plan.targets, maps_on(plan, device), strict=True):
         view = sampling.grid_sample(atlas, maps.grid, target.interpolation)

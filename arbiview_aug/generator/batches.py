@@ -102,7 +102,7 @@ def frame_names(
 def _digest(images: Sequence[torch.Tensor]) -> str:
     digest = hashlib.blake2b()
     for image in images:
-        digest.update(image.detach().cpu().contiguous().numpy().tobytes())
+        digest.update(image.detach().cpu().contiguous().view(torch.uint8).numpy().tobytes())  # bfloat16 too
     return digest.hexdigest()
 
 

@@ -13,10 +13,13 @@ from arbiview_aug.tensors import rewrapped
 
 STACKED = (
     *("images", "K", "cam2ego", "coverage", "ignore", "distortion", "ego2world"),
-    *("depth_m", MOTION_KEY),
+    *("depth_m", MOTION_KEY),  # these are ``_OF_PLANS``
 )
 """What has one shape in all frames of a rig, and so have maps over the images. All else is a list: of points and boxes
 each frame has its own number."""
+
+_OF_PLANS = ("depth_m", MOTION_KEY)
+"""Maps that are geometry."""
 
 
 def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -51,13 +54,52 @@ def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return batch
 
 
+ON_HOST = "on_host"
+"""Key of what stays on the CPU while a batch is moved."""
+
+
+class OnHost:
+    """What Lightning is not to look into while it moves a batch or rounds it to its precision.
+
+    Calibration in bfloat16 is no calibration, rigs are frozen dataclasses, neighbours would be decoded; and plans are
+    made on the CPU anyway.
+    """
+
+    def __init__(self, values: dict[str, Any]) -> None:
+        self.values = values
+
+
+def packed(batch: Mapping[str, Any]) -> dict[str, Any]:
+    """A batch by ``collate``: images and maps over them in the open, for the device, all else ``OnHost``."""
+    images = batch["images"]
+    moved = {key: value for key, value in batch.items() if key not in _OF_PLANS and _are_maps([value], images)}
+    return {**moved, "images": images, ON_HOST: OnHost({k: v for k, v in batch.items() if k not in (*moved, "images")})}
+
+
+def unpacked(batch: Mapping[str, Any]) -> dict[str, Any]:
+    """What ``packed`` was given, images and maps where they are now."""
+    return {**{key: value for key, value in batch.items() if key != ON_HOST}, **batch[ON_HOST].values}
+
+
+def on_device(batch: Mapping[str, Any], device: torch.device) -> dict[str, Any]:
+    """A batch whose tensors are on a device, those in lists too; rigs and neighbours stay. No float64 on MPS."""
+
+    def moved(value: Any) -> Any:
+        if isinstance(value, list):
+            return [moved(one) if isinstance(one, torch.Tensor) else one for one in value]
+        if not isinstance(value, torch.Tensor):
+            return value
+        return (value.float() if value.dtype == torch.float64 and device.type == "mps" else value).to(device)
+
+    return {key: moved(value) for key, value in batch.items()}
+
+
 def _are_maps(values: Sequence[Any], images: Any) -> bool:
-    """Whether all values are maps over all images: label maps, masks."""
-    sizes = [image.shape[-2:] for image in images]
+    """Whether all values are maps over all images: label maps, masks; of a sample, or of a batch."""
+    sizes = [tuple(image.shape[-2:]) for image in images]
     return all(
         isinstance(value, torch.Tensor | list | tuple)
-        and len(value) == len(sizes)
-        and all(isinstance(m, torch.Tensor) and m.shape[-2:] == size for m, size in zip(value, sizes, strict=True))
+        and [tuple(m.shape[-2:]) if isinstance(m, torch.Tensor) else None for m in value] == sizes
         for value in values
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import lightning
@@ -9,7 +10,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from arbiview_aug import RigRetarget
-from integrations.lightning.batches import collate
+from integrations.lightning.batches import collate, on_device, packed, unpacked
 
 
 class RetargetDataModule(lightning.LightningDataModule):
@@ -48,17 +49,18 @@ class RetargetDataModule(lightning.LightningDataModule):
         """Frames to validate on."""
         return self._loader(self.val, shuffle=False)
 
-    def transfer_batch_to_device(
-        self, batch: dict[str, Any], device: torch.device, dataloader_idx: int
-    ) -> dict[str, Any]:
-        """Moves the tensors; the rig stays beside them, since Lightning refuses frozen dataclasses."""
-        rig = {"rig": batch["rig"]} if "rig" in batch else {}
-        rest = {key: value for key, value in batch.items() if key != "rig"}
-        return super().transfer_batch_to_device(rest, device, dataloader_idx) | rig
-
     def on_after_batch_transfer(self, batch: dict[str, Any], dataloader_idx: int) -> dict[str, Any]:
         """The batch stage: on the device, before the training step."""
-        return self.retarget(batch) if self.trainer.training else batch
+        given = unpacked(batch)
+        images = given["images"]
+        device = (images if isinstance(images, torch.Tensor) else images[0]).device
+        return on_device(self.retarget(given) if self.trainer.training else given, device)
 
     def _loader(self, dataset: Dataset[Any], *, shuffle: bool) -> DataLoader[Any]:
-        return DataLoader(dataset, self.batch_size, shuffle=shuffle, num_workers=self.num_workers, collate_fn=collate)
+        return DataLoader(
+            dataset, self.batch_size, shuffle=shuffle, num_workers=self.num_workers, collate_fn=_packed_batch
+        )
+
+
+def _packed_batch(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    return packed(collate(samples))

@@ -10,7 +10,7 @@ from torchvision import tv_tensors
 
 from arbiview_aug import RigRetarget, SampleError
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from integrations.lightning.batches import collate
+from integrations.lightning.batches import ON_HOST, collate, on_device, packed, unpacked
 
 RIG = demo_source_rig((48, 128))
 TARGET = RIG.turned(yaw_deg=15).shifted(z_m=0.2)
@@ -89,3 +89,20 @@ def test_lenses_without_a_rig(samples: list[dict]) -> None:
     out = retarget(collate(frames))
     for k, frame in enumerate(frames):
         assert torch.equal(out["images"][k], retarget(frame)["images"])
+
+
+def test_what_lightning_is_not_to_touch(samples: list[dict]) -> None:
+    """Half precision for all that is floating point, and everything decoded that can be: as Lightning would."""
+    labelled = [{**sample, "labels": torch.ones(6, 48, 128, dtype=torch.uint8)} for sample in samples]
+    batch = collate([{**sample, "neighbours": []} for sample in labelled])
+    moved = {
+        key: value.bfloat16() if isinstance(value, torch.Tensor) and value.is_floating_point() else value
+        for key, value in packed(batch).items()
+    }
+    assert set(moved) == {"images", "labels", ON_HOST}
+    retarget = RigRetarget(TARGET, surface="objects", label_keys=("labels",))
+    out, expected = on_device(retarget(unpacked(moved)), torch.device("cpu")), retarget(batch)
+    assert set(out) == set(expected)
+    for key in ("images", "coverage", "K", "cam2ego", "labels"):
+        assert torch.equal(out[key], expected[key]) and out[key].dtype == expected[key].dtype
+    assert torch.equal(out["boxes_3d"][1], samples[1]["boxes_3d"])

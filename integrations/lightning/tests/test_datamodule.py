@@ -5,8 +5,12 @@ import pytest
 pytest.importorskip("lightning")
 
 import lightning
+import torch
 
-from arbiview_aug.datasets import NuScenesDataset
+from arbiview_aug import RigRetarget
+from arbiview_aug.datasets import Neighbours, NuScenesDataset
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from integrations.lightning.datamodule import RetargetDataModule
 from integrations.lightning.example import NearestBox, main
 from integrations.nuscenes.made import VERSION, made_root
 from integrations.snippets import snippets
@@ -28,3 +32,31 @@ def test_the_readmes_code_trains(tmp_path):
     )
     exec(code, {"model": model, "trainer": trainer, "frames_of_vehicle_b": NuScenesDataset(root, VERSION)})
     assert model.shapes.count(("train", (1, 5, 3, 256, 704))) == 2
+
+
+@pytest.mark.parametrize("precision", ["32-true", "bf16-true"])
+def test_neighbours_and_precisions(precision):
+    """Neighbours are no batch of Lightning's, and calibration rounded to bfloat16 would be none."""
+    rig = demo_source_rig((48, 128))
+    drive = SyntheticDrive(rig, num_frames=2, lidar=False, neighbours=Neighbours(count=1))
+    seen = []
+
+    class Looks(NearestBox):
+        def training_step(self, batch, index):
+            seen.append((batch["K"], batch["cam2ego"], batch["boxes_3d"]))
+            return self.head(torch.ones(1, 8, dtype=self.head.weight.dtype)).sum()
+
+    data = RetargetDataModule(drive, drive, RigRetarget(rig.turned(pitch_deg=-10), surface="street"), batch_size=2)
+    trainer = lightning.Trainer(
+        max_epochs=1,
+        limit_val_batches=0,
+        precision=precision,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        accelerator="cpu",
+    )
+    trainer.fit(Looks(), data)
+    ((K, cam2ego, boxes),) = seen
+    assert K.dtype == cam2ego.dtype == torch.float64 and torch.allclose(K[0], torch.from_numpy(rig.K))
+    assert all(of_frame.dtype == torch.float32 for of_frame in boxes)
