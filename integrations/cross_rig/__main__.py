@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from arbiview_aug.command_line import device_named
+from arbiview_aug.errors import DataError
 from integrations.cross_rig.arms import ARMS
 from integrations.cross_rig.experiment import Run, run
 from integrations.cross_rig.report import markdown, write_report
@@ -26,13 +27,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     settings = _settings(arguments)
     setup = Run(settings=settings, output=arguments.output)
-    device_named(settings.schedule.device)  # before hours of rendering
     missing = setup.missing()
     if arguments.list:
         waiting = {job.name for job in missing}
         for job in jobs(settings):
             print(f"{'missing' if job.name in waiting else 'done   '}  {job.name}")
         return 0
+    try:
+        device_named(settings.schedule.device)  # before hours of rendering
+    except DataError as error:
+        print(error, file=sys.stderr)
+        return 2
     began = time.monotonic()
 
     def log(line: str) -> None:

@@ -168,6 +168,10 @@ def test_command_lists_and_refuses(capsys, tmp_path):
     assert len(lines) == 7 and all(line.startswith("missing") for line in lines)
     with pytest.raises(SystemExit):
         command.main(["--pilot", "--arms", "nothing"])
+    capsys.readouterr()
+    assert command.main(["--pilot", "--device", "cuda:99", "--output", str(tmp_path)]) == 2
+    assert "expected cpu or a CUDA device that is there" in capsys.readouterr().err
+    assert command.main(["--large", "--list", "--output", str(tmp_path)]) == 0, "planned on a machine without a GPU"
 
 
 @pytest.mark.cross
