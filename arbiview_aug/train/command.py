@@ -128,7 +128,8 @@ def evaluate(
     if not indices:
         raise TrainingError("evaluate: expected held-out scenes, this data has too few")
     seeds, show = range(arguments.seeds), not arguments.quiet
-    report(held_out_scores(generator, frames, indices, seeds=seeds, steps=arguments.steps, show=show), say)
+    scores = held_out_scores(generator, frames, indices, seeds=seeds, steps=arguments.steps, show=show)
+    report(scores, len(seeds), say)
     return 0
 
 

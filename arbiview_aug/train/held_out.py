@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import torch
 from tqdm import tqdm
 
@@ -53,8 +54,8 @@ def held_out_scores(
         show: Progress bar.
 
     Returns:
-        ``telea``, ``one_step`` where that was trained, ``sample``, ``mean``; and ``sample_energy``, gradient energy
-        against the truth.
+        A value for each seed's scenes, one after the other: ``telea``, ``one_step`` where that was trained, ``sample``,
+        ``mean``; and ``sample_energy``, gradient energy against the truth.
 
     Raises:
         TrainingError: Frames without truth.
@@ -124,18 +125,23 @@ def _target(frame: Frame, rng: torch.Generator) -> tuple[Camera, torch.Tensor, t
     )
 
 
-def gains(scores: Mapping[str, Sequence[float]]) -> dict[str, Interval]:
-    """By how many dB each way is better than Telea, paired, with 95 % bootstrap intervals."""
-    base = scores["telea"]
+def gains(scores: Mapping[str, Sequence[float]], seeds: int = 1) -> dict[str, Interval]:
+    """By how many dB each way is better than Telea, paired, with 95 % bootstrap intervals over streets.
+
+    Args:
+        scores: By ``held_out_scores``.
+        seeds: How many views there are of each street: they are drawn together.
+    """
     ways = [name for name in scores if name not in ("telea", "sample_energy")]
-    return {name: bootstrap([a - b for a, b in zip(scores[name], base, strict=True)]) for name in ways}
+    better = {name: np.subtract(scores[name], scores["telea"]).reshape(seeds, -1).mean(0) for name in ways}
+    return {name: bootstrap(of_street.tolist()) for name, of_street in better.items()}
 
 
-def report(scores: Mapping[str, Sequence[float]], say: Callable[[str], None] = print) -> None:
-    """The scores in lines for people."""
+def report(scores: Mapping[str, Sequence[float]], seeds: int = 1, say: Callable[[str], None] = print) -> None:
+    """The scores in lines for people; arguments as for ``gains``."""
     count = len(scores["telea"])
     say(f"inside the holes of {count} held-out views; Telea {sum(scores['telea']) / count:.2f} dB; against it, dB:")
-    for name, gain in gains(scores).items():
+    for name, gain in gains(scores, seeds).items():
         say(f"  {name:<9} {gain}")
     energies = scores.get("sample_energy", [])
     if energies:

@@ -92,6 +92,9 @@ def test_held_out_streets_are_scored_against_their_truth(generator: Generator) -
     assert set(scores) == {"telea", "one_step", "sample", "mean", "sample_energy"}
     assert all(len(values) == 2 and all(map(math.isfinite, values)) for values in scores.values())
     assert set(gains(scores)) == {"one_step", "sample", "mean"}
+    twice = {"telea": [0.0] * 8, "one_step": [1.0, 2.0, 3.0, 4.0] * 2}  # two views that say the same of each street
+    once = {name: values[:4] for name, values in twice.items()}
+    assert gains(twice, seeds=2) == gains(once) != gains(twice)
     again = held_out_scores(generator, streets, [0], seeds=(0,), steps=2, mean_of=0, show=False)
     assert again["sample"] == scores["sample"][:1] and "mean" not in again
     untrained = Generator.from_config(config().generator)
