@@ -90,7 +90,8 @@ def outline(camera: Camera, box: FloatArray) -> Outline | None:
         one, two = one[ahead], two[ahead]
         one, two = _cut(one, two), _cut(two, one)
     steps = np.linspace(0, 1, 2 if camera.lens == "pinhole" else _LENS_STEPS)[:, None, None]
-    pixels, _, valid = camera.project_cam((1 - steps) * one + steps * two)  # [steps, edges, 2]
+    points = (1 - steps) * one + steps * two
+    pixels, _, valid = camera.project_cam(points)  # [steps, edges, 2]
     if not valid.any():
         return None
     limits = np.array([camera.width_px, camera.height_px]) - 1.0
@@ -105,8 +106,15 @@ def outline(camera: Camera, box: FloatArray) -> Outline | None:
     )
     if not len(within) or not (within.max(axis=0) > within.min(axis=0)).all():
         return None
-    whole = np.concatenate([pixels[valid].min(axis=0), pixels[valid].max(axis=0)])
-    return Outline(whole, np.concatenate([within.min(axis=0), within.max(axis=0)]))
+    around = [pixels[valid], within]
+    if camera.lens == "radtan":  # past where its polynomial folds back the box goes on, as a pinhole would see it
+        beyond = points[~valid & (points[..., 2] > 0)] @ camera.K.T
+        around.append(beyond[:, :2] / beyond[:, 2:])
+    whole = np.concatenate(around)
+    return Outline(
+        np.concatenate([whole.min(axis=0), whole.max(axis=0)]),
+        np.concatenate([within.min(axis=0), within.max(axis=0)]),
+    )
 
 
 def _clipped(one: FloatArray, two: FloatArray, limits: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ pixel has more than one second source.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,7 +66,9 @@ def maps_on(plan: RenderPlan, device: torch.device) -> Sequence[ViewMaps]:
     """The maps of each of the plan's views on a device; held by the plan."""
     held = plan.on_devices.get(device)
     if held is None:
-        held = tuple(_view_maps(target, plan.layout.size, device) for target in plan.targets)
+        # Made in inference mode, they could never be a part of a backward pass.
+        with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
+            held = tuple(_view_maps(target, plan.layout.size, device) for target in plan.targets)
         plan.on_devices[device] = held
     return held
 

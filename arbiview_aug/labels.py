@@ -185,15 +185,25 @@ def move_to_target(out: dict[str, Any], ego2ego: torch.Tensor, lead: tuple[int, 
         pose = out["ego2world"]
         if tuple(getattr(pose, "shape", (4, 4)))[-2:] != (4, 4):
             raise SampleError(f"ego2world: label_frame='target': expected shape (..., 4, 4), got {pose.shape}")
-        if isinstance(pose, np.ndarray):
-            out["ego2world"] = pose.copy()
-            out["ego2world"][..., :3, 3] -= (pose[..., :3, :3] * offset_m.numpy()[..., None, :]).sum(-1)
-        elif isinstance(pose, torch.Tensor) and pose.is_floating_point():
-            out["ego2world"] = pose.clone()
-            out["ego2world"][..., :3, 3] -= (pose[..., :3, :3] * offset_m[..., None, :].to(pose)).sum(-1)
+        if isinstance(pose, np.ndarray) and pose.dtype.kind in "fiu":
+            out["ego2world"] = _before_move(torch.from_numpy(pose.astype(np.float64)), offset_m).numpy()
+        elif is_readable(pose) and pose.is_floating_point():
+            out["ego2world"] = _before_move(pose, offset_m)
         else:
             kind = pose.dtype if isinstance(pose, torch.Tensor) else type(pose).__name__
             raise SampleTypeError(f"ego2world: label_frame='target': expected a float tensor, got {kind}")
+
+
+def _before_move(pose: torch.Tensor, offset_m: torch.Tensor) -> torch.Tensor:
+    """Poses (*lead, 4, 4) of an ego frame as those of one that lies (*lead, 3) behind it."""
+    try:
+        lead = torch.broadcast_shapes(pose.shape[:-2], offset_m.shape[:-1])
+    except RuntimeError:
+        expected = (*offset_m.shape[:-1], 4, 4)
+        raise SampleError(f"ego2world: expected shape {tuple(expected)}, got {tuple(pose.shape)}") from None
+    moved = pose.expand(*lead, 4, 4).clone()
+    moved[..., :3, 3] -= (pose[..., :3, :3] * offset_m[..., None, :].to(pose)).sum(-1)
+    return moved
 
 
 def _translated(key: str, value: Any, offset_m: torch.Tensor, lead: tuple[int, ...]) -> Any:
@@ -208,6 +218,8 @@ def _translated(key: str, value: Any, offset_m: torch.Tensor, lead: tuple[int, .
     if not is_readable(value) or not value.is_floating_point():
         kind = value.dtype if isinstance(value, torch.Tensor) else type(value).__name__
         raise SampleTypeError(f"{key}: label_frame='target': expected a float tensor, got {kind}")
+    if not value.numel():  # in any shape nothing stands there
+        return value.clone()
     if value.ndim < len(lead) + 1 or value.shape[-1] < 3 or tuple(value.shape[: len(lead)]) != lead:
         expected = ", ".join((*map(str, lead), "count", ">=3"))
         raise SampleError(f"{key}: expected shape ({expected}), got {tuple(value.shape)}")

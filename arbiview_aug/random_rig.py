@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 
 from arbiview_aug.errors import CalibrationError, SampleError
@@ -105,12 +106,10 @@ class RandomRig:
         if key not in sample:
             keys = ", ".join(map(str, sample))
             raise SampleError(f"RandomRig(per='sequence'): expected {key!r} in the sample, got {keys}")
-        value = sample[key]
-        if not isinstance(value, list | tuple):
-            return value
-        if len(set(value)) != 1:
-            raise SampleError(f"RandomRig(per='sequence'): {key}: expected one sequence a batch, got {len(set(value))}")
-        return value[0]
+        names = set(_flat(sample[key]))
+        if len(names) != 1:
+            raise SampleError(f"RandomRig(per='sequence'): {key}: expected one sequence a batch, got {len(names)}")
+        return names.pop()
 
     def rig(self, params: Mapping[str, float]) -> Rig:
         """The rig of drawn parameters: the same numbers give the same rig.
@@ -150,3 +149,14 @@ def _range(name: str, value: Any) -> tuple[float, float]:
         positive = "positive " if name in _SCALES else ""
         raise CalibrationError(f"RandomRig: {name}: expected a half-width or a {positive}(low, high), got {value!r}")
     return low, high
+
+
+def _flat(value: Any) -> Iterator[Any]:
+    """The entries of nested lists, tensors and arrays, as a collated batch has them; of anything else itself."""
+    if isinstance(value, torch.Tensor | np.ndarray):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        for entry in value:
+            yield from _flat(entry)
+    else:
+        yield value

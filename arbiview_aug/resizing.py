@@ -51,7 +51,8 @@ class _PixelTransform(torch.nn.Module, ABC):
             sample: As ``RigRetarget`` takes or gives it, batched or not; it is not changed.
 
         Returns:
-            A new dict. 2D boxes and the like are dropped, with a warning: ``project_boxes_3d`` makes them anew.
+            A new dict. 2D boxes and the like (``project_boxes_3d`` makes them anew), and other frames of the drive, are
+            dropped with a warning.
 
         Raises:
             SampleError: As ``RigRetarget`` raises; ``CropRig``: a window that leaves an image.
@@ -60,7 +61,7 @@ class _PixelTransform(torch.nn.Module, ABC):
         sizes = [tuple(image.shape[-2:]) for image in check_inputs(sample, None)[0].images]
         labels = check_other_keys(sample, sizes, self.label_keys, self.pass_keys)
         out = dict(sample)
-        for key in (*PIXEL_BOUND_KEYS, MOTION_KEY):
+        for key in (*PIXEL_BOUND_KEYS, MOTION_KEY, "neighbours"):
             if key in out and key not in (*_MAPS, *labels, *self.pass_keys):
                 del out[key]
                 self._warn(key, f"{type(self).__name__} drops {key}: it speaks of pixels that have moved")

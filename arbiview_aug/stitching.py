@@ -140,7 +140,8 @@ class Stitcher:
         # What decides no pixel is not even read.
         needed = [needs_geometry(frame.rig, target, self.surface, self.config) for frame in frames]
         scenes = [Scene()] * len(frames)
-        if any(needed) or self.surface != "auto":
+        fills_holes = self.reach is not None and bool(sample.get("neighbours"))  # what stands there decides these
+        if any(needed) or self.surface != "auto" or fills_holes:
             scenes = scenes_of_frames(sample, frames, lead, self.surface)
         names = self._names(sample, len(frames), lead)
         asks_motion = self.surface == "motion" and any(needed) and sample.get(MOTION_KEY) is None

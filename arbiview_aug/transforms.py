@@ -24,6 +24,7 @@ from arbiview_aug.generator.batches import SOURCES_KEY, complete_frame, frame_na
 from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_target, target_labels
 from arbiview_aug.plan import PlanCache, RenderPlan
 from arbiview_aug.random_rig import RandomRig
+from arbiview_aug.required import needs_geometry
 from arbiview_aug.rig import Rig, load_rig
 from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame, check_inputs
 from arbiview_aug.scene import Scene
@@ -316,7 +317,9 @@ class RigRetarget(torch.nn.Module):
         stale = [key for key in sample if key in PIXEL_BOUND_KEYS and key not in kept]
         dropped = [key for key in stale if key not in self.outputs]
         if dropped:
-            self._warn("dropped", f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels")
+            self._warn(
+                f"dropped {dropped}", f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels"
+            )
         rendered = ("images", "K", "cam2ego")  # their places in the dict are kept
         return {k: v for k, v in sample.items() if k in rendered or k not in (*CALIBRATION_KEYS, *stale)}
 
@@ -379,11 +382,18 @@ class RigRetarget(torch.nn.Module):
             source: The rig of the samples; ``source_rig`` by default.
 
         Raises:
-            ValueError: No source rig, a random target, or ``quality="paper"``.
+            ValueError: No source rig, a random target, ``quality="paper"``, or a surface that is made of every frame.
         """
         source = source or self.source_rig
         if source is None or self._fixed_target is None:
             raise ValueError("prepare: expected a source rig and a fixed target rig")
+        surface, config, target = self.stitcher.surface, self.stitcher.config, self._fixed_target
+        of_frames = surface in ("objects", "lidar", "motion")
+        if of_frames and isinstance(config, FavsConfig) and needs_geometry(source, target, surface, config):
+            raise ValueError(
+                f"prepare: expected a surface whose plans come back, got {surface!r}: the boxes, points or depth of "
+                "every frame make its own"
+            )
         return self.plan(source, self._fixed_target)
 
     # --- words ------------------------------------------------------------------------------------------------------
@@ -392,7 +402,8 @@ class RigRetarget(torch.nn.Module):
 
         With ``quality="paper"``: what each stage made of each source.
 
-        A random target is explained for one draw; no state changes, except that the draw advances the RNG.
+        A random target is explained for one draw. As of a call, plans and refinements that it makes are held, what it
+        warns of is not said again, and the draw advances the RNG.
         """
         frames, lead = check_inputs(sample, self.source_rig), leading_shape(sample["images"])
         target, _, _ = self._draw(sample, frames[:1], None)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Camera, Rig, RigRetarget, SampleError, project_boxes_3d
+from arbiview_aug import Camera, Rig, RigRetarget, SampleError, load_rig, project_boxes_3d
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.objects import silhouettes
 
@@ -96,3 +96,19 @@ def test_a_retargeted_sample_knows_its_own_boxes() -> None:
     with pytest.raises(SampleError, match=r"expected one sample, got a batch \(1,\)"):
         batch = {key: out[key][None] for key in ("images", "K", "cam2ego", "coverage")}
         project_boxes_3d(out["boxes_3d"], batch)
+
+
+@pytest.mark.parametrize("beside_m", [3.0, 4.5])
+def test_what_goes_on_where_a_lens_folds_back(beside_m: float) -> None:
+    """Near vehicles of a radtan camera, whose polynomial ends some 40 degrees off its axis: as an undistorted one."""
+    rig = load_rig("waymo").resized((128, 352))
+    boxes = torch.tensor(
+        [[3.2, beside_m, 1.6, 9.3, 2.1, 3.2, 1.1], [6, -beside_m, 1.75, 8, 2.5, 3.5, 0], [12, beside_m, 1, 4, 2, 2, 0]]
+    )
+    bent, plain = (project_boxes_3d(boxes, cameras)[0] for cameras in (rig, rig.undistorted()))
+    assert ((bent.truncation >= 0) & (bent.truncation < 1)).all()
+    both = [int(k) for k in bent.rows if int(k) in plain.rows.tolist()]
+    assert len(both) >= 2
+    for k in both:
+        one, two = (found.truncation[found.rows.tolist().index(k)] for found in (bent, plain))
+        assert abs(float(one - two)) < 0.12

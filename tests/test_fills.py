@@ -222,3 +222,19 @@ def test_a_neighbour_without_a_seam_follows_those_that_have_one() -> None:
     several = [candidate(90, doubt=Doubt.NONE, shows=near), candidate(180, doubt=Doubt.NONE, shows=far)]
     pixels, chosen = merged(HOLE, FREE, SEAM, several, 2)
     assert (chosen[18:] == 1).all() and (pixels[:, FREE].int() - 90).abs().max() <= 1
+
+
+def test_labels_stand_in_holes_where_nothing_else_needs_geometry() -> None:
+    """One camera that turns: no pixel of its own depends on labels, but what the neighbour may fill does."""
+    rig = RIG.with_cameras([RIG[0]])
+    drive = SyntheticDrive(rig, num_frames=1, seed=5, lidar=False, neighbours=Neighbours(count=2, step_m=4))
+    target = rig.turned(yaw_deg=-45)
+    sample = drive[0]
+    ahead = torch.tensor([[7.0, -5.0, 0.9, 4.5, 2.0, 1.8, 0.0]])  # in the hole, on the road that a neighbour shows
+    sample |= {"boxes_3d": ahead, "neighbours": [dict(one) | {"boxes_3d": ahead[:0]} for one in sample["neighbours"]]}
+    by_auto, by_boxes = (
+        RigRetarget(target, surface=surface, outputs=("source_frame",))(sample) for surface in ("auto", "objects")
+    )
+    empty = RigRetarget(target, surface="objects", outputs=("source_frame",))(sample | {"boxes_3d": ahead[:0]})
+    assert torch.equal(by_auto["source_frame"], by_boxes["source_frame"])
+    assert (empty["source_frame"] > 0).sum() > (by_auto["source_frame"] > 0).sum() > 0

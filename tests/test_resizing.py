@@ -99,6 +99,8 @@ def test_batches_lists_and_other_types() -> None:
 def test_what_cannot_follow_is_dropped_and_misuse_is_named() -> None:
     with pytest.warns(UserWarning, match="ResizeRig drops boxes_2d: it speaks of pixels that have moved"):
         assert "boxes_2d" not in ResizeRig((30, 50))(sample_of(boxes_2d=torch.zeros(1, 4)))
+    with pytest.warns(UserWarning, match="ResizeRig drops neighbours"):  # which are of the old size
+        assert "neighbours" not in ResizeRig((30, 50))(sample_of(neighbours=[{}]))
     with pytest.raises(SampleError, match=r"within the image of \(h, w\) = \(60, 100\), got rows 30 to 70"):
         CropRig(30, 0, (40, 10))(sample_of())
     with pytest.raises(SampleError, match="looks like a map"):

@@ -652,6 +652,29 @@ def test_prepare_builds_the_plan_that_samples_use() -> None:
     for bad in (RigRetarget(ring()), RigRetarget(RandomRig(ring()), source_rig=source)):
         with pytest.raises(ValueError, match="prepare: expected a source rig and a fixed target rig"):
             bad.prepare()
+    of_frames = RigRetarget(ring().shifted(z_m=0.5), source_rig=source, surface="lidar")
+    with pytest.raises(ValueError, match="prepare: expected a surface whose plans come back, got 'lidar'"):
+        of_frames.prepare()
+
+
+def test_maps_made_in_inference_mode_take_part_in_training() -> None:
+    """Lightning validates in inference mode, before anything is trained."""
+    source = ring()
+    retarget = RigRetarget(ring().turned(yaw_deg=5), source_rig=source, execution="torch")
+    with torch.inference_mode():
+        retarget({"images": pictures(source)})
+    images = (pictures(source).float() / 255).requires_grad_()
+    retarget({"images": images})["images"].sum().backward()
+    assert images.grad is not None and images.grad.abs().sum() > 0
+
+
+def test_frames_without_objects_move_too() -> None:
+    """``torch.tensor([])``, as a list without boxes gives: accepted as it is, and in the target's frame."""
+    source = ring()
+    for frame in ("source", "target"):
+        retarget = RigRetarget(ring(ground_z_m=-0.5), source_rig=source, label_frame=frame, surface="street")
+        out = retarget({"images": pictures(source), "boxes_3d": torch.tensor([]), "points": torch.zeros(0, 4)})
+        assert out["boxes_3d"].shape == (0,) and out["points"].shape == (0, 4)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from arbiview_aug.bench.data import Recorded
 from arbiview_aug.bench.timing import quartiles, timed_rounds
+from arbiview_aug.camera import BoolArray
 from arbiview_aug.datasets.images import Reduce
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.baselines import Renderer, row_split
@@ -115,8 +116,7 @@ def _renderer(name: str, renderer: Renderer) -> Method:
 def every_move(data: Recorded, frames: int, reduce: Reduce, moves: Sequence[str]) -> dict[str, dict[str, Any]]:
     """PSNR of each rival for each frame and move: over all pixels (unseen ones black), and over common ones.
 
-    Common are the pixels that both ``OURS`` and ``ROW_SPLIT`` cover: what each leaves black is not compared there.
-    OpenCV's stitching covers fewer and is compared over all pixels alone.
+    Common are the pixels that a rival and ``OURS`` both cover: what each leaves black is not compared there.
 
     Args:
         data: The frames, of pinhole cameras.
@@ -131,26 +131,32 @@ def every_move(data: Recorded, frames: int, reduce: Reduce, moves: Sequence[str]
         targets = {name: t for kind in moves for name, t in named_targets(kind, frame.sample["rig"]).items()}
         for move, target in tqdm(targets.items(), desc="every move", unit="move", leave=False):
             views = {method.name: method.render(frame.scored_sample, target) for method in rivals()}
-            common = [a.coverage & b.coverage for a, b in zip(views[OURS], views[ROW_SPLIT], strict=True)]
             row = found.setdefault(f"frame {index}: {move}", {})
             for name, own in views.items():
-                shown = [View(view.image, both) for view, both in zip(own, common, strict=True)]
-                means = mean_of(scores(frame, lambda *_, shown=shown: shown, target, ("even",))[1])
-                seen = float(np.mean([view.coverage.mean() for view in own]))
-                row[name] = {
-                    "psnr_db": means[f"{prefix}_psnr_db"],
-                    "common_psnr_db": None if name == STITCHING else means[f"{prefix}_covered_psnr_db"],
-                    "seen": seen,
-                }
+                common = [a.coverage & b.coverage for a, b in zip(views[OURS], own, strict=True)]
+                parts = {"": own, "common_": _shown(own, common), "ours_common_": _shown(views[OURS], common)}
+                row[name] = {"seen": float(np.mean([view.coverage.mean() for view in own]))}
+                for part, shown in parts.items():
+                    means = mean_of(scores(frame, lambda *_, shown=shown: shown, target, ("even",))[1])
+                    row[name][f"{part}psnr_db"] = means[f"{prefix}_{'covered_' if part else ''}psnr_db"]
     return found
 
 
-def lost_moves(
-    found: Mapping[str, Mapping[str, Any]], metric: str, ours: str = OURS, other: str = ROW_SPLIT
-) -> list[str]:
-    """Moves at which ``other`` has at least the dB of ``ours``, with both figures."""
-    return [
-        f"{move} {row[ours][metric]:.2f} against {row[other][metric]:.2f} dB"
-        for move, row in found.items()
-        if row[ours][metric] <= row[other][metric]
-    ]
+def _shown(views: Sequence[View], pixels: Sequence[BoolArray]) -> list[View]:
+    return [View(view.image, some) for view, some in zip(views, pixels, strict=True)]
+
+
+def lost_moves(found: Mapping[str, Mapping[str, Any]], metric: str, other: str = ROW_SPLIT) -> list[str]:
+    """Moves at which a rival has at least the dB of ``OURS``, with both figures.
+
+    Args:
+        found: By ``every_move``.
+        metric: ``psnr_db``, or ``common_psnr_db``, where ours is over the same pixels.
+        other: The rival.
+    """
+    lost = []
+    for move, row in found.items():
+        ours = row[OURS][metric] if metric == "psnr_db" else row[other][f"ours_{metric}"]
+        if ours <= row[other][metric]:
+            lost.append(f"{move} {ours:.2f} against {row[other][metric]:.2f} dB")
+    return lost
