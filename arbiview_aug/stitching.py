@@ -140,7 +140,8 @@ class Stitcher:
         # What decides no pixel is not even read.
         needed = [needs_geometry(frame.rig, target, self.surface, self.config) for frame in frames]
         scenes = [Scene()] * len(frames)
-        fills_holes = self.reach is not None and bool(sample.get("neighbours"))  # what stands there decides these
+        near = sample.get("neighbours")  # what stands there decides what they may fill
+        fills_holes = self.reach is not None and isinstance(near, list | tuple) and len(near) > 0
         if any(needed) or self.surface != "auto" or fills_holes:
             scenes = scenes_of_frames(sample, frames, lead, self.surface)
         names = self._names(sample, len(frames), lead)
@@ -151,9 +152,9 @@ class Stitcher:
                 "neither"
             )
         wanted = asks_motion or self.reach is not None
-        near = neighbours_of_frames(sample, frames, lead, self.warn) if wanted else [[] for _ in frames]
+        neighbouring = neighbours_of_frames(sample, frames, lead, self.warn) if wanted else [[] for _ in frames]
         views = []
-        for frame, scene, name, needs, neighbours in zip(frames, scenes, names, needed, near, strict=True):
+        for frame, scene, name, needs, neighbours in zip(frames, scenes, names, needed, neighbouring, strict=True):
             depth = self._depth(self.config, frame, target, scene, name) if needs else None
             known = scene if depth is None else replace(scene, corrections=depth.corrections)
             motion = self._motion(frame, scene, neighbours) if asks_motion and needs else None
