@@ -21,7 +21,7 @@ from typing import Any
 import torch
 
 from arbiview_aug.bench.data import recorded
-from arbiview_aug.bench.timing import cuda_ms, machine, machine_line, process_ms, quartiles, show, timed_rounds
+from arbiview_aug.bench.timing import clock_of, machine, machine_line, quartiles, show, timed_rounds
 from arbiview_aug.command_line import add_data, count, device_named, size
 from arbiview_aug.device_maps import maps_on
 from arbiview_aug.environment import one_thread, versions
@@ -154,7 +154,7 @@ def _of_size(
     # One copy for each number of bytes: it must not fit a cache that the frame does not fit.
     copies = {name: _copies(count_of // 2, device) for name, count_of in moved.items()}
     label = "{1}x{0}".format(*to)
-    clock = cuda_ms(device) if device.type == "cuda" else process_ms
+    clock = clock_of(device)
     named = {f"{name} {flag}": run for (name, flag), run in runs.items()} | {
         f"{k} copy": run for k, run in copies.items()
     }

@@ -15,10 +15,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
 
-from arbiview_aug.bench.timing import Clock, cuda_ms, machine, machine_line, process_ms, quartiles, show
-from arbiview_aug.command_line import count, size, writable_folder
+from arbiview_aug.bench.timing import Clock, clock_of, machine, machine_line, quartiles, show
+from arbiview_aug.command_line import count, device_named, size, writable_folder
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.evaluate.consistency import summary, target_consistency
@@ -79,19 +79,19 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     load_before = os.getloadavg()
     folder = arguments.generator
     generator = Generator.shipped() if folder is None else Generator.from_pretrained(folder)
-    generator.to("cuda" if torch.cuda.is_available() else "cpu")
+    device = device_named(None)
+    generator.to(device)
     source = demo_source_rig(arguments.size)
     drive = SyntheticDrive(source, num_frames=arguments.frames, seed=HELD_OUT_SEED, lidar=False)
     target = wide_target(source)
     frames = [make_frame(drive[k], truth=partial(drive.render, k), exposures=()) for k in range(arguments.frames)]
     make = partial(retargeting, "fast", "auto", outputs=("confidence",))
     methods = [make(name="holes black"), make(name="inpainted", path="inpaint")]
-    device = next(generator.parameters()).device
     for steps in arguments.steps:
         if steps == 1 and not generator.config.one_step:
             continue
         methods.append(make(name=row_name(steps), path="diffusion", generator=generator, steps=steps))
-    clock = cuda_ms(device) if device.type == "cuda" else process_ms
+    clock = clock_of(device)
     rows = {method.name: _row(method, frames, target, arguments.repeats, generator, clock) for method in methods}
     return {
         "benchmark": "generator",
@@ -120,7 +120,7 @@ def _row(
         pairs += target_consistency(target, views)
     calls = generator.calls - calls
     run: Callable[[], Any] = partial(method.render, frames[-1].scored_sample, target)
-    times = quartiles(torch.tensor([clock(run) for _ in range(repeats)], dtype=torch.float64).numpy())
+    times = quartiles(np.array([clock(run) for _ in range(repeats)]))
     means = mean_of(found)
     agreement = summary("consistency", pairs)
     return {

@@ -71,6 +71,11 @@ def cuda_ms(device: torch.device) -> Clock:
     return clock
 
 
+def clock_of(device: torch.device) -> Clock:
+    """The one that says how long work on a device takes: its own on a GPU, else the process's CPU time."""
+    return cuda_ms(device) if device.type == "cuda" else process_ms
+
+
 def timed_rounds(
     candidates: Mapping[str, Callable[[], Any]],
     rounds: int,

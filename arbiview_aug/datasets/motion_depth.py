@@ -79,6 +79,18 @@ class DepthFolder:
         Raises:
             DataError: The file is missing, broken, or of another calibration.
         """
+        return self._read(token, rig)[0]
+
+    def held(self, token: str, rig: Rig, neighbours: Sequence[str]) -> MotionDepth | None:
+        """A frame's depth where it is there, fits, and was found from these frames; None otherwise."""
+        try:
+            depth, found_from = self._read(token, rig)
+        except DataError:
+            return None
+        return depth if found_from == list(neighbours) else None
+
+    def _read(self, token: str, rig: Rig) -> tuple[MotionDepth, list[str]]:
+        """A frame's depth, and the names of the frames that it was found from."""
         path = self.path(token)
         if not path.is_file():
             raise DataError(
@@ -96,16 +108,7 @@ class DepthFolder:
             raise DataError(
                 f"{path}: expected depth of this calibration, got another's; delete it and run the depth command again"
             )
-        return found
-
-    def held(self, token: str, rig: Rig, neighbours: Sequence[str]) -> MotionDepth | None:
-        """A frame's depth where it is there, fits, and was found from these frames; None otherwise."""
-        try:
-            depth = self.read(token, rig)
-        except DataError:
-            return None
-        with np.load(self.path(token), allow_pickle=False) as file:
-            return depth if file["neighbours"].tolist() == list(neighbours) else None
+        return found, held["neighbours"].tolist()
 
 
 class WithMotionDepth(Dataset[dict[str, Any]]):

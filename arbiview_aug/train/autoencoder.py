@@ -17,7 +17,7 @@ from arbiview_aug.errors import GeneratorError, TrainingError
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.checkpoint import CONFIG_FILE, check_tensors, read_checkpoint, write_checkpoint
 from arbiview_aug.train.config import AutoencoderTraining, TrainConfig
-from arbiview_aug.train.data import Frames, forked, one_thread_worker
+from arbiview_aug.train.data import Frames, item_workers
 from arbiview_aug.train.losses import Perceptual
 from arbiview_aug.train.masks import one_of
 from arbiview_aug.train.state import Average, has_state, load_state, save_state
@@ -78,12 +78,7 @@ def train_autoencoder(
     vae.train()
     batches = _Batches(frames, training, stage.batch, config.seed)
     loader: DataLoader[torch.Tensor] = DataLoader(
-        batches,
-        batch_size=None,
-        sampler=range(done, stage.steps),
-        num_workers=config.workers,
-        multiprocessing_context=forked(config.workers),
-        worker_init_fn=one_thread_worker if config.workers else None,
+        batches, batch_size=None, sampler=range(done, stage.steps), **item_workers(config.workers)
     )
     bar = tqdm(loader, desc="autoencoder", unit="step", initial=done, total=stage.steps, disable=not show)
     with StopRequests() as stop:

@@ -140,6 +140,12 @@ def forked(workers: int) -> str | None:
     return "fork" if workers else None
 
 
+def item_workers(count: int) -> dict[str, Any]:
+    """Arguments of a ``DataLoader`` whose workers make items, each with one thread; 0 makes them in this process."""
+    started = one_thread_worker if count else None
+    return {"num_workers": count, "multiprocessing_context": forked(count), "worker_init_fn": started}
+
+
 def one_thread_worker(worker: int) -> None:
     """Starts a worker: one thread, and signals are the parent's to answer."""
     cv2.setNumThreads(0)

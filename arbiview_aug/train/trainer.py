@@ -18,7 +18,7 @@ from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import shown_condition
 from arbiview_aug.generator.conditioning import pooled
 from arbiview_aug.train.config import TrainConfig
-from arbiview_aug.train.data import Frames, forked, one_thread_worker
+from arbiview_aug.train.data import Frames, item_workers
 from arbiview_aug.train.losses import Perceptual
 from arbiview_aug.train.masks import mask_bank
 from arbiview_aug.train.measure import hole_psnr, picture, sampled, save_png
@@ -219,9 +219,7 @@ class Trainer:
                 self.items,
                 batch_sampler=numbers,  # type: ignore[arg-type]
                 collate_fn=collate,
-                num_workers=config.workers,
-                multiprocessing_context=forked(config.workers),
-                worker_init_fn=one_thread_worker if config.workers else None,
+                **item_workers(config.workers),
             )
         )
 

@@ -11,15 +11,12 @@ from arbiview_aug.errors import SampleError
 from arbiview_aug.sample import MOTION_KEY
 from arbiview_aug.tensors import rewrapped
 
-STACKED = (
-    *("images", "K", "cam2ego", "coverage", "ignore", "distortion", "ego2world"),
-    *("depth_m", MOTION_KEY),  # these are ``_OF_PLANS``
-)
-"""What has one shape in all frames of a rig, and so have maps over the images. All else is a list: of points and boxes
-each frame has its own number."""
-
 _OF_PLANS = ("depth_m", MOTION_KEY)
 """Maps that are geometry."""
+
+STACKED = ("images", "K", "cam2ego", "coverage", "ignore", "distortion", "ego2world", *_OF_PLANS)
+"""What has one shape in all frames of a rig, and so have maps over the images. All else is a list: of points and boxes
+each frame has its own number."""
 
 
 def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
