@@ -1,0 +1,358 @@
+"""The pages keep their word: code and commands run, links resolve, and tables are those of their commands."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+from collections.abc import Callable, Iterator
+from functools import cache, partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+import yaml
+
+import arbiview_aug
+from arbiview_aug import RigRetarget
+from arbiview_aug.__main__ import main
+from arbiview_aug.bench import generator, neighbours, trade
+from arbiview_aug.bench.ablation import NOTES, ROWS, STEPS, markdown
+from arbiview_aug.bench.sweep import settings
+from arbiview_aug.evaluate import paper_tables
+from arbiview_aug.evaluate.frames import Frame
+from arbiview_aug.evaluate.methods import study_methods
+from arbiview_aug.evaluate.paper_tables import REAL_FRAMES, SETS, SYNTHETIC, Study, paper_report
+from arbiview_aug.favs.config import Quality
+from arbiview_aug.rig import shipped_rigs
+from arbiview_aug.surface import SurfaceName
+from arbiview_aug.train import command as train_command
+from tests.train.small import frames as drawn_frames
+from tests.train.test_command import SMALLER
+
+ROOT = Path(__file__).parents[1]
+DOCS = sorted((ROOT / "docs").glob("*.md"))
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *DOCS, *sorted((ROOT / "integrations").glob("*/*.md"))]
+BENCHMARKS = (ROOT / "docs" / "benchmarks.md").read_text()
+LARGEST_PICTURE_BYTES = 300_000
+LARGEST_PICTURES_BYTES = 900_000
+
+TINY_DEMO = ["--size", "40x104", "--width", "600"]
+TINY_BENCH = ["--quality", "draft", "--reduce", "4", "--size", "40x72", "--repeats", "1"]
+TINY = {
+    "demo": TINY_DEMO,  # the install line's
+    "demo --seed 2 --width 1400 --output docs/images/demo.jpg": TINY_DEMO,
+    "demo --target truck.yaml --seed 2 --width 1000 --output docs/images/truck.jpg": TINY_DEMO,
+    "demo --target truck.yaml": TINY_DEMO,
+    "demo --data FOLDER --target waymo": ["--size", "64x112"],
+    "evaluate --data FOLDER --yaws paper": ["--reduce", "4", "--size", "40x72"],
+    "evaluate --data FOLDER --target waymo": ["--reduce", "4", "--size", "40x72"],
+    "evaluate --paper": ["--size", "16x44", "--frames", "1"],
+    "evaluate --figure --data FOLDER": ["--reduce", "4"],
+    "inspect nuscenes waymo": [],
+    "inspect nuscenes waymo --output docs/images/rigs.jpg": [],
+    "inspect nuscenes truck.yaml": [],
+    "bench --data FOLDER --budget-ms 20": [*TINY_BENCH, "--surface", "far", "street"],
+    "bench --data FOLDER --budget-ms 20 --moves": [*TINY_BENCH, "--surface", "far"],
+    "bench loader --data FOLDER": [
+        *["--surface", "street", "--size", "32x88", "--reduce", "4", "--workers", "0", "1"],
+        *["--frames", "2", "--epochs", "1"],
+    ],
+    "bench scene --data FOLDER": ["--reduce", "4", "--repeats", "1", "--only", "p skips"],
+    "bench generator": ["--size", "32x56", "--steps", "1", "--frames", "1", "--repeats", "1"],
+    "bench neighbours": ["--size", "32x88", "--repeats", "1", "--counts", "0", "1", "--surface", "street"],
+    "bench device": ["--device", "cpu", "--sizes", "32x88", "--repeats", "1"],
+    "bench speed": ["--repeats", "1"],
+    "convert --data FOLDER --target argoverse2 --output converted --size 256x704": [
+        *("--size", "24x40", "--reduce", "4", "--workers", "1", "--surface", "street", "--report", "0")
+    ],
+    "depth --data FOLDER": ["--output", "depth"],
+    "bench ablation --data FOLDER": ["--reduce", "4", "--only", "street, not far"],
+    "train --output output/tiny": ["--quiet", *SMALLER],
+}
+"""Every command of the README and the pages, and options that make it quick."""
+
+
+@cache
+def text_of(page: Path) -> str:
+    return page.read_text()
+
+
+def name_of(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+def commands() -> set[str]:
+    """What follows ``python -m arbiview_aug`` in the README and the pages, without comments."""
+    pages = "\n".join(text_of(page) for page in (ROOT / "README.md", *DOCS))
+    return {" ".join(command.split()) for command in re.findall(r"python -m arbiview_aug ([^`\n#]+)", pages)}
+
+
+def fences(page: Path) -> Iterator[tuple[str, str | None, str]]:
+    """Language, title and text of a page's code blocks, in their order."""
+    for language, title, code in re.findall(
+        r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```', text_of(page), re.DOTALL | re.MULTILINE
+    ):
+        yield language, title or None, code
+
+
+def prose(page: Path) -> str:
+    """A page without its code blocks."""
+    return re.sub(r"^```.*?^```", "", text_of(page), flags=re.DOTALL | re.MULTILINE)
+
+
+def measured(mark: str) -> str:
+    """What stands between two marks."""
+    (found,) = re.findall(rf"<!-- {mark}\b.*?-->\n(.*?)<!-- /{mark} -->", BENCHMARKS, re.DOTALL)
+    return found
+
+
+def tables(markdown: str) -> list[list[list[str]]]:
+    """The cells of each table, row by row."""
+    found = re.findall(r"(?:^\|.*\n?)+", markdown, re.MULTILINE)
+    return [[[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()] for table in found]
+
+
+def words(markdown: str) -> list[str]:
+    """The paragraphs that are no tables."""
+    return [part.strip() for part in markdown.split("\n\n") if part.strip() and not part.lstrip().startswith("|")]
+
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub and MkDocs make them."""
+    headings = re.findall(r"^#+ (.+)$", prose(page), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", re.sub(r"[`*]", "", h)).strip().lower().replace(" ", "-") for h in headings}
+
+
+def run_page(page: Path, only_first: bool = False) -> dict[str, Any]:
+    """Write a page's titled blocks as files and run its Python, in order and in one namespace."""
+    names: dict[str, Any] = {}
+    for language, title, code in fences(page):
+        if title is not None:
+            Path(title).parent.mkdir(parents=True, exist_ok=True)
+            Path(title).write_text(code)
+        elif language == "python":
+            exec(compile(code, name_of(page), "exec"), names)
+            if only_first:
+                break
+    return names
+
+
+# --- code and commands ------------------------------------------------------------------------------------------------
+def check_truck(names: dict[str, Any]) -> None:
+    truck, views = names["truck"], names["views"]
+    assert truck["rear"].fov_deg[0] == pytest.approx(190) and arbiview_aug.load_rig("truck.yaml") == truck
+    seen = RigRetarget("truck.yaml", size=(128, 352))(names["sample"])
+    assert seen["lens"] == ["pinhole"] * 3 + ["fisheye"] and (seen["coverage"].float().mean((1, 2)) > 0.5).all()
+    assert views["retarget_params"]
+
+
+def check_filled(names: dict[str, Any]) -> None:
+    assert names["filled"] > 0.03
+
+
+def check_completed(names: dict[str, Any]) -> None:
+    assert 0.05 < names["completed"]["generated"].float().mean() < 0.5
+
+
+CHECKS: dict[str, Callable[[dict[str, Any]], None]] = {
+    "rigs.md": check_truck,
+    "drives.md": check_filled,
+    "holes.md": check_completed,
+}
+"""What the names that a page's code leaves must be."""
+
+
+@pytest.mark.parametrize("page", [p for p in DOCS if "```python" in text_of(p)], ids=name_of)
+def test_the_code_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_page(page)
+    CHECKS.get(page.name, lambda _: None)(names)
+
+
+def test_every_command_is_known_here() -> None:
+    assert commands() == set(TINY)
+
+
+@pytest.mark.parametrize(
+    "command",
+    # Benchmarks take as long as all the others together; the pictures' commands are others with a seed and a width.
+    [
+        pytest.param(c, marks=pytest.mark.bench if c.startswith("bench") else pytest.mark.slow)
+        if c.startswith("bench") or "docs/images" in c
+        else c
+        for c in sorted(TINY)
+    ],
+)
+def test_the_commands_run(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    arguments = shlex.split(command)
+    if "FOLDER" in arguments:
+        arguments[arguments.index("FOLDER")] = str(request.getfixturevalue("nuscenes_root"))
+    if "--paper" in arguments:  # whole, it takes long
+        monkeypatch.delenv("ARBIVIEW_DATA", raising=False)
+        monkeypatch.setattr(paper_tables, "SETS", ("truck",))
+    monkeypatch.setattr(trade, "MOVES", ("truck",))
+    monkeypatch.setattr(train_command, "open_frames", lambda *_, **__: drawn_frames())  # streets take seconds
+    monkeypatch.chdir(tmp_path)
+    if "truck.yaml" in arguments:
+        run_page(ROOT / "docs" / "rigs.md", only_first=True)
+    assert main([*arguments, *TINY[command]]) == 0
+    assert any(path.is_file() and path.name != "truck.yaml" for path in tmp_path.rglob("*"))
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+def test_the_ablation_is_the_commands() -> None:
+    """``bench ablation --data nuscenes-one ddad-one``: headings and steps, all that frames without boxes can tell."""
+    move = {"psnr_db": 1.0, "gain_db": 1.0, "gain_db_per_ms": 1.0}
+    figures = {"turned": move, "raised": move, "ms": 1.0, "added_ms": {"median_ms": 1.0}}
+    steps = {name: figures for name, step in STEPS.items() if ROWS[step.row].fits(Frame({}))}
+    of = {"steps": steps, "overlap": [{}, {}]}
+    (printed,) = tables(markdown({"data": dict.fromkeys(REAL_FRAMES, of)}))
+    (shown,) = tables(measured("ablation"))
+    assert shown[0] == printed[0] and [row[:2] for row in shown] == [row[:2] for row in printed]
+    assert all(re.fullmatch(r"\d\d\.\d\d \([+-]\d\.\d\d\)", row[k]) for row in shown[2:] for k in (2, 3, 6, 7))
+    assert NOTES in words(measured("ablation"))
+
+
+def test_the_trade_is_the_commands() -> None:
+    (block,) = re.findall(r"<!-- trade -->\n(.*?)<!-- /trade -->", BENCHMARKS, re.DOTALL)
+    (table,) = re.findall(r"((?:^\|.*\n)+)", block, re.MULTILINE)
+    head, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+    assert head == ["", "", *(heading for heading, _ in trade.COLUMNS)]
+    known = {setting.name for setting in settings(["far", "ground", "street", "lidar"])}
+    assert {name for name, *_ in rows} <= known and sum(mark == "step" for _, mark, *_ in rows) >= 4
+    assert trade.NOTES in block and block.count("kornia's warp_perspective") == 2
+    assert re.search(r"^Recommended, the most accurate within 20 ms a frame: ", block, re.MULTILINE)
+
+
+def test_the_neighbours_table_is_the_commands() -> None:
+    (table,) = tables(measured("neighbours"))
+    counts = partial(neighbours.counts_of, counts=neighbours.COUNTS)
+    names = [neighbours.row_name(surface, n) for surface in neighbours.NEEDS for n in counts(surface)]
+    assert table[0] == ["", *neighbours.COLUMNS] and [row[0] for row in table[2:]] == names
+    assert all(re.fullmatch(r"[\d.]+%?", cell) for row in table[2:] for cell in row[1:])
+    assert neighbours.NOTES in measured("neighbours")
+
+
+def test_the_generators_table_is_the_commands() -> None:
+    (table,) = tables(measured("generator"))
+    assert table[0] == ["", *(heading for heading, *_ in generator.COLUMNS)]
+    assert [row[0] for row in table[2:]] == ["holes black", "inpainted", *map(generator.row_name, generator.STEPS)]
+    assert all(re.fullmatch(r"[\d.]+", cell) for row in table[2:] for cell in row[1:])
+    assert generator.NOTES in measured("generator")
+
+
+def test_the_papers_tables_are_the_commands() -> None:
+    """``evaluate --paper``: headings, methods, the paper's own numbers and the words between."""
+    metrics = ("raw_psnr_db", "raw_ssim", "raw_mae", "raw_rmse")
+    real = dict.fromkeys((*metrics, "even_psnr_db"), 1.0)
+    true = dict.fromkeys((*metrics, "true_psnr_db", "true_covered_psnr_db"), 1.0)
+    of_sets = {**dict.fromkeys(REAL_FRAMES, real), SYNTHETIC: true}
+    study = Study({of: {m.name: dict.fromkeys(SETS, row) for m in study_methods()} for of, row in of_sets.items()})
+    for shown, printed in zip(tables(measured("paper")), tables(paper_report(study)), strict=True):
+        assert shown[0] == printed[0] and len(shown) == len(printed)
+        for cells, wanted in zip(shown[2:], printed[2:], strict=True):
+            assert len(cells) == len(wanted)
+            assert all(re.fullmatch(r"-|[\d.]+( / [\d.]+)?", cell) for cell in cells[1:])
+            assert cells[0] == wanted[0]
+            assert [c == "-" for c in cells] == [w == "-" for w in wanted]
+        if "published" in printed[0][1]:
+            assert [row[:5] for row in shown] == [row[:5] for row in printed]
+    assert set(words(paper_report(study))) <= set(words(measured("paper")))
+
+
+def test_measurements_name_tests_that_are_there() -> None:
+    marks = [mark for page in PAGES for mark in re.findall(r"`(?:python -m )?pytest -m (\w+)", text_of(page))]
+    assert marks
+    sources = [path.read_text() for folder in ("tests", "integrations") for path in (ROOT / folder).rglob("test_*.py")]
+    for mark in marks:
+        assert any(f"pytest.mark.{mark}" in source for source in sources), mark
+
+
+# --- links, names, pictures -------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_resolve(page: Path) -> None:
+    links = re.findall(r"\]\(([^)\s]+)\)", prose(page))
+    for link in links:
+        if re.match(r"\w+://", link):
+            continue
+        file, _, anchor = link.partition("#")
+        target = (page.parent / file).resolve() if file else page
+        assert target.is_relative_to(ROOT) and target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_files_and_tests_exist(page: Path) -> None:
+    for path in re.findall(r"(?<![\w/])((?:arbiview_aug|tests|integrations|\.ci)/[\w./-]+)", prose(page)):
+        assert (ROOT / path.rstrip(".")).exists(), path
+
+
+def test_pictures_are_few_and_small() -> None:
+    pictures = sorted((ROOT / "docs" / "images").iterdir())
+    sizes = [picture.stat().st_size for picture in pictures]
+    assert max(sizes) <= LARGEST_PICTURE_BYTES and sum(sizes) <= LARGEST_PICTURES_BYTES
+    gallery = text_of(ROOT / "docs" / "gallery.md")
+    assert all(f"(images/{picture.name})" in gallery for picture in pictures)
+
+
+def test_the_navigation_has_every_page() -> None:
+    def pages(entries: Any) -> Iterator[str]:
+        for entry in entries:
+            for value in entry.values() if isinstance(entry, dict) else [entry]:
+                yield from [value] if isinstance(value, str) else pages(value)
+
+    listed = list(pages(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]))
+    assert len(listed) == len(set(listed))
+    assert {f"{page.name}" for page in DOCS} <= set(listed)
+    beside = {name_of(page) for page in PAGES if "integrations" in page.parts} | {"CHANGELOG.md"}
+    assert beside <= set(listed)
+
+
+def test_the_reference_lists_what_is_public() -> None:
+    listed = re.findall(r"^::: ([\w.]+)$", text_of(ROOT / "docs" / "api.md"), re.MULTILINE)
+    for name in listed:
+        module, _, attribute = name.rpartition(".")
+        assert getattr(import_module(module), attribute).__doc__, name
+    assert {f"arbiview_aug.{name}" for name in arbiview_aug.__all__} <= set(listed)
+
+
+def test_names_are_complete() -> None:
+    for page, names in (
+        ("rigs.md", shipped_rigs()),
+        ("surfaces.md", [*get_args(SurfaceName), *get_args(Quality)]),
+    ):
+        for name in names:
+            assert f"`{name}`" in text_of(ROOT / "docs" / page)
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *DOCS], ids=name_of)
+def test_table_cells_hold_one_sentence(page: Path) -> None:
+    text = re.sub(r"<!-- (\w+)\b.*?<!-- /\1 -->", "", text_of(page), flags=re.DOTALL)  # generated ones
+    for table in tables(text):
+        for cell in (cell for row in table for cell in row):
+            assert not re.search(r"[a-z`)][.] [A-Z`]", cell), cell
+
+
+def test_the_site_hook_parses_and_knows_its_files() -> None:
+    (patterns,) = (
+        ast.literal_eval(node.value)
+        for node in ast.parse((ROOT / "docs" / "site_hook.py").read_text()).body
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "BESIDE_CODE"
+    )
+    assert all(list(ROOT.glob(pattern)) for pattern in patterns)
+
+
+def test_the_citation_is_complete() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    paper = citation["preferred-citation"]
+    authors = ", ".join(f"{author['given-names']} {author['family-names']}" for author in paper["authors"])
+    version = re.search(r'^version = "(.+)"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
+    assert version and citation["version"] == version[1]
+    readme = text_of(ROOT / "README.md")
+    assert authors in readme and paper["title"] in readme
+    assert f"## {citation['version']}" in text_of(ROOT / "CHANGELOG.md")
