@@ -1,7 +1,9 @@
 """Fixtures that several test modules share."""
 
 import importlib.util
+import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -11,6 +13,30 @@ from hypothesis import settings
 # The same examples in every run: a failure must come from the change that is tested.
 settings.register_profile("reproducible", derandomize=True, deadline=None)
 settings.load_profile("reproducible")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--bounds", action="store_true", help="fail where a measured time misses its bound")
+
+
+@pytest.fixture
+def report_bound(request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]) -> Callable[..., None]:
+    """Print a measured time, ratio or rate beside its bound; a miss fails with ``--bounds`` alone.
+
+    Times depend on the machine and on what else runs there, so tests report them; the release checks
+    (``docs/contributing.md``) pass ``--bounds`` on a machine that is otherwise idle.
+    """
+
+    def report(name: str, value: float, *, at_most: float = math.inf, at_least: float = -math.inf) -> None:
+        bound = f"at most {at_most:g}" if at_most < math.inf else f"at least {at_least:g}"
+        missed = not at_least <= value <= at_most
+        line = f"{name}: {value:.4g} (bound: {bound}){', missed' if missed else ''}"
+        with capsys.disabled():
+            print(f"\n{line}")
+        if missed and request.config.getoption("--bounds"):
+            pytest.fail(line)
+
+    return report
 
 
 @pytest.fixture(scope="session")

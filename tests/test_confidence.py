@@ -7,9 +7,9 @@ import torch
 from arbiview_aug import Rig, RigRetarget
 from arbiview_aug.camera import Camera
 from arbiview_aug.confidence import certainty, confidence
-from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.objects import Objects
 from arbiview_aug.surface import Far, Street
+from tests.helpers import street_sample
 
 SIZE = (96, 256)
 CAR = np.array([[10.0, 0.0, 0.75, 4.0, 2.0, 1.5, 0.0]])
@@ -17,7 +17,7 @@ CAR = np.array([[10.0, 0.0, 0.75, 4.0, 2.0, 1.5, 0.0]])
 
 @pytest.fixture(scope="module")
 def sample() -> dict:
-    return SyntheticDrive(demo_source_rig(SIZE), num_frames=1, seed=3, lidar=False)[0]
+    return street_sample(SIZE, seed=3, lidar=False)
 
 
 def retargeted(sample: dict, target: Rig, **settings) -> dict:

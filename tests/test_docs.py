@@ -180,9 +180,7 @@ def test_every_command_is_known_here() -> None:
     "command",
     # Benchmarks take as long as all the others together; the pictures' commands are others with a seed and a width.
     [
-        pytest.param(c, marks=pytest.mark.bench if c.startswith("bench") else pytest.mark.slow)
-        if c.startswith("bench") or "docs/images" in c
-        else c
+        pytest.param(c, marks=pytest.mark.slow) if c.startswith("bench") or "docs/images" in c else c
         for c in sorted(TINY)
     ],
 )

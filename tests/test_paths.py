@@ -36,8 +36,8 @@ def generator() -> Generator:
     return made.eval()
 
 
-SOURCE = ring(3, fov_deg=70)
-TARGET = ring(3, fov_deg=70, yaw_deg=40, name="t")
+SOURCE = ring(3, horizontal_fov_deg=70)
+TARGET = ring(3, horizontal_fov_deg=70, yaw_deg=40, name="t")
 
 
 def a_sample(token: str = "one", seed: int = 0, rig: Rig = SOURCE) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,9 @@ import pytest
 from arbiview_aug.camera import Camera
 from arbiview_aug.errors import CalibrationError
 from arbiview_aug.rig import Rig, content_order, load_rig, shipped_rigs
+from tests import helpers
 
-
-def camera(name: str = "front", azimuth_deg: float = 0.0, **changes: object) -> Camera:
-    values: dict = dict(width_px=64, height_px=48, horizontal_fov_deg=70.0, position_m=(1.5, 0.1, 1.6))
-    return Camera.looking(name=name, azimuth_deg=azimuth_deg, **{**values, **changes})
+camera = partial(helpers.camera, size=(48, 64), horizontal_fov_deg=70.0, position_m=(1.5, 0.1, 1.6))
 
 
 def rig_with_everything() -> Rig:

@@ -8,7 +8,8 @@ import cv2
 import torch
 from torch.utils.data import Dataset, get_worker_info
 
-from arbiview_aug import Camera, Rig, RigRetarget
+from arbiview_aug import Rig, RigRetarget
+from tests.helpers import ring
 
 SIZE = (36, 64)
 FRAMES = 8
@@ -17,11 +18,7 @@ PER_SEQUENCE = 4
 
 def rig(size: tuple[int, int] = SIZE) -> Rig:
     """Four cameras all around."""
-    cameras = [
-        Camera.looking(name=f"c{k}", azimuth_deg=90.0 * k, width_px=size[1], height_px=size[0], horizontal_fov_deg=120)
-        for k in range(4)
-    ]
-    return Rig(cameras, name="ring")
+    return Rig(ring(4, radius_m=0.0, size=size, horizontal_fov_deg=120.0).cameras, name="ring")
 
 
 class Frames(Dataset[dict[str, Any]]):

@@ -18,7 +18,7 @@ from arbiview_aug.rig import Rig
 
 JPEG_QUALITY = 96
 """With chroma at full resolution (4:4:4). A nuScenes frame as three other rigs see it loses 0.01, 0.03 and 0.08 dB,
-scored against LiDAR points (``pytest -m acceptance tests/acceptance/test_converted.py``); at 95 with OpenCV's halved
+scored against LiDAR points (``pytest -m slow tests/acceptance/test_converted.py``); at 95 with OpenCV's halved
 chroma 0.03, 0.07 and 0.21 dB, in files a quarter smaller."""
 
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111)

@@ -5,13 +5,14 @@ overlap of neighbours on the odd tiles; and a frame rendered at the next frame's
 Run with ``-s`` for the tables.
 """
 
+
 from __future__ import annotations
 
 import time
 import warnings
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from arbiview_aug.datasets.synthetic import GROUND_CLASSES, SyntheticDrive, demo
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
 from arbiview_aug.evaluate.overlap import overlap_scores
 from arbiview_aug.evaluate.scores import psnr_db
-from arbiview_aug.evaluate.sparse import coloured_points, equalised, sparse_metrics
+from arbiview_aug.evaluate.sparse import coloured_points, sparse_metrics
 from arbiview_aug.evaluate.targets import UP_M, YAWS_DEG
 from arbiview_aug.favs.config import Quality
 from arbiview_aug.favs.overlap_depth import overlap_depth
@@ -32,34 +33,23 @@ from arbiview_aug.rig import Rig
 from arbiview_aug.scene import Scene
 from arbiview_aug.surface import Surface, SurfaceName
 from arbiview_aug.transforms import RigRetarget
+from tests.helpers import ProtocolFrame, as_camera, few_or_all
 
-pytestmark = [pytest.mark.acceptance, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.timeout(900)
 
-FRAMES = ("nuscenes-one", "ddad-one")
+FRAMES = [pytest.param("nuscenes-one", marks=pytest.mark.slow), pytest.param("ddad-one", marks=pytest.mark.release)]
 QUALITIES: tuple[Quality, ...] = ("fast", "accurate")
 SETS = ("yaw", "up")
 
 
 MOVES = ("0.6 m higher", "0.5 m forward", "turned by 20°")
-SEEDS = range(20)
+SEEDS = few_or_all(3, 20)
 SIZE = (128, 352)
 NEAR_M = 20.0
 
 
-class Frame:
-    """A frame at half resolution, exposures made even unless ``raw``; the protocol's cameras and ours."""
-
-    def __init__(self, referee: ModuleType, folder: Path, raw: bool = False) -> None:
-        self.cameras, self.lidar, self.calibration = referee.load_frame(str(folder), 0.5)
-        self.ground_z_m = float(self.calibration["ground_z_m"])
-        self.rig = Rig(
-            [as_camera(name, c["K"], c["cam2ego"], c["mask"].shape, c["mask"] > 0) for name, c in self.cameras.items()],
-            ground_z_m=self.ground_z_m,
-        )
-        self.images: list[Image] = [c["image"] for c in self.cameras.values()]
-        if not raw:
-            self.images = list(equalised(self.rig, self.images, self.lidar))
-            self.cameras = referee.equalised(self.cameras, self.lidar)
+class Frame(ProtocolFrame):
+    """Rendered and scored."""
 
     def render(self, target: Rig, quality: Quality) -> tuple[list[Image], BoolArray]:
         lifted = not np.allclose(target.cam2ego[:, 2, 3], self.rig.cam2ego[:, 2, 3])
@@ -81,10 +71,6 @@ class Frame:
             return image, plan.targets[0].coverage
 
         return np.array([s.fitted_psnr_db for s in overlap_scores(self.rig, render)], float)
-
-
-def as_camera(name: str, K: Any, cam2ego: Any, size: tuple[int, int], mask: Any = None) -> Camera:
-    return Camera(name=name, width_px=size[1], height_px=size[0], K=K, cam2ego=cam2ego, mask=mask)
 
 
 class Real(NamedTuple):
@@ -167,6 +153,7 @@ def test_neighbours_agree_better(real: Real) -> None:
     assert gain.min() >= -0.1
 
 
+@pytest.mark.slow
 def test_the_next_frame_as_truth(referee: ModuleType, data_root: Path) -> None:
     """DDAD's frame from the cameras of the next one, 1.26 m ahead, as recorded; ``ground`` 16.12 dB, far 14.56."""
     frame = Frame(referee, data_root / "ddad-one", raw=True)
@@ -204,8 +191,8 @@ def moved(rig: Rig) -> dict[str, Rig]:
     return dict(zip(MOVES, (rig.shifted(z_m=0.6), rig.shifted(x_m=0.5), rig.turned(yaw_deg=20)), strict=True))
 
 
-@pytest.fixture(scope="module")
-def streets() -> Truth:
+@pytest.fixture(scope="module", params=SEEDS)
+def streets(request: pytest.FixtureRequest) -> Truth:
     """20 streets, three moves; of each street two cameras next to each other in the rig's order."""
     start, source = time.process_time(), demo_source_rig(SIZE)
     pairs = [moved(source.with_cameras([source[k], source[k + 1]])) for k in (0, 2, 4)]
@@ -221,7 +208,7 @@ def streets() -> Truth:
     rows: dict[tuple[str, str, str], list[list[float]]] = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for seed in SEEDS:
+        for seed in range(request.param):
             drive = SyntheticDrive(source, num_frames=1, seed=seed, lidar=False)
             sample = {**drive[0]}
             for move, target in pairs[seed % 3].items():

@@ -1,4 +1,4 @@
-"""Converted, read again and scored: the same as rendered on the fly, but for JPEG. Run with -m acceptance -s."""
+"""Converted, read again and scored: the same as rendered on the fly, but for JPEG. Run with -s for the numbers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from arbiview_aug.evaluate.methods import views_of
 MOST_DB = 0.1
 
 
-@pytest.mark.acceptance
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "target"),
     [

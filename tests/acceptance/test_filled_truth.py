@@ -16,9 +16,10 @@ import torch
 
 from arbiview_aug import Camera, Rig, RigRetarget
 from arbiview_aug.datasets import Neighbours
-from arbiview_aug.datasets.synthetic import RenderedViews, Scene, SceneClass, SyntheticDrive, demo_source_rig
+from arbiview_aug.datasets.synthetic import RenderedViews, SceneClass, SyntheticDrive, demo_source_rig
+from tests.helpers import Standing
 
-pytestmark = [pytest.mark.truth, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 RIG = demo_source_rig((128, 352))
 FRAMES = range(4)
@@ -31,14 +32,6 @@ class Street(NamedTuple):
     moving: dict[str, Any]
     standing: dict[str, Any]
     truth: dict[float, RenderedViews]
-
-
-class Standing(SyntheticDrive):
-    """The same streets, where only the vehicle moves."""
-
-    def scene(self, index: int) -> Scene:
-        scene = super().scene(index)
-        return replace(scene, velocities=np.zeros_like(scene.velocities))
 
 
 def lowered(up_m: float) -> Rig:

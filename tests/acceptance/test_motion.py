@@ -3,7 +3,6 @@
 Four streets, 128 by 352 pixels, one frame 1.2 m before and one after; views from 0.6 m higher and 1 m aside.
 """
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,23 +14,16 @@ import torch
 
 from arbiview_aug import Rig, RigRetarget
 from arbiview_aug.datasets import FrameFolder, Neighbours
-from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive, demo_source_rig
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.motion.depth import MotionDepth, motion_depth
 from arbiview_aug.neighbours import neighbours_of_frames
 from arbiview_aug.sample import MOTION_KEY, check_inputs
+from tests.helpers import Standing
 
 RIG = demo_source_rig((128, 352))
 STREETS = (0, 1, 2, 3)
 MOVES = {"0.6 m higher": RIG.shifted(z_m=0.6), "1 m aside": RIG.shifted(y_m=1.0)}
 OFF_MOTION_DEG, FAR_M = 6.0, 80.0
-
-
-class Standing(SyntheticDrive):
-    """The same streets, where only the vehicle moves."""
-
-    def scene(self, index: int) -> Scene:
-        scene = super().scene(index)
-        return replace(scene, velocities=np.zeros_like(scene.velocities))
 
 
 @cache
@@ -89,7 +81,7 @@ def gain_db(index: int, move: str, sample: dict[str, Any], depth: MotionDepth) -
     return float(10 * np.log10(squares[1] / squares[0]))
 
 
-@pytest.mark.truth
+@pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.filterwarnings("ignore:RigRetarget drops")
 @pytest.mark.parametrize(
@@ -122,7 +114,7 @@ def test_depth_is_right_and_renders_better_than_the_street(
     assert min(min(found) for found in gains.values()) >= -0.1
 
 
-@pytest.mark.acceptance
+@pytest.mark.slow
 def test_the_next_frame_as_truth(ddad_root: Path) -> None:
     """DDAD's frame as its cameras see it 1.26 m on, by depth from the two: one side alone, the hard case.
 

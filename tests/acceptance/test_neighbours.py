@@ -12,7 +12,7 @@ from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.sparse import coloured_points, colours_at, equalised, visible_points
 
-pytestmark = pytest.mark.acceptance
+pytestmark = pytest.mark.slow
 
 
 def lowered(rig: Rig) -> Rig:

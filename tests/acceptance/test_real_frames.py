@@ -12,23 +12,21 @@ import time
 import warnings
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import pytest
 
-from arbiview_aug.camera import Camera
 from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
-from arbiview_aug.evaluate.sparse import coloured_points, equalised, score_targets
+from arbiview_aug.evaluate.sparse import coloured_points, score_targets
 from arbiview_aug.evaluate.targets import UP_M, YAWS_DEG
 from arbiview_aug.rig import Rig
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.transforms import RigRetarget
+from tests.helpers import ProtocolFrame, as_camera
 
-pytestmark = [pytest.mark.acceptance, pytest.mark.timeout(600)]
+pytestmark = pytest.mark.timeout(900)
 
-FRAMES = ("nuscenes-one", "ddad-one")
-SCALE = 0.5
+FRAMES = [pytest.param("nuscenes-one", marks=pytest.mark.slow), pytest.param("ddad-one", marks=pytest.mark.release)]
 SURFACES: tuple[SurfaceName, ...] = ("auto", "ground", "far")
 REFERENCE = "reference ground"
 LARGEST_LOSS_DB = {"yaw": 0.1, "up": 0.25, "paper": 0.1}
@@ -38,24 +36,12 @@ Scores = dict[tuple[str, bool], dict[str, float]]
 """By (method, raw): PSNR of each set of targets."""
 
 
-class Frame:
-    """A frame as the protocol reads it; exposures as recorded, or made even by the protocol and by this package."""
+class Frame(ProtocolFrame):
+    """With the protocol's targets, scored by the protocol and by this package."""
 
     def __init__(self, referee: ModuleType, folder: Path, raw: bool) -> None:
+        super().__init__(referee, folder, raw)
         self.referee = referee
-        self.cameras, self.lidar, calibration = referee.load_frame(str(folder), SCALE)
-        self.ground_z_m = float(calibration["ground_z_m"])
-        self.rig = Rig(
-            [
-                as_camera(name, c["K"], c["cam2ego"], c["image"].shape[:2], c["mask"] > 0)
-                for name, c in self.cameras.items()
-            ],
-            ground_z_m=self.ground_z_m,
-        )
-        self.images: list[Image] = [c["image"] for c in self.cameras.values()]
-        if not raw:
-            self.images = list(equalised(self.rig, self.images, self.lidar))
-            self.cameras = referee.equalised(self.cameras, self.lidar)
         self.points = coloured_points(self.rig, self.images, self.lidar)
         # The protocol's own targets: on every rig it takes the paper's degrees, which are of nuScenes' spacing.
         self.sets = {
@@ -84,10 +70,6 @@ class Frame:
         render = self.referee.reference_renderer(self.cameras, "ground", ground_z=self.ground_z_m)
         score = self.referee.score
         return {name: score(render, self.cameras, self.lidar, targets)["psnr"] for name, targets in self.sets.items()}
-
-
-def as_camera(name: str, K: Any, cam2ego: Any, size: tuple[int, int], mask: Any = None) -> Camera:
-    return Camera(name=name, width_px=size[1], height_px=size[0], K=K, cam2ego=cam2ego, mask=mask)
 
 
 @pytest.fixture(scope="module", params=FRAMES)

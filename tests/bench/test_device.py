@@ -12,16 +12,16 @@ import torch
 
 from arbiview_aug.__main__ import main
 from arbiview_aug.bench.device import DTYPES, bytes_moved, measure, table
-from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.favs.config import draft
 from arbiview_aug.plan import build_plan
+from tests.helpers import street_sample
 
 SIZES = [(32, 88), (64, 176)]
 
 
 @pytest.fixture(scope="module")
 def sample() -> dict[str, Any]:
-    return SyntheticDrive(demo_source_rig((64, 176)), num_frames=1, lidar=False)[0]
+    return street_sample(lidar=False)
 
 
 def test_bytes(sample: dict[str, Any]) -> None:

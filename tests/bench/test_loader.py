@@ -1,4 +1,4 @@
-"""``python -m arbiview_aug bench loader``: that it runs; and, marked ``bench``, two workers against one."""
+"""``python -m arbiview_aug bench loader``: that it runs; and, as a release check, two workers against one."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import importlib
 import json
 import multiprocessing
 import os
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -67,9 +68,10 @@ def test_command(tmp_path: Path, nuscenes_root: Path, capsys: pytest.CaptureFixt
         main([*arguments, "--workers", "-1"])
 
 
-@pytest.mark.bench
-@pytest.mark.xfail("CI" in os.environ, reason="on shared machines times are reported, not asserted", strict=False)
-def test_two_workers_against_one(samples: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.release
+def test_two_workers_against_one(
+    samples: ModuleType, capsys: pytest.CaptureFixture[str], report_bound: Callable[..., None]
+) -> None:
     """Four 800x450 images a frame to four of 704x256."""
     source = samples.rig((450, 800))
     retarget = RigRetarget(source.turned(yaw_deg=20), source_rig=source, size=(256, 704))
@@ -87,5 +89,5 @@ def test_two_workers_against_one(samples: ModuleType, capsys: pytest.CaptureFixt
     with capsys.disabled():
         print("\n" + report)
     if (os.cpu_count() or 1) < 2 or given < QUIET or load > QUIET_LOAD:
-        pytest.skip(f"the machine is busy, so nothing is asserted: {report}")
-    assert scaling >= EXPECTED, report
+        pytest.skip(f"the machine is busy, so the bound says nothing: {report}")
+    report_bound("frames/s, two workers over one", scaling, at_least=EXPECTED)

@@ -10,16 +10,16 @@ import pytest
 
 from arbiview_aug.__main__ import main
 from arbiview_aug.bench.scene import Done, Situation, done, situations, subsets
-from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.overlaps import adjacent_pairs
 from arbiview_aug.rig import load_rig
+from tests.helpers import street_sample
 
 SIZE = (72, 200)
 
 
 @pytest.fixture(scope="module")
 def sample() -> dict[str, Any]:
-    return SyntheticDrive(demo_source_rig(SIZE), num_frames=1)[0]
+    return street_sample(SIZE)
 
 
 @pytest.fixture(scope="module")

@@ -1,9 +1,9 @@
-"""``python -m arbiview_aug bench speed``: that it runs, and, marked ``bench``, that its bounds hold."""
+"""``python -m arbiview_aug bench speed``: that it runs, and, as a release check, its bounds."""
 
 from __future__ import annotations
 
 import json
-import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -82,10 +82,9 @@ def _known_miss(name: str) -> list[pytest.MarkDecorator]:
     return [missed] if " plan" in name else []
 
 
-@pytest.mark.bench
-@pytest.mark.xfail("CI" in os.environ, reason="on shared machines ratios are reported, not asserted", strict=False)
+@pytest.mark.release
 @pytest.mark.parametrize(
     ("name", "bound"), [pytest.param(name, bound, marks=_known_miss(name)) for name, bound in BOUNDED]
 )
-def test_bounds(name: str, bound: float, best_ratios: dict[str, float]) -> None:
-    assert best_ratios[name] <= bound
+def test_bounds(name: str, bound: float, best_ratios: dict[str, float], report_bound: Callable[..., None]) -> None:
+    report_bound(f"ratio, {name}", best_ratios[name], at_most=bound)

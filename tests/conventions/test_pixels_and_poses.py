@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import cv2
 import numpy as np
 import pytest
 
-from arbiview_aug.camera import Camera
 from arbiview_aug.rig import Rig
 from arbiview_aug.rotations import rotation_z
+from tests import helpers
 
-
-def camera(**changes: object) -> Camera:
-    values: dict = dict(
-        name="c",
-        width_px=200,
-        height_px=100,
-        azimuth_deg=0.0,
-        position_m=(1.0, 0.5, 1.5),
-        K=np.array([[100.0, 0, 90], [0, 120.0, 55], [0, 0, 1]]),
-    )
-    return Camera.looking(**{**values, **changes})
+K = np.array([[100.0, 0, 90], [0, 120.0, 55], [0, 0, 1]])
+camera = partial(helpers.camera, "c", size=(100, 200), position_m=(1.0, 0.5, 1.5), K=K)
 
 
 def test_convention_pixel_centres_are_integers() -> None:

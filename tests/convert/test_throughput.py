@@ -1,4 +1,4 @@
-"""What two processes bring, and where a sample's time goes; run with -m bench."""
+"""What two processes bring, and where a sample's time goes; a release check."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -40,9 +41,10 @@ class Timed(Jobs):
         return done._replace(words=(str(time.process_time() - started),))
 
 
-@pytest.mark.bench
-@pytest.mark.xfail("CI" in os.environ, reason="on shared machines times are reported, not asserted", strict=False)
-def test_two_processes_and_the_share_of_retargeting(nuscenes_root: Path, tmp_path: Path) -> None:
+@pytest.mark.release
+def test_two_processes_and_the_share_of_retargeting(
+    nuscenes_root: Path, tmp_path: Path, report_bound: Callable[..., None]
+) -> None:
     """One real frame again and again, decoded and encoded each time; one calibration, so its plan is held.
 
     On a busy machine the wall's clock says nothing: there the second process must not cost CPU time.
@@ -73,25 +75,28 @@ def test_two_processes_and_the_share_of_retargeting(nuscenes_root: Path, tmp_pat
         f"{possible:.2f} x (load {os.getloadavg()[0]:.1f}); decode {decode:.0%}, retarget {retarget:.0%}, encode and "
         f"write {encode:.0%}; CPU {1e3 * cpu_s[1]:.0f} and {1e3 * cpu_s[2]:.0f} ms a sample"
     )
-    assert retarget <= MOST_RETARGETING
-    assert cpu_s[2] <= cpu_s[1] * 2 / LEAST_SPEEDUP
+    report_bound("share of retargeting in a conversion", retarget, at_most=MOST_RETARGETING)
+    report_bound("CPU time of a sample, two processes over one", cpu_s[2] / cpu_s[1], at_most=2 / LEAST_SPEEDUP)
     if possible > IDLE:
-        assert speedup >= LEAST_SPEEDUP
+        report_bound("samples/s, two processes over one", speedup, at_least=LEAST_SPEEDUP)
 
 
-@pytest.mark.bench
-@pytest.mark.xfail("CI" in os.environ, reason="on shared machines times are reported, not asserted", strict=False)
+@pytest.mark.release
 @pytest.mark.parametrize(
     ("surface", "size"),
     [("street", SIZE), ("lidar", SIZE), ("lidar", None)],
     ids=["street", "lidar", "lidar, full size"],
 )
 def test_what_calibrations_of_their_own_cost(
-    surface: SurfaceName, size: tuple[int, int] | None, nuscenes_root: Path, tmp_path: Path
+    surface: SurfaceName,
+    size: tuple[int, int] | None,
+    nuscenes_root: Path,
+    tmp_path: Path,
+    report_bound: Callable[..., None],
 ) -> None:
     """As in nuScenes, whose cameras stand elsewhere in every keyframe: each sample has a plan of its own.
 
-    The README's costs; there is no bound, but retargeting is more than half of it.
+    There is no bound, but retargeting is more than half of it.
     """
     source = tmp_path / "frames"
     for k in range(OWN_PLANS):
@@ -113,4 +118,5 @@ def test_what_calibrations_of_their_own_cost(
     print(
         f"{surface}, {size or 'full size'}: CPU {cpu_ms:.0f} ms a sample; decode, retarget, encode and write {shares}"
     )
-    assert seconds[1] > MOST_RETARGETING * seconds.sum()
+    share = seconds[1] / seconds.sum()
+    report_bound(f"share of retargeting, {surface}, {size or 'full size'}", share, at_least=MOST_RETARGETING)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug.camera import Camera
 from arbiview_aug.datasets import images as images_module
 from arbiview_aug.datasets.images import decode_images, read_header, reduced_camera
 from arbiview_aug.errors import DataError
+from tests.helpers import camera
 
 
 def ramp(height_px: int, width_px: int) -> np.ndarray:
@@ -25,12 +25,6 @@ def write(path: Path, rgb: np.ndarray) -> Path:
     pixels = rgb.round().astype(np.uint8)[..., ::-1]
     assert cv2.imwrite(str(path), pixels, parameters if path.suffix == ".jpg" else [])
     return path
-
-
-def camera(height_px: int, width_px: int, mask: np.ndarray | None = None) -> Camera:
-    return Camera.looking(
-        name="front", azimuth_deg=0, width_px=width_px, height_px=height_px, horizontal_fov_deg=80, mask=mask
-    )
 
 
 @pytest.fixture
@@ -105,7 +99,7 @@ def test_convention_reduced_pixels_and_camera_agree(
     """The ramp's value at a reduced pixel is the ramp at the full pixel that sees the same ray."""
     grey = ramp(*size)[..., :1].repeat(3, axis=-1)
     image = decode_images([write(tmp_path / f"ramp{suffix}", grey)], reduce=reduce)[0].permute(1, 2, 0).numpy()
-    full, small = camera(*size), reduced_camera(camera(*size), reduce)
+    full, small = camera(size=size), reduced_camera(camera(size=size), reduce)
     assert image.shape == (*small.size, 3) == (-(-size[0] // reduce), -(-size[1] // reduce), 3)
 
     inside = np.s_[1:-1, 1:-1]  # the last row and column may reach past the image
@@ -120,19 +114,20 @@ def test_convention_reduced_pixels_and_camera_agree(
 
 def test_convention_reduced_camera_is_not_a_resize_for_odd_sizes() -> None:
     """Right: x' = x / 2 - 1/4 exactly. Wrong: the ratio of sizes, 102 / 203, off by 0.25 px at the right border."""
-    full = camera(101, 203)
+    full = camera(size=(101, 203))
     small = reduced_camera(full, 2)
     A = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
     np.testing.assert_allclose(small.K, A @ full.K, atol=1e-12)
     wrong = full.resize(small.size)
     assert abs(wrong.K[0, 0] - small.K[0, 0]) > 1e-3
-    np.testing.assert_allclose(reduced_camera(camera(100, 200), 4).K, camera(100, 200).resize((25, 50)).K, atol=1e-9)
+    whole = camera(size=(100, 200))
+    np.testing.assert_allclose(reduced_camera(whole, 4).K, whole.resize((25, 50)).K, atol=1e-9)
 
 
 def test_a_reduced_mask_is_scene_where_all_of_its_pixels_are() -> None:
     mask = np.ones((5, 7), bool)
     mask[3, 2] = mask[0, 6] = False
-    small = reduced_camera(camera(5, 7, mask), 2)
+    small = reduced_camera(camera(size=(5, 7), mask=mask), 2)
     expected = np.ones((3, 4), bool)
     expected[1, 1] = expected[0, 3] = False
     assert small.mask is not None

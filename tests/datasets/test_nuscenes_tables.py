@@ -6,6 +6,7 @@ import itertools
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -131,7 +132,7 @@ def write_large(root: Path, scenes: int, exposures: int) -> int:
 
 
 @pytest.mark.slow
-def test_large_tables_take_little_memory(tmp_path: Path) -> None:
+def test_large_tables_take_little_memory(tmp_path: Path, report_bound: Callable[..., None]) -> None:
     """200,000 rows of two tables, sweeps and all, against each table's rows as objects."""
     rows = write_large(tmp_path, 140, 240)
     assert rows > 200_000
@@ -149,4 +150,4 @@ def test_large_tables_take_little_memory(tmp_path: Path) -> None:
     ]
     print(f"\n{rows} rows: {'; '.join(words)}")
     assert columns[0] < 0.4 * objects[0]
-    assert columns[1] < 3 * objects[1]  # 1.8 times, 2.25 beside other work
+    report_bound("CPU time of columns over objects, large tables", columns[1] / objects[1], at_most=3)  # 1.8

@@ -1,7 +1,6 @@
 """SyntheticDrive: the sample's contract, determinism, lenses, antialiasing, the road's texture, speed."""
 
 import json
-import os
 import pickle
 import subprocess
 import sys
@@ -331,9 +330,8 @@ def test_road_is_as_hard_as_a_real_one(nuscenes_root):
     assert 0.5 < ratio < 2.0
 
 
-@pytest.mark.bench
-@pytest.mark.xfail("CI" in os.environ, reason="on shared machines seconds are reported, not asserted", strict=False)
-def test_six_cameras_take_less_than_two_cpu_seconds():
+@pytest.mark.release
+def test_six_cameras_take_less_than_two_cpu_seconds(report_bound):
     """CPU time of the best frame on its one thread; 1.1 s on the machine it was written on."""
     drive = SyntheticDrive(demo_source_rig((256, 704)), num_frames=7)
     drive[0]  # rays of the cameras
@@ -342,7 +340,7 @@ def test_six_cameras_take_less_than_two_cpu_seconds():
         start = time.thread_time()
         drive[index]
         seconds.append(time.thread_time() - start)
-    assert min(seconds) < 2.0, seconds
+    report_bound("s of CPU, a synthetic frame of six 704x256 images", min(seconds), at_most=2.0)
 
 
 def test_scene_is_plain_data():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -9,24 +11,13 @@ from arbiview_aug.camera import Camera
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.baselines import BASELINES, SPLIT_DEPTH_M, crop_and_slide, own_camera, row_split
 from arbiview_aug.rig import Rig
+from tests import helpers
+from tests.helpers import ring
 
 COLOURS = ((200, 30, 30), (30, 200, 30), (30, 30, 200), (200, 200, 30))
 
 
-def camera(azimuth_deg: float = 0.0, name: str = "front", x: float = 0.0, y: float = 0.0, z: float = 1.5) -> Camera:
-    return Camera.looking(
-        name=name,
-        azimuth_deg=azimuth_deg,
-        position_m=(x, y, z),
-        width_px=181,
-        height_px=91,
-        horizontal_fov_deg=90.0,
-    )
-
-
-def ring() -> Rig:
-    """Four cameras that see a quarter each: ahead, left, back, right."""
-    return Rig([camera(90.0 * k, f"at {90 * k}") for k in range(4)])
+camera = partial(helpers.camera, size=(91, 181), horizontal_fov_deg=90.0)
 
 
 def plain(colour: tuple[int, int, int]) -> np.ndarray:
@@ -39,7 +30,7 @@ def noise(seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("name", BASELINES)
 def test_the_source_rig_comes_back(name: str) -> None:
-    rig = ring()
+    rig = ring(4, radius_m=0.0, name="at ", size=(91, 181), horizontal_fov_deg=90.0)
     images = [noise(k) for k in range(4)]
     for image, view in zip(images, BASELINES[name](rig, images, rig), strict=True):
         assert view.image.shape == image.shape and view.coverage.dtype == bool
@@ -51,28 +42,28 @@ def test_the_source_rig_comes_back(name: str) -> None:
 
 
 def test_own_camera_is_alone() -> None:
-    rig = ring()
+    rig = ring(4, radius_m=0.0, name="at ", size=(91, 181), horizontal_fov_deg=90.0)
     images = [plain(colour) for colour in COLOURS]
-    (view,) = own_camera(rig, images, rig.with_cameras([camera(45.0, "at 0")]))
+    (view,) = own_camera(rig, images, rig.with_cameras([camera("at 0", 45.0)]))
     # 45 degrees to the left, the image's right half of the angle is what the own camera saw; none else helps.
     columns = view.coverage.mean(0)
     assert columns[:88].max() == 0 and columns[93:].min() > 0.6
     assert set(map(tuple, view.image[view.coverage].tolist())) == {COLOURS[0]}
     assert not view.image[~view.coverage].any()
-    (other,) = own_camera(rig, images, rig.with_cameras([camera(80.0, "of another rig")]))
+    (other,) = own_camera(rig, images, rig.with_cameras([camera("of another rig", 80.0)]))
     assert tuple(other.image[45, 90]) == COLOURS[1], "without its name, the camera that looks most nearly its way"
 
 
 def test_crop_and_slide_is_a_window_over_strips() -> None:
-    rig = ring()
+    rig = ring(4, radius_m=0.0, name="at ", size=(91, 181), horizontal_fov_deg=90.0)
     images = [plain(colour) for colour in COLOURS]
-    (view,) = crop_and_slide(rig, images, rig.with_cameras([camera(30.0, "any", x=5.0, z=3.0)]))
+    (view,) = crop_and_slide(rig, images, rig.with_cameras([camera("any", 30.0, position_m=(5.0, 0.0, 3.0))]))
     assert view.coverage.all(), "position and coverage play no part"
     # 30 of 90 degrees to the left: a third of the width, from the left, is the left neighbour's.
     row = view.image[45]
     np.testing.assert_array_equal(row[:58], np.broadcast_to(COLOURS[1], (58, 3)))
     np.testing.assert_array_equal(row[63:], np.broadcast_to(COLOURS[0], (118, 3)))
-    (back,) = crop_and_slide(rig, images, rig.with_cameras([camera(180.0, "any")]))
+    (back,) = crop_and_slide(rig, images, rig.with_cameras([camera("any", 180.0)]))
     assert tuple(back.image[45, 90]) == COLOURS[2], "the panorama is closed"
 
 
@@ -83,7 +74,7 @@ def test_crop_and_slide_of_one_camera() -> None:
 
 
 def test_row_split_below_the_horizon_is_the_road() -> None:
-    source, target = camera(z=1.5), camera(z=3.0)
+    source, target = camera(), camera(position_m=(0.0, 0.0, 3.0))
     row = np.broadcast_to(np.arange(91, dtype=np.uint8)[:, None, None], (91, 181, 3)).copy()
     (view,) = row_split(Rig([source]), [row], Rig([target]))
     # f = 90.5 px, the horizon at row 45. A road point at row 45 + v is at 90.5 · 3 / v m, and there at half of v.
@@ -95,7 +86,7 @@ def test_row_split_below_the_horizon_is_the_road() -> None:
 
 def test_row_split_above_the_horizon_is_a_plane() -> None:
     column = np.broadcast_to(np.arange(181, dtype=np.uint8)[None, :, None], (91, 181, 3)).copy()
-    (view,) = row_split(Rig([camera()]), [column], Rig([camera(y=2.0)]))
+    (view,) = row_split(Rig([camera()]), [column], Rig([camera(position_m=(0.0, 2.0, 1.5))]))
     shift = round(float(camera().K[0, 0]) * 2.0 / SPLIT_DEPTH_M)
     assert shift == 4
     assert view.image[10, 90, 0] == 90 - shift, "from 2 m to the left, what is 50 m ahead was further left"

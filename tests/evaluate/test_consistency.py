@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -11,22 +13,15 @@ from arbiview_aug.evaluate.images import View, as_tensors
 from arbiview_aug.evaluate.methods import retargeting
 from arbiview_aug.evaluate.overlap import OverlapScore
 from arbiview_aug.rig import Rig
+from tests import helpers
 
 SIZE = (112, 200)
 
 
-def camera(azimuth_deg: float, name: str, z: float = 1.5) -> Camera:
-    return Camera.looking(
-        name=name,
-        azimuth_deg=azimuth_deg,
-        position_m=(0.0, 0.0, z),
-        width_px=320,
-        height_px=180,
-        horizontal_fov_deg=80.0,
-    )
+camera = partial(helpers.camera, size=(180, 320))
 
 
-RIG = Rig([camera(0, "front"), camera(40, "left")])
+RIG = Rig([camera("front"), camera("left", 40)])
 
 
 def world(at: Camera, turned_deg: float = 0.0) -> np.ndarray:

@@ -16,11 +16,12 @@ from arbiview_aug.favs.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.overlaps import half_way_view
 from arbiview_aug.rig import Rig
 from arbiview_aug.transforms import RigRetarget
+from tests.helpers import street_sample
 
 
 @pytest.fixture(scope="module")
 def sample() -> dict:
-    return SyntheticDrive(demo_source_rig((48, 132)), num_frames=1)[0]
+    return street_sample((48, 132))
 
 
 def test_retargeting_is_the_transform(sample: dict) -> None:

@@ -5,27 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from arbiview_aug.camera import Camera
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.opencv_stitching import opencv_stitching
 from arbiview_aug.evaluate.truth import truth_metrics
-from arbiview_aug.rig import Rig, load_rig
-
-
-def ring() -> Rig:
-    """Six cameras at one centre, 80 degrees wide: nothing is seen from two places."""
-    return Rig(
-        [
-            Camera.looking(name=f"{a}", azimuth_deg=a, width_px=160, height_px=96, horizontal_fov_deg=80)
-            for a in range(0, 360, 60)
-        ]
-    )
+from arbiview_aug.rig import load_rig
+from tests.helpers import ring
 
 
 def test_cameras_at_one_centre_give_the_true_views() -> None:
-    rig = ring()
+    rig = ring(radius_m=0.0, size=(96, 160))  # nothing is seen from two places
     drive = SyntheticDrive(rig, num_frames=1, lidar=False)
     target = rig.turned(yaw_deg=25)
     views = opencv_stitching(rig, as_arrays(drive[0]["images"]), target)

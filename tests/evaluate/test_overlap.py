@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -15,11 +17,9 @@ from arbiview_aug.evaluate.overlap import (
     overlap_scores,
 )
 from arbiview_aug.rig import Rig, load_rig
+from tests import helpers
 
-
-def camera(name: str, azimuth_deg: float, fov_deg: float = 70.0, **changes: object) -> Camera:
-    values: dict = dict(width_px=160, height_px=90, horizontal_fov_deg=fov_deg)
-    return Camera.looking(name=name, azimuth_deg=azimuth_deg, **{**values, **changes})
+camera = partial(helpers.camera, size=(90, 160), horizontal_fov_deg=70.0)
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_adjacent_pairs_of_few_cameras() -> None:
 
 def test_half_way_view() -> None:
     a = camera("a", 10.0, position_m=(1.0, 0.0, 1.5))
-    b = camera("b", 50.0, fov_deg=50.0, position_m=(2.0, 1.0, 1.7))
+    b = camera("b", 50.0, horizontal_fov_deg=50.0, position_m=(2.0, 1.0, 1.7))
     view = half_way_view(a, b, (45, 80))
     assert view.azimuth_deg == pytest.approx(30.0) and view.elevation_deg == pytest.approx(0.0)
     np.testing.assert_allclose(view.center_m, [1.5, 0.5, 1.6])

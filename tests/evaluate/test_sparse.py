@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
-from arbiview_aug.camera import Camera
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.sparse import (
     ColouredPoints,
@@ -19,13 +20,12 @@ from arbiview_aug.evaluate.sparse import (
     visible_points,
 )
 from arbiview_aug.rig import Rig
+from tests import helpers
 
 K = np.array([[100.0, 0, 50], [0, 100.0, 40], [0, 0, 1]])
 
 
-def camera(name: str = "front", azimuth_deg: float = 0.0, **changes: object) -> Camera:
-    values: dict = dict(K=K, width_px=101, height_px=81, position_m=(5.0, 0.0, 1.5))
-    return Camera.looking(name=name, azimuth_deg=azimuth_deg, **{**values, **changes})
+camera = partial(helpers.camera, size=(81, 101), K=K, position_m=(5.0, 0.0, 1.5))
 
 
 def plain(colour: tuple[int, int, int]) -> np.ndarray:

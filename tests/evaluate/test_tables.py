@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from arbiview_aug.camera import Camera
 from arbiview_aug.evaluate.images import View
 from arbiview_aug.evaluate.pictures import HOLE
 from arbiview_aug.evaluate.sheet import frame_sheet, hatched_view, left_to_right, shrunk
@@ -18,6 +17,7 @@ from arbiview_aug.evaluate.tables import (
     text_table,
 )
 from arbiview_aug.rig import Rig
+from tests.helpers import camera
 
 
 def test_cells() -> None:
@@ -42,24 +42,13 @@ def test_metrics_are_named_once() -> None:
         assert len({c.metric for c in columns}) == len(columns)
 
 
-def camera(azimuth_deg: float) -> Camera:
-    return Camera.looking(
-        name=f"at {azimuth_deg:g}",
-        azimuth_deg=azimuth_deg,
-        position_m=(0, 0, 1.5),
-        width_px=60,
-        height_px=40,
-        horizontal_fov_deg=60,
-    )
-
-
 def test_cameras_stand_as_in_a_panorama() -> None:
-    rig = Rig([camera(0), camera(-60), camera(60), camera(180)])
+    rig = Rig([camera(f"at {a}", a) for a in (0, -60, 60, 180)])
     assert [rig.names[k] for k in left_to_right(rig)] == ["at 60", "at 0", "at -60", "at 180"]
 
 
 def test_sheets_hatch_only_what_is_unseen() -> None:
-    rig = Rig([camera(0), camera(60)])
+    rig = Rig([camera(f"at {a}", a) for a in (0, 60)])
     images = [np.full((40, 60, 3), 90, np.uint8)] * 2
     seen, half = np.ones((40, 60), bool), np.ones((40, 60), bool)
     half[:, :30] = False

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,10 @@ from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.plan import RenderPlan, build_plan
 from arbiview_aug.projection import ego_rays, project_rays
 from arbiview_aug.scene import Scene
+from tests import helpers
 from tests.extremes import reference
 from tests.extremes.conftest import Worst
+from tests.helpers import ring
 
 MAP_TOLERANCE_PX = 1 / 32
 BOXES = np.array([[12.0, 1.0, 0.8, 4.5, 1.9, 1.6, 0.3], [-8.0, -3.0, 1.0, 4.0, 2.0, 2.0, 1.5]])
@@ -31,24 +34,7 @@ SCENES = {
 }
 
 
-def camera(name: str = "c", **values: Any) -> Camera:
-    lens = values.get("lens", "pinhole")
-    usual: dict[str, Any] = {"azimuth_deg": 0.0, "width_px": 96, "height_px": 72, "position_m": (1.5, 0.0, 1.5)}
-    if "K" not in values:
-        usual["horizontal_fov_deg"] = 80.0
-    return Camera.looking(name=name, **(usual | {"distortion": (0.0,) * 4 if lens == "fisheye" else ()} | values))
-
-
-def ring(count: int = 6, **values: Any) -> Rig:
-    """Cameras all around, half a metre from the middle."""
-    angles = [360.0 * k / count for k in range(count)]
-    places = [(0.5 * np.cos(np.radians(a)), 0.5 * np.sin(np.radians(a)), 1.5) for a in angles]
-    return Rig(
-        [
-            camera(f"c{k}", **({"azimuth_deg": a, "position_m": p} | values))
-            for k, (a, p) in enumerate(zip(angles, places, strict=True))
-        ]
-    )
+camera = partial(helpers.camera, position_m=(1.5, 0.0, 1.5))
 
 
 def focal(f_px: float) -> list[list[float]]:

@@ -1,19 +1,17 @@
 """FAVS Stage 1: H_geom, H_planar and the check of homographies."""
 
+from functools import partial
+
 import cv2
 import numpy as np
 import pytest
 
-from arbiview_aug.camera import Camera
 from arbiview_aug.errors import CalibrationError
 from arbiview_aug.favs.geometric_transformation import check_homography, h_geom, h_planar
 from arbiview_aug.rig import load_rig
+from tests import helpers
 
-
-def camera(azimuth_deg: float = 0.0, position_m=(0.0, 0.0, 1.5)) -> Camera:
-    return Camera.looking(
-        name="c", azimuth_deg=azimuth_deg, position_m=position_m, width_px=640, height_px=360, horizontal_fov_deg=70.0
-    )
+camera = partial(helpers.camera, "c", size=(360, 640), horizontal_fov_deg=70.0)
 
 
 def apply(H: np.ndarray, uv: np.ndarray) -> np.ndarray:

@@ -22,19 +22,13 @@ from arbiview_aug.scene import Scene
 from arbiview_aug.solids import draw_boxes
 from arbiview_aug.surface import Static, Street
 from arbiview_aug.transforms import RigRetarget
+from tests import helpers
 
 SIZE = (225, 400)
 
 
-def camera(name: str, azimuth_deg: float, y_m: float, fov_deg: float = 80) -> Camera:
-    return Camera.looking(
-        name=name,
-        azimuth_deg=azimuth_deg,
-        position_m=(1.5, y_m, 1.6),
-        width_px=SIZE[1],
-        height_px=SIZE[0],
-        horizontal_fov_deg=fov_deg,
-    )
+def camera(name: str, azimuth_deg: float, y_m: float, fov_deg: float = 80.0) -> Camera:
+    return helpers.camera(name, azimuth_deg, size=SIZE, position_m=(1.5, y_m, 1.6), horizontal_fov_deg=fov_deg)
 
 
 RIG = Rig([camera("left", 25, 0.5), camera("right", -25, -0.5)])

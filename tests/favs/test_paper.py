@@ -1,6 +1,7 @@
 """``quality="paper"``: the published stages joined, alone and in ``RigRetarget``."""
 
 from dataclasses import fields, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -14,21 +15,13 @@ from arbiview_aug.favs.adaptive_fusion import fuse
 from arbiview_aug.favs.geometric_transformation import h_geom
 from arbiview_aug.favs.paper import PaperRendering, fusion_weight, paper_labels, primary_camera, render_paper
 from arbiview_aug.plan import build_plan
+from tests import helpers
 
 OFF = PaperConfig(**{f.name: False for f in fields(PaperConfig) if f.name.startswith("use_")})
 GEOMETRIC = PaperConfig(use_feature_matching=False, use_object_alignment=False)
 
 
-def camera(name: str, azimuth_deg: float, fov_deg: float = 70.0, mask=None, position_m=(0.0, 0.0, 1.5)) -> Camera:
-    return Camera.looking(
-        name=name,
-        azimuth_deg=azimuth_deg,
-        position_m=position_m,
-        width_px=400,
-        height_px=240,
-        horizontal_fov_deg=fov_deg,
-        mask=mask,
-    )
+camera = partial(helpers.camera, size=(240, 400), horizontal_fov_deg=70.0)
 
 
 def panorama(seed: int = 0) -> np.ndarray:

@@ -2,39 +2,17 @@
 
 from __future__ import annotations
 
-import math
+from functools import partial
 
 import torch
 
-from arbiview_aug.camera import Camera
 from arbiview_aug.generator.config import GeneratorConfig, UNetConfig
-from arbiview_aug.rig import Rig
+from tests import helpers
 
 LATENT = (6, 10)
 
 
-def ring(
-    count: int, *, radius_m: float = 0.5, yaw_deg: float = 0.0, fov_deg: float = 90.0, name: str = "c", z_m: float = 1.5
-) -> Rig:
-    """Cameras looking outwards, evenly around the vehicle."""
-    turn = 360 / count
-    return Rig(
-        [
-            Camera.looking(
-                name=f"{name}{k}",
-                azimuth_deg=turn * k + yaw_deg,
-                position_m=(
-                    radius_m * math.cos(math.radians(turn * k)),
-                    radius_m * math.sin(math.radians(turn * k)),
-                    z_m,
-                ),
-                width_px=80,
-                height_px=48,
-                horizontal_fov_deg=fov_deg,
-            )
-            for k in range(count)
-        ]
-    )
+ring = partial(helpers.ring, size=(48, 80), horizontal_fov_deg=90.0)
 
 
 def small_config(**changes: object) -> GeneratorConfig:

@@ -60,7 +60,7 @@ def test_turned_queries_see_the_offset() -> None:
 
 def test_gathered_attention_is_the_formula() -> None:
     """Attention(Q_i, K_j, V_j) = Σ_l w_l Attention^(l), token by token, tap by tap."""
-    rig = Rig([c.shifted(z_m=0.1 * k) for k, c in enumerate(ring(4, fov_deg=110))])
+    rig = Rig([c.shifted(z_m=0.1 * k) for k, c in enumerate(ring(4, horizontal_fov_deg=110))])
     h, w = size = (4, 6)
     at, layer = windows(rig, size), block()
     x = features(at, 4)
@@ -120,7 +120,7 @@ def test_gathered_attention_is_the_formula() -> None:
 @pytest.mark.parametrize("case", ["turned", "ring", "nuscenes", "one centre"])
 def test_dense_attention_equals_gathered_attention(case: str) -> None:
     rigs = {
-        "turned": Rig([c.turned(yaw_deg=3 * k) for k, c in enumerate(ring(3, radius_m=0.2, fov_deg=120))]),
+        "turned": Rig([c.turned(yaw_deg=3 * k) for k, c in enumerate(ring(3, radius_m=0.2, horizontal_fov_deg=120))]),
         "ring": ring(6),
         "nuscenes": load_rig("nuscenes"),
         "one centre": ring(5, radius_m=0.0),
@@ -138,7 +138,7 @@ def test_dense_attention_equals_gathered_attention(case: str) -> None:
 
 
 def test_both_ways_have_the_same_gradients() -> None:
-    rig = ring(4, fov_deg=110)
+    rig = ring(4, horizontal_fov_deg=110)
     at = windows(rig, (4, 6))
     x = features(at, 4)
     found = []
@@ -175,7 +175,7 @@ def test_zero_initialised_it_changes_nothing() -> None:
 def test_what_no_view_overlaps_is_returned_bit_for_bit(dense: bool, dtype: torch.dtype) -> None:
     """With trained weights: a rig whose cameras look apart, and the tokens of a ring outside the overlap."""
     layer = block().to(dtype)
-    for rig in (ring(4, fov_deg=60), ring(6, fov_deg=80), ring(1)):
+    for rig in (ring(4, horizontal_fov_deg=60), ring(6, horizontal_fov_deg=80), ring(1)):
         at = windows(rig, (4, 7))
         x = features(at, len(rig)).to(dtype)
         with torch.no_grad():
@@ -191,7 +191,7 @@ def test_what_no_view_overlaps_is_returned_bit_for_bit(dense: bool, dtype: torch
 @pytest.mark.parametrize("dense", [False, True])
 def test_every_parameter_has_a_finite_gradient_even_where_nothing_overlaps(dense: bool) -> None:
     layer = block()
-    at = windows(ring(4, fov_deg=60), (3, 5))
+    at = windows(ring(4, horizontal_fov_deg=60), (3, 5))
     x = features(at, 4).requires_grad_()
     y, rows = layer(x, *layer.keys_values(x), at, dense=dense, with_rows=True)
     (y.sum() + rows.sum()).backward()

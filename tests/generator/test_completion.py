@@ -18,8 +18,8 @@ from arbiview_aug.generator.config import AutoencoderConfig
 from arbiview_aug.rig import Rig, load_rig
 from tests.generator.small import ring, small_config, stirred
 
-SOURCES = ring(4, fov_deg=100)
-TARGETS = ring(3, fov_deg=110, yaw_deg=25, name="t", z_m=1.8)
+SOURCES = ring(4, horizontal_fov_deg=100)
+TARGETS = ring(3, horizontal_fov_deg=110, yaw_deg=25, name="t", z_m=1.8)
 
 
 def frame(targets: Rig = TARGETS, sources: Rig = SOURCES, seed: int = 0):
@@ -151,8 +151,8 @@ def test_extremes_are_finite_in_bfloat16(generator: Generator) -> None:
         nothing = [torch.zeros_like(seen) for seen in coverage]
         out = low.complete_views(views, nothing, targets, [i / 255 for i in images], SOURCES, steps=2, guidance=7.5)
         assert out.generated.all() and torch.isfinite(out.images).all()
-    behind = Rig([ring(1, fov_deg=40)[0].turned(yaw_deg=180)])
-    assert completed(low, ring(1, fov_deg=40, name="t"), behind).images.float().isfinite().all()
+    behind = Rig([ring(1, horizontal_fov_deg=40)[0].turned(yaw_deg=180)])
+    assert completed(low, ring(1, horizontal_fov_deg=40, name="t"), behind).images.float().isfinite().all()
 
 
 def test_with_an_autoencoder(generator: Generator) -> None:

@@ -103,7 +103,7 @@ def test_the_pose_token_follows_the_prompt() -> None:
 
 def test_frames_of_different_rigs_make_a_batch() -> None:
     config = small_config()
-    close, apart = ring(4, radius_m=0.0, fov_deg=120), ring(4, fov_deg=120)
+    close, apart = ring(4, radius_m=0.0, horizontal_fov_deg=120), ring(4, horizontal_fov_deg=120)
     frames = [frame_geometry([rig[0]], [rig[1], rig[3]], 0.0, config) for rig in (close, apart)]
     both = batched(frames)
     assert both.target_rays.shape == (2, 1, 6, 6, 10) and both.source_pose.shape == (2, 2, 16)

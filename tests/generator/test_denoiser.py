@@ -39,8 +39,8 @@ def run(denoiser: Denoiser, geometry: FrameGeometry, t: int = 400, seed: int = 0
 
 @pytest.fixture
 def geometry() -> FrameGeometry:
-    sources = ring(4, fov_deg=100)
-    targets = ring(4, fov_deg=120, yaw_deg=20, name="t")
+    sources = ring(4, horizontal_fov_deg=100)
+    targets = ring(4, horizontal_fov_deg=120, yaw_deg=20, name="t")
     return frame_geometry(list(targets)[:2], list(sources), 0.0, small_config())
 
 
@@ -126,7 +126,8 @@ def test_targets_read_sources_and_targets(generator: Generator, geometry: FrameG
 
 
 def test_permuting_the_cameras_permutes_the_output(generator: Generator) -> None:
-    sources, targets, config = ring(4, fov_deg=100), ring(5, fov_deg=100, yaw_deg=15, name="t"), small_config()
+    sources, config = ring(4, horizontal_fov_deg=100), small_config()
+    targets = ring(5, horizontal_fov_deg=100, yaw_deg=15, name="t")
     denoiser, t = generator.denoiser, torch.tensor([300])
     order, source_order = [4, 2, 0, 3, 1], [2, 3, 1, 0]
     base = frame_geometry(list(targets), list(sources), 0.0, config)
@@ -245,8 +246,8 @@ def test_it_is_one_graph_for_torch_compile(generator: Generator) -> None:
     denoiser, config = generator.denoiser, small_config()
     compiled = torch.compile(denoiser, fullgraph=True, backend="aot_eager")
     for yaw_deg in (20, 30, -10):
-        targets = list(ring(4, fov_deg=120, yaw_deg=yaw_deg, name="t"))[:2]
-        geometry = frame_geometry(targets, list(ring(4, fov_deg=100)), 0.0, config)
+        targets = list(ring(4, horizontal_fov_deg=120, yaw_deg=yaw_deg, name="t"))[:2]
+        geometry = frame_geometry(targets, list(ring(4, horizontal_fov_deg=100)), 0.0, config)
         noisy = torch.randn(1, 2, 3, 6, 10)
         with torch.no_grad():
             read = denoiser.read_sources(views(geometry, "source", 1), geometry.source_windows())
@@ -292,7 +293,7 @@ def test_views_read_each_other_at_the_chosen_levels_alone() -> None:
     config = small_config(unet=UNetConfig(**unet, cross_view=(False, True)))
     denoiser = stirred(Generator.from_config(config).denoiser).eval()
     assert sorted(denoiser.cross_view) == ["1", "2", "3"]
-    geometry = frame_geometry(list(ring(3, name="t")), list(ring(3, fov_deg=130)), 0.0, config)
+    geometry = frame_geometry(list(ring(3, name="t")), list(ring(3, horizontal_fov_deg=130)), 0.0, config)
     with torch.no_grad():
         read = denoiser.read_sources(views(geometry, "source"), geometry.source_windows())
         assert len(read) == 3

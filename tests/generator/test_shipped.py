@@ -47,7 +47,7 @@ def test_diffusion_works_out_of_the_box() -> None:
     assert made["images"].movedim(1, -1)[holes].float().std() > 5
 
 
-@pytest.mark.truth
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_they_beat_inpainting_on_streets_never_seen() -> None:
     generator = Generator.shipped()

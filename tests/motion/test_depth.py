@@ -1,6 +1,5 @@
 """Depth from motion on streets that stand still: how right, how dense, and when it declines."""
 
-from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -10,22 +9,15 @@ import torch
 
 from arbiview_aug import RigRetarget
 from arbiview_aug.datasets import Neighbours
-from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive, demo_source_rig
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.motion.depth import MotionDepth, motion_depth
 from arbiview_aug.neighbours import Neighbour, neighbours_of_frames
 from arbiview_aug.sample import check_inputs
+from tests.helpers import Standing
 
 SIDE = demo_source_rig((96, 256))
 SIDE = SIDE.with_cameras([SIDE[0], SIDE[1]])  # front and front left: two cameras are quick
-
-
-class Standing(SyntheticDrive):
-    """Only the vehicle moves."""
-
-    def scene(self, index: int) -> Scene:
-        scene = super().scene(index)
-        return replace(scene, velocities=np.zeros_like(scene.velocities))
 
 
 @pytest.fixture(scope="module")

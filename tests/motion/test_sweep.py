@@ -1,10 +1,11 @@
 """The sweep: families of surfaces, and one score on the CPU and on any device."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Camera
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.motion.aggregation import JUMP, STEP, aggregated
 from arbiview_aug.motion.sweep import (
@@ -17,13 +18,12 @@ from arbiview_aug.motion.sweep import (
     scores_opencv,
     scores_torch,
 )
+from tests import helpers
 
 SIZE = (48, 80)
 
 
-def camera(**how) -> Camera:
-    settings = {"name": "a", "azimuth_deg": 90, "width_px": SIZE[1], "height_px": SIZE[0], "horizontal_fov_deg": 65}
-    return Camera.looking(**(settings | how))
+camera = partial(helpers.camera, "a", 90, size=SIZE, horizontal_fov_deg=65.0)
 
 
 def textured(size: tuple[int, int], seed: int = 0) -> np.ndarray:

@@ -19,7 +19,7 @@ class Pictures(Dataset[dict[str, Any]]):
     """Frames of smooth random pictures; ``broken`` ones hold what makes losses infinite."""
 
     def __init__(self, count: int = 5) -> None:
-        self.count, self.rig = count, ring(6, radius_m=0.5, fov_deg=80.0)
+        self.count, self.rig = count, ring(6, horizontal_fov_deg=80.0)
 
     def __len__(self) -> int:
         return self.count

@@ -37,7 +37,7 @@ def test_one_rig_by_heart(tmp_path: Path) -> None:
     assert whole > 25 and inside > telea
 
 
-@pytest.mark.learning
+@pytest.mark.release
 @pytest.mark.timeout(1500)
 def test_tiny_beats_telea_on_held_out_streets(tmp_path: Path) -> None:
     """The README's command: one step at least Telea's, four steps at most 0.5 dB below."""

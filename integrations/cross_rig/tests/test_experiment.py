@@ -174,7 +174,7 @@ def test_command_lists_and_refuses(capsys, tmp_path):
     assert command.main(["--large", "--list", "--output", str(tmp_path)]) == 0, "planned on a machine without a GPU"
 
 
-@pytest.mark.cross
+@pytest.mark.release
 @pytest.mark.timeout(900)
 def test_quick_oracle_is_above_raw(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(cache, "CHUNK_FRAMES", 20)

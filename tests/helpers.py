@@ -1,0 +1,109 @@
+"""Cameras, rigs, samples and streets that several test modules are made of. Fixtures are in ``conftest.py``."""
+
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from arbiview_aug import Camera, Rig
+from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive, demo_source_rig
+from arbiview_aug.evaluate.sparse import equalised
+
+
+def camera(
+    name: str = "front", azimuth_deg: float = 0.0, *, size: tuple[int, int] = (72, 96), **changes: Any
+) -> Camera:
+    """A camera of (h, w) pixels, 80 degrees wide unless a ``K`` is given; changes are those of ``Camera.looking``."""
+    usual: dict[str, Any] = {"height_px": size[0], "width_px": size[1]}
+    if changes.get("K") is None:
+        usual["horizontal_fov_deg"] = 80.0
+    if changes.get("lens") == "fisheye":
+        usual["distortion"] = (0.0,) * 4
+    return Camera.looking(name=name, azimuth_deg=azimuth_deg, **(usual | changes))
+
+
+def ring(
+    count: int = 6,
+    *,
+    radius_m: float = 0.5,
+    z_m: float = 1.5,
+    yaw_deg: float = 0.0,
+    name: str = "c",
+    **changes: Any,
+) -> Rig:
+    """Cameras evenly around the vehicle that look outwards; changes are those of ``camera``, for all of them.
+
+    Args:
+        count: The number of cameras.
+        radius_m: Distance of their centres from the ego origin.
+        z_m: Height of their centres.
+        yaw_deg: Turn of every camera about its own centre.
+        name: What their names begin with.
+    """
+    cameras = []
+    for k in range(count):
+        around = math.radians(360.0 / count * k)
+        place = {"position_m": (radius_m * math.cos(around), radius_m * math.sin(around), z_m)}
+        cameras.append(camera(f"{name}{k}", 360.0 * k / count + yaw_deg, **(place | changes)))
+    return Rig(cameras)
+
+
+def street_sample(size: tuple[int, int] = (64, 176), **settings: Any) -> dict[str, Any]:
+    """One frame of the demo rig on a synthetic street; settings are those of ``SyntheticDrive``."""
+    return SyntheticDrive(demo_source_rig(size), num_frames=1, **settings)[0]
+
+
+def few_or_all(few: int, every: int, what: str = "streets") -> list[Any]:
+    """Fixture parameters: a guard of few streets for CI, all of them for the release check."""
+    return [
+        pytest.param(few, marks=pytest.mark.slow, id=f"{few} {what}"),
+        pytest.param(every, marks=pytest.mark.release, id=f"{every} {what}"),
+    ]
+
+
+class Standing(SyntheticDrive):
+    """A street where only the vehicle moves."""
+
+    def scene(self, index: int) -> Scene:
+        scene = super().scene(index)
+        return replace(scene, velocities=np.zeros_like(scene.velocities))
+
+
+# --- the evaluation protocol ------------------------------------------------------------------------------------------
+def as_camera(name: str, K: Any, cam2ego: Any, size: tuple[int, int], mask: Any = None) -> Camera:
+    """A camera in the protocol's words; its size is (h, w)."""
+    return Camera(name=name, width_px=size[1], height_px=size[0], K=K, cam2ego=cam2ego, mask=mask)
+
+
+class ProtocolFrame:
+    """A frame at half resolution as the protocol reads it, and as this package does.
+
+    Attributes:
+        cameras: The protocol's cameras; exposures made even unless ``raw``.
+        lidar: (P, 3+) points in the ego frame.
+        rig: The cameras as ours.
+        images: (h, w, 3) uint8 for each camera; exposures made even unless ``raw``.
+    """
+
+    def __init__(self, referee: ModuleType, folder: Path, raw: bool = False) -> None:
+        self.cameras, self.lidar, self.calibration = referee.load_frame(str(folder), 0.5)
+        self.ground_z_m = float(self.calibration["ground_z_m"])
+        self.rig = Rig(
+            [
+                as_camera(name, c["K"], c["cam2ego"], c["image"].shape[:2], c["mask"] > 0)
+                for name, c in self.cameras.items()
+            ],
+            ground_z_m=self.ground_z_m,
+            name=folder.name,
+        )
+        self.images = [c["image"] for c in self.cameras.values()]
+        if not raw:
+            self.images = list(equalised(self.rig, self.images, self.lidar))
+            self.cameras = referee.equalised(self.cameras, self.lidar)
