@@ -2,7 +2,7 @@
 
 from arbiview_aug.boxes_2d import ImageBoxes, project_boxes_3d
 from arbiview_aug.camera import Camera
-from arbiview_aug.datasets.wrappers import RetargetedDataset, RetargetedIterable
+from arbiview_aug.datasets.wrappers import MixedDataset, RetargetedDataset, RetargetedIterable
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, SampleTypeError
 from arbiview_aug.favs.config import FavsConfig, PaperConfig
 from arbiview_aug.favs.refinement import RefinementCache
@@ -19,6 +19,7 @@ __all__ = [
     "DataError",
     "FavsConfig",
     "ImageBoxes",
+    "MixedDataset",
     "PaperConfig",
     "RandomRig",
     "RefinementCache",

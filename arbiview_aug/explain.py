@@ -13,10 +13,9 @@ from arbiview_aug.favs.overlap_depth import OverlapDepth
 from arbiview_aug.favs.paper import PaperRendering, SourceReport
 from arbiview_aug.favs.photometric import PhotometricReport
 from arbiview_aug.fills import Fills
-from arbiview_aug.heights import MOVED_M, lifts_m
 from arbiview_aug.motion.depth import MotionDepth
 from arbiview_aug.plan import RenderPlan
-from arbiview_aug.rig import Rig
+from arbiview_aug.required import harm_remedies
 from arbiview_aug.target_view import PairReport
 
 
@@ -26,19 +25,19 @@ class Explanation:
 
     Attributes:
         plan: The plan.
-        asked: The target rig that was asked for, in its own ego frame.
         harmonisation: The sources' gains and why, where harmonisation was asked for.
         depth: What became of each pair of neighbours, where depth from overlap was asked for and matters.
         motion: What motion said of the distances, where it was asked.
         fills: What other frames of the drive show of the holes, where the sample has any.
+        harm: How a detector suffers from the surface, where that is static and cameras move.
     """
 
     plan: RenderPlan
-    asked: Rig
     harmonisation: PhotometricReport | None = None
     depth: OverlapDepth | None = None
     motion: MotionDepth | None = None
     fills: Fills | None = None
+    harm: str | None = None
 
     def as_dict(self) -> list[dict[str, Any]]:
         """One entry for each target camera: coverage, share to invent, and its sources with surface and reason.
@@ -70,11 +69,8 @@ class Explanation:
         ]
         if self.harmonisation is not None:
             lines.append(f"  {self.harmonisation}")
-        for camera, lift_m in zip(self.plan.target, lifts_m(self.asked, self.plan.target), strict=True):
-            if abs(lift_m) > MOVED_M:
-                where = f"{abs(lift_m):.2f} m {'below' if lift_m > 0 else 'above'} the target's place"
-                why = "nothing is known of what stands on the street"
-                lines.append(f"  {camera.name}: {where}, at the source's height: {why}")
+        if self.harm is not None:
+            lines += [f"  {self.harm}", f"  better: {harm_remedies(self.plan.source, self.plan.target)}"]
         if self.depth is not None:
             lines.extend(f"  {line}" for line in str(self.depth).splitlines())
         if self.motion is not None:

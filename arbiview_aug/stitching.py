@@ -20,11 +20,10 @@ from arbiview_aug.favs.photometric import Harmoniser
 from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.favs.synthesis import render_opencv, render_torch
 from arbiview_aug.fills import Fills, Patch, Reach, fill_views, plan_fills
-from arbiview_aug.heights import MOVED_M, at_source_heights, lifts_m, only_heights_differ
 from arbiview_aug.motion.depth import MotionDepth, motion_depth
 from arbiview_aug.neighbours import Neighbour, neighbours_of_frames, warn_lost
 from arbiview_aug.plan import PlanCache, RenderPlan, build_plan, plan_key
-from arbiview_aug.required import baselines_m, needs_geometry
+from arbiview_aug.required import harm_remedies, needs_geometry, static_harm
 from arbiview_aug.rig import Rig
 from arbiview_aug.sample import MOTION_KEY, SourceFrame, names_of_frames, scenes_of_frames
 from arbiview_aug.sampling import Scratch
@@ -74,6 +73,7 @@ class View:
         motion: What motion said of its distances, where it was asked here and not offline.
         fills: How its holes are filled from neighbouring frames, where those show any of them.
         curves: A tone curve for each source, where they are harmonised.
+        harm: How a detector suffers from its surface, where that is static and cameras move.
     """
 
     made: RenderPlan | PaperRendering
@@ -81,6 +81,7 @@ class View:
     motion: MotionDepth | None = None
     fills: Fills | None = None
     curves: tuple[ToneCurve, ...] | None = None
+    harm: str | None = None
 
 
 class Stitcher:
@@ -95,6 +96,7 @@ class Stitcher:
         cache_bytes: Memory for plans that may come back.
         reach: What neighbouring frames may fill; None leaves them out.
         mixed: Half of the samples or more stay untouched.
+        strict: Refuse what harms a detector instead of warning of it.
         warn: Says what a user should know.
 
     Raises:
@@ -111,6 +113,7 @@ class Stitcher:
         cache_bytes: int,
         reach: Reach | None,
         mixed: bool,
+        strict: bool,
         warn: WarnOnce,
     ) -> None:
         if isinstance(config, PaperConfig):
@@ -121,7 +124,7 @@ class Stitcher:
             raise ValueError("refinement: expected quality='accurate' (or overlap_depth=True) with a RefinementCache")
         self.config, self.surface, self.harmoniser = config, surface, harmoniser
         self.refinement, self.execution, self.reach, self.warn = refinement, execution, reach, warn
-        self.mixed = mixed
+        self.mixed, self.strict = mixed, strict
         self.plans = PlanCache(cache_bytes)
         self._plan_of_frame = PlanCache(0)  # holds one
         self._scratch = Scratch()
@@ -155,16 +158,18 @@ class Stitcher:
         neighbouring = neighbours_of_frames(sample, frames, lead, self.warn) if wanted else [[] for _ in frames]
         views = []
         for frame, scene, name, needs, neighbours in zip(frames, scenes, names, needed, neighbouring, strict=True):
-            depth = self._depth(self.config, frame, target, scene, name) if needs else None
+            depth = self._depth(self.config, frame, scene, name) if needs else None
             known = scene if depth is None else replace(scene, corrections=depth.corrections)
             motion = self._motion(frame, scene, neighbours) if asks_motion and needs else None
             if self.surface == "motion" and known.motion is None:
                 known = replace(known, motion=np.zeros((0, 3)) if motion is None else motion.points(frame.rig))
             plan, fills = self.plan(frame.rig, target, known), None
+            surface = known.best if self.surface == "auto" else self.surface
             if neighbours and self.reach is not None:
-                surface = known.best if self.surface == "auto" else self.surface
                 fills = plan_fills(plan, neighbours, known, surface, self.config, self.reach)
-            views.append(View(plan, depth, motion, fills, self.harmoniser.curves(frame.rig, frame.images)))
+            curves = self.harmoniser.curves(frame.rig, frame.images)
+            harm = static_harm(frame.rig, target, surface, self.config)
+            views.append(View(plan, depth, motion, fills, curves, harm))
         return views
 
     def _published(
@@ -203,22 +208,10 @@ class Stitcher:
         key = plan_key(source, target, self.surface, config, known)
         return cache.get(key, lambda: self._built(source, target, config, known))
 
-    def _built(self, source: Rig, asked: Rig, config: FavsConfig, scene: Scene) -> RenderPlan:
-        target = self._placed(source, asked, config, scene)
+    def _built(self, source: Rig, target: Rig, config: FavsConfig, scene: Scene) -> RenderPlan:
         plan = build_plan(source, target, surface=self.surface, config=config, scene=scene)
         self._warn_unreachable(plan)
-        if self.surface == "auto" and scene.best == "street" and not self.mixed:
-            self._warn_lifted(asked, plan)
-            if needs_geometry(source, target, "auto", config):
-                self._warn_static(source, target)
         return plan
-
-    def _placed(self, source: Rig, target: Rig, config: FavsConfig, scene: Scene) -> Rig:
-        """The target as ``auto`` renders it: at the source's heights where only these differ, only the street is known,
-        and no untouched samples are mixed in."""
-        guessed = self.surface == "auto" and scene.best == "street" and needs_geometry(source, target, "auto", config)
-        kept = guessed and not self.mixed and only_heights_differ(source, target)
-        return at_source_heights(source, target) if kept else target
 
     # --- depth from overlap -------------------------------------------------------------------------------------------
     def _names(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[object]:
@@ -234,15 +227,10 @@ class Stitcher:
             raise SampleError(f"refinement: expected {key!r} in the sample, to tell which frames share a refinement")
         return names_of_frames(key, sample[key], count, lead)
 
-    def _depth(
-        self, config: FavsConfig, frame: SourceFrame, target: Rig, scene: Scene, name: object
-    ) -> OverlapDepth | None:
+    def _depth(self, config: FavsConfig, frame: SourceFrame, scene: Scene, name: object) -> OverlapDepth | None:
         """Depth from overlap, where it is asked for and decides a pixel, and nothing was measured."""
         surface = scene.best if self.surface == "auto" else self.surface
         if not config.overlap_depth or surface in ("far", "ground", "lidar", "motion"):
-            return None
-        placed = self._placed(frame.rig, target, config, scene)
-        if placed is not target and not needs_geometry(frame.rig, placed, self.surface, config):
             return None
         boxes = scene.boxes if surface == "objects" else None
         if self.refinement is None:
@@ -339,24 +327,18 @@ class Stitcher:
                 f"{', '.join(poor)}; train with the coverage mask, or choose another target",
             )
 
-    def _warn_lifted(self, asked: Rig, plan: RenderPlan) -> None:
-        lifted_m = max(abs(lift) for lift in lifts_m(asked, plan.target))
-        if lifted_m > MOVED_M:
-            self.warn(
-                "height",
-                f"target cameras stand up to {lifted_m:.2f} m above or below the source's, and the sample does not say "
-                "what stands on the street: they are rendered at the source's height, and cam2ego says so, since views "
-                "over a static surface alone train worse than untouched images. Pass 'points' or 'boxes_3d' in the "
-                "samples; or mix with untouched ones (p=0.5), and they move; or move them with surface='street'",
-            )
+    def judge(self, views: Sequence[View]) -> None:
+        """Warn, once, of what ``auto`` renders over the static street to the harm of a detector.
 
-    def _warn_static(self, source: Rig, target: Rig) -> None:
-        moved_m = float(baselines_m(source, target).min(axis=1).max())
-        if moved_m > MOVED_M:
-            self.warn(
-                "static",
-                f"target cameras stand up to {moved_m:.2f} m from the nearest source camera, and the sample does not "
-                "say what stands on the street: objects will lean and stretch, and a detector trained on that alone is "
-                "worse than one trained on untouched images. Pass 'points' or 'boxes_3d' in the samples, mix with "
-                "untouched ones (p=0.5), or accept it with surface='street'",
+        Raises:
+            SampleError: It does, and ``strict`` is set.
+        """
+        for view in views:
+            if view.harm is None or self.surface != "auto" or self.mixed:
+                continue
+            message = (
+                f"{view.harm}. Better: {harm_remedies(view.made.source, view.made.target)}; surface='street' accepts it"
             )
+            if self.strict:
+                raise SampleError(f"strict=True: {message}")
+            self.warn("static", message)

@@ -47,8 +47,8 @@ Made = RenderPlan | PaperRendering | tuple[int, int]
 """What a frame's views are made by: a plan, the published stages; or it is only resized, to this size."""
 
 _MIXED_P = 0.5
-"""With half of the samples untouched or more, views over a static street alone help a detector instead of harming it:
-``arbiview_aug.heights``. Other shares have not been measured."""
+"""With half of the samples untouched or more, views over a static street do not harm a detector
+(``integrations/cross_rig``). Other shares have not been measured."""
 
 
 class RigRetarget(torch.nn.Module):
@@ -95,9 +95,10 @@ class RigRetarget(torch.nn.Module):
             what its ``neighbours`` show of distances (``arbiview_aug.motion``; seconds a frame), or ``motion_depth_m``
             of the ``depth`` command, with its ``boxes_3d``; the street where that is declined, with a warning;
             ``auto``: for each pair of cameras ``far`` where their centres coincide, else the best that the sample
-            offers: ``lidar``, else ``objects``, else ``street``, with a warning, unless ``p`` mixes half untouched
-            samples in; where the target differs from the source in heights alone, the cameras then keep the source's
-            (``paper``: always ``far``). Plans over points and boxes are made anew for every frame.
+            offers: ``lidar``, else ``objects``, else ``street`` (``paper``: always ``far``). Cameras that move over
+            the street alone harm a detector: a warning says so, once, unless ``p`` mixes half untouched samples in.
+            Plans over points and boxes are made anew for every frame.
+        strict: Raise SampleError instead of that warning.
         harmonise: Bring the sources to one exposure (``arbiview_aug.favs.photometric``): True or a ``HarmoniseConfig``
             estimates a gain for each camera in every frame; numbers are gains to use as they are. Off by default.
             Samples that ``p`` skips keep their colours.
@@ -109,7 +110,8 @@ class RigRetarget(torch.nn.Module):
             whatever the surface says; None does not read them. Never what the current frame sees. ``paper`` has none.
         size: (h, w) of every output image; the target cameras are resized to it.
         p: Probability of retargeting. A skipped sample keeps its own cameras, resized to ``size``, with full coverage;
-            so ``p < 1`` needs ``size`` and equal camera counts. The output then always has ``lens``, ``distortion``
+            so ``p < 1`` needs ``size`` and equal camera counts; where these differ, mix by
+            ``arbiview_aug.MixedDataset``. The output then always has ``lens``, ``distortion``
             and ``ignore``, whichever rig they come from: batches collate.
         rng: A generator for the draws instead of torch's global one; only outside DataLoader workers.
         label_frame: ``source``: output poses, points and boxes are in the source's ego frame. ``target``: they (and
@@ -145,6 +147,7 @@ class RigRetarget(torch.nn.Module):
         seed: int = 0,
         quality: Quality | FavsConfig | PaperConfig = "fast",
         surface: SurfaceName = "auto",
+        strict: bool = False,
         harmonise: Harmonise = None,
         refinement: RefinementCache | None = None,
         neighbours: Reach | None = "ground",
@@ -169,6 +172,8 @@ class RigRetarget(torch.nn.Module):
             one_of("neighbours", neighbours, get_args(Reach))
         for name in checked_names("outputs", outputs):
             one_of("outputs", name, OUTPUTS)
+        if not isinstance(strict, bool):
+            raise ValueError(f"strict: expected True or False, got {strict!r}")
         if not is_number(p) or not 0 <= p <= 1:
             raise ValueError(f"p: expected a probability from 0 to 1, got {p!r}")
         if p < 1 and size is None:
@@ -216,6 +221,7 @@ class RigRetarget(torch.nn.Module):
             cache_bytes=0 if once else cache_bytes,
             reach=neighbours,
             mixed=p <= _MIXED_P,
+            strict=strict,
             warn=self._warn,
         )
         self._fixed_target = self._sized(self.target) if isinstance(self.target, Rig) else None
@@ -304,7 +310,7 @@ class RigRetarget(torch.nn.Module):
         if self.p < 1 and counts:
             raise SampleError(
                 f"p < 1: expected the target to have the source's {counts.pop()} cameras, got {len(target)}; "
-                "batches could not be collated"
+                "batches could not be collated; mix on the level of the data set (arbiview_aug.MixedDataset)"
             )
         return target, bool(drawn.get("skipped")), drawn
 
@@ -331,6 +337,7 @@ class RigRetarget(torch.nn.Module):
         if skip and self.size:
             return [self._resized(frame, self.size) for frame in frames], [self.size] * len(frames)
         views = self.stitcher.views(sample, frames, lead, target)
+        self.stitcher.judge(views)
         seams: list[list[torch.Tensor]] | None = [] if self._trusts else None
         names = [] if self.completion is None else frame_names(sample, frames, lead, self.completion)
         parts = []
@@ -411,7 +418,7 @@ class RigRetarget(torch.nn.Module):
         if isinstance(view.made, PaperRendering):
             return PaperExplanation(view.made)
         gains = self.harmonisation(sample) if self.stitcher.harmoniser.is_on else None
-        return Explanation(view.made, target, gains, view.depth, view.motion, view.fills)
+        return Explanation(view.made, gains, view.depth, view.motion, view.fills, view.harm)
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
         """The gains that a sample's source images would get, and why; of a batch, its first frame."""

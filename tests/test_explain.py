@@ -9,6 +9,7 @@ import torch
 
 from arbiview_aug import RandomRig, Rig, RigRetarget, load_rig
 from arbiview_aug.explain import Explanation
+from arbiview_aug.surface import SurfaceName
 
 
 def nuscenes(scale: float = 0.1) -> Rig:
@@ -47,14 +48,21 @@ def test_in_words() -> None:
     assert repr(explained(ahead)) == text
 
 
-@pytest.mark.filterwarnings("ignore:target cameras stand")
-def test_cameras_that_keep_their_height_are_named() -> None:
-    lines = str(explained(nuscenes().shifted(z_m=0.6))).splitlines()
-    for name in nuscenes().names:
-        why = "nothing is known of what stands on the street"
-        assert f"  {name}: 0.60 m below the target's place, at the source's height: {why}" in lines
-    assert "0.60 m above the target's place" in str(explained(nuscenes().shifted(z_m=-0.6)))
-    assert "target's place" not in str(explained(nuscenes().shifted(z_m=0.1)))
+@pytest.mark.parametrize("surface", ["auto", "street", "far"])
+def test_what_a_static_street_does_to_a_detector_is_said_with_what_helps(surface: SurfaceName) -> None:
+    source = nuscenes()
+    sample = {"images": [torch.zeros((3, *size), dtype=torch.uint8) for size in source.sizes], "rig": source}
+
+    def text(target: Rig, **more: torch.Tensor) -> str:
+        return str(RigRetarget(target, surface=surface).explain(sample | more))
+
+    _, harm, better, *_ = text(source.shifted(z_m=0.6)).splitlines()
+    assert harm.startswith("  target cameras stand up to 0.60 m from the nearest source camera")
+    assert "points of IoU worse than one trained on untouched images" in harm
+    assert better.startswith("  better: 'points'") and better.endswith("mixing with untouched samples (p=0.5)")
+    for fine in (text(source.shifted(z_m=0.1)), text(source.turned(yaw_deg=20))):
+        assert "IoU" not in fine and "better:" not in fine
+    assert ("IoU" in text(source.shifted(z_m=0.6), boxes_3d=torch.zeros(0, 7))) == (surface != "auto")
 
 
 def test_what_has_to_be_invented() -> None:

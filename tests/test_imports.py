@@ -34,7 +34,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("favs.paper",),
     ("dense",),
     ("projection",),
-    ("required", "heights"),
+    ("required",),
     ("target_rays", "target_view"),
     ("shadowing",),
     ("maps",),

@@ -14,7 +14,7 @@ from arbiview_aug import target_plan
 from arbiview_aug.camera import Camera
 from arbiview_aug.favs.config import FavsConfig, draft
 from arbiview_aug.plan import RenderPlan, build_plan
-from arbiview_aug.required import baselines_m, needs_geometry, serves_alone
+from arbiview_aug.required import MOVED_M, baselines_m, needs_geometry, serves_alone, static_harm
 from arbiview_aug.rig import Rig, load_rig
 
 FAST = FavsConfig()
@@ -161,3 +161,16 @@ def test_baselines_align_the_roads() -> None:
     rig = ring()
     lifted = Rig([c.shifted(z_m=-0.4) for c in rig], ground_z_m=-0.4)
     assert np.allclose(np.diag(baselines_m(rig, lifted)), 0, atol=1e-9)
+
+
+def test_a_static_surface_harms_where_cameras_move_and_pixels_depend_on_the_street() -> None:
+    rig = ring()
+    for surface in ("far", "ground", "street"):
+        assert "stand up to 0.60 m" in str(static_harm(rig, rig.shifted(z_m=0.6), surface, FAST))
+        assert static_harm(rig, rig.shifted(z_m=0.9 * MOVED_M), surface, FAST) is None
+        assert static_harm(rig, rig.turned(yaw_deg=20), surface, FAST) is None
+    for surface in ("objects", "lidar", "motion"):
+        assert static_harm(rig, rig.shifted(z_m=0.6), surface, FAST) is None
+    one = Rig([rig[0]])
+    assert static_harm(one, one.turned(yaw_deg=180).shifted(z_m=0.6), "street", FAST) is None  # nothing is seen
+    assert "stand up to 0.60 m" in str(static_harm(rig, Rig([rig[0], rig[1].shifted(z_m=0.6)]), "street", FAST))

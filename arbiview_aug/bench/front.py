@@ -19,11 +19,13 @@ class Point:
         name: Of the setting.
         time: Of a frame.
         psnr_db: Its accuracy.
+        harm: Why it is not recommended, whatever it measures; None where nothing is known against it.
     """
 
     name: str
     time: Quartiles
     psnr_db: float
+    harm: str | None = None
 
 
 def pareto_front(points: Sequence[Point]) -> list[Point]:
@@ -60,7 +62,7 @@ class Advice:
     """What to use.
 
     Attributes:
-        point: As measured in the sweep; None where nothing keeps to the limit.
+        point: As measured in the sweep; None where nothing harmless keeps to the limit.
         again: Its times when it was measured again.
         reason: In words.
     """
@@ -71,24 +73,30 @@ class Advice:
 
 
 def within_budget(points: Sequence[Point], budget_ms: float, measure_again: Callable[[Point], Quartiles]) -> Advice:
-    """The most accurate setting that keeps to ``budget_ms`` in the sweep and when it is measured again."""
+    """The most accurate harmless setting that keeps to ``budget_ms`` in the sweep and when it is measured again."""
+    points = _harmless(points)
     for point in reversed(pareto_front(points)):
         if point.time.q3_ms <= budget_ms:
             again = measure_again(point)
             if again.median_ms <= budget_ms:
                 return Advice(point, again, f"the most accurate within {budget_ms:g} ms a frame")
     if not points:
-        return Advice(None, None, "nothing was measured")
+        return Advice(None, None, "nothing was measured that may be recommended")
     fastest = min(points, key=lambda p: p.time.median_ms)
     return Advice(None, None, f"nothing keeps to {budget_ms:g} ms: the fastest takes {fastest.time.median_ms:.1f} ms")
 
 
 def at_least(points: Sequence[Point], min_psnr_db: float, measure_again: Callable[[Point], Quartiles]) -> Advice:
-    """The fastest setting of at least ``min_psnr_db``."""
+    """The fastest harmless setting of at least ``min_psnr_db``."""
+    points = _harmless(points)
     for point in pareto_front(points):
         if point.psnr_db >= min_psnr_db:
             return Advice(point, measure_again(point), f"the fastest of at least {min_psnr_db:g} dB")
     if not points:
-        return Advice(None, None, "nothing was measured")
+        return Advice(None, None, "nothing was measured that may be recommended")
     best = max(points, key=lambda p: p.psnr_db)
     return Advice(None, None, f"nothing reaches {min_psnr_db:g} dB: the best has {best.psnr_db:.2f} dB ({best.name})")
+
+
+def _harmless(points: Sequence[Point]) -> list[Point]:
+    return [point for point in points if point.harm is None]

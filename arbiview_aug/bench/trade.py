@@ -2,7 +2,8 @@
 
 Sweeps settings (``bench.sweep``), marks the Pareto front of time and accuracy, puts others beside them
 (``bench.others``), draws one plot, and recommends a setting for ``--budget-ms`` or ``--min-psnr``, measured again
-before it is named.
+before it is named. Decibels do not tell what a detector learns: static surfaces are not recommended where cameras move
+(``required.static_harm``).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -27,7 +29,8 @@ from arbiview_aug.command_line import add_data, add_target, count, size, writabl
 from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.tables import markdown_table
-from arbiview_aug.favs.config import Quality
+from arbiview_aug.favs.config import FavsConfig, Quality
+from arbiview_aug.required import HELPFUL_DATA, STATIC_SURFACES, static_harm
 from arbiview_aug.rig import Rig
 from arbiview_aug.surface import SurfaceName
 
@@ -37,7 +40,7 @@ MOVES = ("paper", "yaw", "vehicles", "truck")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure, print the tables, write the JSON and the plot; 1 where nothing keeps to the stated limit."""
+    """Measure, print the tables, write the JSON and the plot; 1 where nothing harmless keeps to the stated limit."""
     parser = _parser()
     arguments = parser.parse_args(argv)
     folder = writable_folder(Path(arguments.output), arguments.output)
@@ -100,7 +103,8 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
         executions=arguments.execution or arguments.executions,
     )
     found = sweep.measure(wanted)
-    points = [one.point for one in found]
+    harm = {name: static_harm(source, target, name, FavsConfig()) for name in get_args(SurfaceName)}
+    points = [replace(one.point, harm=harm[one.setting.surface]) for one in found]
     by_name = {one.setting.name: one.setting for one in found}
     advice: Advice | None = None
 
@@ -122,7 +126,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
         "against": "true views" if data.truth is not None else "LiDAR points, exposures made even",
         "settings": [{**one.as_dict(), "front": one.setting.name in front} for one in found],
         "steps": [point.name for point in distinct_steps(points)],
-        "advice": None if advice is None else _advice(advice),
+        "advice": None if advice is None else _advice(advice, points),
         "same_rotation": _rotations(data, source, arguments),
         "moves": every_move(data, arguments.frames, REFERENCE, MOVES) if arguments.moves else None,
         "machine": machine(load_before),
@@ -130,11 +134,13 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _advice(advice: Advice) -> dict[str, Any]:
+def _advice(advice: Advice, points: Sequence[Point]) -> dict[str, Any]:
+    left_out = next((point.harm for point in points if point.harm is not None), None)
     again = None if advice.again is None else advice.again._asdict()
     point = advice.point
     measured = None if point is None else {"psnr_db": point.psnr_db, **point.time._asdict()}
-    return {"setting": point and point.name, "reason": advice.reason, "measured": measured, "again": again}
+    words = {"setting": point and point.name, "reason": advice.reason, "left_out": left_out}
+    return {**words, "measured": measured, "again": again}
 
 
 def _rotations(data: Recorded, source: Rig, arguments: argparse.Namespace) -> list[dict[str, Any]]:
@@ -230,10 +236,14 @@ def _moves(moves: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def advice_line(advice: Mapping[str, Any]) -> str:
-    """The recommendation in a sentence."""
+    """The recommendation in a sentence; in two more, why static surfaces were left out, and the data that helps."""
+    without = ""
+    if advice["left_out"] is not None:
+        without = f" Static surfaces ({', '.join(STATIC_SURFACES)}) are not recommended here: {advice['left_out']}. "
+        without += f"Better: {HELPFUL_DATA}."
     if advice["setting"] is None:
-        return f"No recommendation: {advice['reason']}."
+        return f"No recommendation: {advice['reason']}.{without}"
     return (
         f"Recommended, {advice['reason']}: {advice['setting']}, {advice['measured']['psnr_db']:.2f} dB, "
-        f"{advice['measured']['median_ms']:.1f} ms; measured again {advice['again']['median_ms']:.1f} ms."
+        f"{advice['measured']['median_ms']:.1f} ms; measured again {advice['again']['median_ms']:.1f} ms.{without}"
     )

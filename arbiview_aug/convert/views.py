@@ -43,7 +43,7 @@ def rig_of(target: Rig, out: Mapping[str, Any]) -> Rig:
 
     Args:
         target: The rig that was asked for, at the size of the views.
-        out: The sample: its poses count, which may be at other heights (``arbiview_aug.heights``).
+        out: The sample, which has the cameras' poses in its ego frame.
     """
     poses, K = out["cam2ego"].numpy(), out["K"].numpy()
     cameras = [replace(camera, K=K[k], cam2ego=poses[k]) for k, camera in enumerate(target)]

@@ -6,11 +6,12 @@ from arbiview_aug.datasets.motion_depth import WithMotionDepth
 from arbiview_aug.datasets.nuscenes import NuScenesDataset
 from arbiview_aug.datasets.opening import open_data
 from arbiview_aug.datasets.sequence import LazyFrame, Neighbours
-from arbiview_aug.datasets.wrappers import RetargetedDataset, RetargetedIterable
+from arbiview_aug.datasets.wrappers import MixedDataset, RetargetedDataset, RetargetedIterable
 
 __all__ = [
     "FrameFolder",
     "LazyFrame",
+    "MixedDataset",
     "Neighbours",
     "NuScenesDataset",
     "RetargetedDataset",

@@ -1,13 +1,15 @@
-"""A retargeted view of any dataset: the transform runs where the sample is read, so in the DataLoader's workers."""
+"""Datasets around any other: retargeted where samples are read, so in the DataLoader's workers, or mixed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import torch
 from torch.utils.data import Dataset, IterableDataset
 
-from arbiview_aug.errors import SampleTypeError
+from arbiview_aug.errors import DataError, SampleTypeError
+from arbiview_aug.transform_settings import is_number
 
 Retarget = Callable[[Any], Any]
 
@@ -28,12 +30,8 @@ class RetargetedDataset(Dataset[Any]):
 
     def __init__(self, dataset: Any, retarget: Retarget) -> None:
         name = type(self).__name__
-        if isinstance(dataset, IterableDataset) or not hasattr(dataset, "__getitem__"):
-            fix = "use RetargetedIterable" if hasattr(dataset, "__iter__") else "pass the dataset first"
-            raise SampleTypeError(f"{name}: expected a map-style dataset, got {type(dataset).__name__}; {fix}")
-        if not hasattr(dataset, "__len__"):
-            raise SampleTypeError(f"{name}: expected a dataset with __len__, got {type(dataset).__name__}")
-        self.dataset = dataset
+        fix = "use RetargetedIterable" if hasattr(dataset, "__iter__") else "pass the dataset first"
+        self.dataset = _checked_map_style(dataset, name, fix)
         self.retarget = _checked_retarget(retarget, name)
 
     def __len__(self) -> int:
@@ -46,6 +44,54 @@ class RetargetedDataset(Dataset[Any]):
         if callable(getattr(self.dataset, "__getitems__", None)):
             return [self.retarget(sample) for sample in self.dataset.__getitems__(indices)]
         return [self[index] for index in indices]
+
+
+class MixedDataset(Dataset[Any]):
+    """The same samples untouched and retargeted, mixed by a coin for each item.
+
+    Item ``i`` is ``retargeted[i]`` with probability ``share``, else ``raw[i]``. The coin is thrown by torch's global
+    RNG whenever an item is read: each epoch and each DataLoader worker throws its own, and the same seed repeats them.
+    So samplers, subsets and the length are those of either dataset.
+
+    Unlike ``RigRetarget(p=...)``, it lets the two have other numbers of cameras and other keys. ``default_collate``
+    cannot stack such items: use ``DataLoader(..., batch_size=None)`` for single items, or ``collate_fn=list`` for
+    batches that are lists of samples.
+
+    The transform within ``retargeted`` does not know that it is mixed. ``RigRetarget(surface="street")`` tells it that
+    cameras may move over the static street.
+
+    Args:
+        raw: Map-style: the untouched samples.
+        retargeted: Map-style: the same samples in the same order, for example ``RetargetedDataset(raw, retarget)`` or
+            a converted folder.
+        share: Expected share of retargeted items, from 0 to 1.
+
+    Raises:
+        SampleTypeError: One of the datasets is not map-style.
+        DataError: Their lengths differ.
+        ValueError: ``share`` is no number from 0 to 1.
+    """
+
+    def __init__(self, raw: Any, retargeted: Any, share: float = 0.5) -> None:
+        name = type(self).__name__
+        self.raw, self.retargeted = (
+            _checked_map_style(dataset, name, "pass two that have __getitem__") for dataset in (raw, retargeted)
+        )
+        if len(raw) != len(retargeted):
+            raise DataError(
+                f"{name}: expected the same samples untouched and retargeted, got {len(raw)} and {len(retargeted)}; "
+                "take those that both have with torch.utils.data.Subset"
+            )
+        if not is_number(share) or not 0 <= share <= 1:
+            raise ValueError(f"share: expected a share of retargeted items from 0 to 1, got {share!r}")
+        self.share = float(share)
+
+    def __len__(self) -> int:
+        return len(self.raw)
+
+    def __getitem__(self, index: Any) -> Any:
+        chosen = self.retargeted if torch.rand(()).item() < self.share else self.raw
+        return chosen[index]
 
 
 class RetargetedIterable(IterableDataset[Any]):
@@ -78,6 +124,14 @@ class RetargetedIterable(IterableDataset[Any]):
     def __iter__(self) -> Iterator[Any]:
         for sample in self.dataset:
             yield self.retarget(sample)
+
+
+def _checked_map_style(dataset: Any, name: str, fix: str) -> Any:
+    if isinstance(dataset, IterableDataset) or not hasattr(dataset, "__getitem__"):
+        raise SampleTypeError(f"{name}: expected a map-style dataset, got {type(dataset).__name__}; {fix}")
+    if not hasattr(dataset, "__len__"):
+        raise SampleTypeError(f"{name}: expected a dataset with __len__, got {type(dataset).__name__}")
+    return dataset
 
 
 def _checked_retarget(retarget: Any, name: str) -> Retarget:

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug import RandomRig, Rig, RigRetarget
+from arbiview_aug import Camera, RandomRig, Rig, RigRetarget
 from arbiview_aug.evaluate.baselines import row_split
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.fills import Reach
-from arbiview_aug.heights import at_source_heights, most_alike
 from integrations.cross_rig.arm import RANDOM, Arm
 from integrations.cross_rig.cache import Arrays
 
 _POSE = ("ego2world", "time_s")  # where neighbours are read
+_SAME_HEIGHT_M = 0.2
 
 
 class ViewMaker:
@@ -81,3 +81,21 @@ def at_source_centres(source: Rig, target: Rig) -> Rig:
     """The target rig, in the source's ego frame, with each camera in the centre of the source camera most like it."""
     moves = (most_alike(source, camera).center_m - camera.center_m for camera in target)
     return target.with_cameras([camera.shifted(*move) for camera, move in zip(target, moves, strict=True)])
+
+
+def at_source_heights(source: Rig, target: Rig) -> Rig:
+    """The target rig, in the source's ego frame, with each camera at the height of the source camera most like it.
+
+    Cameras whose heights differ by no more than ``_SAME_HEIGHT_M`` stay.
+    """
+    target = target.in_frame_of(source)
+    cameras = []
+    for camera in target:
+        lift_m = float(camera.center_m[2] - most_alike(source, camera).center_m[2])
+        cameras.append(camera.shifted(z_m=-lift_m) if abs(lift_m) > _SAME_HEIGHT_M else camera)
+    return target.with_cameras(cameras)
+
+
+def most_alike(rig: Rig, camera: Camera) -> Camera:
+    """The camera of a rig whose optical axis is nearest to that of another one, both in one ego frame."""
+    return max(rig, key=lambda one: float(one.cam2ego[:3, 2] @ camera.cam2ego[:3, 2]))

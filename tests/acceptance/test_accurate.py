@@ -52,9 +52,7 @@ class Frame(ProtocolFrame):
     """Rendered and scored."""
 
     def render(self, target: Rig, quality: Quality) -> tuple[list[Image], BoolArray]:
-        lifted = not np.allclose(target.cam2ego[:, 2, 3], self.rig.cam2ego[:, 2, 3])
-        surface: SurfaceName = "street" if lifted else "auto"  # auto would keep the height
-        retarget = RigRetarget(target, source_rig=self.rig, quality=quality, surface=surface)
+        retarget = RigRetarget(target, source_rig=self.rig, quality=quality)
         out = retarget({"images": as_tensors(self.images)})
         return as_arrays(out["images"]), out["coverage"].numpy()
 

@@ -55,12 +55,11 @@ class Frame(ProtocolFrame):
         images = as_tensors(self.images)
 
         def render(target: Rig) -> list[Image]:
-            retarget = RigRetarget(target, source_rig=self.rig, surface=over, quality="fast")
+            retarget = RigRetarget(target, source_rig=self.rig, surface=surface, quality="fast")
             return as_arrays(retarget({"images": images})["images"])
 
         found = {}
         for name, targets in self.sets.items():
-            over: SurfaceName = "street" if (surface, name) == ("auto", "up") else surface  # auto keeps the height
             rigs = [Rig([as_camera(*view) for view in views], ground_z_m=self.ground_z_m) for views in targets]
             found[name] = score_targets(render, self.points, rigs)["psnr_db"]
         return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import pytest
 
@@ -60,6 +61,18 @@ def test_budget_is_kept_when_measured_again() -> None:
 def test_least_accuracy(db: float, expected: Point) -> None:
     advice = at_least(ALL, db, lambda p: p.time)
     assert advice.point is expected and advice.again == expected.time
+
+
+def test_what_harms_is_not_recommended() -> None:
+    """Whatever it measures: with a harmless one that is slower, and without any."""
+    street = replace(FAST, name="street", harm="objects lean")
+    assert within_budget([DRAFT, street, LIDAR], 20, lambda p: p.time).point is DRAFT
+    assert at_least([DRAFT, street, LIDAR], 19, lambda p: p.time).point is LIDAR
+    slow = within_budget([street, LIDAR], 20, lambda p: p.time)
+    assert slow.point is None and "nothing keeps to 20 ms: the fastest takes 300.0 ms" in slow.reason
+    for advice in (within_budget([street], 20, lambda p: p.time), at_least([street], 10, lambda p: p.time)):
+        assert advice.point is None and advice.reason == "nothing was measured that may be recommended"
+    assert names(pareto_front([DRAFT, street, LIDAR])) == ["draft", "street", "lidar"]
 
 
 def test_accuracy_that_nothing_reaches() -> None:

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 import torch
-from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+from torch.utils.data import DataLoader, IterableDataset, Subset, get_worker_info
 
-from arbiview_aug.datasets import RetargetedDataset, RetargetedIterable
+from arbiview_aug.datasets import MixedDataset, RetargetedDataset, RetargetedIterable
 from arbiview_aug.errors import DataError, SampleTypeError
 
 
@@ -84,3 +84,68 @@ def test_wrong_types() -> None:
         RetargetedDataset(Numbers(), "waymo")  # type: ignore[arg-type]
     with pytest.raises(SampleTypeError, match="with __len__, got Unsized"):
         RetargetedDataset(type("Unsized", (), {"__getitem__": lambda self, k: k})(), add_ten)
+
+
+# --- mixing -----------------------------------------------------------------------------------------------------------
+class Views:
+    """Map-style: samples with a number of cameras."""
+
+    def __init__(self, cameras: int, count: int = 40) -> None:
+        self.cameras, self.count = cameras, count
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        return {"index": index, "images": torch.zeros(self.cameras, 3, 2, 2)}
+
+
+def cameras_of(samples: list[dict[str, Any]]) -> list[int]:
+    return [len(sample["images"]) for sample in samples]
+
+
+def test_mixed_items_are_the_same_samples_in_one_form_or_the_other() -> None:
+    mixed = pickle.loads(pickle.dumps(MixedDataset(Views(6), Views(5), 0.25)))
+    assert len(mixed) == 40
+    torch.manual_seed(0)
+    drawn = [mixed[i] for _ in range(25) for i in range(40)]
+    assert [sample["index"] for sample in drawn] == 25 * list(range(40))
+    assert cameras_of(drawn).count(5) / 1000 == pytest.approx(0.25, abs=0.04)  # three standard deviations
+    torch.manual_seed(0)
+    assert cameras_of([mixed[i] for _ in range(25) for i in range(40)]) == cameras_of(drawn)
+    assert {*cameras_of([MixedDataset(Views(6), Views(5), 0)[i] for i in range(40)])} == {6}
+    assert {*cameras_of([MixedDataset(Views(6), Views(5), 1)[i] for i in range(40)])} == {5}
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("batch", [{"batch_size": None}, {"batch_size": 4, "collate_fn": list}])
+def test_mixed_in_a_data_loader(workers: int, batch: dict[str, Any]) -> None:
+    """Every sample once an epoch, whatever the sampler; other coins in each worker and epoch; the seed repeats them."""
+    dataset = Subset(MixedDataset(Views(6), Views(5), 0.5), range(32))
+
+    def epochs() -> list[list[dict[str, Any]]]:
+        torch.manual_seed(3)
+        loader = DataLoader(dataset, shuffle=True, num_workers=workers, **batch)
+        found = [list(loader) for _ in range(2)]
+        return found if "collate_fn" not in batch else [[s for part in epoch for s in part] for epoch in found]
+
+    one, again = epochs(), epochs()
+    forms = []
+    for epoch, repeated in zip(one, again, strict=True):
+        assert sorted(sample["index"] for sample in epoch) == list(range(32))
+        assert cameras_of(epoch) == cameras_of(repeated) and {*cameras_of(epoch)} == {5, 6}
+        forms.append({sample["index"]: len(sample["images"]) for sample in epoch})
+    assert forms[0] != forms[1]
+    first, second = cameras_of(one[0])[::2], cameras_of(one[0])[1::2]  # single samples: the workers in turn
+    assert batch["batch_size"] or first != second
+
+
+def test_wrong_mixtures() -> None:
+    with pytest.raises(DataError, match=r"same samples untouched and retargeted, got 40 and 39; take those .*Subset"):
+        MixedDataset(Views(6), Views(5, 39), 0.5)
+    for share in (-0.1, 1.1, float("nan"), "half", True):
+        with pytest.raises(ValueError, match="share: expected a share of retargeted items from 0 to 1, got"):
+            MixedDataset(Views(6), Views(5), share)  # type: ignore[arg-type]
+    for wrong in ((Stream(), Views(5)), (Views(6), Stream())):
+        with pytest.raises(SampleTypeError, match="MixedDataset: expected a map-style dataset, got Stream; pass two"):
+            MixedDataset(*wrong, 0.5)
