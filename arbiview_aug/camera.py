@@ -33,6 +33,7 @@ from arbiview_aug.calibration import (
     checked_size,
 )
 from arbiview_aug.errors import CalibrationError
+from arbiview_aug.framing import Fit, framing
 from arbiview_aug.lens import BoolArray, FloatArray, Lens, distort, fold_limit, intrinsics_for_fov, undistort
 from arbiview_aug.rotations import CAMERA_AXES_IN_EGO, rotation_x, rotation_z
 
@@ -296,8 +297,23 @@ class Camera:
         return np.stack([u, v], -1)
 
     # --- changed copies -------------------------------------------------------------------------------------------
-    def resize(self, size: tuple[int, int]) -> Camera:
-        """The camera of the image resized to (h, w): outer edges stay, so centres move by half pixels."""
+    def resize(self, size: tuple[int, int], fit: Fit = "stretch") -> Camera:
+        """The camera of the image resized to (h, w): outer edges stay, so centres move by half pixels.
+
+        Args:
+            size: (h, w) in pixels.
+            fit: ``stretch``: the whole image in this shape. ``crop`` and ``pad`` keep the aspect: what covers the size
+                is cut at the top and at both sides, or what fits inside gets bars there. A mask is False on bars.
+
+        Raises:
+            CalibrationError: An impossible size, or one that ``crop`` would have to be cut from too large an image.
+        """
+        if fit != "stretch":
+            frame = framing(self.name, self.size, size, fit)
+            scaled = self.resize(frame.scaled)
+            if frame.has_bars and self.mask is None:
+                scaled = replace(scaled, mask=np.ones(frame.scaled, bool))
+            return scaled.crop(frame.top, frame.left, frame.size)
         h, w = checked_size(self.name, size)
         A = resize_matrix(self.size, (h, w))
         camera = replace(self, width_px=w, height_px=h, K=A @ self.K, mask=None)

@@ -145,8 +145,8 @@ def _parser() -> argparse.ArgumentParser:
         "--size",
         type=size,
         metavar="HxW",
-        help="render at this height and width; on a synthetic street the source cameras too (default: 256x704 on a "
-        "synthetic street, with --data the rig's own)",
+        help="render at this height and width, the target cut to this aspect; on a synthetic street the source cameras "
+        "too (default: 256x704 on a synthetic street, with --data the rig's own)",
     )
     parser.add_argument(
         "--width", type=count, default=1800, metavar="PX", help="of the contact sheet (default: %(default)s)"
@@ -191,7 +191,7 @@ def _compared(quality: Quality, surface: SurfaceName, path: RenderPath) -> list[
 
 
 def _resized(rig: Rig, to: tuple[int, int] | None) -> Rig:
-    return rig if to is None else rig.resized(to)
+    return rig if to is None else rig.resized(to, "crop")
 
 
 def _timings(retarget: RigRetarget, sample: dict[str, Any]) -> tuple[float, float]:

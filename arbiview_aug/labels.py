@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -12,9 +13,10 @@ import torch
 from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.favs.paper import PaperRendering, paper_labels
 from arbiview_aug.favs.synthesis import render_labels
+from arbiview_aug.framing import Framing
 from arbiview_aug.plan import RenderPlan
 from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame
-from arbiview_aug.tensors import gathered, is_readable, nearest_resized, rewrapped, split, stacked
+from arbiview_aug.tensors import barred, framed, gathered, is_readable, nearest_resized, rewrapped, split, stacked
 
 PIXEL_BOUND_KEYS = (
     "boxes_2d",
@@ -105,8 +107,9 @@ def target_labels(
     value: Any,
     frames: Sequence[SourceFrame],
     lead: tuple[int, ...],
-    views: Sequence[RenderPlan | PaperRendering | tuple[int, int]],
+    views: Sequence[RenderPlan | PaperRendering | list[Framing]],
     fill: float,
+    size: tuple[int, int] | None = None,
 ) -> Any:
     """The label maps (..., N, H, W) of a sample in the target's views.
 
@@ -115,9 +118,10 @@ def target_labels(
         value: A tensor, or a list of one (..., Hi, Wi) tensor a camera.
         frames: The frames of the sample.
         lead: Its leading dimensions.
-        views: The plan of each frame, or its rendering by ``quality="paper"``; or, where the frame is only resized,
-            its new size.
+        views: The plan of each frame, or its rendering by ``quality="paper"``; or, where the frame keeps its cameras,
+            how each comes to its new size.
         fill: Value of pixels that no source sees (False for bool maps).
+        size: (h, w) of the maps, where rendered views stand between bars.
 
     Raises:
         SampleError: Maps that do not belong to the images, or a fill that their type cannot hold.
@@ -137,12 +141,18 @@ def target_labels(
     for frame, view, maps in zip(frames, views, of_frames, strict=True):
         _check_maps(key, maps, frame)
         plain = [label.as_subclass(torch.Tensor) for label in maps]
-        if isinstance(view, RenderPlan):
-            rendered.append(stacked(render_labels(view, plain, _checked_fill(key, fill, plain[0].dtype))))
-        elif isinstance(view, PaperRendering):
-            rendered.append(stacked(paper_labels(view, plain, _checked_fill(key, fill, plain[0].dtype))))
+        empty = partial(_checked_fill, key, fill, plain[0].dtype)
+        if isinstance(view, list):
+            found = [
+                framed(nearest_resized(label, f.scaled), f, empty() if f.has_bars else 0)
+                for label, f in zip(plain, view, strict=True)
+            ]
         else:
-            rendered.append(stacked([nearest_resized(label, view) for label in plain]))
+            render = paper_labels if isinstance(view, PaperRendering) else render_labels
+            found = render(view, plain, empty())  # type: ignore[arg-type, operator]
+            if size is not None:
+                found = [barred(label, size, empty()) for label in found]
+        rendered.append(stacked(found))
     return rewrapped(gathered(rendered, lead), value)
 
 

@@ -25,6 +25,7 @@ import yaml
 
 from arbiview_aug.camera import Camera, FloatArray
 from arbiview_aug.errors import CalibrationError
+from arbiview_aug.framing import Fit
 
 _CAMERA_KEYS = {"name", "width", "height", "K", "cam2ego", "distortion", "mask"}
 
@@ -141,15 +142,15 @@ class Rig:
         """The same rig with other cameras."""
         return Rig(cameras, ground_z_m=self.ground_z_m, name=self.name)
 
-    def resized(self, size: tuple[int, int] | float) -> Rig:
-        """All cameras resized to (h, w), or by a scale."""
+    def resized(self, size: tuple[int, int] | float, fit: Fit = "stretch") -> Rig:
+        """All cameras resized to (h, w), each as ``Camera.resize`` fits it; or by a scale."""
 
         def new(c: Camera) -> tuple[int, int]:
             if isinstance(size, tuple):
                 return size
             return max(1, round(c.height_px * size)), max(1, round(c.width_px * size))
 
-        return self.with_cameras([c.resize(new(c)) for c in self.cameras])
+        return self.with_cameras([c.resize(new(c), fit) for c in self.cameras])
 
     def turned(self, *, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Rig:
         """Each camera turned about its own centre (see ``Camera.turned``)."""

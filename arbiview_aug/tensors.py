@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import torch
 
+from arbiview_aug.framing import Framing, framing
 from arbiview_aug.sampling import halved, interleaved
 
 
@@ -130,6 +131,21 @@ def nearest_resized(label: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     y = ((torch.arange(size[0], device=label.device) + 0.5) * h / size[0]).long().clamp(max=h - 1)
     x = ((torch.arange(size[1], device=label.device) + 0.5) * w / size[1]).long().clamp(max=w - 1)
     return label[..., y[:, None], x]
+
+
+def framed(scaled: torch.Tensor, frame: Framing, fill: float = 0) -> torch.Tensor:
+    """The window of a framing in an image or map (..., h, w) that is at its ``scaled`` size; ``fill`` on bars."""
+    (h, w), (to_h, to_w) = frame.scaled, frame.size
+    if (h, w) == (to_h, to_w):
+        return scaled
+    beside = (-frame.left, to_w - w + frame.left, -frame.top, to_h - h + frame.top)
+    return torch.nn.functional.pad(scaled, beside, value=fill)  # a negative number of columns is cut
+
+
+def barred(view: torch.Tensor, size: tuple[int, int], fill: float = 0) -> torch.Tensor:
+    """A view or map (..., h, w), which fits inside ``size``, between bars of ``fill``; itself where it fills it."""
+    h, w = view.shape[-2:]
+    return framed(view, framing("view", (h, w), size, "pad"), fill)
 
 
 def like(value: torch.Tensor, given: Any) -> torch.Tensor:

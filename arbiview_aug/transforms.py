@@ -19,6 +19,7 @@ from arbiview_aug.favs.paper import PaperRendering, check_pinhole
 from arbiview_aug.favs.photometric import Harmonise, Harmoniser, PhotometricReport
 from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.fills import Reach
+from arbiview_aug.framing import Fit, Framing, framing
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.batches import SOURCES_KEY, complete_frame, frame_names
 from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_target, target_labels
@@ -30,7 +31,17 @@ from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame, check_inputs
 from arbiview_aug.scene import Scene
 from arbiview_aug.stitching import Execution, Stitcher, WarnOnce
 from arbiview_aug.surface import SurfaceName
-from arbiview_aug.tensors import gathered, leading_shape, lens_names, like, resized, rewrapped, stacked
+from arbiview_aug.tensors import (
+    barred,
+    framed,
+    gathered,
+    leading_shape,
+    lens_names,
+    like,
+    resized,
+    rewrapped,
+    stacked,
+)
 from arbiview_aug.transform_settings import (
     OUTPUTS,
     RenderPath,
@@ -43,8 +54,8 @@ from arbiview_aug.transform_settings import (
 )
 from arbiview_aug.view_entries import calibration_entries, seen_entries, source_sample, untouched_entries
 
-Made = RenderPlan | PaperRendering | tuple[int, int]
-"""What a frame's views are made by: a plan, the published stages; or it is only resized, to this size."""
+Made = RenderPlan | PaperRendering | list[Framing]
+"""What a frame's views are made by: a plan, the published stages; or each camera's image is only brought to size."""
 
 _MIXED_P = 0.5
 """With half of the samples untouched or more, views over a static street do not harm a detector
@@ -108,11 +119,14 @@ class RigRetarget(torch.nn.Module):
         neighbours: What other frames of the drive may fill, where the sample has ``neighbours`` (their format:
             ``arbiview_aug.neighbours``): ``ground``, the road near the cameras that no source sees now; ``all``,
             whatever the surface says; None does not read them. Never what the current frame sees. ``paper`` has none.
-        size: (h, w) of every output image; the target cameras are resized to it.
-        p: Probability of retargeting. A skipped sample keeps its own cameras, resized to ``size``, with full coverage;
-            so ``p < 1`` needs ``size`` and equal camera counts; where these differ, mix by
-            ``arbiview_aug.MixedDataset``. The output then always has ``lens``, ``distortion``
-            and ``ignore``, whichever rig they come from: batches collate.
+        size: (h, w) of every output image; the target cameras are brought to it by ``fit``, and ``K`` says so.
+        fit: ``crop``: the aspect is kept, what then exceeds the size is cut at the top and at both sides. ``pad``: the
+            aspect is kept, black bars above and at both sides fill the size; there ``coverage`` is False, ``ignore``
+            True, label maps hold ``label_fill``, and nothing is filled in. ``stretch``: the aspect is not kept.
+        p: Probability of retargeting. A skipped sample keeps its own cameras, brought to ``size`` by ``fit``, with full
+            coverage; so ``p < 1`` needs ``size`` and equal camera counts; where these differ, mix by
+            ``arbiview_aug.MixedDataset``. The output then always has ``lens``, ``distortion`` and ``ignore``, whichever
+            rig they come from: batches collate.
         rng: A generator for the draws instead of torch's global one; only outside DataLoader workers.
         label_frame: ``source``: output poses, points and boxes are in the source's ego frame. ``target``: they (and
             ``ego2world``) are moved into the target's, and ``ego2ego`` (..., 4, 4) is returned.
@@ -152,6 +166,7 @@ class RigRetarget(torch.nn.Module):
         refinement: RefinementCache | None = None,
         neighbours: Reach | None = "ground",
         size: tuple[int, int] | None = None,
+        fit: Fit = "crop",
         p: float = 1.0,
         rng: torch.Generator | None = None,
         label_frame: Literal["source", "target"] = "source",
@@ -166,6 +181,7 @@ class RigRetarget(torch.nn.Module):
         warn_about_cv2_wheels()
         one_of("path", path, get_args(RenderPath))
         one_of("surface", surface, get_args(SurfaceName))
+        one_of("fit", fit, get_args(Fit))
         one_of("label_frame", label_frame, ("source", "target"))
         one_of("execution", execution, get_args(Execution))
         if neighbours is not None:
@@ -205,7 +221,7 @@ class RigRetarget(torch.nn.Module):
         self.path, self.p, self.rng = path, float(p), rng
         self.completion = completion_of(path, generator, steps, guidance, min_confidence, seed)
         self.generator = None if self.completion is None else self.completion.generator  # moves with this module
-        self.size = None if size is None else checked_size(size)
+        self.size, self.fit = None if size is None else checked_size(size), fit
         self.label_frame, self.label_fill = label_frame, label_fill
         self.label_keys = checked_names("label_keys", label_keys)
         self.pass_keys, self.outputs = checked_names("pass_keys", pass_keys), tuple(outputs)
@@ -225,6 +241,11 @@ class RigRetarget(torch.nn.Module):
             warn=self._warn,
         )
         self._fixed_target = self._sized(self.target) if isinstance(self.target, Rig) else None
+        base = self.target.base if isinstance(self.target, RandomRig) else self.target
+        base = base if self.size is None else base.resized(self.size, fit)
+        # Which keys there are depends on the settings alone.
+        self._lenses = p < 1 or any(camera.lens != "pinhole" for camera in base)
+        self._masks = p < 1 or any(camera.mask is not None for camera in base)
         self._limited_process: int | None = None
 
     def extra_repr(self) -> str:
@@ -232,7 +253,8 @@ class RigRetarget(torch.nn.Module):
         target = self.target if isinstance(self.target, RandomRig) else (self.target.name or "unnamed rig")
         how = self.stitcher
         settings = (
-            f"path={self.path}, surface={how.surface}, harmonise={how.harmoniser}, size={self.size}, p={self.p:g}"
+            f"path={self.path}, surface={how.surface}, harmonise={how.harmoniser}, size={self.size}, fit={self.fit}, "
+            f"p={self.p:g}"
         )
         held = "" if how.refinement is None else f"refinement={how.refinement!r}, "
         return f"target={target}, {settings}, {held}{self.config}"
@@ -275,7 +297,7 @@ class RigRetarget(torch.nn.Module):
         if "lens" in parts[0]:
             out["lens"] = lens_names([part["lens"] for part in parts], lead)
         for key in labels:
-            out[key] = target_labels(key, sample[key], frames, lead, made, self.label_fill)
+            out[key] = target_labels(key, sample[key], frames, lead, made, self.label_fill, self.size)
         if drawn:
             out["retarget_params"] = drawn
         if self.label_frame == "target":
@@ -315,7 +337,10 @@ class RigRetarget(torch.nn.Module):
         return target, bool(drawn.get("skipped")), drawn
 
     def _sized(self, target: Rig) -> Rig:
-        return target if self.size is None else target.resized(self.size)
+        """The cameras that are rendered: at ``size``, without its bars."""
+        if self.size is None or self.fit != "pad":
+            return target if self.size is None else target.resized(self.size, self.fit)
+        return target.with_cameras([c.resize(framing(c.name, c.size, self.size, "pad").scaled) for c in target])
 
     def _kept(self, sample: Mapping[str, Any], labels: Sequence[str]) -> dict[str, Any]:
         """The entries that go with any images, as the same objects."""
@@ -335,7 +360,8 @@ class RigRetarget(torch.nn.Module):
     ) -> tuple[list[dict[str, Any]], list[Made]]:
         """Images, calibration and masks of each frame, rendered or resized; and what they were made by."""
         if skip and self.size:
-            return [self._resized(frame, self.size) for frame in frames], [self.size] * len(frames)
+            done = [self._resized(frame, self.size) for frame in frames]
+            return [part for part, _ in done], [framings for _, framings in done]
         views = self.stitcher.views(sample, frames, lead, target)
         self.stitcher.judge(views)
         seams: list[list[torch.Tensor]] | None = [] if self._trusts else None
@@ -344,30 +370,33 @@ class RigRetarget(torch.nn.Module):
         for b, images in enumerate(self.stitcher.render(frames, views, seams)):
             made = views[b].made
             filled, patches = self.stitcher.filled(frames[b], views[b], images)
-            part = self._described(made.target, images[0].device)
-            part["images"] = stacked(filled)
-            part.update(seen_entries(made, filled, patches, None if seams is None else seams[b], self.outputs))
+            part = {"images": stacked(filled)}
+            part |= seen_entries(made, filled, patches, None if seams is None else seams[b], self.outputs)
+            shown = made.target
+            if self.size is not None and self.fit == "pad":
+                shown = made.target.resized(self.size, "pad")
+                for key, views_of in part.items():
+                    empty = -1 if key.startswith("source") else 0
+                    part[key] = torch.stack([barred(view, self.size, empty) for view in views_of])
+            part |= calibration_entries(shown, images[0].device, lenses=self._lenses, masks=self._masks)
             if self.completion is not None:
-                complete_frame(part, made.target, frames[b], names[b], self.completion)
+                complete_frame(part, shown, frames[b], names[b], self.completion)
             parts.append(part)
         return parts, [view.made for view in views]
 
-    def _resized(self, frame: SourceFrame, size: tuple[int, int]) -> dict[str, Any]:
-        """A frame that keeps its cameras: they saw all of it."""
+    def _resized(self, frame: SourceFrame, size: tuple[int, int]) -> tuple[dict[str, Any], list[Framing]]:
+        """A frame that keeps its cameras: they saw all of it; and how each came to the size."""
         device = frame.images[0].device
-        part = self._described(frame.rig.resized(size), device)
-        part["images"] = stacked([resized(image, size) for image in frame.images])
-        part.update(untouched_entries(len(frame.rig), size, device, self.outputs))
+        framings = [framing(camera.name, camera.size, size, self.fit) for camera in frame.rig]
+        rig = frame.rig.resized(size, self.fit)
+        part = calibration_entries(rig, device, lenses=self._lenses, masks=self._masks)
+        images = [framed(resized(image, f.scaled), f) for image, f in zip(frame.images, framings, strict=True)]
+        part["images"] = stacked(images)
+        seen = [framed(torch.ones(f.scaled, dtype=torch.bool, device=device), f) for f in framings]
+        part.update(untouched_entries(torch.stack(seen), self.outputs))
         if self.completion is not None:
             part["generated"] = torch.zeros_like(part["coverage"])
-        return part
-
-    def _described(self, rig: Rig, device: torch.device) -> dict[str, Any]:
-        """The calibration that goes with a frame's images; which keys there are depends on the settings alone."""
-        base = self.target.base if isinstance(self.target, RandomRig) else self.target
-        lenses = self.p < 1 or any(c.lens != "pinhole" for c in base)
-        masks = self.p < 1 or any(c.mask is not None for c in base)
-        return calibration_entries(rig, device, lenses=lenses, masks=masks)
+        return part, framings
 
     @property
     def plans(self) -> PlanCache:

@@ -85,19 +85,17 @@ def seen_entries(
     return part
 
 
-def untouched_entries(
-    count: int, size: tuple[int, int], device: torch.device, outputs: Collection[str]
-) -> dict[str, torch.Tensor]:
-    """The same of a frame that keeps its ``count`` cameras: they saw all of it."""
-    coverage = torch.ones((count, *size), dtype=torch.bool, device=device)
+def untouched_entries(coverage: torch.Tensor, outputs: Collection[str]) -> dict[str, torch.Tensor]:
+    """The same of a frame that keeps its cameras: each saw all of its own view, ``coverage`` (N, h, w)."""
     part = {"coverage": coverage}
     if "confidence" in outputs:
         part["confidence"] = coverage.float()
+    frame = coverage.to(torch.int8) - 1
     if "source_camera" in outputs:
-        numbers = torch.arange(count, dtype=torch.int8, device=device)
-        part["source_camera"] = numbers[:, None, None].expand_as(coverage).clone()
+        numbers = torch.arange(len(coverage), dtype=torch.int8, device=coverage.device)
+        part["source_camera"] = torch.where(coverage, numbers[:, None, None], frame)
     if "source_frame" in outputs:
-        part["source_frame"] = torch.zeros_like(coverage, dtype=torch.int8)
+        part["source_frame"] = frame
     return part
 
 

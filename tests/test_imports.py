@@ -19,6 +19,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("lens",),
     ("rotations",),
     ("calibration",),
+    ("framing",),
     ("camera",),
     ("rig",),
     ("surface", "grid", "overlaps", "tone", "command_line"),

@@ -54,10 +54,13 @@ class Recorded:
         return partial(data.__getitem__, 0)
 
     def target(self, name: str | None, size: tuple[int, int]) -> Rig:
-        """The rig to render at (h, w): by its name or file, else what the commands take where none is named."""
+        """The rig to render at (h, w): by its name or file, else what the commands take where none is named.
+
+        Stretched, as it was when the published figures were recorded.
+        """
         if name is None and self.truth is not None:
             return demo_target_rig(size)
-        return without_masks(load_rig(name or REAL_TARGET)).resized(size)
+        return without_masks(load_rig(name or REAL_TARGET)).resized(size, "stretch")
 
     def frame(self, index: int, reduce: Reduce, reference: Reduce) -> Frame:
         """A frame to evaluate on, with images at 1 / ``reduce``, scored by the colours of images at 1 / ``reference``.

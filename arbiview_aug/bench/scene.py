@@ -259,7 +259,7 @@ def situations(sample: Mapping[str, Any]) -> list[Situation]:
             )
         )
     size = (rig.sizes[0][0] // 2, rig.sizes[0][1] // 2)
-    skipping: dict[str, Any] = {"size": size}
+    skipping: dict[str, Any] = {"size": size, "fit": "stretch"}
     found.append(
         Situation(
             "a sample that p skips, at half size",
@@ -340,7 +340,7 @@ def _plan(case: Case) -> Callable[[], Any]:
     assert isinstance(config, FavsConfig)
     (frame,) = check_inputs(case.sample, None)
     (scene,) = scenes_of_frames(case.sample, [frame], (), surface)
-    target = case.target if retarget.size is None else case.target.resized(retarget.size)
+    target = case.target if retarget.size is None else case.target.resized(retarget.size, retarget.fit)
     # A scene keeps what it made of its points: each plan gets one that was not asked before.
     return lambda: build_plan(frame.rig, target, surface=surface, config=config, scene=replace(scene))
 

@@ -23,6 +23,7 @@ from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError
 from arbiview_aug.favs.config import Quality
 from arbiview_aug.files import remove_parts
+from arbiview_aug.framing import Fit
 from arbiview_aug.offline import results
 from arbiview_aug.rig import load_rig
 from arbiview_aug.surface import SurfaceName
@@ -91,6 +92,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--quality", choices=get_args(Quality), default="fast", help="(default: %(default)s)")
     parser.add_argument("--surface", choices=get_args(SurfaceName), default="auto", help="(default: %(default)s)")
     parser.add_argument("--size", type=size, metavar="HxW", help="of every view (default: the target's own)")
+    parser.add_argument(
+        "--fit",
+        choices=get_args(Fit),
+        default="crop",
+        help="with --size: keep the aspect and cut at the top and the sides (default), or add black bars there; or "
+        "stretch",
+    )
     parser.add_argument("--reduce", type=int, choices=(1, 2, 4), default=1, help="decode images at 1, 1/2 or 1/4 size")
     parser.add_argument(
         "--neighbours",
@@ -151,6 +159,7 @@ def _settings(arguments: argparse.Namespace) -> Settings:
         quality=arguments.quality,
         surface=arguments.surface,
         size=arguments.size,
+        fit=arguments.fit,
         reduce=arguments.reduce,
         neighbours=arguments.neighbours,
         motion_depth=None if depth is None else depth.absolute(),

@@ -15,6 +15,7 @@ from arbiview_aug.datasets.sequence import Neighbours
 from arbiview_aug.errors import CalibrationError, DataError
 from arbiview_aug.favs.config import Quality
 from arbiview_aug.files import checksum, is_part
+from arbiview_aug.framing import Fit
 from arbiview_aug.generator import Generator
 from arbiview_aug.rig import Rig
 from arbiview_aug.surface import SurfaceName
@@ -43,6 +44,7 @@ class Settings:
         quality: As for ``RigRetarget``.
         surface: As for ``RigRetarget``.
         size: (h, w) of every view; None for the target's own.
+        fit: How the target's cameras come to ``size``, as for ``RigRetarget``.
         reduce: Decode the source's images at 1, 1/2 or 1/4 of their size.
         neighbours: How many other frames of the drive in each direction may fill holes; 0 for none.
         motion_depth: Folder of the ``depth`` command's files, for ``surface="motion"``; None finds depth anew, from the
@@ -61,6 +63,7 @@ class Settings:
     quality: Quality = "fast"
     surface: SurfaceName = "auto"
     size: tuple[int, int] | None = None
+    fit: Fit = "crop"
     reduce: Reduce = 1
     neighbours: int = 0
     motion_depth: Path | None = None
@@ -69,7 +72,7 @@ class Settings:
     @property
     def sized_target(self) -> Rig:
         """The target at the size of the views, in its own ego frame."""
-        return self.target if self.size is None else self.target.resized(self.size)
+        return self.target if self.size is None else self.target.resized(self.size, self.fit)
 
     def open(self) -> Data:
         """The source.
@@ -95,6 +98,7 @@ class Settings:
             quality=self.quality,
             surface=self.surface,
             size=self.size,
+            fit=self.fit,
             outputs=outputs,
         )
 
@@ -106,7 +110,7 @@ class Settings:
         names = ("path", "steps", "quality", "surface", "size", "reduce", "neighbours", "suffix")
         files = [] if self.generator is None else sorted(path for path in self.generator.iterdir() if path.is_file())
         generator = {path.name: checksum(path) for path in files}
-        settings = {name: getattr(self, name) for name in names}
+        settings = {name: getattr(self, name) for name in names} | ({} if self.size is None else {"fit": self.fit})
         return {
             **settings,
             "motion_depth": self.motion_depth is not None,

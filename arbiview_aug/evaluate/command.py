@@ -105,7 +105,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--frames", type=count, metavar="N", help="how many (default: 1; --paper: 3 synthetic ones)")
     parser.add_argument("--seed", type=seed, default=0, help="of the synthetic streets (default: %(default)s)")
     parser.add_argument("--reduce", type=int, choices=(1, 2, 4), default=1, help="decode images at 1, 1/2 or 1/4 size")
-    parser.add_argument("--size", type=size, metavar="HxW", help="of every view; of synthetic sources too (256x704)")
+    sizes = "of every view, the target cut to this aspect; of synthetic sources too (256x704)"
+    parser.add_argument("--size", type=size, metavar="HxW", help=sizes)
     parser.add_argument("--output", default="output", metavar="DIR", help="(default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the JSON instead of the tables")
     what = parser.add_mutually_exclusive_group()
@@ -197,7 +198,7 @@ def _targets(arguments: argparse.Namespace, asked: Rig | None, source: Rig) -> d
         found = {name: rig.undistorted() for name, rig in found.items()}
     if arguments.size is None:
         return found
-    return {name: rig.resized(arguments.size) for name, rig in found.items()}
+    return {name: rig.resized(arguments.size, "crop") for name, rig in found.items()}
 
 
 def _frames(data: Any, frames: int, hand_over_points: bool) -> Iterator[tuple[str, Frame]]:

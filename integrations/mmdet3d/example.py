@@ -23,7 +23,7 @@ def main() -> int:
     """Retarget a frame in each form and say what came of its keys."""
     source = source_rig((128, 352))
     given = recording(SyntheticDrive(source, num_frames=1)[0])
-    target = load_rig("waymo").undistorted().resized(SIZE)
+    target = load_rig("waymo").undistorted().resized(SIZE, "crop")
     config: dict[str, Any] = {"type": "RigRetargetMultiView", "target": target, "lidar2ego": LIDAR2EGO}
     if find_spec("mmengine"):
         from mmengine.dataset import Compose

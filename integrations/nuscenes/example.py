@@ -24,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--frames", type=int, default=2)
     parser.add_argument("--workers", type=int, default=0)
     arguments = parser.parse_args(argv)
-    target = load_rig(arguments.target).resized(tuple(arguments.size))
+    target = load_rig(arguments.target).resized(tuple(arguments.size), "crop")
     if arguments.data is not None:
         return _run(arguments.data, arguments.version, target, arguments.frames, arguments.workers)
     from integrations.nuscenes.made import made_root

@@ -48,7 +48,7 @@ def test_the_reader_finds_what_was_rendered(source: Path, output: Path) -> None:
         assert torch.allclose(after["cam2ego"], out["cam2ego"]) and torch.allclose(after["K"], out["K"])
         assert after["rig"].ground_z_m == before["rig"].ground_z_m == -0.1
         assert after["rig"].names == load_rig("waymo").names and after["rig"][0].lens == "radtan"
-        assert after["rig"] == load_rig("waymo").resized((24, 40)).in_frame_of(before["rig"])
+        assert after["rig"] == load_rig("waymo").resized((24, 40), "crop").in_frame_of(before["rig"])
         for key in ("points", "boxes_3d", "ego2world"):
             assert torch.equal(after[key], before[key])
         assert after["time_s"] == before["time_s"]
@@ -78,6 +78,21 @@ def test_provenance_names_versions_settings_and_sources(source: Path, output: Pa
 def test_a_report_shows_what_was_written(output: Path) -> None:
     page = (output / "conversion" / "report.html").read_text()
     assert "drive as waymo would have seen it" in page and "1 of 3 frames" in page and "converted" in page
+
+
+def test_fits_and_bars(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = FrameFolder(source)[0]
+    for fit in ("pad", "stretch"):
+        assert main(command(source, tmp_path / fit, "--images", "png", "--fit", fit)) == 0
+        after = FrameFolder(tmp_path / fit)[0]
+        expected = load_rig("argoverse2").resized((24, 40), fit).in_frame_of(before["rig"])
+        assert np.allclose(after["rig"].K, expected.K) and after["rig"][0].size == (24, 40)
+        if fit == "pad":
+            for camera, image, wanted in zip(after["rig"], after["images"], expected, strict=True):
+                assert np.array_equal(camera.mask, wanted.mask) and not camera.mask.all()
+                assert not image[:, torch.from_numpy(~camera.mask)].any()
+    assert main(command(source, tmp_path / "pad", "--images", "png", "--fit", "crop")) != 0
+    assert "got settings.fit 'crop' instead of 'pad'" in capsys.readouterr().err
 
 
 def test_masks_of_the_targets_own_car(source: Path, tmp_path: Path) -> None:

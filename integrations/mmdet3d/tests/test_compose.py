@@ -33,6 +33,6 @@ pipeline = [
     config = Config.fromfile(tmp_path / "config.py")
     assert "RigRetargetMultiView" in config.pretty_text
     results = Compose(config.pipeline)(FORMS[form](recording(SyntheticDrive(SOURCE, num_frames=1)[0])))
-    error_px = worst_error_px(results, rig.resized(SIZE).in_frame_of(SOURCE))
+    error_px = worst_error_px(results, rig.resized(SIZE, "crop").in_frame_of(SOURCE))
     print(f"{form}: {error_px:.1e} px, coverage {np.mean(results['coverage']):.2f}")
     assert error_px <= 1e-3
