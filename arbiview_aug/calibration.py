@@ -19,6 +19,9 @@ ROTATION_TOLERANCE = 1e-4
 
 _MAX_COEFFICIENT = 1e6  # real lenses stay below 1e3, and near 1e300 their polynomials overflow
 
+LENS_ALIASES = {"opencv_radtan": "radtan", "opencv_fisheye": "fisheye"}
+"""Names of lenses that are read, and what they are called here."""
+
 MAX_SIZE_PX = 32766
 """Largest image side: OpenCV's remap needs sizes below 32767."""
 
@@ -122,7 +125,8 @@ def checked_pose(name: str, value: Any) -> FloatArray:
 
 
 def checked_lens(name: str, value: Any) -> Lens:
-    """The name of a lens model."""
+    """The name of a lens model; one of ``LENS_ALIASES`` by its own name."""
+    value = LENS_ALIASES.get(value, value) if isinstance(value, str) else value
     if not isinstance(value, str) or value not in get_args(Lens):
         raise _error(name, "lens", f"one of {', '.join(get_args(Lens))}", repr(value))
     return cast(Lens, value)

@@ -75,7 +75,7 @@ class Camera:
         K: (3, 3) intrinsics in pixels, ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]``.
         cam2ego: (4, 4) pose, camera to ego.
         lens: ``pinhole``; ``radtan`` (OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]); ``fisheye`` (Kannala-Brandt,
-            OpenCV's k1..k4).
+            OpenCV's k1..k4). ``opencv_radtan`` and ``opencv_fisheye`` are read as these two.
         distortion: Coefficients of the lens.
         mask: (H, W) bool, True where the scene is seen, False on the own car's body.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -14,6 +14,7 @@ from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.favs.paper import PaperRendering, paper_labels
 from arbiview_aug.favs.synthesis import render_labels
 from arbiview_aug.framing import Framing
+from arbiview_aug.keys import misnamed
 from arbiview_aug.plan import RenderPlan
 from arbiview_aug.sample import CALIBRATION_KEYS, SourceFrame
 from arbiview_aug.tensors import barred, framed, gathered, is_readable, nearest_resized, rewrapped, split, stacked
@@ -83,6 +84,30 @@ def check_other_keys(
                     f"label_keys=({key!r},) to render it, or in pass_keys=({key!r},) to keep it as it is"
                 )
     return labels
+
+
+def warn_of_misnamed(
+    sample: Mapping[str, Any],
+    calibrated: bool,
+    static: bool,
+    named: Sequence[str],
+    warn: Callable[[str, str], None],
+) -> None:
+    """Say which keys go unread because they are probably called something else here.
+
+    Args:
+        sample: The sample dict.
+        calibrated: A rig says what its ``lens``, ``distortion`` and ``ground_z_m`` would.
+        static: Nothing in the ego frame is read or moved.
+        named: Keys that the user named: they are as they should be.
+        warn: Takes a topic and words.
+    """
+    lenses = () if calibrated else ("distortion", "lens", "ground_z_m")
+    geometry = () if static else (*EGO_KEYS, "depth_m")
+    for found, meant in misnamed(sample, ("neighbours", *lenses, *geometry)).items():
+        if found not in named:
+            words = f"the sample's {found!r} is not read; did you mean {meant!r}?"
+            warn(f"key {found}", f"{words} Rename it, in the form that RigRetarget documents, or name it in pass_keys")
 
 
 def _tv_tensor(value: Any) -> str:

@@ -26,6 +26,7 @@ import yaml
 from arbiview_aug.camera import Camera, FloatArray
 from arbiview_aug.errors import CalibrationError
 from arbiview_aug.framing import Fit
+from arbiview_aug.keys import hint, misnamed
 
 _CAMERA_KEYS = {"name", "width", "height", "K", "cam2ego", "distortion", "mask"}
 
@@ -210,6 +211,7 @@ class Rig:
         """
         if not isinstance(data, Mapping) or not isinstance(data.get("cameras"), list):
             raise CalibrationError(f"{where}: expected a mapping with a list 'cameras', got {type(data).__name__}")
+        _refuse_misnamed(data, "ground_z_m", where)
         cameras = [_camera_from_dict(entry, k, folder, where) for k, entry in enumerate(data["cameras"])]
         name = data.get("name", data.get("dataset", ""))
         try:
@@ -281,7 +283,8 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
     missing = [key for key in ("name", "width", "height", "K", "cam2ego") if entry.get(key) is None]
     if missing:
         expected = ", ".join(sorted(_CAMERA_KEYS))
-        raise CalibrationError(f"{label}: expected keys {expected}, missing {', '.join(missing)}")
+        raise CalibrationError(f"{label}: expected keys {expected}, missing {', '.join(missing)}{hint(entry, missing)}")
+    _refuse_misnamed(entry, "distortion", label)
     distortion = entry.get("distortion")
     lens: Any = "pinhole"
     coefficients: Any = ()
@@ -303,6 +306,18 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
         )
     except CalibrationError as error:
         raise CalibrationError(f"{where}: {error}") from None
+
+
+def _refuse_misnamed(entries: Mapping[str, Any], key: str, label: str) -> None:
+    """Refuse numbers under another name of an absent key, which would silently be 0; words are somebody's notes."""
+    for found in misnamed(entries, (key,)):
+        value = entries[found]
+        is_zero = not any(value) if isinstance(value, list) else not value
+        if isinstance(value, Mapping | list | int | float) and not is_zero:
+            raise CalibrationError(
+                f"{label}: {key!r} is absent, and {found!r} is not read: did you mean {key!r}? Rename it, or add "
+                f"{key!r} if it is something else"
+            )
 
 
 def read_mask(file: Any, folder: Path | None, label: str) -> np.ndarray:

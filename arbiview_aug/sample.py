@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from arbiview_aug.calibration import LENS_ALIASES
 from arbiview_aug.camera import BoolArray, Camera, FloatArray
 from arbiview_aug.errors import SampleError, SampleTypeError
+from arbiview_aug.keys import hint
 from arbiview_aug.lidar import checked_points, points_of_depth
 from arbiview_aug.motion.sweep import reduced_camera
 from arbiview_aug.objects import checked_boxes
@@ -71,7 +73,8 @@ def check_inputs(sample: Any, source_rig: Rig | None) -> list[SourceFrame]:
     if not isinstance(sample, Mapping):
         raise SampleTypeError(f"sample: expected a dict, got {type(sample).__name__}")
     if "images" not in sample:
-        raise SampleError(f"sample: expected a key 'images', got {', '.join(map(str, sample)) or 'an empty dict'}")
+        got = ", ".join(map(str, sample)) or "an empty dict"
+        raise SampleError(f"sample: expected a key 'images', got {got}{hint(sample, ('images',))}")
     images = sample["images"]
     check_container(images)
     lead = leading_shape(images)
@@ -107,13 +110,13 @@ def scenes_of_frames(
     if boxes is None and surface == "objects":
         raise SampleError(
             "surface='objects': expected 'boxes_3d' (B, 7) in the sample, got none; an empty (0, 7) tensor says "
-            "that nothing stands there"
+            f"that nothing stands there{hint(sample, ('boxes_3d',))}"
         )
     points = _points_of_frames(sample, frames, lead) if surface in ("auto", "lidar") else None
     if points is None and surface == "lidar":
         raise SampleError(
             "surface='lidar': expected 'points' (P, >= 3) in the ego frame, or 'depth_m' (N, H, W), z-depth of each "
-            "camera in metres, in the sample, got neither"
+            f"camera in metres, in the sample, got neither{hint(sample, ('points', 'depth_m'))}"
         )
     motion = None
     if surface == "motion" and sample.get(MOTION_KEY) is not None:
@@ -243,8 +246,8 @@ def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any
     missing = [key for key in ("K", "cam2ego") if sample.get(key) is None]
     if missing:
         raise SampleError(
-            f"sample: expected calibration, 'rig' or 'K' and 'cam2ego', missing {', '.join(missing)}; "
-            "or pass source_rig= to the transform"
+            f"sample: expected calibration, 'rig' or 'K' and 'cam2ego', missing {', '.join(missing)}"
+            f"{hint(sample, missing)}; or pass source_rig= to the transform"
         )
     K, cam2ego = (_numbers(key, sample[key], index) for key in ("K", "cam2ego"))
     for key, array, shape in (("K", K, (3, 3)), ("cam2ego", cam2ego, (4, 4))):
@@ -293,17 +296,21 @@ def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> li
     coefficients = None if distortion is None else _numbers("distortion", distortion, index)
     if names is None:
         if coefficients is not None and coefficients.any():
-            raise SampleError("distortion: expected 'lens' beside it, one of pinhole, radtan, fisheye a camera")
+            raise SampleError(
+                "distortion: expected 'lens' beside it, one of pinhole, radtan, fisheye a camera"
+                + hint(sample, ("lens",))
+            )
         return [("pinhole", ())] * count
     if not isinstance(names, list | tuple) or len(names) != count:
         raise SampleError(f"lens: expected a list of {count} names, one a camera, got {names!r}")
     lenses = [_entry(name, index) for name in names]
     if not all(isinstance(lens, str) for lens in lenses):
         raise SampleTypeError(f"lens: expected names, one a camera, got {lenses!r}")
+    lenses = [LENS_ALIASES.get(lens, lens) for lens in lenses]
     if all(lens == "pinhole" for lens in lenses):
         return [("pinhole", ())] * count
     if coefficients is None or coefficients.ndim != 2 or len(coefficients) != count:
-        got = "none" if coefficients is None else f"shape {coefficients.shape}"
+        got = f"none{hint(sample, ('distortion',))}" if coefficients is None else f"shape {coefficients.shape}"
         raise SampleError(f"distortion: expected shape ({count}, up to 8) for the lenses {lenses}, got {got}")
     result = []
     for lens, row in zip(lenses, coefficients.tolist(), strict=True):

@@ -22,7 +22,7 @@ from arbiview_aug.fills import Reach
 from arbiview_aug.framing import Fit, Framing, framing
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.batches import SOURCES_KEY, complete_frame, frame_names
-from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_target, target_labels
+from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_target, target_labels, warn_of_misnamed
 from arbiview_aug.plan import PlanCache, RenderPlan
 from arbiview_aug.random_rig import RandomRig
 from arbiview_aug.required import needs_geometry
@@ -274,6 +274,9 @@ class RigRetarget(torch.nn.Module):
         frames = check_inputs(sample, self.source_rig)
         lead = leading_shape(sample["images"])
         sizes = {tuple(image.shape[-2:]) for frame in frames for image in frame.images}
+        calibrated = sample.get("rig") is not None or self.source_rig is not None
+        static = self.stitcher.surface in ("far", "ground", "street") and self.label_frame == "source"
+        warn_of_misnamed(sample, calibrated, static, (*self.label_keys, *self.pass_keys), self._warn)
         labels = check_other_keys(sample, list(sizes), self.label_keys, self.pass_keys)
         target, skip, drawn = self._draw(sample, frames, params)
         parts, made = self._parts(sample, frames, lead, target, skip)

@@ -19,7 +19,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("lens",),
     ("rotations",),
     ("calibration",),
-    ("framing",),
+    ("framing", "keys"),
     ("camera",),
     ("rig",),
     ("surface", "grid", "overlaps", "tone", "command_line"),

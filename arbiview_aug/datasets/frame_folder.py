@@ -19,7 +19,9 @@ from arbiview_aug.datasets.images import Reduce, check_reduce, decode_images, re
 from arbiview_aug.datasets.sequence import Drive, LazyFrame, Neighbours, Unreadable, check_neighbours, parts_of_clock
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError
 from arbiview_aug.files import BROKEN_ARRAY
+from arbiview_aug.keys import hint, misnamed
 from arbiview_aug.rig import Rig, read_mask
+from arbiview_aug.stitching import WarnOnce
 
 CALIBRATION_FILE = "calib.json"
 SEQUENCE_FILE = "sequence.json"
@@ -32,7 +34,8 @@ _CACHED_MASKS = 16
 class FrameFolder(Dataset[dict[str, Any]]):
     """A folder that is a frame (it has ``calib.json``), or a folder of such folders, in the order of their names.
 
-    ``calib.json`` holds (keys not named here are ignored, so notes and licences may stand beside)::
+    ``calib.json`` holds (keys not named here are ignored, so notes and licences may stand beside; those that look like
+    another name of one that is absent are warned of, or refused where geometry would be lost)::
 
         {
           "cameras": [                       one or more, in the order of the sample's images
@@ -94,6 +97,7 @@ class FrameFolder(Dataset[dict[str, Any]]):
         self._last_rig: tuple[str, Rig] | None = None
         self._times_s, order = _read_sequence(self.root, self._index)
         self.neighbours = neighbours
+        self._warn = WarnOnce()
         self._driven: list[str] = []
         self._drive = None if neighbours is None else self._find_drive(order)
 
@@ -131,6 +135,9 @@ class FrameFolder(Dataset[dict[str, Any]]):
         calib = _read_calibration(folder)
         where = str(folder / CALIBRATION_FILE)
         rig = self._rig(calib, folder, where)
+        for entries, read in ((calib, ("boxes_3d", "ego2world", "lidar")), *((c, ("mask",)) for c in calib["cameras"])):
+            for found, meant in misnamed(entries, read).items():
+                self._warn(found, f"{where}: {found!r} is not read; did you mean {meant!r}?")
         sample: dict[str, Any] = {
             "images": self._images(calib, folder, rig),
             "rig": rig,
@@ -201,7 +208,7 @@ class FrameFolder(Dataset[dict[str, Any]]):
         masks = [entry.get("mask") if isinstance(entry, Mapping) else None for entry in calib["cameras"]]
         bare = [_calibration_of(entry) for entry in calib["cameras"]]
         data = {"name": calib.get("name", calib.get("dataset", "")), "cameras": bare}
-        data["ground_z_m"] = calib.get("ground_z_m", 0.0)
+        data |= {key: calib[key] for key in ("ground_z_m", *misnamed(calib, ("ground_z_m",))) if key in calib}
         key = json.dumps([data, [mask and str((folder / str(mask)).resolve()) for mask in masks]])
         last = self._last_rig  # another thread may read another frame
         if last is None or last[0] != key:
@@ -257,7 +264,8 @@ def _read_calibration(folder: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise DataError(f"{path}: expected JSON, got {error}") from None
     if not isinstance(calib, dict) or not isinstance(calib.get("cameras"), list):
-        raise DataError(f"{path}: expected an object with a list 'cameras', got {type(calib).__name__}")
+        got = type(calib).__name__ + (hint(calib, ("cameras",)) if isinstance(calib, dict) else "")
+        raise DataError(f"{path}: expected an object with a list 'cameras', got {got}")
     return calib
 
 
@@ -265,13 +273,15 @@ def _calibration_of(entry: Any) -> Any:
     """What of a camera's entry decides the rig: timestamps and files change every frame."""
     if not isinstance(entry, Mapping):
         return entry
-    return {key: entry.get(key) for key in ("name", "width", "height", "K", "cam2ego", "distortion")}
+    read = ("name", "width", "height", "K", "cam2ego", "distortion")
+    return {key: entry[key] for key in (*read, *misnamed(entry, read)) if key in entry}
 
 
 def _image_file(entry: Mapping[str, Any], folder: Path, where: str) -> Path:
     file = entry.get("file")
     if not isinstance(file, str) or not file:
-        raise DataError(f"{where}: camera {entry['name']!r}: file: expected an image's file name, got {file!r}")
+        got = f"{file!r}{hint(entry, ('file',))}"
+        raise DataError(f"{where}: camera {entry['name']!r}: file: expected an image's file name, got {got}")
     return folder / file
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import nn
@@ -45,6 +46,15 @@ def shipped_weights() -> str:
     return read_config(_SHIPPED)[1]
 
 
+def _networks() -> tuple[Any, Any]:
+    """diffusers' classes of a U-Net and an autoencoder.
+
+    Importing them imports ``torch._dynamo``, which torch 2.6 cannot do while tensors are made on meta.
+    """
+    diffusers = optional_package("diffusers", "generator")
+    return diffusers.UNet2DConditionModel, diffusers.AutoencoderKL
+
+
 class Generator(nn.Module):
     """Completes target views where no camera saw anything (Sec. CVC-SSL).
 
@@ -74,10 +84,10 @@ class Generator(nn.Module):
     @classmethod
     def from_config(cls, config: GeneratorConfig) -> Generator:
         """An untrained generator, its weights drawn from torch's RNG."""
-        diffusers = optional_package("diffusers", "generator")
+        unet_class, vae_class = _networks()
         latent = config.autoencoder.latent_channels
-        unet = diffusers.UNet2DConditionModel(**config.unet.arguments(input_channels(latent), latent))
-        vae = diffusers.AutoencoderKL(**config.autoencoder.arguments()) if config.autoencoder.widths else None
+        unet = unet_class(**config.unet.arguments(input_channels(latent), latent))
+        vae = vae_class(**config.autoencoder.arguments()) if config.autoencoder.widths else None
         signal = None
         if config.residual:
             with torch.device("cpu"):  # also where the weights are on meta
@@ -134,6 +144,7 @@ class Generator(nn.Module):
         """
         data, tensors = read_checkpoint(Path(folder))
         config = GeneratorConfig.from_dict(data.get("generator", {}), f"{folder}/config.json")
+        _networks()
         with torch.device("meta"):
             made = cls.from_config(config)
         check_tensors(made.state_dict(), tensors, str(folder))

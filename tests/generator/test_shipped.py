@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -34,6 +36,27 @@ def test_they_are_those_of_compact() -> None:
     made = Generator.shipped()
     assert made.config == compact() and not made.training
     assert all(p.dtype == torch.float32 for p in made.parameters())
+
+
+def test_nothing_is_imported_while_tensors_are_made_on_meta() -> None:
+    """In a process where nothing was imported before: torch 2.6 cannot import ``torch._dynamo`` then."""
+    code = """
+import sys
+import torch
+from arbiview_aug.generator import Generator
+
+class Watch:
+    def find_spec(self, name, path=None, target=None):
+        if torch.empty(0).device.type == "meta":
+            found.append(name)
+
+found = []
+sys.meta_path.insert(0, Watch())
+Generator.shipped()
+assert "diffusers" in sys.modules and not found, found
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
 
 
 def test_diffusion_works_out_of_the_box() -> None:

@@ -1,0 +1,79 @@
+"""Keys that are not read because they are called something else: "did you mean …"."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
+from numbers import Number
+from typing import Any
+
+USUAL_NAMES = {
+    "images": ("image", "imgs", "img"),
+    "K": ("intrinsics", "intrinsic", "camera_intrinsics", "camera_intrinsic", "cam_intrinsic", "cam2img", "Ks"),
+    "cam2ego": (
+        *("extrinsics", "extrinsic", "cam_to_ego", "camera_to_ego", "cam2egos", "camera2ego", "sensor2ego"),
+        *("cam2vehicle", "cam_to_vehicle"),
+    ),
+    "distortion": ("distortions", "dist", "dist_coeffs", "distortion_coeffs", "distortion_coefficients", "D", "coeffs"),
+    "lens": ("lenses", "lens_model", "distortion_model", "camera_model"),
+    "ground_z_m": ("ground_z", "ground_height", "ground_height_m", "road_z_m"),
+    "points": ("lidar_points", "lidar", "pts", "point_cloud", "pointcloud", "lidar_pts"),
+    "boxes_3d": ("gt_boxes", "gt_bboxes_3d", "gt_boxes_3d", "bboxes_3d", "boxes3d", "boxes"),
+    "depth_m": ("depth", "depth_map", "depth_maps"),
+    "neighbours": ("neighbors",),
+    "ego2world": ("ego_to_world", "ego2global"),
+    "lidar": ("lidar_points", "points", "point_cloud", "lidar_file"),
+    "file": ("filename", "file_name", "image", "image_file", "img_path", "image_path"),
+    "mask": ("mask_file", "mask_path", "ego_mask"),
+    "width": ("width_px", "image_width", "w"),
+    "height": ("height_px", "image_height", "h"),
+    "cameras": ("cams", "sensors"),
+}
+"""What other tools and people call the keys that are read here."""
+
+_LIKENESS = 0.88
+"""difflib's ratio of a misspelling, case apart: ``masks`` has 0.89; ``boxes_2d``, which is another thing, 0.875."""
+
+
+def misnamed(entries: Mapping[Any, Any], read: Sequence[str]) -> dict[str, str]:
+    """Keys that nobody reads and what they are likely to be meant as: keys that are read here, and absent.
+
+    Args:
+        entries: A sample, or a part of a calibration file.
+        read: The keys that are read of it.
+    """
+    names = tuple(read)
+    found = ((key, meant_by(key, names)) for key in entries if isinstance(key, str))
+    return {k: meant for k, meant in found if meant and meant not in entries and _could_be(meant, entries[k])}
+
+
+def hint(entries: Iterable[Any], wanted: Sequence[str]) -> str:
+    """For an error about keys that are missing: which ones were probably meant as these; else nothing."""
+    names = tuple(wanted)
+    found = [f"found {k!r}: did you mean {m!r}?" for k in entries if isinstance(k, str) and (m := meant_by(k, names))]
+    return "".join(f"; {words}" for words in found)
+
+
+@lru_cache(maxsize=4096)
+def meant_by(key: str, names: tuple[str, ...]) -> str | None:
+    """The one of some names that another key is a usual name, or a misspelling, of."""
+    if key in names:
+        return None
+    usual = (name for name in names if key in USUAL_NAMES.get(name, ()))
+    spelled = {name.lower(): name for name in names}
+    close = difflib.get_close_matches(key.lower(), spelled, n=1, cutoff=_LIKENESS)
+    return next(usual, spelled[close[0]] if close else None)
+
+
+def _could_be(meant: str, value: Any) -> bool:
+    """Whether a value is of the kind: people keep paths, counts and 2D boxes under such names too."""
+    if meant in ("points", "boxes_3d", "depth_m", "neighbours") and isinstance(value, str | Number | Mapping):
+        return False
+    if meant == "lidar" and isinstance(value, Number):
+        return False
+    if meant == "boxes_3d":
+        first = value[0] if isinstance(value, list | tuple) and value else value
+        last = first.shape[-1:] if hasattr(first, "shape") else [len(first)] if isinstance(first, list | tuple) else ()
+        return all(n >= 7 for n in last)
+    return value is not None
