@@ -105,7 +105,7 @@ def warn_of_misnamed(
     lenses = () if calibrated else ("distortion", "lens", "ground_z_m")
     geometry = () if static else (*EGO_KEYS, "depth_m")
     for found, meant in misnamed(sample, ("neighbours", *lenses, *geometry)).items():
-        if found not in named:
+        if found not in (*named, *PIXEL_BOUND_KEYS):  # it is said of these that they are dropped
             words = f"the sample's {found!r} is not read; did you mean {meant!r}?"
             warn(f"key {found}", f"{words} Rename it, in the form that RigRetarget documents, or name it in pass_keys")
 

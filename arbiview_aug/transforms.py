@@ -22,6 +22,7 @@ from arbiview_aug.fills import Reach
 from arbiview_aug.framing import Fit, Framing, framing
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.batches import SOURCES_KEY, complete_frame, frame_names
+from arbiview_aug.keys import hint
 from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_target, target_labels, warn_of_misnamed
 from arbiview_aug.plan import PlanCache, RenderPlan
 from arbiview_aug.random_rig import RandomRig
@@ -351,9 +352,9 @@ class RigRetarget(torch.nn.Module):
         stale = [key for key in sample if key in PIXEL_BOUND_KEYS and key not in kept]
         dropped = [key for key in stale if key not in self.outputs]
         if dropped:
-            self._warn(
-                f"dropped {dropped}", f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels"
-            )
+            meant = "" if "depth_m" in sample else hint(dropped, ("depth_m",))
+            words = f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels{meant}"
+            self._warn(f"dropped {dropped}", words)
         rendered = ("images", "K", "cam2ego")  # their places in the dict are kept
         return {k: v for k, v in sample.items() if k in rendered or k not in (*CALIBRATION_KEYS, *stale)}
 

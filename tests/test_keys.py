@@ -51,7 +51,7 @@ def warned(given: dict[str, Any], calls: int = 2, **settings: Any) -> list[str]:
         ("lidar_points", torch.rand(5, 3), "points"),
         ("pts", torch.rand(5, 4), "points"),
         ("Points", torch.rand(5, 4), "points"),
-        ("depth", torch.rand(1, 6, 8), "depth_m"),
+        ("depth_map", torch.rand(1, 6, 8), "depth_m"),
         ("distortions", torch.zeros(1, 4), "distortion"),
         ("lenses", ["fisheye"], "lens"),
         ("ground_z", 0.3, "ground_z_m"),
@@ -71,7 +71,7 @@ def test_a_key_that_nobody_reads_is_named_once(key: str, value: Any, meant: str)
         ({"gt_boxes": BOXES}, {"surface": "street"}),  # nothing would read it
         ({"boxes": torch.rand(3, 4)}, {}),  # torchvision's, in pixels
         ({"boxes": [torch.rand(3, 4)]}, {}),
-        ({"boxes": 3, "lidar": "0001.bin", "depth": "0001.png"}, {}),
+        ({"boxes": 3, "lidar": "0001.bin", "depth_map": "0001.png"}, {}),
         ({"lenses": ["radtan"], "ground_z": 1.0, "rig": RIG}, {}),  # the rig says it
         ({"lenses": ["radtan"], "ground_z": 1.0}, {"source_rig": RIG}),
         ({"token": "a", "timestamp": 1, "time_s": 0.1, "labels": [1], "labels_3d": [1], "boxes_2d": []}, {}),
@@ -80,6 +80,12 @@ def test_a_key_that_nobody_reads_is_named_once(key: str, value: Any, meant: str)
 )
 def test_no_false_alarm(more: dict[str, Any], settings: dict[str, Any]) -> None:
     assert not warned(sample(**more), **settings)
+
+
+def test_depth_that_is_dropped_is_named() -> None:
+    (words,) = warned(sample(depth=torch.rand(1, 12, 16)))
+    assert "drops depth: they speak of the source's pixels; found 'depth': did you mean 'depth_m'?" in words
+    assert not warned(sample(depth=torch.rand(1, 12, 16), depth_m=torch.zeros(1, 12, 16)))
 
 
 def test_labels_that_would_not_be_moved_are_named() -> None:
