@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 import re
 import shlex
 from collections.abc import Callable, Iterator
@@ -264,6 +265,24 @@ def test_the_papers_tables_are_the_commands() -> None:
         if "published" in printed[0][1]:
             assert [row[:5] for row in shown] == [row[:5] for row in printed]
     assert set(words(paper_report(study))) <= set(words(measured("paper")))
+
+
+def test_the_detectors_numbers_are_the_reports() -> None:
+    """``python -m integrations.cross_rig --pilot``: the first table of the benchmarks, and the README's shares."""
+    report = json.loads((ROOT / "integrations" / "cross_rig" / "results" / "pilot.json").read_text())
+    variants = [report["changes"][change]["arms"] for change in ("fov50", "up70", "waymo")]
+    table = tables(BENCHMARKS)[0]
+    for row, found in zip(table[2:], variants, strict=True):
+        ious = [f"{100 * found[name]['iou']['value']:.1f}" for name in ("raw", "auto", "oracle")]
+        assert row[1:] == [f"{100 * found['auto']['share']['value']:.0f} %", *ious]
+    shares = {
+        name: [round(100 * found[name]["share"]["value"]) for found in variants]
+        for name in ("auto", "objects_mixed", "scale_crop")
+    }
+    readme = text_of(ROOT / "README.md")
+    assert f"| {shares['auto'][0]} % |" in readme
+    for _, *risen in shares.values():  # where cameras rise
+        assert f"| {min(risen)} to {max(risen)} % |" in readme
 
 
 def test_measurements_name_tests_that_are_there() -> None:
