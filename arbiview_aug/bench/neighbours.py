@@ -87,7 +87,7 @@ def row_name(surface: str, neighbours: int) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure, print the table as it stands in the README, write the JSON."""
+    """Measure, print the table as it stands in docs/benchmarks.md, write the JSON."""
     parser = argparse.ArgumentParser(
         prog="python -m arbiview_aug bench neighbours",
         description="What other frames of the drive cost: milliseconds and MiB a frame, and the share that they fill.",

@@ -76,7 +76,7 @@ def best_ratios() -> dict[str, float]:
 
 
 def _known_miss(name: str) -> list[pytest.MarkDecorator]:
-    """The bound stands; the miss is published in the README, and a plan that meets it shows up as a pass."""
+    """The bound stands; the miss is published in docs/benchmarks.md, and a plan that meets it shows up as a pass."""
     reason = "building a plan costs 2.5 (full size) to 5 (small) frames, not 1.5"
     missed = pytest.mark.xfail(reason=reason, strict=False)
     return [missed] if " plan" in name else []

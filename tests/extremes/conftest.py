@@ -1,4 +1,4 @@
-"""What the tests here measured at worst, printed at the end with ``-s``: the figures of the README's table."""
+"""Worst values of the tests here, printed at the end with ``-s``: the figures of docs/limits.md."""
 
 from __future__ import annotations
 

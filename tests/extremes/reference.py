@@ -1,4 +1,4 @@
-"""Slow float64 truth, written from the README's conventions alone: rays, lenses, surfaces, boxes and who sees what.
+"""Slow float64 truth, from the conventions of docs/formats.md alone: rays, lenses, surfaces, boxes and who sees what.
 
 Nothing here is shared with the package's renderer, and nothing is fast: every pixel is evaluated, lenses are inverted
 by bisection or by OpenCV, boxes are met one by one.

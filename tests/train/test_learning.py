@@ -40,7 +40,7 @@ def test_one_rig_by_heart(tmp_path: Path) -> None:
 @pytest.mark.release
 @pytest.mark.timeout(1500)
 def test_tiny_beats_telea_on_held_out_streets(tmp_path: Path) -> None:
-    """The README's command: one step at least Telea's, four steps at most 0.5 dB below."""
+    """The command of docs/holes.md: one step at least Telea's, four steps at most 0.5 dB below."""
     settings = tiny()
     frames = open_frames("synthetic", settings.generator.image_size, scenes=settings.scenes)
     torch.manual_seed(0)
