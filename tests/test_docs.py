@@ -56,6 +56,7 @@ TINY = {
     "inspect nuscenes waymo --output docs/images/rigs.jpg": [],
     "inspect nuscenes truck.yaml": [],
     "bench --data FOLDER --budget-ms 20": [*TINY_BENCH, "--surface", "far", "lidar", "--budget-ms", "5000"],
+    "bench --data FOLDER --budget-ms 200": [*TINY_BENCH, "--surface", "far", "lidar", "--budget-ms", "5000"],
     "bench --data FOLDER --budget-ms 20 --moves": [*TINY_BENCH, "--surface", "lidar", "--budget-ms", "5000"],
     "bench loader --data FOLDER": [
         *["--surface", "street", "--size", "32x88", "--reduce", "4", "--workers", "0", "1"],
