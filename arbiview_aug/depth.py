@@ -14,7 +14,8 @@ from torch.utils.data import Dataset
 from arbiview_aug.command_line import count, device_named, gathered_warnings, writable_folder
 from arbiview_aug.datasets.motion_depth import FOLDER, WANTED, DepthFolder
 from arbiview_aug.datasets.opening import open_data
-from arbiview_aug.errors import ArbiviewError
+from arbiview_aug.errors import ArbiviewError, described
+from arbiview_aug.files import inside
 from arbiview_aug.motion.depth import motion_depth
 from arbiview_aug.neighbours import Neighbour, neighbours_of_frames, warn_lost
 from arbiview_aug.offline import results
@@ -53,8 +54,8 @@ class _Frames(Dataset[Done]):
         token = self.tokens[index]
         try:
             return self._done(token, self.data[index])
-        except (ArbiviewError, OSError) as error:
-            return Done(token, 0.0, str(error), failed=True)
+        except Exception as error:  # whatever is wrong with a frame, the others go on
+            return Done(token, 0.0, described(error), failed=True)
 
     def _done(self, token: str, sample: dict[str, Any]) -> Done:
         rig = sample["rig"]
@@ -102,9 +103,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--workers", type=count, default=1, help="processes, on the CPU (default: %(default)s)")
     arguments = parser.parse_args(argv)
     device = device_named(arguments.device)
-    asked = arguments.output or str(Path(arguments.data) / FOLDER)
     data: Any = open_data(arguments.data, neighbours=WANTED)
-    depths = DepthFolder(writable_folder(Path(asked), asked))
+    folder = Path(arguments.output) if arguments.output else inside(Path(arguments.data), FOLDER, "depth from motion")
+    depths = DepthFolder(writable_folder(folder, str(folder)))
     frames = _Frames(data, data.tokens, depths, str(device))
     workers = arguments.workers if device.type == "cpu" else 1  # one process keeps a GPU busy
     warned: list[str] = []

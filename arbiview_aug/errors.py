@@ -5,6 +5,11 @@ class ArbiviewError(Exception):
     """Base of every error raised on purpose; the message names the camera or file, what was expected, what came."""
 
 
+def described(error: Exception) -> str:
+    """An error in one line: those of other packages with their type, which is half of what they say."""
+    return str(error) if isinstance(error, ArbiviewError) else f"{type(error).__name__}: {error}"
+
+
 class CalibrationError(ArbiviewError, ValueError):
     """A camera, rig or rig file that does not describe real cameras."""
 

@@ -1,4 +1,7 @@
-"""Files that are whole or not there: written beside their place, flushed to the disk, and renamed."""
+"""Files that are whole or not there: written beside their place, flushed to the disk, and renamed.
+
+And the names that files of a data set may have: no name and no link leads out of its folder.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ import os
 import re
 import secrets
 import socket
+import stat
 import tokenize
 import zipfile
 import zlib
@@ -15,9 +19,10 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+from urllib.parse import quote
 
-from arbiview_aug.errors import OutputError
+from arbiview_aug.errors import DataError, OutputError
 
 BROKEN_ARRAY = (
     *(OSError, ValueError, EOFError, SyntaxError, RuntimeError, MemoryError),
@@ -25,10 +30,95 @@ BROKEN_ARRAY = (
 )
 """What ``numpy.load`` raises for files that are damaged, here and there a byte: nine kinds."""
 
+_SEPARATOR = re.compile(r"[/\\]")
+_LONGEST_NAME = 255
+"""Bytes of a file's or folder's name, in all common file systems."""
+_LONGEST_TOKEN = 200
+"""Characters of an escaped token: the names of half-written files are 50 longer."""
+
 _PART = ".part"
 _IS_PART = re.compile(r"\..+\.\w*-[0-9a-f]{8}-\d+-[0-9a-f]{8}\.part")
 _FLUSHES = 16
 """At once: a file system writes them out together. 16 files of 100 kB: 3 ms, one after the other 60 ms (ext4)."""
+
+
+def check_name(name: Any, what: str) -> None:
+    """Refuse a name that no file below a folder can have, without a look at the disk.
+
+    Args:
+        name: Relative to the folder.
+        what: Names what names the file: data set, table and row.
+
+    Raises:
+        DataError: Not a string, an absolute name, one with ``..``, or one that file systems cannot hold.
+    """
+    try:
+        coded = name.encode()
+        short = len(coded) <= _LONGEST_NAME or max(map(len, coded.split(b"/"))) <= _LONGEST_NAME
+        leads_out = name.startswith(("/", "\\")) or (".." in name and ".." in _SEPARATOR.split(name))
+        if name and short and not leads_out and "\0" not in name:
+            return
+    except (TypeError, AttributeError, UnicodeEncodeError):  # no string, or half of a surrogate pair
+        pass
+    got = ascii(name)
+    raise DataError(
+        f"{what}: expected a file name relative to the folder of the data, without '..', in UTF-8, at most "
+        f"{_LONGEST_NAME} bytes a part, got {got if len(got) <= _LONGEST_NAME else got[:80] + '…'}"
+    )
+
+
+def inside(root: Path, name: Any, what: str) -> Path:
+    """A file below a folder: neither its name nor a link leads out of it.
+
+    Args:
+        root: The folder, which may itself be a link.
+        name: Relative to it.
+        what: As for ``check_name``.
+
+    Returns:
+        The path, with its links; there may be no such file.
+
+    Raises:
+        DataError: Another name, a link that leaves the folder, or neither a file nor a folder.
+    """
+    check_name(name, what)
+    path, at, mode = root / name, str(root), stat.S_IFDIR
+    try:
+        for part in name.split(os.sep):  # links are rare, and following the whole path takes several times as long
+            at = f"{at}{os.sep}{part}"
+            mode = os.lstat(at).st_mode
+            if stat.S_ISLNK(mode):
+                mode = _followed(root, path, name, what)
+                break
+    except (FileNotFoundError, NotADirectoryError, PermissionError):  # said by whoever opens it
+        return path
+    except OSError as error:
+        raise DataError(f"{what}: expected a file, got {name}: {error.strerror}") from None
+    except UnicodeEncodeError:  # of the folder's own name
+        raise DataError(f"{what}: expected a folder whose name is UTF-8, got {str(root)!a}; rename it") from None
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise DataError(f"{what}: expected a regular file, got {name}, a pipe, socket or device")
+    return path
+
+
+def _followed(root: Path, path: Path, name: str, what: str) -> int:
+    """Mode of what a path with links leads to, which must be below the folder."""
+    base, real = os.path.realpath(root), os.path.realpath(path)
+    if real != base and not real.startswith(os.path.join(base, "")):
+        raise DataError(
+            f"{what}: expected a file in {root}, got {name}, which a link leads to {real}: links must not leave the "
+            "folder; pass the folder that holds the files themselves, move them into it, or pass a copy without links "
+            "(cp -rL; on one disk cp -rlL, which takes no space)"
+        )
+    return os.stat(real).st_mode
+
+
+def file_name(token: str) -> str:
+    """A token as a file's name: escaped, and a long one cut, with a checksum for the rest."""
+    name = quote(token, safe="", errors="surrogatepass")
+    if len(name) <= _LONGEST_TOKEN:
+        return name
+    return f"{name[: _LONGEST_TOKEN // 2]}-{hashlib.sha256(name.encode()).hexdigest()[:32]}"
 
 
 @contextmanager
@@ -89,9 +179,18 @@ def link_whole(source: Path, path: Path, owner: str = "") -> None:
 
     Raises:
         FileNotFoundError: There is no such source.
+        DataError: The source is a folder, or cannot be read.
         OutputError: The link cannot be made.
     """
-    size = source.stat().st_size
+    try:
+        status = source.stat()
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise DataError(f"{source}: expected a file that can be read, got {error.strerror}") from None
+    if not stat.S_ISREG(status.st_mode):
+        raise DataError(f"{source}: expected a regular file, got none: remove its row, or put the file there")
+    size = status.st_size
     if path.is_file() and path.stat().st_size == size:
         return
     with writing(path):

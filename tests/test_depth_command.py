@@ -144,3 +144,13 @@ def test_a_broken_frame_is_no_neighbour(recorded: Path, tmp_path: Path) -> None:
     assert drive[1]["neighbours"] and all(frame["token"] != "002" for frame in drive[1]["neighbours"])
     with pytest.raises(DataError, match="002"):
         drive[2]
+
+
+@pytest.mark.parametrize("broken", [{"format": [1, 2]}, {"words": None}, {"format": None}, {"K": [1]}, {"depth_00": 3}])
+def test_files_of_nonsense_are_named(made: Path, recorded: Path, tmp_path: Path, broken: dict) -> None:
+    """Arrays that are missing or of other shapes."""
+    with np.load(made / "000.npz") as file:
+        held = {name: file[name] for name in file.files} | {name: np.array(value) for name, value in broken.items()}
+    np.savez(tmp_path / "000.npz", **{name: value for name, value in held.items() if broken.get(name, 0) is not None})
+    with pytest.raises(DataError, match=r"000\.npz: expected depth"):
+        DepthFolder(tmp_path).read("000", FrameFolder(recorded)[0]["rig"])

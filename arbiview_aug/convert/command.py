@@ -22,7 +22,7 @@ from arbiview_aug.datasets.motion_depth import FOLDER as DEPTH_FOLDER
 from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError
 from arbiview_aug.favs.config import Quality
-from arbiview_aug.files import remove_parts
+from arbiview_aug.files import inside, remove_parts
 from arbiview_aug.framing import Fit
 from arbiview_aug.offline import results
 from arbiview_aug.rig import load_rig
@@ -138,7 +138,7 @@ def _data(text: str) -> tuple[str | None, Path]:
 def _settings(arguments: argparse.Namespace) -> Settings:
     kind, root = arguments.data
     root = root.absolute()  # Ray's actors have a working directory of their own
-    depth, beside = arguments.motion_depth, root / DEPTH_FOLDER
+    depth, beside = arguments.motion_depth, inside(root, DEPTH_FOLDER, "depth from motion")
     if depth is None and arguments.surface == "motion" and beside.is_dir():
         depth = beside
     if depth is None and arguments.surface == "motion" and not arguments.neighbours:

@@ -11,7 +11,7 @@ from arbiview_aug.convert.manifest import Record
 from arbiview_aug.convert.settings import FOLDER, Settings
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, POINTS_FILE, SEQUENCE_FILE, FrameFolder
 from arbiview_aug.errors import DataError
-from arbiview_aug.files import link_whole, write_whole
+from arbiview_aug.files import inside, link_whole, write_whole
 from arbiview_aug.rig import Rig
 
 
@@ -71,12 +71,13 @@ class FrameFolders:
                 key = {".jpg": "file", ".png": "file"}.get(suffix, suffix.split(".")[1])
                 entry[key] = Path(name).name
         kept = {key: value for key, value in source.items() if key not in (*calib, "dataset", "lidar")}
-        folder = self.output / calibration.parent.name
+        folder = calibration.parent.name
         if "points" in sample:
-            link_whole(files[-1], folder / POINTS_FILE, owner=str(index))
+            points = inside(self.output, f"{folder}/{POINTS_FILE}", f"--output {self.output}")
+            link_whole(files[-1], points, owner=str(index))
             kept["lidar"] = {"file": POINTS_FILE}
         text = json.dumps({**calib, **kept}, indent=1).encode()
-        return {f"{folder.name}/{CALIBRATION_FILE}": text}, {}
+        return {f"{folder}/{CALIBRATION_FILE}": text}, {}
 
     def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
         """Write what belongs to all frames: their sequence, without those that were left out.

@@ -20,13 +20,13 @@ from arbiview_aug.convert.views import coded_views, rig_of
 from arbiview_aug.datasets.motion_depth import WithMotionDepth
 from arbiview_aug.datasets.nuscenes import NuScenesDataset
 from arbiview_aug.environment import repeatable_opencv
-from arbiview_aug.errors import ArbiviewError, OutputError
-from arbiview_aug.files import checksum, write_whole
+from arbiview_aug.errors import OutputError, described
+from arbiview_aug.files import checksum, inside, write_whole
 from arbiview_aug.transforms import RigRetarget
 
 OnError = Literal["report", "skip", "fatal"]
-"""What becomes of a sample that cannot be read or rendered: ``report``: the others are converted, the output is not
-finished; ``skip``: it is left out, and said so; ``fatal``: all stops."""
+"""What becomes of a sample that cannot be read or rendered, whatever it raises: ``report``: the others are converted,
+the output is not finished; ``skip``: it is left out, and said so; ``fatal``: all stops."""
 
 State = Literal["made", "kept", "skipped", "failed", "stopped"]
 
@@ -84,33 +84,36 @@ class Jobs(Dataset[Done]):
     def __getitem__(self, number: int) -> Done:
         index = self.indices[number]
         token = self.data.tokens[index]
+        try:
+            return self._done(token, index)
+        except OutputError as error:
+            return Done(token, "stopped", words=(str(error),))
+        except Exception as error:  # one sample of thousands: whatever is wrong with it, the others go on
+            return self._failed(token, index, described(error))
+
+    def _done(self, token: str, index: int) -> Done:
         held = self.manifest.holds(token)
         if held is not None and self._is_current(index, held):
             return Done(token, "kept", float(np.mean(held["coverage"])))
         warned: list[str] = []
         started = time.perf_counter()
-        try:
-            with gathered_warnings(warned), repeatable_opencv():
-                sample = self.samples[index]
-                read = time.perf_counter()
-                out = self.retarget(sample)
-                made = time.perf_counter()
-                coverage = self._written(index, sample, out)
-        except OutputError as error:
-            return Done(token, "stopped", words=(str(error),))
-        except (ArbiviewError, OSError) as error:
-            return self._failed(token, index, error)
+        with gathered_warnings(warned), repeatable_opencv():
+            sample = self.samples[index]
+            read = time.perf_counter()
+            out = self.retarget(sample)
+            made = time.perf_counter()
+            coverage = self._written(index, sample, out)
         seconds = read - started, made - read, time.perf_counter() - made
         return Done(token, "made", coverage, seconds, tuple(warned))
 
-    def _failed(self, token: str, index: int, error: Exception) -> Done:
+    def _failed(self, token: str, index: int, words: str) -> Done:
         if self.on_error != "skip":
-            return Done(token, "failed", words=(str(error),))
+            return Done(token, "failed", words=(words,))
         try:
-            self.manifest.write({"token": token, "skipped": str(error)}, owner=str(index))
+            self.manifest.write({"token": token, "skipped": words}, owner=str(index))
         except OutputError as full:
             return Done(token, "stopped", words=(str(full),))
-        return Done(token, "skipped", words=(str(error),))
+        return Done(token, "skipped", words=(words,))
 
     def _written(self, index: int, sample: Mapping[str, Any], out: Mapping[str, Any]) -> float:
         """Write a sample's files, then its record; gives the share of pixels that some source saw."""
@@ -123,7 +126,8 @@ class Jobs(Dataset[Done]):
             files |= {stem + suffix: coded for suffix, coded in view.items()}
         rest, facts = self.format.rest(index, sample, out, rig, names)
         files |= rest
-        write_whole({output / name: content for name, content in files.items()}, owner=str(index))
+        paths = {inside(output, name, f"--output {output}"): content for name, content in files.items()}
+        write_whole(paths, owner=str(index))
         cameras = rig.to_dict()["cameras"]
         for camera, of_camera in zip(cameras, names, strict=True):
             camera["file"] = of_camera[self.settings.suffix]
@@ -159,7 +163,7 @@ class Jobs(Dataset[Done]):
                 and _total_bytes(files) == record["source_bytes"]
                 and all(checksum(path) == record["sources"][n] for n, path in read.items() if path.suffix == ".json")
             )
-        except (ArbiviewError, OSError):
+        except Exception:  # said when it is read
             return False
 
     def _read(self, index: int) -> list[Path]:

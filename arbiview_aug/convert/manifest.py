@@ -10,11 +10,10 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from arbiview_aug.convert.settings import FOLDER
 from arbiview_aug.errors import DataError
-from arbiview_aug.files import write_whole
+from arbiview_aug.files import file_name, write_whole
 
 Record = Mapping[str, Any]
 """``token``, and of a converted sample ``cameras``, ``ground_z_m``, ``files`` (bytes by path), ``sources`` (SHA-256 by
@@ -55,7 +54,7 @@ class Manifest:
 
     def path(self, token: str) -> Path:
         """Of a sample's record."""
-        return self.folder / "samples" / f"{quote(token, safe='')}.json"
+        return self.folder / "samples" / f"{file_name(token)}.json"
 
     def record(self, token: str) -> Record | None:
         """A sample's record; None where there is none."""

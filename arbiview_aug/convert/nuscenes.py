@@ -11,19 +11,19 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import chain
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from arbiview_aug.convert.manifest import Record
 from arbiview_aug.convert.nuscenes_rows import NewCameras, Remaining, view_stem
-from arbiview_aug.convert.settings import Settings
+from arbiview_aug.convert.settings import FOLDER, Settings
 from arbiview_aug.convert.visibility import visible_shares
 from arbiview_aug.datasets.nuscenes import NuScenesDataset
 from arbiview_aug.datasets.nuscenes_tables import Row, Tables
 from arbiview_aug.errors import DataError
-from arbiview_aug.files import checksum, link_whole, whole_file
+from arbiview_aug.files import check_name, checksum, inside, link_whole, whole_file
 from arbiview_aug.rig import Rig
 
 _TABLES = (
@@ -45,6 +45,10 @@ _REFERENCES = (
     ("sample_data", "calibrated_sensor_token", "calibrated_sensor"),
 )
 
+_REFERRING = {table for table, _, _ in _REFERENCES}
+_WITH_FILES = ("sample_data", "lidarseg", "panoptic", "map")
+"""Tables whose rows name files: they are checked where these are kept."""
+
 _NEEDED = ("sample_token", "ego_pose_token", "calibrated_sensor_token", "is_key_frame", "filename")
 """Columns of ``sample_data`` without which its rows cannot be kept."""
 
@@ -59,11 +63,11 @@ class NuScenes:
 
     def __init__(self, settings: Settings, data: NuScenesDataset) -> None:
         self.output, self.data, self.suffix = settings.output, data, settings.suffix
+        self.target = settings.target
 
     def facts(self) -> dict[str, Any]:
         """What the source is, as plain data."""
-        folder = self.data.root / self.data.version
-        tables = {name: checksum(folder / f"{name}.json") for name in self._tables()}
+        tables = {name: checksum(self._opened().path(name)) for name in self._tables()}
         return {
             "kind": "nuscenes",
             "root": self.data.root.resolve().name,
@@ -72,11 +76,11 @@ class NuScenes:
         }
 
     def check(self) -> None:
-        """Look for tokens that lead nowhere and names that are not unique, before hours of work end with them.
+        """Look for what could not be written, before hours of work end with it.
 
         Raises:
-            DataError: A row names another one that is not there, or has no column that is needed; two samples would
-                write images of one name.
+            DataError: A row names another one that is not there, or a file outside the root, or has no column that is
+                needed; two samples would write images of one name, or a camera's name makes no file's name.
         """
         names = [self.data.files(index)[-1].name for index in range(len(self.data))]
         (stem, times), *_ = Counter(view_stem(name, "") for name in names).most_common(1)
@@ -86,22 +90,32 @@ class NuScenes:
                 f"nuScenes {self.data.root}: expected LiDAR files of different names, after which the new images are "
                 f"named, got {times} of the name {name}; rename them"
             )
+        for camera in self.target:
+            longest = view_stem(max(names, key=len), camera.name) + ".confidence.png"
+            check_name(longest, f"rig {self.target.name!r}: camera {camera.name!r}")
         tables, there = self._opened(), self._tables()
         references = [(table, key, of) for table, key, of in _REFERENCES if table in there and of in there]
         known = {
             of: dict.fromkeys(row["token"] for batch in tables.batches(of) for row in batch)
             for of in dict.fromkeys(of for _, _, of in references)
         }
-        for table in dict.fromkeys(table for table, _, _ in references):
+        cameras = {row["token"] for row in tables.rows("sensor") if row.get("modality") == "camera"}
+        kept = {row["token"] for row in tables.rows("calibrated_sensor") if row["sensor_token"] not in cameras}
+        folders = {path.parent.relative_to(self.data.root).as_posix(): "maps" for path in self._maps()}
+        for table in (table for table in there if table in _WITH_FILES or table in _REFERRING):
             keys = [(key, of) for referring, key, of in references if referring == table]
             needed = _NEEDED if table == "sample_data" else ()
             for row in (row for batch in tables.batches(table) for row in batch):
                 for key in needed:
                     tables.value(table, row, key)
+                if table in _WITH_FILES and (table != "sample_data" or row["calibrated_sensor_token"] in kept):
+                    folders.setdefault(self._folder(tables, table, row), self._where(table, row))
                 for key, of in keys:
                     # Unknown is an empty token; some sources have fewer columns.
                     if row.get(key) or key in needed:
                         tables.follow(table, row, key, of, known[of])
+        for folder, where in folders.items():
+            self._kept(folder, where)
 
     def stem(self, index: int, camera: int, name: str) -> str:
         """The path of a view below the output, without its suffix."""
@@ -153,15 +167,14 @@ class NuScenes:
             "instance": remaining.instance,
             "sample_annotation": lambda: remaining.sample_annotation(cameras.visible),
             "sample_data": lambda: chain(
-                self._linked(remaining.sample_data()), cameras.sample_data(remaining.drives, keyframes)
+                self._linked("sample_data", remaining.sample_data()), cameras.sample_data(remaining.drives, keyframes)
             ),
-            "lidarseg": lambda: self._linked(source.rows("lidarseg")),
-            "panoptic": lambda: self._linked(source.rows("panoptic")),
+            "lidarseg": lambda: self._linked("lidarseg", source.rows("lidarseg")),
+            "panoptic": lambda: self._linked("panoptic", source.rows("panoptic")),
             "sample": remaining.sample,
         }
-        for path in sorted((self.data.root / "maps").rglob("*")):
-            if path.is_file():
-                link_whole(path, self.output / path.relative_to(self.data.root))
+        for path in self._maps():
+            link_whole(*self._kept(path.relative_to(self.data.root).as_posix(), "maps"))
         for name in there:
             _write_table(self.output / self.data.version / f"{name}.json", rows.get(name, partial(source.rows, name))())
         return self._notes()
@@ -176,14 +189,34 @@ class NuScenes:
             notes.append(f"left out, since they may speak of the source's images: tables {', '.join(left)}")
         return notes
 
-    def _linked(self, rows: Iterable[Row]) -> Iterator[Row]:
+    def _linked(self, table: str, rows: Iterable[Row]) -> Iterator[Row]:
         """Rows, whose files are linked on the way."""
         for row in rows:
             try:
-                link_whole(self.data.root / row["filename"], self.output / row["filename"])
+                link_whole(*self._kept(row["filename"], self._where(table, row)))
             except FileNotFoundError:
                 self._missing += 1
             yield row
+
+    def _kept(self, name: str, where: str) -> tuple[Path, Path]:
+        """A file that is kept, in the source and in the output; links in either must not leave it."""
+        return inside(self.data.root, name, where), inside(self.output, name, f"--output {self.output}: {where}")
+
+    def _maps(self) -> list[Path]:
+        return sorted(path for path in (self.data.root / "maps").rglob("*") if not path.is_dir())
+
+    def _where(self, table: str, row: Row) -> str:
+        return f"nuScenes {self.data.root} {self.data.version}: table {table}: row {row.get('token')!r}: filename"
+
+    def _folder(self, tables: Tables, table: str, row: Row) -> str:
+        """Where a row's file lies below the root: not outside, and not where the conversion itself writes."""
+        name = tables.value(table, row, "filename")
+        check_name(name, self._where(table, row))
+        parts = PurePosixPath(name).parts
+        own = (FOLDER, self.data.version, *(view_stem("", camera.name).rpartition("/")[0] for camera in self.target))
+        if not parts or parts[0] in own or "/".join(parts[:2]) in own:
+            raise DataError(f"{self._where(table, row)}: expected a file outside of {', '.join(own)}, got {name!r}")
+        return "/".join(parts[:-1]) or "."
 
     def _opened(self) -> Tables:
         return Tables(self.data.root, self.data.version, None)

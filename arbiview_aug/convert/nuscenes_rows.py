@@ -220,10 +220,10 @@ def view_stem(lidar: str, name: str) -> str:
         lidar: The name of the LiDAR's file of the same sample.
         name: Of the camera.
     """
-    channel, stem = quote(name, safe=""), lidar.removesuffix(".bin").removesuffix(".pcd")
+    channel, stem = quote(name, safe="", errors="surrogatepass"), lidar.removesuffix(".bin").removesuffix(".pcd")
     return f"samples/{channel}/{stem.replace(LIDAR, channel) if LIDAR in stem else f'{stem}__{channel}'}"
 
 
 def token_of(*parts: str) -> str:
     """A token in nuScenes' form, 32 hexadecimal digits, that depends on nothing else."""
-    return hashlib.md5("\n".join(parts).encode(), usedforsecurity=False).hexdigest()
+    return hashlib.md5("\n".join(parts).encode(errors="surrogatepass"), usedforsecurity=False).hexdigest()

@@ -7,6 +7,7 @@ once: what is generated there differs from a CPU's in its last bits.
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -30,8 +31,7 @@ class Actor:
             jobs.retarget.to("cuda")
 
     def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
-        done = self.jobs[int(row["id"])]._asdict()
-        return {**done, "seconds": list(done["seconds"]), "words": list(done["words"])}
+        return {"done": pickle.dumps(self.jobs[int(row["id"])])}  # Arrow's strings cannot hold every file's name
 
 
 def ray_results(jobs: Jobs, workers: int, label: str, note: Callable[[Done], str]) -> Iterator[Done]:
@@ -59,8 +59,5 @@ def ray_results(jobs: Jobs, workers: int, label: str, note: Callable[[Done], str
         num_cpus=1,
         num_gpus=min(1.0, gpus / workers),
     )
-    found = (
-        Done(row["token"], row["state"], row["coverage"], tuple(row["seconds"]), tuple(row["words"]))
-        for row in done.iter_rows()
-    )
+    found: Iterator[Done] = (pickle.loads(row["done"]) for row in done.iter_rows())
     yield from with_progress(found, len(jobs), label, note)

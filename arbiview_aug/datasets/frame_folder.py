@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from arbiview_aug.camera import BoolArray, Camera
 from arbiview_aug.datasets.images import Reduce, check_reduce, decode_images, reduced_rig
 from arbiview_aug.datasets.sequence import Drive, LazyFrame, Neighbours, Unreadable, check_neighbours, parts_of_clock
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError
-from arbiview_aug.files import BROKEN_ARRAY
+from arbiview_aug.files import BROKEN_ARRAY, inside
 from arbiview_aug.keys import hint, misnamed
 from arbiview_aug.rig import Rig, read_mask
 from arbiview_aug.stitching import WarnOnce
@@ -29,6 +30,33 @@ POINTS_FILE = "lidar.npy"
 
 # Masks a worker keeps: those of two eight-camera rigs, 2 MB each at full size.
 _CACHED_MASKS = 16
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A frame's folder, in the folder of the data or that folder itself."""
+
+    root: Path
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        return self.folder.name
+
+    @property
+    def where(self) -> str:
+        """What messages name."""
+        return str(self.folder / CALIBRATION_FILE)
+
+    def file(self, name: str, what: str = "") -> Path:
+        """One of its files, or one of another frame of the same data.
+
+        Raises:
+            DataError: A name or a link that leaves the folder of the data.
+        """
+        if self.folder != self.root and not os.path.isabs(name):
+            name = os.path.normpath(f"{self.name}/{name}")
+        return inside(self.root, name, f"{self.where}: {what}" if what else self.where)
 
 
 class FrameFolder(Dataset[dict[str, Any]]):
@@ -59,7 +87,8 @@ class FrameFolder(Dataset[dict[str, Any]]):
 
         {"frames": ["000", {"name": "001", "time_s": 0.1}, ...]}      names of folders; seconds if known
 
-    The points are a float .npy of shape (P, >=3), x y z first, in the ego frame, metres.
+    The points are a float .npy of shape (P, >=3), x y z first, in the ego frame, metres. All files lie below ``root``,
+    which may be a link: names and links that leave it are refused.
 
     A sample is a dict: ``images`` (N, 3, h, w) uint8 RGB, or a list where sizes differ; ``rig`` (names, lenses, masks,
     ground); ``K`` (N, 3, 3) and ``cam2ego`` (N, 4, 4) float64; ``token`` (the folder's name); and, where the frame has
@@ -93,7 +122,7 @@ class FrameFolder(Dataset[dict[str, Any]]):
         self.reduce = reduce
         self.load_points = load_points
         self._frames = _find_frames(self.root)
-        self._index = {folder.name: k for k, folder in enumerate(self._frames)}
+        self._index = {frame.name: k for k, frame in enumerate(self._frames)}
         self._last_rig: tuple[str, Rig] | None = None
         self._times_s, order = _read_sequence(self.root, self._index)
         self.neighbours = neighbours
@@ -107,7 +136,7 @@ class FrameFolder(Dataset[dict[str, Any]]):
     @property
     def tokens(self) -> list[str]:
         """The frames' names in order."""
-        return [folder.name for folder in self._frames]
+        return [frame.name for frame in self._frames]
 
     def by_token(self, token: str) -> dict[str, Any]:
         """The sample of a frame by its folder's name.
@@ -122,52 +151,50 @@ class FrameFolder(Dataset[dict[str, Any]]):
 
     def files(self, index: int) -> list[Path]:
         """What a frame is read from: its calibration, images, masks and points."""
-        folder = self._frames[index]
-        calib = _read_calibration(folder)
-        where = str(folder / CALIBRATION_FILE)
-        found = [folder / CALIBRATION_FILE, *(_image_file(entry, folder, where) for entry in calib["cameras"])]
-        found += [folder / entry["mask"] for entry in calib["cameras"] if entry.get("mask") is not None]
-        points = _points_file(calib, folder, where) if self.load_points else None
+        frame = self._frames[index]
+        calib = _read_calibration(frame)
+        found = [frame.folder / CALIBRATION_FILE, *(_image_file(entry, frame) for entry in calib["cameras"])]
+        found += [mask for entry in calib["cameras"] if (mask := _mask_file(entry, frame)) is not None]
+        points = _points_file(calib, frame) if self.load_points else None
         return found if points is None else [*found, points]
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        folder = self._frames[index]
-        calib = _read_calibration(folder)
-        where = str(folder / CALIBRATION_FILE)
-        rig = self._rig(calib, folder, where)
+        frame = self._frames[index]
+        calib = _read_calibration(frame)
+        rig = self._rig(calib, frame)
         for entries, read in ((calib, ("boxes_3d", "ego2world", "lidar")), *((c, ("mask",)) for c in calib["cameras"])):
             for found, meant in misnamed(entries, read).items():
-                self._warn(found, f"{where}: {found!r} is not read; did you mean {meant!r}?")
+                self._warn(found, f"{frame.where}: {found!r} is not read; did you mean {meant!r}?")
         sample: dict[str, Any] = {
-            "images": self._images(calib, folder, rig),
+            "images": self._images(calib, frame, rig),
             "rig": rig,
             "K": torch.from_numpy(rig.K),
             "cam2ego": torch.from_numpy(rig.cam2ego),
-            "token": folder.name,
+            "token": frame.name,
         }
-        if self.load_points and (points := _read_points(calib, folder, where)) is not None:
+        if self.load_points and (points := _read_points(calib, frame)) is not None:
             sample["points"] = points
-        sample |= self._in_ego_frame(calib, folder, where)
+        sample |= self._in_ego_frame(calib, frame)
         if self._drive is not None and self.neighbours is not None:
             near = []
-            if folder.name in self._driven:
-                near = self._drive.neighbours(self._driven.index(folder.name), self.neighbours)
+            if frame.name in self._driven:
+                near = self._drive.neighbours(self._driven.index(frame.name), self.neighbours)
             sample["neighbours"] = [self._neighbour(self._driven[k]) for k in near]
         return sample
 
-    def _in_ego_frame(self, calib: Mapping[str, Any], folder: Path, where: str) -> dict[str, Any]:
+    def _in_ego_frame(self, calib: Mapping[str, Any], frame: _Frame) -> dict[str, Any]:
         """The boxes, the pose and the time that a frame has."""
         found: dict[str, Any] = {}
         if calib.get("boxes_3d") is not None:
-            found["boxes_3d"] = _boxes(calib["boxes_3d"], where)
+            found["boxes_3d"] = _boxes(calib["boxes_3d"], frame.where)
         if calib.get("ego2world") is not None:
-            found["ego2world"] = _pose(calib["ego2world"], where)
-        if folder.name in self._times_s:
-            found["time_s"] = self._times_s[folder.name]
+            found["ego2world"] = _pose(calib["ego2world"], frame.where)
+        if frame.name in self._times_s:
+            found["time_s"] = self._times_s[frame.name]
         return found
 
-    def _images(self, calib: Mapping[str, Any], folder: Path, rig: Rig) -> torch.Tensor | list[torch.Tensor]:
-        files = [_image_file(entry, folder, str(folder / CALIBRATION_FILE)) for entry in calib["cameras"]]
+    def _images(self, calib: Mapping[str, Any], frame: _Frame, rig: Rig) -> torch.Tensor | list[torch.Tensor]:
+        files = [_image_file(entry, frame) for entry in calib["cameras"]]
         sizes = [(int(entry["height"]), int(entry["width"])) for entry in calib["cameras"]]
         return decode_images(files, names=rig.names, sizes=sizes, reduce=self.reduce)
 
@@ -175,11 +202,11 @@ class FrameFolder(Dataset[dict[str, Any]]):
         """The frames of ``sequence.json`` that have a pose; broken ones are named, and raise when they are read."""
         positions_m = {}
         for name in order:
-            folder = self._frames[self._index[name]]
+            frame = self._frames[self._index[name]]
             try:
-                pose = _read_calibration(folder).get("ego2world")
+                pose = _read_calibration(frame).get("ego2world")
                 if pose is not None:
-                    positions_m[name] = _pose(pose, str(folder / CALIBRATION_FILE)).numpy()[:3, 3]
+                    positions_m[name] = _pose(pose, frame.where).numpy()[:3, 3]
             except ArbiviewError as error:
                 warnings.warn(f"{error}; this frame is no neighbour", stacklevel=3)
         self._driven = list(positions_m)
@@ -189,41 +216,40 @@ class FrameFolder(Dataset[dict[str, Any]]):
 
     def _neighbour(self, name: str) -> Mapping[str, Any]:
         """What of a frame needs no decoding; what is broken is said where it is used."""
-        folder = self._frames[self._index[name]]
-        where = str(folder / CALIBRATION_FILE)
+        frame = self._frames[self._index[name]]
         known: dict[str, Any] = {"token": name}
         try:
-            calib = _read_calibration(folder)
-            rig = self._rig(calib, folder, where)
-            known |= {"rig": rig, **self._in_ego_frame(calib, folder, where)}
+            calib = _read_calibration(frame)
+            rig = self._rig(calib, frame)
+            known |= {"rig": rig, **self._in_ego_frame(calib, frame)}
         except ArbiviewError as error:
             return Unreadable(known, error)
-        return LazyFrame(known, partial(self._images, calib, folder, rig))
+        return LazyFrame(known, partial(self._images, calib, frame, rig))
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_last_rig": None}
 
-    def _rig(self, calib: Mapping[str, Any], folder: Path, where: str) -> Rig:
+    def _rig(self, calib: Mapping[str, Any], frame: _Frame) -> Rig:
         """The frame's rig; the last one itself where the calibration is the same, as it is along most drives."""
-        masks = [entry.get("mask") if isinstance(entry, Mapping) else None for entry in calib["cameras"]]
+        masks = [_mask_file(entry, frame) if isinstance(entry, Mapping) else None for entry in calib["cameras"]]
         bare = [_calibration_of(entry) for entry in calib["cameras"]]
         data = {"name": calib.get("name", calib.get("dataset", "")), "cameras": bare}
         data |= {key: calib[key] for key in ("ground_z_m", *misnamed(calib, ("ground_z_m",))) if key in calib}
-        key = json.dumps([data, [mask and str((folder / str(mask)).resolve()) for mask in masks]])
+        key = json.dumps([data, [mask and os.path.realpath(mask) for mask in masks]])
         last = self._last_rig  # another thread may read another frame
         if last is None or last[0] != key:
-            rig = Rig.from_dict(data, where=where)
-            cameras = [_with_mask(camera, file, folder, where) for camera, file in zip(rig, masks, strict=True)]
+            rig = Rig.from_dict(data, where=frame.where)
+            cameras = [_with_mask(camera, file, frame) for camera, file in zip(rig, masks, strict=True)]
             last = self._last_rig = key, reduced_rig(rig.with_cameras(cameras), self.reduce)
         return last[1]
 
 
-def _find_frames(root: Path) -> list[Path]:
+def _find_frames(root: Path) -> list[_Frame]:
     if not root.is_dir():
         raise DataError(f"frame folder {root}: expected a folder, found none")
     if (root / CALIBRATION_FILE).is_file():
-        return [root.resolve()]  # resolved, so that "." has a name
-    frames = sorted(folder for folder in root.iterdir() if (folder / CALIBRATION_FILE).is_file())
+        return [_Frame(root.resolve(), root.resolve())]  # resolved, so that "." has a name
+    frames = [_Frame(root, folder) for folder in sorted(root.iterdir()) if (folder / CALIBRATION_FILE).is_file()]
     if not frames:
         raise DataError(
             f"frame folder {root}: expected {CALIBRATION_FILE}, or folders that have one, found neither; "
@@ -234,7 +260,7 @@ def _find_frames(root: Path) -> list[Path]:
 
 def _read_sequence(root: Path, index: Mapping[str, int]) -> tuple[dict[str, float], list[str]]:
     """Seconds by frame, and the frames in their order; nothing where there is no ``sequence.json``."""
-    path = root / SEQUENCE_FILE
+    path = inside(root, SEQUENCE_FILE, str(root))
     if not path.is_file():
         return {}, []
     try:
@@ -255,13 +281,13 @@ def _read_sequence(root: Path, index: Mapping[str, int]) -> tuple[dict[str, floa
     return times_s, names
 
 
-def _read_calibration(folder: Path) -> dict[str, Any]:
-    path = folder / CALIBRATION_FILE
+def _read_calibration(frame: _Frame) -> dict[str, Any]:
+    path = frame.file(CALIBRATION_FILE)
     try:
         calib = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise DataError(f"{path}: expected a calibration, found no file") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # ValueError: numbers of thousands of digits too
         raise DataError(f"{path}: expected JSON, got {error}") from None
     if not isinstance(calib, dict) or not isinstance(calib.get("cameras"), list):
         got = type(calib).__name__ + (hint(calib, ("cameras",)) if isinstance(calib, dict) else "")
@@ -277,26 +303,41 @@ def _calibration_of(entry: Any) -> Any:
     return {key: entry[key] for key in (*read, *misnamed(entry, read)) if key in entry}
 
 
-def _image_file(entry: Mapping[str, Any], folder: Path, where: str) -> Path:
-    file = entry.get("file")
+def _image_file(entry: Any, frame: _Frame) -> Path:
+    label, file = _file_of(entry, "file")
     if not isinstance(file, str) or not file:
-        got = f"{file!r}{hint(entry, ('file',))}"
-        raise DataError(f"{where}: camera {entry['name']!r}: file: expected an image's file name, got {got}")
-    return folder / file
+        got = f"{file!r}{hint(entry, ('file',)) if isinstance(entry, Mapping) else ''}"
+        raise DataError(f"{frame.where}: {label}: expected an image's file name, got {got}")
+    return frame.file(file, label)
 
 
-def _with_mask(camera: Camera, file: Any, folder: Path, where: str) -> Camera:
+def _mask_file(entry: Any, frame: _Frame) -> Path | None:
+    label, file = _file_of(entry, "mask")
     if file is None:
+        return None
+    if not isinstance(file, str) or not file:
+        raise CalibrationError(f"{frame.where}: {label}: expected an image's file name, got {file!r}")
+    return frame.file(file, label)
+
+
+def _file_of(entry: Any, key: str) -> tuple[str, Any]:
+    """What to call a camera's file in messages, and its name."""
+    if not isinstance(entry, Mapping):
+        return f"camera {entry!r}: {key}", None
+    return f"camera {entry.get('name')!r}: {key}", entry.get(key)
+
+
+def _with_mask(camera: Camera, path: Path | None, frame: _Frame) -> Camera:
+    if path is None:
         return camera
-    label = f"{where}: camera {camera.name!r}"
     try:
-        mask = _cached_mask(str((folder / str(file)).resolve()))
+        mask = _cached_mask(os.path.realpath(path))
     except CalibrationError:
-        mask = read_mask(file, folder, label)  # raises again, in this frame's name
+        mask = read_mask(str(path), path.parent, f"{frame.where}: camera {camera.name!r}")  # again, in its frame's name
     try:
         return replace(camera, mask=mask)
     except CalibrationError as error:
-        raise CalibrationError(f"{where}: {error}") from None
+        raise CalibrationError(f"{frame.where}: {error}") from None
 
 
 @lru_cache(maxsize=_CACHED_MASKS)
@@ -304,28 +345,24 @@ def _cached_mask(path: str) -> BoolArray:
     return read_mask(path, Path(path).parent, "rig")
 
 
-def _points_file(calib: Mapping[str, Any], folder: Path, where: str) -> Path | None:
+def _points_file(calib: Mapping[str, Any], frame: _Frame) -> Path | None:
     entry = calib.get("lidar")
     named = entry.get("file") if isinstance(entry, Mapping) else entry
     if named is not None and not isinstance(named, str):
-        raise DataError(f"{where}: lidar: expected {{'file': name}}, got {entry!r}")
-    path = folder / (named or POINTS_FILE)
-    try:
-        found = path.is_file()
-    except (OSError, ValueError):  # a name that no file can have
-        found = False
-    if not found:
+        raise DataError(f"{frame.where}: lidar: expected {{'file': name}}, got {entry!r}")
+    path = frame.file(named or POINTS_FILE, "lidar")
+    if not path.is_file():
         if named is None:
             return None
         raise DataError(
-            f"{where}: lidar: expected the points {path}, found no file; copy it, remove the key 'lidar', "
+            f"{frame.where}: lidar: expected the points {path}, found no file; copy it, remove the key 'lidar', "
             "or pass load_points=False"
         )
     return path
 
 
-def _read_points(calib: Mapping[str, Any], folder: Path, where: str) -> torch.Tensor | None:
-    path = _points_file(calib, folder, where)
+def _read_points(calib: Mapping[str, Any], frame: _Frame) -> torch.Tensor | None:
+    path = _points_file(calib, frame)
     if path is None:
         return None
     try:

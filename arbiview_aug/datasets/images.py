@@ -159,8 +159,11 @@ def read_header(path: Path, label: str | None = None) -> ImageHeader:
             return header
     except FileNotFoundError:
         raise DataError(f"{label}: expected an image file, found none; check the path and the data root") from None
-    except OSError as error:
-        raise DataError(f"{label}: expected a readable image file, got {error.strerror}") from None
+    except DataError:
+        raise
+    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        got = getattr(error, "strerror", None) or error
+        raise DataError(f"{label}: expected a readable image file, got {got}") from None
 
 
 def _label(name: str, path: Path) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 import torch
@@ -14,7 +13,7 @@ from torch.utils.data import Dataset
 from arbiview_aug.datasets.sequence import Neighbours
 from arbiview_aug.dense import Layer
 from arbiview_aug.errors import DataError, SampleError
-from arbiview_aug.files import BROKEN_ARRAY, whole_file
+from arbiview_aug.files import BROKEN_ARRAY, file_name, inside, whole_file
 from arbiview_aug.motion.depth import BEST_TRAVEL_M, MotionDepth
 from arbiview_aug.motion.sweep import reduced_camera
 from arbiview_aug.rig import Rig
@@ -43,8 +42,12 @@ class DepthFolder:
         self.root = Path(root)
 
     def path(self, token: str) -> Path:
-        """Of a frame; what a file system would not have in a name is escaped."""
-        return self.root / f"{quote(token, safe='')}.npz"
+        """Of a frame; what a file system would not have in a name is escaped.
+
+        Raises:
+            DataError: It is a link that leaves the folder.
+        """
+        return inside(self.root, f"{file_name(token)}.npz", f"depth from motion of frame {token!r}")
 
     def write(self, token: str, rig: Rig, depth: MotionDepth, neighbours: Sequence[str] = ()) -> None:
         """Write a frame's depth: all of the file or nothing.
@@ -102,13 +105,15 @@ class DepthFolder:
                 held: dict[str, Any] = {name: file[name] for name in file.files}
             depth = tuple(held[f"depth_{k:02}"].astype(np.float32) for k in range(len(held["K"])))
             found = MotionDepth(depth, str(held["words"]))
-        except (*BROKEN_ARRAY, KeyError) as error:
+            fits = int(held["format"]) == _FORMAT and _same(held, rig, depth)
+            found_from = held["neighbours"].tolist() if fits else []
+        except (*BROKEN_ARRAY, KeyError, TypeError) as error:
             raise DataError(f"{path}: expected depth from motion, got {type(error).__name__}; delete it") from None
-        if int(held["format"]) != _FORMAT or not _same(held, rig, depth):
+        if not fits:
             raise DataError(
                 f"{path}: expected depth of this calibration, got another's; delete it and run the depth command again"
             )
-        return found, held["neighbours"].tolist()
+        return found, found_from
 
 
 class WithMotionDepth(Dataset[dict[str, Any]]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Iterable, Sequence
 from functools import partial
@@ -20,6 +21,7 @@ from arbiview_aug.datasets.nuscenes_recordings import IntArray, read_recordings
 from arbiview_aug.datasets.nuscenes_tables import Row, Tables
 from arbiview_aug.datasets.sequence import Drive, LazyFrame, Neighbours, Unreadable, check_neighbours
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError
+from arbiview_aug.files import inside
 from arbiview_aug.rig import Rig
 
 CAMERA_RING = (
@@ -55,6 +57,8 @@ class NuScenesDataset(Dataset[dict[str, Any]]):
     that the vehicle came. A sweep has its time and ego pose, and of each other camera the image beside it, posed as
     above; its boxes are those of the keyframes around it, moved to its time (``Annotations.at_time``). Images are
     decoded when they are asked for.
+
+    All files lie below the root, which may be a link: names and links that leave it are refused when they are read.
 
     The ego's origin is on the road (``ground_z_m`` = 0). Boxes stand upright: roll and pitch of the ego (below 2
     degrees) are left out of their yaw.
@@ -161,7 +165,7 @@ class NuScenesDataset(Dataset[dict[str, Any]]):
         }
         if self.load_points:
             sensor2ego = recordings.sensor2ego[recordings.rows["sensor"][lidar]]
-            sample["points"] = _read_points(self.root / recordings.file(lidar), sensor2ego)
+            sample["points"] = _read_points(self._file(lidar), sensor2ego)
         if self._annotations is not None:
             boxes = self._annotations.rows(index)
             sample["boxes_3d"] = torch.from_numpy(self._annotations.at_sample(index, _inverse(ego2global)))
@@ -190,9 +194,15 @@ class NuScenesDataset(Dataset[dict[str, Any]]):
             found.append(camera)
         return reduced_rig(Rig(found, ground_z_m=0.0, name="nuscenes"), self.reduce)
 
+    def _file(self, row: int) -> Path:
+        """A recording's file, which must lie below the root."""
+        sample = self.tokens[self._recordings.rows["sample"][row]]
+        where = f"nuScenes {self.root} {self.version}: table sample_data: row of sample {sample!r}: filename"
+        return inside(self.root, self._recordings.file(row), where)
+
     def _images(self, cameras: IntArray) -> torch.Tensor | list[torch.Tensor]:
         return decode_images(
-            [self.root / self._recordings.file(row) for row in cameras],
+            [self._file(row) for row in cameras],
             names=self.channels,
             sizes=[self._recordings.size(row) for row in cameras],
             reduce=self.reduce,
@@ -207,7 +217,7 @@ class NuScenesDataset(Dataset[dict[str, Any]]):
         _, of_channels = np.unique(recordings.rows["channel"][sweeps], return_index=True)
         for row in sweeps[of_channels]:
             folder = (self.root / recordings.file(row)).parent
-            if not folder.is_dir():
+            if not os.path.isdir(folder):  # also of names that no folder can have
                 warnings.warn(f"nuScenes: {folder}: found no sweeps: only keyframes are neighbours", stacklevel=3)
                 return own[key[own]]
         return own

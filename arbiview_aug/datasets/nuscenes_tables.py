@@ -13,6 +13,7 @@ import numpy as np
 
 from arbiview_aug.camera import FloatArray
 from arbiview_aug.errors import DataError, SampleTypeError
+from arbiview_aug.files import inside
 
 _QUATERNION_NORM_TOLERANCE = 1e-3
 
@@ -62,6 +63,14 @@ class Tables:
             )
         self.root, self.version = Path(nusc.dataroot), str(getattr(nusc, "version", version))
 
+    def path(self, table: str) -> Path:
+        """A table's file.
+
+        Raises:
+            DataError: It is a link that leaves the root.
+        """
+        return inside(self.root, f"{self.version}/{table}.json", f"nuScenes {self.root}: table {table}")
+
     def rows(self, table: str) -> list[Row]:
         """All rows of a small table."""
         return [row for batch in self.batches(table) for row in batch]
@@ -79,7 +88,7 @@ class Tables:
             rows = list(rows)
             yield from (rows[k : k + _BATCH] for k in range(0, len(rows), _BATCH))
             return
-        path = self.root / self.version / f"{table}.json"
+        path = self.path(table)
         try:
             with path.open(encoding="utf-8") as file:
                 entries = _entries(file)

@@ -219,15 +219,15 @@ def test_a_frame_must_not_be_called_as_the_conversions_folder(source: Path, tmp_
 
 
 def test_points_that_are_links_are_followed(source: Path, tmp_path: Path) -> None:
-    """As caches of downloads have them: relative links, which lead nowhere from elsewhere."""
+    """As caches of downloads have them: relative links, which lead nowhere from elsewhere; within the data."""
     shutil.copytree(source, tmp_path / "drive")
-    (tmp_path / "blobs").mkdir()
+    (tmp_path / "drive" / "blobs").mkdir()
     for folder in sorted((tmp_path / "drive").glob("0*")):
-        (folder / "lidar.npy").rename(tmp_path / "blobs" / folder.name)
-        (folder / "lidar.npy").symlink_to(Path("..", "..", "blobs", folder.name))
+        (folder / "lidar.npy").rename(tmp_path / "drive" / "blobs" / folder.name)
+        (folder / "lidar.npy").symlink_to(Path("..", "blobs", folder.name))
     assert main(command(tmp_path / "drive", tmp_path / "new")) == 0
     linked = tmp_path / "new" / "0001" / "lidar.npy"
-    assert not linked.is_symlink() and linked.samefile(tmp_path / "blobs" / "0001")
+    assert not linked.is_symlink() and linked.samefile(tmp_path / "drive" / "blobs" / "0001")
 
 
 @pytest.mark.parametrize("surface", ["lidar", "motion"])

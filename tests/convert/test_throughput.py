@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -32,6 +33,13 @@ def counting(processes: int) -> float:
     return float(sum(int(process.communicate()[0]) for process in running))
 
 
+def _copied(root: Path, frame: Path) -> None:
+    """A frame folder, without the tables beside it."""
+    shutil.copytree(root / "samples", frame / "samples")
+    for name in ("calib.json", "lidar.npy"):
+        shutil.copy(root / name, frame)
+
+
 class Timed(Jobs):
     """Says how many CPU seconds each sample took, in its words."""
 
@@ -51,9 +59,7 @@ def test_two_processes_and_the_share_of_retargeting(
     """
     source = tmp_path / "frames"
     for k in range(SAMPLES):
-        (source / f"{k:03}").mkdir(parents=True)
-        for name in ("calib.json", "lidar.npy", "samples"):
-            (source / f"{k:03}" / name).symlink_to(nuscenes_root / name)
+        _copied(nuscenes_root, source / f"{k:03}")
     rates, shares, cpu_s = {}, [], {}
     cores = {processes: counting(processes) for processes in (1, 2)}
     for processes in (1, 2):
@@ -100,9 +106,7 @@ def test_what_calibrations_of_their_own_cost(
     """
     source = tmp_path / "frames"
     for k in range(OWN_PLANS):
-        (source / str(k)).mkdir(parents=True)
-        for name in ("lidar.npy", "samples"):
-            (source / str(k) / name).symlink_to(nuscenes_root / name)
+        _copied(nuscenes_root, source / str(k))
         calib = json.loads((nuscenes_root / "calib.json").read_text())
         for camera in calib["cameras"]:
             camera["cam2ego"][0][3] += 1e-3 * k
