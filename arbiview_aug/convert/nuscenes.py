@@ -109,13 +109,19 @@ class NuScenes:
                 for key in needed:
                     tables.value(table, row, key)
                 if table in _WITH_FILES and (table != "sample_data" or row["calibrated_sensor_token"] in kept):
-                    folders.setdefault(self._folder(tables, table, row), self._where(table, row))
+                    where, name = self._where(table, row), tables.value(table, row, "filename")
+                    check_name(name, where)
+                    folders.setdefault(name.rpartition("/")[0], where)
                 for key, of in keys:
                     # Unknown is an empty token; some sources have fewer columns.
                     if row.get(key) or key in needed:
                         tables.follow(table, row, key, of, known[of])
+        own = (FOLDER, self.data.version, *(view_stem("", camera.name).rpartition("/")[0] for camera in self.target))
         for folder, where in folders.items():
-            self._kept(folder, where)
+            self._kept(folder or ".", where)
+            parts = PurePosixPath(folder).parts
+            if parts and (parts[0] in own or "/".join(parts[:2]) in own):
+                raise DataError(f"{where}: expected a file outside of {', '.join(own)}, got one in {folder}")
 
     def stem(self, index: int, camera: int, name: str) -> str:
         """The path of a view below the output, without its suffix."""
@@ -207,16 +213,6 @@ class NuScenes:
 
     def _where(self, table: str, row: Row) -> str:
         return f"nuScenes {self.data.root} {self.data.version}: table {table}: row {row.get('token')!r}: filename"
-
-    def _folder(self, tables: Tables, table: str, row: Row) -> str:
-        """Where a row's file lies below the root: not outside, and not where the conversion itself writes."""
-        name = tables.value(table, row, "filename")
-        check_name(name, self._where(table, row))
-        parts = PurePosixPath(name).parts
-        own = (FOLDER, self.data.version, *(view_stem("", camera.name).rpartition("/")[0] for camera in self.target))
-        if not parts or parts[0] in own or "/".join(parts[:2]) in own:
-            raise DataError(f"{self._where(table, row)}: expected a file outside of {', '.join(own)}, got {name!r}")
-        return "/".join(parts[:-1]) or "."
 
     def _opened(self) -> Tables:
         return Tables(self.data.root, self.data.version, None)
