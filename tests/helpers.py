@@ -1,9 +1,12 @@
 """Cameras, rigs, samples and streets that several test modules are made of. Fixtures are in ``conftest.py``."""
 
-
 from __future__ import annotations
 
+import inspect
+import itertools
 import math
+from collections import Counter
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -11,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, Phase, given, settings
 
 from arbiview_aug import Camera, Rig
 from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive, demo_source_rig
@@ -66,6 +70,61 @@ def few_or_all(few: int, every: int, what: str = "streets") -> list[Any]:
         pytest.param(few, marks=pytest.mark.slow, id=f"{few} {what}"),
         pytest.param(every, marks=pytest.mark.release, id=f"{every} {what}"),
     ]
+
+
+def sampled(*factors: Iterable[Any]) -> list[Any]:
+    """All combinations as parameters, a sample of them in the default run and the others slow.
+
+    The sample has every pair of values of three factors or more, and every value of two.
+    """
+    combinations = list(itertools.product(*factors))
+    strength = min(2, len(combinations[0]) - 1)
+
+    def parts(values: tuple[Any, ...]) -> set[Any]:
+        return set(itertools.combinations(enumerate(values), strength))
+
+    missing = set().union(*map(parts, combinations))
+    chosen: Counter[tuple[Any, ...]] = Counter()
+    used: Counter[tuple[int, Any]] = Counter()
+    while missing:  # greedily, values that were rarely taken first
+        best = max(combinations, key=lambda c: (len(parts(c) & missing), -sum(used[part] for part in enumerate(c))))
+        missing -= parts(best)
+        chosen[best] += 1
+        used.update(enumerate(best))
+    return [pytest.param(*c, marks=() if c in chosen else pytest.mark.slow) for c in combinations]
+
+
+def examples(few: int, many: int, **strategies: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Run a property on some drawn examples by default, and on many of them as a slow test.
+
+    Shrinking rigs takes minutes, past the time limit, and explains little: a failure shows what was drawn.
+
+    Args:
+        few: Examples of the default run.
+        many: Examples of the slow one.
+        strategies: What to draw, by the property's parameters; others are fixtures.
+    """
+    drawing = settings(
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much], phases=[Phase.generate]
+    )
+
+    def decorate(holds: Callable[..., None]) -> Callable[..., None]:
+        def test(count: int, **fixtures: Any) -> None:
+            @settings(drawing, max_examples=count)
+            @given(**strategies)
+            def drawn(**values: Any) -> None:
+                holds(**fixtures, **values)
+
+            drawn()
+
+        known = inspect.signature(holds).parameters.values()
+        count = inspect.Parameter("count", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        asked = inspect.Signature([count, *(p for p in known if p.name not in strategies)])
+        vars(test).update(__signature__=asked)  # what pytest reads the fixtures from
+        test.__doc__, test.__name__ = holds.__doc__, holds.__name__
+        return pytest.mark.parametrize("count", [few, pytest.param(many, marks=pytest.mark.slow)])(test)
+
+    return decorate
 
 
 class Standing(SyntheticDrive):

@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader, default_collate
 from arbiview_aug import RandomRig, RetargetedDataset, RigRetarget, SampleError, load_rig
 from arbiview_aug.datasets import FrameFolder, NuScenesDataset
 
-STARTS = [(0, None), (2, "fork"), (2, "spawn")]
+STARTS = [(0, None), (2, "fork"), pytest.param(2, "spawn", marks=pytest.mark.slow)]  # spawned ones import torch anew
 
 
 @pytest.fixture
@@ -49,15 +49,16 @@ def draws(loader: DataLoader[Any], name: str = "yaw_deg") -> list[float]:
 
 
 # --- the same bits ----------------------------------------------------------------------------------------------------
-def test_workers_give_the_same_bits(samples: ModuleType) -> None:
+@pytest.mark.parametrize(("workers", "start"), STARTS)
+def test_workers_give_the_same_bits(workers: int, start: str | None, samples: ModuleType) -> None:
     target = samples.rig((30, 50)).turned(yaw_deg=20).shifted(z_m=0.4)
     dataset = RetargetedDataset(samples.Frames(), RigRetarget(target, outputs=["source_camera"]))
     expected = [default_collate([dataset[k], dataset[k + 1]]) for k in range(0, len(dataset), 2)]
     assert expected[0]["images"].shape == (2, 4, 3, 30, 50)
-    for workers, start in STARTS:
-        assert same(batches(dataset, workers, start), expected), (workers, start)
+    assert same(batches(dataset, workers, start), expected)
 
 
+@pytest.mark.slow
 def test_forked_and_spawned_workers_draw_alike(samples: ModuleType) -> None:
     random_rig = RandomRig(samples.rig(), yaw_deg=20, height_m=0.5)
     dataset = RetargetedDataset(samples.Frames(), RigRetarget(random_rig, p=0.7, size=samples.SIZE))

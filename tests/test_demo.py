@@ -46,7 +46,7 @@ def test_holes_filled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert float(filled) > float(plain) + 1, "whole views, holes and all"
 
 
-@pytest.mark.parametrize("reader", ["frame folder", "tables"])
+@pytest.mark.parametrize("reader", ["frame folder", pytest.param("tables", marks=pytest.mark.slow)])
 def test_real_keyframe(reader: str, nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = nuscenes_root
     if reader == "tables":
@@ -62,6 +62,7 @@ def test_real_keyframe(reader: str, nuscenes_root: Path, tmp_path: Path, capsys:
     assert cv2.imread(str(picture)) is not None
 
 
+@pytest.mark.slow
 def test_the_published_method_beside_fast(nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     options = ["--quality", "paper", "--output", str(tmp_path)]
     assert main(["demo", *options, "--size", "64x112"]) == 0

@@ -76,6 +76,8 @@ TINY = {
 }
 """Every command of the README and the pages, and options that make it quick."""
 
+SLOW = ("bench", "evaluate --paper", "evaluate --figure", "evaluate --data FOLDER --yaws")
+
 
 @cache
 def text_of(page: Path) -> str:
@@ -181,9 +183,9 @@ def test_every_command_is_known_here() -> None:
 
 @pytest.mark.parametrize(
     "command",
-    # Benchmarks take as long as all the others together; the pictures' commands are others with a seed and a width.
+    # These take as long as all the others together; the pictures' commands are others with a seed and a width.
     [
-        pytest.param(c, marks=pytest.mark.slow) if c.startswith("bench") or "docs/images" in c else c
+        pytest.param(c, marks=pytest.mark.slow) if c.startswith(SLOW) or "docs/images" in c else c
         for c in sorted(TINY)
     ],
 )

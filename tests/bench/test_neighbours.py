@@ -37,6 +37,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_costs(drive: Path) -> None:
     report = measure(
         lambda: FrameFolder(drive, neighbours=Neighbours(count=4)),

@@ -32,6 +32,7 @@ def found(sample: dict[str, Any]) -> dict[str, tuple[Situation, Done, Done]]:
 
 
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.slow
 def test_what_is_done(found: dict[str, tuple[Situation, Done, Done]]) -> None:
     def of(start: str) -> tuple[Done, Done]:
         (name,) = (name for name in found if name.startswith(start))
@@ -70,6 +71,7 @@ def test_what_is_done(found: dict[str, tuple[Situation, Done, Done]]) -> None:
 
 
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.slow
 def test_sparing_work_changes_no_view(found: dict[str, tuple[Situation, Done, Done]]) -> None:
     """But where a source was exact: there the street, or points, were a guess."""
     compared = 0

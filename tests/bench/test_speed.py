@@ -40,6 +40,7 @@ def test_runs_and_restores_threads() -> None:
     assert all(name in printed for name in names) and cv2.__version__ in printed
 
 
+@pytest.mark.slow
 def test_command_writes_the_report(
     nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -47,6 +47,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return json.loads((folder / "trade.json").read_text())
 
 
+@pytest.mark.slow
 def test_the_sweep(report: dict[str, Any]) -> None:
     rows = {row["name"]: row for row in report["settings"]}
     assert len(rows) == 2 * 3 * 2 * 2 and report["against"] == "true views" and report["size"] == list(SIZE)
@@ -131,6 +132,7 @@ def moves() -> dict[str, dict[str, Any]]:
         return every_move(data, 1, 1, ("truck", "yaw"))
 
 
+@pytest.mark.slow
 def test_rivals_at_every_move(moves: dict[str, dict[str, Any]]) -> None:
     assert list(moves) == ["frame 0: truck", *(f"frame 0: yaw {yaw:+g}" for yaw in (11, -11, 22, -22, 35))]
     assert lost_moves(moves, "common_psnr_db", ROW_SPLIT) == []

@@ -2,8 +2,6 @@
 
 import json
 import pickle
-import subprocess
-import sys
 import time
 
 import cv2
@@ -71,9 +69,11 @@ def test_truth_is_complete(drive):
 
 def test_scenes_do_not_depend_on_the_rig():
     one, other = (SyntheticDrive(r, num_frames=3, seed=8) for r in (demo_source_rig(SIZE), demo_target_rig(SIZE)))
-    torch.testing.assert_close(one[1]["boxes_3d"], other[1]["boxes_3d"], rtol=0, atol=0)
-    torch.testing.assert_close(one[1]["points"], other[1]["points"], rtol=0, atol=0)
-    torch.testing.assert_close(one.render(1, other.rig).images, other[1]["images"], rtol=0, atol=0)
+    sample = other[1]
+    boxes, points = (torch.as_tensor(of) for of in (one.scene(1).boxes_ego(one.rig.ground_z_m), one.points(1)))
+    torch.testing.assert_close(boxes.float(), sample["boxes_3d"], rtol=0, atol=0)
+    torch.testing.assert_close(points, sample["points"], rtol=0, atol=0)
+    torch.testing.assert_close(one.render(1, other.rig).images, sample["images"], rtol=0, atol=0)
 
 
 def equal(a: dict, b: dict) -> bool:
@@ -90,7 +90,7 @@ def test_same_arguments_give_the_same_bits(drive):
     assert not torch.equal(first["images"], SyntheticDrive(drive.rig, num_frames=5, seed=1)[3]["images"])
 
 
-@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("threads", [1, 3])
 def test_threads_and_global_seeds_change_nothing(drive, threads):
     before, usual = drive[0], torch.get_num_threads()
     try:
@@ -138,15 +138,6 @@ def test_pickles_small(drive):
     data = pickle.dumps(drive)
     assert len(data) < 20_000  # the caches stay behind
     assert equal(pickle.loads(data)[0], drive[0])
-
-
-def test_import_is_light():
-    code = (
-        "import sys, arbiview_aug.datasets.synthetic\n"
-        "print([m for m in ('torchvision', 'sklearn', 'diffusers', 'matplotlib') if m in sys.modules])"
-    )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.strip() == "[]"
 
 
 @pytest.mark.parametrize(

@@ -58,16 +58,16 @@ def test_vectorised_cast_equals_a_naive_loop():
         scene = make_scene(5, index)
         origin = np.array([1.0, scene.ego2street[1, 3], 1.6])
         azimuth = rng.uniform(0, 2 * math.pi, (8, 1))
-        # Packets of 25 rays in narrow bundles, most of them near the horizon where the objects are.
-        az = azimuth + rng.uniform(-0.05, 0.05, (8, 25))
-        el = rng.uniform(-0.15, 0.12, (8, 1)) + rng.uniform(-0.05, 0.05, (8, 25))
+        # Packets of 12 rays in narrow bundles, most of them near the horizon where the objects are.
+        az = azimuth + rng.uniform(-0.05, 0.05, (8, 12))
+        el = rng.uniform(-0.15, 0.12, (8, 1)) + rng.uniform(-0.05, 0.05, (8, 12))
         rays = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], 1)
         local = scene_from(scene, origin, torch.device("cpu"))
         tensor = torch.from_numpy(rays.astype(np.float32))
         t, hit = cast(local, tensor, find_candidates(local, tensor))
         differing = 0
         for n in range(8):
-            for r in range(25):
+            for r in range(12):
                 expected, row = naive_hit(scene, origin, rays[n, :, r])
                 if row != int(hit[n, r]):
                     differing += 1  # float32 may fall on the other side of an outline
@@ -130,7 +130,7 @@ def test_instances_fill_their_boxes():
     """Surface points of every well visible object lie in its box and reach the sides that face the camera."""
     drive = SyntheticDrive(demo_source_rig((128, 352)), num_frames=4, seed=1)
     checked = 0
-    for index in range(4):
+    for index in range(2):
         boxes = drive.scene(index).boxes_ego(0.0)
         views = drive.render(index)
         for camera, depth, instances in zip(drive.rig, views.depth_m, views.instances, strict=True):
@@ -146,9 +146,10 @@ def test_instances_fill_their_boxes():
                 )
                 assert (np.abs(local) <= boxes[row, 3:6] / 2 + 0.01).all()
                 checked += 1
-    assert checked > 40
+    assert checked > 20
 
 
+@pytest.mark.slow
 def test_isolated_vehicles_outlines_agree_with_their_boxes():
     """Far and whole in the image: the silhouette's bounds are those of the projected corners within 2 pixels.
 
@@ -240,7 +241,7 @@ def test_boxes_are_where_the_lidar_sees_objects():
 
 
 def test_nothing_stands_where_the_cameras_are():
-    for index in range(25):
+    for index in range(12):
         scene = make_scene(1, index)
         R, origin = scene.ego2street[:3, :3], scene.ego2street[:3, 3]
         corners = (scene.corners - origin) @ R

@@ -39,7 +39,7 @@ def as_camera(name: str, c: dict[str, Any]) -> Camera:
     return Camera(name=name, width_px=w, height_px=h, K=c["K"], cam2ego=c["cam2ego"], mask=c["mask"] > 0)
 
 
-@pytest.fixture(scope="module", params=["nuscenes_root", "ddad_root"])
+@pytest.fixture(scope="module", params=["nuscenes_root", pytest.param("ddad_root", marks=pytest.mark.slow)])
 def frame(request: pytest.FixtureRequest, referee: ModuleType) -> Frame:
     return Frame(referee, request.getfixturevalue(request.param))
 

@@ -119,6 +119,7 @@ def test_lenses_that_a_method_cannot_take(
     assert "pinhole" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_figures(nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", "--figure", "--size", "40x110", "--output", str(tmp_path)]) == 0
     assert capsys.readouterr().out.count("picture: ") == 5

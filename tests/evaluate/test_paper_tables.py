@@ -32,6 +32,7 @@ def test_published_numbers() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:the target rig")
+@pytest.mark.slow
 def test_synthetic_streets(no_real_frames: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(paper_tables, "SETS", ("paper", "truck"))
     told = []

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from arbiview_aug.camera import Camera
 from arbiview_aug.errors import CalibrationError
+from tests.helpers import examples
 
 any_float = st.floats(allow_nan=True, allow_infinity=True)
 coefficient = st.one_of(st.floats(-1.0, 1.0), st.floats(-1e-300, 1e-300), any_float)
@@ -30,8 +30,7 @@ def calibrations(draw: st.DrawFn) -> dict:
     }
 
 
-@given(calibrations())
-@settings(max_examples=200, deadline=None)
+@examples(50, 200, values=calibrations())
 def test_finite_or_refused(values: dict) -> None:
     try:
         camera = Camera.looking(name="c", width_px=9, height_px=7, **values)
@@ -49,14 +48,15 @@ def test_finite_or_refused(values: dict) -> None:
         repr(camera)
 
 
-@given(
+@examples(
+    25,
+    100,
     azimuth_deg=st.floats(-180, 180),
     elevation_deg=st.floats(-89, 89),
     fov_deg=st.floats(5, 170),
     k1=st.floats(-0.1, 0.1),
     lens=st.sampled_from(["pinhole", "radtan", "fisheye"]),
 )
-@settings(max_examples=100, deadline=None)
 def test_round_trip_of_reasonable_cameras(
     azimuth_deg: float, elevation_deg: float, fov_deg: float, k1: float, lens: str
 ) -> None:

@@ -20,7 +20,7 @@ from arbiview_aug.scene import Scene
 from tests import helpers
 from tests.extremes import reference
 from tests.extremes.conftest import Worst
-from tests.helpers import ring
+from tests.helpers import ring, sampled
 
 MAP_TOLERANCE_PX = 1 / 32
 BOXES = np.array([[12.0, 1.0, 0.8, 4.5, 1.9, 1.6, 0.3], [-8.0, -3.0, 1.0, 4.0, 2.0, 2.0, 1.5]])
@@ -107,8 +107,7 @@ def check(plan: RenderPlan, surface: str, scene: Scene, worst: Worst) -> None:
             assert error <= MAP_TOLERANCE_PX, f"{source.name} over {name}: {error:.4f} px from float64"
 
 
-@pytest.mark.parametrize("surface", SCENES)
-@pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.parametrize(("name", "surface"), sampled(TARGETS, SCENES))
 def test_targets_at_the_edges(name: str, surface: str, worst: Worst) -> None:
     source, target, scene = ring(), TARGETS[name](), SCENES[surface]
     with no_numpy_warnings():
@@ -137,8 +136,7 @@ SOURCES: dict[str, Callable[[], Rig]] = {
 }
 
 
-@pytest.mark.parametrize("surface", SCENES)
-@pytest.mark.parametrize("name", SOURCES)
+@pytest.mark.parametrize(("name", "surface"), sampled(SOURCES, SCENES))
 def test_sources_at_the_edges(name: str, surface: str, worst: Worst) -> None:
     scene, target = SCENES[surface], Rig([camera("t0"), camera("t1", azimuth_deg=70.0, position_m=(0.0, 0.6, 1.9))])
     with no_numpy_warnings():
@@ -146,9 +144,14 @@ def test_sources_at_the_edges(name: str, surface: str, worst: Worst) -> None:
     check(plan, surface, scene, worst)
 
 
-@pytest.mark.parametrize("quality", ["draft", "fast", "accurate"])
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.float16, torch.bfloat16, torch.float64])
-@pytest.mark.parametrize("name", ["one camera", "1x1", "2x1", "odd", "fisheye 220", "below the road"])
+@pytest.mark.parametrize(
+    ("name", "dtype", "quality"),
+    sampled(
+        ["one camera", "1x1", "2x1", "odd", "fisheye 220", "below the road"],
+        [torch.uint8, torch.float16, torch.bfloat16, torch.float64],
+        ["draft", "fast", "accurate"],
+    ),
+)
 def test_pixels_are_finite_and_in_range(name: str, dtype: torch.dtype, quality: str) -> None:
     source = SOURCES[name]()
     shape = (len(source), 3, *source[0].size)

@@ -143,7 +143,9 @@ def test_placeholders_of_rays_that_are_none_reach_no_pixel() -> None:
     assert errors(build_plan(source, target, surface="street"), "street", Scene(), 10**6).px.max() <= TOLERANCE_PX
 
 
-@pytest.mark.parametrize("boxes", [None, BOXES], ids=["points", "points and boxes"])
+@pytest.mark.parametrize(
+    "boxes", [pytest.param(None, marks=pytest.mark.slow, id="points"), pytest.param(BOXES, id="points and boxes")]
+)
 def test_measured_points(boxes: FloatArray | None) -> None:
     """Every pixel is projected. On outlines rounding may decide which side a pixel shows; and where no point is near,
     a single ray may be asked of another panorama around the same centre than the image was."""

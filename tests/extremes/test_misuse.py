@@ -22,6 +22,7 @@ from arbiview_aug.errors import CalibrationError, SampleError, SampleTypeError
 from arbiview_aug.tensors import is_readable
 from tests.extremes import misuse
 from tests.extremes.conftest import Worst
+from tests.helpers import few_or_all
 
 TARGET = misuse.rig(spread_deg=30.0).shifted(z_m=0.3)
 HANG_S = 20  # CPU seconds; the slowest input takes about one
@@ -101,13 +102,13 @@ def check(samples: range, files: range, folder: Path, worst: Worst) -> None:
 
 
 def test_mutated_inputs(frame_folder: Path, worst: Worst) -> None:
-    check(range(300), range(200), frame_folder, worst)
+    check(range(120), range(100), frame_folder, worst)
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_ten_thousand_mutated_inputs(frame_folder: Path, worst: Worst) -> None:
-    check(range(300, 5800), range(200, 4700), frame_folder, worst)
+@pytest.mark.parametrize("thousands", few_or_all(2, 10, "thousand"))
+def test_thousands_of_mutated_inputs(thousands: int, frame_folder: Path, worst: Worst) -> None:
+    check(range(120, 120 + 550 * thousands), range(100, 100 + 450 * thousands), frame_folder, worst)
 
 
 @pytest.mark.parametrize(

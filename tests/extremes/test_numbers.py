@@ -31,6 +31,7 @@ from arbiview_aug.tone import ToneCurve
 from tests.extremes import reference
 from tests.extremes.conftest import Worst
 from tests.extremes.test_geometry import SOURCES, TARGETS, camera, no_numpy_warnings, ring
+from tests.helpers import sampled
 
 SIZE = (300, 800)  # the width at which PaperConfig states its lengths
 EVERYWHERE = Region(0, 0, 799, 299)
@@ -306,8 +307,7 @@ POINTS: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("quality", ["draft", "fast", "accurate"])
-@pytest.mark.parametrize("name", POINTS)
+@pytest.mark.parametrize(("name", "quality"), sampled(POINTS, ["draft", "fast", "accurate"]))
 def test_few_or_broken_points(name: str, quality: Any) -> None:
     rig = ring(2, position_m=(1.5, 0.0, 1.5), horizontal_fov_deg=90.0)
     images = torch.stack(pictures(rig))

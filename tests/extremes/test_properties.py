@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, Phase, assume, given, settings
+from hypothesis import assume
 from hypothesis import strategies as st
 
 from arbiview_aug import Camera, FavsConfig, Rig, load_rig
@@ -19,15 +19,13 @@ from arbiview_aug.scene import Scene
 from arbiview_aug.surface import WALL_CENTER_M
 from tests.extremes import drawn, reference
 from tests.extremes.conftest import Worst
+from tests.helpers import examples
 
 BOXES = np.array([[12.03, 1.0, 0.807, 4.5, 1.9, 1.613, 0.3], [-8.0, -3.0, 1.01, 4.0, 2.0, 2.02, 1.5]])
 MAP_TOLERANCE_PX = 1 / 32
 ROUNDING_PX = 1e-3  # the slack that maps allow at an image's border
 BLEND_ERROR = 1e-4  # cv2.blendLinear adds 1e-5 to the sum of its weights, once for every band
 UNBLENDED = FavsConfig(seam_width=0.0, interpolation="linear")
-
-# Shrinking rigs takes minutes, past the time limit, and explains little.
-any_drawn = settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much], phases=[Phase.generate])
 
 
 def scene_of(surface: str, boxes: np.ndarray = BOXES) -> Scene:
@@ -69,13 +67,14 @@ def must_see(source: Camera, found: reference.Seen, level: int) -> np.ndarray:
     return (np.minimum(u, v) >= margin) & (u <= source.width_px - 1 - margin) & (v <= source.height_px - 1 - margin)
 
 
-@given(
+@examples(
+    15,
+    60,
     pair=drawn.pairs(),
     surface=st.sampled_from(["far", "ground", "street", "objects"]),
     seam_width=st.sampled_from([0.0, 0.03, 0.3]),
     execution=st.sampled_from(["opencv", "torch"]),
 )
-@settings(any_drawn, max_examples=60)
 def test_only_what_a_source_truly_sees(
     worst: Worst, pair: tuple[Rig, Rig], surface: str, seam_width: float, execution: str
 ) -> None:
@@ -117,8 +116,7 @@ def test_only_what_a_source_truly_sees(
 
 
 # --- lenses there and back --------------------------------------------------------------------------------------------
-@given(camera=drawn.cameras("c"), seed=st.integers(0, 2**32 - 1))
-@settings(any_drawn, max_examples=100)
+@examples(25, 100, camera=drawn.cameras("c"), seed=st.integers(0, 2**32 - 1))
 def test_unproject_is_the_inverse_of_project(worst: Worst, camera: Camera, seed: int) -> None:
     rng = np.random.default_rng(seed)
     grid = camera.pixel_grid()
@@ -147,14 +145,15 @@ def moved(rig: Rig, ego2ego: np.ndarray) -> Rig:
     return Rig([c.moved(ego2ego) for c in rig], ground_z_m=rig.ground_z_m + ego2ego[2, 3])
 
 
-@given(
+@examples(
+    10,
+    40,
     pair=drawn.pairs(masked=False),
     surface=st.sampled_from(["far", "ground", "street", "objects"]),
     yaw_deg=st.floats(-180, 180),
     pitch_deg=st.floats(-90, 90),
     shift_m=st.tuples(*[st.floats(-100, 100)] * 3),
 )
-@settings(any_drawn, max_examples=40)
 def test_rigs_moved_together_with_the_world_render_the_same(
     worst: Worst,
     pair: tuple[Rig, Rig],
@@ -197,8 +196,7 @@ def test_rigs_moved_together_with_the_world_render_the_same(
             assert difference_px <= MAP_TOLERANCE_PX  # one step of a fixed-point map
 
 
-@given(pair=drawn.pairs(), surface=st.sampled_from(["far", "street", "objects"]), data=st.data())
-@settings(any_drawn, max_examples=30)
+@examples(10, 30, pair=drawn.pairs(), surface=st.sampled_from(["far", "street", "objects"]), data=st.data())
 def test_permuted_cameras_permute_the_views(pair: tuple[Rig, Rig], surface: str, data: st.DataObject) -> None:
     """Bit for bit: the order of targets orders the views, the order of sources changes nothing."""
     source, target = pair
@@ -266,8 +264,7 @@ def read_inside(plan: RenderPlan, k: int) -> np.ndarray:
     return inside
 
 
-@given(pair=drawn.pairs(masked=False), surface=st.sampled_from(["far", "ground", "street"]))
-@settings(any_drawn, max_examples=40)
+@examples(10, 40, pair=drawn.pairs(masked=False), surface=st.sampled_from(["far", "ground", "street"]))
 def test_resizing_k_and_the_image_together_changes_nothing(worst: Worst, pair: tuple[Rig, Rig], surface: str) -> None:
     """On constant gradients, which averaging over areas keeps, in pixels of the image that is read.
 
@@ -312,8 +309,7 @@ def exact_rigs(draw: st.DrawFn) -> Rig:
 
 
 @pytest.mark.parametrize("suffix", [".yaml", ".json"])
-@given(rig=exact_rigs())
-@settings(any_drawn, max_examples=25)
+@examples(10, 25, rig=exact_rigs())
 def test_files_keep_every_bit(suffix: str, rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> None:
     folder: Path = tmp_path_factory.mktemp("rig")
     again = load_rig(rig.save(folder / f"rig{suffix}"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from arbiview_aug.sampling import AtlasLayout
 from arbiview_aug.scene import Scene
 from tests.extremes.conftest import Worst
 from tests.extremes.test_geometry import camera, check, no_numpy_warnings, ring
+from tests.helpers import sampled
 
 
 def shades(count: int) -> list[int]:
@@ -79,14 +81,16 @@ def test_too_large_an_atlas_is_refused_by_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("quality", "execution"),
-    [*((q, e) for q in ("draft", "fast", "accurate") for e in ("opencv", "torch")), ("paper", "opencv")],
+    ("which", "size", "how"),
+    sampled(
+        ["source", "target"],
+        [(1, 1), (1, 64), (48, 1), (2, 1), (1, 5000), (5000, 1)],
+        [*itertools.product(("draft", "fast", "accurate"), ("opencv", "torch")), ("paper", "opencv")],
+    ),
 )
-@pytest.mark.parametrize("size", [(1, 1), (1, 64), (48, 1), (2, 1), (1, 5000), (5000, 1)])
-@pytest.mark.parametrize("which", ["source", "target"])
-def test_images_of_a_row_or_a_pixel(which: str, size: tuple[int, int], quality: Any, execution: Any) -> None:
+def test_images_of_a_row_or_a_pixel(which: str, size: tuple[int, int], how: tuple[Any, Any]) -> None:
     """Held between 0.25 and 0.75, where the images are; a view of equal cameras gives them back."""
-    h, w = size
+    (h, w), (quality, execution) = size, how
     tiny, usual = ring(2, height_px=h, width_px=w), ring(2)
     source, target = (tiny, usual) if which == "source" else (usual, tiny)
     generator = torch.Generator().manual_seed(0)

@@ -84,16 +84,17 @@ def check_warp(rig: Rig, images: list[torch.Tensor]) -> None:
         assert error.mean() <= 0.05 and np.quantile(error, 0.999) <= 1
 
 
+@pytest.mark.parametrize("reduce", [4, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("quality", ["draft", "fast"])
-def test_executions_agree_on_real_images(nuscenes_root, ddad_root, quality: str) -> None:
+def test_executions_agree_on_real_images(nuscenes_root, ddad_root, quality: str, reduce: int) -> None:
     from arbiview_aug.datasets import FrameFolder
     from arbiview_aug.favs.config import favs_config
 
     for root in (nuscenes_root, ddad_root):
-        sample = FrameFolder(root)[0]
+        sample = FrameFolder(root, reduce=reduce)[0]
         rig, images = sample["rig"], list(sample["images"])
-        lifted = rig.resized((256, 704)).shifted(z_m=0.5)
-        for target in (rig.turned(yaw_deg=22), load_rig("waymo").resized(0.3), lifted):
+        lifted = rig.resized((256 // reduce, 704 // reduce)).shifted(z_m=0.5)
+        for target in (rig.turned(yaw_deg=22), load_rig("waymo").resized(0.3 / reduce), lifted):
             plan = build_plan(rig, target, config=favs_config(quality))
             error = differences(by("opencv", plan, images), by("torch", plan, images))
             assert error.mean() <= 0.05 and np.quantile(error, 0.999) <= 1
@@ -285,13 +286,12 @@ def test_magnified_views_are_sharper() -> None:
     """65 to 50 degrees: what took the detector of ``integrations/cross_rig`` from 77 to 91 % of the gap."""
     rig = demo_source_rig((96, 256))
     target, drive = zoomed(rig, 1.37), SyntheticDrive(rig, num_frames=3, seed=7, lidar=False)
+    streets = [(list(drive[k]["images"]), drive.render(k, target).images.float()) for k in range(len(drive))]
     psnr = []
     for interpolation in ("linear", "cubic"):
         plan = build_plan(rig, target, config=FavsConfig(interpolation=interpolation))
-        errors = []
-        for index in range(len(drive)):
-            views = torch.stack(render_opencv(plan, list(drive[index]["images"])))
-            errors.append((views.float() - drive.render(index, target).images.float()).square().mean().item())
+        views = [torch.stack(render_opencv(plan, images)).float() for images, _ in streets]
+        errors = [(view - truth).square().mean().item() for view, (_, truth) in zip(views, streets, strict=True)]
         psnr.append(10 * np.log10(255**2 / np.mean(errors)))
     assert psnr[1] > psnr[0] + 0.4
 

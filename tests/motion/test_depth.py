@@ -76,6 +76,7 @@ def test_most_pixels_have_the_right_depth(drive: SyntheticDrive, exact: MotionDe
     assert "synthetic-5-1" in str(exact) and "%" in str(exact)
 
 
+@pytest.mark.slow
 def test_wrong_poses_are_mended_or_declined(drive: SyntheticDrive, sample: dict[str, Any], exact: MotionDepth) -> None:
     mended = found(turned(sample, 0.3))
     assert "poses mended by" in mended.words

@@ -80,6 +80,7 @@ def test_a_stopped_run_goes_on_bit_for_bit(tmp_path: Path) -> None:
     assert (tmp_path / "parts" / "validation" / "000004.png").is_file()
 
 
+@pytest.mark.slow
 def test_workers_change_nothing(tmp_path: Path) -> None:
     for workers in (0, 2):
         run(tmp_path / str(workers), steps=2, workers=workers).train()
