@@ -36,6 +36,7 @@ def test_synthetic_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert f"picture: {tmp_path / 'demo.png'}" in printed
 
 
+@pytest.mark.slow
 def test_holes_filled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demo", "--size", "40x104", "--output", str(tmp_path), "--width", "600", "--path", "inpaint"]) == 0
     printed = capsys.readouterr().out

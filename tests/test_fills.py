@@ -76,6 +76,7 @@ def test_both_executions_fill_alike(sample: dict[str, Any], filled: dict[str, An
     assert float((off > 2).float().mean()) < 1e-3
 
 
+@pytest.mark.slow
 def test_floats_fill_as_bytes_do(sample: dict[str, Any], filled: dict[str, Any]) -> None:
     floats = sample | {"images": sample["images"].float() / 255}
     floats["neighbours"] = [n | {"images": n["images"].float() / 255} for n in sample["neighbours"]]
@@ -84,6 +85,7 @@ def test_floats_fill_as_bytes_do(sample: dict[str, Any], filled: dict[str, Any])
     assert (255 * out["images"] - filled["images"]).abs().mean() < 0.5
 
 
+@pytest.mark.slow
 def test_gradients_reach_the_current_images(sample: dict[str, Any]) -> None:
     images = (sample["images"].float() / 255).requires_grad_()
     near = [n | {"images": n["images"].float() / 255} for n in sample["neighbours"]]
@@ -101,6 +103,7 @@ def test_explain_says_what_travel_adds(sample: dict[str, Any], alone: dict[str, 
     assert "filled" not in RigRetarget(low(), neighbours=None).explain(sample).as_dict()[0]
 
 
+@pytest.mark.slow
 def test_a_labelled_object_is_not_read(sample: dict[str, Any], alone: dict[str, Any]) -> None:
     """A box over all that a neighbour sees of the road: then, nothing of it may fill anything."""
     wall = torch.tensor([[-8.0, 0.0, 1.0, 6.0, 40.0, 2.0, 0.0], [9.0, 0.0, 1.0, 6.0, 40.0, 2.0, 0.0]])
@@ -224,6 +227,7 @@ def test_a_neighbour_without_a_seam_follows_those_that_have_one() -> None:
     assert (chosen[18:] == 1).all() and (pixels[:, FREE].int() - 90).abs().max() <= 1
 
 
+@pytest.mark.slow
 def test_labels_stand_in_holes_where_nothing_else_needs_geometry() -> None:
     """One camera that turns: no pixel of its own depends on labels, but what the neighbour may fill does."""
     rig = RIG.with_cameras([RIG[0]])

@@ -101,6 +101,7 @@ def test_a_street_tells_the_surfaces_apart() -> None:
     assert all(f"| {name} " in printed for name in STEPS) and f"{steps['blended seams']['ms']:.1f} (" in printed
 
 
+@pytest.mark.slow
 def test_command(nuscenes_root: Path, fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "new" / "ablation.json"
     arguments = ["bench", "ablation", "--reduce", "4", "--output", str(path)]

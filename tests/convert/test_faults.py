@@ -19,6 +19,7 @@ import pytest
 from arbiview_aug.__main__ import main
 from arbiview_aug.convert import command as converting
 from tests.convert.drives import SURROUND, command, tree, write_frames, write_nuscenes
+from tests.helpers import sampled
 
 SEED, KILLS, PARTIAL = 0, 24, 5
 MANY = 120
@@ -39,8 +40,7 @@ def undisturbed(sources: dict[str, Path], tmp_path_factory: pytest.TempPathFacto
     return {kind: tree(root / kind) for kind in sources}
 
 
-@pytest.mark.parametrize("kind", ["frames", "nuscenes"])
-@pytest.mark.parametrize("written", [0, 3, 40, 95])
+@pytest.mark.parametrize(("written", "kind"), sampled([0, 3, 40, 95], ["frames", "nuscenes"]))
 def test_a_full_disk(
     kind: str,
     written: int,

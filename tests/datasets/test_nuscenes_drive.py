@@ -353,6 +353,7 @@ def test_workers_and_devkit_objects_get_the_same(root: Path, dataset: NuScenesDa
         assert torch.equal(one[0]["images"], two[0]["images"]) and one[0]["rig"] == two[0]["rig"]
 
 
+@pytest.mark.slow
 def test_the_road_is_filled_with_the_road(tmp_path: Path) -> None:
     """Cameras pitched down, from sweeps that are not synchronous, against the true views."""
     (street,) = streets(3, goes=lambda time_s: SPEED_MPS * time_s)

@@ -127,6 +127,7 @@ def test_one_torch_thread_while_a_street_is_cast(drive, monkeypatch):
         torch.set_num_threads(usual)
 
 
+@pytest.mark.slow
 def test_workers_return_the_same_bits(drive):
     loader = DataLoader(drive, batch_size=None, num_workers=1, sampler=[0, 3])
     for expected, got in zip((drive[0], drive[3]), loader, strict=True):
@@ -224,6 +225,7 @@ def test_extreme_cameras(changes):
     assert torch.equal(nothing, views.depth_m.isinf())
 
 
+@pytest.mark.slow
 def test_prefiltered_road_agrees_with_a_supersampled_one():
     """A render is close to the mean of one of four times the size: detail fades instead of turning into patterns."""
     small = Camera.looking(

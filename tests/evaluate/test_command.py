@@ -87,6 +87,7 @@ def test_points_that_methods_may_read_do_not_score(
     assert 0.4 < ratio < 0.7
 
 
+@pytest.mark.slow
 def test_json_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = [
         "evaluate",

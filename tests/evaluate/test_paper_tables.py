@@ -83,6 +83,7 @@ def test_real_sets_stand_in_the_papers_measure() -> None:
     assert ["fast", "28.00", "25.00 / 24.00"] in rows
 
 
+@pytest.mark.slow
 def test_real_frames(nuscenes_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(paper_tables, "SETS", ("paper", "truck"))
     monkeypatch.setattr(paper_tables, "REDUCE", 4)

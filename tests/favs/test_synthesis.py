@@ -282,6 +282,7 @@ def test_only_magnified_views_are_read_by_cubics(factor: float, expected: str) -
     assert {view.interpolation for view in build_plan(rig, target, config=draft()).targets} == {"nearest"}
 
 
+@pytest.mark.slow
 def test_magnified_views_are_sharper() -> None:
     """65 to 50 degrees: what took the detector of ``integrations/cross_rig`` from 77 to 91 % of the gap."""
     rig = demo_source_rig((96, 256))

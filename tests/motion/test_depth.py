@@ -87,6 +87,7 @@ def test_wrong_poses_are_mended_or_declined(drive: SyntheticDrive, sample: dict[
     assert "the pose of frame" in lost.words or "too little of frame" in lost.words
 
 
+@pytest.mark.slow
 def test_one_side_is_asked_twice(drive: SyntheticDrive, sample: dict[str, Any]) -> None:
     density, share = right(drive, found({**sample, "neighbours": sample["neighbours"][:1]}))
     assert density > 0.4 and share > 0.85

@@ -86,6 +86,7 @@ def test_scores_of_the_attention(batch: Batch, generator: Generator) -> None:
     assert 0 < correct_correspondences(generator, batch) < 1
 
 
+@pytest.mark.slow
 def test_held_out_streets_are_scored_against_their_truth(generator: Generator) -> None:
     streets = open_frames("synthetic", config().generator.image_size, scenes=1)
     scores = held_out_scores(generator, streets, [0], seeds=(0, 1), steps=2, mean_of=2, show=False)

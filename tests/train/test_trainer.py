@@ -162,6 +162,7 @@ def test_signals_of_workers_are_left_to_the_trainer() -> None:
             signal.signal(number, handler)
 
 
+@pytest.mark.slow
 def test_a_frozen_unet_stays_as_it_is(tmp_path: Path) -> None:
     frozen = replace(config().generator, frozen_unet=True)
     made = run(tmp_path, generator=frozen, steps=2)
@@ -250,6 +251,7 @@ def test_others_are_not_left_waiting_where_saving_fails(tmp_path: Path, monkeypa
     assert waited == [1]
 
 
+@pytest.mark.slow
 def test_recomputing_blocks_changes_no_step(tmp_path: Path) -> None:
     plain, again = run(tmp_path / "a", steps=1), run(tmp_path / "b", steps=1, checkpointing=True)
     for made in (plain, again):
@@ -258,6 +260,7 @@ def test_recomputing_blocks_changes_no_step(tmp_path: Path) -> None:
         assert torch.allclose(a, b, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_perceptual_term_comes_every_nth_step(tmp_path: Path) -> None:
     torch.manual_seed(0)
     settings = config(loss=LossConfig(perceptual=0.01, perceptual_every=2, perceptual_below_t=1000, regression=0.0))
@@ -274,6 +277,7 @@ def test_the_perceptual_term_comes_every_nth_step(tmp_path: Path) -> None:
     assert terms[0]["total"] == pytest.approx(weighted, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_what_the_condition_lacks_is_measured_and_shipped(tmp_path: Path) -> None:
     """It sets the scale of a residual generator's diffusion: the same for the same data; it is saved."""
     one, two = (run(tmp_path / name, steps=1) for name in ("one", "two"))

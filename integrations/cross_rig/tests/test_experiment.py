@@ -45,6 +45,7 @@ def counts(setup: Run) -> dict[str, list]:
     return {arm: by_seed[0]["by_distance"] for arm, by_seed in load_results(setup)["fov50"].items()}
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_numbers(done, tmp_path, monkeypatch):
     shutil.copytree(done.output / "frames", tmp_path / "frames")
     shutil.rmtree(tmp_path / "frames" / done.source("test", "fov50").store().key / "00000")
@@ -76,6 +77,7 @@ def test_what_is_done_is_not_done_again(done, monkeypatch):
     assert list(run(more, 1, lambda line: None)) == [1, 0]
 
 
+@pytest.mark.slow
 def test_arms_with_the_same_frames_are_one_training(done):
     """Every surface is the same when the centres stay: only the far one is trained."""
     more = replace(done, settings=replace(TINY, arms=("raw", "far", "street", "oracle")))
@@ -87,6 +89,7 @@ def test_arms_with_the_same_frames_are_one_training(done):
     assert "| street (the frames of far) |" in markdown(report)
 
 
+@pytest.mark.slow
 def test_true_pixels_replace_what_was_rendered(done):
     """The two arms of the diagnosis: the truth where something was seen, or where nothing was; and inpainting."""
     more = replace(
@@ -171,7 +174,11 @@ def test_command_lists_and_refuses(capsys, tmp_path):
     capsys.readouterr()
     assert command.main(["--pilot", "--device", "cuda:99", "--output", str(tmp_path)]) == 2
     assert "expected cpu or a CUDA device that is there" in capsys.readouterr().err
-    assert command.main(["--large", "--list", "--output", str(tmp_path)]) == 0, "planned on a machine without a GPU"
+
+
+@pytest.mark.slow
+def test_the_large_run_is_planned_on_a_machine_without_a_gpu(tmp_path):
+    assert command.main(["--large", "--list", "--output", str(tmp_path)]) == 0
 
 
 @pytest.mark.release

@@ -50,6 +50,7 @@ def test_every_arm_renders(frame, name):
         assert (np.abs(away[:, :2]).max() > 0.01) == (ARMS[name].stays == "centre")
 
 
+@pytest.mark.slow
 def test_arms_are_given_the_frames_before_and_after(tmp_path, frame):
     source = Source(root=tmp_path, size=SIZE, split="train", change="up70", arm=ARMS["auto_neighbours"])
     given = _ArmFrames(source)._neighbours(3)
