@@ -20,13 +20,12 @@ from arbiview_aug.evaluate.methods import views_of
 MOST_DB = 0.1
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "target"),
     [
-        ("nuscenes", load_rig("waymo").undistorted()),
-        ("nuscenes", load_rig("argoverse2")),
-        ("frames", load_rig("fisheye_surround")),
+        pytest.param("nuscenes", load_rig("waymo").undistorted(), marks=pytest.mark.slow),
+        pytest.param("nuscenes", load_rig("argoverse2"), marks=pytest.mark.release),
+        pytest.param("frames", load_rig("fisheye_surround"), marks=pytest.mark.release),
     ],
     ids=lambda value: value if isinstance(value, str) else value.name,
 )

@@ -19,7 +19,7 @@ from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import RenderedViews, SceneClass, SyntheticDrive, demo_source_rig
 from tests.helpers import Standing
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.timeout(900)
 
 RIG = demo_source_rig((128, 352))
 FRAMES = range(4)
@@ -79,7 +79,14 @@ def near_road(camera: Camera) -> np.ndarray:
     return valid & (np.hypot(rays[..., 0], rays[..., 1]) <= NEAR_M * -rays[..., 2] / camera.center_m[2])
 
 
-@pytest.mark.parametrize(("lidar", "count", "step_m"), [(False, 1, 1.2), (True, 1, 1.2), (True, 4, 2.5)])
+@pytest.mark.parametrize(
+    ("lidar", "count", "step_m"),
+    [
+        pytest.param(False, 1, 1.2, marks=pytest.mark.slow),
+        pytest.param(True, 1, 1.2, marks=pytest.mark.slow),
+        pytest.param(True, 4, 2.5, marks=pytest.mark.release),
+    ],
+)
 def test_real_pixels_beat_invented_ones(lidar: bool, count: int, step_m: float) -> None:
     target = lowered(0.6)
     ours, theirs, road, walk = [], [], [], []
@@ -108,7 +115,10 @@ def test_real_pixels_beat_invented_ones(lidar: bool, count: int, step_m: float) 
         assert filled > 0.8 * missing
 
 
-@pytest.mark.parametrize(("count", "step_m"), [(1, 1.2), (4, 2.5)])
+@pytest.mark.parametrize(
+    ("count", "step_m"),
+    [pytest.param(1, 1.2, marks=pytest.mark.slow), pytest.param(4, 2.5, marks=pytest.mark.release)],
+)
 @pytest.mark.parametrize(("labels", "most"), [(True, 0.001), (False, 0.005)])
 def test_what_moved_leaves_nothing(labels: bool, most: float, count: int, step_m: float) -> None:
     """Pixels worse than 30 grey levels that are not so where the traffic stands still."""
@@ -134,6 +144,7 @@ def test_what_moved_leaves_nothing(labels: bool, most: float, count: int, step_m
         assert filled > (0.75 if labels else 0.4) * missing
 
 
+@pytest.mark.release
 def test_confidence_knows_how_far_away_a_fill_was_recorded() -> None:
     """Fills from farther along the drive are less right, and trusted less; age counts by the distance travelled."""
     rig = demo_source_rig((96, 264))

@@ -20,7 +20,7 @@ from arbiview_aug.rig import Rig
 from arbiview_aug.surface import Ground, Static, Street
 from arbiview_aug.transforms import RigRetarget
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.timeout(900)
 
 SOURCE = demo_source_rig((128, 352))
 TARGETS = {
@@ -67,7 +67,13 @@ def scores_db(images: torch.Tensor, truth: torch.Tensor, move: str, quality: Qua
     return np.array(scores)
 
 
-@pytest.mark.parametrize("wall", WALLS)
+@pytest.mark.parametrize(
+    "wall",
+    [
+        pytest.param(wall, marks=pytest.mark.release if wall == "circle of 40 m" else pytest.mark.slow)
+        for wall in WALLS
+    ],
+)
 def test_never_worse(wall: str) -> None:
     """Of every view and every quarter of one."""
     images = photographs(WALLS[wall], SOURCE)

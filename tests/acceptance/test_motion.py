@@ -81,16 +81,15 @@ def gain_db(index: int, move: str, sample: dict[str, Any], depth: MotionDepth) -
     return float(10 * np.log10(squares[1] / squares[0]))
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.filterwarnings("ignore:RigRetarget drops")
 @pytest.mark.parametrize(
     ("standing", "labels", "turned_deg", "density", "share", "least_db"),
     [
-        pytest.param(True, False, 0.0, 0.6, 0.9, 3.0, id="nothing else moves"),
-        pytest.param(False, True, 0.0, 0.0, 0.9, 2.7, id="traffic, labelled"),
-        pytest.param(False, False, 0.0, 0.6, 0.9, 2.0, id="traffic, no labels"),
-        pytest.param(True, False, 0.2, 0.6, 0.9, 3.0, id="poses 0.2 degrees wrong"),
+        pytest.param(True, False, 0.0, 0.6, 0.9, 3.0, id="nothing else moves", marks=pytest.mark.slow),
+        pytest.param(False, True, 0.0, 0.0, 0.9, 2.7, id="traffic, labelled", marks=pytest.mark.release),
+        pytest.param(False, False, 0.0, 0.6, 0.9, 2.0, id="traffic, no labels", marks=pytest.mark.release),
+        pytest.param(True, False, 0.2, 0.6, 0.9, 3.0, id="poses 0.2 degrees wrong", marks=pytest.mark.release),
     ],
 )
 def test_depth_is_right_and_renders_better_than_the_street(

@@ -37,7 +37,7 @@ from tests.helpers import few_or_all
 
 pytestmark = pytest.mark.timeout(900)
 
-SEEDS = few_or_all(2, 20)
+SEEDS = few_or_all(6, 20)
 SIZE = (256, 704)
 SOURCES = ("front", "front_left", "front_right")
 TARGETS = ("front", "front_left")

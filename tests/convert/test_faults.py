@@ -193,10 +193,16 @@ def killed(commands: Sequence[Sequence[str]], after_s: float) -> int:
     return len(alive)
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("kind", ["frames", "nuscenes"])
-@pytest.mark.parametrize("shards", [1, 3])
+@pytest.mark.parametrize(
+    ("kind", "shards"),
+    [
+        pytest.param("frames", 1, marks=pytest.mark.slow),
+        pytest.param("nuscenes", 3, marks=pytest.mark.slow),
+        pytest.param("frames", 3, marks=pytest.mark.release),
+        pytest.param("nuscenes", 1, marks=pytest.mark.release),
+    ],
+)
 def test_killed_at_any_moment_it_goes_on(kind: str, shards: int, tmp_path: Path) -> None:
     """At least 40 samples and 20 kills, in six outputs or fewer, from the first file to the last table."""
     if kind == "frames":

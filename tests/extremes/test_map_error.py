@@ -123,7 +123,8 @@ def test_small_images() -> None:
     sweep(0.12, SURFACES[1:], at_most=3000, views=slice(None, None, 4))
 
 
-@pytest.mark.slow
+@pytest.mark.release
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize(
     ("scale", "at_most", "views"),
     [

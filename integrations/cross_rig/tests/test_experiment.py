@@ -172,7 +172,8 @@ def test_command_lists_and_refuses(capsys, tmp_path):
     with pytest.raises(SystemExit):
         command.main(["--pilot", "--arms", "nothing"])
     capsys.readouterr()
-    assert command.main(["--pilot", "--device", "cuda:99", "--output", str(tmp_path)]) == 2
+    few = ["--pilot", "--seeds", "0", "--changes", "up70", "--output", str(tmp_path)]
+    assert command.main([*few, "--device", "cuda:99"]) == 2
     assert "expected cpu or a CUDA device that is there" in capsys.readouterr().err
 
 
