@@ -137,7 +137,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--surface", choices=get_args(SurfaceName), default="auto", help="(default: %(default)s)")
     parser.add_argument(
-        "--path", choices=get_args(RenderPath), default="favs", help="what fills holes: nothing (default), see README"
+        "--path",
+        choices=get_args(RenderPath),
+        default="favs",
+        help="what completes holes: favs (default) continues them from their borders; inpaint, diffusion: see README",
     )
     parser.add_argument("--frames", type=count, default=1, metavar="N", help="how many (default: %(default)s)")
     parser.add_argument("--seed", type=seed, default=0, help="of the synthetic streets (default: %(default)s)")

@@ -12,7 +12,7 @@ RADIUS_PX = 3.0
 _MARGIN_PX = 8
 """Around holes: the neighbourhood, its gradients, and the band in which distances are held; more changes nothing."""
 
-_GREY = 0.5
+GREY = 0.5
 """Where nothing at all is known."""
 
 
@@ -29,7 +29,7 @@ def telea(image: torch.Tensor, hole: torch.Tensor) -> torch.Tensor:
         return image
     whole = image.dtype == torch.uint8
     if hole.all():
-        return torch.full_like(image, round(_GREY * 255) if whole else _GREY)
+        return torch.full_like(image, round(GREY * 255) if whole else GREY)
     box = tuple(_with_margin(hole.any(1 - axis).nonzero(), side) for axis, side in enumerate(hole.shape))
     part, marks = image[:, box[0], box[1]].detach(), hole[box]
     picture = part if whole else (part.float() * 255).round().clamp(0, 255).to(torch.uint8)

@@ -239,7 +239,7 @@ class PairMap:
 
     def full_resolution(
         self, slot: Slot, rows: tuple[int, int]
-    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8], npt.NDArray[np.uint8] | None]:
         """Positions in the source and visibility over the pixels between some rows of the nodes in use.
 
         Args:
@@ -248,7 +248,9 @@ class PairMap:
             rows: First and last row of nodes.
 
         Returns:
-            (h, w, 2) float32 positions, and (h, w) uint8, 255 where the source sees the pixel.
+            (h, w, 2) float32 positions; (h, w) uint8, 255 where the source sees the pixel; (h, w) uint8, 255 where the
+            pixel lies in its image, seen or not, None where these are the same. What an object shows counts where the
+            background behind it does, too.
         """
         assert self.nodes is not None
         grid, source = self.rays.grid, self.source
@@ -275,12 +277,15 @@ class PairMap:
         visible: Any = cv2.inRange(at, tuple(low), tuple(high))
         if self._use is not None:
             visible &= grid.cells_to_pixels(self._use, nodes)
+        is_masked = source.mask is not None and not source.mask.all()
+        in_image = visible.copy() if q is not None or self.solids is not None or is_masked else None
         if q is not None:
             beyond = self._in_light(slot.level)[0].beyond
             visible &= cv2.compare(read_nearest(beyond, at), q, cv2.CMP_LE).astype(np.uint8)
         if self.solids is not None:
             self._put_solids(at, visible, nodes, slot)
-        if source.mask is not None and not source.mask.all():
+            in_image |= visible
+        if is_masked:
             if slot.level not in self._clean:
                 self._clean[slot.level] = clean_pixels(source, slot.level)
             visible &= mask_at(self._clean[slot.level], at)
@@ -288,7 +293,7 @@ class PairMap:
             # The outer half pixel of the full image lies outside the halved one: read its border pixel.
             h, w = slot.size
             at = np.clip(at, (slot.x, slot.y), (slot.x + w - 1, slot.y + h - 1), dtype=np.float32)
-        return at, visible
+        return at, visible, in_image
 
     def _put_solids(self, at: npt.NDArray[np.float32], visible: npt.NDArray[np.uint8], nodes: Box, slot: Slot) -> None:
         """What lies in the shadow of solids is not seen; then the pixels that show solids."""

@@ -63,6 +63,7 @@ class _Visible:
     box: Box  # y0, y1, x0, x1
     at: FixedMap  # [box h, box w] atlas positions
     visible: npt.NDArray[np.uint8]  # [box h, box w] 255 where the source sees the pixel
+    in_image: npt.NDArray[np.uint8] | None  # [box h, box w] 255 where its image contains the pixel, if that differs
     weight: npt.NDArray[np.float32]  # [box h, box w] seam weight
     certainty: npt.NDArray[np.uint8] | None  # [box h, box w]
 
@@ -183,6 +184,7 @@ class TargetDraft:
         h, w = self.camera.size
         fixed = FixedMap.outside((h, w))
         winner = np.full((h, w), -1, np.int8)
+        hidden = np.zeros((h, w), np.uint8)
         certain = np.zeros((h, w), np.uint8) if self.config.certainty else None
         weights = self._seam_weights()
         shared = np.count_nonzero([weight > 0 for weight in weights], axis=0) > 1
@@ -205,6 +207,8 @@ class TargetDraft:
                 fixed.part(slice(top, bottom), slice(left, right)).put(part.at, wins)
                 own = np.full(wins.shape, region.source, np.int8)
                 cv2.copyTo(own, wins, winner[top:bottom, left:right])
+                if part.in_image is not None:
+                    hidden[top:bottom, left:right] |= part.in_image
                 if certain is not None and part.certainty is not None:
                     cv2.copyTo(part.certainty, wins, certain[top:bottom, left:right])
             for part in seen:
@@ -217,7 +221,10 @@ class TargetDraft:
             fixed = fixed.rounded()
         edge = self._edge(fixed, winner, layout) if interpolation == "cubic" else None
         reports = tuple(self._reports(winner, won_px))
-        return TargetPlan(fixed, winner, tuple(bands), reports, interpolation, certain, edge)
+        occluded = (hidden > 0) & (winner < 0)
+        return TargetPlan(
+            fixed, winner, tuple(bands), reports, interpolation, certain, edge, occluded if occluded.any() else None
+        )
 
     def _interpolation(self, won_px: Counter[int]) -> str:
         """Cubic where it is asked for and the view magnifies, by ``MAGNIFIED``, what lies at its own centre."""
@@ -258,12 +265,12 @@ class TargetDraft:
         if box[1] <= box[0] or box[3] <= box[2]:
             return None
         slot = layout.slot(region.source, region.level)
-        at, visible = region.pair.full_resolution(slot.alone(), nodes[:2])
+        at, visible, in_image = region.pair.full_resolution(slot.alone(), nodes[:2])
         certain = None
         if region.certainty is not None:
             certain = np.round(self.grid.upsample(region.certainty, nodes)).astype(np.uint8)
         fixed = FixedMap.in_slot(at, slot)
-        return _Visible(region.source, box, fixed, visible, self.grid.upsample(weight, nodes), certain)
+        return _Visible(region.source, box, fixed, visible, in_image, self.grid.upsample(weight, nodes), certain)
 
     def _seam_weights(self) -> list[npt.NDArray[np.float32]]:
         """Weights on the nodes: each source's winning area, softened over the seam width, fading at its own border."""

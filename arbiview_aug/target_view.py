@@ -91,6 +91,8 @@ class TargetPlan:
             two sources is no sharper for it.
         certainty: (h, w) ``confidence.certainty`` of the winning source in 255ths, 0 where uncovered; if asked for.
         edge: Where cubics must not be used.
+        occluded: (h, w) bool, pixels that no source sees although some source's image contains them: something hides
+            them there, an object or the source's own car. None where there are none: what is uncovered lies outside.
     """
 
     at: FixedMap
@@ -100,6 +102,7 @@ class TargetPlan:
     interpolation: str = "linear"
     certainty: npt.NDArray[np.uint8] | None = None
     edge: Edge | None = None
+    occluded: BoolArray | None = None
 
     @property
     def coverage(self) -> BoolArray:
@@ -125,5 +128,5 @@ class TargetPlan:
     def nbytes(self) -> int:
         """Memory held."""
         bands = sum(b.at.nbytes + b.weight.nbytes for b in self.bands)
-        further = sum(part.nbytes for part in (self.certainty, self.edge) if part is not None)
+        further = sum(part.nbytes for part in (self.certainty, self.edge, self.occluded) if part is not None)
         return self.at.nbytes + self.source_camera.nbytes + bands + further

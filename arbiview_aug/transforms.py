@@ -22,6 +22,7 @@ from arbiview_aug.fills import Reach
 from arbiview_aug.framing import Fit, Framing, framing
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.batches import SOURCES_KEY, complete_frame, frame_names
+from arbiview_aug.holes import Holes, fill_holes
 from arbiview_aug.keys import hint
 from arbiview_aug.labels import PIXEL_BOUND_KEYS, check_other_keys, move_to_target, target_labels, warn_of_misnamed
 from arbiview_aug.plan import PlanCache, RenderPlan
@@ -85,10 +86,16 @@ class RigRetarget(torch.nn.Module):
     Args:
         target_rig: A ``Rig``, the name of a shipped one, a rig file, or a ``RandomRig``.
         source_rig: The rig of every sample that carries none.
-        path: ``favs``: stitching; what no source sees stays black. ``inpaint``: that is filled by Telea's inpainting.
-            ``diffusion``: by a generator (``arbiview_aug.generator``); targets that are whole never ask it. With both,
-            the output has ``generated`` (..., M, h, w) bool, True where a pixel was made up; what sources see stays as
-            it is, bit for bit, and ``coverage`` says no more than that.
+        path: ``favs``: stitching, with what no source sees as ``holes`` says. ``inpaint``: that is filled by Telea's
+            inpainting at full size. ``diffusion``: by a generator (``arbiview_aug.generator``); targets that are whole
+            never ask it.
+        holes: What pixels become that no source sees, after ``neighbours`` filled theirs. ``fill``: those that lie in
+            some source's image, where an object or the source's own car hides them, are continued from their borders,
+            and so are those outside all images up to an eighth of the view's shorter side; farther outside they become
+            the mean colour of what the frame's views show. ``mean``: all become that colour. ``black``: they stay
+            black. But for ``black``, and with the other paths, the output has ``generated`` (..., M, h, w) bool, True
+            where a pixel was made up. ``coverage`` is False there, ``confidence`` 0, ``source_camera`` -1 and labels
+            ``label_fill``; what sources see stays as it is, bit for bit. Other paths replace it: leave it at ``fill``.
         generator: For ``diffusion``: ``Generator.from_pretrained(DIR)``; None loads the weights that ship with the
             package, trained on synthetic streets alone. On a GPU it needs ``num_workers=0``, or
             ``generator.complete_batch`` after collating.
@@ -155,6 +162,7 @@ class RigRetarget(torch.nn.Module):
         *,
         source_rig: Rig | str | Path | None = None,
         path: RenderPath = "favs",
+        holes: Holes = "fill",
         generator: Generator | None = None,
         steps: int | None = None,
         guidance: float | None = None,
@@ -181,6 +189,9 @@ class RigRetarget(torch.nn.Module):
         super().__init__()
         warn_about_cv2_wheels()
         one_of("path", path, get_args(RenderPath))
+        one_of("holes", holes, get_args(Holes))
+        if path != "favs" and holes != "fill":
+            raise ValueError(f"holes: path={path!r} fills them itself: expected 'fill', the default, got {holes!r}")
         one_of("surface", surface, get_args(SurfaceName))
         one_of("fit", fit, get_args(Fit))
         one_of("label_frame", label_frame, ("source", "target"))
@@ -219,7 +230,7 @@ class RigRetarget(torch.nn.Module):
                 raise ValueError("min_confidence: quality='paper' has no confidence, expected 0")
         elif "confidence" in outputs or min_confidence or path == "diffusion":  # the generator is told of it
             self._trusts, self.config = True, replace(self.config, certainty=True)
-        self.path, self.p, self.rng = path, float(p), rng
+        self.path, self.holes, self.p, self.rng = path, holes, float(p), rng
         self.completion = completion_of(path, generator, steps, guidance, min_confidence, seed)
         self.generator = None if self.completion is None else self.completion.generator  # moves with this module
         self.size, self.fit = None if size is None else checked_size(size), fit
@@ -254,8 +265,8 @@ class RigRetarget(torch.nn.Module):
         target = self.target if isinstance(self.target, RandomRig) else (self.target.name or "unnamed rig")
         how = self.stitcher
         settings = (
-            f"path={self.path}, surface={how.surface}, harmonise={how.harmoniser}, size={self.size}, fit={self.fit}, "
-            f"p={self.p:g}"
+            f"path={self.path}, holes={self.holes}, surface={how.surface}, harmonise={how.harmoniser}, "
+            f"size={self.size}, fit={self.fit}, p={self.p:g}"
         )
         held = "" if how.refinement is None else f"refinement={how.refinement!r}, "
         return f"target={target}, {settings}, {held}{self.config}"
@@ -350,7 +361,8 @@ class RigRetarget(torch.nn.Module):
         """The entries that go with any images, as the same objects."""
         kept = (*labels, *self.pass_keys)
         stale = [key for key in sample if key in PIXEL_BOUND_KEYS and key not in kept]
-        dropped = [key for key in stale if key not in self.outputs]
+        # What an earlier retargeting made up its coverage masks already.
+        dropped = [key for key in stale if key not in self.outputs and key != "generated"]
         if dropped:
             meant = "" if "depth_m" in sample else hint(dropped, ("depth_m",))
             words = f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels{meant}"
@@ -374,8 +386,12 @@ class RigRetarget(torch.nn.Module):
         for b, images in enumerate(self.stitcher.render(frames, views, seams)):
             made = views[b].made
             filled, patches = self.stitcher.filled(frames[b], views[b], images)
-            part = {"images": stacked(filled)}
+            part: dict[str, Any] = {"images": stacked(filled)}
             part |= seen_entries(made, filled, patches, None if seams is None else seams[b], self.outputs)
+            if self.completion is None and self.holes != "black":
+                occluded = [view.occluded for view in made.targets]
+                part["images"] = stacked(fill_holes(filled, part["coverage"], occluded, self.holes))
+                part["generated"] = stacked([~seen for seen in part["coverage"]])
             shown = made.target
             if self.size is not None and self.fit == "pad":
                 shown = made.target.resized(self.size, "pad")
@@ -398,7 +414,7 @@ class RigRetarget(torch.nn.Module):
         part["images"] = stacked(images)
         seen = [framed(torch.ones(f.scaled, dtype=torch.bool, device=device), f) for f in framings]
         part.update(untouched_entries(torch.stack(seen), self.outputs))
-        if self.completion is not None:
+        if self.completion is not None or self.holes != "black":
             part["generated"] = torch.zeros_like(part["coverage"])
         return part, framings
 

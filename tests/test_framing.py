@@ -120,8 +120,8 @@ def test_all_fits_agree_bit_by_bit_where_the_aspect_is_equal(size: tuple[int, in
 def test_a_crop_is_the_window_of_the_scaled_view(size: tuple[int, int], skipped: float) -> None:
     params = {"skipped": skipped}
     f = framing("c", OWN, size, "crop")
-    cut = transform(size, "crop", p=0.5)(sample(masked=True), params)
-    whole = transform(f.scaled, "stretch", p=0.5)(sample(masked=True), params)
+    cut = transform(size, "crop", p=0.5, holes="black")(sample(masked=True), params)
+    whole = transform(f.scaled, "stretch", p=0.5, holes="black")(sample(masked=True), params)
     exact = bool(skipped)  # a target's maps are interpolated on another grid
     for key in ("images", "classes", "coverage", "source_camera", "confidence", "ignore"):
         expected = framed(whole[key], f)
@@ -156,10 +156,11 @@ def test_no_filler_touches_bars() -> None:
     size, f = (40, 64), framing("c", OWN, (40, 64), "pad")
     wide = Rig([replace(c, K=c.K * [[0.5, 1, 1], [1, 0.5, 1], [1, 1, 1]]) for c in rig()])  # holes above and below
     bars = framed(torch.zeros(f.scaled), f, 1).bool()
-    out = RigRetarget(wide, size=size, fit="pad", path="inpaint")(given)
-    assert out["generated"].any() and not out["generated"][:, bars].any() and not out["images"][..., bars].any()
-    assert not torch.logical_or(out["coverage"], out["generated"])[:, bars].any()
-    assert torch.logical_or(out["coverage"], out["generated"])[:, ~bars].all()
+    for path in ("favs", "inpaint"):
+        out = RigRetarget(wide, size=size, fit="pad", path=path)(given)  # type: ignore[arg-type]
+        assert out["generated"].any() and not out["generated"][:, bars].any() and not out["images"][..., bars].any()
+        assert not torch.logical_or(out["coverage"], out["generated"])[:, bars].any()
+        assert torch.logical_or(out["coverage"], out["generated"])[:, ~bars].all()
     later = RigRetarget(wide, size=size, fit="pad", outputs=("sources", "confidence"))(given)
     assert torch.equal(complete_batch(None, later)["images"], out["images"])  # after collating as well
     # Black does not bleed in from the bars: they are not read.

@@ -52,7 +52,7 @@ LAYERS: list[tuple[str, ...]] = [
     ("sample",),
     ("boxes_2d",),
     ("labels", "detections", "neighbours"),
-    ("fills", "motion.depth"),
+    ("fills", "holes", "motion.depth"),
     ("explain", "view_entries"),
     ("stitching",),
     ("generator",),

@@ -52,7 +52,7 @@ def on(mask: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
 
 # --- in the transform -------------------------------------------------------------------------------------------------
 def test_inpainting_fills_what_nobody_sees_and_nothing_else() -> None:
-    seen = RigRetarget(TARGET)(a_sample())
+    seen = RigRetarget(TARGET, holes="black")(a_sample())
     filled = RigRetarget(TARGET, path="inpaint")(a_sample())
     holes = ~seen["coverage"]
     assert holes.any() and torch.equal(filled["generated"], holes) and torch.equal(filled["coverage"], ~holes)
@@ -133,7 +133,7 @@ def test_skipped_samples_collate_with_completed_ones(generator: Generator) -> No
 
 def test_what_was_made_up_is_masked_when_retargeted_again() -> None:
     once = RigRetarget(TARGET, path="inpaint", outputs=("sources", "confidence"))(a_sample())
-    again = RigRetarget(TARGET.undistorted())(once)
+    again = RigRetarget(TARGET.undistorted(), holes="black")(once)
     assert torch.equal(again["coverage"], once["coverage"])
     assert "generated" not in again and "sources" not in again
 

@@ -225,10 +225,10 @@ def _costs(
     runs: dict[str, Callable[[], Any]] = {}
     for n in numbers:
         fresh = data[index]
-        first = RigRetarget(target, surface=surface)
+        first = RigRetarget(target, surface=surface, holes="black")
         peaks[n] = peak_mib(partial(first, fresh | {"neighbours": nearest(fresh)[:n]}))
         frame = sample | {"neighbours": in_memory[:n]}
-        out = RigRetarget(target, surface=surface, outputs=("source_frame",))(frame)
+        out = RigRetarget(target, surface=surface, outputs=("source_frame",), holes="black")(frame)
         filled[n] = float((out["source_frame"] > 0).double().mean())
         frames = itertools.cycle([frame, as_of_another_frame(frame)])
         runs[f"{n} read"] = partial(_read, data, index, n)

@@ -58,7 +58,7 @@ class Case:
 
     def retarget(self) -> RigRetarget:
         """A transform that holds nothing yet."""
-        return RigRetarget(self.target, **self.settings)
+        return RigRetarget(self.target, holes="black", **self.settings)
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,10 @@ rounds of candidate / floor within a round.
 
 ``frame`` is the cached plan executed: the sample's uint8 images in, one uint8 (M, 3, h, w) tensor out. ``interleaved``
 images lie channels-last in one block, as this package's readers give them, ``planar`` ones are contiguous. ``whole
-call`` is ``RigRetarget`` with its checks and the plan's lookup. ``plan`` builds the plan of a calibration that was not
-seen before; its ratio is to the frame, which it precedes where every frame has its own calibration. ``harmonised`` is
-the frame with known gains for all cameras.
+call`` is ``RigRetarget`` with its checks and the plan's lookup, holes left black; ``filled``: with them filled, the
+default. ``holes`` is that filling alone, of so many of the pixels. ``plan`` builds the plan of a calibration that was
+not seen before; its ratio is to the frame, which it precedes where every frame has its own calibration. ``harmonised``
+is the frame with known gains for all cameras.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.favs.synthesis import render_opencv
+from arbiview_aug.holes import Holes, fill_holes
 from arbiview_aug.plan import build_plan
 from arbiview_aug.rig import Rig, load_rig
 from arbiview_aug.sampling import Scratch
@@ -176,7 +178,9 @@ def _full_size(rig: Rig, images: torch.Tensor) -> list[_Candidate]:
         _Candidate(frame, _frame(rig, target, images), floor, 1.5),
         _Candidate(f"{label} frame, planar", _frame(rig, target, images.contiguous()), floor, 1.5),
         _Candidate(f"{label} frame, harmonised", _frame(rig, target, images, _GAINS), frame),
-        _Candidate(f"{label} whole call", _call(rig, target, images), floor),
+        _Candidate(f"{label} whole call", _call(rig, target, images, "black"), floor),
+        _Candidate(f"{label} whole call, filled", _call(rig, target, images, "fill"), floor),
+        _holes(rig, target, images, label, floor),
         _Candidate(f"{label} plan", _plan(rig, target), frame, 1.5),
         _Candidate(f"{label} plan, ego motion", _plan_with_ego_motion(rig, target), frame),
     ]
@@ -192,7 +196,9 @@ def _small_size(rig: Rig, images: torch.Tensor, halves: torch.Tensor, size: tupl
         _Candidate(f"{full}, harmonised", _frame(rig, target, images, _GAINS), full),
         _Candidate(half, _frame(half_rig, target, halves), floor, 1.6),
         _Candidate(f"{half}, harmonised", _frame(half_rig, target, halves, _GAINS), half),
-        _Candidate(f"{label} whole call, from half size", _call(half_rig, target, halves), floor),
+        _Candidate(f"{label} whole call, from half size", _call(half_rig, target, halves, "black"), floor),
+        _Candidate(f"{label} whole call, filled", _call(half_rig, target, halves, "fill"), floor),
+        _holes(half_rig, target, halves, label, floor),
         _Candidate(f"{label} plan, from full size", _plan(rig, target), full, 1.5),
         _Candidate(f"{label} plan, from half size", _plan(half_rig, target), half, 1.5),
         _Candidate(f"{label} plan, ego motion", _plan_with_ego_motion(half_rig, target), half),
@@ -220,10 +226,19 @@ def _frame(source: Rig, target: Rig, images: torch.Tensor, gains: Sequence[float
     return lambda: render_opencv(plan, views, scratch, curves)
 
 
-def _call(source: Rig, target: Rig, images: torch.Tensor) -> Callable[[], Any]:
-    retarget = RigRetarget(target, source_rig=source)
+def _call(source: Rig, target: Rig, images: torch.Tensor, holes: Holes) -> Callable[[], Any]:
+    retarget = RigRetarget(target, source_rig=source, holes=holes)
     retarget.prepare()
     return lambda: retarget({"images": images})
+
+
+def _holes(source: Rig, target: Rig, images: torch.Tensor, label: str, floor: str) -> _Candidate:
+    """Filling the holes of one frame's views, again and again: the time does not depend on what stands in them."""
+    plan = build_plan(source, target)
+    views, coverage = render_opencv(plan, list(images)), [torch.from_numpy(seen) for seen in plan.coverage]
+    share = 1 - statistics.mean(float(seen.float().mean()) for seen in coverage)
+    occluded = [view.occluded for view in plan.targets]
+    return _Candidate(f"{label} holes, {share:.1%}", lambda: fill_holes(views, coverage, occluded, "fill"), floor)
 
 
 def _plan(source: Rig, target: Rig) -> Callable[[], Any]:

@@ -79,6 +79,7 @@ class Setting:
             execution="torch" if self.execution == "cuda" else self.execution,
             refinement=RefinementCache() if self.held else None,
             cache_bytes=0,
+            holes="black",
         )
 
 

@@ -24,6 +24,7 @@ from arbiview_aug.errors import ArbiviewError, DataError, OutputError
 from arbiview_aug.favs.config import Quality
 from arbiview_aug.files import inside, remove_parts
 from arbiview_aug.framing import Fit
+from arbiview_aug.holes import Holes
 from arbiview_aug.offline import results
 from arbiview_aug.rig import load_rig
 from arbiview_aug.surface import SurfaceName
@@ -87,6 +88,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--target", required=True, metavar="RIG", help="the rig to render: a shipped one, or a file")
     parser.add_argument("--output", required=True, metavar="DIR", help="where to write")
     parser.add_argument("--path", choices=get_args(RenderPath), default="favs", help="(default: %(default)s)")
+    parser.add_argument(
+        "--holes",
+        choices=get_args(Holes),
+        default="fill",
+        help="what no camera saw, with --path favs: continued from its borders and marked in .generated.png (default), "
+        "the mean colour, or black",
+    )
     parser.add_argument("--generator", type=Path, metavar="DIR", help="for diffusion (default: the package's own)")
     parser.add_argument("--steps", type=count, metavar="N", help="of the generator (default: its own)")
     parser.add_argument("--quality", choices=get_args(Quality), default="fast", help="(default: %(default)s)")
@@ -154,6 +162,7 @@ def _settings(arguments: argparse.Namespace) -> Settings:
         target=load_rig(arguments.target),
         output=Path(arguments.output).absolute(),
         path=arguments.path,
+        holes=arguments.holes,
         generator=None if arguments.generator is None else arguments.generator.absolute(),
         steps=arguments.steps,
         quality=arguments.quality,

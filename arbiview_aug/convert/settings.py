@@ -17,6 +17,7 @@ from arbiview_aug.favs.config import Quality
 from arbiview_aug.files import checksum, is_part
 from arbiview_aug.framing import Fit
 from arbiview_aug.generator import Generator
+from arbiview_aug.holes import Holes
 from arbiview_aug.rig import Rig
 from arbiview_aug.surface import SurfaceName
 from arbiview_aug.transform_settings import RenderPath
@@ -39,6 +40,7 @@ class Settings:
         target: The rig to render, in its own ego frame.
         output: Where to write.
         path: As for ``RigRetarget``.
+        holes: As for ``RigRetarget``.
         generator: Folder of the generator, for ``path="diffusion"``; None for the package's own.
         steps: Of the generator; None for its own number.
         quality: As for ``RigRetarget``.
@@ -58,6 +60,7 @@ class Settings:
     target: Rig
     output: Path
     path: RenderPath = "favs"
+    holes: Holes = "fill"
     generator: Path | None = None
     steps: int | None = None
     quality: Quality = "fast"
@@ -93,6 +96,7 @@ class Settings:
         return RigRetarget(
             self.target,
             path=self.path,
+            holes=self.holes,
             generator=None if self.generator is None else Generator.from_pretrained(self.generator),
             steps=self.steps,
             quality=self.quality,
@@ -107,7 +111,7 @@ class Settings:
         target = self.target.to_dict()
         for entry, camera in zip(target["cameras"], self.target, strict=True):
             entry["content"] = camera.content_key.hex()  # of its mask too
-        names = ("path", "steps", "quality", "surface", "size", "reduce", "neighbours", "suffix")
+        names = ("path", "holes", "steps", "quality", "surface", "size", "reduce", "neighbours", "suffix")
         files = [] if self.generator is None else sorted(path for path in self.generator.iterdir() if path.is_file())
         generator = {path.name: checksum(path) for path in files}
         settings = {name: getattr(self, name) for name in names} | ({} if self.size is None else {"fit": self.fit})

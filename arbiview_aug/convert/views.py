@@ -17,7 +17,7 @@ from arbiview_aug.rig import Rig
 
 MASKS = {"coverage": "coverage", "confidence": "confidence", "generated": "generated", "ignore": "mask"}
 """Outputs of a retargeted sample, and what their files are called: ``<image>.<name>.png``. ``coverage``: 255 where some
-source saw the pixel; ``confidence``: 255 times it; ``generated``: 255 where a generator invented it; ``mask``: 255 for
+source saw the pixel; ``confidence``: 255 times it; ``generated``: 255 where it was made up; ``mask``: 255 for
 the scene, 0 for the target's own car, as in frame folders."""
 
 

@@ -80,6 +80,8 @@ def retargeting(
 ) -> Method:
     """``RigRetarget`` as a method; a transform, with its last plan, for each of the last target rigs.
 
+    With ``path="favs"`` holes stay black: scores are of what was seen.
+
     Args:
         quality: As for ``RigRetarget``.
         surface: As for ``RigRetarget``.
@@ -91,6 +93,7 @@ def retargeting(
         generator: As for ``RigRetarget``.
         steps: As for ``RigRetarget``.
     """
+    completes = path != "favs"
     if path == "diffusion" and generator is None:
         generator = Generator.shipped()  # once, not for each target
 
@@ -107,6 +110,7 @@ def retargeting(
             generator=generator,
             steps=steps,
             cache_bytes=0,
+            holes="fill" if completes else "black",
         )
 
     def render(sample: Sample, target: Rig) -> list[View]:
@@ -120,7 +124,9 @@ def retargeting(
             held, found = RefinementCache(), depth
             held.get((given["rig"].content_key, None), lambda: found)
         gain = None if gains is None else gains[camera : camera + 1]
-        retarget = RigRetarget(target, quality=quality, surface=surface, harmonise=gain, refinement=held, cache_bytes=0)
+        retarget = RigRetarget(
+            target, quality=quality, surface=surface, harmonise=gain, refinement=held, cache_bytes=0, holes="black"
+        )
         (view,) = views_of(retarget(given))
         return view
 
@@ -131,7 +137,6 @@ def retargeting(
     learns = isinstance(config, FavsConfig) and config.overlap_depth
     overlaps = _LastOverlaps(surface if learns else None, Harmoniser(harmonise))
     reads_points = surface in READS_POINTS and not isinstance(config, PaperConfig)
-    completes = path != "favs"
     return Method(label, render, reads_points, render_alone if overlaps.tell or completes else None)
 
 

@@ -66,11 +66,13 @@ class PaperView:
         image: (3, h, w) in the type of the source images, black where no source sees.
         source_camera: (h, w) int8 index of the source with the largest weight, -1 where there is none.
         reports: One for each source that the target shows.
+        occluded: (h, w) bool, uncovered pixels that a source's image contains: its own car hides them; None for none.
     """
 
     image: torch.Tensor
     source_camera: npt.NDArray[np.int8]
     reports: tuple[SourceReport, ...]
+    occluded: BoolArray | None = None
 
     @property
     def coverage(self) -> BoolArray:
@@ -141,7 +143,8 @@ def render_paper(
     with repeatable_opencv():
         for camera in target:
             blended, winners, reports = _render_view(source, order, camera, arrays, config, detections or {})
-            views.append(PaperView(_as_tensor(blended, images[0].dtype), winners, reports))
+            occluded = _behind_own_car(source, winners, reports)
+            views.append(PaperView(_as_tensor(blended, images[0].dtype), winners, reports, occluded))
     return PaperRendering(source, target, tuple(views))
 
 
@@ -219,6 +222,19 @@ def _render_view(
         for k, H_final, features, objects in found
     )
     return blended.astype(np.float32), winners, reports
+
+
+def _behind_own_car(
+    source: Rig, winners: npt.NDArray[np.int8], reports: Sequence[SourceReport]
+) -> BoolArray | None:
+    """Uncovered pixels (h, w) that lie in some source's image: nothing but its own car hides the far surface."""
+    uncovered = winners < 0
+    shown = np.zeros_like(uncovered)
+    for report in reports:
+        if source[report.source].mask is not None and uncovered.any():
+            shown |= _source_pixels(source[report.source], report.H_final, winners.shape)[1]
+    shown &= uncovered
+    return shown if shown.any() else None
 
 
 # --- stages 1 and 4 ---------------------------------------------------------------------------------------------------

@@ -149,7 +149,10 @@ def complete_batch(
     maps = {key: split(batch[key], lead) for key in _MAPS if key in batch}
     names, parts = frame_names(batch, sources, lead, how), []
     for b, (view, source) in enumerate(zip(views, sources, strict=True)):
-        part = {"images": list(view.images), **{key: of_frames[b] for key, of_frames in maps.items()}}
+        images = list(view.images)
+        if "generated" in batch:  # ``holes`` of the transform filled them
+            images = [torch.where(seen, image, 0) for seen, image in zip(maps["coverage"][b], images, strict=True)]
+        part = {"images": images, **{key: of_frames[b] for key, of_frames in maps.items()}}
         complete_frame(part, view.rig, source, names[b], how)
         parts.append(part)
     out = {key: value for key, value in batch.items() if key != SOURCES_KEY}

@@ -38,7 +38,9 @@ class ViewMaker:
         self.random = RandomRig(target, **RANDOM) if arm.random else None
         # Motion is asked for distances alone, so that the arm shows what these do.
         reach: Reach | None = None if arm.surface == "motion" else "ground"
-        self.retarget = RigRetarget(self.random or target, source_rig=source, surface=arm.surface, neighbours=reach)
+        self.retarget = RigRetarget(
+            self.random or target, source_rig=source, surface=arm.surface, neighbours=reach, holes="black"
+        )
 
     def __call__(self, index: int, frame: Mapping[str, Any]) -> Arrays:
         """The arrays of a retargeted frame.

@@ -52,7 +52,7 @@ class Frame(ProtocolFrame):
     """Rendered and scored."""
 
     def render(self, target: Rig, quality: Quality) -> tuple[list[Image], BoolArray]:
-        retarget = RigRetarget(target, source_rig=self.rig, quality=quality)
+        retarget = RigRetarget(target, source_rig=self.rig, quality=quality, holes="black")
         out = retarget({"images": as_tensors(self.images)})
         return as_arrays(out["images"]), out["coverage"].numpy()
 
@@ -197,7 +197,11 @@ def streets(request: pytest.FixtureRequest) -> Truth:
     refinements = RefinementCache(key="seed")
     retargets = {
         (pair, move, surface, quality): RigRetarget(
-            target, quality=quality, surface=surface, refinement=refinements if quality == "accurate" else None
+            target,
+            quality=quality,
+            surface=surface,
+            refinement=refinements if quality == "accurate" else None,
+            holes="black",
         )
         for pair, targets in enumerate(pairs)
         for move, target in targets.items()

@@ -99,7 +99,7 @@ def all_pixels(request: pytest.FixtureRequest) -> dict[tuple[str, str], Pixels]:
             truth = drive.render(0, target).images
             assert isinstance(truth, torch.Tensor)
             for surface in SURFACES:
-                out = RigRetarget(target, surface=surface, outputs=("confidence",))(sample)
+                out = RigRetarget(target, surface=surface, outputs=("confidence",), holes="black")(sample)
                 error = (out["images"].float() - truth.float()).abs().mean(1)
                 seen = out["coverage"]
                 parts[surface, move].append(Pixels(out["confidence"][seen].numpy(), error[seen].numpy()))

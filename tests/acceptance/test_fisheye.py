@@ -53,7 +53,7 @@ def test_synthetic_fisheyes_give_the_true_pinhole_views() -> None:
     sample, truth = drive[0], drive.render(0, target).images
 
     def score(sample: dict) -> list[float]:
-        out = RigRetarget(target, surface="far")(sample)  # centres coincide: exact
+        out = RigRetarget(target, surface="far", holes="black")(sample)  # centres coincide: exact
         assert out["coverage"].float().mean() > 0.99
         squares = (out["images"].float() - truth).square().mean(1)
         return [psnr_db(float(s[seen].mean())) for s, seen in zip(squares, out["coverage"], strict=True)]
@@ -102,11 +102,11 @@ def test_a_real_fisheye_frame_becomes_straight(fisheye_root: Path) -> None:
         ],
         ground_z_m=source.ground_z_m,
     )
-    out = RigRetarget(target)(sample)
+    out = RigRetarget(target, holes="black")(sample)
     assert (out["coverage"].float().mean((1, 2)) >= 0.95).all()
-    floats = RigRetarget(target)({**sample, "images": sample["images"].float() / 255})["images"]
+    floats = RigRetarget(target, holes="black")({**sample, "images": sample["images"].float() / 255})["images"]
     assert torch.isfinite(floats).all() and floats.min() >= 0 and floats.max() <= 1
-    ignored = RigRetarget(target)({**sample, "rig": lens_ignored(source)})
+    ignored = RigRetarget(target, holes="black")({**sample, "rig": lens_ignored(source)})
     for name in ("left", "right"):
         k = target.names.index(name)
         edge = cloth_edge(as_arrays(out["images"])[k])

@@ -57,7 +57,7 @@ def photographs(surface: Static, rig: Rig) -> torch.Tensor:
 
 def scores_db(images: torch.Tensor, truth: torch.Tensor, move: str, quality: Quality) -> np.ndarray:
     """(cameras, 1 + parts) of each view, and of its parts from left to right."""
-    retarget = RigRetarget(TARGETS[move], source_rig=SOURCE, quality=quality, surface="street")
+    retarget = RigRetarget(TARGETS[move], source_rig=SOURCE, quality=quality, surface="street", holes="black")
     out = retarget({"images": images})
     squares = (out["images"].float() - truth.float()).square().mean(1).numpy()
     scores = []

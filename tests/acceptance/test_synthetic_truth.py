@@ -55,7 +55,9 @@ def scores(request: pytest.FixtureRequest) -> Scores:
     """All numbers, printed as tables."""
     start, source = time.perf_counter(), demo_source_rig(SIZE)
     targets = {move: moved(source, move) for move in MOVES}
-    retargets = {(m, s): RigRetarget(target, surface=s) for m, target in targets.items() for s in SURFACES}
+    retargets = {
+        (m, s): RigRetarget(target, surface=s, holes="black") for m, target in targets.items() for s in SURFACES
+    }
     rows: dict[tuple[str, str], list[tuple[float, float]]] = {key: [] for key in retargets}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

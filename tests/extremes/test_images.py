@@ -85,7 +85,11 @@ def test_every_quality_keeps_the_range_of_the_images(kind: str, how: tuple[Any, 
     rig, target = RIG.with_cameras(RIG.cameras[:3]), TARGET.with_cameras(TARGET.cameras[:3]).shifted(z_m=0.3)
     values = images(kind)[:3].float() / 255
     retarget = RigRetarget(
-        target, quality=quality, surface="auto" if quality == "paper" else "street", harmonise=harmonise
+        target,
+        quality=quality,
+        surface="auto" if quality == "paper" else "street",
+        harmonise=harmonise,
+        holes="black",
     )
     out = retarget({"images": values, "rig": rig})
     for view, coverage in zip(out["images"], out["coverage"], strict=True):

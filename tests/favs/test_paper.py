@@ -222,7 +222,9 @@ def test_rig_retarget_renders_by_it(pair_images) -> None:
         "segmentation": torch.stack([torch.full((240, 400), k, dtype=torch.uint8) for k in range(2)]),
         "token": "a",
     }
-    retarget = RigRetarget(MIDDLE, quality="paper", outputs=("source_camera",), label_keys=("segmentation",))
+    retarget = RigRetarget(
+        MIDDLE, quality="paper", holes="black", outputs=("source_camera",), label_keys=("segmentation",)
+    )
     out = retarget(sample)
     direct = render_paper(PAIR, MIDDLE, pair_images).targets[0]
     assert torch.equal(out["images"][0], direct.image) and out["images"].shape == (1, 3, 240, 400)

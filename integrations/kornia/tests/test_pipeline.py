@@ -48,9 +48,11 @@ def test_v2s_own_resize_leaves_k_wrong(sample: dict) -> None:
 
 
 def test_kornias_image_sequential(sample: dict) -> None:
-    """Known again by inverting; holes stay black; one draw for all cameras where it is asked for."""
-    expected = RigRetarget(TARGET, surface="far")(sample)
-    invert = torch.nn.Sequential(RigRetarget(TARGET, surface="far"), OnImages(K.ImageSequential(K.RandomInvert(p=1.0))))
+    """Known again by inverting; black holes stay black; one draw for all cameras where it is asked for."""
+    expected = RigRetarget(TARGET, surface="far", holes="black")(sample)
+    invert = torch.nn.Sequential(
+        RigRetarget(TARGET, surface="far", holes="black"), OnImages(K.ImageSequential(K.RandomInvert(p=1.0)))
+    )
     out = invert(sample)
     seen = out["coverage"].unsqueeze(1).expand_as(out["images"])
     assert 0.1 < (~seen).float().mean() < 0.9

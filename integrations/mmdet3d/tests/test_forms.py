@@ -140,7 +140,7 @@ def test_every_key_of_mmdet3d(given: Recording) -> None:
     assert "lidar2img" not in step()({**results, "lidar2img": single})  # one camera's, which may be gone
     # Only the nested infos: what is missing at the top is not invented.
     nested = {key: results[key] for key in ("images", "img", "lidar_points")}
-    assert set(step()(nested)) == {*nested, "coverage"}
+    assert set(step()(nested)) == {*nested, "coverage", "generated"}
 
 
 @pytest.mark.filterwarnings("ignore:retarget. drops")
