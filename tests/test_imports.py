@@ -164,7 +164,7 @@ def test_importing_loads_nothing_heavy() -> None:
         "import arbiview_aug, arbiview_aug.datasets.synthetic, arbiview_aug.generator, arbiview_aug.train.command\n"
         f"print([m for m in {HEAVY} if m in sys.modules and m not in had])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=500, check=True)
     assert done.stdout.strip() == "[]"
 
 
@@ -176,5 +176,5 @@ def test_importing_costs_little_more_than_torch(tmp_path: Path, report_bound: Ca
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     environment["PYTHONPYCACHEPREFIX"] = str(tmp_path)
     command = [sys.executable, "-c", code]
-    runs = [subprocess.run(command, capture_output=True, timeout=120, check=True, env=environment) for _ in range(5)]
+    runs = [subprocess.run(command, capture_output=True, timeout=500, check=True, env=environment) for _ in range(5)]
     report_bound("s of CPU, import arbiview_aug after torch", min(float(run.stdout) for run in runs), at_most=LIMIT_S)

@@ -86,5 +86,5 @@ def test_the_dispatcher_imports_no_command_and_nothing_optional() -> None:
         "import sys; from arbiview_aug.__main__ import main; main(['--version']); "
         f"sys.exit(', '.join(m for m in {modules} if m in sys.modules) or 0)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=500)
     assert done.returncode == 0 and not done.stderr, done.stderr

@@ -49,7 +49,7 @@ def devkit_boxes(python: Path, root: Path, version: str, output: Path) -> list[d
         output: A file to write.
     """
     script = Path(__file__).with_name("devkit_boxes.py")
-    subprocess.run([str(python), str(script), str(root), version, str(output)], check=True, timeout=280)
+    subprocess.run([str(python), str(script), str(root), version, str(output)], check=True, timeout=500)
     found: list[dict[str, Any]] = json.loads(output.read_text())
     return found
 

@@ -285,7 +285,6 @@ def test_killed_with_its_workers_it_goes_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_ray_writes_the_same_bytes(
     sources: dict[str, Path],
     undisturbed: dict[str, dict[str, bytes]],
@@ -313,7 +312,6 @@ def settled(root: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_ray_killed_goes_on(tmp_path: Path) -> None:
     """The driver dies, and its actors with it; the next run finishes what is missing."""
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'arbiview_aug[distributed]'")

@@ -109,7 +109,7 @@ def test_sliders_and_choices(page: str, tmp_path: Path) -> None:
         ],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=500,
     )
     (found,) = re.findall(r"<title>PROBE (.*?)</title>", done.stdout)
     before, after, clip, moved, chosen, width = json.loads(found)

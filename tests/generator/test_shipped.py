@@ -56,7 +56,7 @@ sys.meta_path.insert(0, Watch())
 Generator.shipped()
 assert "diffusers" in sys.modules and not found, found
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=240)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stderr
 
 

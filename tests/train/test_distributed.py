@@ -48,7 +48,7 @@ def test_two_processes_train_one_model(tmp_path: Path) -> None:
         [*launch, str(program), str(tmp_path / "run"), str(tmp_path)],
         capture_output=True,
         text=True,
-        timeout=280,
+        timeout=500,
         env=variables,
         cwd=ROOT,
         check=False,
