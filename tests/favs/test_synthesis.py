@@ -93,7 +93,7 @@ def test_executions_agree_on_real_images(nuscenes_root, ddad_root, quality: str,
     for root in (nuscenes_root, ddad_root):
         sample = FrameFolder(root, reduce=reduce)[0]
         rig, images = sample["rig"], list(sample["images"])
-        lifted = rig.resized((256 // reduce, 704 // reduce)).shifted(z_m=0.5)
+        lifted = rig.resized((256, 704)).shifted(z_m=0.5)
         for target in (rig.turned(yaw_deg=22), load_rig("waymo").resized(0.3 / reduce), lifted):
             plan = build_plan(rig, target, config=favs_config(quality))
             error = differences(by("opencv", plan, images), by("torch", plan, images))
