@@ -21,7 +21,19 @@ from arbiview_aug.convert.nuscenes_rows import NewCameras, Remaining, view_stem
 from arbiview_aug.convert.settings import FOLDER, Settings
 from arbiview_aug.convert.visibility import visible_shares
 from arbiview_aug.datasets.nuscenes import NuScenesDataset
-from arbiview_aug.datasets.nuscenes_tables import Row, Tables
+from arbiview_aug.datasets.nuscenes_tables import (
+    COUNTS,
+    FILES,
+    FLAGS,
+    LINKS,
+    MICROSECONDS,
+    TOKENS,
+    Kind,
+    Row,
+    Tables,
+    Tokens,
+    on_circle,
+)
 from arbiview_aug.errors import DataError
 from arbiview_aug.files import check_name, checksum, inside, link_whole, whole_file
 from arbiview_aug.rig import Rig
@@ -43,14 +55,27 @@ _REFERENCES = (
     ("sample_data", "sample_token", "sample"),
     ("sample_data", "ego_pose_token", "ego_pose"),
     ("sample_data", "calibrated_sensor_token", "calibrated_sensor"),
+    ("scene", "first_sample_token", "sample"),
+    ("scene", "last_sample_token", "sample"),
+    ("instance", "first_annotation_token", "sample_annotation"),
+    ("instance", "last_annotation_token", "sample_annotation"),
+    *((table, key, table) for table in ("sample", "sample_annotation", "sample_data") for key in ("prev", "next")),
 )
+"""Table, column, and the table that it names rows of. Unknown is an empty token; some sources have fewer columns."""
 
-_REFERRING = {table for table, _, _ in _REFERENCES}
-_WITH_FILES = ("sample_data", "lidarseg", "panoptic", "map")
-"""Tables whose rows name files: they are checked where these are kept."""
-
-_NEEDED = ("sample_token", "ego_pose_token", "calibrated_sensor_token", "is_key_frame", "filename")
-"""Columns of ``sample_data`` without which its rows cannot be kept."""
+_NEEDED: Mapping[str, Mapping[str, Kind]] = {
+    "sample": {"timestamp": MICROSECONDS},
+    "sample_annotation": {"sample_token": TOKENS, "instance_token": TOKENS},
+    "sample_data": {
+        **dict.fromkeys(("sample_token", "ego_pose_token", "calibrated_sensor_token"), TOKENS),
+        "is_key_frame": FLAGS,
+        "filename": FILES,
+        "timestamp": MICROSECONDS,
+    },
+    "lidarseg": {"filename": FILES},
+    "panoptic": {"filename": FILES},
+}
+"""Columns without which rows cannot be kept."""
 
 
 class NuScenes:
@@ -76,12 +101,16 @@ class NuScenes:
         }
 
     def check(self) -> None:
-        """Look for what could not be written, before hours of work end with it.
+        """Read all tables once, and look for everything that could not be written, before hours of work end with it.
 
         Raises:
-            DataError: A row names another one that is not there, or a file outside the root, or has no column that is
-                needed; two samples would write images of one name, or a camera's name makes no file's name.
+            DataError: A table that is none; a row that names another one that is not there, or a file outside the root,
+                or has no column that is needed; a token that occurs twice; ``next`` or ``prev`` that lead round in a
+                circle; no samples; two samples that would write images of one name, or a camera's name makes no file's
+                name.
         """
+        if not len(self.data):
+            raise DataError(f"nuScenes {self.data.root} {self.data.version}: expected samples, got none")
         names = [self.data.files(index)[-1].name for index in range(len(self.data))]
         (stem, times), *_ = Counter(view_stem(name, "") for name in names).most_common(1)
         if times > 1:
@@ -95,33 +124,42 @@ class NuScenes:
             check_name(longest, f"rig {self.target.name!r}: camera {camera.name!r}")
         tables, there = self._opened(), self._tables()
         references = [(table, key, of) for table, key, of in _REFERENCES if table in there and of in there]
-        known = {
-            of: dict.fromkeys(row["token"] for batch in tables.batches(of) for row in batch)
-            for of in dict.fromkeys(of for _, _, of in references)
-        }
-        cameras = {row["token"] for row in tables.rows("sensor") if row.get("modality") == "camera"}
-        kept = {row["token"] for row in tables.rows("calibrated_sensor") if row["sensor_token"] not in cameras}
+        own = {of: Tokens(tables, of) for _, _, of in references}
+        named = {(table, key): Tokens(tables, table, key) for table, key, _ in references}
         folders = {path.parent.relative_to(self.data.root).as_posix(): "maps" for path in self._maps()}
-        for table in (table for table in there if table in _WITH_FILES or table in _REFERRING):
-            keys = [(key, of) for referring, key, of in references if referring == table]
-            needed = _NEEDED if table == "sample_data" else ()
-            for row in (row for batch in tables.batches(table) for row in batch):
-                for key in needed:
-                    tables.value(table, row, key)
-                if table in _WITH_FILES and (table != "sample_data" or row["calibrated_sensor_token"] in kept):
-                    where, name = self._where(table, row), tables.value(table, row, "filename")
-                    check_name(name, where)
-                    folders.setdefault(name.rpartition("/")[0], where)
-                for key, of in keys:
-                    # Unknown is an empty token; some sources have fewer columns.
-                    if row.get(key) or key in needed:
-                        tables.follow(table, row, key, of, known[of])
-        own = (FOLDER, self.data.version, *(view_stem("", camera.name).rpartition("/")[0] for camera in self.target))
+        cameras = {row["token"] for row in tables.rows("sensor") if row["modality"] == "camera"}
+        kept = {row["token"] for row in tables.rows("calibrated_sensor") if row["sensor_token"] not in cameras}
+        for table in there:
+            needed = _NEEDED.get(table, {})
+            columns = [column for (of, _), column in named.items() if of == table]
+            for rows in tables.batches(table):
+                for key, kind in needed.items():
+                    tables.column(table, rows, key, kind)
+                if table == "instance":
+                    tables.column(table, rows, "nbr_annotations", COUNTS, default=0)
+                if table in own:
+                    own[table].add(rows)
+                for column in columns:
+                    column.add(rows, LINKS, default="")
+                for row in rows if table == "map" or "filename" in needed else ():
+                    name = row.get("filename") or ""
+                    if (name or table != "map") and (table != "sample_data" or row["calibrated_sensor_token"] in kept):
+                        where = self._where(table, row)
+                        check_name(name, where)
+                        folders.setdefault(name.rpartition("/")[0], where)
+        for tokens in own.values():
+            tokens.check()
+        for table, key, of in references:
+            after = named[table, key].places_in(own[of], or_empty=key not in _NEEDED.get(table, {}))
+            for k in on_circle(after)[:1] if key in ("prev", "next") else ():
+                got = f"a circle through row {tables.row(table, int(k))['token']!r}"
+                raise tables.error(table, f"{key} that lead to an end", got, f"empty one row's {key}")
+        own_folders = (FOLDER, self.data.version, *(view_stem("", c.name).rpartition("/")[0] for c in self.target))
         for folder, where in folders.items():
             self._kept(folder or ".", where)
             parts = PurePosixPath(folder).parts
-            if parts and (parts[0] in own or "/".join(parts[:2]) in own):
-                raise DataError(f"{where}: expected a file outside of {', '.join(own)}, got one in {folder}")
+            if parts and (parts[0] in own_folders or "/".join(parts[:2]) in own_folders):
+                raise DataError(f"{where}: expected a file outside of {', '.join(own_folders)}, got one in {folder}")
 
     def stem(self, index: int, camera: int, name: str) -> str:
         """The path of a view below the output, without its suffix."""

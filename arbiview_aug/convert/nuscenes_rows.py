@@ -82,7 +82,7 @@ class Remaining:
             ends = {"first_annotation_token": self._beyond(first, 1), "last_annotation_token": self._beyond(last, 0)}
             if ends["first_annotation_token"] or not first:
                 yield self._changed(
-                    row, {**ends, "nbr_annotations": row.get("nbr_annotations", 0) - fewer[row["token"]]}
+                    row, {**ends, "nbr_annotations": (row.get("nbr_annotations") or 0) - fewer[row["token"]]}
                 )
 
     def sample_annotation(self, visible: Mapping[str, float]) -> Iterator[Row]:
@@ -143,7 +143,11 @@ class Remaining:
 
     def _beyond(self, token: str, way: int) -> str:
         """The first annotation of a chain that stays, from one on."""
+        seen = set()
         while token in self._gone:
+            if token in seen:  # in an output that was begun before chains were checked
+                raise self.tables.error("sample_annotation", "chains that end", f"a circle through row {token!r}")
+            seen.add(token)
             token = self._gone[token][way]
         return token
 

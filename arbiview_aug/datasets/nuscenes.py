@@ -17,8 +17,8 @@ from arbiview_aug.camera import Camera, FloatArray
 from arbiview_aug.datasets.frame_folder import checked_points
 from arbiview_aug.datasets.images import Reduce, check_reduce, decode_images, reduced_rig
 from arbiview_aug.datasets.nuscenes_boxes import read_annotations
-from arbiview_aug.datasets.nuscenes_recordings import IntArray, read_recordings
-from arbiview_aug.datasets.nuscenes_tables import Row, Tables
+from arbiview_aug.datasets.nuscenes_recordings import LIDAR, IntArray, read_recordings
+from arbiview_aug.datasets.nuscenes_tables import TEXTS, TOKENS, Row, Tables
 from arbiview_aug.datasets.sequence import Drive, LazyFrame, Neighbours, Unreadable, check_neighbours
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError
 from arbiview_aug.files import inside
@@ -256,17 +256,15 @@ def _inverse(pose: FloatArray) -> FloatArray:
 
 
 def _chosen_samples(tables: Tables, split_scenes: Iterable[str] | None) -> list[Row]:
-    samples = tables.rows("sample")
+    samples = [*tables.by_token("sample").values()]
     scenes = tables.by_token("scene")
-    for row in samples:
-        tables.value("sample", row, "token")
-        tables.follow("sample", row, "scene_token", "scene", scenes)
+    tables.follow("sample", samples, "scene_token", "scene", scenes)
     if split_scenes is None:
         return samples
     if isinstance(split_scenes, str):
         raise DataError(f"split_scenes: expected a collection of scene names, got the string {split_scenes!r}")
     wanted = set(split_scenes)
-    names = {token: tables.value("scene", row, "name") for token, row in scenes.items()}
+    names = dict(zip(scenes, tables.column("scene", [*scenes.values()], "name", TEXTS), strict=True))
     unknown = sorted(wanted - set(names) - set(names.values()))
     if unknown:
         raise tables.error("scene", f"the scenes {', '.join(unknown[:5])}", f"{len(names)} others")
@@ -275,7 +273,11 @@ def _chosen_samples(tables: Tables, split_scenes: Iterable[str] | None) -> list[
 
 def _chosen_channels(tables: Tables, channels: Sequence[str] | None) -> list[str]:
     rows = tables.rows("sensor")
-    cameras = {tables.value("sensor", row, "channel") for row in rows if row.get("modality") == "camera"}
+    modalities = tables.column("sensor", rows, "modality", TEXTS)
+    names = tables.column("sensor", rows, "channel", TOKENS)
+    cameras = {name for name, modality in zip(names, modalities, strict=True) if modality == "camera"}
+    if LIDAR in cameras:
+        raise tables.error("sensor", f"modality lidar of {LIDAR}", "camera")
     if channels is None:
         chosen = [channel for channel in CAMERA_RING if channel in cameras]
         chosen += sorted(cameras - set(CAMERA_RING))
@@ -283,7 +285,7 @@ def _chosen_channels(tables: Tables, channels: Sequence[str] | None) -> list[str
         chosen = list(channels)
     unknown = [channel for channel in chosen if channel not in cameras]
     if unknown or not chosen:
-        known, got = (", ".join(names) or "none" for names in (sorted(cameras), map(repr, unknown)))
+        known, got = (", ".join(of) or "none" for of in (sorted(cameras), map(repr, unknown)))
         raise DataError(f"nuScenes {tables.root}: channels: expected some of {known}, got {got}")
     return chosen
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.camera import FloatArray
-from arbiview_aug.datasets.nuscenes_tables import Tables
+from arbiview_aug.datasets.nuscenes_tables import TEXTS, TOKENS, Tables, Tokens
 
 MAX_STEP_S = 1.5
 """Annotations farther apart give no velocity; over both neighbours in time, twice as much. As in nuscenes-devkit's
@@ -123,33 +123,35 @@ def read_annotations(
         DataError: Rows that are malformed or lead nowhere.
     """
     categories = tables.by_token("category")
-    names = sorted({tables.value("category", row, "name") for row in categories.values()})
+    names = sorted({*tables.column("category", [*categories.values()], "name", TEXTS)})
     number = {name: k for k, name in enumerate(names)}
-    objects: dict[str, tuple[int, int]] = {}  # number and category by token
-    for row in tables.rows("instance"):
-        name = tables.follow("instance", row, "category_token", "category", categories)["name"]
-        objects[tables.value("instance", row, "token")] = len(objects), number[name]
+    instances = tables.by_token("instance")
+    kinds = tables.follow("instance", [*instances.values()], "category_token", "category", categories)
+    objects = {token: (k, number[kind["name"]]) for k, (token, kind) in enumerate(zip(instances, kinds, strict=True))}
     table = "sample_annotation"
+    unique = Tokens(tables, table)
     none = np.empty((0, 3), np.float32)
     found: list[tuple[Any, ...]] = [
         (np.empty(0, np.int32), np.empty((0, 2), np.int32), np.empty(0, np.bytes_), none.astype(np.float64), none, none)
     ]
     for batch in tables.batches(table):
-        rows = [row for row in batch if tables.value(table, row, "sample_token") in samples]
+        of_samples = tables.column(table, batch, "sample_token", TOKENS)
+        rows = [row for row, token in zip(batch, of_samples, strict=True) if token in samples]
         sizes_m = tables.numbers(table, rows, "size", (3,))
         for k in np.flatnonzero((sizes_m <= 0).any(axis=1))[:1]:
             raise tables.error(table, "sizes above 0", f"{sizes_m[k].tolist()} in row {rows[k].get('token')!r}")
-        of = [tables.follow(table, row, "instance_token", "instance", objects) for row in rows]
+        of = tables.follow(table, rows, "instance_token", "instance", objects)
         found.append(
             (
                 np.array([samples[row["sample_token"]] for row in rows], np.int32),
                 np.array(of, np.int32).reshape(-1, 2),
-                np.array([str(tables.value(table, row, "token")).encode() for row in rows], np.bytes_),
+                np.array([token.encode() for token in unique.add(rows)], np.bytes_),
                 tables.numbers(table, rows, "translation", (3,)),
                 sizes_m[:, [1, 0, 2]].astype(np.float32),  # width, length, height in the table
                 tables.rotations(table, rows)[:, :, 0].astype(np.float32),
             )
         )
+    unique.check()
     columns = [np.concatenate([batch[k] for batch in found]) for k in range(len(found[0]))]
     order = np.argsort(columns[0], kind="stable")
     sample, of_object, tokens, centers_m, sizes, headings = (column[order] for column in columns)

@@ -8,13 +8,25 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.camera import FloatArray
-from arbiview_aug.datasets.nuscenes_tables import Row, Tables, rotation_from_quaternion
+from arbiview_aug.datasets.nuscenes_tables import (
+    COUNTS,
+    FILES,
+    FLAGS,
+    LINKS,
+    MICROSECONDS,
+    TOKENS,
+    Row,
+    Tables,
+    Tokens,
+    rotation_from_quaternion,
+)
 from arbiview_aug.datasets.sequence import went_back
 from arbiview_aug.errors import DataError
 
@@ -141,32 +153,51 @@ def read_recordings(
     tokens: list[str] = []
     previous: list[str] = []
     parts = [np.empty(0, _ROW)]
-    for batch in tables.batches("sample_data"):
-        kept = []
-        for row in batch:
-            key = bool(row.get("is_key_frame"))
-            sample = samples.get(tables.value("sample_data", row, "sample_token")) if key or sweeps else None
-            if sample is None:
-                continue  # of a scene that was not chosen
-            sensor = tables.follow("sample_data", row, "calibrated_sensor_token", "calibrated_sensor", calibrated)
-            channel = channel_of[sensor] if sensor >= 0 else None
-            if channel is None or not (key or channel < len(channels)):
-                continue
-            time_us = tables.value("sample_data", row, "timestamp")
-            head, time, tail = str(tables.value("sample_data", row, "filename")).partition(str(time_us))
-            pose = poses.setdefault(tables.value("sample_data", row, "ego_pose_token"), len(poses))
-            file = files.setdefault((head, tail if time else None), len(files))
-            height_px, width_px = row.get("height") or 0, row.get("width") or 0  # none for the LiDAR
-            record = (channel, scenes[sample], sample, time_us, sensor, pose, file, height_px, width_px, key)
-            kept.append((*record, len(tokens)))
-            if sweeps and channel == 0:
-                tokens.append(tables.value("sample_data", row, "token"))
-                previous.append(tables.value("sample_data", row, "prev"))
-        parts.append(_as_rows(tables, kept))
+    table, unique = "sample_data", Tokens(tables, "sample_data")
+    for batch in tables.batches(table):
+        is_key = tables.column(table, batch, "is_key_frame", FLAGS)
+        kept = batch if sweeps else [*compress(batch, is_key)]
+        of_samples = tables.column(table, kept, "sample_token", TOKENS)
+        kept = [row for row, token in zip(kept, of_samples, strict=True) if token in samples]  # of the chosen scenes
+        sensors = tables.follow(table, kept, "calibrated_sensor_token", "calibrated_sensor", calibrated)
+        is_wanted = [
+            sensor >= 0 and (row["is_key_frame"] or channel_of[sensor] < len(channels))
+            for row, sensor in zip(kept, sensors, strict=True)
+        ]
+        kept, sensors = [*compress(kept, is_wanted)], [*compress(sensors, is_wanted)]
+        part = np.zeros(len(kept), _ROW)
+        part["sensor"], part["channel"] = sensors, [channel_of[sensor] for sensor in sensors]
+        part["sample"] = [samples[row["sample_token"]] for row in kept]
+        part["scene"] = [scenes[sample] for sample in part["sample"].tolist()]
+        part["key"] = [row["is_key_frame"] for row in kept]
+        part["time_us"] = times_us = tables.column(table, kept, "timestamp", MICROSECONDS)
+        for key in ("height", "width"):
+            part[key] = tables.column(table, kept, key, COUNTS, default=0)  # none for the LiDAR
+        of_poses = tables.column(table, kept, "ego_pose_token", TOKENS)
+        part["pose"] = [poses.setdefault(token, len(poses)) for token in of_poses]
+        of_files = []
+        for name, time_us in zip(tables.column(table, kept, "filename", FILES), times_us, strict=True):
+            head, time, tail = name.partition(str(time_us))
+            of_files.append(files.setdefault((head, tail if time else None), len(files)))
+        part["file"] = of_files
+        of_tokens = unique.add(kept)
+        if sweeps:
+            is_first = part["channel"] == 0
+            part["token"][is_first] = len(tokens) + np.arange(is_first.sum())
+            tokens += compress(of_tokens, is_first)
+            previous += tables.column(table, [*compress(kept, is_first)], "prev", LINKS)
+        parts.append(part)
+    unique.check()
     rows = np.concatenate(parts)
     rows = rows[np.lexsort((rows["time_us"], rows["scene"], rows["channel"]))]
     keyframes = np.full((len(samples), len(wanted)), -1)
-    keyframes[rows["sample"][rows["key"]], rows["channel"][rows["key"]]] = np.flatnonzero(rows["key"])
+    of_keys = rows[rows["key"]]
+    times = np.zeros(keyframes.shape, np.int64)
+    np.add.at(times, (of_keys["sample"], of_keys["channel"]), 1)
+    for k, channel in np.argwhere(times > 1)[:1]:
+        one = f"one keyframe of {wanted[channel]} for sample {list(samples)[k]}"
+        raise tables.error(table, one, str(times[k, channel]), "remove the others")
+    keyframes[of_keys["sample"], of_keys["channel"]] = np.flatnonzero(rows["key"])
     for k in np.flatnonzero((keyframes < 0).any(axis=1))[:1]:
         missing = ", ".join(channel for channel, row in zip(wanted, keyframes[k], strict=True) if row < 0)
         raise tables.error("sample_data", f"keyframes of {missing} for sample {list(samples)[k]}", "none")
@@ -188,13 +219,6 @@ def read_recordings(
     )
 
 
-def _as_rows(tables: Tables, kept: Sequence[tuple[Any, ...]]) -> npt.NDArray[Any]:
-    try:
-        return np.array(kept, _ROW)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise tables.error("sample_data", "timestamp, height and width as whole numbers", str(error)) from None
-
-
 def _calibrations(tables: Tables, wanted: Sequence[str]) -> tuple[dict[str, int], list[int], FloatArray, FloatArray]:
     """Number of each calibrated sensor, -1 where it is not wanted; by number the channels, sensor2ego (C, 4, 4) and K
     (C, 3, 3)."""
@@ -202,11 +226,12 @@ def _calibrations(tables: Tables, wanted: Sequence[str]) -> tuple[dict[str, int]
     calibrated: dict[str, int] = {}
     rows: list[Row] = []
     channel_of: list[int] = []
-    for row in tables.rows("calibrated_sensor"):
-        sensor = tables.follow("calibrated_sensor", row, "sensor_token", "sensor", sensors)
-        channel = tables.value("sensor", sensor, "channel")
+    every = tables.by_token("calibrated_sensor")
+    of_sensors = tables.follow("calibrated_sensor", [*every.values()], "sensor_token", "sensor", sensors)
+    for (token, row), sensor in zip(every.items(), of_sensors, strict=True):
+        channel = sensor["channel"]
         # Radars are calibrated too: known, so that their tokens are no dangling ones, but not read.
-        calibrated[tables.value("calibrated_sensor", row, "token")] = len(rows) if channel in wanted else -1
+        calibrated[token] = len(rows) if channel in wanted else -1
         if channel in wanted:
             rows.append(row)
             channel_of.append(wanted.index(channel))
@@ -220,15 +245,17 @@ def _calibrations(tables: Tables, wanted: Sequence[str]) -> tuple[dict[str, int]
 def _ego_poses(tables: Tables, wanted: Mapping[str, int]) -> FloatArray:
     """(E, 7) poses of tokens, by their numbers."""
     poses = np.full((len(wanted), 7), np.nan)
+    times = np.zeros(len(wanted), np.int64)
     for batch in tables.batches("ego_pose"):
-        rows = [row for row in batch if row.get("token") in wanted]
-        at = [wanted[row["token"]] for row in rows]
+        tokens = tables.column("ego_pose", batch, "token", TOKENS)
+        is_wanted = [token in wanted for token in tokens]
+        rows, at = [*compress(batch, is_wanted)], [wanted[token] for token in compress(tokens, is_wanted)]
+        np.add.at(times, at, 1)
         poses[at, :3] = tables.numbers("ego_pose", rows, "translation", (3,))
         poses[at, 3:] = tables.quaternions("ego_pose", rows)
-    lost = np.flatnonzero(np.isnan(poses[:, 0]))
-    if len(lost):
-        token = list(wanted)[lost[0]]
-        raise tables.error("ego_pose", f"the token {token!r} that a row of sample_data names", "none")
+    for k in np.flatnonzero(times != 1)[:1]:
+        one = f"the token {list(wanted)[k]!r} that a row of sample_data names"
+        raise tables.error("ego_pose", one, f"{times[k]} of them" if times[k] else "none")
     return poses
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import islice
+import reprlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
+import numpy.typing as npt
 
 from arbiview_aug.camera import FloatArray
 from arbiview_aug.errors import DataError, SampleTypeError
@@ -17,15 +19,68 @@ from arbiview_aug.files import inside
 
 _QUATERNION_NORM_TOLERANCE = 1e-3
 
-_BATCH = 1 << 12
-"""Rows in memory at once, 6 MB of them: the largest tables have 2.6 million."""
+_BATCH = 1 << 10
+"""Rows in memory at once, 1.5 MB of them: the largest tables have 2.6 million."""
 
 _BLOCK, _LONGEST_ROW = 1 << 20, 1 << 16
 """Characters read at once, and more than a row has: it is never cut where a block ends."""
 
+_LONGEST_TOKEN = 255
+"""Characters; nuScenes' own have 32. Files and fixed-width columns are named after tokens."""
+
+_LARGEST_WHOLE, _LARGEST = 2**53, 1e9
+"""Times beyond the first are not exact in float64; positions (m) and pixels beyond the second are no measurements."""
+
 _SPACE, _DELIMITER = re.compile(r"\s*"), re.compile(r"\s*([,\]])\s*")
 
+_short = reprlib.Repr()
+_short.maxstring = _short.maxother = 120
+
 Row = Mapping[str, Any]
+
+
+class Kind(NamedTuple):
+    """The values that a column may have.
+
+    Attributes:
+        words: They in words, to follow the column's name in errors.
+        holds: Whether all of some values are such: a column is checked at once, and row by row only where it fails.
+    """
+
+    words: str
+    holds: Callable[[list[Any]], bool]
+
+
+def _are_texts(values: list[Any]) -> bool:
+    try:
+        return b"\0" not in "".join(values).encode()
+    except (TypeError, UnicodeEncodeError):  # an unpaired surrogate
+        return False
+
+
+def _are_links(values: list[Any]) -> bool:
+    return _are_texts(values) and max(map(len, values), default=0) <= _LONGEST_TOKEN
+
+
+def _are_whole(values: list[Any]) -> bool:
+    kinds = {*map(type, values)}  # a bool is no number here
+    if kinds <= {int}:
+        return -_LARGEST_WHOLE < min(values, default=0) and max(values, default=0) < _LARGEST_WHOLE
+    # NaN and infinity are not below any number.
+    return kinds <= {int, float} and all(abs(value) < _LARGEST_WHOLE and value % 1 == 0 for value in values)
+
+
+TEXTS = Kind("as text", _are_texts)
+FILES = Kind("as text", lambda values: {*map(type, values)} <= {str})
+"""Names that no file can have are refused where the file is read or linked (``arbiview_aug.files.inside``)."""
+LINKS = Kind("as a token or an empty text", _are_links)
+TOKENS = Kind(f"as a token of 1 to {_LONGEST_TOKEN} letters", lambda values: _are_links(values) and all(values))
+FLAGS = Kind("as true or false", lambda values: {*map(type, values)} <= {bool})
+MICROSECONDS = Kind("as a whole number of microseconds", _are_whole)
+COUNTS = Kind(
+    "as a whole number from 0",
+    lambda values: _are_whole(values) and 0 <= min(values, default=0) and max(values, default=0) < 1 << 31,
+)
 
 
 class Tables:
@@ -83,65 +138,108 @@ class Tables:
         """
         if self.nusc is not None:
             rows = getattr(self.nusc, table, None)
-            if rows is None:
-                raise self.error(table, "a list of rows", "no such attribute of the NuScenes object")
-            rows = list(rows)
-            yield from (rows[k : k + _BATCH] for k in range(0, len(rows), _BATCH))
+            if not isinstance(rows, list | tuple):
+                got = "no such attribute of the NuScenes object" if rows is None else type(rows).__name__
+                raise self.error(table, "a list of rows", got)
+            for k in range(0, len(rows), _BATCH):
+                yield self._objects(table, list(rows[k : k + _BATCH]), k)
             return
-        path = self.path(table)
+        path, count = self.path(table), 0
         try:
             with path.open(encoding="utf-8") as file:
                 entries = _entries(file)
                 while batch := list(islice(entries, _BATCH)):
-                    wrong = next((row for row in batch if not isinstance(row, dict)), None)
-                    if wrong is not None:
-                        raise self.error(table, "a list of objects", f"an entry {type(wrong).__name__}")
-                    yield batch
+                    yield self._objects(table, batch, count)
+                    count += len(batch)
+        except DataError:
+            raise
         except FileNotFoundError:
             fix = "the version's metadata archive has it"
             raise self.error(table, f"the file {path}", "none", fix) from None
         except _NoListError as error:
             raise self.error(table, "a list of objects", str(error)) from None
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        except (OSError, ValueError, RecursionError) as error:  # no UTF-8, no JSON, or a number of 5,000 digits
             # Without its place: it is counted from where a block begins.
             raise self.error(table, "JSON", getattr(error, "msg", str(error)), "unpack the archive again") from None
 
+    def row(self, table: str, number: int) -> Row:
+        """One row of a table, by its place."""
+        return next(islice(chain.from_iterable(self.batches(table)), number, None))
+
     def by_token(self, table: str) -> dict[str, Row]:
-        """A table's rows by their tokens."""
-        return {self.value(table, row, "token"): row for row in self.rows(table)}
+        """A table's rows by their tokens.
 
-    def value(self, table: str, row: Row, key: str) -> Any:
-        """One field of a row."""
+        Raises:
+            DataError: Tokens that are none, or occur twice.
+        """
+        rows = self.rows(table)
+        tokens = Tokens(self, table)
+        found = dict(zip(tokens.add(rows), rows, strict=True))
+        tokens.check()
+        return found
+
+    def column(self, table: str, rows: Sequence[Row], key: str, kind: Kind, default: Any = None) -> list[Any]:
+        """The values of one column.
+
+        Args:
+            table: Its name, for errors.
+            rows: Some of its rows.
+            key: The column.
+            kind: What its values have to be.
+            default: For rows without the column, or with null in it; None where that is an error.
+
+        Raises:
+            DataError: A row whose value is another.
+        """
         try:
-            return row[key]
+            if default is None:
+                values = [row[key] for row in rows]
+            else:
+                values = [default if (value := row.get(key)) is None else value for row in rows]
+            if kind.holds(values):
+                return values
         except KeyError:
-            raise self.error(table, f"key {key!r}", f"a row with {', '.join(row)}") from None
+            pass
+        for row in rows:
+            token = _short.repr(row.get("token"))
+            if key not in row and default is None:
+                raise self.error(table, f"key {key!r}", f"a row with {', '.join(map(str, row))} (token {token})")
+            value = row.get(key, default)
+            if not kind.holds([default if value is None and default is not None else value]):
+                raise self.error(table, f"{key} {kind.words}", f"{_short.repr(value)} in row {token}")
+        raise AssertionError("a column holds what none of its values is")
 
-    def follow(self, table: str, row: Row, key: str, target: str, rows: Mapping[str, Any]) -> Any:
-        """The entry of ``rows`` (of table ``target``) that ``row[key]`` names."""
-        token = self.value(table, row, key)
-        if token not in rows:
-            raise self.error(target, f"the token {token!r} that row {row.get('token')!r} of {table} names", "none")
-        return rows[token]
+    def follow(self, table: str, rows: Sequence[Row], key: str, target: str, known: Mapping[str, Any]) -> list[Any]:
+        """The entries of ``known``, of table ``target`` by token, that a column names."""
+        tokens = self.column(table, rows, key, TOKENS)
+        found = [*map(known.get, tokens)]
+        if None in found:
+            k = found.index(None)
+            raise self.dangling(table, rows[k], key, target)
+        return found
+
+    def dangling(self, table: str, row: Row, key: str, target: str) -> DataError:
+        """An error to raise where a row names one of another table that is not there."""
+        token, of = _short.repr(row.get(key)), _short.repr(row.get("token"))
+        fix = f"correct its {key}, or unpack the archive again"
+        return self.error(target, f"the token {token} that row {of} of {table} names", "none", fix)
 
     def numbers(self, table: str, rows: Sequence[Row], key: str, shape: tuple[int, ...]) -> FloatArray:
         """(len(rows), *shape) finite numbers of one column."""
-        try:
-            array = np.array([row[key] for row in rows], dtype=np.float64).reshape(len(rows), *shape)
-            if np.isfinite(array).all():
-                return array
-        except (KeyError, TypeError, ValueError):
-            pass
-        for row in rows:
-            value = self.value(table, row, key)
+        if not rows:
+            return np.empty((0, *shape))
+        found: list[npt.NDArray[Any]] = []
+
+        def holds(values: list[Any]) -> bool:
             try:
-                sound = np.array(value, dtype=np.float64)
-                if sound.shape == shape and np.isfinite(sound).all():
-                    continue
-            except (TypeError, ValueError):
-                pass
-            raise self.error(table, f"{key} of shape {shape}, finite", f"{value!r} in row {row.get('token')!r}")
-        raise self.error(table, f"{key} of shape {shape}", "rows of different shapes")
+                found[:] = [np.array(values)]
+            except ValueError:  # of different shapes
+                return False
+            (array,) = found
+            return array.shape[1:] == shape and array.dtype.kind in "iuf" and bool((np.abs(array) < _LARGEST).all())
+
+        self.column(table, rows, key, Kind(f"of shape {shape}, below {_LARGEST:g} and finite", holds))
+        return found[0].astype(np.float64, copy=False)
 
     def poses(self, table: str, rows: Sequence[Row]) -> FloatArray:
         """(len(rows), 4, 4) from the columns ``translation`` and ``rotation``."""
@@ -163,10 +261,88 @@ class Tables:
             raise self.error(table, "unit quaternions w x y z", f"{row['rotation']} in row {row.get('token')!r}")
         return quaternions
 
-    def error(self, table: str, expected: str, got: str, fix: str = "") -> DataError:
+    def error(
+        self, table: str, expected: str, got: str, fix: str = "mend the table, or unpack the archive again"
+    ) -> DataError:
         """An error to raise that names data set, version and table."""
-        tail = f"; {fix}" if fix else ""
-        return DataError(f"nuScenes {self.root} {self.version}: table {table}: expected {expected}, got {got}{tail}")
+        return DataError(f"nuScenes {self.root} {self.version}: table {table}: expected {expected}, got {got}; {fix}")
+
+    def _objects(self, table: str, batch: list[Any], first: int) -> list[Row]:
+        if not {*map(type, batch)} <= {dict}:
+            for k, row in enumerate(batch):
+                if not isinstance(row, Mapping):
+                    raise self.error(table, "a list of objects", f"an entry {type(row).__name__}, number {first + k}")
+        return batch
+
+
+class Tokens:
+    """A column of tokens as 64-bit hashes: of millions, they take a twelfth of the texts' memory.
+
+    Different tokens have different hashes, but for one in a million tables of millions.
+
+    Args:
+        tables: The data set.
+        table: Whose.
+        key: The column.
+    """
+
+    def __init__(self, tables: Tables, table: str, key: str = "token") -> None:
+        self.tables, self.table, self.key = tables, table, key
+        self._hashes = [np.empty(0, np.int64)]
+
+    def add(self, rows: Sequence[Row], kind: Kind = TOKENS, default: str | None = None) -> list[str]:
+        """Some more rows, all in the end; gives their tokens, checked as ``Tables.column`` does."""
+        tokens = self.tables.column(self.table, rows, self.key, kind, default)
+        self._hashes.append(np.fromiter(map(hash, tokens), np.int64, len(tokens)))
+        return tokens
+
+    def check(self) -> None:
+        """Refuse what occurs twice.
+
+        Raises:
+            DataError: It does.
+        """
+        in_order = np.sort(self._all())
+        twice = in_order[1:][in_order[1:] == in_order[:-1]]
+        if len(twice):
+            token = self.tables.row(self.table, int(np.flatnonzero(self._all() == twice[0])[0]))[self.key]
+            raise self.tables.error(self.table, "each token once", f"{token!r} twice", "remove one of the rows")
+
+    def places_in(self, other: Tokens, or_empty: bool) -> npt.NDArray[np.int64]:
+        """(rows,) the row of another table that each token names, -1 for an empty token.
+
+        Args:
+            other: That table's tokens, each once.
+            or_empty: Whether there may be empty ones.
+
+        Raises:
+            DataError: One is not there.
+        """
+        wanted, there = self._all(), other._all()
+        if not len(there):
+            there = np.array([hash("")])
+        order = np.argsort(there)
+        at = order[np.minimum(np.searchsorted(there, wanted, sorter=order), len(there) - 1)]
+        at[there[at] != wanted] = -1
+        for k in np.flatnonzero((at < 0) & ~(or_empty & (wanted == hash(""))))[:1]:
+            raise self.tables.dangling(self.table, self.tables.row(self.table, int(k)), self.key, other.table)
+        return at
+
+    def _all(self) -> npt.NDArray[np.int64]:
+        self._hashes = [np.concatenate(self._hashes)]
+        return self._hashes[0]
+
+
+def on_circle(after: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Rows (c,) on circles, one for each row from which a chain does not come to an end.
+
+    Args:
+        after: (n,) the row that each one leads to, -1 for none.
+    """
+    far = np.append(after, -1)  # from -1 on to -1
+    for _ in range(len(after).bit_length()):  # 1, 2, 4, ... rows on: at last more than there are
+        far = far[far]
+    return far[:-1][far[:-1] >= 0]
 
 
 def rotation_from_quaternion(wxyz: Any) -> FloatArray:

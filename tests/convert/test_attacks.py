@@ -126,7 +126,7 @@ def test_names_of_kept_files(
     before = outside(home)
     assert main(command(source, home / "new")) == 2
     said = capsys.readouterr().err
-    assert f"table {table}: row {token!r}: filename: expected" in said and "Traceback" not in said
+    assert f"table {table}: " in said and repr(token) in said and "filename" in said and "Traceback" not in said
     assert outside(home) == before and not (home / "new").exists()
 
 
@@ -154,9 +154,9 @@ def test_readers_of_tables_refuse_names(channel: str, name: Any, made: dict[str,
                 row["filename"] = name
 
     change(source, "sample_data", edit)
-    for data in (NuScenesDataset(source), RetargetedDataset(NuScenesDataset(source), lambda sample: sample)):
+    for wrap in (lambda data: data, lambda data: RetargetedDataset(data, lambda sample: sample)):
         with pytest.raises(DataError, match="expected "):
-            next(iter(DataLoader(data, batch_size=None)))
+            next(iter(DataLoader(wrap(NuScenesDataset(source)), batch_size=None)))
 
 
 @pytest.mark.parametrize("key", ["file", "mask", "lidar"])

@@ -189,7 +189,7 @@ def test_a_mended_sample_comes_back(source: Path, output: Path, tmp_path: Path) 
     ("table", "key", "message"),
     [
         ("sample_data", "sample_token", "table sample: expected the token 'nobody' that row"),
-        ("sample_data", "sample_token", "table sample: expected the token '' that row"),
+        ("sample_data", "sample_token", "sample_data: expected sample_token as a token of 1 to 255 letters, got '' in"),
         ("sample_data", "ego_pose_token", "table ego_pose: expected the token 'nobody' that"),
         ("sample_data", "calibrated_sensor_token", "table calibrated_sensor: expected the token 'nobody' that"),
         ("sample_annotation", "visibility_token", "table visibility: expected the token 'nobody' that"),

@@ -339,7 +339,8 @@ def test_nothing_is_a_neighbour_across_a_cut(tmp_path: Path, cut: str) -> None:
 
 
 def test_tables_without_times_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(nuscenes.DataError, match="sample_data: expected timestamp, height and width as whole numbers"):
+    message = "sample_data: expected timestamp as a whole number of microseconds, got 'noon' in row"
+    with pytest.raises(nuscenes.DataError, match=message):
         NuScenesDataset(write(tmp_path, lambda data: data["sample_data"][0].update(timestamp="noon")), neighbours=EVERY)
 
 
