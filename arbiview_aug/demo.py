@@ -140,7 +140,8 @@ def _parser() -> argparse.ArgumentParser:
         "--path",
         choices=get_args(RenderPath),
         default="favs",
-        help="what completes holes: favs (default) continues them from their borders; inpaint, diffusion: see README",
+        help="what completes holes: favs (default) continues them from their borders; inpaint and diffusion are in "
+        "docs/holes.md",
     )
     parser.add_argument("--frames", type=count, default=1, metavar="N", help="how many (default: %(default)s)")
     parser.add_argument("--seed", type=seed, default=0, help="of the synthetic streets (default: %(default)s)")
