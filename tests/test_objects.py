@@ -150,7 +150,8 @@ def street() -> tuple[SyntheticDrive, Rig]:
     return SyntheticDrive(rig, num_frames=3, seed=0, lidar=False), rig
 
 
-@pytest.mark.parametrize("move", [{"z_m": 0.7}, pytest.param({"y_m": 1.0}, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("move", [{"z_m": 0.7}, {"y_m": 1.0}])
 def test_vehicles_are_truer_than_over_a_static_surface(street: tuple[SyntheticDrive, Rig], move: dict) -> None:
     drive, rig = street
     gain = []

@@ -54,6 +54,7 @@ def test_costs(drive: Path) -> None:
     assert none["ratio"] == 1 and all(cost[part][0] >= 0 for cost in (one, three) for part in ("plan", "fill", "frame"))
 
 
+@pytest.mark.slow
 def test_command(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "new" / "neighbours.json"
     arguments = ["bench", "neighbours", *QUICK, "--surface", "street", "--output", str(path)]

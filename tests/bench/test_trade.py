@@ -83,6 +83,7 @@ def test_what_nothing_keeps_to_is_said(tmp_path: Path, capsys: pytest.CaptureFix
     assert "| draft, objects, 1/1, opencv | step |" in printed
 
 
+@pytest.mark.slow
 def test_static_surfaces_are_recommended_where_cameras_only_turn(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -43,6 +43,7 @@ def test_synthetic_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert "<h2>van</h2>" in (tmp_path / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_numbers_agree_with_the_protocol(
     referee: ModuleType, nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -77,6 +78,7 @@ def test_numbers_agree_with_the_protocol(
         assert mean[f"{exposure}_points"] == pytest.approx(want["n"])
 
 
+@pytest.mark.slow
 def test_points_that_methods_may_read_do_not_score(
     nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

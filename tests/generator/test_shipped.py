@@ -39,6 +39,7 @@ def test_they_are_those_of_compact() -> None:
     assert all(p.dtype == torch.float32 for p in made.parameters())
 
 
+@pytest.mark.slow
 def test_nothing_is_imported_while_tensors_are_made_on_meta() -> None:
     """In a process where nothing was imported before: torch 2.6 cannot import ``torch._dynamo`` then."""
     code = """

@@ -61,6 +61,7 @@ def test_a_stopped_stage_goes_on_bit_for_bit(tmp_path: Path, monkeypatch: pytest
     assert len(calls) == 4 and third.autoencoder.scale == again.autoencoder.scale
 
 
+@pytest.mark.slow
 def test_it_learns_and_its_latents_have_unit_variance(tmp_path: Path) -> None:
     generator, data = fresh(), frames()
     images = torch.stack([image for k in range(3) for image in data[k].images]).float() / 255
