@@ -35,7 +35,7 @@ from arbiview_aug.surface import Surface, SurfaceName
 from arbiview_aug.transforms import RigRetarget
 from tests.helpers import ProtocolFrame, as_camera, few_or_all
 
-pytestmark = pytest.mark.timeout(900)
+pytestmark = pytest.mark.timeout(1800)
 
 FRAMES = [pytest.param("nuscenes-one", marks=pytest.mark.slow), pytest.param("ddad-one", marks=pytest.mark.release)]
 QUALITIES: tuple[Quality, ...] = ("fast", "accurate")

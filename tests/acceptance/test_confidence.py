@@ -20,7 +20,7 @@ from arbiview_aug.surface import SurfaceName
 from arbiview_aug.transforms import RigRetarget
 from tests.helpers import few_or_all
 
-pytestmark = pytest.mark.timeout(900)
+pytestmark = pytest.mark.timeout(1800)
 
 SEEDS = few_or_all(1, 5)
 SIZE = (256, 704)

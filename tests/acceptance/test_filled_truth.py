@@ -19,7 +19,7 @@ from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import RenderedViews, SceneClass, SyntheticDrive, demo_source_rig
 from tests.helpers import Standing
 
-pytestmark = pytest.mark.timeout(900)
+pytestmark = pytest.mark.timeout(1800)
 
 RIG = demo_source_rig((128, 352))
 FRAMES = range(4)

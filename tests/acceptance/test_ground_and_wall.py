@@ -20,7 +20,7 @@ from arbiview_aug.rig import Rig
 from arbiview_aug.surface import Ground, Static, Street
 from arbiview_aug.transforms import RigRetarget
 
-pytestmark = pytest.mark.timeout(900)
+pytestmark = pytest.mark.timeout(1800)
 
 SOURCE = demo_source_rig((128, 352))
 TARGETS = {

@@ -28,7 +28,7 @@ from arbiview_aug.scene import Scene
 from arbiview_aug.transforms import RigRetarget
 from tests.helpers import as_camera, few_or_all
 
-pytestmark = pytest.mark.timeout(900)
+pytestmark = pytest.mark.timeout(1800)
 
 MOVES = {"up 0.6 m": (0.0, (0.0, 0.0, 0.6)), "11° and moved": (11.0, (0.5, 0.3, 0.7)), "22°": (22.0, (0.0, 0.0, 0.0))}
 GAINS_DB = {"nuscenes-one": (8.0, 9.0, 3.0), "ddad-one": (7.0, 7.0, 3.5)}

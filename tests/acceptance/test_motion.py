@@ -81,7 +81,7 @@ def gain_db(index: int, move: str, sample: dict[str, Any], depth: MotionDepth) -
     return float(10 * np.log10(squares[1] / squares[0]))
 
 
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 @pytest.mark.filterwarnings("ignore:RigRetarget drops")
 @pytest.mark.parametrize(
     ("standing", "labels", "turned_deg", "density", "share", "least_db"),

@@ -35,7 +35,7 @@ from arbiview_aug.scene import Scene as Geometry
 from arbiview_aug.surface import Street
 from tests.helpers import few_or_all
 
-pytestmark = pytest.mark.timeout(900)
+pytestmark = pytest.mark.timeout(1800)
 
 SEEDS = few_or_all(6, 20)
 SIZE = (256, 704)

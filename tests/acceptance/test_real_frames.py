@@ -24,7 +24,7 @@ from arbiview_aug.surface import SurfaceName
 from arbiview_aug.transforms import RigRetarget
 from tests.helpers import ProtocolFrame, as_camera
 
-pytestmark = pytest.mark.timeout(900)
+pytestmark = pytest.mark.timeout(1800)
 
 FRAMES = [pytest.param("nuscenes-one", marks=pytest.mark.slow), pytest.param("ddad-one", marks=pytest.mark.release)]
 SURFACES: tuple[SurfaceName, ...] = ("auto", "ground", "far")

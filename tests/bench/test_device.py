@@ -55,7 +55,7 @@ def test_measure(sample: dict[str, Any], name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 @pytest.mark.skipif(not any(map(shutil.which, ("c++", "g++", "clang++"))), reason="no C++ compiler")
 def test_compiled(sample: dict[str, Any]) -> None:
     report = measure(sample, "street", device=torch.device("cpu"), batch=1, sizes=SIZES[:1], compiled=True, repeats=1)

@@ -193,7 +193,7 @@ def killed(commands: Sequence[Sequence[str]], after_s: float) -> int:
     return len(alive)
 
 
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize(
     ("kind", "shards"),
     [

@@ -105,7 +105,7 @@ def test_mutated_inputs(frame_folder: Path, worst: Worst) -> None:
     check(range(120), range(100), frame_folder, worst)
 
 
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("thousands", few_or_all(2, 10, "thousand"))
 def test_thousands_of_mutated_inputs(thousands: int, frame_folder: Path, worst: Worst) -> None:
     check(range(120, 120 + 550 * thousands), range(100, 100 + 450 * thousands), frame_folder, worst)

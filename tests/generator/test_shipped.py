@@ -72,7 +72,7 @@ def test_diffusion_works_out_of_the_box() -> None:
     assert made["images"].movedim(1, -1)[holes].float().std() > 5
 
 
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("streets", few_or_all(6, 24))
 def test_they_beat_inpainting_on_streets_never_seen(streets: int) -> None:
     generator = Generator.shipped()

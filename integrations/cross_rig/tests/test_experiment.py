@@ -183,7 +183,7 @@ def test_the_large_run_is_planned_on_a_machine_without_a_gpu(tmp_path):
 
 
 @pytest.mark.release
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 def test_quick_oracle_is_above_raw(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(cache, "CHUNK_FRAMES", 20)
     assert command.main(["--quick", "--output", str(tmp_path)]) == 0
