@@ -116,6 +116,7 @@ def test_a_labelled_object_is_not_read(sample: dict[str, Any], alone: dict[str, 
     assert gained < 0.4 * plain
 
 
+@pytest.mark.slow
 def test_all_fills_more_than_the_ground(sample: dict[str, Any], filled: dict[str, Any]) -> None:
     out = RigRetarget(RIG.turned(yaw_deg=3, pitch_deg=6), neighbours="all")(sample)
     ground = RigRetarget(RIG.turned(yaw_deg=3, pitch_deg=6))(sample)

@@ -116,6 +116,7 @@ def low(rig: Rig) -> Rig:
     return rig.turned(pitch_deg=-12)
 
 
+@pytest.mark.slow
 def test_folders_fill_the_road(recorded: Path) -> None:
     folder = FrameFolder(recorded, neighbours=Neighbours())
     assert [len(folder[k]["neighbours"]) for k in range(3)] == [1, 2, 1]

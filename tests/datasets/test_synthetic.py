@@ -80,6 +80,7 @@ def equal(a: dict, b: dict) -> bool:
     return all(torch.equal(a[k], b[k]) for k in ("images", "points", "boxes_3d", "box_classes"))
 
 
+@pytest.mark.slow
 def test_same_arguments_give_the_same_bits(drive):
     first = drive[3]
     drive[1]
@@ -134,6 +135,7 @@ def test_workers_return_the_same_bits(drive):
         assert equal(expected, got)
 
 
+@pytest.mark.slow
 def test_pickles_small(drive):
     drive[0]
     data = pickle.dumps(drive)

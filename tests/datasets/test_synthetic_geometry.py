@@ -89,6 +89,7 @@ def test_ground_depth_is_the_plane_intersection():
     np.testing.assert_allclose(views.depth_m[0].numpy()[ground], expected, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_depth_and_color_agree_between_two_rigs():
     a = Rig([forward_camera()])
     b = Rig([forward_camera(position_m=(2.3, 0.3, 2.1), azimuth_deg=6.0, elevation_deg=-4.0)])
@@ -114,6 +115,7 @@ def test_depth_and_color_agree_between_two_rigs():
     assert np.mean(errors) < 8  # grey levels; nearest-pixel sampling and view-dependent reflections included
 
 
+@pytest.mark.slow
 def test_a_rig_on_another_ground_height_sees_the_same_pixels():
     rig = demo_source_rig(SIZE)
     raised = Rig([c.shifted(z_m=0.7) for c in rig], ground_z_m=0.7)

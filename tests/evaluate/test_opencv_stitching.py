@@ -14,6 +14,7 @@ from arbiview_aug.rig import load_rig
 from tests.helpers import ring
 
 
+@pytest.mark.slow
 def test_cameras_at_one_centre_give_the_true_views() -> None:
     rig = ring(radius_m=0.0, size=(96, 160))  # nothing is seen from two places
     drive = SyntheticDrive(rig, num_frames=1, lidar=False)

@@ -145,7 +145,7 @@ def test_placeholders_of_rays_that_are_none_reach_no_pixel() -> None:
 
 
 @pytest.mark.parametrize(
-    "boxes", [pytest.param(None, marks=pytest.mark.slow, id="points"), pytest.param(BOXES, id="points and boxes")]
+    "boxes", [pytest.param(None, id="points"), pytest.param(BOXES, marks=pytest.mark.slow, id="points and boxes")]
 )
 def test_measured_points(boxes: FloatArray | None) -> None:
     """Every pixel is projected. On outlines rounding may decide which side a pixel shows; and where no point is near,
