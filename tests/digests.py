@@ -1,0 +1,211 @@
+"""Digests of all public outputs, bit for bit: ``python -m tests.digests [--against FILE]``.
+
+Run it before and after a change that must not change what users get. Public names alone are used, so that the same
+file runs on both sides. Without the folder of real frames (``ARBIVIEW_DATA``) only the synthetic street is digested.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import hashlib
+import io
+import json
+import os
+import sys
+import tempfile
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from arbiview_aug import CropRig, RandomRig, RefinementCache, ResizeRig, RigRetarget, load_rig, project_boxes_3d
+from arbiview_aug.__main__ import main
+from arbiview_aug.datasets import FrameFolder, Neighbours, NuScenesDataset
+from arbiview_aug.datasets.synthetic import SyntheticDrive
+
+ALL = ("source_camera", "source_frame", "confidence")
+SETTINGS: dict[str, dict[str, Any]] = {
+    "fast": {},
+    "black": {"holes": "black", "outputs": ALL},
+    "mean": {"holes": "mean"},
+    "draft": {"quality": "draft"},
+    "accurate": {"quality": "accurate", "surface": "street", "outputs": ALL},
+    "held refinement": {"quality": "accurate", "surface": "street", "refinement": RefinementCache(key=None)},
+    "paper": {"quality": "paper", "outputs": ("source_camera",)},
+    "far": {"surface": "far"},
+    "ground": {"surface": "ground"},
+    "street": {"surface": "street", "outputs": ALL},
+    "objects": {"surface": "objects", "outputs": ALL},
+    "lidar": {"surface": "lidar", "outputs": ALL},
+    "motion": {"surface": "motion", "outputs": ALL},
+    "harmonised": {"harmonise": True},
+    "torch": {"execution": "torch", "outputs": ALL},
+    "inpaint": {"path": "inpaint"},
+    "inpaint doubtful": {"path": "inpaint", "min_confidence": 0.4},
+    "diffusion": {"path": "diffusion", "steps": 1},
+    "all neighbours": {"neighbours": "all", "outputs": ALL},
+    "no neighbours": {"neighbours": None, "outputs": ALL},
+    "target frame": {"label_frame": "target"},
+    "cropped": {"size": (64, 96)},
+    "padded": {"size": (64, 96), "fit": "pad"},
+    "stretched": {"size": (64, 96), "fit": "stretch"},
+}
+
+
+def digest(value: Any) -> str:
+    """Hexadecimal digits of a nested value: tensors and arrays by bytes, everything else by its words."""
+    found = hashlib.sha256()
+    for part in _parts(value):
+        found.update(part)
+    return found.hexdigest()[:16]
+
+
+def _parts(value: Any) -> Iterator[bytes]:
+    if isinstance(value, torch.Tensor):
+        value = value.detach().cpu().contiguous().numpy()
+    if isinstance(value, np.ndarray):
+        yield f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes()
+    elif isinstance(value, Mapping):
+        for key in sorted(value):
+            if key != "neighbours":  # frames that are decoded late
+                yield str(key).encode()
+                yield from _parts(value[key])
+    elif isinstance(value, list | tuple):
+        for entry in value:
+            yield from _parts(entry)
+    elif hasattr(value, "to_dict"):
+        yield json.dumps(value.to_dict(), sort_keys=True).encode()
+    else:
+        yield repr(value).encode()
+
+
+def street() -> dict[str, Any]:
+    """A frame of a synthetic drive with LiDAR, boxes, neighbours and label maps."""
+    rig = load_rig("nuscenes").undistorted().resized((90, 160))
+    sample = SyntheticDrive(rig, num_frames=2, neighbours=Neighbours(count=1, step_m=1.2))[1]
+    sample["semantics"] = (sample["images"].sum(1) % 7).to(torch.uint8)
+    return sample
+
+
+def samples(data: Path | None) -> dict[str, dict[str, Any]]:
+    """Frames to retarget, by name."""
+    found = {"street": street()}
+    if data is not None:
+        found["nuscenes"] = NuScenesDataset(data / "nuscenes-one", reduce=4)[0]
+        found["ddad"] = FrameFolder(data / "ddad-one", reduce=4)[0]
+        found["fisheye"] = FrameFolder(data / "surround-fisheye", reduce=4)[0]
+    return found
+
+
+def outputs(sample: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    """What every setting gives, for turned, lifted, lens and drawn targets."""
+    rig = sample["rig"]
+    lifted = rig.turned(yaw_deg=11.0).with_cameras([c.shifted(z_m=0.5) for c in rig.turned(yaw_deg=11.0)])
+    pinhole = all(camera.lens == "pinhole" for camera in rig)
+    labels = ("semantics",) if "semantics" in sample else ()
+    for name, settings in SETTINGS.items():
+        if name in ("motion", "all neighbours") and not sample.get("neighbours"):
+            continue
+        if (name == "paper" and not pinhole) or (name == "objects" and "boxes_3d" not in sample):
+            continue
+        if name == "lidar" and "points" not in sample:
+            continue
+        out = RigRetarget(lifted, label_keys=labels, **settings)(sample)
+        yield name, {key: value for key, value in out.items() if key != "sources"}
+    yield "words", str(RigRetarget(lifted).explain(sample))
+    yield "waymo", RigRetarget(load_rig("waymo").resized((64, 96)), label_keys=labels)(sample)
+    lenses = load_rig("fisheye_surround").resized((64, 96))
+    yield "fisheye", RigRetarget(lenses, outputs=ALL, label_keys=labels)(sample)
+    torch.manual_seed(0)
+    drawn = RandomRig(rig, yaw_deg=10, height_m=(0, 0.5), focal_scale=0.1)
+    random = RigRetarget(drawn, size=(64, 96), p=0.5, label_keys=labels)
+    yield "random", [random(sample) for _ in range(3)]
+    if isinstance(sample["images"], torch.Tensor):
+        floats = {**sample, "images": sample["images"].float() / 255}
+        yield "float", RigRetarget(lifted, label_keys=labels)(floats)
+    small = {k: v for k, v in sample.items() if k != "neighbours"}
+    yield "resized", ResizeRig((45, 80), label_keys=labels)(small)
+    yield "windowed", CropRig(4, 8, (32, 64), label_keys=labels)(small)
+    if "boxes_3d" in sample:
+        boxes = project_boxes_3d(sample["boxes_3d"], RigRetarget(lifted, label_keys=labels)(sample))
+        yield "boxes 2D", [vars(box) if hasattr(box, "__dict__") else box for box in boxes]
+
+
+def files_of(folder: Path) -> dict[str, str]:
+    """Digests of a conversion's files; its own records name versions and times, and stay out."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and "conversion" not in path.relative_to(folder).parts:
+            found[str(path.relative_to(folder))] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found
+
+
+def commands(data: Path | None) -> Iterator[tuple[str, Any]]:
+    """What commands write: conversions by their bytes, rigs by their words."""
+    with tempfile.TemporaryDirectory() as scratch:
+        if data is not None:
+            for kind, folder in (("nuscenes", "nuscenes-one"), ("frames", "ddad-one")):
+                for holes in ("fill", "black"):
+                    output = Path(scratch, f"{kind}-{holes}")
+                    arguments = ["convert", "--data", f"{kind}:{data / folder}", "--target", "argoverse2"]
+                    arguments += ["--size", "64x96", "--reduce", "4", "--workers", "1", "--report", "0"]
+                    yield (
+                        f"convert {kind} {holes}",
+                        _quiet([*arguments, "--output", str(output), "--holes", holes]) or files_of(output),
+                    )
+    yield "inspect", _said(["inspect", "nuscenes", "waymo"])
+
+
+def _quiet(arguments: list[str]) -> int:
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        return main(arguments)
+
+
+def _said(arguments: list[str]) -> str:
+    with contextlib.redirect_stdout(io.StringIO()) as said, tempfile.TemporaryDirectory() as folder:
+        before = Path.cwd()
+        os.chdir(folder)  # pictures go here
+        try:
+            main(arguments)
+        finally:
+            os.chdir(before)
+    return said.getvalue()
+
+
+def all_digests(data: Path | None) -> dict[str, str]:
+    """Every digest by its name."""
+    found: dict[str, str] = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for frame, sample in samples(data).items():
+            found[f"{frame}: sample"] = digest(sample)
+            for name, value in outputs(sample):
+                found[f"{frame}: {name}"] = digest(value)
+        for name, value in commands(data):
+            found[name] = digest(value)
+    return found
+
+
+def report(argv: list[str] | None = None) -> int:
+    """Print the digests as JSON; with ``--against``, the names of those that differ, and exit status 1."""
+    parser = argparse.ArgumentParser(prog="python -m tests.digests", description=__doc__)
+    parser.add_argument("--against", type=Path, metavar="FILE", help="digests that an earlier run printed")
+    arguments = parser.parse_args(argv)
+    torch.set_num_threads(1)
+    data = os.environ.get("ARBIVIEW_DATA")
+    found = all_digests(Path(data) if data else None)
+    if arguments.against is None:
+        print(json.dumps(found, indent=1))
+        return 0
+    before = json.loads(arguments.against.read_text())
+    changed = [name for name in sorted(before | found) if before.get(name) != found.get(name)]
+    print("\n".join(f"differs: {name}" for name in changed) or f"{len(found)} digests, all equal")
+    return 1 if changed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(report())
