@@ -10,13 +10,16 @@ from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import ArbiviewError
 
 COMMANDS = {
-    "bench": ("arbiview_aug.bench", "measure speed, on your own data too"),
-    "convert": ("arbiview_aug.convert.command", "write a data set as another vehicle's cameras would have seen it"),
-    "demo": ("arbiview_aug.demo", "the main job on a synthetic street or on real frames, with numbers and a picture"),
-    "depth": ("arbiview_aug.depth", "depth from motion of a drive's frames, for surface='motion'"),
-    "evaluate": ("arbiview_aug.evaluate.command", "how good are the views: metrics, pictures, a report in HTML"),
-    "inspect": ("arbiview_aug.inspect", "show rigs: tables, differences, a picture"),
-    "train": ("arbiview_aug.train.__main__", "train the generator that completes what no camera saw"),
+    "bench": ("arbiview_aug.cli.bench", "measure speed, on your own data too"),
+    "convert": ("arbiview_aug.cli.convert.command", "write a data set as another vehicle's cameras would have seen it"),
+    "demo": (
+        "arbiview_aug.cli.demo",
+        "the main job on a synthetic street or on real frames, with numbers and a picture",
+    ),
+    "depth": ("arbiview_aug.cli.depth", "depth from motion of a drive's frames, for surface='motion'"),
+    "evaluate": ("arbiview_aug.cli.evaluate", "how good are the views: metrics, pictures, a report in HTML"),
+    "inspect": ("arbiview_aug.cli.rigs", "show rigs: tables, differences, a picture"),
+    "train": ("arbiview_aug.train", "train the generator that completes what no camera saw"),
 }
 """Module and one-line help of each command."""
 

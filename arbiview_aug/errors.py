@@ -1,5 +1,8 @@
 """The errors this package raises on bad input: one base class, so that a pipeline can catch them all."""
 
+import sys
+import warnings
+
 
 class ArbiviewError(Exception):
     """Base of every error raised on purpose; the message names the camera or file, what was expected, what came."""
@@ -36,3 +39,30 @@ class OutputError(ArbiviewError, RuntimeError):
 
 class TrainingError(ArbiviewError, RuntimeError):
     """A training run with impossible settings or data, or one that cannot go on."""
+
+
+class WarnOnce:
+    """Warnings that are said once for each topic."""
+
+    def __init__(self) -> None:
+        self._said: set[str] = set()
+
+    def __contains__(self, topic: str) -> bool:
+        return topic in self._said
+
+    def __call__(self, topic: str, message: str) -> None:
+        """Say it, if nothing was said on this topic before."""
+        if topic not in self._said:
+            self._said.add(topic)
+            warnings.warn(message, stacklevel=_callers_level())
+
+
+def _callers_level() -> int:
+    """``stacklevel`` of the nearest line that is neither this package's nor torch's, as seen from our caller."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _INSIDE:
+        level, frame = level + 1, frame.f_back
+    return level
+
+
+_INSIDE = (__name__.partition(".")[0], "torch", "torchvision")

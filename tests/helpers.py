@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 
 from arbiview_aug import Camera, Rig
 from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive, demo_source_rig
-from arbiview_aug.evaluate.sparse import equalised
+from arbiview_aug.evaluate.lidar import equalised
 
 
 def camera(

@@ -18,20 +18,20 @@ import yaml
 import arbiview_aug
 from arbiview_aug import RigRetarget
 from arbiview_aug.__main__ import main
-from arbiview_aug.bench import generator, neighbours, trade
-from arbiview_aug.bench.ablation import NOTES, ROWS, STEPS, markdown
-from arbiview_aug.bench.sweep import settings
-from arbiview_aug.evaluate import paper_tables
-from arbiview_aug.evaluate.frames import Frame
+from arbiview_aug.cameras.rig import shipped_rigs
+from arbiview_aug.cli.bench import generator, neighbours, trade
+from arbiview_aug.cli.bench.ablation import NOTES, ROWS, STEPS, markdown
+from arbiview_aug.cli.bench.sweep import settings
+from arbiview_aug.evaluate import paper_study
+from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.evaluate.methods import study_methods
-from arbiview_aug.evaluate.paper_tables import REAL_FRAMES, SETS, SYNTHETIC, Study, paper_report
+from arbiview_aug.evaluate.paper_study import REAL_FRAMES, SETS, SYNTHETIC, Study, paper_report
 from arbiview_aug.favs.config import Quality
-from arbiview_aug.required import HELPFUL_DATA
-from arbiview_aug.rig import shipped_rigs
-from arbiview_aug.surface import SurfaceName
-from arbiview_aug.train import command as train_command
-from tests.train.small import frames as drawn_frames
-from tests.train.test_command import SMALLER
+from arbiview_aug.generator.training import command as train_command
+from arbiview_aug.render.requirements import HELPFUL_DATA
+from arbiview_aug.scene.surface import SurfaceName
+from tests.generator.training.small import frames as drawn_frames
+from tests.generator.training.test_command import SMALLER
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted((ROOT / "docs").glob("*.md"))
@@ -124,7 +124,6 @@ def words(markdown: str) -> list[str]:
     return [part.strip() for part in markdown.split("\n\n") if part.strip() and not part.lstrip().startswith("|")]
 
 
-
 def anchors(page: Path) -> set[str]:
     """The anchors of a page's headings, as GitHub and MkDocs make them."""
     headings = re.findall(r"^#+ (.+)$", prose(page), re.MULTILINE)
@@ -184,10 +183,7 @@ def test_every_command_is_known_here() -> None:
 @pytest.mark.parametrize(
     "command",
     # These take as long as all the others together; the pictures' commands are others with a seed and a width.
-    [
-        pytest.param(c, marks=pytest.mark.slow) if c.startswith(SLOW) or "docs/images" in c else c
-        for c in sorted(TINY)
-    ],
+    [pytest.param(c, marks=pytest.mark.slow) if c.startswith(SLOW) or "docs/images" in c else c for c in sorted(TINY)],
 )
 def test_the_commands_run(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
@@ -197,7 +193,7 @@ def test_the_commands_run(
         arguments[arguments.index("FOLDER")] = str(request.getfixturevalue("nuscenes_root"))
     if "--paper" in arguments:  # whole, it takes long
         monkeypatch.delenv("ARBIVIEW_DATA", raising=False)
-        monkeypatch.setattr(paper_tables, "SETS", ("truck",))
+        monkeypatch.setattr(paper_study, "SETS", ("truck",))
     monkeypatch.setattr(trade, "MOVES", ("truck",))
     monkeypatch.setattr(train_command, "open_frames", lambda *_, **__: drawn_frames())  # streets take seconds
     monkeypatch.chdir(tmp_path)
@@ -212,7 +208,7 @@ def test_the_ablation_is_the_commands() -> None:
     """``bench ablation --data nuscenes-one ddad-one``: headings and steps, all that frames without boxes can tell."""
     move = {"psnr_db": 1.0, "gain_db": 1.0, "gain_db_per_ms": 1.0}
     figures = {"turned": move, "raised": move, "ms": 1.0, "added_ms": {"median_ms": 1.0}}
-    steps = {name: figures for name, step in STEPS.items() if ROWS[step.row].fits(Frame({}))}
+    steps = {name: figures for name, step in STEPS.items() if ROWS[step.row].fits(ScoredFrame({}))}
     of = {"steps": steps, "overlap": [{}, {}]}
     (printed,) = tables(markdown({"data": dict.fromkeys(REAL_FRAMES, of)}))
     (shown,) = tables(measured("ablation"))

@@ -1,11 +1,11 @@
 """Readers that give samples in this package's format, and wrappers that retarget any dataset's."""
 
+from arbiview_aug.datasets.drive import LazyFrame, Neighbours
 from arbiview_aug.datasets.frame_folder import FrameFolder
-from arbiview_aug.datasets.images import decode_images, reduced_camera, reduced_rig
+from arbiview_aug.datasets.image_io import decode_images, reduced_camera, reduced_rig
 from arbiview_aug.datasets.motion_depth import WithMotionDepth
-from arbiview_aug.datasets.nuscenes import NuScenesDataset
-from arbiview_aug.datasets.opening import open_data
-from arbiview_aug.datasets.sequence import LazyFrame, Neighbours
+from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
+from arbiview_aug.datasets.registry import open_data
 from arbiview_aug.datasets.wrappers import MixedDataset, RetargetedDataset, RetargetedIterable
 
 __all__ = [

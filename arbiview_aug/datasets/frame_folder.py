@@ -15,14 +15,14 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
-from arbiview_aug.camera import BoolArray, Camera
-from arbiview_aug.datasets.images import Reduce, check_reduce, decode_images, reduced_rig
-from arbiview_aug.datasets.sequence import Drive, LazyFrame, Neighbours, Unreadable, check_neighbours, parts_of_clock
-from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError
-from arbiview_aug.files import BROKEN_ARRAY, inside
-from arbiview_aug.keys import hint, misnamed
-from arbiview_aug.rig import Rig, read_mask
-from arbiview_aug.stitching import WarnOnce
+from arbiview_aug.atomic_io import BROKEN_ARRAY, inside
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.key_names import hint, misnamed
+from arbiview_aug.cameras.lens import BoolArray
+from arbiview_aug.cameras.rig import Rig, read_mask
+from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, Unreadable, check_neighbours, parts_of_clock
+from arbiview_aug.datasets.image_io import Reduce, check_reduce, decode_images, reduced_rig
+from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, WarnOnce
 
 CALIBRATION_FILE = "calib.json"
 SEQUENCE_FILE = "sequence.json"

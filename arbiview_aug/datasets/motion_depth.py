@@ -10,14 +10,14 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
-from arbiview_aug.datasets.sequence import Neighbours
-from arbiview_aug.dense import Layer
+from arbiview_aug.atomic_io import BROKEN_ARRAY, file_name, inside, whole_file
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets.drive import Neighbours
 from arbiview_aug.errors import DataError, SampleError
-from arbiview_aug.files import BROKEN_ARRAY, file_name, inside, whole_file
-from arbiview_aug.motion.depth import BEST_TRAVEL_M, MotionDepth
-from arbiview_aug.motion.sweep import reduced_camera
-from arbiview_aug.rig import Rig
-from arbiview_aug.sample import MOTION_KEY
+from arbiview_aug.render.pixel_projection import Layer
+from arbiview_aug.sample.inputs import MOTION_KEY
+from arbiview_aug.scene.depth_maps import motion_camera
+from arbiview_aug.temporal.motion_depth import BEST_TRAVEL_M, MotionDepth
 
 FOLDER = "motion_depth"
 """Name beside a data set."""
@@ -148,12 +148,12 @@ class WithMotionDepth(Dataset[dict[str, Any]]):
 
 
 def _calibration(rig: Rig) -> dict[str, Any]:
-    small = [reduced_camera(camera) for camera in rig]
+    small = [motion_camera(camera) for camera in rig]
     return {"K": np.stack([camera.K for camera in small]), "cam2ego": np.stack([camera.cam2ego for camera in small])}
 
 
 def _same(held: Mapping[str, Any], rig: Rig, depth: tuple[Layer, ...]) -> bool:
-    small, now = [reduced_camera(camera) for camera in rig], _calibration(rig)
+    small, now = [motion_camera(camera) for camera in rig], _calibration(rig)
     return (
         [one.shape for one in depth] == [camera.size for camera in small]
         and np.allclose(held["K"], now["K"], rtol=0, atol=_SAME_PX)

@@ -9,7 +9,7 @@ import torch
 from torch.utils.data import Dataset, IterableDataset
 
 from arbiview_aug.errors import DataError, SampleTypeError
-from arbiview_aug.transform_settings import is_number
+from arbiview_aug.transforms.settings import is_number
 
 Retarget = Callable[[Any], Any]
 

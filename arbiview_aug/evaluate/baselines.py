@@ -11,21 +11,21 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
-from arbiview_aug.camera import FloatArray
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
-from arbiview_aug.evaluate.images import Image, View, as_arrays, as_tensors, to_bytes
-from arbiview_aug.favs.synthesis import render_opencv
-from arbiview_aug.plan import build_plan
-from arbiview_aug.rig import Rig
+from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors, to_bytes
+from arbiview_aug.render.opencv_backend import render_opencv
+from arbiview_aug.render.plan import build_plan
 
-Renderer = Callable[[Rig, Sequence[Image], Rig], list[View]]
+Renderer = Callable[[Rig, Sequence[Image], Rig], list[RenderedView]]
 """Source rig, its images, target rig: one view for each target camera."""
 
 SPLIT_DEPTH_M = 50.0
 """Depth of everything above the horizon row in ``row_split``: UniDrive's value."""
 
 
-def own_camera(source: Rig, images: Sequence[Image], target: Rig) -> list[View]:
+def own_camera(source: Rig, images: Sequence[Image], target: Rig) -> list[RenderedView]:
     """Each target camera sees one source camera, of its own name or else looking most nearly its way: far surface.
 
     This is "Geometric" of the paper's Table 2: projection by H = K' R' Rᵀ K⁻¹, without fusion.
@@ -38,11 +38,11 @@ def own_camera(source: Rig, images: Sequence[Image], target: Rig) -> list[View]:
         alone = source.with_cameras([source[index]])
         plan = build_plan(alone, target.with_cameras([camera]), surface="far")
         (view,) = as_arrays(render_opencv(plan, as_tensors([images[index]])))
-        views.append(View(view, plan.coverage[0]))
+        views.append(RenderedView(view, plan.coverage[0]))
     return views
 
 
-def crop_and_slide(source: Rig, images: Sequence[Image], target: Rig) -> list[View]:
+def crop_and_slide(source: Rig, images: Sequence[Image], target: Rig) -> list[RenderedView]:
     """DriveSuprim's augmentation by rotation: a window slid over the side-cropped images in ring order.
 
     Each image is cropped to the columns half-way to its neighbours' azimuths, at a constant number of pixels a degree;
@@ -70,7 +70,7 @@ def crop_and_slide(source: Rig, images: Sequence[Image], target: Rig) -> list[Vi
         centre_px.append(x + left * per_degree)
         x += wide
     panorama = np.concatenate(strips, axis=1)
-    views: list[View] = []
+    views: list[RenderedView] = []
     for camera in target:
         # The window's centre: the nearest strip's, moved by the turn from it.
         turn = (azimuth - camera.azimuth_deg + 180) % 360 - 180
@@ -79,11 +79,13 @@ def crop_and_slide(source: Rig, images: Sequence[Image], target: Rig) -> list[Vi
         half = per_degree * camera.fov_deg[0] / 2
         columns = np.arange(round(middle - half), round(middle + half)) % panorama.shape[1]
         h, w = camera.size
-        views.append(View(np.asarray(cv2.resize(panorama[:, columns], (w, h)), np.uint8), np.ones((h, w), bool)))
+        views.append(
+            RenderedView(np.asarray(cv2.resize(panorama[:, columns], (w, h)), np.uint8), np.ones((h, w), bool))
+        )
     return views
 
 
-def row_split(source: Rig, images: Sequence[Image], target: Rig) -> list[View]:
+def row_split(source: Rig, images: Sequence[Image], target: Rig) -> list[RenderedView]:
     """UniDrive's projection: below the camera's horizon row the road's plane, above it a plane 50 m ahead.
 
     Nearest neighbour; where several sources see a pixel, the last one in the rig's order wins.
@@ -93,7 +95,7 @@ def row_split(source: Rig, images: Sequence[Image], target: Rig) -> list[View]:
     """
     if any(camera.lens != "pinhole" for camera in (*source, *target)):
         raise SampleError("row_split: expected pinhole cameras; use Rig.undistorted()")
-    views: list[View] = []
+    views: list[RenderedView] = []
     for camera in target:
         points = _split_points(camera.K, camera.cam2ego, camera.size, source.ground_z_m).reshape(-1, 3)
         view, seen = np.zeros((len(points), 3), np.float32), np.zeros(len(points), bool)
@@ -108,7 +110,7 @@ def row_split(source: Rig, images: Sequence[Image], target: Rig) -> list[View]:
                 index, column, row = index[free], column[free], row[free]
             view[index] = np.asarray(image)[row, column]
             seen[index] = True
-        views.append(View(view.reshape(*camera.size, 3), seen.reshape(camera.size)))
+        views.append(RenderedView(view.reshape(*camera.size, 3), seen.reshape(camera.size)))
     return views
 
 

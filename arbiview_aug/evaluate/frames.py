@@ -18,14 +18,14 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from arbiview_aug.camera import BoolArray
+from arbiview_aug.cameras.lens import BoolArray
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import GROUND_CLASSES, RenderedViews, SceneClass
-from arbiview_aug.evaluate.images import Image, View, as_arrays, as_tensors
-from arbiview_aug.evaluate.sparse import ColouredPoints, coloured_points, equalised, lidar_split, sparse_metrics
-from arbiview_aug.evaluate.truth import truth_metrics
-from arbiview_aug.rig import Rig
+from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors
+from arbiview_aug.evaluate.lidar import ColouredPoints, coloured_points, equalised, lidar_split, sparse_metrics
+from arbiview_aug.evaluate.metrics import truth_metrics
 
-Render = Callable[[Mapping[str, Any], Rig], list[View]]
+Render = Callable[[Mapping[str, Any], Rig], list[RenderedView]]
 """Sample and target rig in, one view for each target camera out."""
 
 
@@ -45,7 +45,7 @@ class LidarReference(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Frame:
+class ScoredFrame:
     """What a method gets, and what scores it.
 
     Attributes:
@@ -72,7 +72,7 @@ def make_frame(
     truth: Callable[[Rig], RenderedViews] | None = None,
     exposures: Sequence[Exposure] = EXPOSURES,
     hand_over_points: bool = False,
-) -> Frame:
+) -> ScoredFrame:
     """Split a sample into what methods get and what scores them.
 
     Args:
@@ -85,9 +85,9 @@ def make_frame(
     truth = None if truth is None else lru_cache(_HELD_TRUTHS)(truth)
     given = {key: value for key, value in sample.items() if key != "points"}
     if "points" not in sample:
-        return Frame(given, truth=truth)
+        return ScoredFrame(given, truth=truth)
     if not exposures:
-        return Frame({**given, "points": sample["points"]} if hand_over_points else given, truth=truth)
+        return ScoredFrame({**given, "points": sample["points"]} if hand_over_points else given, truth=truth)
     rig, images = sample["rig"], as_arrays(sample["images"])
     cloud = sample["points"].numpy().astype(np.float64)
     if hand_over_points:
@@ -99,12 +99,12 @@ def make_frame(
         if hand_over_points:
             points = points.subset(lidar_split(points.points)[1])
         lidar[exposure] = LidarReference({**given, "images": as_tensors(exposed)}, points)
-    return Frame(given, lidar, hand_over_points, truth)
+    return ScoredFrame(given, lidar, hand_over_points, truth)
 
 
 def scores(
-    frame: Frame, render: Render, target: Rig, exposures: Sequence[Exposure] = EXPOSURES
-) -> tuple[list[View], list[dict[str, float]]]:
+    frame: ScoredFrame, render: Render, target: Rig, exposures: Sequence[Exposure] = EXPOSURES
+) -> tuple[list[RenderedView], list[dict[str, float]]]:
     """A method's views of a frame, and their metrics: one row for each target camera.
 
     Args:
@@ -136,7 +136,7 @@ def regions(classes: npt.NDArray[np.uint8]) -> dict[str, BoolArray]:
     return {"ground": ground, "sky": sky, "object": ~ground & ~sky & (classes != SceneClass.VOID)}
 
 
-def _add_truth(rows: list[dict[str, float]], views: list[View], truth: RenderedViews) -> None:
+def _add_truth(rows: list[dict[str, float]], views: list[RenderedView], truth: RenderedViews) -> None:
     images, classes = as_arrays(truth.images), [of.numpy() for of in truth.classes]
     for row, view, true, of in zip(rows, views, images, classes, strict=True):
         found = truth_metrics(
@@ -146,7 +146,7 @@ def _add_truth(rows: list[dict[str, float]], views: list[View], truth: RenderedV
 
 
 def _add_sparse(
-    rows: list[dict[str, float]], views: list[View], mounted: Rig, points: ColouredPoints, prefix: str
+    rows: list[dict[str, float]], views: list[RenderedView], mounted: Rig, points: ColouredPoints, prefix: str
 ) -> None:
     for row, camera, view in zip(rows, mounted, views, strict=True):
         score = sparse_metrics(view.image, camera, points, coverage=view.coverage)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from arbiview_aug.camera import BoolArray
+from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.errors import SampleError
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ Image = npt.NDArray[np.uint8] | npt.NDArray[np.floating[Any]]
 """(h, w, 3) RGB on the scale 0-255: uint8, or float where a renderer kept fractions."""
 
 
-class View(NamedTuple):
+class RenderedView(NamedTuple):
     """A rendered view.
 
     Attributes:

@@ -13,19 +13,19 @@ from typing import Any
 
 import torch
 
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.evaluate.baselines import BASELINES, Renderer
-from arbiview_aug.evaluate.images import Image, View, as_arrays
+from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config, paper
-from arbiview_aug.favs.overlap_depth import OverlapDepth, overlap_depth
-from arbiview_aug.favs.photometric import Harmonise, Harmoniser
-from arbiview_aug.favs.refinement import RefinementCache
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.model import has_shipped
-from arbiview_aug.rig import Rig
-from arbiview_aug.sample import check_inputs, scenes_of_frames
-from arbiview_aug.surface import SurfaceName
-from arbiview_aug.transform_settings import RenderPath
-from arbiview_aug.transforms import RigRetarget
+from arbiview_aug.generator.generator import has_shipped
+from arbiview_aug.render.harmonise import Harmonise, Harmoniser
+from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
+from arbiview_aug.render.refinement import RefinementCache
+from arbiview_aug.sample.inputs import read_frames, read_scenes
+from arbiview_aug.scene.surface import SurfaceName
+from arbiview_aug.transforms.rig_retarget import RigRetarget
+from arbiview_aug.transforms.settings import RenderPath
 
 Sample = Mapping[str, Any]
 
@@ -54,11 +54,11 @@ class Method:
     """
 
     name: str
-    render: Callable[[Sample, Rig], list[View]]
+    render: Callable[[Sample, Rig], list[RenderedView]]
     reads_points: bool = False
-    render_alone: Callable[[Sample, int, Rig], View] | None = None
+    render_alone: Callable[[Sample, int, Rig], RenderedView] | None = None
 
-    def alone(self, sample: Sample, camera: int, target: Rig) -> View:
+    def alone(self, sample: Sample, camera: int, target: Rig) -> RenderedView:
         """A one-camera target from one source camera alone."""
         if self.render_alone is not None:
             return self.render_alone(sample, camera, target)
@@ -113,10 +113,10 @@ def retargeting(
             holes="fill" if completes else "black",
         )
 
-    def render(sample: Sample, target: Rig) -> list[View]:
+    def render(sample: Sample, target: Rig) -> list[RenderedView]:
         return views_of(transform(target)(sample))
 
-    def render_alone(sample: Sample, camera: int, target: Rig) -> View:
+    def render_alone(sample: Sample, camera: int, target: Rig) -> RenderedView:
         """With the depth and the gain that all cameras' overlaps gave, as if they had been found before."""
         given, (depth, gains) = one_camera(sample, camera), overlaps.get(sample)
         held = None
@@ -168,7 +168,7 @@ class _LastOverlaps:
     def _depth(self, sample: Sample, rig: Rig, images: list[torch.Tensor]) -> OverlapDepth | None:
         if self._surface is None:
             return None
-        (scene,) = scenes_of_frames(sample, check_inputs(sample, None), (), self._surface)
+        (scene,) = read_scenes(sample, read_frames(sample, None), (), self._surface)
         surface = scene.best if self._surface == "auto" else self._surface
         return overlap_depth(rig, images, scene.boxes if surface == "objects" else None)  # as ``Stitcher`` measures it
 
@@ -180,19 +180,19 @@ def one_camera(sample: Sample, camera: int) -> dict[str, Any]:
     return {**given, "images": [sample["images"][camera]], "rig": rig.with_cameras([rig[camera]])}
 
 
-def views_of(out: Sample) -> list[View]:
+def views_of(out: Sample) -> list[RenderedView]:
     """A retargeted sample's views."""
     images, coverage = as_arrays(out["images"]), [mask.cpu().numpy() for mask in out["coverage"]]
     confidence = [c.float().cpu().numpy() for c in out["confidence"]] if "confidence" in out else [None] * len(images)
     generated = [g.cpu().numpy() for g in out["generated"]] if "generated" in out else [None] * len(images)
-    return [View(*parts) for parts in zip(images, coverage, confidence, generated, strict=True)]
+    return [RenderedView(*parts) for parts in zip(images, coverage, confidence, generated, strict=True)]
 
 
 def baseline(name: str) -> Method:
     """One of ``baselines.BASELINES``."""
     renderer: Renderer = BASELINES[name]
 
-    def render(sample: Sample, target: Rig) -> list[View]:
+    def render(sample: Sample, target: Rig) -> list[RenderedView]:
         rig: Rig = sample["rig"]
         images: list[Image] = as_arrays(sample["images"])
         return renderer(rig, images, target.in_frame_of(rig))

@@ -14,17 +14,17 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from arbiview_aug.camera import FloatArray
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
-from arbiview_aug.evaluate.images import Image, View, to_bytes
-from arbiview_aug.rig import Rig
+from arbiview_aug.evaluate.images import Image, RenderedView, to_bytes
 
 # The panorama's axes, seen from the ego frame: x right, y down, z forward.
 _EGO2PANORAMA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 _SEAM_SCALE = 0.25  # seams are found on smaller images, as in the example
 
 
-def opencv_stitching(source: Rig, images: Sequence[Image], target: Rig) -> list[View]:
+def opencv_stitching(source: Rig, images: Sequence[Image], target: Rig) -> list[RenderedView]:
     """One view for each target camera.
 
     Args:
@@ -50,7 +50,7 @@ def opencv_stitching(source: Rig, images: Sequence[Image], target: Rig) -> list[
         at[..., 0] %= np.float32(around_px)
         view = cv2.remap(panorama, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
         seen = cv2.remap(covered, at[..., 0], at[..., 1], cv2.INTER_NEAREST) > 0
-        views.append(View(np.asarray(view * seen[..., None], np.uint8), seen))
+        views.append(RenderedView(np.asarray(view * seen[..., None], np.uint8), seen))
     return views
 
 

@@ -6,14 +6,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import CalibrationError, SampleError
-from arbiview_aug.evaluate.consistency import source_overlap, summary, target_consistency
-from arbiview_aug.evaluate.frames import Frame, scores
-from arbiview_aug.evaluate.images import View
+from arbiview_aug.evaluate.agreement import OverlapScore, source_overlap, summary, target_consistency
+from arbiview_aug.evaluate.frames import ScoredFrame, scores
+from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import Method
-from arbiview_aug.evaluate.overlap import OverlapScore
-from arbiview_aug.evaluate.scores import mean_of
-from arbiview_aug.rig import Rig
+from arbiview_aug.evaluate.metrics import mean_of
 
 
 @dataclass
@@ -32,9 +31,9 @@ class Evaluation:
 
     views: list[dict[str, Any]] = field(default_factory=list)
     pairs: list[dict[str, Any]] = field(default_factory=list)
-    pictures: dict[tuple[str, str], list[View]] = field(default_factory=dict)
+    pictures: dict[tuple[str, str], list[RenderedView]] = field(default_factory=dict)
     targets: dict[str, Rig] = field(default_factory=dict)
-    first: Frame | None = None
+    first: ScoredFrame | None = None
     declined: dict[str, str] = field(default_factory=dict)
 
     def means(self, method: str, target: str | None = None) -> dict[str, float]:
@@ -53,7 +52,7 @@ class Evaluation:
 
 
 def evaluate(
-    frames: Iterable[tuple[str, Frame]],
+    frames: Iterable[tuple[str, ScoredFrame]],
     targets: Callable[[Rig], Mapping[str, Rig]],
     methods: Sequence[Method],
     tick: Callable[[str, int], None] = lambda _, __: None,
@@ -83,7 +82,7 @@ def evaluate(
 def _one(
     done: Evaluation,
     name: str,
-    frame: Frame,
+    frame: ScoredFrame,
     rigs: Mapping[str, Rig],
     method: Method,
     steps: int,

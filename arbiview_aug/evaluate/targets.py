@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from arbiview_aug.camera import FloatArray
-from arbiview_aug.datasets.nuscenes import CAMERA_RING
-from arbiview_aug.rig import Rig, load_rig
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.datasets.nuscenes.reader import CAMERA_RING
 
 PAPER_SHARES = (0.2, -0.2, 0.4, -0.4, 0.5, -0.25)
 """The paper's configurations: each camera yawed by this share of the azimuth spacing to its neighbour.

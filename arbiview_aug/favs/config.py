@@ -16,7 +16,7 @@ class FavsConfig:
 
     interpolation: Literal["nearest", "linear", "cubic"] = "cubic"
     """Sampling of the sources. ``cubic`` is so only where a target camera magnifies what it reads at its own centre
-    (``arbiview_aug.target_plan.MAGNIFIED``)."""
+    (``arbiview_aug.render.view_planner.MAGNIFIED``)."""
 
     antialias: bool = True
     """Read from a source halved until the target no longer minifies it by two or more: 47 against 42 dB at 256x704."""
@@ -244,8 +244,8 @@ def fast() -> FavsConfig:
 
 
 def accurate() -> FavsConfig:
-    """``fast`` and depth from overlap (``arbiview_aug.favs.overlap_depth``): slower, as every frame has geometry of its
-    own, unless refinements are reused."""
+    """``fast`` and depth from overlap (``arbiview_aug.render.overlap_depth``): slower, as every frame has geometry of
+    its own, unless refinements are reused."""
     return FavsConfig(overlap_depth=True)
 
 

@@ -24,7 +24,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from arbiview_aug.generator.correspondence import MASKED, TAPS, Window, steps
+from arbiview_aug.generator.correspondence import MASKED, TAPS, TokenWindow, steps
 
 HEAD_WIDTH = 32
 
@@ -143,7 +143,7 @@ class CrossViewAttention(nn.Module):
         tokens: torch.Tensor,
         keys: torch.Tensor,
         values: torch.Tensor,
-        at: Window,
+        at: TokenWindow,
         *,
         dense: bool | None = None,
         with_rows: bool = False,
@@ -179,7 +179,9 @@ class CrossViewAttention(nn.Module):
         return tokens, torch.softmax(logits.float(), -1).mean(1) if with_rows else None
 
     # --- the two ways to read -----------------------------------------------------------------------------------------
-    def _gathered(self, logits: torch.Tensor, values: torch.Tensor, weight: torch.Tensor, at: Window) -> torch.Tensor:
+    def _gathered(
+        self, logits: torch.Tensor, values: torch.Tensor, weight: torch.Tensor, at: TokenWindow
+    ) -> torch.Tensor:
         """The reference: Σ_taps softmax(logits) v of each valid place, gathered; (B, Q, T, width)."""
         share = torch.softmax(logits.float(), -1) * weight.reshape(-1, self.heads)[at.place][..., None]
         read = self._taken(values, at.tap)  # [E, 9, heads, 32]
@@ -189,7 +191,7 @@ class CrossViewAttention(nn.Module):
         return values.new_zeros(B * Q * T, values.shape[-1]).index_add(0, at.token, of_place).view(B, Q, T, -1)
 
     def _dense(
-        self, queries: torch.Tensor, keys: torch.Tensor, values: torch.Tensor, weight: torch.Tensor, at: Window
+        self, queries: torch.Tensor, keys: torch.Tensor, values: torch.Tensor, weight: torch.Tensor, at: TokenWindow
     ) -> torch.Tensor:
         """All tokens of a neighbour with all but the window masked: one fused attention call, wider by the encoding."""
         B, Q, J, L, T = at.valid.shape
@@ -215,7 +217,7 @@ class CrossViewAttention(nn.Module):
         share = weight.permute(0, 1, 2, 5, 3, 4)[..., None].to(attended.dtype)
         return (attended * share).sum((2, 4)).transpose(2, 3).flatten(3)
 
-    def _logits(self, queries: torch.Tensor, keys: torch.Tensor, at: Window, taps: slice) -> torch.Tensor:
+    def _logits(self, queries: torch.Tensor, keys: torch.Tensor, at: TokenWindow, taps: slice) -> torch.Tensor:
         """(E, heads, taps) q·(k + PE(Δp)) / √32, those outside view j at ``MASKED``."""
         q = queries.reshape(-1, self.heads, HEAD_WIDTH).index_select(0, at.token)
         read = self._taken(keys, at.tap[:, taps])  # [E, taps, heads, 32]
@@ -224,7 +226,7 @@ class CrossViewAttention(nn.Module):
         logits = logits + self.positions.turned(q, at.fraction) @ places.T  # q·PE(Δp)
         return (logits / math.sqrt(HEAD_WIDTH)).masked_fill(~at.inside[:, None, taps], MASKED)
 
-    def _weights(self, nearest: torch.Tensor, at: Window) -> torch.Tensor:
+    def _weights(self, nearest: torch.Tensor, at: TokenWindow) -> torch.Tensor:
         """(B, Q, J, L, T, heads) float32 weight of each pair and level, sum 1; 0 where not valid.
 
         Args:
@@ -248,6 +250,6 @@ class CrossViewAttention(nn.Module):
         return rows.view(*tap.shape, self.heads, HEAD_WIDTH)
 
 
-def pays_dense(at: Window) -> bool:
+def pays_dense(at: TokenWindow) -> bool:
     """Whether dense attention is expected to be the faster way to read: see ``DENSE_TOKENS``."""
     return at.valid.shape[-1] <= DENSE_TOKENS and len(at.place) > DENSE_SHARE * at.valid.numel()

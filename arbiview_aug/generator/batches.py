@@ -5,18 +5,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.generator.completion import complete, inpainted
-from arbiview_aug.rig import Rig
-from arbiview_aug.sample import SourceFrame, check_inputs, names_of_frames
-from arbiview_aug.tensors import gathered, leading_shape, rewrapped, split, stacked
-
-if TYPE_CHECKING:
-    from arbiview_aug.generator.model import Generator
+from arbiview_aug.generator.networks import GeneratorNetworks
+from arbiview_aug.sample.batching import gathered, leading_shape, rewrapped, split, stacked
+from arbiview_aug.sample.inputs import Frame, names_of_frames, read_frames
 
 SOURCES_KEY = "sources"
 """Key of a retargeted sample that holds what it was made from, a sample itself: for completion after collating."""
@@ -37,14 +35,14 @@ class Completion:
         seed: Of the noise.
     """
 
-    generator: Generator | None = None
+    generator: GeneratorNetworks | None = None
     steps: int | None = None
     guidance: float | None = None
     min_confidence: float = 0.0
     seed: int = 0
 
 
-def complete_frame(part: dict[str, Any], target: Rig, frame: SourceFrame, name: str, how: Completion) -> None:
+def complete_frame(part: dict[str, Any], target: Rig, frame: Frame, name: str, how: Completion) -> None:
     """Complete one frame's views in place: ``images``, and ``generated`` (M, h, w) bool beside them.
 
     Made-up pixels are not covered any more: ``coverage`` False, ``confidence`` 0, ``source_camera`` and
@@ -89,7 +87,7 @@ def complete_frame(part: dict[str, Any], target: Rig, frame: SourceFrame, name: 
 
 
 def frame_names(
-    sample: Mapping[str, Any], frames: Sequence[SourceFrame], lead: tuple[int, ...], how: Completion
+    sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...], how: Completion
 ) -> list[str]:
     """What tells the noise of frames apart: their ``token``, else their images; nothing where there is no noise."""
     if how.generator is None:  # hashing six images of 1600 x 900 takes 33 ms
@@ -108,7 +106,7 @@ def _digest(images: Sequence[torch.Tensor]) -> str:
 
 @torch.no_grad()
 def complete_batch(
-    generator: Generator | None,
+    generator: GeneratorNetworks | None,
     batch: Mapping[str, Any],
     *,
     steps: int | None = None,
@@ -141,8 +139,8 @@ def complete_batch(
         raise SampleError(
             f"complete: expected {', '.join(missing)} in the batch: retarget with outputs=('sources', 'confidence')"
         )
-    sources = check_inputs(batch[SOURCES_KEY], None)
-    views = check_inputs({key: value for key, value in batch.items() if key != "coverage"}, None)
+    sources = read_frames(batch[SOURCES_KEY], None)
+    views = read_frames({key: value for key, value in batch.items() if key != "coverage"}, None)
     lead = leading_shape(batch["images"])
     if len(sources) != len(views):
         raise SampleError(f"complete: expected sources of {len(views)} frames, got {len(sources)}")
@@ -171,7 +169,9 @@ class CompletedLoader:
         settings: Of ``complete_batch``.
     """
 
-    def __init__(self, loader: Iterable[Mapping[str, Any]], generator: Generator | None, **settings: Any) -> None:
+    def __init__(
+        self, loader: Iterable[Mapping[str, Any]], generator: GeneratorNetworks | None, **settings: Any
+    ) -> None:
         self.loader, self.generator, self.settings = loader, generator, settings
 
     def __iter__(self) -> Iterator[dict[str, Any]]:

@@ -14,9 +14,9 @@ from typing import Any
 
 import torch
 
+from arbiview_aug.atomic_io import checksum
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError
-from arbiview_aug.files import checksum
 
 FORMAT = 1
 CONFIG_FILE = "config.json"

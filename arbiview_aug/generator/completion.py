@@ -8,25 +8,24 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch.nn import functional
 
-from arbiview_aug.camera import Camera
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import GeneratorError, SampleError
 from arbiview_aug.generator.conditioning import Views
 from arbiview_aug.generator.config import GeneratorConfig
-from arbiview_aug.generator.correspondence import Window
+from arbiview_aug.generator.correspondence import TokenWindow
 from arbiview_aug.generator.denoiser import REGRESSION
 from arbiview_aug.generator.geometry import FrameGeometry, frame_geometry
+from arbiview_aug.generator.inpainting import telea
+from arbiview_aug.generator.networks import GeneratorNetworks
 from arbiview_aug.generator.sampler import Solver, guided, noise_schedule, sample
-from arbiview_aug.inpainting import telea
-from arbiview_aug.rig import Rig
-from arbiview_aug.tensors import resized, stacked
-
-if TYPE_CHECKING:
-    from arbiview_aug.generator.model import Generator
+from arbiview_aug.image_ops import resized
+from arbiview_aug.sample.batching import stacked
 
 ALMOST_WHOLE = 0.995
 """Views with this share of known pixels need no denoiser: what is left is a seam, which inpainting fills as well."""
@@ -60,7 +59,7 @@ class Sampling(NamedTuple):
 
 @torch.no_grad()
 def complete(
-    generator: Generator,
+    generator: GeneratorNetworks,
     views: torch.Tensor | Sequence[torch.Tensor],
     coverage: torch.Tensor | Sequence[torch.Tensor],
     targets: Rig,
@@ -181,7 +180,7 @@ def _holes(known: Sequence[torch.Tensor], targets: Rig) -> list[torch.Tensor]:
 
 
 def _denoised(
-    generator: Generator,
+    generator: GeneratorNetworks,
     targets: Sequence[Camera],
     prefilled: torch.Tensor,
     known: torch.Tensor,
@@ -214,7 +213,7 @@ def _denoised(
 
 
 def denoised(
-    generator: Generator,
+    generator: GeneratorNetworks,
     geometry: FrameGeometry,
     prefilled: torch.Tensor,
     known: torch.Tensor,
@@ -247,7 +246,7 @@ def denoised(
     unconditional = (views.dropped(everything), geometry.target_windows(everything)) if is_guided else None
 
     def predict(x: torch.Tensor, t: int) -> torch.Tensor:
-        def run(views: Views, windows: Sequence[Window]) -> torch.Tensor:
+        def run(views: Views, windows: Sequence[TokenWindow]) -> torch.Tensor:
             generator.calls += 1
             return denoiser(x, torch.full((len(x),), t, device=x.device), views, windows, read).float()
 
@@ -333,7 +332,7 @@ def _seen(camera: Camera, size: tuple[int, int]) -> torch.Tensor:
     return torch.ones(size) if mask is None else torch.tensor(mask, dtype=torch.float32)
 
 
-def _noise(generator: Generator, seed: int, frame: str | int, camera: str) -> torch.Tensor:
+def _noise(generator: GeneratorNetworks, seed: int, frame: str | int, camera: str) -> torch.Tensor:
     """(C, h, w) standard normal of a (frame, camera), drawn on the CPU: the same on every device."""
     digest = hashlib.sha256(repr((seed, str(frame), camera)).encode()).digest()
     rng = torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1)

@@ -22,7 +22,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from arbiview_aug.camera import Camera, FloatArray
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import FloatArray
 
 RAY_CHANNELS = 6
 POSE_WIDTH = 16

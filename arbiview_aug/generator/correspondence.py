@@ -22,8 +22,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from arbiview_aug.camera import BoolArray, Camera, FloatArray, Rays
-from arbiview_aug.required import SAME_CENTER_M
+from arbiview_aug.cameras.camera import Camera, Rays
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.render.requirements import SAME_CENTER_M
 
 FACING_M = 10.0
 """Distance of the plane that faces the camera. With 36 tokens of focal length (28 x 50 latents of a 70° camera) and a
@@ -208,7 +209,7 @@ MASKED = -1e4
 """The logit of what must not be read: finite in every type, so that a row with nothing to read stays finite."""
 
 
-class Window(NamedTuple):
+class TokenWindow(NamedTuple):
     """What the attention reads on one token grid of T = h w tokens: 3 x 3 integer taps around each valid p_j^(l).
 
     A rig's views overlap by a fifth to a third, so the E valid places (a token, a neighbour, a level) are listed.
@@ -260,7 +261,7 @@ class Window(NamedTuple):
         return weight / weight.sum(-1, keepdim=True)
 
 
-def window(correspondence: Correspondence, views: int) -> Window:
+def window(correspondence: Correspondence, views: int) -> TokenWindow:
     """The 3 x 3 taps of a correspondence.
 
     Args:
@@ -282,7 +283,9 @@ def window(correspondence: Correspondence, views: int) -> Window:
     x, y = torch.minimum(taps.clamp(min=0), last).unbind(-1)
     view = frame * views + neighbour[frame, query, slot]
     tap = (view * T)[:, None] + y * w + x
-    return Window(neighbour, centre, valid, place, (frame * Q + query) * T + token, tap, inside, at - nearest, size)
+    return TokenWindow(
+        neighbour, centre, valid, place, (frame * Q + query) * T + token, tap, inside, at - nearest, size
+    )
 
 
 def nearest_token(centre: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:

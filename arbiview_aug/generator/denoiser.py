@@ -22,7 +22,7 @@ from torch.utils.checkpoint import checkpoint
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator.attention import CrossViewAttention
 from arbiview_aug.generator.conditioning import PoseContext, Views, input_channels
-from arbiview_aug.generator.correspondence import LEVELS, Window
+from arbiview_aug.generator.correspondence import LEVELS, TokenWindow
 
 TIMESTEPS = 1000
 """Diffusion steps while training (Sec. Training Parameters)."""
@@ -142,7 +142,7 @@ class Denoiser(nn.Module):
         parts = (self.cross_view, self.context, self.regression, self.unet.conv_in)
         return [parameter for part in parts for parameter in part.parameters()]
 
-    def read_sources(self, sources: Views, windows: Sequence[Window]) -> Sources:
+    def read_sources(self, sources: Views, windows: Sequence[TokenWindow]) -> Sources:
         """Run the source branches; sources read sources only.
 
         Args:
@@ -161,7 +161,7 @@ class Denoiser(nn.Module):
         noisy: torch.Tensor,
         t: torch.Tensor,
         targets: Views,
-        windows: Sequence[Window],
+        windows: Sequence[TokenWindow],
         sources: Sources,
         rows: list[Rows] | None = None,
     ) -> torch.Tensor:
@@ -230,7 +230,7 @@ class Denoiser(nn.Module):
         noisy: torch.Tensor,
         t: torch.Tensor,
         views: Views,
-        windows: Sequence[Window],
+        windows: Sequence[TokenWindow],
         sources: Sources | None,
         read: Sources | None,
         rows: list[Rows] | None,
@@ -242,7 +242,7 @@ class Denoiser(nn.Module):
         context = self.context(views.pose.flatten(0, 1))
         place, done = 0, 0  # blocks of the U-Net, and cross-view blocks among them
 
-        def attend(h: torch.Tensor, window: Window) -> torch.Tensor:
+        def attend(h: torch.Tensor, window: TokenWindow) -> torch.Tensor:
             nonlocal place, done
             name, place = str(place), place + 1
             if name not in self.cross_view:
@@ -316,7 +316,7 @@ def _decoded(
 def _attended(
     block: CrossViewAttention,
     h: torch.Tensor,
-    window: Window,
+    window: TokenWindow,
     known: KeysValues | None,
     count: Sequence[int],
     with_rows: bool,

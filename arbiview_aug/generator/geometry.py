@@ -7,10 +7,17 @@ from typing import NamedTuple
 
 import torch
 
-from arbiview_aug.camera import Camera
+from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.generator.conditioning import Views, camera_conditions, pooled, reference_camera
 from arbiview_aug.generator.config import GeneratorConfig
-from arbiview_aug.generator.correspondence import Correspondence, Window, correspondences, stacked, token_sizes, window
+from arbiview_aug.generator.correspondence import (
+    Correspondence,
+    TokenWindow,
+    correspondences,
+    stacked,
+    token_sizes,
+    window,
+)
 
 
 class FrameGeometry(NamedTuple):
@@ -57,13 +64,13 @@ class FrameGeometry(NamedTuple):
         """The sources' conditions; their latents are their images'."""
         return _views(latent, mask, confidence, self.source_rays, self.source_pose)
 
-    def target_windows(self, dropped: torch.Tensor | None = None) -> list[Window]:
+    def target_windows(self, dropped: torch.Tensor | None = None) -> list[TokenWindow]:
         """What targets read, without sources in the frames ``dropped`` (B,) bool: for classifier-free guidance."""
         sources, targets = self.source_pose.shape[1], self.target_pose.shape[1]
         reads = self.target_reads if dropped is None else [c.without(sources, dropped) for c in self.target_reads]
         return [window(c, sources + targets) for c in reads]
 
-    def source_windows(self) -> list[Window]:
+    def source_windows(self) -> list[TokenWindow]:
         """What sources read."""
         return [window(c, self.source_pose.shape[1]) for c in self.source_reads]
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from arbiview_aug.command_line import device_named
+from arbiview_aug.cli.arguments import device_named
 from arbiview_aug.errors import DataError
 from integrations.cross_rig.arms import ARMS
 from integrations.cross_rig.experiment import Run, run

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from arbiview_aug.surface import SurfaceName
+from arbiview_aug.scene.surface import SurfaceName
 
 Kind = Literal["raw", "oracle", "row_split", "retarget"]
 Geometry = Literal["points", "boxes_3d", "depth_m", "neighbours"]

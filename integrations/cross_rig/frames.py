@@ -20,7 +20,7 @@ from arbiview_aug.datasets import LazyFrame, Neighbours
 from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import inpainted
-from arbiview_aug.generator.model import shipped_weights
+from arbiview_aug.generator.generator import shipped_weights
 from integrations.cross_rig.arm import Arm
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, fill
 from integrations.cross_rig.labels import Grid, box_cells, visible_objects
@@ -33,7 +33,7 @@ _FORMAT = 1
 NEIGHBOURS = Neighbours()
 """One frame before and one after, 1.2 m away."""
 
-_FILLING = ("arbiview_aug.generator", "arbiview_aug.generator.batches", "arbiview_aug.transform_settings")
+_FILLING = ("arbiview_aug.generator", "arbiview_aug.generator.batches", "arbiview_aug.transforms.settings")
 """What ``RigRetarget`` asks to fill holes."""
 
 _MAX_FRAMES = 1 << 20
@@ -89,7 +89,9 @@ class Source:
             if arm.filled == "generator":
                 spec["weights"] = shipped_weights()
             elif arm.filled is not None:
-                spec["filling"] = code_hash("arbiview_aug.inpainting") + code_hash("arbiview_aug.generator.completion")
+                spec["filling"] = code_hash("arbiview_aug.generator.inpainting") + code_hash(
+                    "arbiview_aug.generator.completion"
+                )
             if "neighbours" in arm.reads:
                 spec["neighbours"] = vars(NEIGHBOURS)
         return FrameStore(self.root, spec)

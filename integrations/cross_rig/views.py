@@ -12,7 +12,7 @@ import torch
 from arbiview_aug import Camera, RandomRig, Rig, RigRetarget
 from arbiview_aug.evaluate.baselines import row_split
 from arbiview_aug.evaluate.images import as_arrays
-from arbiview_aug.fills import Reach
+from arbiview_aug.temporal.fill import Reach
 from integrations.cross_rig.arm import RANDOM, Arm
 from integrations.cross_rig.cache import Arrays
 

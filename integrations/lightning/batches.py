@@ -8,8 +8,8 @@ from typing import Any
 import torch
 
 from arbiview_aug.errors import SampleError
-from arbiview_aug.sample import MOTION_KEY
-from arbiview_aug.tensors import rewrapped
+from arbiview_aug.sample.batching import rewrapped
+from arbiview_aug.sample.inputs import MOTION_KEY
 
 _OF_PLANS = ("depth_m", MOTION_KEY)
 """Maps that are geometry."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug.camera import FloatArray
+from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import SampleError
 from integrations.mmdet3d.matrices import Views, padded, upper_triangular
 from integrations.mmdet3d.results import (

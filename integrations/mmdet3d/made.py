@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from arbiview_aug import Rig
-from arbiview_aug.camera import FloatArray
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rotations import rotation_z
 from arbiview_aug.datasets.synthetic import demo_source_rig
-from arbiview_aug.rotations import rotation_z
 from integrations.mmdet3d.bevdet import MEAN_STD
 
 SPEED_MPS = 9.0

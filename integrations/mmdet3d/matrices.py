@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug.camera import FloatArray
+from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import SampleError
 
 MATRICES = {

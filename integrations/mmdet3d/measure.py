@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug import Rig
-from arbiview_aug.camera import FloatArray
+from arbiview_aug.cameras.lens import FloatArray
 from integrations.mmdet3d.made import LIDAR2EGO
 from integrations.mmdet3d.matrices import MATRICES, stacked
 

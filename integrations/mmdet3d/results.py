@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug.camera import Camera, FloatArray
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import CalibrationError, SampleError
-from arbiview_aug.rig import Rig
 from integrations.mmdet3d.images import like_given as images_like
 from integrations.mmdet3d.images import to_tensors
 from integrations.mmdet3d.matrices import MATRICES, Views, is_transposed, like_given, read_views, stacked

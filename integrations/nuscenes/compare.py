@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.camera import FloatArray
-from arbiview_aug.rig import Rig
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rig import Rig
 
 _CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 _MARGIN = 1.0

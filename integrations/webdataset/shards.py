@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 import torch
 
-from arbiview_aug.datasets.writing import encoded, encoded_image
+from arbiview_aug.atomic_io import BROKEN_ARRAY
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets.image_io import encoded, encoded_image
 from arbiview_aug.errors import DataError
-from arbiview_aug.files import BROKEN_ARRAY
-from arbiview_aug.rig import Rig
 
 ARRAYS = ("points", "boxes_3d", "ego2world")
 """Entries that are stored as .npy files."""

@@ -5,7 +5,6 @@ overlap of neighbours on the odd tiles; and a frame rendered at the next frame's
 Run with ``-s`` for the tables.
 """
 
-
 from __future__ import annotations
 
 import time
@@ -17,22 +16,23 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from arbiview_aug.camera import BoolArray, Camera
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import BoolArray
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import GROUND_CLASSES, SyntheticDrive, demo_source_rig
+from arbiview_aug.evaluate.agreement import overlap_scores
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
-from arbiview_aug.evaluate.overlap import overlap_scores
-from arbiview_aug.evaluate.scores import psnr_db
-from arbiview_aug.evaluate.sparse import coloured_points, sparse_metrics
+from arbiview_aug.evaluate.lidar import coloured_points, sparse_metrics
+from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.evaluate.targets import UP_M, YAWS_DEG
 from arbiview_aug.favs.config import Quality
-from arbiview_aug.favs.overlap_depth import overlap_depth
-from arbiview_aug.favs.refinement import RefinementCache
-from arbiview_aug.favs.synthesis import render_opencv
-from arbiview_aug.plan import build_plan
-from arbiview_aug.rig import Rig
-from arbiview_aug.scene import Scene
-from arbiview_aug.surface import Surface, SurfaceName
-from arbiview_aug.transforms import RigRetarget
+from arbiview_aug.render.opencv_backend import render_opencv
+from arbiview_aug.render.overlap_depth import overlap_depth
+from arbiview_aug.render.plan import build_plan
+from arbiview_aug.render.refinement import RefinementCache
+from arbiview_aug.scene.scene import Scene
+from arbiview_aug.scene.surface import Surface, SurfaceName
+from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.helpers import ProtocolFrame, as_camera, few_or_all
 
 pytestmark = pytest.mark.timeout(1800)

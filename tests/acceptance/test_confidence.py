@@ -1,10 +1,10 @@
 """Confidence against true views: pixels that claim less error have less.
 
-Synthetic streets that no constant was fitted on (``arbiview_aug.confidence`` names those), the demo's six-camera rig at
-256x704, four vehicle changes; all covered pixels of all streets and changes together, and of each change alone. Bins
-are of equal count, and of equal width; errors are mean absolute ones over the channels. Run with ``-s`` for the tables.
+Synthetic streets that no constant was fitted on (``arbiview_aug.render.confidence`` names those), the demo's six-camera
+rig at 256x704, four vehicle changes; all covered pixels of all streets and changes together, and of each change alone.
+Bins are of equal count, and of equal width; errors are mean absolute ones over the channels. Run with ``-s`` for the
+tables.
 """
-
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug.confidence import EXPECTED_ERROR_LEVELS
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.surface import SurfaceName
-from arbiview_aug.transforms import RigRetarget
+from arbiview_aug.render.confidence import EXPECTED_ERROR_LEVELS
+from arbiview_aug.scene.surface import SurfaceName
+from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.helpers import few_or_all
 
 pytestmark = pytest.mark.timeout(1800)

@@ -11,10 +11,10 @@ import pytest
 
 from arbiview_aug import Rig, RigRetarget, load_rig
 from arbiview_aug.__main__ import main
-from arbiview_aug.convert.report import converted
-from arbiview_aug.convert.settings import Settings
+from arbiview_aug.cli.convert.report import converted
+from arbiview_aug.cli.convert.settings import Settings
 from arbiview_aug.evaluate.frames import make_frame, scores
-from arbiview_aug.evaluate.images import View
+from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import views_of
 
 MOST_DB = 0.1
@@ -39,7 +39,7 @@ def test_it_scores_as_on_the_fly(name: Any, target: Rig, nuscenes_root: Path, tm
     sample = settings.open()[0]
     retarget = RigRetarget(settings.target)
 
-    def on_the_fly(_: Mapping[str, Any], __: Rig) -> list[View]:
+    def on_the_fly(_: Mapping[str, Any], __: Rig) -> list[RenderedView]:
         return views_of(retarget(sample))
 
     frame = make_frame(sample, exposures=("raw",))

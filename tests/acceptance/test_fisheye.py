@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 import torch
 
-from arbiview_aug.camera import Camera
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import Lens
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.evaluate.images import as_arrays
-from arbiview_aug.evaluate.scores import psnr_db
-from arbiview_aug.lens import Lens
-from arbiview_aug.rig import Rig
-from arbiview_aug.transforms import RigRetarget
+from arbiview_aug.evaluate.metrics import psnr_db
+from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 PLACES = ((0.0, (2.0, 0.0, 1.0)), (90.0, (1.0, 0.9, 1.0)), (180.0, (-1.0, 0.0, 1.0)), (-90.0, (1.0, -0.9, 1.0)))
 """Azimuth and position of a surround-view rig."""

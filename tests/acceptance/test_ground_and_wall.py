@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 import torch
 
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import demo_source_rig
-from arbiview_aug.evaluate.scores import psnr_db
+from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.favs.config import Quality
-from arbiview_aug.rig import Rig
-from arbiview_aug.surface import Ground, Static, Street
-from arbiview_aug.transforms import RigRetarget
+from arbiview_aug.scene.static import Ground, Street
+from arbiview_aug.scene.surface import StaticSurface
+from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 pytestmark = pytest.mark.timeout(1800)
 
@@ -28,7 +29,7 @@ TARGETS = {
     "0.5 m forward": SOURCE.shifted(x_m=0.5),
     "turned by 20°": SOURCE.turned(yaw_deg=20),
 }
-WALLS: dict[str, Static] = {
+WALLS: dict[str, StaticSurface] = {
     "the street's own": Street(),
     "circle of 40 m": Ground(radius_m=40),
     "ellipse of 60 by 30 m": Street(half_length_m=60, half_width_m=30, sharpness=64),
@@ -38,7 +39,7 @@ PARTS = 4
 LARGEST_LOSS_DB = 0.05
 
 
-def photographs(surface: Static, rig: Rig) -> torch.Tensor:
+def photographs(surface: StaticSurface, rig: Rig) -> torch.Tensor:
     """(N, 3, h, w) uint8 of a surface with a texture fixed in space: waves of 0.3 to 60 m, averaged over the pixel."""
     rng = np.random.default_rng(3)
     waves = rng.normal(size=(3, 48)) * np.geomspace(0.15, 8, 48)  # rad/m
@@ -69,10 +70,7 @@ def scores_db(images: torch.Tensor, truth: torch.Tensor, move: str, quality: Qua
 
 @pytest.mark.parametrize(
     "wall",
-    [
-        pytest.param(wall, marks=pytest.mark.release if wall == "circle of 40 m" else pytest.mark.slow)
-        for wall in WALLS
-    ],
+    [pytest.param(wall, marks=pytest.mark.release if wall == "circle of 40 m" else pytest.mark.slow) for wall in WALLS],
 )
 def test_never_worse(wall: str) -> None:
     """Of every view and every quarter of one."""

@@ -17,15 +17,15 @@ import numpy as np
 import pytest
 import torch
 
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
-from arbiview_aug.favs.synthesis import render_labels
-from arbiview_aug.lidar import checked_points
-from arbiview_aug.objects import checked_boxes
-from arbiview_aug.plan import build_plan
-from arbiview_aug.rig import Rig
-from arbiview_aug.scene import Scene
-from arbiview_aug.transforms import RigRetarget
+from arbiview_aug.render.labels import render_labels
+from arbiview_aug.render.plan import build_plan
+from arbiview_aug.scene.boxes import checked_boxes
+from arbiview_aug.scene.point_cloud import checked_points
+from arbiview_aug.scene.scene import Scene
+from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.helpers import as_camera, few_or_all
 
 pytestmark = pytest.mark.timeout(1800)

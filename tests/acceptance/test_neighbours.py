@@ -10,7 +10,7 @@ import torch
 from arbiview_aug import Camera, Rig, RigRetarget
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.evaluate.images import as_arrays
-from arbiview_aug.evaluate.sparse import coloured_points, colours_at, equalised, visible_points
+from arbiview_aug.evaluate.lidar import coloured_points, colours_at, equalised, visible_points
 
 pytestmark = pytest.mark.slow
 

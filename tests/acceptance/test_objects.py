@@ -13,7 +13,6 @@ pixels that the street surface covers and objects leave uncovered. Marked pixels
 ones within 2 px of the marked, are no errors. Run with ``-s`` for the tables.
 """
 
-
 from __future__ import annotations
 
 import dataclasses
@@ -25,14 +24,14 @@ import pytest
 import torch
 
 from arbiview_aug import Rig
+from arbiview_aug.cameras.projection import project_rays
 from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig
 from arbiview_aug.datasets.synthetic.scene import BoxClass, Material, Scene, SceneBuilder
-from arbiview_aug.favs.synthesis import render_labels
-from arbiview_aug.objects import Objects, checked_boxes
-from arbiview_aug.plan import build_plan
-from arbiview_aug.projection import project_rays
-from arbiview_aug.scene import Scene as Geometry
-from arbiview_aug.surface import Street
+from arbiview_aug.render.labels import render_labels
+from arbiview_aug.render.plan import build_plan
+from arbiview_aug.scene.boxes import BoxSurface, checked_boxes
+from arbiview_aug.scene.scene import Scene as Geometry
+from arbiview_aug.scene.static import Street
 from tests.helpers import few_or_all
 
 pytestmark = pytest.mark.timeout(1800)
@@ -135,7 +134,7 @@ def measure(seed: int, found: dict[tuple[str, str, str], Found]) -> None:
                     true, label = truth.instances[m].numpy(), labels[m].numpy()
                     for row in np.intersect1d(np.unique(true), vehicles):
                         displaced(true == row, label == row, seen[m], into)
-                    boxes = Objects(Street(), geometry.boxes[vehicles]).drawn(camera).pixel
+                    boxes = BoxSurface(Street(), geometry.boxes[vehicles]).drawn(camera).pixel
                     in_box = np.zeros(camera.size, bool)
                     in_box.flat[boxes] = True
                     shown = np.isin(label, vehicles)

@@ -15,13 +15,13 @@ from types import ModuleType
 
 import pytest
 
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
-from arbiview_aug.evaluate.sparse import coloured_points, score_targets
+from arbiview_aug.evaluate.lidar import coloured_points, score_targets
 from arbiview_aug.evaluate.targets import UP_M, YAWS_DEG
-from arbiview_aug.rig import Rig
-from arbiview_aug.surface import SurfaceName
-from arbiview_aug.transforms import RigRetarget
+from arbiview_aug.scene.surface import SurfaceName
+from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.helpers import ProtocolFrame, as_camera
 
 pytestmark = pytest.mark.timeout(1800)

@@ -4,7 +4,6 @@ A move's PSNR on a street is over the covered pixels of all six views together; 
 Run with ``-s`` for the tables.
 """
 
-
 from __future__ import annotations
 
 import time
@@ -14,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import GROUND_CLASSES, SyntheticDrive, demo_source_rig
-from arbiview_aug.evaluate.scores import psnr_db
-from arbiview_aug.rig import Rig
-from arbiview_aug.surface import SurfaceName
-from arbiview_aug.transforms import RigRetarget
+from arbiview_aug.evaluate.metrics import psnr_db
+from arbiview_aug.scene.surface import SurfaceName
+from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.helpers import few_or_all
 
 pytestmark = pytest.mark.timeout(1800)

@@ -12,11 +12,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from arbiview_aug.camera import FloatArray
-from arbiview_aug.datasets.nuscenes_tables import quaternion_from_rotation
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets.nuscenes.tables import quaternion_from_rotation
 from arbiview_aug.datasets.synthetic import Scene, make_scene
 from arbiview_aug.datasets.synthetic.render import Renderer
-from arbiview_aug.rig import Rig
 
 VERSION = "v1.0-mini"
 START_US = 1_532_402_927_000_000

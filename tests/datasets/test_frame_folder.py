@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug.camera import Camera
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.errors import CalibrationError, DataError
-from arbiview_aug.rig import Rig
 
 Change = Callable[[dict[str, Any]], None]
 

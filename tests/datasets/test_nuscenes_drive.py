@@ -16,7 +16,8 @@ import pytest
 import torch
 
 from arbiview_aug import Rig, RigRetarget
-from arbiview_aug.datasets import Neighbours, NuScenesDataset, nuscenes
+from arbiview_aug.datasets import Neighbours, NuScenesDataset
+from arbiview_aug.datasets.nuscenes import reader
 from arbiview_aug.datasets.synthetic import SceneClass, demo_source_rig
 from arbiview_aug.datasets.synthetic.render import Renderer
 from tests.datasets.nuscenes_root import (
@@ -114,9 +115,9 @@ def test_standing_adds_nothing_and_costs_nothing(root: Path, monkeypatch: pytest
 
 def test_images_are_read_where_they_fill(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[str] = []
-    decode = nuscenes.decode_images
+    decode = reader.decode_images
     monkeypatch.setattr(
-        nuscenes, "decode_images", lambda files, **of: read.extend(map(str, files)) or decode(files, **of)
+        reader, "decode_images", lambda files, **of: read.extend(map(str, files)) or decode(files, **of)
     )
     sample = NuScenesDataset(root, neighbours=Neighbours()).by_token("goes-sample-2")
     assert len(read) == 6
@@ -195,7 +196,7 @@ def test_velocities_are_those_of_the_traffic(dataset: NuScenesDataset) -> None:
 
 def test_velocities_that_nobody_knows() -> None:
     """nuscenes-devkit's rule: over both neighbours in time up to 3 s, over one up to 1.5 s."""
-    from arbiview_aug.datasets.nuscenes_boxes import _in_time, _velocities_mps
+    from arbiview_aug.datasets.nuscenes.boxes import _in_time, _velocities_mps
 
     times_s = np.array([0, 0.5, 1.0, 3.0, 0.0, 2.5, 3.5, 9.0])
     of_object = np.array([0, 0, 0, 0, 1, 1, 1, 2], np.int32)
@@ -340,7 +341,7 @@ def test_nothing_is_a_neighbour_across_a_cut(tmp_path: Path, cut: str) -> None:
 
 def test_tables_without_times_are_refused(tmp_path: Path) -> None:
     message = "sample_data: expected timestamp as a whole number of microseconds, got 'noon' in row"
-    with pytest.raises(nuscenes.DataError, match=message):
+    with pytest.raises(reader.DataError, match=message):
         NuScenesDataset(write(tmp_path, lambda data: data["sample_data"][0].update(timestamp="noon")), neighbours=EVERY)
 
 

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from arbiview_aug.datasets import nuscenes_tables
-from arbiview_aug.datasets.nuscenes_tables import Tables
+from arbiview_aug.datasets.nuscenes import tables as tables_module
+from arbiview_aug.datasets.nuscenes.tables import Tables
 from arbiview_aug.errors import DataError
 
 
@@ -26,9 +26,9 @@ def table(root: Path, text: str) -> Tables:
 @pytest.mark.parametrize("indent", [None, 0, 4])
 def test_rows_are_those_of_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, indent: int | None) -> None:
     """Whatever a block ends in."""
-    monkeypatch.setattr(nuscenes_tables, "_BLOCK", 500)
-    monkeypatch.setattr(nuscenes_tables, "_LONGEST_ROW", 400)
-    monkeypatch.setattr(nuscenes_tables, "_BATCH", 7)
+    monkeypatch.setattr(tables_module, "_BLOCK", 500)
+    monkeypatch.setattr(tables_module, "_LONGEST_ROW", 400)
+    monkeypatch.setattr(tables_module, "_BATCH", 7)
     rows: list[dict[str, Any]] = [
         {"token": "]}, {[" * (k % 5), "é": [k, -k / 7, None], "deep": {"of": [{}]}, "n": k} for k in range(100)
     ]
@@ -64,7 +64,7 @@ def test_what_is_no_table(tmp_path: Path, text: str, message: str) -> None:
 GROWTH = """
 import json, sys, time
 from pathlib import Path
-from arbiview_aug.bench.timing import peak_mib
+from arbiview_aug.cli.bench.timing import peak_mib
 from arbiview_aug.datasets import Neighbours, NuScenesDataset
 
 def as_objects():

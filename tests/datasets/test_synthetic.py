@@ -10,17 +10,11 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from arbiview_aug.camera import Camera
-from arbiview_aug.datasets.synthetic import (
-    SceneClass,
-    SyntheticDrive,
-    demo_source_rig,
-    demo_target_rig,
-    make_scene,
-)
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig, demo_target_rig, make_scene
 from arbiview_aug.datasets.synthetic.raycast import cast
 from arbiview_aug.datasets.synthetic.texture import band, noise, pulses
-from arbiview_aug.rig import Rig
 
 SIZE = (64, 176)
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug.camera import Camera
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig, demo_target_rig, make_scene
 from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, SKY_ID, cast, find_candidates, scene_from
 from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, BoxClass
-from arbiview_aug.rig import Rig
 
 SIZE = (96, 256)
 

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from arbiview_aug.camera import Camera
-from arbiview_aug.evaluate.overlap import adjacent_pairs, half_way_view, overlap_psnr, overlap_scores
-from arbiview_aug.evaluate.sparse import (
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.overlap import adjacent_pairs, half_way_view
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.evaluate.agreement import overlap_psnr, overlap_scores
+from arbiview_aug.evaluate.lidar import (
     coloured_points,
     equalised,
     equalising_gains,
@@ -20,7 +22,6 @@ from arbiview_aug.evaluate.sparse import (
     sparse_metrics,
 )
 from arbiview_aug.evaluate.targets import paper_target, shifted_target, yawed_targets
-from arbiview_aug.rig import Rig
 
 AGREEMENT_DB = 0.01
 

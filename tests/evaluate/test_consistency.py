@@ -7,12 +7,11 @@ from functools import partial
 import numpy as np
 import pytest
 
-from arbiview_aug.camera import Camera
-from arbiview_aug.evaluate.consistency import source_overlap, summary, target_consistency
-from arbiview_aug.evaluate.images import View, as_tensors
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.evaluate.agreement import OverlapScore, source_overlap, summary, target_consistency
+from arbiview_aug.evaluate.images import RenderedView, as_tensors
 from arbiview_aug.evaluate.methods import retargeting
-from arbiview_aug.evaluate.overlap import OverlapScore
-from arbiview_aug.rig import Rig
 from tests import helpers
 
 SIZE = (112, 200)
@@ -32,10 +31,10 @@ def world(at: Camera, turned_deg: float = 0.0) -> np.ndarray:
     return np.repeat(np.clip(np.round(grey), 0, 255).astype(np.uint8)[..., None], 3, -1)
 
 
-def views(second_turned_deg: float = 0.0, seen: float = 1.0) -> list[View]:
+def views(second_turned_deg: float = 0.0, seen: float = 1.0) -> list[RenderedView]:
     coverage = np.ones((180, 320), bool)
     coverage[: round(180 * (1 - seen))] = False
-    return [View(world(RIG[0]), coverage), View(world(RIG[1], second_turned_deg), coverage)]
+    return [RenderedView(world(RIG[0]), coverage), RenderedView(world(RIG[1], second_turned_deg), coverage)]
 
 
 def test_views_of_one_world_are_consistent() -> None:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.frames import make_frame, regions, scores
-from arbiview_aug.evaluate.images import View, as_arrays
-from arbiview_aug.evaluate.sparse import coloured_points, lidar_split
-from arbiview_aug.rig import Rig
+from arbiview_aug.evaluate.images import RenderedView, as_arrays
+from arbiview_aug.evaluate.lidar import coloured_points, lidar_split
 
 SIZE = (64, 176)
 
@@ -25,9 +25,9 @@ def sample(drive: SyntheticDrive) -> dict:
     return drive[0]
 
 
-def untouched(sample: dict, target: Rig) -> list[View]:
+def untouched(sample: dict, target: Rig) -> list[RenderedView]:
     """For a target that is the source."""
-    return [View(image, np.ones(image.shape[:2], bool)) for image in as_arrays(sample["images"])]
+    return [RenderedView(image, np.ones(image.shape[:2], bool)) for image in as_arrays(sample["images"])]
 
 
 def test_points_are_split_between_method_and_score(sample: dict) -> None:
@@ -74,7 +74,7 @@ def test_even_exposures_reach_the_method(sample: dict) -> None:
 def test_scores_of_the_source_itself(drive: SyntheticDrive, sample: dict) -> None:
     calls = []
 
-    def render(given: dict, target: Rig) -> list[View]:
+    def render(given: dict, target: Rig) -> list[RenderedView]:
         calls.append(given)
         return untouched(given, target)
 

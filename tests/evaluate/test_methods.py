@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import torch
 
+from arbiview_aug.cameras.overlap import half_way_view
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate import methods
 from arbiview_aug.evaluate.baselines import BASELINES, row_split
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.methods import baseline, one_camera, paper_stages, retargeting, study_methods, views_of
 from arbiview_aug.favs.config import PaperConfig
-from arbiview_aug.favs.overlap_depth import OverlapDepth, overlap_depth
-from arbiview_aug.overlaps import half_way_view
-from arbiview_aug.rig import Rig
-from arbiview_aug.transforms import RigRetarget
+from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
+from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.helpers import street_sample
 
 

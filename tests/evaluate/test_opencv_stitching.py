@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.images import as_arrays
+from arbiview_aug.evaluate.metrics import truth_metrics
 from arbiview_aug.evaluate.opencv_stitching import opencv_stitching
-from arbiview_aug.evaluate.truth import truth_metrics
-from arbiview_aug.rig import load_rig
 from tests.helpers import ring
 
 

@@ -7,16 +7,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from arbiview_aug.camera import Camera
-from arbiview_aug.evaluate.overlap import (
-    MIN_PIXELS,
-    adjacent_pairs,
-    half_way_view,
-    odd_tiles,
-    overlap_psnr,
-    overlap_scores,
-)
-from arbiview_aug.rig import Rig, load_rig
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.overlap import adjacent_pairs, half_way_view, odd_tiles
+from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.evaluate.agreement import MIN_PIXELS, overlap_psnr, overlap_scores
 from tests import helpers
 
 camera = partial(helpers.camera, size=(90, 160), horizontal_fov_deg=70.0)

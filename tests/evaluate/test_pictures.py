@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from arbiview_aug.camera import Camera
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.pictures import HOLE, contact_sheet, outline_coverage, put_text, save_picture
-from arbiview_aug.evaluate.rig_picture import COLOURS, draw_rigs
-from arbiview_aug.rig import Rig, load_rig
+from arbiview_aug.evaluate.report.pictures import HOLE, contact_sheet, outline_coverage, put_text, save_picture
+from arbiview_aug.evaluate.report.rig_picture import COLOURS, draw_rigs
 
 
 def plain(h: int, w: int, colour: tuple[int, int, int]) -> np.ndarray:

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from skimage.metrics import mean_squared_error, peak_signal_noise_ratio, structural_similarity
 
-from arbiview_aug.evaluate.scores import errors, psnr_db, ssim_map
-from arbiview_aug.evaluate.truth import truth_metrics
+from arbiview_aug.evaluate.metrics import errors, psnr_db, ssim_map, truth_metrics
 
 
 @pytest.fixture(params=[2.0, 20.0])

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from arbiview_aug.evaluate.images import View
-from arbiview_aug.evaluate.pictures import HOLE
-from arbiview_aug.evaluate.sheet import frame_sheet, hatched_view, left_to_right, shrunk
-from arbiview_aug.evaluate.tables import (
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.evaluate.images import RenderedView
+from arbiview_aug.evaluate.report.pictures import HOLE
+from arbiview_aug.evaluate.report.sheet import frame_sheet, hatched_view, left_to_right, shrunk
+from arbiview_aug.evaluate.report.tables import (
     OVERLAP_COLUMNS,
     SEEN,
     SPARSE_COLUMNS,
@@ -16,7 +17,6 @@ from arbiview_aug.evaluate.tables import (
     cell,
     text_table,
 )
-from arbiview_aug.rig import Rig
 from tests.helpers import camera
 
 
@@ -52,11 +52,13 @@ def test_sheets_hatch_only_what_is_unseen() -> None:
     images = [np.full((40, 60, 3), 90, np.uint8)] * 2
     seen, half = np.ones((40, 60), bool), np.ones((40, 60), bool)
     half[:, :30] = False
-    whole = frame_sheet(rig, images, rig, [View(images[0], seen)] * 2, width_px=400)
-    holed = frame_sheet(rig, images, rig, [View(images[0], seen), View(images[0], half)], images, width_px=400)
+    whole = frame_sheet(rig, images, rig, [RenderedView(images[0], seen)] * 2, width_px=400)
+    holed = frame_sheet(
+        rig, images, rig, [RenderedView(images[0], seen), RenderedView(images[0], half)], images, width_px=400
+    )
     assert not (whole == HOLE).all(-1).any() and (holed == HOLE).all(-1).any()
     assert holed.shape[0] > 1.7 * whole.shape[0], "two rows more: hatched, and the truth"
-    hatched = (hatched_view(View(images[0], half), 40) == HOLE).all(-1)
+    hatched = (hatched_view(RenderedView(images[0], half), 40) == HOLE).all(-1)
     assert hatched[:, :25].any() and not hatched[:, 35:].any()
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from arbiview_aug.camera import Camera
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.evaluate.targets import (
     PAPER_SHARES,
     VEHICLES,
@@ -17,7 +18,6 @@ from arbiview_aug.evaluate.targets import (
     standard_targets,
     yawed_targets,
 )
-from arbiview_aug.rig import Rig, load_rig
 
 
 def turned_by(source: Rig, target: Rig) -> dict[str, float]:

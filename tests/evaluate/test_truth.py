@@ -8,8 +8,7 @@ import torch
 
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.images import as_arrays, as_tensors, to_bytes
-from arbiview_aug.evaluate.scores import errors, mean_of, psnr_db, ssim, ssim_map
-from arbiview_aug.evaluate.truth import truth_metrics
+from arbiview_aug.evaluate.metrics import errors, mean_of, psnr_db, ssim, ssim_map, truth_metrics
 
 
 def test_regions() -> None:

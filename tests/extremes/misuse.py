@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from arbiview_aug import Camera, FavsConfig, PaperConfig, Rig
-from arbiview_aug.favs.refinement import RefinementCache
+from arbiview_aug.render.refinement import RefinementCache
 
 SIZE = (18, 24)
 

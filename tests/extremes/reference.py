@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 
 from arbiview_aug import Camera
-from arbiview_aug.sampling import Slot
-from arbiview_aug.surface import MAX_INVERSE_DISTANCE, WALL_CENTER_M, Ground, Street
+from arbiview_aug.render.atlas import Slot
+from arbiview_aug.scene.static import WALL_CENTER_M, Ground, Street
+from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 
 LEAST_DEPTH = 1e-6  # of unit directions, for lenses that see less than half a turn
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from arbiview_aug.camera import Camera
+from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.errors import CalibrationError
 from tests.helpers import examples
 

@@ -13,10 +13,10 @@ import pytest
 import torch
 
 from arbiview_aug import Camera, Rig, RigRetarget
+from arbiview_aug.cameras.projection import ego_rays, project_rays
 from arbiview_aug.favs.config import FavsConfig
-from arbiview_aug.plan import RenderPlan, build_plan
-from arbiview_aug.projection import ego_rays, project_rays
-from arbiview_aug.scene import Scene
+from arbiview_aug.render.plan import RenderPlan, build_plan
+from arbiview_aug.scene.scene import Scene
 from tests import helpers
 from tests.extremes import reference
 from tests.extremes.conftest import Worst

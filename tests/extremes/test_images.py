@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from arbiview_aug import Camera, PaperConfig, Rig, RigRetarget, load_rig
-from arbiview_aug.explain import PaperExplanation
+from arbiview_aug.transforms.explain import PaperExplanation
 from tests.extremes import reference
 from tests.extremes.conftest import Worst
 from tests.extremes.test_properties import RAMP, coordinates

@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 
 from arbiview_aug import Rig, load_rig
-from arbiview_aug.camera import BoolArray, FloatArray
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.cameras.projection import ego_rays, project_rays
+from arbiview_aug.cameras.rig import shipped_rigs
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.lidar import checked_points
-from arbiview_aug.plan import RenderPlan, build_plan
-from arbiview_aug.projection import ego_rays, project_rays
-from arbiview_aug.rig import shipped_rigs
-from arbiview_aug.sampling import FixedMap
-from arbiview_aug.scene import Scene
-from arbiview_aug.surface import Surface
+from arbiview_aug.render.atlas import FixedMap
+from arbiview_aug.render.plan import RenderPlan, build_plan
+from arbiview_aug.scene.point_cloud import checked_points
+from arbiview_aug.scene.scene import Scene
+from arbiview_aug.scene.surface import Surface
 
 TOLERANCE_PX = 1 / 32
 BOXES = np.array(

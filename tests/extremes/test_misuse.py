@@ -19,7 +19,7 @@ import torch
 from arbiview_aug import ArbiviewError, Camera, FavsConfig, PaperConfig, RandomRig, Rig, RigRetarget, load_rig
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.errors import CalibrationError, SampleError, SampleTypeError
-from arbiview_aug.tensors import is_readable
+from arbiview_aug.sample.batching import is_readable
 from tests.extremes import misuse
 from tests.extremes.conftest import Worst
 from tests.helpers import few_or_all

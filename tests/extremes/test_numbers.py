@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from arbiview_aug import Camera, FavsConfig, PaperConfig, Rig, RigRetarget
-from arbiview_aug.favs.adaptive_fusion import fuse
-from arbiview_aug.favs.feature_matching import (
+from arbiview_aug.favs.renderer import render_paper
+from arbiview_aug.favs.stage1_geometry import check_homography, h_geom
+from arbiview_aug.favs.stage2_features import (
     Matches,
     Region,
     accept,
@@ -22,12 +23,12 @@ from arbiview_aug.favs.feature_matching import (
     normalised,
     optimise_transformation,
 )
-from arbiview_aug.favs.geometric_transformation import check_homography, h_geom
-from arbiview_aug.favs.paper import render_paper
-from arbiview_aug.favs.photometric import HarmoniseConfig, estimate_gains
-from arbiview_aug.favs.synthesis import render_opencv, render_torch
-from arbiview_aug.plan import build_plan
-from arbiview_aug.tone import ToneCurve
+from arbiview_aug.favs.stage4_fusion import fuse
+from arbiview_aug.render.harmonise import HarmoniseConfig, estimate_gains
+from arbiview_aug.render.opencv_backend import render_opencv
+from arbiview_aug.render.plan import build_plan
+from arbiview_aug.render.tone_curve import ToneCurve
+from arbiview_aug.render.torch_backend import render_torch
 from tests.extremes import reference
 from tests.extremes.conftest import Worst
 from tests.extremes.test_geometry import SOURCES, TARGETS, camera, no_numpy_warnings, ring
@@ -179,7 +180,7 @@ def test_coverage_does_not_depend_on_weights(weight: float, execution: str, monk
     rig, target = ring(8), Rig([camera("t", azimuth_deg=20.0, position_m=(0.1, 0.2, 1.7))])
     config = FavsConfig(seam_width=0.1)
     _, covered, _ = shaded(rig, target, config, execution)
-    monkeypatch.setattr("arbiview_aug.target_plan.distance_weight", lambda d, *_: np.full(d.shape, weight))
+    monkeypatch.setattr("arbiview_aug.render.view_planner.distance_weight", lambda d, *_: np.full(d.shape, weight))
     with no_numpy_warnings():
         image, still, plan = shaded(rig, target, config, execution)
     assert np.array_equal(still, covered) and np.isfinite(image).all()

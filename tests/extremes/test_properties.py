@@ -11,12 +11,13 @@ from hypothesis import assume
 from hypothesis import strategies as st
 
 from arbiview_aug import Camera, FavsConfig, Rig, load_rig
-from arbiview_aug.camera import UNPROJECT_TOLERANCE_PX
-from arbiview_aug.favs.synthesis import render_opencv, render_torch
-from arbiview_aug.plan import RenderPlan, build_plan
-from arbiview_aug.rotations import rotation_x, rotation_z
-from arbiview_aug.scene import Scene
-from arbiview_aug.surface import WALL_CENTER_M
+from arbiview_aug.cameras.camera import UNPROJECT_TOLERANCE_PX
+from arbiview_aug.cameras.rotations import rotation_x, rotation_z
+from arbiview_aug.render.opencv_backend import render_opencv
+from arbiview_aug.render.plan import RenderPlan, build_plan
+from arbiview_aug.render.torch_backend import render_torch
+from arbiview_aug.scene.scene import Scene
+from arbiview_aug.scene.static import WALL_CENTER_M
 from tests.extremes import drawn, reference
 from tests.extremes.conftest import Worst
 from tests.helpers import examples

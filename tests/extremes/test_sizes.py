@@ -11,9 +11,9 @@ import torch
 
 from arbiview_aug import Rig, RigRetarget
 from arbiview_aug.errors import CalibrationError
-from arbiview_aug.plan import build_plan
-from arbiview_aug.sampling import AtlasLayout
-from arbiview_aug.scene import Scene
+from arbiview_aug.render.atlas import AtlasLayout
+from arbiview_aug.render.plan import build_plan
+from arbiview_aug.scene.scene import Scene
 from tests.extremes.conftest import Worst
 from tests.extremes.test_geometry import camera, check, no_numpy_warnings, ring
 from tests.helpers import sampled

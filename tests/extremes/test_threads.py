@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from arbiview_aug import RigRetarget
-from arbiview_aug.favs.refinement import RefinementCache
-from arbiview_aug.plan import PlanCache
+from arbiview_aug.render.plan import PlanCache
+from arbiview_aug.render.refinement import RefinementCache
 from tests.extremes import misuse
 
 

@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
+from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.generator.attention import HEAD_WIDTH, CrossViewAttention, PositionalEncoding, pays_dense
-from arbiview_aug.generator.correspondence import Window, correspondences, stacked, window
-from arbiview_aug.rig import Rig, load_rig
+from arbiview_aug.generator.correspondence import TokenWindow, correspondences, stacked, window
 from tests.generator.small import ring, stirred
 
 WIDTH = 64
@@ -22,12 +22,12 @@ def block(width: int = WIDTH, levels: int = 3) -> CrossViewAttention:
     return made.eval()
 
 
-def windows(rig: Rig, size: tuple[int, int], copies: int = 1) -> Window:
+def windows(rig: Rig, size: tuple[int, int], copies: int = 1) -> TokenWindow:
     reads = correspondences(list(rig), list(rig), range(len(rig)), [size], rig.ground_z_m)[0]
     return window(stacked([reads] * copies), len(rig))
 
 
-def features(at: Window, views: int, seed: int = 0) -> torch.Tensor:
+def features(at: TokenWindow, views: int, seed: int = 0) -> torch.Tensor:
     batch, _, tokens = at.read.shape
     return torch.randn(batch, views, tokens, WIDTH, generator=torch.Generator().manual_seed(seed))
 

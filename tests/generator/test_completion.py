@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug.camera import Camera
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.errors import GeneratorError, SampleError
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.config import AutoencoderConfig
-from arbiview_aug.rig import Rig, load_rig
 from tests.generator.small import ring, small_config, stirred
 
 SOURCES = ring(4, horizontal_fov_deg=100)

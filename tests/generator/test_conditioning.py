@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from arbiview_aug.camera import Camera
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.generator.conditioning import (
     PoseContext,
     Views,
@@ -18,7 +19,6 @@ from arbiview_aug.generator.conditioning import (
     reference_camera,
 )
 from arbiview_aug.generator.geometry import batched, frame_geometry
-from arbiview_aug.rig import load_rig
 from tests.generator.small import ring, small_config
 
 ONE = Camera.looking(

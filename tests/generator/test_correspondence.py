@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug.camera import Camera
-from arbiview_aug.favs.geometric_transformation import h_geom, h_planar
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.favs.stage1_geometry import h_geom, h_planar
 from arbiview_aug.generator.correspondence import (
     FACING_M,
     Correspondence,
@@ -21,7 +22,6 @@ from arbiview_aug.generator.correspondence import (
     token_sizes,
     window,
 )
-from arbiview_aug.rig import Rig, load_rig
 from tests.generator.small import ring
 
 GRID = (14, 25)

@@ -15,8 +15,8 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.targets import named_targets
 from arbiview_aug.generator import Generator, compact
 from arbiview_aug.generator.checkpoint import read_checkpoint
-from arbiview_aug.train.data import open_frames
-from arbiview_aug.train.held_out import gains, held_out_scores
+from arbiview_aug.generator.training.data import open_frames
+from arbiview_aug.generator.training.held_out import gains, held_out_scores
 from tests.helpers import few_or_all
 
 FOLDER = Path(arbiview_aug.generator.__file__).with_name("weights")

@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from arbiview_aug.camera import Camera
-from arbiview_aug.datasets.sequence import LazyFrame, Neighbours, check_neighbours
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets.drive import LazyFrame, Neighbours, check_neighbours
 from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, cast, find_candidates, scene_from
 from arbiview_aug.datasets.synthetic.render import Renderer, stack_or_list
 from arbiview_aug.datasets.synthetic.scene import Material, Scene, SceneClass
 from arbiview_aug.datasets.synthetic.street import make_scene
 from arbiview_aug.datasets.synthetic.threads import one_torch_thread
-from arbiview_aug.rig import Rig
 
 LIDAR_POSITION_M = (0.9, 0.0, 1.9)
 """Ego x, y and height over the road: a roof-mounted sensor, as on nuScenes' vehicles."""

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from arbiview_aug.camera import Camera
+from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.datasets.synthetic.raycast import (
     GROUND_ID,
     SKY_ID,

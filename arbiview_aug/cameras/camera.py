@@ -1,0 +1,380 @@
+"""Cameras: intrinsics, lens and pose; projection and its inverse; resizing and cropping.
+
+Conventions (pinned by ``tests/conventions``):
+
+- Pixel centres are integers: (0, 0) is the centre of the top-left pixel, points are (x, y), sizes (h, w).
+- ``cam2ego`` maps camera points to the ego frame: ``p_ego = cam2ego @ p_cam``. Camera axes: x right, y down,
+  z forward. Ego axes: x forward, y left, z up, metres. The paper's rotation R_i is ``cam2ego[:3, :3].T``.
+- Angles at the public face are in degrees, geometry is float64.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from arbiview_aug.cameras.framing import Fit, framing
+from arbiview_aug.cameras.lens import BoolArray, FloatArray, Lens, distort, fold_limit, intrinsics_for_fov, undistort
+from arbiview_aug.cameras.rotations import CAMERA_AXES_IN_EGO, rotation_x, rotation_z
+from arbiview_aug.cameras.validation import (
+    MAX_SIZE_PX,
+    checked_array,
+    checked_distortion,
+    checked_intrinsics,
+    checked_lens,
+    checked_mask,
+    checked_name,
+    checked_numbers,
+    checked_pixels,
+    checked_pose,
+    checked_size,
+)
+from arbiview_aug.errors import CalibrationError
+
+UNPROJECT_TOLERANCE_PX = 1e-6
+"""A ray counts as found when projecting it again lands this close to its pixel."""
+
+_ANGLES, _METRES = "finite angles in degrees", "finite (x, y, z) in metres"
+
+
+class Projection(NamedTuple):
+    """Pixels of projected points.
+
+    Attributes:
+        uv: (..., 2) pixels (x, y); meaningless where ``valid`` is False, but always finite.
+        depth_m: (...,) z in the camera frame.
+        valid: (...,) in front of the camera and on the lens's unfolded branch; says nothing about image bounds.
+    """
+
+    uv: FloatArray
+    depth_m: FloatArray
+    valid: BoolArray
+
+
+class Rays(NamedTuple):
+    """Unit viewing directions (..., 3) and whether the lens could be inverted there (...,)."""
+
+    directions: FloatArray
+    valid: BoolArray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Camera:
+    """One calibrated camera.
+
+    Args:
+        name: Unique within its rig.
+        width_px: Image width.
+        height_px: Image height.
+        K: (3, 3) intrinsics in pixels, ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]``.
+        cam2ego: (4, 4) pose, camera to ego.
+        lens: ``pinhole``; ``radtan`` (OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]); ``fisheye`` (Kannala-Brandt,
+            OpenCV's k1..k4). ``opencv_radtan`` and ``opencv_fisheye`` are read as these two.
+        distortion: Coefficients of the lens.
+        mask: (H, W) bool, True where the scene is seen, False on the own car's body.
+
+    Raises:
+        CalibrationError: With the camera's name, what was expected, what came and how to mend it.
+    """
+
+    name: str
+    width_px: int
+    height_px: int
+    K: FloatArray
+    cam2ego: FloatArray
+    lens: Lens = "pinhole"
+    distortion: tuple[float, ...] = ()
+    mask: BoolArray | None = None
+
+    def __post_init__(self) -> None:
+        put = lambda field, value: object.__setattr__(self, field, value)  # noqa: E731 - frozen dataclass
+        name = checked_name(self.name)
+        for field in ("width_px", "height_px"):
+            put(field, checked_pixels(name, field, getattr(self, field)))
+        put("K", checked_intrinsics(name, self.K))
+        put("cam2ego", checked_pose(name, self.cam2ego))
+        put("lens", checked_lens(name, self.lens))
+        put("distortion", checked_distortion(name, self.lens, self.distortion))
+        if self.mask is not None:
+            put("mask", checked_mask(name, self.mask, self.size))
+
+    # --- construction ---------------------------------------------------------------------------------------------
+    @classmethod
+    def looking(
+        cls,
+        *,
+        name: str,
+        azimuth_deg: float,
+        elevation_deg: float = 0.0,
+        roll_deg: float = 0.0,
+        position_m: tuple[float, float, float] = (0.0, 0.0, 1.5),
+        width_px: int,
+        height_px: int,
+        horizontal_fov_deg: float | None = None,
+        K: Any = None,
+        lens: Lens = "pinhole",
+        distortion: tuple[float, ...] = (),
+        mask: Any = None,
+    ) -> Camera:
+        """A camera by its viewing direction: the paper's R = R_z(θ) R_x(φ) (Sec. FAVS, Stage 1).
+
+        ``cam2ego[:3, :3] = R_z(azimuth) B R_x(elevation) R_z(roll)``, where B puts the resting camera's axes
+        (right, down, forward) on the ego axes (-y, -z, +x). R_z(azimuth) turns about the ego's z axis (up):
+        positive looks to the left. R_x(elevation) turns about the camera's own x axis (right): positive looks up.
+        Roll turns about the optical axis: positive turns the camera clockwise as seen from behind it.
+
+        Args:
+            name: The camera's name.
+            azimuth_deg: 0 looks forward, 90 to the left.
+            elevation_deg: 0 looks level, 90 straight up.
+            roll_deg: 0 for an upright image.
+            position_m: Optical centre in the ego frame.
+            width_px: Image width.
+            height_px: Image height.
+            horizontal_fov_deg: Angle between the outer edges of the image, measured along the row of the principal
+                point; gives a K with square pixels and a central principal point. Either this or ``K``.
+            K: (3, 3) intrinsics.
+            lens: The lens model.
+            distortion: Its coefficients.
+            mask: The car-body mask.
+
+        Raises:
+            CalibrationError: On impossible values, or when both or none of K and horizontal_fov_deg are given.
+        """
+        if (K is None) == (horizontal_fov_deg is None):
+            raise CalibrationError(f"camera {name!r}: expected either K or horizontal_fov_deg, got both or none")
+        angles = azimuth_deg, elevation_deg, roll_deg
+        azimuth, elevation, roll = checked_numbers(name, "azimuth, elevation, roll", angles, 3, _ANGLES)
+        position = checked_numbers(name, "position_m", position_m, 3, _METRES)
+        cam2ego = np.eye(4)
+        cam2ego[:3, :3] = rotation_z(azimuth) @ CAMERA_AXES_IN_EGO @ rotation_x(elevation) @ rotation_z(roll)
+        cam2ego[:3, 3] = position
+        camera = cls(
+            name=name,
+            width_px=width_px,
+            height_px=height_px,
+            K=np.eye(3) if K is None else K,
+            cam2ego=cam2ego,
+            lens=lens,
+            distortion=distortion,
+            mask=mask,
+        )
+        if horizontal_fov_deg is None:
+            return camera
+        size = camera.width_px, camera.height_px
+        return replace(camera, K=intrinsics_for_fov(name, horizontal_fov_deg, *size, camera.lens, camera.distortion))
+
+    # --- derived ----------------------------------------------------------------------------------------------------
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        return self.height_px, self.width_px
+
+    @property
+    def center_m(self) -> FloatArray:
+        """(3,) optical centre in the ego frame."""
+        return self.cam2ego[:3, 3]
+
+    @property
+    def azimuth_deg(self) -> float:
+        """Direction of the optical axis in the ego's x-y plane: 0 forward, 90 to the left."""
+        return math.degrees(math.atan2(self.cam2ego[1, 2], self.cam2ego[0, 2]))
+
+    @property
+    def elevation_deg(self) -> float:
+        """Angle of the optical axis above the ego's x-y plane."""
+        return math.degrees(math.asin(max(-1.0, min(1.0, self.cam2ego[2, 2]))))
+
+    @property
+    def fov_deg(self) -> tuple[float, float]:
+        """(horizontal, vertical) angle between the image's outer edges, through the principal point."""
+        cx, cy = self.K[0, 2], self.K[1, 2]
+        edges = np.array([[-0.5, cy], [self.width_px - 0.5, cy], [cx, -0.5], [cx, self.height_px - 0.5]])
+        d = self.unproject_cam(edges).directions
+        theta = np.arctan2(np.stack([d[:2, 0], d[2:, 1]]), np.stack([d[:2, 2], d[2:, 2]]))  # [axis, edge]
+        return tuple(float(x) for x in np.degrees(theta[:, 1] - theta[:, 0]))  # type: ignore[return-value]
+
+    @cached_property
+    def content_key(self) -> bytes:
+        """Digest of everything that decides where pixels fall; the name is not part of it."""
+        digest = hashlib.sha256(repr((self.size, self.lens, self.distortion)).encode())
+        digest.update(self.K.tobytes() + self.cam2ego.tobytes())
+        if self.mask is not None:
+            digest.update(np.packbits(self.mask).tobytes())
+        return digest.digest()
+
+    @cached_property
+    def fold_limit(self) -> float:
+        """Where the lens's radial function stops rising: past it, points fold back into the image.
+
+        tan(angle off axis) for pinhole and radtan, the angle in radians for fisheye.
+        """
+        return fold_limit(self.lens, self.distortion)
+
+    @cached_property
+    def half_angle_rad(self) -> float:
+        """Angle between the optical axis and the image's farthest ray; π where the lens cannot be inverted there."""
+        h, w = self.size
+        border = np.stack(np.meshgrid(np.linspace(-0.5, w - 0.5, 9), np.linspace(-0.5, h - 0.5, 9)), -1)
+        directions, valid = self.unproject_cam(border)
+        return math.acos(float(np.clip(directions[..., 2].min(), -1, 1))) if valid.all() else math.pi
+
+    @property
+    def cone_rad(self) -> float:
+        """Angle off the optical axis beyond which no point falls into the image."""
+        fold = self.fold_limit if self.lens == "fisheye" else math.atan(self.fold_limit)
+        return min(self.half_angle_rad, fold)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Camera):
+            return NotImplemented
+        return self.name == other.name and self.content_key == other.content_key
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.content_key))
+
+    def __repr__(self) -> str:
+        h_fov, v_fov = self.fov_deg
+        x, y, z = self.center_m
+        lens = "" if self.lens == "pinhole" else f" {self.lens}"
+        mask = "" if self.mask is None else f" mask {1 - self.mask.mean():.0%} own car"
+        return (
+            f"Camera({self.name} {self.width_px}x{self.height_px}{lens} fov {h_fov:.1f}x{v_fov:.1f} deg "
+            f"azimuth {self.azimuth_deg:+.1f} elevation {self.elevation_deg:+.1f} deg "
+            f"at ({x:.2f}, {y:.2f}, {z:.2f}) m{mask})"
+        )
+
+    # --- geometry ---------------------------------------------------------------------------------------------------
+    def project(self, points_ego: Any) -> Projection:
+        """Pixels of ego-frame points (..., 3)."""
+        points = np.asarray(points_ego, dtype=np.float64)
+        return self.project_cam((points - self.center_m) @ self.cam2ego[:3, :3])
+
+    def project_cam(self, points_cam: FloatArray) -> Projection:
+        """Pixels of camera-frame points (..., 3); directions without a distance do as well."""
+        x, y, z = points_cam[..., 0], points_cam[..., 1], points_cam[..., 2]
+        xd, yd, valid = distort(self.lens, self.distortion, self.fold_limit, x, y, z)
+        u = self.K[0, 0] * xd + self.K[0, 1] * yd + self.K[0, 2]
+        v = self.K[1, 1] * yd + self.K[1, 2]
+        return Projection(np.stack([u, v], -1), z, valid)
+
+    def unproject(self, uv: Any) -> Rays:
+        """Unit viewing directions in the ego frame of pixels (..., 2); the ray starts at ``center_m``.
+
+        Lenses are inverted by Newton's method. ``valid`` is False where no ray projects to within
+        ``UNPROJECT_TOLERANCE_PX`` of the pixel: outside the image circle, or past the lens's fold.
+        """
+        directions, valid = self.unproject_cam(np.asarray(uv, dtype=np.float64))
+        return Rays(directions @ self.cam2ego[:3, :3].T, valid)
+
+    def unproject_cam(self, uv: FloatArray) -> Rays:
+        """As ``unproject``, in the camera frame."""
+        yd = (uv[..., 1] - self.K[1, 2]) / self.K[1, 1]
+        xd = (uv[..., 0] - self.K[0, 2] - self.K[0, 1] * yd) / self.K[0, 0]
+        directions = undistort(self.lens, self.distortion, self.fold_limit, xd, yd)
+        if self.lens == "pinhole":
+            x, y, z = np.moveaxis(directions, -1, 0)  # a reduction over so short an axis takes ten times as long
+            return Rays(directions, np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
+        again = self.project_cam(directions)
+        with np.errstate(invalid="ignore"):
+            near = np.abs(again.uv - uv).max(-1) <= UNPROJECT_TOLERANCE_PX
+        return Rays(directions, again.valid & near)
+
+    def contains(self, uv: FloatArray, slack_px: float = 0.0) -> BoolArray:
+        """Whether pixels (..., 2) lie between the outermost pixel centres, where bilinear sampling reads no border."""
+        u, v = uv[..., 0] + slack_px, uv[..., 1] + slack_px
+        return (u >= 0) & (u <= self.width_px - 1 + 2 * slack_px) & (v >= 0) & (v <= self.height_px - 1 + 2 * slack_px)
+
+    def pixel_grid(self) -> FloatArray:
+        """(h, w, 2) pixel centres (x, y)."""
+        u, v = np.meshgrid(np.arange(self.width_px, dtype=np.float64), np.arange(self.height_px, dtype=np.float64))
+        return np.stack([u, v], -1)
+
+    # --- changed copies -------------------------------------------------------------------------------------------
+    def resize(self, size: tuple[int, int], fit: Fit = "stretch") -> Camera:
+        """The camera of the image resized to (h, w): outer edges stay, so centres move by half pixels.
+
+        Args:
+            size: (h, w) in pixels.
+            fit: ``stretch``: the whole image in this shape. ``crop`` and ``pad`` keep the aspect: what covers the size
+                is cut at the top and at both sides, or what fits inside gets bars there. A mask is False on bars.
+
+        Raises:
+            CalibrationError: An impossible size, or one that ``crop`` would have to be cut from too large an image.
+        """
+        if fit != "stretch":
+            frame = framing(self.name, self.size, size, fit)
+            scaled = self.resize(frame.scaled)
+            if frame.has_bars and self.mask is None:
+                scaled = replace(scaled, mask=np.ones(frame.scaled, bool))
+            return scaled.crop(frame.top, frame.left, frame.size)
+        h, w = checked_size(self.name, size)
+        A = resize_matrix(self.size, (h, w))
+        camera = replace(self, width_px=w, height_px=h, K=A @ self.K, mask=None)
+        if self.mask is None:
+            return camera
+        mask = cv2.resize(self.mask.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST_EXACT)
+        return replace(camera, mask=mask.astype(bool))
+
+    def crop(self, top: int, left: int, size: tuple[int, int]) -> Camera:
+        """The camera of the window of ``size`` (h, w) whose first pixel is (left, top); it may exceed the image.
+
+        Outside the image a mask is False: nothing was recorded there.
+        """
+        h, w = checked_size(self.name, size)
+        K = self.K.copy()
+        top, left = (checked_pixels(self.name, f, n, -MAX_SIZE_PX) for f, n in (("top", top), ("left", left)))
+        K[:2, 2] -= left, top
+        camera = replace(self, width_px=w, height_px=h, K=K, mask=None)
+        if self.mask is None:
+            return camera
+        mask = np.zeros((h, w), bool)
+        y0, y1 = max(0, top), min(self.height_px, top + h)
+        x0, x1 = max(0, left), min(self.width_px, left + w)
+        if y1 > y0 and x1 > x0:
+            mask[y0 - top : y1 - top, x0 - left : x1 - left] = self.mask[y0:y1, x0:x1]
+        return replace(camera, mask=mask)
+
+    def moved(self, ego2ego: Any) -> Camera:
+        """The same camera in another ego frame: ``cam2ego`` becomes ``ego2ego @ cam2ego``."""
+        move = checked_array(self.name, "ego2ego", ego2ego, (4, 4))
+        with np.errstate(over="ignore", invalid="ignore"):  # refused as a pose
+            cam2ego = move @ self.cam2ego
+        return replace(self, cam2ego=cam2ego)
+
+    def turned(self, *, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Camera:
+        """Turned about its own centre: yaw about the ego's z (left), pitch about its own x (up), roll about its z."""
+        yaw, pitch, roll = checked_numbers(self.name, "yaw, pitch, roll", (yaw_deg, pitch_deg, roll_deg), 3, _ANGLES)
+        cam2ego = self.cam2ego.copy()
+        cam2ego[:3, :3] = rotation_z(yaw) @ cam2ego[:3, :3] @ rotation_x(pitch) @ rotation_z(roll)
+        return replace(self, cam2ego=cam2ego)
+
+    def shifted(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Camera:
+        """Moved along the ego's axes."""
+        cam2ego = self.cam2ego.copy()
+        cam2ego[:3, 3] += checked_numbers(self.name, "shift", (x_m, y_m, z_m), 3, _METRES)
+        return replace(self, cam2ego=cam2ego)
+
+    def undistorted(self) -> Camera:
+        """The pinhole camera with the same K, size and pose; the mask is re-sampled to it."""
+        if self.lens == "pinhole":
+            return self
+        pinhole = replace(self, lens="pinhole", distortion=(), mask=None)
+        if self.mask is None:
+            return pinhole
+        uv, _, valid = self.project_cam(pinhole.unproject_cam(pinhole.pixel_grid()).directions)
+        pixel = np.round(uv).clip(0, [self.width_px - 1, self.height_px - 1]).astype(int)
+        seen = valid & self.contains(uv)
+        return replace(pinhole, mask=self.mask[pixel[..., 1], pixel[..., 0]] & seen)
+
+
+def resize_matrix(size: tuple[int, int], new_size: tuple[int, int]) -> FloatArray:
+    """(3, 3) pixel map of a resize between (h, w) sizes: x' = s x + (s - 1) / 2, so that outer edges coincide."""
+    sy, sx = new_size[0] / size[0], new_size[1] / size[1]
+    return np.array([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5], [0.0, 0.0, 1.0]])

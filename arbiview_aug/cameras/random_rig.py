@@ -1,0 +1,162 @@
+"""Random target rigs around a base rig: one draw a sample, or one a sequence; replayable as plain numbers."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.errors import CalibrationError, SampleError
+
+Range = float | tuple[float, float]
+"""A half-width about the neutral value (0, or 1 for scales: 0.2 means 0.8 to 1.2), or (low, high)."""
+
+_SCALES = ("focal_scale",)
+
+
+class RandomRig:
+    """Draws target rigs around ``base``: the whole rig turned, moved and zoomed by random amounts.
+
+    Args:
+        base: A rig, the name of a shipped one, or a rig file.
+        yaw_deg: Every camera turned about the vertical through its own centre; positive to the left.
+        pitch_deg: Every camera turned about its own x axis; positive up.
+        roll_deg: Every camera turned about its optical axis.
+        height_m: The rig moved up.
+        forward_m: The rig moved forward.
+        lateral_m: The rig moved to the left.
+        focal_scale: Focal lengths scaled about the principal point.
+        per: ``sample``: a draw for each call, from torch's RNG (seeded per worker and epoch by the DataLoader).
+            ``sequence``: one draw for all samples of one ``sequence_key``, the same in every worker. It follows the
+            DataLoader's seed, so each epoch that starts its workers anew draws anew; without workers, or with
+            persistent ones, ``set_epoch`` before each epoch does it.
+        sequence_key: Which entry of a sample names its sequence.
+    """
+
+    def __init__(
+        self,
+        base: Rig | str | Path,
+        *,
+        yaw_deg: Range = 0.0,
+        pitch_deg: Range = 0.0,
+        roll_deg: Range = 0.0,
+        height_m: Range = 0.0,
+        forward_m: Range = 0.0,
+        lateral_m: Range = 0.0,
+        focal_scale: Range = 0.0,
+        per: Literal["sample", "sequence"] = "sample",
+        sequence_key: str = "scene_token",
+    ) -> None:
+        self.base = base if isinstance(base, Rig) else load_rig(base)
+        if per not in ("sample", "sequence"):
+            raise CalibrationError(f"RandomRig: per: expected 'sample' or 'sequence', got {per!r}")
+        self.per, self.sequence_key = per, sequence_key
+        given = {
+            "yaw_deg": yaw_deg,
+            "pitch_deg": pitch_deg,
+            "roll_deg": roll_deg,
+            "height_m": height_m,
+            "forward_m": forward_m,
+            "lateral_m": lateral_m,
+            "focal_scale": focal_scale,
+        }
+        self.ranges = {name: _range(name, value) for name, value in given.items()}
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        if not self._epoch.is_shared():  # a copy, or from a file
+            self._epoch.share_memory_()
+
+    def draw(self, rng: torch.Generator | None = None) -> dict[str, float]:
+        """Random parameters, uniform in their ranges; from torch's global RNG unless ``rng`` is given."""
+        u = torch.rand(len(self.ranges), generator=rng, dtype=torch.float64).tolist()
+        return {name: low + (high - low) * x for (name, (low, high)), x in zip(self.ranges.items(), u, strict=True)}
+
+    def set_epoch(self, epoch: int) -> None:
+        """Let ``per="sequence"`` draw anew; reaches workers that run already. See the class."""
+        self._epoch.fill_(epoch)
+
+    def draw_for(self, sample: Mapping[str, Any], rng: torch.Generator | None = None) -> dict[str, float]:
+        """Parameters for a sample, following ``per``.
+
+        Raises:
+            SampleError: No sequence to draw for, or a batch of several.
+        """
+        if self.per == "sample":
+            return self.draw(rng)
+        # Workers of one epoch share a base seed; sequences may be split between workers.
+        worker = torch.utils.data.get_worker_info()
+        if worker is not None:
+            seed = worker.seed - worker.id
+        else:
+            seed = torch.initial_seed() if rng is None else rng.initial_seed()
+        digest = hashlib.sha256(f"{seed} {int(self._epoch)} {self._sequence(sample)}".encode()).digest()
+        return self.draw(torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1))
+
+    def _sequence(self, sample: Mapping[str, Any]) -> Any:
+        key = self.sequence_key
+        if key not in sample:
+            keys = ", ".join(map(str, sample))
+            raise SampleError(f"RandomRig(per='sequence'): expected {key!r} in the sample, got {keys}")
+        names = set(_flat(sample[key]))
+        if len(names) != 1:
+            raise SampleError(f"RandomRig(per='sequence'): {key}: expected one sequence a batch, got {len(names)}")
+        return names.pop()
+
+    def rig(self, params: Mapping[str, float]) -> Rig:
+        """The rig of drawn parameters: the same numbers give the same rig.
+
+        Raises:
+            CalibrationError: Unknown or missing parameters.
+        """
+        if set(params) != set(self.ranges):
+            raise CalibrationError(
+                f"RandomRig: expected the parameters {', '.join(self.ranges)}, got {', '.join(map(str, params))}"
+            )
+        p = {name: float(value) for name, value in params.items()}
+        rig = self.base.turned(yaw_deg=p["yaw_deg"], pitch_deg=p["pitch_deg"], roll_deg=p["roll_deg"])
+        rig = rig.shifted(p["forward_m"], p["lateral_m"], p["height_m"])
+        cameras = []
+        for camera in rig:
+            K = camera.K.copy()
+            K[:2, :2] *= p["focal_scale"]
+            cameras.append(replace(camera, K=K))
+        return rig.with_cameras(cameras)
+
+    def __repr__(self) -> str:
+        moving = ", ".join(f"{n} {lo:g}..{hi:g}" for n, (lo, hi) in self.ranges.items() if hi > lo)
+        return f"RandomRig({self.base.name or 'unnamed'}: {moving or 'nothing varies'}; per {self.per})"
+
+
+def _range(name: str, value: Any) -> tuple[float, float]:
+    neutral = 1.0 if name in _SCALES else 0.0
+    try:
+        if isinstance(value, tuple | list):
+            low, high = (float(x) for x in value)
+        else:
+            low, high = neutral - float(value), neutral + float(value)
+    except (TypeError, ValueError):
+        low, high = math.nan, math.nan
+    if not (math.isfinite(low) and math.isfinite(high) and low <= high) or (name in _SCALES and low <= 0):
+        positive = "positive " if name in _SCALES else ""
+        raise CalibrationError(f"RandomRig: {name}: expected a half-width or a {positive}(low, high), got {value!r}")
+    return low, high
+
+
+def _flat(value: Any) -> Iterator[Any]:
+    """The entries of nested lists, tensors and arrays, as a collated batch has them; of anything else itself."""
+    if isinstance(value, torch.Tensor | np.ndarray):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        for entry in value:
+            yield from _flat(entry)
+    else:
+        yield value

@@ -1,0 +1,340 @@
+"""Rigs: the cameras of one vehicle, their files, and the vehicles that ship with the package.
+
+A rig file (YAML or JSON) holds ``name``, ``ground_z_m`` and ``cameras``, each with ``name``, ``width``, ``height``,
+``K`` (3x3), ``cam2ego`` (4x4), ``distortion`` (null or ``{model: radtan|fisheye, coeffs: [...]}``) and optionally
+``mask`` (a PNG beside the file, white = scene). ``source``, ``notes``, ``ego_frame``, ``ground_source``, ``dataset``,
+``kind`` and ``license`` document it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.framing import Fit
+from arbiview_aug.cameras.key_names import hint, misnamed
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.errors import CalibrationError
+
+_CAMERA_KEYS = {"name", "width", "height", "K", "cam2ego", "distortion", "mask"}
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """The cameras of one vehicle.
+
+    Args:
+        cameras: One or more cameras with different names; all ``cam2ego`` are in this rig's ego frame.
+        ground_z_m: Height of the road in that frame (-0.33 where the origin is a rear axle 0.33 m above it).
+        name: For people.
+
+    Raises:
+        CalibrationError: No cameras, duplicate names, or a ground height that is not finite.
+    """
+
+    cameras: tuple[Camera, ...]
+    ground_z_m: float = 0.0
+    name: str = ""
+
+    def __init__(self, cameras: Sequence[Camera], *, ground_z_m: float = 0.0, name: str = "") -> None:
+        cameras = tuple(cameras)
+        where = f"rig {name!r}" if name else "rig"
+        if not cameras:
+            raise CalibrationError(f"{where}: expected at least one camera, got none")
+        for camera in cameras:
+            if not isinstance(camera, Camera):
+                raise CalibrationError(f"{where}: expected Camera objects, got {type(camera).__name__}")
+        names = [camera.name for camera in cameras]
+        twice = sorted({n for n in names if names.count(n) > 1})
+        if twice:
+            raise CalibrationError(f"{where}: expected different camera names, got {', '.join(twice)} more than once")
+        try:
+            ground = float(ground_z_m)
+        except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: tensors of several heights
+            ground = math.nan
+        if not math.isfinite(ground):
+            raise CalibrationError(f"{where}: ground_z_m: expected a finite height in metres, got {ground_z_m!r}")
+        object.__setattr__(self, "cameras", cameras)
+        object.__setattr__(self, "ground_z_m", ground)
+        object.__setattr__(self, "name", name)
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def __iter__(self) -> Iterator[Camera]:
+        return iter(self.cameras)
+
+    def __getitem__(self, key: int | str) -> Camera:
+        if isinstance(key, str):
+            for camera in self.cameras:
+                if camera.name == key:
+                    return camera
+            raise KeyError(f"no camera {key!r} in rig {self.name!r}: it has {', '.join(self.names)}")
+        return self.cameras[key]
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Rig):
+            return NotImplemented
+        return self.cameras == other.cameras and self.ground_z_m == other.ground_z_m
+
+    def __hash__(self) -> int:
+        return hash((self.cameras, self.ground_z_m))
+
+    def __repr__(self) -> str:
+        """A table: one line a camera, as ``inspect`` prints it."""
+        head = f"Rig {self.name or '(unnamed)'}: {len(self)} cameras, road at z = {self.ground_z_m:+.2f} m"
+        width = max(len(n) for n in self.names)
+        lines = [
+            f"  {'camera':<{width}}  {'size':>9}  {'lens':<7}  {'fov h x v':>13}  {'azimuth':>7}  {'elev.':>6}"
+            f"  {'x':>6} {'y':>6} {'above road':>10}"
+        ]
+        for c in self.cameras:
+            h_fov, v_fov = c.fov_deg
+            x, y, z = c.center_m
+            lines.append(
+                f"  {c.name:<{width}}  {c.width_px:>4}x{c.height_px:<4}  {c.lens:<7}  {h_fov:5.1f} x {v_fov:5.1f}"
+                f"  {c.azimuth_deg:+7.1f}  {c.elevation_deg:+6.1f}  {x:6.2f} {y:6.2f} {z - self.ground_z_m:8.2f} m"
+                + ("" if c.mask is None else f"  mask: {1 - c.mask.mean():.0%} own car")
+            )
+        return "\n".join([head, *lines])
+
+    @property
+    def names(self) -> list[str]:
+        """Camera names in order."""
+        return [camera.name for camera in self.cameras]
+
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """(h, w) of each camera."""
+        return [camera.size for camera in self.cameras]
+
+    @property
+    def K(self) -> FloatArray:
+        """(N, 3, 3) intrinsics."""
+        return np.stack([camera.K for camera in self.cameras])
+
+    @property
+    def cam2ego(self) -> FloatArray:
+        """(N, 4, 4) poses."""
+        return np.stack([camera.cam2ego for camera in self.cameras])
+
+    @cached_property
+    def content_key(self) -> bytes:
+        """Digest of the calibration: equal for rigs that render the same, whatever their names."""
+        digest = hashlib.sha256(np.float64(self.ground_z_m).tobytes())
+        for camera in self.cameras:
+            digest.update(camera.content_key)
+        return digest.digest()
+
+    # --- changed copies -------------------------------------------------------------------------------------------
+    def with_cameras(self, cameras: Sequence[Camera]) -> Rig:
+        """The same rig with other cameras."""
+        return Rig(cameras, ground_z_m=self.ground_z_m, name=self.name)
+
+    def resized(self, size: tuple[int, int] | float, fit: Fit = "stretch") -> Rig:
+        """All cameras resized to (h, w), each as ``Camera.resize`` fits it; or by a scale."""
+
+        def new(c: Camera) -> tuple[int, int]:
+            if isinstance(size, tuple):
+                return size
+            return max(1, round(c.height_px * size)), max(1, round(c.width_px * size))
+
+        return self.with_cameras([c.resize(new(c), fit) for c in self.cameras])
+
+    def turned(self, *, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Rig:
+        """Each camera turned about its own centre (see ``Camera.turned``)."""
+        return self.with_cameras([c.turned(yaw_deg=yaw_deg, pitch_deg=pitch_deg, roll_deg=roll_deg) for c in self])
+
+    def shifted(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Rig:
+        """All cameras moved along the ego's axes; the road stays."""
+        return self.with_cameras([c.shifted(x_m, y_m, z_m) for c in self])
+
+    def undistorted(self) -> Rig:
+        """The rig with pinhole cameras of the same K, sizes and poses."""
+        return self.with_cameras([c.undistorted() for c in self])
+
+    def ego2ego(self, other: Rig) -> FloatArray:
+        """(4, 4) from this rig's ego frame to ``other``'s: both roads coincide, and so do the x and y origins."""
+        T = np.eye(4)
+        T[2, 3] = other.ground_z_m - self.ground_z_m
+        return T
+
+    def in_frame_of(self, other: Rig) -> Rig:
+        """This rig as mounted on ``other``'s vehicle: poses in ``other``'s ego frame, on ``other``'s road."""
+        if self.ground_z_m == other.ground_z_m:
+            return self
+        T = self.ego2ego(other)
+        return Rig([c.moved(T) for c in self], ground_z_m=other.ground_z_m, name=self.name)
+
+    # --- files ----------------------------------------------------------------------------------------------------
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data in the rig file's format, without masks (those are files: see ``save``)."""
+        return {
+            "name": self.name,
+            "ground_z_m": self.ground_z_m,
+            "cameras": [
+                {
+                    "name": c.name,
+                    "width": c.width_px,
+                    "height": c.height_px,
+                    "K": c.K.tolist(),
+                    "distortion": None if c.lens == "pinhole" else {"model": c.lens, "coeffs": list(c.distortion)},
+                    "cam2ego": c.cam2ego.tolist(),
+                }
+                for c in self.cameras
+            ],
+        }
+
+    @classmethod
+    def from_dict(cls, data: Any, *, folder: Path | None = None, where: str = "rig") -> Rig:
+        """A rig from plain data in the rig file's format.
+
+        Args:
+            data: The parsed file.
+            folder: Where the mask files lie.
+            where: Named in error messages.
+
+        Raises:
+            CalibrationError: Missing keys or impossible values, by camera.
+        """
+        if not isinstance(data, Mapping) or not isinstance(data.get("cameras"), list):
+            raise CalibrationError(f"{where}: expected a mapping with a list 'cameras', got {type(data).__name__}")
+        _refuse_misnamed(data, "ground_z_m", where)
+        cameras = [_camera_from_dict(entry, k, folder, where) for k, entry in enumerate(data["cameras"])]
+        name = data.get("name", data.get("dataset", ""))
+        try:
+            return cls(cameras, ground_z_m=data.get("ground_z_m", 0.0), name=str(name))
+        except CalibrationError as error:
+            raise CalibrationError(f"{where}: {error}") from None
+
+    def save(self, path: str | Path) -> Path:
+        """Write the rig to a .yaml, .yml or .json file; masks become PNGs beside it. Returns the path."""
+        path = Path(path)
+        data = self.to_dict()
+        for k, (entry, camera) in enumerate(zip(data["cameras"], self.cameras, strict=True)):
+            if camera.mask is not None:
+                # Names such as /camera/front are no file names; with a space, the other cannot be a camera's own name.
+                name = camera.name if re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", camera.name) else f"camera {k}"
+                file = path.with_name(f"{path.stem}.{name}.mask.png")
+                cv2.imwrite(str(file), camera.mask.astype(np.uint8) * 255)
+                entry["mask"] = file.name
+        if path.suffix == ".json":
+            text = json.dumps(data, indent=1)
+        elif path.suffix in (".yaml", ".yml"):
+            text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120)
+        else:
+            raise CalibrationError(f"rig file {path}: expected the suffix .yaml, .yml or .json, got {path.suffix!r}")
+        path.write_text(text)
+        return path
+
+
+def shipped_rigs() -> list[str]:
+    """Names that ``load_rig`` knows without a file."""
+    folder = resources.files("arbiview_aug.cameras") / "rigs"
+    return sorted(f.name.removesuffix(".yaml") for f in folder.iterdir() if f.name.endswith(".yaml"))
+
+
+def load_rig(name_or_path: str | Path) -> Rig:
+    """A shipped rig by name (see ``shipped_rigs``), or a rig file (YAML or JSON; read with YAML's safe loader).
+
+    Raises:
+        CalibrationError: An unknown name, a missing or unreadable file, or an impossible calibration.
+    """
+    if not isinstance(name_or_path, str | Path):
+        got = type(name_or_path).__name__
+        raise CalibrationError(f"rig: expected a shipped rig's name or the path of a rig file, got {got}")
+    if isinstance(name_or_path, str) and name_or_path in shipped_rigs():
+        text = (resources.files("arbiview_aug.cameras") / "rigs" / f"{name_or_path}.yaml").read_text()
+        return Rig.from_dict(yaml.safe_load(text), where=f"rig {name_or_path}")
+    path = Path(name_or_path)
+    where = f"rig file {path}"
+    try:
+        found = path.is_file()
+    except (OSError, ValueError):  # a name that no file can have
+        found = False
+    if not found:
+        raise CalibrationError(
+            f"{where}: expected a file or one of the shipped rigs ({', '.join(shipped_rigs())}), found neither"
+        )
+    try:
+        text = path.read_text()
+        data = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
+    except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:  # ValueError: YAML's impossible dates too
+        raise CalibrationError(f"{where}: expected plain YAML or JSON, got {' '.join(str(error).split())}") from None
+    return Rig.from_dict(data, folder=path.parent, where=where)
+
+
+def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -> Camera:
+    if not isinstance(entry, Mapping):
+        raise CalibrationError(f"{where}: camera {index}: expected a mapping, got {type(entry).__name__}")
+    label = f"{where}: camera {entry.get('name', index)!r}"
+    missing = [key for key in ("name", "width", "height", "K", "cam2ego") if entry.get(key) is None]
+    if missing:
+        expected = ", ".join(sorted(_CAMERA_KEYS))
+        raise CalibrationError(f"{label}: expected keys {expected}, missing {', '.join(missing)}{hint(entry, missing)}")
+    _refuse_misnamed(entry, "distortion", label)
+    distortion = entry.get("distortion")
+    lens: Any = "pinhole"
+    coefficients: Any = ()
+    if distortion is not None:
+        if not isinstance(distortion, Mapping) or "model" not in distortion or "coeffs" not in distortion:
+            raise CalibrationError(f"{label}: distortion: expected null or {{model, coeffs}}, got {distortion!r}")
+        lens, coefficients = distortion["model"], distortion["coeffs"]
+    mask = None if entry.get("mask") is None else read_mask(entry["mask"], folder, label)
+    try:
+        return Camera(
+            name=entry["name"],
+            width_px=entry["width"],
+            height_px=entry["height"],
+            K=entry["K"],
+            cam2ego=entry["cam2ego"],
+            lens=lens,
+            distortion=coefficients,
+            mask=mask,
+        )
+    except CalibrationError as error:
+        raise CalibrationError(f"{where}: {error}") from None
+
+
+def _refuse_misnamed(entries: Mapping[str, Any], key: str, label: str) -> None:
+    """Refuse numbers under another name of an absent key, which would silently be 0; words are somebody's notes."""
+    for found in misnamed(entries, (key,)):
+        value = entries[found]
+        is_zero = not any(value) if isinstance(value, list) else not value
+        if isinstance(value, Mapping | list | int | float) and not is_zero:
+            raise CalibrationError(
+                f"{label}: {key!r} is absent, and {found!r} is not read: did you mean {key!r}? Rename it, or add "
+                f"{key!r} if it is something else"
+            )
+
+
+def read_mask(file: Any, folder: Path | None, label: str) -> np.ndarray:
+    """(H, W) bool car-body mask from an image file: bright = scene."""
+    if not isinstance(file, str) or folder is None:
+        raise CalibrationError(f"{label}: mask: expected a file name beside the rig file, got {file!r}")
+    path = folder / file
+    try:
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    except (OSError, ValueError):  # a name that no file can have
+        image = None
+    if image is None:
+        raise CalibrationError(f"{label}: mask: expected an image file {path}, found none that can be read")
+    return np.asarray(image > 0)
+
+
+def content_order(cameras: Sequence[Camera]) -> list[int]:
+    """Indices of cameras in an order that depends on their calibration alone, never on their place in the list."""
+    return sorted(range(len(cameras)), key=lambda k: (cameras[k].content_key, k))

@@ -1,0 +1,165 @@
+"""What a camera's calibration may be: each value checked, or refused with the camera's name and how to mend it.
+
+All functions take the camera's name first and raise ``CalibrationError``; what they return is read-only.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, cast, get_args
+
+import numpy as np
+
+from arbiview_aug.cameras.lens import COEFFICIENT_COUNTS, BoolArray, FloatArray, Lens
+from arbiview_aug.cameras.rotations import nearest_rotation
+from arbiview_aug.errors import CalibrationError
+
+ROTATION_TOLERANCE = 1e-4
+"""Largest entry of |R Rᵀ - I| that is still a rotation: published calibrations carry 5 to 7 digits."""
+
+_MAX_COEFFICIENT = 1e6  # real lenses stay below 1e3, and near 1e300 their polynomials overflow
+
+LENS_ALIASES = {"opencv_radtan": "radtan", "opencv_fisheye": "fisheye"}
+"""Names of lenses that are read, and what they are called here."""
+
+MAX_SIZE_PX = 32766
+"""Largest image side: OpenCV's remap needs sizes below 32767."""
+
+
+def checked_name(name: Any) -> str:
+    """A non-empty string."""
+    if not isinstance(name, str) or not name:
+        raise CalibrationError(f"camera name: expected a non-empty string, got {name!r}")
+    return name
+
+
+def checked_pixels(name: str, field: str, value: Any, least: int = 1) -> int:
+    """A whole number of pixels up to ``MAX_SIZE_PX``: an image's side, or a place with ``least`` below 1."""
+    try:
+        pixels = int(value)
+        whole = pixels == value
+    except (TypeError, ValueError, OverflowError):
+        pixels, whole = 0, False
+    if not whole or not least <= pixels <= MAX_SIZE_PX:
+        raise _error(name, field, f"a whole number of pixels from {least} to {MAX_SIZE_PX}", repr(value))
+    return pixels
+
+
+def checked_size(name: str, value: Any) -> tuple[int, int]:
+    """A size (h, w)."""
+    try:
+        h, w = value
+    except (TypeError, ValueError):
+        raise _error(name, "size", "(h, w) in pixels", repr(value)) from None
+    return checked_pixels(name, "height_px", h), checked_pixels(name, "width_px", w)
+
+
+def checked_numbers(name: str, field: str, values: Any, count: int, expected: str) -> tuple[float, ...]:
+    """Finite numbers; ``expected`` says in the error which."""
+    try:
+        numbers = tuple(float(v) for v in values)
+        good = len(numbers) == count and all(map(math.isfinite, numbers))
+        good = good and not any(isinstance(v, str | bytes) for v in values)  # float reads words too
+    except (TypeError, ValueError, OverflowError):
+        good = False
+    if not good:
+        raise _error(name, field, expected, repr(values))
+    return numbers
+
+
+def checked_array(name: str, field: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
+    """Finite float64 numbers of a shape, copied."""
+    try:
+        if np.iscomplexobj(value):
+            raise TypeError("complex numbers")
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise _error(name, field, f"numbers of shape {shape}", f"{type(value).__name__} ({error})") from None
+    if array.shape != shape:
+        raise _error(name, field, f"shape {shape}", f"shape {array.shape}")
+    if not np.isfinite(array).all():
+        raise _error(name, field, "finite numbers", f"NaN or infinity in {array.tolist()}")
+    array += 0.0  # -0.0 becomes 0.0: equal calibrations have equal bytes (content_key)
+    array.setflags(write=False)
+    return array
+
+
+def checked_intrinsics(name: str, value: Any) -> FloatArray:
+    """(3, 3) K with positive focal lengths, normalised and upper triangular."""
+    K = checked_array(name, "K", value, (3, 3))
+    if K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise _error(name, "K", "positive focal lengths", f"fx {K[0, 0]:g}, fy {K[1, 1]:g}")
+    if K[1, 0] != 0 or K[2, 0] != 0 or K[2, 1] != 0 or abs(K[2, 2] - 1) > 1e-9:
+        fix = "pass K.T" if np.any(K[2, :2]) and not np.any(K[:2, 2]) else "divide K by K[2, 2]"
+        raise _error(name, "K", "[[fx, s, cx], [0, fy, cy], [0, 0, 1]]", f"{K.tolist()}", fix)
+    return K
+
+
+def checked_pose(name: str, value: Any) -> FloatArray:
+    """(4, 4) cam2ego whose rotation is within ``ROTATION_TOLERANCE`` of one, made exact."""
+    cam2ego = checked_array(name, "cam2ego", value, (4, 4))
+    if np.abs(cam2ego[3] - (0, 0, 0, 1)).max() > 1e-9:
+        fix = "pass cam2ego.T" if np.any(cam2ego[3, :3]) and not np.any(cam2ego[:3, 3]) else ""
+        raise _error(name, "cam2ego", "last row (0, 0, 0, 1)", f"{cam2ego[3].tolist()}", fix)
+    R = cam2ego[:3, :3]
+    largest = float(np.abs(R).max())
+    if largest > 2:  # near 1e308 the products below overflow
+        fix = f"the nearest rotation is {nearest_rotation(R / largest).round(9).tolist()}"
+        raise _error(name, "cam2ego", "a rotation, with entries from -1 to 1", f"{R.tolist()}", fix)
+    deviation = float(np.abs(R @ R.T - np.eye(3)).max())
+    determinant = float(np.linalg.det(R))
+    if deviation > ROTATION_TOLERANCE or determinant < 0:
+        raise _error(
+            name,
+            "cam2ego",
+            f"a rotation (|R Rᵀ - I| <= {ROTATION_TOLERANCE:g}, determinant +1)",
+            f"deviation {deviation:.3g}, determinant {determinant:.6g}",
+            f"the nearest rotation is {nearest_rotation(R).round(9).tolist()}",
+        )
+    # Residual scale and skew of published digits would bend straight lines by a fraction of a pixel.
+    if deviation > 1e-12:
+        cam2ego = cam2ego.copy()
+        cam2ego[:3, :3] = nearest_rotation(R)
+        cam2ego.setflags(write=False)
+    return cam2ego
+
+
+def checked_lens(name: str, value: Any) -> Lens:
+    """The name of a lens model; one of ``LENS_ALIASES`` by its own name."""
+    value = LENS_ALIASES.get(value, value) if isinstance(value, str) else value
+    if not isinstance(value, str) or value not in get_args(Lens):
+        raise _error(name, "lens", f"one of {', '.join(get_args(Lens))}", repr(value))
+    return cast(Lens, value)
+
+
+def checked_distortion(name: str, lens: Lens, value: Any) -> tuple[float, ...]:
+    """As many coefficients as the lens takes, at most 1e6."""
+    try:
+        coefficients = tuple(float(k) + 0.0 for k in value)
+    except (TypeError, ValueError, OverflowError):
+        raise _error(name, "distortion", "a sequence of numbers", repr(value)) from None
+    counts = COEFFICIENT_COUNTS[lens]
+    if len(coefficients) not in counts:
+        expected = " or ".join(map(str, counts)) + f" coefficients for a {lens} lens"
+        fix = "name the lens: lens='radtan' or lens='fisheye'" if lens == "pinhole" else ""
+        raise _error(name, "distortion", expected, str(len(coefficients)), fix)
+    if not all(abs(k) <= _MAX_COEFFICIENT for k in coefficients):  # also catches NaN
+        raise _error(name, "distortion", f"finite numbers up to {_MAX_COEFFICIENT:g}", repr(coefficients))
+    return coefficients
+
+
+def checked_mask(name: str, value: Any, size: tuple[int, int]) -> BoolArray:
+    """(h, w) bool of the image's size, copied."""
+    array = np.asarray(value)
+    if array.dtype != np.bool_:
+        raise _error(name, "mask", "bool, True = scene", f"dtype {array.dtype}", "pass mask > 0")
+    if array.shape != size:
+        raise _error(name, "mask", f"shape {size}, the size (h, w) of the image", f"shape {array.shape}")
+    array = array.copy()
+    array.setflags(write=False)
+    return array
+
+
+def _error(name: str, field: str, expected: str, got: str, fix: str = "") -> CalibrationError:
+    tail = f"; {fix}" if fix else ""
+    return CalibrationError(f"camera {name!r}: {field}: expected {expected}, got {got}{tail}")

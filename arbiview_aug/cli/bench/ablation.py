@@ -1,0 +1,300 @@
+"""``python -m arbiview_aug bench ablation``: what each stage and setting is worth, in dB and in milliseconds.
+
+Every row is a method; all render the same targets: the paper's six configurations (each camera turned by a share of
+the spacing to its neighbour) and the rig raised by 0.6 m. On real frames they are scored by the paper's measure, LiDAR
+points with the colours that the source cameras saw, exposures made even, unseen pixels black; on the synthetic street
+against the true views, on seen pixels (``evaluate.frames``). A step is the difference of two rows.
+
+Milliseconds are CPU time of a frame on one thread, the median over the targets, without the plan that a calibration
+needs once; steps whose plan belongs to one frame pay for it. What a step adds is the median over the targets of the
+difference between its two rows: rows take turns on each target, so that what else the machine does slows all alike.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cli.bench.timing import cpu_model, quartiles, write_json
+from arbiview_aug.datasets import open_data, reduced_rig
+from arbiview_aug.datasets.image_io import Reduce
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.environment import one_thread
+from arbiview_aug.errors import DataError
+from arbiview_aug.evaluate.agreement import source_overlap, summary
+from arbiview_aug.evaluate.frames import ScoredFrame, make_frame, scores
+from arbiview_aug.evaluate.images import RenderedView
+from arbiview_aug.evaluate.methods import Method, Sample, paper_stages, retargeting
+from arbiview_aug.evaluate.metrics import mean_of
+from arbiview_aug.evaluate.report.tables import Column, cell, markdown_table
+from arbiview_aug.evaluate.targets import UP_M, paper_targets, shifted_target
+from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality
+from arbiview_aug.render.refinement import RefinementCache
+from arbiview_aug.scene.surface import SurfaceName
+
+SYNTHETIC = "synthetic street"
+_WEIGHTS = ("distance", "gradient", "quality", "primary")
+
+
+def _stages_1_and_4(*without: str) -> PaperConfig:
+    off: dict[str, Any] = {f"use_{weight}_weight": False for weight in without}
+    return replace(paper_stages()["paper without stages 2 and 3"], **off)
+
+
+class Row(NamedTuple):
+    """Settings of ``retargeting``; ``held``: with depth from overlap held; ``reduce``: targets 1 / this as large."""
+
+    quality: Quality | FavsConfig | PaperConfig
+    surface: SurfaceName = "street"
+    harmonise: bool = False
+    held: bool = False
+    reduce: Reduce = 1
+
+    def method(self, name: str) -> Method:
+        """The row as a method that holds nothing yet."""
+        refinement = RefinementCache() if self.held else None
+        return retargeting(self.quality, self.surface, name, harmonise=self.harmonise, refinement=refinement)
+
+    def fits(self, frame: ScoredFrame) -> bool:
+        """Whether a frame can tell what the row is worth.
+
+        Boxes are needed to stand on the street. LiDAR's colours are read at points: no measure for antialiased views.
+        """
+        if self.reduce > 1:
+            return frame.truth is not None
+        return self.surface != "objects" or "boxes_3d" in frame.sample
+
+
+ROWS: dict[str, Row] = {
+    **{name: Row(config, "far") for name, config in paper_stages().items()},
+    **{f"stages 1 and 4 without w_{w}": Row(_stages_1_and_4(w), "far") for w in _WEIGHTS},
+    "stage 1": Row(_stages_1_and_4(*_WEIGHTS), "far"),
+    "draft": Row("draft"),
+    "fast without blended seams": Row(FavsConfig(seam_width=0.0)),
+    "fast": Row("fast"),
+    "fast, far": Row("fast", "far"),
+    "fast, ground": Row("fast", "ground"),
+    "fast, objects": Row("fast", "objects"),
+    "fast, a quarter as large": Row("fast", reduce=4),
+    "fast, a quarter as large, aliased": Row(FavsConfig(antialias=False), reduce=4),
+    "fast, harmonised": Row("fast", harmonise=True),
+    "accurate": Row("accurate"),
+    "accurate, held": Row("accurate", held=True),
+}
+"""Methods by name."""
+
+
+class Step(NamedTuple):
+    """Two rows that differ by one thing; ``replanned``: with it, every frame needs a plan of its own."""
+
+    row: str
+    without: str
+    replanned: bool = False
+
+
+STEPS: dict[str, Step] = {
+    "stage 2, matching": Step("paper", "paper without stage 2, matching"),
+    "stage 3, objects": Step("paper", "paper without stage 3, objects"),
+    "stages 2 and 3": Step("paper", "paper without stages 2 and 3"),
+    "stage 4, weights": Step("paper", "paper without stage 4, weights"),
+    "stages 2, 3 and 4": Step("paper", "stage 1"),
+    **{f"w_{w}": Step("paper without stages 2 and 3", f"stages 1 and 4 without w_{w}") for w in _WEIGHTS},
+    "bilinear, not nearest": Step("fast without blended seams", "draft"),
+    "blended seams": Step("fast", "fast without blended seams"),
+    "ground, not far": Step("fast, ground", "fast, far"),
+    "street, not far": Step("fast", "fast, far"),
+    "street, not ground": Step("fast", "fast, ground"),
+    "boxes on the street": Step("fast, objects", "fast", replanned=True),
+    "antialiasing": Step("fast, a quarter as large", "fast, a quarter as large, aliased"),
+    "depth from overlap": Step("accurate", "fast", replanned=True),
+    "depth from overlap, held": Step("accurate, held", "fast"),
+    "harmonising": Step("fast, harmonised", "fast"),
+}
+"""What is switched on, by name."""
+
+NOTES = (
+    f"PSNR in dB on the paper's six configurations (turned) and {UP_M} m higher (raised): on real frames at LiDAR "
+    "points, exposures made even, unseen pixels black; on the synthetic street against the true views, on seen pixels. "
+    "CPU ms a frame on one thread, without plans, but for boxes and depth from overlap, where every frame needs its "
+    "own. In parentheses what the step adds; last what a ms of it buys, in 0.001 dB turned / raised; *no time*: the "
+    "added time is within its spread over the targets."
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure, print the table, write the JSON."""
+    parser = argparse.ArgumentParser(
+        prog="python -m arbiview_aug bench ablation",
+        description="Each stage and setting on and off: accuracy, milliseconds on one thread, and what a ms buys.",
+    )
+    parser.add_argument(
+        "--data",
+        metavar="FOLDER",
+        nargs="+",
+        type=Path,
+        default=[],
+        help="data with LiDAR, of each its first frame (default: a synthetic street)",
+    )
+    parser.add_argument(
+        "--reduce", type=int, choices=(1, 2, 4), default=2, help="decode its images at 1/N (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the synthetic street (default: %(default)s)")
+    parser.add_argument("--only", metavar="TEXT", default="", help="steps whose names contain it")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of the table")
+    parser.add_argument("--output", default="output/ablation.json", metavar="FILE", help="(default: %(default)s)")
+    arguments = parser.parse_args(argv)
+    steps = [name for name in STEPS if arguments.only in name]
+    if not steps:
+        parser.error(f"argument --only: expected part of one of {', '.join(STEPS)}")
+    if len({folder.resolve().name for folder in arguments.data}) < len(arguments.data):
+        parser.error("argument --data: expected folders of different names")
+    with one_thread(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of targets that are half outside: the paper's are
+        report = measure(arguments.data, steps, reduce=arguments.reduce, seed=arguments.seed)
+    path = Path(arguments.output)
+    text = write_json(report, path)
+    print(text if arguments.json else f"{markdown(report)}\n\n{report['cpu']}; report: {path}")
+    return 0
+
+
+def measure(
+    data: Sequence[Path],
+    steps: Sequence[str],
+    *,
+    reduce: Reduce = 2,
+    seed: int = 0,
+    size: tuple[int, int] = (256, 704),
+) -> dict[str, Any]:
+    """All steps asked for and the rows that they need, as plain data for JSON.
+
+    Args:
+        data: Folders of data with LiDAR, of each the first frame; none for a synthetic street.
+        steps: Names out of ``STEPS``.
+        reduce: The images of folders are decoded at 1 / this.
+        seed: Of the street.
+        size: (h, w) of its images.
+    """
+    found = {}
+    for name, frame in _frames(data, reduce, seed, size):
+        fitting = {step: STEPS[step] for step in steps if ROWS[STEPS[step].row].fits(frame)}
+        rows = _rows(name, frame, {row for step in fitting.values() for row in (step.row, step.without)})
+        metric = "even_psnr_db" if frame.truth is None else "true_covered_psnr_db"
+        found[name] = {
+            "size": list(frame.sample["rig"].sizes[0]),
+            "rows": rows,
+            "steps": {step: step_figures(which, rows, metric) for step, which in fitting.items()},
+            "overlap": [_overlap(frame, harmonised) for harmonised in (False, True) if "harmonising" in fitting],
+        }
+    return {"benchmark": "ablation", "cpu": cpu_model(), "data": found}
+
+
+def markdown(report: Mapping[str, Any]) -> str:
+    """The table of steps, data sets side by side, and what is to be known about it."""
+    sets: Mapping[str, Any] = report["data"]
+    head = ["", "part of", *(h for name in sets for h in (f"{name}: turned", "raised", "ms", "mdB a ms"))]
+    rows = [
+        [name, step.row, *(text for of in sets.values() for text in _cells(of["steps"].get(name)))]
+        for name, step in STEPS.items()
+        if any(name in of["steps"] for of in sets.values())
+    ]
+    parts = [NOTES, markdown_table(head, rows, left=2)]
+    db = Column("", "overlap_raw_psnr_db")
+    overlaps = [
+        f"{name} {' to '.join(cell(row, db) for row in of['overlap'])}" for name, of in sets.items() if of["overlap"]
+    ]
+    if overlaps:
+        parts.append(f"Harmonising is for where neighbours overlap: as recorded, in dB, {', '.join(overlaps)}.")
+    return "\n\n".join(parts)
+
+
+# --- what is measured -------------------------------------------------------------------------------------------------
+def _frames(
+    data: Sequence[Path], reduce: Reduce, seed: int, size: tuple[int, int]
+) -> Iterator[tuple[str, ScoredFrame]]:
+    for folder in data:
+        sample = open_data(folder, reduce=reduce)[0]
+        if "points" not in sample:
+            raise DataError(f"--data {folder}: expected LiDAR points to score by, got none")
+        yield folder.resolve().name, make_frame(sample, exposures=("even",))
+    if not data:
+        drive = SyntheticDrive(demo_source_rig(size), num_frames=1, seed=seed, lidar=False)
+        yield SYNTHETIC, make_frame(drive[0], truth=partial(drive.render, 0), exposures=())
+
+
+def _rows(data: str, frame: ScoredFrame, names: set[str]) -> dict[str, dict[str, Any]]:
+    """Of each row the mean metrics, ``turned`` and ``raised``, and the times on each target, ``ms`` and ``plan_ms``."""
+    rig: Rig = frame.sample["rig"]
+    targets = [("turned", target) for target in paper_targets(rig)] + [("raised", shifted_target(rig, z_m=UP_M))]
+    keys = ("turned", "raised", "ms", "plan_ms")
+    found: dict[str, dict[str, Any]] = {row: {key: [] for key in keys} for row in ROWS if row in names}
+    with tqdm(total=len(targets) * len(found), desc=data, unit="row", leave=False) as progress:
+        for move, target in targets:
+            for name, row in found.items():
+                metrics, times = _timed(frame, name, target)
+                row[move] += metrics
+                row["ms"].append(times[-1])
+                row["plan_ms"].append(times[0] - times[-1])
+                progress.update()
+    return {name: row | {move: mean_of(row[move]) for move in ("turned", "raised")} for name, row in found.items()}
+
+
+def _timed(frame: ScoredFrame, name: str, target: Rig) -> tuple[list[dict[str, float]], list[float]]:
+    """Metrics of a row's views, and CPU ms of the first call, which plans, and of the next; the paper plans nothing."""
+    row, times = ROWS[name], []
+    method, calls = row.method(name), 1 if isinstance(row.quality, PaperConfig) else 2
+
+    def render(sample: Sample, rig: Rig) -> list[RenderedView]:
+        for _ in range(calls):
+            start = time.process_time()
+            views = method.render(sample, rig)
+            times.append(1e3 * (time.process_time() - start))
+        return views
+
+    return scores(frame, render, reduced_rig(target, row.reduce), ("even",))[1], times
+
+
+def step_figures(step: Step, rows: Mapping[str, Any], metric: str) -> dict[str, Any]:
+    """What a step reaches, what it adds, and how much of it for each ms; None where the ms are within their spread."""
+    row, without = rows[step.row], rows[step.without]
+    ms = np.add(row["ms"], row["plan_ms"]) if step.replanned else np.array(row["ms"])
+    added = quartiles(ms - np.array(without["ms"]))
+    figures: dict[str, Any] = {"ms": statistics.median(ms.tolist()), "added_ms": added._asdict()}
+    for move in ("turned", "raised"):
+        gain = row[move][metric] - without[move][metric]
+        per_ms = gain / added.median_ms if added.q1_ms > 0 else None
+        figures[move] = {"psnr_db": row[move][metric], "gain_db": gain, "gain_db_per_ms": per_ms}
+    return figures
+
+
+def _cells(step: Mapping[str, Any] | None) -> list[str]:
+    if step is None:
+        return ["-"] * 4
+    moves, ms, added_ms = (step["turned"], step["raised"]), step["ms"], step["added_ms"]["median_ms"]
+    digits = 0 if ms >= 100 else 1
+    bought = [move["gain_db_per_ms"] for move in moves]
+    return [
+        *(f"{move['psnr_db']:.2f} ({_signed(move['gain_db'], 2)})" for move in moves),
+        f"{ms:.{digits}f} ({_signed(added_ms, digits)})",
+        "no time" if None in bought else " / ".join(_signed(1e3 * db, 0) for db in bought),
+    ]
+
+
+def _signed(value: float, digits: int) -> str:
+    """With a sign, of which a rounded 0 has +."""
+    return f"{round(value, digits) + 0.0:+.{digits}f}"
+
+
+def _overlap(frame: ScoredFrame, harmonised: bool) -> dict[str, float]:
+    """Agreement of neighbours in the view between them, on the frame as recorded."""
+    return summary("overlap", source_overlap(frame.sample, retargeting("fast", "street", harmonise=harmonised)))

@@ -1,0 +1,292 @@
+"""``python -m arbiview_aug bench loader``: frames per second out of a ``DataLoader``, and what a worker holds.
+
+Real frames: they are read and decoded from disk, repeated to an epoch, with and without retargeting, by 0, 1, 2 and
+more workers. Workers persist, so that their start is not counted, and a first epoch warms them. Rates are by the clock
+on the wall, since workers run beside each other: other work on the machine slows them. So the load stands beside them,
+and how far as many processes come that only count, against one.
+
+*Unique* is the memory that a worker has for itself (Linux: its private pages), what a further one costs; *peak* its
+largest resident set, with what it shares with the others. *CPU* is processor time a frame over all workers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import re
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from torch.utils.data import DataLoader, Dataset
+from tqdm import tqdm
+
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cli.arguments import add_data, add_target, count, size
+from arbiview_aug.cli.bench.data import REDUCES, SOURCES_OVER_VIEWS, Recorded, recorded
+from arbiview_aug.cli.bench.timing import Quartiles, machine, machine_line, quartiles, show
+from arbiview_aug.datasets import RetargetedDataset, open_data
+from arbiview_aug.datasets.image_io import Reduce
+from arbiview_aug.environment import one_thread, versions
+from arbiview_aug.scene.surface import SurfaceName
+from arbiview_aug.transforms.rig_retarget import RigRetarget
+
+WORKERS = (0, 1, 2)
+SIZE = (256, 704)
+FRAMES, EPOCHS = 48, 3
+PLAIN = "read only"
+_APART_M = 1e-4
+_MIB = 2**20
+
+_COUNTING = """
+import time
+end, n = time.perf_counter() + 1.0, 0
+while time.perf_counter() < end:
+    n += 1
+print(n)
+"""
+
+
+class Repeated(Dataset[Any]):
+    """A data set over and over, to a length; points and boxes are a hair higher each time, so that nothing planned for
+    one frame serves another.
+
+    Args:
+        dataset: Of dicts, with ``__getitem__`` and ``__len__``.
+        length: How many samples.
+    """
+
+    def __init__(self, dataset: Any, length: int) -> None:
+        self.dataset, self.length = dataset, length
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, index: int) -> Any:
+        lap, index = divmod(index, len(self.dataset))
+        sample = dict(self.dataset[index])
+        for key in ("points", "boxes_3d"):
+            if lap and key in sample:
+                sample[key] = sample[key].clone()
+                sample[key][:, 2] += lap * _APART_M
+        return sample
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A data set through a number of workers.
+
+    Attributes:
+        name: Of the data set.
+        workers: How many; 0 is the process itself.
+        frames_per_s: Median over the epochs, by the clock on the wall.
+        best_per_s: The fastest epoch's: other work on a machine can only slow it.
+        ms: Median and quartiles of the time a frame takes.
+        cpu_ms: Processor time a frame, over all workers; None where the system does not tell.
+        unique_mib: Memory that a worker has for itself at the end, mean over the workers; None without workers.
+        peak_mib: A worker's largest resident set, the largest of them.
+    """
+
+    name: str
+    workers: int
+    frames_per_s: float
+    best_per_s: float
+    ms: Quartiles
+    cpu_ms: float | None
+    unique_mib: float | None
+    peak_mib: float | None
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure, print the table, write the JSON."""
+    parser = argparse.ArgumentParser(
+        prog="python -m arbiview_aug bench loader",
+        description="Frames per second of a DataLoader with and without retargeting, and memory per worker.",
+    )
+    add_data(parser, "synthetic streets, written as JPEGs")
+    add_target(parser)
+    parser.add_argument("--workers", type=int, nargs="+", default=list(WORKERS), metavar="N", help="(default: 0 1 2)")
+    parser.add_argument("--size", type=size, default=SIZE, metavar="HxW", help="of every view (default: 256x704)")
+    parser.add_argument(
+        "--reduce", type=int, choices=REDUCES, default=2, help="decode the images at 1/N (default: %(default)s)"
+    )
+    parser.add_argument("--surface", nargs="+", choices=get_args(SurfaceName), default=["auto"], help="(default: auto)")
+    parser.add_argument("--frames", type=count, default=FRAMES, metavar="N", help="an epoch (default: %(default)s)")
+    parser.add_argument("--epochs", type=count, default=EPOCHS, metavar="N", help="(default: %(default)s)")
+    parser.add_argument("--output", default="output/loader.json", metavar="FILE", help="(default: %(default)s)")
+    arguments = parser.parse_args(argv)
+    if min(arguments.workers) < 0:
+        parser.error(f"argument --workers: expected whole numbers from 0, got {min(arguments.workers)}")
+    h, w = (SOURCES_OVER_VIEWS * side for side in arguments.size)
+    with recorded(arguments.data, size=(h, w)) as data:
+        report = measure(
+            data,
+            data.target(arguments.target, arguments.size),
+            workers=arguments.workers,
+            reduce=arguments.reduce,
+            surfaces=arguments.surface,
+            frames=arguments.frames,
+            epochs=arguments.epochs,
+        )
+    show(table(report), report, Path(arguments.output))
+    return 0
+
+
+def measure(
+    data: Recorded,
+    target: Rig,
+    *,
+    workers: Sequence[int] = WORKERS,
+    reduce: Reduce = 2,
+    surfaces: Sequence[SurfaceName] = ("auto",),
+    frames: int = FRAMES,
+    epochs: int = EPOCHS,
+) -> dict[str, Any]:
+    """All rates, as plain data for JSON.
+
+    Args:
+        data: The frames.
+        target: The rig to render.
+        workers: Numbers of workers.
+        reduce: Images are decoded at 1 / this.
+        surfaces: Retargeted over each.
+        frames: Samples in an epoch.
+        epochs: How many are measured.
+    """
+    load_before = os.getloadavg()
+    plain: Dataset[Any] = Repeated(open_data(data.root, reduce=reduce), frames)
+    datasets: dict[str, Dataset[Any]] = {PLAIN: plain}
+    rig = data.sample(0, reduce)["rig"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of static surfaces and of what no source sees
+        for surface in surfaces:
+            retarget = RigRetarget(target, surface=surface)
+            retarget.prepare(rig)  # plans that do not depend on the frame: workers share them
+            datasets[f"retargeted, {surface}"] = RetargetedDataset(plain, retarget)
+        most = max(workers)
+        alone, together = counted(1), counted(max(most, 1))
+        rates = loader_rates(datasets, workers, epochs)
+    return {
+        "benchmark": "loader",
+        "clock": "on the wall",
+        "data": data.name,
+        "sources": [list(of_camera) for of_camera in rig.sizes],
+        "target": target.name or "target",
+        "size": list(target.sizes[0]),
+        "frames": frames,
+        "epochs": epochs,
+        "counting": {"processes": most, "against_one": together / alone},
+        "machine": machine(load_before),
+        "versions": versions(),
+        "rates": [asdict(rate) for rate in rates],
+    }
+
+
+def table(report: Mapping[str, Any]) -> str:
+    """The report to read."""
+    h, w = report["size"]
+    counting = report["counting"]
+    lines = [
+        machine_line(report),
+        f"{report['data']}, {len(report['sources'])} cameras to {report['target']} at {w}x{h}, epochs of "
+        f"{report['frames']} frames; {counting['processes']} processes that only count do "
+        f"{counting['against_one']:.2f} times one's work",
+        f"{'':<24}{'workers':>8}{'frames/s':>10}{'best':>8}{'CPU ms':>8}{'unique MiB':>12}{'peak MiB':>10}",
+    ]
+    for rate in report["rates"]:
+        cells = [
+            "-" if rate[key] is None else f"{rate[key]:.{digits}f}"
+            for key, digits in (("cpu_ms", 1), ("unique_mib", 0), ("peak_mib", 0))
+        ]
+        lines.append(
+            f"{rate['name']:<24}{rate['workers']:>8}{rate['frames_per_s']:>10.1f}{rate['best_per_s']:>8.1f}"
+            + "".join(f"{cell:>{width}}" for cell, width in zip(cells, (8, 12, 10), strict=True))
+        )
+    return "\n".join(lines)
+
+
+# --- measuring --------------------------------------------------------------------------------------------------------
+def loader_rates(datasets: Mapping[str, Dataset[Any]], workers: Sequence[int], epochs: int) -> list[Rate]:
+    """Rates of all data sets with all numbers of workers, epoch by epoch in turn; one thread in this process."""
+    with one_thread():
+        loaders = {
+            (name, n): DataLoader(dataset, batch_size=None, num_workers=n, persistent_workers=n > 0)
+            for name, dataset in datasets.items()
+            for n in workers
+        }
+        pids: dict[tuple[str, int], list[int]] = {}
+        for key, loader in loaders.items():
+            before = _children()
+            epoch_s(loader)  # workers start, buffers are made
+            pids[key] = sorted(_children() - before) or [os.getpid()]
+        times: dict[tuple[str, int], list[float]] = {key: [] for key in loaders}
+        used_s = {key: 0.0 for key in loaders}
+        for _ in tqdm(range(epochs), unit="epoch", leave=False):
+            for key, loader in loaders.items():
+                start_s = _cpu_s(pids[key])
+                times[key].append(epoch_s(loader))
+                used_s[key] += _cpu_s(pids[key]) - start_s
+        return [_rate(key, datasets[key[0]], times[key], used_s[key], pids[key]) for key in loaders]
+
+
+def epoch_s(loader: DataLoader[Any]) -> float:
+    """Seconds on the wall that an epoch takes."""
+    start = time.perf_counter()
+    for _ in loader:
+        pass
+    return time.perf_counter() - start
+
+
+def counted(processes: int) -> int:
+    """How far processes that only count come together in one second: what the machine gives beside its other work."""
+    running = [subprocess.Popen([sys.executable, "-c", _COUNTING], stdout=subprocess.PIPE) for _ in range(processes)]
+    return sum(int(process.communicate()[0]) for process in running)
+
+
+def _rate(key: tuple[str, int], dataset: Any, epochs_s: list[float], used_s: float, pids: list[int]) -> Rate:
+    (name, workers), frames = key, len(dataset)
+    found = quartiles(1e3 * np.array(epochs_s) / frames)
+    unique = [_mib(pid, "smaps_rollup", "Private_(?:Clean|Dirty)") for pid in pids] if workers else []
+    peaks = [_mib(pid, "status", "VmHWM") for pid in pids] if workers else []
+    return Rate(
+        name=name,
+        workers=workers,
+        frames_per_s=1e3 / found.median_ms,
+        best_per_s=frames / min(epochs_s),
+        ms=found,
+        cpu_ms=1e3 * used_s / frames / len(epochs_s) if used_s else None,
+        unique_mib=float(np.mean(unique)) if all(unique) and unique else None,
+        peak_mib=max(peaks) if all(peaks) and peaks else None,
+    )
+
+
+def _children() -> set[int]:
+    return {child.pid for child in multiprocessing.active_children() if child.pid is not None}
+
+
+def _cpu_s(pids: Sequence[int]) -> float:
+    """Processor time of processes so far; 0 where the system does not tell (no Linux)."""
+    total = 0.0
+    for pid in pids:
+        try:
+            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            return 0.0
+        total += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")  # utime, stime
+    return total
+
+
+def _mib(pid: int, file: str, fields: str) -> float:
+    """The sum of some of a process's memory figures; 0 where the system does not tell."""
+    try:
+        text = Path(f"/proc/{pid}/{file}").read_text()
+    except OSError:
+        return 0.0
+    return sum(int(kib) for kib in re.findall(rf"^{fields}:\s+(\d+) kB", text, re.MULTILINE)) * 1024 / _MIB

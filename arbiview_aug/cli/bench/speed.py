@@ -1,0 +1,305 @@
+"""``python -m arbiview_aug bench speed``: how near rendering comes to what reading the pixels alone costs.
+
+The floor, fixed forever: for six cameras, six bare ``cv2.remap`` calls, linear, from interleaved uint8 RGB images into
+preallocated outputs of the target's size, with float32 maps that read a source of the output's own size at
+
+    x' = 0.97 x + 0.02 y + 3        y' = 0.95 y + 0.01 x + 5
+
+(x, y the output pixel): a mild stretch, one source each. Every figure is a ratio to the floor of the same output size,
+because milliseconds of different machines cannot be compared.
+
+How times are taken stands in ``bench.timing``. A time is the median over the rounds; a ratio is the median over the
+rounds of candidate / floor within a round.
+
+``frame`` is the cached plan executed: the sample's uint8 images in, one uint8 (M, 3, h, w) tensor out. ``interleaved``
+images lie channels-last in one block, as this package's readers give them, ``planar`` ones are contiguous. ``whole
+call`` is ``RigRetarget`` with its checks and the plan's lookup, holes left black; ``filled``: with them filled, the
+default. ``holes`` is that filling alone, of so many of the pixels. ``plan`` builds the plan of a calibration that was
+not seen before; its ratio is to the frame, which it precedes where every frame has its own calibration. ``harmonised``
+is the frame with known gains for all cameras.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.cli.bench.timing import machine, machine_line, quartiles, show, timed_rounds
+from arbiview_aug.datasets import FrameFolder, reduced_rig
+from arbiview_aug.environment import one_thread, versions
+from arbiview_aug.errors import DataError
+from arbiview_aug.evaluate.targets import without_masks
+from arbiview_aug.generator.fillers import Holes, fill_holes
+from arbiview_aug.render.atlas import Scratch
+from arbiview_aug.render.opencv_backend import render_opencv
+from arbiview_aug.render.plan import build_plan
+from arbiview_aug.render.tone_curve import ToneCurve
+from arbiview_aug.transforms.rig_retarget import RigRetarget
+
+YAW_DEG = 22.0
+SMALL_SIZE = (256, 704)
+REPEATS = 15
+_SMALL_ROUNDS = 3
+"""Small frames take a sixth of the time and more rounds: their times are noisier."""
+_NEW_CALIBRATION_M = 0.01
+_EGO_MOTION = (0.4, 0.07)
+"""Largest movement (m) and turn (deg) of a camera between its own and the LiDAR's time on nuScenes."""
+_GAINS = (0.8, 1.1, 0.9, 1.25, 1.05, 0.95)
+"""Gains of every source, as far apart as a real frame's: none of them is free."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One candidate, and how it compares.
+
+    Attributes:
+        name: Output size and what was run.
+        of: What ``ratio`` is relative to: another measure's name, empty for a floor.
+        median_ms: Median time.
+        q1_ms: First quartile.
+        q3_ms: Third quartile.
+        ratio: Median over the rounds of this time / the other's in the same round.
+        bound: The largest ratio that is acceptable; None where the figure is for information.
+    """
+
+    name: str
+    of: str
+    median_ms: float
+    q1_ms: float
+    q3_ms: float
+    ratio: float
+    bound: float | None
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    name: str
+    run: Callable[[], Any]
+    of: str = ""
+    bound: float | None = None
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure, print the table, write the JSON."""
+    parser = argparse.ArgumentParser(
+        prog="python -m arbiview_aug bench speed",
+        description="Milliseconds on one thread, and ratios to six bare cv2.remap calls of the same output pixels.",
+    )
+    parser.add_argument(
+        "--data",
+        metavar="FOLDER",
+        help="a frame folder whose images to render (default: nuscenes-one below ARBIVIEW_DATA where that is, else "
+        "random smooth images for nuScenes' rig)",
+    )
+    parser.add_argument("--output", default="output/speed.json", metavar="FILE", help="(default: %(default)s)")
+    parser.add_argument(
+        "--repeats", type=int, default=REPEATS, metavar="N", help="rounds at full size (default: %(default)s)"
+    )
+    arguments = parser.parse_args(argv)
+    if arguments.repeats < 1:
+        parser.error(f"argument --repeats: expected a whole number above 0, got {arguments.repeats}")
+    report = measure(arguments.data or default_data(), arguments.repeats)
+    show(table(report), report, Path(arguments.output))
+    return 0
+
+
+def default_data() -> Path | None:
+    """The real keyframe, where ``ARBIVIEW_DATA`` leads to it."""
+    root = os.environ.get("ARBIVIEW_DATA")
+    folder = Path(root) / "nuscenes-one" if root else None
+    return folder if folder is not None and folder.is_dir() else None
+
+
+def measure(
+    data: str | Path | None = None,
+    repeats: int = REPEATS,
+    *,
+    full_size: tuple[int, int] | None = None,
+    small_size: tuple[int, int] = SMALL_SIZE,
+) -> dict[str, Any]:
+    """All measures, as plain data for JSON.
+
+    Args:
+        data: A frame folder; None for random smooth images on nuScenes' rig.
+        repeats: Rounds at full size.
+        full_size: (h, w) of the random images; only to try the benchmark out.
+        small_size: (h, w) of the small output.
+    """
+    rig, images, halves = _inputs(data, full_size)
+    load_before = os.getloadavg()
+    with one_thread():
+        measures = _run(_full_size(rig, images), repeats, "full size")
+        measures += _run(_small_size(rig, images, halves, small_size), repeats * _SMALL_ROUNDS, "small")
+    return {
+        "benchmark": "speed",
+        "floor": "six cv2.remap, linear, float32 maps, x' = 0.97 x + 0.02 y + 3, y' = 0.95 y + 0.01 x + 5",
+        "clock": "CPU time of the process, milliseconds",
+        "data": "random smooth images" if data is None else Path(data).name,
+        "sources": [list(size) for size in rig.sizes],
+        "rounds": {"full size": repeats, "small": repeats * _SMALL_ROUNDS},
+        "machine": machine(load_before),
+        "versions": versions(),
+        "measures": [asdict(m) for m in measures],
+    }
+
+
+def table(report: dict[str, Any]) -> str:
+    """The report to read."""
+    lines = [
+        machine_line(report),
+        f"{'':<44}{'median':>11}{'quartiles':>18}  ratio to",
+    ]
+    for m in report["measures"]:
+        quartiles = f"{m['q1_ms']:.2f} .. {m['q3_ms']:.2f}"
+        ratio = f"  {m['ratio']:5.2f} {m['of']}" if m["of"] else ""
+        bound = f" (at most {m['bound']:g})" if m["bound"] is not None else ""
+        lines.append(f"{m['name']:<44}{m['median_ms']:>8.2f} ms{quartiles:>18}{ratio}{bound}")
+    return "\n".join(lines)
+
+
+# --- what is measured -------------------------------------------------------------------------------------------------
+def _full_size(rig: Rig, images: torch.Tensor) -> list[_Candidate]:
+    target = rig.turned(yaw_deg=YAW_DEG)
+    label = "{1}x{0}".format(*rig.sizes[0])
+    floor, frame = f"{label} floor", f"{label} frame, interleaved"
+    return [
+        _Candidate(floor, remap_floor(images, rig.sizes[0])),
+        _Candidate(frame, _frame(rig, target, images), floor, 1.5),
+        _Candidate(f"{label} frame, planar", _frame(rig, target, images.contiguous()), floor, 1.5),
+        _Candidate(f"{label} frame, harmonised", _frame(rig, target, images, _GAINS), frame),
+        _Candidate(f"{label} whole call", _call(rig, target, images, "black"), floor),
+        _Candidate(f"{label} whole call, filled", _call(rig, target, images, "fill"), floor),
+        _holes(rig, target, images, label, floor),
+        _Candidate(f"{label} plan", _plan(rig, target), frame, 1.5),
+        _Candidate(f"{label} plan, ego motion", _plan_with_ego_motion(rig, target), frame),
+    ]
+
+
+def _small_size(rig: Rig, images: torch.Tensor, halves: torch.Tensor, size: tuple[int, int]) -> list[_Candidate]:
+    target, half_rig = rig.turned(yaw_deg=YAW_DEG).resized(size), reduced_rig(rig, 2)
+    label = "{1}x{0}".format(*size)
+    floor, full, half = f"{label} floor", f"{label} frame, from full size", f"{label} frame, from half size"
+    return [
+        _Candidate(floor, remap_floor(images, size)),
+        _Candidate(full, _frame(rig, target, images), floor, 2.2),
+        _Candidate(f"{full}, harmonised", _frame(rig, target, images, _GAINS), full),
+        _Candidate(half, _frame(half_rig, target, halves), floor, 1.6),
+        _Candidate(f"{half}, harmonised", _frame(half_rig, target, halves, _GAINS), half),
+        _Candidate(f"{label} whole call, from half size", _call(half_rig, target, halves, "black"), floor),
+        _Candidate(f"{label} whole call, filled", _call(half_rig, target, halves, "fill"), floor),
+        _holes(half_rig, target, halves, label, floor),
+        _Candidate(f"{label} plan, from full size", _plan(rig, target), full, 1.5),
+        _Candidate(f"{label} plan, from half size", _plan(half_rig, target), half, 1.5),
+        _Candidate(f"{label} plan, ego motion", _plan_with_ego_motion(half_rig, target), half),
+    ]
+
+
+def remap_floor(images: torch.Tensor, size: tuple[int, int]) -> Callable[[], None]:
+    """The floor: bare remaps of as many views of ``size`` (h, w) as there are images (N, 3, >=h, >=w) uint8."""
+    h, w = size
+    sources = [np.ascontiguousarray(image.permute(1, 2, 0).numpy()[:h, :w]) for image in images]
+    y, x = np.indices((h, w), dtype=np.float32)
+    map_x, map_y = 0.97 * x + 0.02 * y + 3, 0.95 * y + 0.01 * x + 5
+    outputs = np.empty((len(sources), h, w, 3), np.uint8)
+
+    def run() -> None:
+        for source, output in zip(sources, outputs, strict=True):
+            cv2.remap(source, map_x, map_y, cv2.INTER_LINEAR, dst=output)
+
+    return run
+
+
+def _frame(source: Rig, target: Rig, images: torch.Tensor, gains: Sequence[float] = ()) -> Callable[[], Any]:
+    plan, scratch, views = build_plan(source, target), Scratch(), list(images)
+    curves = [ToneCurve(gains[k % len(gains)]) for k in range(len(source))] if gains else None
+    return lambda: render_opencv(plan, views, scratch, curves)
+
+
+def _call(source: Rig, target: Rig, images: torch.Tensor, holes: Holes) -> Callable[[], Any]:
+    retarget = RigRetarget(target, source_rig=source, holes=holes)
+    retarget.prepare()
+    return lambda: retarget({"images": images})
+
+
+def _holes(source: Rig, target: Rig, images: torch.Tensor, label: str, floor: str) -> _Candidate:
+    """Filling the holes of one frame's views, again and again: the time does not depend on what stands in them."""
+    plan = build_plan(source, target)
+    views, coverage = render_opencv(plan, list(images)), [torch.from_numpy(seen) for seen in plan.coverage]
+    share = 1 - statistics.mean(float(seen.float().mean()) for seen in coverage)
+    occluded = [view.occluded for view in plan.targets]
+    return _Candidate(f"{label} holes, {share:.1%}", lambda: fill_holes(views, coverage, occluded, "fill"), floor)
+
+
+def _plan(source: Rig, target: Rig) -> Callable[[], Any]:
+    """Each call with a calibration of its own: nothing that was evaluated before can serve."""
+    calls = iter(range(1, 1 << 30))
+
+    def run() -> None:
+        x_m = _NEW_CALIBRATION_M * next(calls)
+        build_plan(source.shifted(x_m=x_m), target.shifted(x_m=x_m))
+
+    return run
+
+
+def _plan_with_ego_motion(source: Rig, target: Rig) -> Callable[[], Any]:
+    """Each call with every source camera moved on its own, as ego motion between the cameras' times does."""
+    rng = np.random.default_rng(0)
+    move_m, turn_deg = _EGO_MOTION
+
+    def run() -> None:
+        cameras = [
+            camera.shifted(x_m=rng.uniform(-move_m, move_m)).turned(yaw_deg=rng.uniform(-turn_deg, turn_deg))
+            for camera in source
+        ]
+        build_plan(source.with_cameras(cameras), target)
+
+    return run
+
+
+# --- measuring --------------------------------------------------------------------------------------------------------
+def _run(candidates: list[_Candidate], rounds: int, label: str) -> list[Measure]:
+    times = timed_rounds({candidate.name: candidate.run for candidate in candidates}, rounds, label)
+    return [_measure(candidate, times) for candidate in candidates]
+
+
+def _measure(candidate: _Candidate, times: dict[str, npt.NDArray[np.float64]]) -> Measure:
+    own = times[candidate.name]
+    ratio = statistics.median(own / times[candidate.of]) if candidate.of else 1.0
+    return Measure(
+        name=candidate.name,
+        of=candidate.of,
+        **quartiles(own)._asdict(),
+        ratio=float(ratio),
+        bound=candidate.bound,
+    )
+
+
+def _inputs(data: str | Path | None, full_size: tuple[int, int] | None) -> tuple[Rig, torch.Tensor, torch.Tensor]:
+    """Rig, images (N, 3, H, W) uint8 in one channels-last block, and the same at half size."""
+    if data is None:
+        rig = load_rig("nuscenes") if full_size is None else load_rig("nuscenes").resized(full_size)
+        half_size = reduced_rig(rig, 2).sizes[0]
+        return rig, _smooth_images(len(rig), rig.sizes[0]), _smooth_images(len(rig), half_size)
+    sample, half = FrameFolder(data, load_points=False)[0], FrameFolder(data, load_points=False, reduce=2)[0]
+    if not isinstance(sample["images"], torch.Tensor):
+        raise DataError(f"--data {data}: expected images of one size, got several")
+    rig, images, halves = without_masks(sample["rig"]), sample["images"], half["images"]
+    return rig, images, halves
+
+
+def _smooth_images(count: int, size: tuple[int, int]) -> torch.Tensor:
+    rng = np.random.default_rng(0)
+    coarse = rng.integers(0, 256, (count, 24, 40, 3), np.uint8)
+    block = np.stack([cv2.resize(image, size[::-1], interpolation=cv2.INTER_CUBIC) for image in coarse])
+    return torch.from_numpy(block).permute(0, 3, 1, 2)

@@ -1,0 +1,279 @@
+"""``python -m arbiview_aug convert``: a data set as another vehicle's cameras would have recorded it."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from arbiview_aug.atomic_io import inside, remove_parts
+from arbiview_aug.cameras.framing import Fit
+from arbiview_aug.cameras.rig import load_rig
+from arbiview_aug.cli.arguments import count, seed, size, writable_folder
+from arbiview_aug.cli.convert.job import Done, Jobs, OnError
+from arbiview_aug.cli.convert.ray_runner import ray_results
+from arbiview_aug.cli.convert.report import write_report
+from arbiview_aug.cli.convert.settings import FOLDER, Data, Settings, check_output, check_target
+from arbiview_aug.cli.parallel import results
+from arbiview_aug.datasets.motion_depth import FOLDER as DEPTH_FOLDER
+from arbiview_aug.environment import one_thread, versions
+from arbiview_aug.errors import ArbiviewError, DataError, OutputError
+from arbiview_aug.favs.config import Quality
+from arbiview_aug.generator.fillers import Holes
+from arbiview_aug.scene.surface import SurfaceName
+from arbiview_aug.transforms.settings import RenderPath
+
+_INTERRUPTED = 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Convert this shard's samples that are not there yet; whoever finds all there finishes the output.
+
+    Returns:
+        0; 1 where samples could not be read or rendered (unless they are to be skipped) or files not be written, which
+        are named; 130 where it was interrupted.
+    """
+    parser = _parser()
+    arguments = parser.parse_args(argv)
+    if arguments.shard_index >= arguments.num_shards:
+        parser.error(f"argument --shard-index: expected less than {arguments.num_shards}, got {arguments.shard_index}")
+    if arguments.motion_depth is not None and arguments.surface != "motion":
+        parser.error(f"argument --motion-depth: expected it with --surface motion, got {arguments.surface}")
+    settings = _settings(arguments)
+    check_output(settings)
+    data = settings.open()
+    check_target(settings, data)
+    jobs, facts = _begun(settings, data, arguments)
+    tally = _Tally()
+    started = time.perf_counter()
+    try:
+        for one in _run(jobs, arguments, tally):
+            if one.state == "stopped" or (one.state == "failed" and arguments.on_error == "fatal"):
+                break
+    except KeyboardInterrupt:
+        print("interrupted: run it again to go on", file=sys.stderr)
+        return _INTERRUPTED
+    for line in dict.fromkeys(tally.warned):
+        print(f"note: {line}", file=sys.stderr)
+    print(tally.summary(settings.output, time.perf_counter() - started))
+    for one in tally.named:
+        print(f"  {one.token}: {one.state}: {'; '.join(one.words)}", file=sys.stderr)
+    if tally.states["stopped"] or tally.states["failed"]:
+        return 1
+    _finish(jobs, facts, arguments.report, arguments.num_shards)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m arbiview_aug convert",
+        description="Writes a data set as another vehicle's cameras would have recorded it, in the source's format: "
+        "nuScenes tables, or frame folders. What is there is left as it is: run it again to go on.",
+    )
+    parser.add_argument(
+        "--data",
+        required=True,
+        type=_data,
+        metavar="[KIND:]DIR",
+        help="nuscenes:ROOT, frames:DIR (a frame folder or a folder of them), or a folder alone: whichever it is",
+    )
+    parser.add_argument("--version", metavar="NAME", help="nuScenes' folder of tables (default: v1.0-mini, -trainval)")
+    parser.add_argument("--target", required=True, metavar="RIG", help="the rig to render: a shipped one, or a file")
+    parser.add_argument("--output", required=True, metavar="DIR", help="where to write")
+    parser.add_argument("--path", choices=get_args(RenderPath), default="favs", help="(default: %(default)s)")
+    parser.add_argument(
+        "--holes",
+        choices=get_args(Holes),
+        default="fill",
+        help="what no camera saw, with --path favs: continued from its borders and marked in .generated.png (default), "
+        "the mean colour, or black",
+    )
+    parser.add_argument("--generator", type=Path, metavar="DIR", help="for diffusion (default: the package's own)")
+    parser.add_argument("--steps", type=count, metavar="N", help="of the generator (default: its own)")
+    parser.add_argument("--quality", choices=get_args(Quality), default="fast", help="(default: %(default)s)")
+    parser.add_argument("--surface", choices=get_args(SurfaceName), default="auto", help="(default: %(default)s)")
+    parser.add_argument("--size", type=size, metavar="HxW", help="of every view (default: the target's own)")
+    parser.add_argument(
+        "--fit",
+        choices=get_args(Fit),
+        default="crop",
+        help="with --size: keep the aspect and cut at the top and the sides (default), or add black bars there; or "
+        "stretch",
+    )
+    parser.add_argument("--reduce", type=int, choices=(1, 2, 4), default=1, help="decode images at 1, 1/2 or 1/4 size")
+    parser.add_argument(
+        "--neighbours",
+        type=seed,
+        default=0,
+        metavar="N",
+        help="let N frames of the drive before and after each fill holes (default: none)",
+    )
+    parser.add_argument(
+        "--motion-depth",
+        type=Path,
+        metavar="DIR",
+        help=f"what the depth command wrote, for --surface motion (default: {DEPTH_FOLDER} in the data, where it is)",
+    )
+    parser.add_argument("--images", choices=("jpg", "png"), default="jpg", help="jpg: quality 96, 4:4:4; png: lossless")
+    parser.add_argument("--shard-index", type=seed, default=0, metavar="I", help="this shard, from 0 (default: 0)")
+    parser.add_argument("--num-shards", type=count, default=1, metavar="N", help="of so many (default: 1)")
+    parser.add_argument("--runner", choices=("local", "ray"), default="local", help="processes here, or Ray actors")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    parser.add_argument("--workers", type=count, default=cores, help="processes or actors (default: one a core)")
+    parser.add_argument(
+        "--on-error",
+        choices=get_args(OnError),
+        default="report",
+        help="samples that cannot be read or rendered: report them, convert the others and do not finish the output "
+        "(default); skip them: leave them out; or stop at once",
+    )
+    parser.add_argument("--report", type=seed, default=2, metavar="N", help="frames in report.html (default: 2)")
+    return parser
+
+
+def _data(text: str) -> tuple[str | None, Path]:
+    kind, _, folder = text.partition(":")
+    return (kind, Path(folder)) if kind in ("nuscenes", "frames") and folder else (None, Path(text))
+
+
+def _settings(arguments: argparse.Namespace) -> Settings:
+    kind, root = arguments.data
+    root = root.absolute()  # Ray's actors have a working directory of their own
+    depth, beside = arguments.motion_depth, inside(root, DEPTH_FOLDER, "depth from motion")
+    if depth is None and arguments.surface == "motion" and beside.is_dir():
+        depth = beside
+    if depth is None and arguments.surface == "motion" and not arguments.neighbours:
+        raise DataError(
+            f"--surface motion: expected depth from motion in {beside}, found none; make it with "
+            "python -m arbiview_aug depth --data DIR, or name its folder (--motion-depth), or find it anew from "
+            "other frames (--neighbours 2)"
+        )
+    return Settings(
+        root=root,
+        kind=kind,
+        version=arguments.version,
+        target=load_rig(arguments.target),
+        output=Path(arguments.output).absolute(),
+        path=arguments.path,
+        holes=arguments.holes,
+        generator=None if arguments.generator is None else arguments.generator.absolute(),
+        steps=arguments.steps,
+        quality=arguments.quality,
+        surface=arguments.surface,
+        size=arguments.size,
+        fit=arguments.fit,
+        reduce=arguments.reduce,
+        neighbours=arguments.neighbours,
+        motion_depth=None if depth is None else depth.absolute(),
+        suffix=f".{arguments.images}",  # type: ignore[arg-type]
+    )
+
+
+def _begun(settings: Settings, data: Data, arguments: argparse.Namespace) -> tuple[Jobs, Mapping[str, Any]]:
+    """The jobs of this shard, in a folder that says what it is made of; and that."""
+    shard, shards = arguments.shard_index, arguments.num_shards
+    try:
+        settings.retarget()
+    except ArbiviewError:
+        raise
+    except ValueError as error:
+        raise DataError(str(error)) from None
+    jobs = Jobs(settings, data, range(shard, len(data), shards), arguments.on_error)
+    facts = {"versions": versions(), "settings": settings.rendering(), "source": jobs.format.facts()}
+    if not (settings.output / FOLDER / "settings.json").is_file():
+        jobs.format.check()
+        writable_folder(settings.output, str(settings.output))
+    jobs.manifest.begin(facts)
+    remove_parts(settings.output, lambda owner: int(owner) % shards == shard)
+    return jobs, facts
+
+
+def _run(jobs: Jobs, arguments: argparse.Namespace, tally: _Tally) -> Iterator[Done]:
+    """What becomes of each sample, counted."""
+
+    def counted(one: Done) -> str:
+        tally.add(one)
+        return f"coverage {tally.coverage:.1%}"
+
+    if arguments.runner == "ray":
+        yield from ray_results(jobs, arguments.workers, "convert", counted)
+    elif arguments.workers > 1 and len(jobs) > 1:
+        yield from results(jobs, min(arguments.workers, len(jobs)), "convert", counted)
+    else:
+        with one_thread():
+            yield from results(jobs, 1, "convert", counted)
+
+
+class _Tally:
+    """What became of the samples so far."""
+
+    def __init__(self) -> None:
+        self.states: Counter[str] = Counter()
+        self.seconds = np.zeros(3)
+        self.named: list[Done] = []
+        self.warned: list[str] = []
+        self._seen = 0.0
+
+    @property
+    def coverage(self) -> float:
+        """Share of the pixels that some source saw, so far."""
+        return self._seen / max(1, self.states["made"] + self.states["kept"])
+
+    def add(self, one: Done) -> None:
+        """One more."""
+        self.states[one.state] += 1
+        if one.state in ("made", "kept"):
+            self._seen += one.coverage
+            self.seconds += one.seconds
+            self.warned += one.words
+        else:
+            self.named.append(one)
+
+    def summary(self, output: Path, wall_s: float) -> str:
+        """Counts, coverage and where the time went."""
+        words = {"kept": "there before", "skipped": "skipped", "failed": "failed"}
+        counts = "".join(f", {self.states[state]} {word}" for state, word in words.items() if self.states[state])
+        lines = [f"{output}: {self.states['made']} samples converted{counts}; {self.coverage:.1%} of the pixels seen"]
+        made, spent_s = self.states["made"], float(self.seconds.sum())
+        if made:
+            read, retarget, write = self.seconds / spent_s
+            lines.append(
+                f"{1e3 * spent_s / made:.0f} ms a sample: read and decode {read:.0%}, retarget {retarget:.0%}, encode "
+                f"and write {write:.0%}; {made / wall_s:.2f} samples/s"
+            )
+        return "\n".join(lines)
+
+
+def _finish(jobs: Jobs, facts: Mapping[str, Any], report_frames: int, shards: int) -> None:
+    """Tables, provenance and report, where all samples of all shards are there."""
+    settings, tokens = jobs.settings, jobs.data.tokens
+    converted, left_out = [], set()
+    for record in jobs.manifest.records(tokens):
+        if "skipped" in record:
+            left_out.add(record["token"])
+        else:
+            converted.append(record["token"])
+    missing = len(tokens) - len(converted) - len(left_out)
+    if missing and shards == 1:
+        raise OutputError(
+            f"{settings.output}: expected the records of all {len(tokens)} samples, found {missing} missing; do all "
+            "machines see this folder under this path?"
+        )
+    if missing:
+        print(f"{missing} samples of other shards are not there yet; the last shard writes what belongs to all")
+        return
+    if not converted:
+        raise DataError(f"{settings.output}: expected at least one sample that can be converted, got none")
+    for note in jobs.format.finish(jobs.manifest.records(converted), left_out):
+        print(f"note: {note}", file=sys.stderr)
+    jobs.manifest.write_provenance(facts, tokens)
+    if report_frames:
+        write_report(settings, jobs.data, converted, report_frames)
+        print(f"report: {settings.output / FOLDER / 'report.html'}")

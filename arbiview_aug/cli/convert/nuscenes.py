@@ -1,0 +1,268 @@
+"""nuScenes v1.0 out of nuScenes v1.0: new cameras at the LiDAR's times, everything else kept or linked.
+
+Keyframes are converted; what the source's cameras recorded between them is left out. A new camera recorded when the
+LiDAR did, from the LiDAR's ego pose: that is where its views are rendered, whenever the source's cameras exposed.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import chain
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from arbiview_aug.atomic_io import check_name, checksum, inside, link_whole, whole_file
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cli.convert.manifest import Record
+from arbiview_aug.cli.convert.nuscenes_rows import NewCameras, Remaining, view_stem
+from arbiview_aug.cli.convert.settings import FOLDER, Settings
+from arbiview_aug.cli.convert.visibility import visible_shares
+from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
+from arbiview_aug.datasets.nuscenes.tables import (
+    COUNTS,
+    FILES,
+    FLAGS,
+    LINKS,
+    MICROSECONDS,
+    TOKENS,
+    Kind,
+    Row,
+    Tables,
+    Tokens,
+    on_circle,
+)
+from arbiview_aug.errors import DataError
+
+_TABLES = (
+    *("attribute", "category", "log", "map", "visibility", "sensor", "calibrated_sensor", "ego_pose", "scene"),
+    *("instance", "sample_annotation", "sample_data", "lidarseg", "panoptic", "sample"),
+)
+"""In the order in which they are written: while ``sample`` is missing, nobody takes the root for a whole one."""
+
+_REFERENCES = (
+    ("sample", "scene_token", "scene"),
+    ("scene", "log_token", "log"),
+    ("instance", "category_token", "category"),
+    ("calibrated_sensor", "sensor_token", "sensor"),
+    ("sample_annotation", "sample_token", "sample"),
+    ("sample_annotation", "instance_token", "instance"),
+    ("sample_annotation", "visibility_token", "visibility"),
+    ("sample_data", "sample_token", "sample"),
+    ("sample_data", "ego_pose_token", "ego_pose"),
+    ("sample_data", "calibrated_sensor_token", "calibrated_sensor"),
+    ("scene", "first_sample_token", "sample"),
+    ("scene", "last_sample_token", "sample"),
+    ("instance", "first_annotation_token", "sample_annotation"),
+    ("instance", "last_annotation_token", "sample_annotation"),
+    *((table, key, table) for table in ("sample", "sample_annotation", "sample_data") for key in ("prev", "next")),
+)
+"""Table, column, and the table that it names rows of. Unknown is an empty token; some sources have fewer columns."""
+
+_NEEDED: Mapping[str, Mapping[str, Kind]] = {
+    "sample": {"timestamp": MICROSECONDS},
+    "sample_annotation": {"sample_token": TOKENS, "instance_token": TOKENS},
+    "sample_data": {
+        **dict.fromkeys(("sample_token", "ego_pose_token", "calibrated_sensor_token"), TOKENS),
+        "is_key_frame": FLAGS,
+        "filename": FILES,
+        "timestamp": MICROSECONDS,
+    },
+    "lidarseg": {"filename": FILES},
+    "panoptic": {"filename": FILES},
+}
+"""Columns without which rows cannot be kept."""
+
+
+class NuScenes:
+    """Tables, images and masks of the new cameras.
+
+    Args:
+        settings: Of the conversion.
+        data: The source.
+    """
+
+    def __init__(self, settings: Settings, data: NuScenesDataset) -> None:
+        self.output, self.data, self.suffix = settings.output, data, settings.suffix
+        self.target = settings.target
+
+    def facts(self) -> dict[str, Any]:
+        """What the source is, as plain data."""
+        tables = {name: checksum(self._opened().path(name)) for name in self._tables()}
+        return {
+            "kind": "nuscenes",
+            "root": self.data.root.resolve().name,
+            "version": self.data.version,
+            "tables": tables,
+        }
+
+    def check(self) -> None:
+        """Read all tables once, and look for everything that could not be written, before hours of work end with it.
+
+        Raises:
+            DataError: A table that is none; a row that names another one that is not there, or a file outside the root,
+                or has no column that is needed; a token that occurs twice; ``next`` or ``prev`` that lead round in a
+                circle; no samples; two samples that would write images of one name, or a camera's name makes no file's
+                name.
+        """
+        if not len(self.data):
+            raise DataError(f"nuScenes {self.data.root} {self.data.version}: expected samples, got none")
+        names = [self.data.files(index)[-1].name for index in range(len(self.data))]
+        (stem, times), *_ = Counter(view_stem(name, "") for name in names).most_common(1)
+        if times > 1:
+            name = next(name for name in names if view_stem(name, "") == stem)
+            raise DataError(
+                f"nuScenes {self.data.root}: expected LiDAR files of different names, after which the new images are "
+                f"named, got {times} of the name {name}; rename them"
+            )
+        for camera in self.target:
+            longest = view_stem(max(names, key=len), camera.name) + ".confidence.png"
+            check_name(longest, f"rig {self.target.name!r}: camera {camera.name!r}")
+        tables, there = self._opened(), self._tables()
+        references = [(table, key, of) for table, key, of in _REFERENCES if table in there and of in there]
+        own = {of: Tokens(tables, of) for _, _, of in references}
+        named = {(table, key): Tokens(tables, table, key) for table, key, _ in references}
+        folders = {path.parent.relative_to(self.data.root).as_posix(): "maps" for path in self._maps()}
+        cameras = {row["token"] for row in tables.rows("sensor") if row["modality"] == "camera"}
+        kept = {row["token"] for row in tables.rows("calibrated_sensor") if row["sensor_token"] not in cameras}
+        for table in there:
+            needed = _NEEDED.get(table, {})
+            columns = [column for (of, _), column in named.items() if of == table]
+            for rows in tables.batches(table):
+                for key, kind in needed.items():
+                    tables.column(table, rows, key, kind)
+                if table == "instance":
+                    tables.column(table, rows, "nbr_annotations", COUNTS, default=0)
+                if table in own:
+                    own[table].add(rows)
+                for column in columns:
+                    column.add(rows, LINKS, default="")
+                for row in rows if table == "map" or "filename" in needed else ():
+                    name = row.get("filename") or ""
+                    if (name or table != "map") and (table != "sample_data" or row["calibrated_sensor_token"] in kept):
+                        where = self._where(table, row)
+                        check_name(name, where)
+                        folders.setdefault(name.rpartition("/")[0], where)
+        for tokens in own.values():
+            tokens.check()
+        for table, key, of in references:
+            after = named[table, key].places_in(own[of], or_empty=key not in _NEEDED.get(table, {}))
+            for k in on_circle(after)[:1] if key in ("prev", "next") else ():
+                got = f"a circle through row {tables.row(table, int(k))['token']!r}"
+                raise tables.error(table, f"{key} that lead to an end", got, f"empty one row's {key}")
+        own_folders = (FOLDER, self.data.version, *(view_stem("", c.name).rpartition("/")[0] for c in self.target))
+        for folder, where in folders.items():
+            self._kept(folder or ".", where)
+            parts = PurePosixPath(folder).parts
+            if parts and (parts[0] in own_folders or "/".join(parts[:2]) in own_folders):
+                raise DataError(f"{where}: expected a file outside of {', '.join(own_folders)}, got one in {folder}")
+
+    def stem(self, index: int, camera: int, name: str) -> str:
+        """The path of a view below the output, without its suffix."""
+        return view_stem(self.data.files(index)[-1].name, name)
+
+    def rest(
+        self,
+        index: int,
+        sample: Mapping[str, Any],
+        out: Mapping[str, Any],
+        rig: Rig,
+        views: Sequence[Mapping[str, str]],
+    ) -> tuple[dict[str, bytes], dict[str, Any]]:
+        """No more files; the share of each annotation's box that the new cameras show.
+
+        Args:
+            index: Of the sample.
+            sample: As it was read.
+            out: The same, retargeted.
+            rig: Its cameras.
+            views: Of each camera the files' names, by what follows their stem.
+        """
+        if "boxes_3d" not in sample:  # nothing is annotated
+            return {}, {"visible": {}}
+        boxes, coverage = sample["boxes_3d"].numpy(), [mask.numpy() for mask in out["coverage"]]
+        shares = np.round(visible_shares(rig, coverage, boxes), 3).tolist()
+        return {}, {"visible": dict(zip(sample["box_tokens"], shares, strict=True))}
+
+    def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
+        """Write the tables and link the files of the sensors that stay.
+
+        Args:
+            records: Of the converted samples.
+            left_out: Tokens of the others.
+
+        Returns:
+            Notes for people.
+        """
+        source, there = self._opened(), self._tables()
+        remaining = Remaining(source, left_out)
+        cameras = NewCameras(records, self.suffix)
+        keyframes, poses = remaining.moments()
+        self._missing = 0
+        rows: dict[str, Callable[[], Iterable[Row]]] = {
+            "sensor": lambda: chain(remaining.sensor(), cameras.sensor()),
+            "calibrated_sensor": lambda: chain(remaining.calibrated_sensor(), cameras.calibrated_sensor()),
+            "ego_pose": lambda: remaining.ego_pose(poses),
+            "scene": remaining.scene,
+            "instance": remaining.instance,
+            "sample_annotation": lambda: remaining.sample_annotation(cameras.visible),
+            "sample_data": lambda: chain(
+                self._linked("sample_data", remaining.sample_data()), cameras.sample_data(remaining.drives, keyframes)
+            ),
+            "lidarseg": lambda: self._linked("lidarseg", source.rows("lidarseg")),
+            "panoptic": lambda: self._linked("panoptic", source.rows("panoptic")),
+            "sample": remaining.sample,
+        }
+        for path in self._maps():
+            link_whole(*self._kept(path.relative_to(self.data.root).as_posix(), "maps"))
+        for name in there:
+            _write_table(self.output / self.data.version / f"{name}.json", rows.get(name, partial(source.rows, name))())
+        return self._notes()
+
+    def _notes(self) -> list[str]:
+        notes = []
+        if self._missing:
+            notes.append(f"{self._missing} files that sample_data names are not in the source: were sweeps not copied?")
+        known = {*_TABLES}
+        left = sorted({path.stem for path in (self.data.root / self.data.version).glob("*.json")} - known)
+        if left:
+            notes.append(f"left out, since they may speak of the source's images: tables {', '.join(left)}")
+        return notes
+
+    def _linked(self, table: str, rows: Iterable[Row]) -> Iterator[Row]:
+        """Rows, whose files are linked on the way."""
+        for row in rows:
+            try:
+                link_whole(*self._kept(row["filename"], self._where(table, row)))
+            except FileNotFoundError:
+                self._missing += 1
+            yield row
+
+    def _kept(self, name: str, where: str) -> tuple[Path, Path]:
+        """A file that is kept, in the source and in the output; links in either must not leave it."""
+        return inside(self.data.root, name, where), inside(self.output, name, f"--output {self.output}: {where}")
+
+    def _maps(self) -> list[Path]:
+        return sorted(path for path in (self.data.root / "maps").rglob("*") if not path.is_dir())
+
+    def _where(self, table: str, row: Row) -> str:
+        return f"nuScenes {self.data.root} {self.data.version}: table {table}: row {row.get('token')!r}: filename"
+
+    def _opened(self) -> Tables:
+        return Tables(self.data.root, self.data.version, None)
+
+    def _tables(self) -> list[str]:
+        """The tables that there are, in the order in which they are written."""
+        return [name for name in _TABLES if (self.data.root / self.data.version / f"{name}.json").is_file()]
+
+
+def _write_table(path: Path, rows: Iterable[Row]) -> None:
+    with whole_file(path) as file:
+        file.write(b"[")
+        for k, row in enumerate(rows):
+            file.write((b",\n" if k else b"\n") + json.dumps(row).encode())
+        file.write(b"\n]\n")

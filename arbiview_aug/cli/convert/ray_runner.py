@@ -1,0 +1,63 @@
+"""The same jobs on a Ray cluster: Ray Data actors, each with one transform for all of its samples.
+
+All machines see the source and the output under the same paths. Actors keep a job's order to themselves; its bytes do
+not depend on it. Where the cluster has GPUs and a generator is asked for, actors share them, each with the generator
+once: what is generated there differs from a CPU's in its last bits.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from arbiview_aug.cli.convert.job import Done, Jobs
+from arbiview_aug.cli.parallel import with_progress
+from arbiview_aug.environment import one_thread, optional_package
+
+
+class Actor:
+    """Holds the jobs, and with them the transform.
+
+    Args:
+        jobs: All of them; each call names one.
+    """
+
+    def __init__(self, jobs: Jobs) -> None:
+        self.jobs = jobs
+        self._held = one_thread()
+        self._held.__enter__()
+        if optional_package("ray", "distributed").get_gpu_ids():
+            jobs.retarget.to("cuda")
+
+    def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
+        return {"done": pickle.dumps(self.jobs[int(row["id"])])}  # Arrow's strings cannot hold every file's name
+
+
+def ray_results(jobs: Jobs, workers: int, label: str, note: Callable[[Done], str]) -> Iterator[Done]:
+    """What becomes of each job, in any order.
+
+    Args:
+        jobs: What is to be done.
+        workers: Actors; a running cluster is used where ``RAY_ADDRESS`` names one, else this machine.
+        label: Names the progress bar.
+        note: What it says besides.
+
+    Raises:
+        ImportError: Ray is not installed; with the command that installs it.
+    """
+    ray = optional_package("ray", "distributed")
+    data = optional_package("ray.data", "distributed")
+    ray.init(ignore_reinit_error=True, include_dashboard=False, log_to_driver=False)
+    data.DataContext.get_current().enable_progress_bars = False
+    gpus = float(ray.cluster_resources().get("GPU", 0)) if jobs.settings.path == "diffusion" else 0.0
+    rows = data.range(len(jobs), override_num_blocks=max(1, min(len(jobs), 4 * workers)))
+    done = rows.map(
+        Actor,
+        fn_constructor_args=(jobs,),
+        compute=data.ActorPoolStrategy(size=workers),
+        num_cpus=1,
+        num_gpus=min(1.0, gpus / workers),
+    )
+    found: Iterator[Done] = (pickle.loads(row["done"]) for row in done.iter_rows())
+    yield from with_progress(found, len(jobs), label, note)

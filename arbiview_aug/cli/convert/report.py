@@ -1,0 +1,74 @@
+"""``report.html`` of a conversion: what was written, read again and scored as ``evaluate`` scores."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from arbiview_aug.atomic_io import write_whole
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cli.convert.manifest import Manifest
+from arbiview_aug.cli.convert.settings import FOLDER, Data, Settings
+from arbiview_aug.cli.convert.views import coverage_of
+from arbiview_aug.datasets.registry import open_data
+from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
+from arbiview_aug.evaluate.images import RenderedView, as_arrays
+from arbiview_aug.evaluate.methods import READS_POINTS, Method, retargeting
+from arbiview_aug.evaluate.report.html import html_report
+from arbiview_aug.evaluate.report.tables import evaluation_tables
+from arbiview_aug.evaluate.run import Evaluation, evaluate
+
+CONVERTED = "converted"
+"""The name of the views that were written, in tables."""
+
+
+def converted(settings: Settings) -> Method:
+    """The views that a conversion wrote, as a method: of its own target; others are rendered as it rendered that."""
+    # The frame that scores holds its points back, and depth from motion is not read again.
+    anew = retargeting(settings.quality, "auto" if settings.surface in ("lidar", "motion") else settings.surface)
+    manifest, target = Manifest(settings.output), settings.sized_target
+    written = open_data(settings.output, kind=settings.kind, version=settings.version)
+
+    def render(sample: Mapping[str, Any], rig: Rig) -> list[RenderedView]:
+        record = manifest.record(sample["token"])
+        if rig != target or record is None:
+            return anew.render(sample, rig)
+        found = written.by_token(sample["token"])
+        images = dict(zip(found["rig"].names, as_arrays(found["images"]), strict=True))  # the reader has its own order
+        files = {camera["name"]: settings.output / camera["file"] for camera in record["cameras"]}
+        return [RenderedView(images[name], coverage_of(files[name])) for name in rig.names]
+
+    return Method(CONVERTED, render, anew.reads_points, anew.render_alone)
+
+
+def write_report(settings: Settings, data: Data, tokens: Sequence[str], count: int) -> Evaluation:
+    """Score some converted frames, spread evenly over all, and write the page.
+
+    Args:
+        settings: Of the conversion.
+        data: The source.
+        tokens: Of the samples that were converted.
+        count: How many to score.
+
+    Returns:
+        What was measured.
+    """
+    picked = [tokens[int(k)] for k in np.unique(np.linspace(0, len(tokens) - 1, min(count, len(tokens))).round())]
+    target = settings.sized_target
+    done = evaluate(_frames(data, picked), lambda _: {target.name or "target": target}, [converted(settings)])
+    title = f"{data.root.resolve().name} as {target.name or 'the target'} would have seen it"
+    notes = [f"{len(picked)} of {len(tokens)} frames, as they were written to {settings.output}."]
+    if settings.surface in READS_POINTS:
+        notes.append("LiDAR points score views that were made with them: evaluate holds half of them out.")
+    notes += [f"Not everything could be scored: {words}." for words in done.declined.values()]
+    page = html_report(title, done, [CONVERTED], evaluation_tables(done, [CONVERTED]), notes)
+    write_whole({settings.output / FOLDER / "report.html": page.encode()})
+    return done
+
+
+def _frames(data: Data, tokens: Sequence[str]) -> Iterator[tuple[str, ScoredFrame]]:
+    """At the exposures that were recorded: the views cannot be made again at others."""
+    for token in tokens:
+        yield token, make_frame(data.by_token(token), exposures=("raw",))

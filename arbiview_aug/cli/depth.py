@@ -1,0 +1,130 @@
+"""``python -m arbiview_aug depth --data FOLDER``: depth from motion of every frame, into files beside the data set."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch.utils.data import Dataset
+
+from arbiview_aug.atomic_io import inside
+from arbiview_aug.cli.arguments import count, device_named, gathered_warnings, writable_folder
+from arbiview_aug.cli.parallel import results
+from arbiview_aug.datasets.motion_depth import FOLDER, WANTED, DepthFolder
+from arbiview_aug.datasets.registry import open_data
+from arbiview_aug.errors import ArbiviewError, WarnOnce, described
+from arbiview_aug.sample.inputs import read_frames
+from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames, warn_lost
+from arbiview_aug.temporal.motion_depth import motion_depth
+
+
+class Done(NamedTuple):
+    """What became of a frame.
+
+    Attributes:
+        token: Of the frame.
+        density: Share of the pixels whose distance is known; 0 where it was declined.
+        words: How, or why not.
+        failed: It could not even be read.
+        kept: Its file was there before.
+    """
+
+    token: str
+    density: float
+    words: str
+    failed: bool = False
+    kept: bool = False
+
+
+class _Frames(Dataset[Done]):
+    """Frames whose depth is found and written where they are asked for: in a DataLoader's workers."""
+
+    def __init__(self, data: Any, tokens: Sequence[str], depths: DepthFolder, device: str) -> None:
+        self.data, self.tokens, self.depths, self.device = data, tokens, depths, device
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def __getitem__(self, index: int) -> Done:
+        token = self.tokens[index]
+        try:
+            return self._done(token, self.data[index])
+        except Exception as error:  # whatever is wrong with a frame, the others go on
+            return Done(token, 0.0, described(error), failed=True)
+
+    def _done(self, token: str, sample: dict[str, Any]) -> Done:
+        rig = sample["rig"]
+        (frame,) = read_frames(sample, None)
+        warn = WarnOnce()
+        (neighbours,) = neighbours_of_frames(sample, [frame], (), warn)
+        used = [neighbour.name for neighbour in neighbours]
+        held = self.depths.held(token, rig, used)
+        if held is not None:
+            return Done(token, held.density, "", kept=True)
+        boxes = None if sample.get("boxes_3d") is None else sample["boxes_3d"].numpy().astype(float)
+
+        def load(neighbour: Neighbour) -> Sequence[torch.Tensor] | None:
+            try:
+                return neighbour.images(frame.images)
+            except (ArbiviewError, OSError) as error:
+                warn_lost(warn, neighbour.name, error)
+                used.remove(neighbour.name)  # once it is mended, the frame is done again
+                return None
+
+        found = motion_depth(frame.rig, frame.images, neighbours, boxes, load, self.device)
+        self.depths.write(token, rig, found, used)
+        return Done(token, found.density, str(found))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Find and write the depth of every frame that has none yet.
+
+    Returns:
+        0; 1 where frames could not be read or written, which are named.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m arbiview_aug depth",
+        description="Depth from motion of every frame of a drive, for surface='motion'. Frames that have theirs, from "
+        "the frames that are their neighbours now, are left as they are: run it again to go on.",
+    )
+    parser.add_argument(
+        "--data",
+        required=True,
+        metavar="FOLDER",
+        help="a folder of frame folders with a sequence.json, or a nuScenes root",
+    )
+    parser.add_argument("--output", metavar="FOLDER", help=f"where to write (default: {FOLDER} in the data's folder)")
+    parser.add_argument("--device", default="cpu", help="where to compute: cpu, cuda, cuda:1 (default: %(default)s)")
+    parser.add_argument("--workers", type=count, default=1, help="processes, on the CPU (default: %(default)s)")
+    arguments = parser.parse_args(argv)
+    device = device_named(arguments.device)
+    data: Any = open_data(arguments.data, neighbours=WANTED)
+    folder = Path(arguments.output) if arguments.output else inside(Path(arguments.data), FOLDER, "depth from motion")
+    depths = DepthFolder(writable_folder(folder, str(folder)))
+    frames = _Frames(data, data.tokens, depths, str(device))
+    workers = arguments.workers if device.type == "cpu" else 1  # one process keeps a GPU busy
+    warned: list[str] = []
+    with gathered_warnings(warned):
+        done = list(results(frames, workers, "depth from motion"))
+    for line in warned:
+        print(line, file=sys.stderr)
+    return _summary(done, depths)
+
+
+def _summary(done: Sequence[Done], depths: DepthFolder) -> int:
+    made = [one for one in done if not one.kept and not one.failed]
+    declined = [one for one in made if one.density == 0]
+    failed = [one for one in done if one.failed]
+    known = [one.density for one in done if one.density > 0]
+    share = f", {sum(known) / len(known):.0%} of their pixels on average" if known else ""
+    kept = len(done) - len(made) - len(failed)
+    print(f"{depths.root}: {len(known)} of {len(done)} frames have depth{share}; {kept} were there before")
+    for one in declined:
+        print(f"  {one.token}: {one.words}")
+    for one in failed:
+        print(f"  {one.token}: failed: {one.words}", file=sys.stderr)
+    return 1 if failed else 0

@@ -1,0 +1,312 @@
+"""nuScenes: keyframes from the v1.0 tables, read here, so that no devkit (and no second cv2 wheel) is needed."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from arbiview_aug.atomic_io import inside
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, Unreadable, check_neighbours
+from arbiview_aug.datasets.frame_folder import checked_points
+from arbiview_aug.datasets.image_io import Reduce, check_reduce, decode_images, reduced_rig
+from arbiview_aug.datasets.nuscenes.boxes import read_annotations
+from arbiview_aug.datasets.nuscenes.recordings import LIDAR, IntArray, read_recordings
+from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Row, Tables
+from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError
+
+CAMERA_RING = (
+    "CAM_FRONT",
+    "CAM_FRONT_RIGHT",
+    "CAM_BACK_RIGHT",
+    "CAM_BACK",
+    "CAM_BACK_LEFT",
+    "CAM_FRONT_LEFT",
+)
+"""The order of the cameras in a sample, clockwise from above; others follow by name."""
+
+_POINT_FLOATS = 5  # x y z intensity ring
+
+
+class NuScenesDataset(Dataset[dict[str, Any]]):
+    """The keyframes of a nuScenes v1.0 data set, in the order of its ``sample`` table.
+
+    A sample is a dict, everything in the ego frame at the LiDAR's time: ``images`` (N, 3, h, w) uint8 RGB; ``rig``;
+    ``K`` (N, 3, 3) and ``cam2ego`` (N, 4, 4) float64; ``token``, ``scene_token``; ``ego2world`` (4, 4) float64;
+    ``time_s``; with ``load_points`` the ``points`` (P, 5) float32: x y z intensity ring; with ``load_boxes`` the
+    ``boxes_3d`` (B, 9) float32: centre, length, width, height in metres, yaw in radians, velocity x y in m/s over the
+    ground (NaN where nobody knows), with ``box_names`` (categories) and ``box_tokens``. The numbers of points and boxes
+    vary: batch with ``batch_size=None`` or a ``collate_fn`` that keeps them as lists. Samples of which no annotation is
+    there at all have no boxes, with a warning.
+
+    Cameras and LiDAR record at different times. With ``compensate_ego_motion`` a camera's pose is where the camera was
+    when it recorded, seen from the ego at the LiDAR's time: inv(ego2global at LiDAR time) @ ego2global at camera time
+    @ calibrated_sensor. Without, it is the mounting alone, which at 9 m/s is 0.4 m away from the pixels.
+
+    With ``neighbours`` a sample also has other frames of its scene: keyframes, and sweeps, what the cameras recorded
+    between them. The first of ``channels`` decides which: its images in the order of their ``prev``, by the distance
+    that the vehicle came. A sweep has its time and ego pose, and of each other camera the image beside it, posed as
+    above; its boxes are those of the keyframes around it, moved to its time (``Annotations.at_time``). Images are
+    decoded when they are asked for.
+
+    All files lie below the root, which may be a link: names and links that leave it are refused when they are read.
+
+    The ego's origin is on the road (``ground_z_m`` = 0). Boxes stand upright: roll and pitch of the ego (below 2
+    degrees) are left out of their yaw.
+
+    Args:
+        root: The folder with ``samples`` and the folder of tables. Either this or ``nusc``.
+        version: The folder of tables.
+        nusc: A devkit ``NuScenes`` object that is loaded already; its tables are used.
+        split_scenes: Names or tokens of the scenes to keep; None keeps all.
+        channels: Camera channels in the order wanted; None takes all of them in the order of ``CAMERA_RING``.
+        compensate_ego_motion: See above.
+        load_points: Whether to read the LiDAR's points.
+        load_boxes: Whether to read the boxes.
+        reduce: Decode the images at 1, 1/2 or 1/4 of their size; the rig follows (see ``decode_images``).
+        neighbours: Which other frames of the drive come with a sample; None for none. Opening takes half as long
+            again: the sweeps' rows are read too. Where their files are missing altogether, with a warning, only
+            keyframes are neighbours.
+
+    Raises:
+        TypeError: ``neighbours`` is something else.
+        DataError: A table that is missing or malformed, a token that leads nowhere, unknown scenes or channels; on
+            access, a file that is missing or broken.
+    """
+
+    def __init__(
+        self,
+        root: str | Path | None = None,
+        version: str = "v1.0-mini",
+        *,
+        nusc: Any = None,
+        split_scenes: Iterable[str] | None = None,
+        channels: Sequence[str] | None = None,
+        compensate_ego_motion: bool = True,
+        load_points: bool = True,
+        load_boxes: bool = True,
+        reduce: Reduce = 1,
+        neighbours: Neighbours | None = None,
+    ) -> None:
+        check_reduce(reduce)
+        check_neighbours(neighbours)
+        tables = Tables(root, version, nusc)
+        self.root, self.version = tables.root, tables.version
+        self.compensate_ego_motion = compensate_ego_motion
+        self.load_points = load_points
+        self.reduce = reduce
+        self.neighbours = neighbours
+        samples = _chosen_samples(tables, split_scenes)
+        self.tokens: list[str] = [row["token"] for row in samples]
+        self.scene_tokens: list[str] = [row["scene_token"] for row in samples]
+        self._index = {token: k for k, token in enumerate(self.tokens)}
+        scene = {token: k for k, token in enumerate(dict.fromkeys(self.scene_tokens))}
+        scenes = [scene[token] for token in self.scene_tokens]
+        self.channels = _chosen_channels(tables, channels)
+        self.other_channels = [row["channel"] for row in tables.rows("sensor") if row.get("modality") != "camera"]
+        self._recordings = read_recordings(tables, self._index, scenes, self.channels, neighbours is not None)
+        times_s = self._recordings.time_s(self._recordings.keyframes[:, -1])
+        self._annotations = read_annotations(tables, self._index, times_s, np.array(scenes)) if load_boxes else None
+        if self._annotations is not None and self.tokens and not len(self._annotations.tokens):
+            self._annotations = None  # boxes of nothing would say that nothing stands or moves anywhere
+            warnings.warn(
+                f"nuScenes {self.root}: sample_annotation has no rows of these samples (a test split?): they come "
+                "without boxes_3d",
+                stacklevel=2,
+            )
+        self._driven = np.empty(0, np.int64) if neighbours is None else self._with_files()
+        positions_m = self._recordings.ego2global(self._driven)[:, :3, 3]
+        self._drive = Drive(positions_m, self._recordings.parts[self._driven])
+
+    def __len__(self) -> int:
+        return len(self.tokens)
+
+    def by_token(self, token: str) -> dict[str, Any]:
+        """The sample with this token.
+
+        Raises:
+            DataError: No such sample, or not in the chosen scenes.
+        """
+        if token not in self._index:
+            raise DataError(
+                f"nuScenes {self.root}: expected the token of one of {len(self)} samples, got {token!r}; "
+                "is it of another version, or of a scene that split_scenes leaves out?"
+            )
+        return self[self._index[token]]
+
+    def files(self, index: int) -> list[Path]:
+        """What a sample is read from: each camera's image, then the LiDAR's points."""
+        return [self.root / self._recordings.file(row) for row in self._recordings.keyframes[index]]
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        index = range(len(self))[index]  # IndexError, and negative indices
+        recordings = self._recordings
+        cameras, lidar = recordings.keyframes[index, :-1], recordings.keyframes[index, -1]
+        ego2global = recordings.ego2global(lidar)
+        rig = self._rig(cameras, ego2global)
+        sample: dict[str, Any] = {
+            "images": self._images(cameras),
+            "rig": rig,
+            "K": torch.from_numpy(rig.K),
+            "cam2ego": torch.from_numpy(rig.cam2ego),
+            "ego2world": torch.from_numpy(ego2global),
+            "time_s": float(recordings.time_s(lidar)),
+            "token": self.tokens[index],
+            "scene_token": self.scene_tokens[index],
+        }
+        if self.load_points:
+            sensor2ego = recordings.sensor2ego[recordings.rows["sensor"][lidar]]
+            sample["points"] = _read_points(self._file(lidar), sensor2ego)
+        if self._annotations is not None:
+            boxes = self._annotations.rows(index)
+            sample["boxes_3d"] = torch.from_numpy(self._annotations.at_sample(index, _inverse(ego2global)))
+            sample["box_names"] = [self._annotations.categories[k] for k in self._annotations.category[boxes]]
+            sample["box_tokens"] = [token.decode() for token in self._annotations.tokens[boxes].tolist()]
+        if self.neighbours is not None:
+            place = int(np.searchsorted(self._driven, cameras[0]))
+            near = self._drive.neighbours(place, self.neighbours)
+            sample["neighbours"] = [self._neighbour(int(self._driven[k])) for k in near]
+        return sample
+
+    def _rig(self, cameras: IntArray, ego2global: FloatArray) -> Rig:
+        """The cameras as rows of the recordings, seen from an ego pose."""
+        recordings, global2ego, found = self._recordings, _inverse(ego2global), []
+        moved = global2ego @ recordings.ego2global(cameras)
+        for channel, row, own2ego in zip(self.channels, cameras, moved, strict=True):
+            sensor = recordings.rows["sensor"][row]
+            cam2ego, K = recordings.sensor2ego[sensor], recordings.K[sensor]
+            if self.compensate_ego_motion:
+                cam2ego = own2ego @ cam2ego
+            height_px, width_px = recordings.size(row)
+            try:
+                camera = Camera(name=channel, width_px=width_px, height_px=height_px, K=K, cam2ego=cam2ego)
+            except CalibrationError as error:
+                raise CalibrationError(f"nuScenes {self.root}: image {recordings.file(row)}: {error}") from None
+            found.append(camera)
+        return reduced_rig(Rig(found, ground_z_m=0.0, name="nuscenes"), self.reduce)
+
+    def _file(self, row: int) -> Path:
+        """A recording's file, which must lie below the root."""
+        sample = self.tokens[self._recordings.rows["sample"][row]]
+        where = f"nuScenes {self.root} {self.version}: table sample_data: row of sample {sample!r}: filename"
+        return inside(self.root, self._recordings.file(row), where)
+
+    def _images(self, cameras: IntArray) -> torch.Tensor | list[torch.Tensor]:
+        return decode_images(
+            [self._file(row) for row in cameras],
+            names=self.channels,
+            sizes=[self._recordings.size(row) for row in cameras],
+            reduce=self.reduce,
+        )
+
+    # --- other frames of the drive ------------------------------------------------------------------------------------
+    def _with_files(self) -> IntArray:
+        """The first camera's recordings that can be neighbours: all, or where sweeps were not copied, keyframes."""
+        recordings = self._recordings
+        own, key = np.arange(len(recordings.tokens)), recordings.rows["key"]
+        sweeps = np.flatnonzero(~key)
+        _, of_channels = np.unique(recordings.rows["channel"][sweeps], return_index=True)
+        for row in sweeps[of_channels]:
+            folder = (self.root / recordings.file(row)).parent
+            if not os.path.isdir(folder):  # also of names that no folder can have
+                warnings.warn(f"nuScenes: {folder}: found no sweeps: only keyframes are neighbours", stacklevel=3)
+                return own[key[own]]
+        return own
+
+    def _neighbour(self, row: int) -> LazyFrame:
+        """What of another frame needs no decoding; what is broken is said where it is used."""
+        recordings, record = self._recordings, self._recordings.rows[row]
+        sample, is_keyframe = int(record["sample"]), recordings.is_keyframe(row)
+        moment = int(recordings.keyframes[sample, -1]) if is_keyframe else row
+        ego2global, time_s = recordings.ego2global(moment), float(recordings.time_s(moment))
+        known: dict[str, Any] = {
+            "token": self.tokens[sample] if is_keyframe else recordings.tokens[row].decode(),
+            "time_s": time_s,
+            "ego2world": torch.from_numpy(ego2global),
+        }
+        try:
+            cameras = recordings.around(row)
+            known["rig"] = self._rig(cameras, ego2global)
+        except ArbiviewError as error:
+            return Unreadable(known, error)
+        if self._annotations is not None:
+            global2ego = _inverse(ego2global)
+            if is_keyframe:
+                boxes = self._annotations.at_sample(sample, global2ego)
+            else:
+                boxes = self._annotations.at_time(int(record["scene"]), time_s, global2ego)
+            known["boxes_3d"] = torch.from_numpy(boxes)
+        return LazyFrame(known, partial(self._images, cameras))
+
+
+def _inverse(pose: FloatArray) -> FloatArray:
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse
+
+
+def _chosen_samples(tables: Tables, split_scenes: Iterable[str] | None) -> list[Row]:
+    samples = [*tables.by_token("sample").values()]
+    scenes = tables.by_token("scene")
+    tables.follow("sample", samples, "scene_token", "scene", scenes)
+    if split_scenes is None:
+        return samples
+    if isinstance(split_scenes, str):
+        raise DataError(f"split_scenes: expected a collection of scene names, got the string {split_scenes!r}")
+    wanted = set(split_scenes)
+    names = dict(zip(scenes, tables.column("scene", [*scenes.values()], "name", TEXTS), strict=True))
+    unknown = sorted(wanted - set(names) - set(names.values()))
+    if unknown:
+        raise tables.error("scene", f"the scenes {', '.join(unknown[:5])}", f"{len(names)} others")
+    return [row for row in samples if row["scene_token"] in wanted or names[row["scene_token"]] in wanted]
+
+
+def _chosen_channels(tables: Tables, channels: Sequence[str] | None) -> list[str]:
+    rows = tables.rows("sensor")
+    modalities = tables.column("sensor", rows, "modality", TEXTS)
+    names = tables.column("sensor", rows, "channel", TOKENS)
+    cameras = {name for name, modality in zip(names, modalities, strict=True) if modality == "camera"}
+    if LIDAR in cameras:
+        raise tables.error("sensor", f"modality lidar of {LIDAR}", "camera")
+    if channels is None:
+        chosen = [channel for channel in CAMERA_RING if channel in cameras]
+        chosen += sorted(cameras - set(CAMERA_RING))
+    else:
+        chosen = list(channels)
+    unknown = [channel for channel in chosen if channel not in cameras]
+    if unknown or not chosen:
+        known, got = (", ".join(of) or "none" for of in (sorted(cameras), map(repr, unknown)))
+        raise DataError(f"nuScenes {tables.root}: channels: expected some of {known}, got {got}")
+    return chosen
+
+
+def _read_points(path: Path, sensor2ego: FloatArray) -> torch.Tensor:
+    try:
+        numbers = np.fromfile(path, dtype="<f4")
+        size = path.stat().st_size
+    except FileNotFoundError:
+        raise DataError(
+            f"points {path}: expected the LiDAR's file, found none; check the data root, or pass load_points=False"
+        ) from None
+    except OSError as error:
+        raise DataError(f"points {path}: expected a readable file, got {error.strerror}") from None
+    if size == 0 or size % (4 * _POINT_FLOATS):
+        raise DataError(
+            f"points {path}: expected whole points of {_POINT_FLOATS} float32, got {size} bytes (truncated?); "
+            "copy it again"
+        )
+    points = numbers.reshape(-1, _POINT_FLOATS)
+    checked_points(points, str(path))
+    points[:, :3] = points[:, :3].astype(np.float64) @ sensor2ego[:3, :3].T + sensor2ego[:3, 3]
+    return torch.from_numpy(points)

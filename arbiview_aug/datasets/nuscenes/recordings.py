@@ -1,0 +1,274 @@
+"""What nuScenes' cameras and LiDAR recorded: two tables of millions of rows, as columns of numbers.
+
+Rows as objects would take ten times the memory, and be copied into every worker, page by page.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import compress
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.datasets.drive import went_back
+from arbiview_aug.datasets.nuscenes.tables import (
+    COUNTS,
+    FILES,
+    FLAGS,
+    LINKS,
+    MICROSECONDS,
+    TOKENS,
+    Row,
+    Tables,
+    Tokens,
+    rotation_from_quaternion,
+)
+from arbiview_aug.errors import DataError
+
+LIDAR = "LIDAR_TOP"
+"""The sensor whose time and ego pose are the sample's."""
+
+MAX_APART_S = 0.1
+"""A camera records every 50 to 100 ms: so the image nearest to a moment is within half of it, unless some are lost."""
+
+IntArray = npt.NDArray[np.int64]
+
+_ROW = np.dtype(
+    [
+        ("channel", "i2"),
+        ("scene", "i4"),
+        ("sample", "i4"),
+        ("time_us", "i8"),
+        ("sensor", "i4"),  # row of sensor2ego and K
+        ("pose", "i4"),  # row of poses
+        ("file", "i4"),  # row of file_names
+        ("height", "i4"),
+        ("width", "i4"),
+        ("key", "?"),
+        ("token", "i4"),  # of the first channel's rows, in the table's order
+    ]
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Recordings:
+    """What each sensor recorded, sorted by channel, scene and time: so the first channel's rows come first.
+
+    Attributes:
+        channels: The cameras; the first one's exposures are the frames of a drive. The LiDAR, of keyframes, is last.
+        sensor2ego: (C, 4, 4) by calibrated sensor.
+        K: (C, 3, 3), the identity for the LiDAR.
+        rows: (R,) records of ``_ROW``.
+        first: (channels * scenes + 1,) first row of each channel in each scene, and the end.
+        keyframes: (S, channels) row of each sample's recording.
+        poses: (E, 7) the ego's x y z and quaternion w x y z in the world.
+        file_names: What stands before the time in a file's name and behind it; None behind a name without the time.
+        tokens: (F,) of the first channel's rows; empty without sweeps.
+        parts: (F,) number of the uninterrupted drive that a row of the first channel belongs to; empty without sweeps.
+    """
+
+    channels: list[str]
+    sensor2ego: FloatArray
+    K: FloatArray
+    rows: npt.NDArray[Any]
+    first: IntArray
+    keyframes: IntArray
+    poses: FloatArray
+    file_names: list[tuple[str, str | None]]
+    tokens: npt.NDArray[np.bytes_]
+    parts: IntArray
+
+    def file(self, row: int) -> str:
+        """A recording's file, below the root."""
+        head, tail = self.file_names[self.rows["file"][row]]
+        return head if tail is None else f"{head}{self.rows['time_us'][row]}{tail}"
+
+    def size(self, row: int) -> tuple[int, int]:
+        """(h, w) in pixels."""
+        return int(self.rows["height"][row]), int(self.rows["width"][row])
+
+    def ego2global(self, rows: Any) -> FloatArray:
+        """(..., 4, 4) where the ego was when rows (...,) were recorded."""
+        pose = self.poses[self.rows["pose"][rows]]
+        found = np.zeros((*pose.shape[:-1], 4, 4))
+        found[..., :3, :3], found[..., :3, 3] = rotation_from_quaternion(pose[..., 3:]), pose[..., :3]
+        found[..., 3, 3] = 1
+        return found
+
+    def time_s(self, rows: Any) -> FloatArray:
+        """Seconds (...,) of rows (...,)."""
+        return np.asarray(1e-6 * self.rows["time_us"][rows])
+
+    def is_keyframe(self, row: int) -> bool:
+        """Whether a row of the first channel is its sample's image."""
+        return bool(self.keyframes[self.rows["sample"][row], 0] == row)
+
+    def around(self, row: int) -> IntArray:
+        """(cameras,) the rows that belong to one of the first camera's.
+
+        Cameras expose one after the other: of each that row whose distance in time from the first camera's is nearest
+        to what it is in their keyframe.
+
+        Raises:
+            DataError: A camera recorded nothing then.
+        """
+        time_us, record = self.rows["time_us"], self.rows[row]
+        keyframe_us = time_us[self.keyframes[record["sample"]]]
+        found = np.full(len(self.channels) - 1, row)
+        for channel in range(1, len(found)):
+            wanted_us = record["time_us"] + keyframe_us[channel] - keyframe_us[0]
+            scenes = (len(self.first) - 1) // len(self.channels)
+            first, end = self.first[channel * scenes + record["scene"] :][:2]
+            apart_us = np.abs(time_us[first:end] - wanted_us)
+            if not len(apart_us) or apart_us.min() > 1e6 * MAX_APART_S:
+                raise DataError(f"expected an image of {self.channels[channel]} within {MAX_APART_S} s, got none")
+            found[channel] = first + apart_us.argmin()
+        return found
+
+
+def read_recordings(
+    tables: Tables, samples: Mapping[str, int], scenes: Sequence[int], channels: Sequence[str], sweeps: bool
+) -> Recordings:
+    """The recordings of some samples and cameras.
+
+    Args:
+        tables: The data set.
+        samples: Number of each sample's token.
+        scenes: Number of the scene of each sample.
+        channels: The cameras.
+        sweeps: Whether to read what cameras recorded between the keyframes, nine tenths of two tables.
+
+    Raises:
+        DataError: Rows that are malformed or lead nowhere; a sample of which a recording is missing.
+    """
+    wanted = [*channels, LIDAR]
+    calibrated, channel_of, sensor2ego, K = _calibrations(tables, wanted)
+    poses: dict[str, int] = {}
+    files: dict[tuple[str, str | None], int] = {}
+    tokens: list[str] = []
+    previous: list[str] = []
+    parts = [np.empty(0, _ROW)]
+    table, unique = "sample_data", Tokens(tables, "sample_data")
+    for batch in tables.batches(table):
+        is_key = tables.column(table, batch, "is_key_frame", FLAGS)
+        kept = batch if sweeps else [*compress(batch, is_key)]
+        of_samples = tables.column(table, kept, "sample_token", TOKENS)
+        kept = [row for row, token in zip(kept, of_samples, strict=True) if token in samples]  # of the chosen scenes
+        sensors = tables.follow(table, kept, "calibrated_sensor_token", "calibrated_sensor", calibrated)
+        is_wanted = [
+            sensor >= 0 and (row["is_key_frame"] or channel_of[sensor] < len(channels))
+            for row, sensor in zip(kept, sensors, strict=True)
+        ]
+        kept, sensors = [*compress(kept, is_wanted)], [*compress(sensors, is_wanted)]
+        part = np.zeros(len(kept), _ROW)
+        part["sensor"], part["channel"] = sensors, [channel_of[sensor] for sensor in sensors]
+        part["sample"] = [samples[row["sample_token"]] for row in kept]
+        part["scene"] = [scenes[sample] for sample in part["sample"].tolist()]
+        part["key"] = [row["is_key_frame"] for row in kept]
+        part["time_us"] = times_us = tables.column(table, kept, "timestamp", MICROSECONDS)
+        for key in ("height", "width"):
+            part[key] = tables.column(table, kept, key, COUNTS, default=0)  # none for the LiDAR
+        of_poses = tables.column(table, kept, "ego_pose_token", TOKENS)
+        part["pose"] = [poses.setdefault(token, len(poses)) for token in of_poses]
+        of_files = []
+        for name, time_us in zip(tables.column(table, kept, "filename", FILES), times_us, strict=True):
+            head, time, tail = name.partition(str(time_us))
+            of_files.append(files.setdefault((head, tail if time else None), len(files)))
+        part["file"] = of_files
+        of_tokens = unique.add(kept)
+        if sweeps:
+            is_first = part["channel"] == 0
+            part["token"][is_first] = len(tokens) + np.arange(is_first.sum())
+            tokens += compress(of_tokens, is_first)
+            previous += tables.column(table, [*compress(kept, is_first)], "prev", LINKS)
+        parts.append(part)
+    unique.check()
+    rows = np.concatenate(parts)
+    rows = rows[np.lexsort((rows["time_us"], rows["scene"], rows["channel"]))]
+    keyframes = np.full((len(samples), len(wanted)), -1)
+    of_keys = rows[rows["key"]]
+    times = np.zeros(keyframes.shape, np.int64)
+    np.add.at(times, (of_keys["sample"], of_keys["channel"]), 1)
+    for k, channel in np.argwhere(times > 1)[:1]:
+        one = f"one keyframe of {wanted[channel]} for sample {list(samples)[k]}"
+        raise tables.error(table, one, str(times[k, channel]), "remove the others")
+    keyframes[of_keys["sample"], of_keys["channel"]] = np.flatnonzero(rows["key"])
+    for k in np.flatnonzero((keyframes < 0).any(axis=1))[:1]:
+        missing = ", ".join(channel for channel, row in zip(wanted, keyframes[k], strict=True) if row < 0)
+        raise tables.error("sample_data", f"keyframes of {missing} for sample {list(samples)[k]}", "none")
+    count = max(scenes, default=-1) + 1
+    in_order = np.arange(len(wanted) * count + 1)
+    order = rows["token"][: len(tokens)]
+    tokens, previous = ([of[k] for k in order] for of in (tokens, previous))
+    return Recordings(
+        channels=wanted,
+        sensor2ego=sensor2ego,
+        K=K,
+        rows=rows,
+        first=np.searchsorted(rows["channel"].astype(np.int64) * count + rows["scene"], in_order),
+        keyframes=keyframes,
+        poses=_ego_poses(tables, poses),
+        file_names=list(files),
+        tokens=np.array([token.encode() for token in tokens], np.bytes_),
+        parts=_parts(rows["scene"][: len(tokens)], tokens, previous, f"nuScenes {tables.root}"),
+    )
+
+
+def _calibrations(tables: Tables, wanted: Sequence[str]) -> tuple[dict[str, int], list[int], FloatArray, FloatArray]:
+    """Number of each calibrated sensor, -1 where it is not wanted; by number the channels, sensor2ego (C, 4, 4) and K
+    (C, 3, 3)."""
+    sensors = tables.by_token("sensor")
+    calibrated: dict[str, int] = {}
+    rows: list[Row] = []
+    channel_of: list[int] = []
+    every = tables.by_token("calibrated_sensor")
+    of_sensors = tables.follow("calibrated_sensor", [*every.values()], "sensor_token", "sensor", sensors)
+    for (token, row), sensor in zip(every.items(), of_sensors, strict=True):
+        channel = sensor["channel"]
+        # Radars are calibrated too: known, so that their tokens are no dangling ones, but not read.
+        calibrated[token] = len(rows) if channel in wanted else -1
+        if channel in wanted:
+            rows.append(row)
+            channel_of.append(wanted.index(channel))
+    sensor2ego = tables.poses("calibrated_sensor", rows)
+    K = np.tile(np.eye(3), (len(rows), 1, 1))
+    cameras = [k for k, channel in enumerate(channel_of) if wanted[channel] != LIDAR]
+    K[cameras] = tables.numbers("calibrated_sensor", [rows[k] for k in cameras], "camera_intrinsic", (3, 3))
+    return calibrated, channel_of, sensor2ego, K
+
+
+def _ego_poses(tables: Tables, wanted: Mapping[str, int]) -> FloatArray:
+    """(E, 7) poses of tokens, by their numbers."""
+    poses = np.full((len(wanted), 7), np.nan)
+    times = np.zeros(len(wanted), np.int64)
+    for batch in tables.batches("ego_pose"):
+        tokens = tables.column("ego_pose", batch, "token", TOKENS)
+        is_wanted = [token in wanted for token in tokens]
+        rows, at = [*compress(batch, is_wanted)], [wanted[token] for token in compress(tokens, is_wanted)]
+        np.add.at(times, at, 1)
+        poses[at, :3] = tables.numbers("ego_pose", rows, "translation", (3,))
+        poses[at, 3:] = tables.quaternions("ego_pose", rows)
+    for k in np.flatnonzero(times != 1)[:1]:
+        one = f"the token {list(wanted)[k]!r} that a row of sample_data names"
+        raise tables.error("ego_pose", one, f"{times[k]} of them" if times[k] else "none")
+    return poses
+
+
+def _parts(scene: npt.NDArray[Any], tokens: Sequence[str], previous: Sequence[str], where: str) -> IntArray:
+    """(F,) numbers of the uninterrupted drives in recordings of one camera, sorted by scene and time.
+
+    A recording goes on from the one before it where its ``prev`` says so: not at a scene's border, nor where the clock
+    goes back, of which it warns.
+    """
+    place = {token: k for k, token in enumerate(tokens)}
+    before = np.array([place.get(token, -1) for token in previous], np.int64)
+    number = np.arange(len(before))
+    same_scene = (before >= 0) & (scene[before] == scene)
+    for k in np.flatnonzero(same_scene & (before > number)).tolist():
+        warnings.warn(went_back(where, tokens[before[k]], tokens[k]), stacklevel=4)
+    return np.cumsum(~(same_scene & (before == number - 1)))

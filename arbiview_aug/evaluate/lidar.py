@@ -1,0 +1,284 @@
+"""Sparse LiDAR metrics: points coloured by the source cameras are compared with a rendered target where they fall.
+
+This is the paper's measure (its Table 2): there is no true image of a vehicle that was not there, but a LiDAR point's
+colour is known, and so is the pixel of the target where it must appear. Two effects of the protocol:
+
+- Exposure differs between cameras and a point is coloured by one of them, so the raw figure punishes the geometrically
+  exact source. Compare methods on ``equalised`` frames (one gain per camera before colouring and rendering).
+- Pixels that nothing covers are black and count; ``covered`` tells how good the rest is, ``coverage`` how much it is.
+
+Images are (h, w, 3) RGB on the scale 0-255, points (P, >=3) in the ego frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.errors import SampleError
+from arbiview_aug.evaluate.images import Image
+from arbiview_aug.evaluate.metrics import Errors, errors, flat, mean_of, ssim
+from arbiview_aug.scene.point_cloud import own_car
+
+NEAREST_M = 1.0
+"""Points closer to the camera are not used: they lie on the own car."""
+
+_OCCLUSION_FACTOR = 1.1
+_DARK, _SATURATED = 8, 235
+_MIN_SHARED_POINTS = 20
+
+
+class VisiblePoints(NamedTuple):
+    """Points that a camera sees: indices (n,) into the cloud, pixels (n, 2) and depths (n,)."""
+
+    indices: npt.NDArray[np.intp]
+    uv: FloatArray
+    depth_m: FloatArray
+
+
+@dataclass(frozen=True)
+class ColouredPoints:
+    """LiDAR points with the colour that a source camera saw.
+
+    Attributes:
+        points: (n, 3) in the ego frame.
+        colours: (n, 3) RGB, 0-255.
+        on_ground: (n,) bool, within ``ground_band_m`` of the rig's road plane.
+    """
+
+    points: FloatArray
+    colours: FloatArray
+    on_ground: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def subset(self, keep: BoolArray) -> ColouredPoints:
+        """The points where ``keep`` (n,) is True."""
+        return ColouredPoints(self.points[keep], self.colours[keep], self.on_ground[keep])
+
+
+@dataclass(frozen=True)
+class SparseScore:
+    """How one target image agrees with the coloured points that fall into it.
+
+    Attributes:
+        all: All visible points: the paper's figure, uncovered pixels black.
+        ssim: Structural similarity of two images, black but for the points' pixels: rendered and LiDAR colours. It
+            saturates above 0.99 for everything useful.
+        coverage: Share of the points on pixels that some source covers.
+        covered: Points on covered pixels only.
+        ground: Points on the road plane.
+        other: All others.
+    """
+
+    all: Errors
+    ssim: float
+    coverage: float
+    covered: Errors | None
+    ground: Errors | None
+    other: Errors | None
+
+    def as_dict(self) -> dict[str, float]:
+        """Flat numbers: ``psnr_db, mae, rmse, ssim, coverage, covered_psnr_db, ..., ground_psnr_db, ...``."""
+        parts = {"covered": self.covered, "ground": self.ground, "other": self.other}
+        row = {**flat("", self.all), "ssim": self.ssim, "coverage": self.coverage, "points": float(self.all.n)}
+        for name, part in parts.items():
+            row.update(flat(name, part))
+        return row
+
+
+def visible_points(camera: Camera, points: FloatArray, *, cell_px: int = 8, tolerance_m: float = 0.3) -> VisiblePoints:
+    """Points that a camera sees, by a coarse z-buffer.
+
+    LiDAR is sparse, so that points behind a surface shine through its gaps: a point is hidden where another one in a
+    neighbourhood of 5 x 3 cells is closer by more than ``tolerance_m`` and a tenth of its depth.
+
+    Args:
+        camera: The camera; its mask is not applied.
+        points: (P, >=3) in the ego frame.
+        cell_px: Size of the z-buffer's cells.
+        tolerance_m: Depth difference that still counts as the same surface.
+    """
+    h, w = camera.size
+    uv, depth, valid = camera.project(points[:, :3])
+    if camera.lens == "fisheye":  # z is no depth for a lens that sees sideways
+        depth = np.linalg.norm(points[:, :3] - camera.center_m, axis=1)
+    inside = (uv >= 0).all(1) & (uv[:, 0] < w - 1) & (uv[:, 1] < h - 1)
+    index = np.flatnonzero(valid & (depth > NEAREST_M) & inside)
+    uv, depth = uv[index], depth[index]
+    x, y = (uv / cell_px).astype(int).T + 1  # one cell of border for the erosion
+    nearest = np.full((h // cell_px + 3, w // cell_px + 3), np.inf, np.float32)
+    np.minimum.at(nearest, (y, x), depth.astype(np.float32))
+    nearest = cv2.erode(nearest, np.ones((3, 5), np.uint8)).astype(np.float32)
+    seen = depth < nearest[y, x] * _OCCLUSION_FACTOR + tolerance_m
+    return VisiblePoints(index[seen], uv[seen], depth[seen])
+
+
+def colours_at(image: npt.NDArray[Any], uv: FloatArray) -> npt.NDArray[np.float32]:
+    """Bilinear samples (n, c) or (n,) of an image at pixels (n, 2)."""
+    if len(uv) == 0:
+        return np.zeros((0, *image.shape[2:]), np.float32)
+    # remap wants sizes below 32767: any number of points goes through rows of 16384.
+    rows = -(-len(uv) // 16384)
+    padded = np.zeros((rows * min(len(uv), 16384), 2), np.float32)
+    padded[: len(uv)] = uv
+    grid = padded.reshape(rows, -1, 2)
+    samples = cv2.remap(image.astype(np.float32), grid[..., 0], grid[..., 1], cv2.INTER_LINEAR)
+    return np.asarray(samples.reshape(-1, *image.shape[2:])[: len(uv)], dtype=np.float32)
+
+
+def coloured_points(
+    rig: Rig, images: Sequence[Image], points: FloatArray, *, ground_band_m: float = 0.3
+) -> ColouredPoints:
+    """LiDAR points coloured by the camera that sees each closest to its axis.
+
+    Returns of the own car (``lidar.OWN_CAR_M``) and points that no camera sees, or only on a car-body mask, are
+    dropped.
+
+    Args:
+        rig: The source rig.
+        images: One per camera.
+        points: (P, >=3) in the ego frame.
+        ground_band_m: Distance from the road plane that still counts as ground.
+    """
+    _check_images(rig, images)
+    points = points[~own_car(points), :3].astype(np.float64)
+    colours, best_cosine = np.zeros((len(points), 3)), np.full(len(points), -1.0)
+    for camera, image in zip(rig, images, strict=True):
+        index, uv, _ = _unmasked(camera, visible_points(camera, points))
+        rays = points[index] - camera.center_m
+        cosine = rays @ camera.cam2ego[:3, 2] / np.linalg.norm(rays, axis=1)
+        better = cosine > best_cosine[index]
+        colours[index[better]] = colours_at(image, uv[better])
+        best_cosine[index[better]] = cosine[better]
+    seen = best_cosine > -1.0
+    on_ground = np.abs(points[:, 2] - rig.ground_z_m) < ground_band_m
+    return ColouredPoints(points[seen], colours[seen], on_ground[seen])
+
+
+def equalising_gains(rig: Rig, images: Sequence[Image], points: FloatArray, *, prior: float = 0.1) -> FloatArray:
+    """(N,) gains that bring points seen by two cameras to one brightness.
+
+    Least squares on log-gains g: for each pair of cameras with at least 20 shared points that are neither dark nor
+    saturated, g_a - g_b = -median(log brightness_a - log brightness_b); ``prior`` pulls each towards 0, and so does
+    their sum.
+    """
+    _check_images(rig, images)
+    light: list[dict[int, float]] = []
+    for camera, image in zip(rig, images, strict=True):
+        index, uv, _ = _unmasked(camera, visible_points(camera, points))
+        brightness = colours_at(image, uv).mean(-1)
+        usable = (brightness > _DARK) & (brightness < _SATURATED)
+        light.append(dict(zip(index[usable].tolist(), np.log(brightness[usable]).tolist(), strict=True)))
+    count = len(rig)
+    rows, targets = [], []
+    for a in range(count):
+        for b in range(a + 1, count):
+            shared = light[a].keys() & light[b].keys()
+            if len(shared) >= _MIN_SHARED_POINTS:
+                row = np.zeros(count)
+                row[a], row[b] = 1, -1
+                rows.append(row)
+                targets.append(-np.median([light[a][k] - light[b][k] for k in shared]))
+    A = np.vstack([*rows, prior * np.eye(count), np.ones((1, count))])
+    rhs = np.concatenate([targets, np.zeros(count + 1)])
+    return np.asarray(np.exp(np.linalg.lstsq(A, rhs, rcond=None)[0]))
+
+
+def equalised(rig: Rig, images: Sequence[Image], points: FloatArray) -> list[npt.NDArray[np.uint8]]:
+    """The images with ``equalising_gains`` applied."""
+    gains = equalising_gains(rig, images, points)
+    return [np.clip(image * gain, 0, 255).astype(np.uint8) for image, gain in zip(images, gains, strict=True)]
+
+
+def lidar_split(points: FloatArray, width_deg: float = 1.0) -> tuple[BoolArray, BoolArray]:
+    """Masks (fit, test) over alternate azimuth sectors: what a LiDAR surface may use, and what scores it."""
+    azimuth_deg = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    fit = np.asarray(np.floor(azimuth_deg / width_deg) % 2 == 0)
+    return fit, ~fit
+
+
+def sparse_metrics(
+    image: Image, camera: Camera, points: ColouredPoints, *, coverage: BoolArray | None = None
+) -> SparseScore | None:
+    """Agreement of a rendered target with the coloured points it should show.
+
+    Args:
+        image: The target's image, black where nothing covers it (or filled, to score the filling as well).
+        camera: The target camera.
+        points: From ``coloured_points``.
+        coverage: (h, w) bool, where some source saw the target; by default, pixels that are not black.
+
+    Returns:
+        The score, or None where no point is visible.
+    """
+    if image.shape[:2] != camera.size:
+        raise SampleError(f"camera {camera.name!r}: expected an image of {camera.size}, got {image.shape[:2]}")
+    h, w = camera.size
+    index, uv, _ = visible_points(camera, points.points)
+    if len(index) == 0:
+        return None
+    got, want = colours_at(image, uv), points.colours[index]
+    column, row = np.round(uv).astype(int).clip(0, [w - 1, h - 1]).T
+    sparse_got, sparse_want = np.zeros((h, w, 3), np.float32), np.zeros((h, w, 3), np.float32)
+    sparse_got[row, column], sparse_want[row, column] = got, want
+    covered = np.asarray(image.any(-1) if coverage is None else coverage)[row, column]
+    ground = points.on_ground[index]
+    everything = errors(got, want)
+    assert everything is not None
+    return SparseScore(
+        all=everything,
+        ssim=ssim(sparse_got, sparse_want),
+        coverage=float(covered.mean()),
+        covered=errors(got[covered], want[covered]),
+        ground=errors(got[ground], want[ground]),
+        other=errors(got[~ground], want[~ground]),
+    )
+
+
+def score_targets(
+    render: Callable[[Rig], Iterable[Image]],
+    points: ColouredPoints,
+    targets: Iterable[Rig],
+) -> dict[str, float]:
+    """Mean sparse metrics over all cameras of all target rigs.
+
+    Args:
+        render: Renders a target rig: one image per camera.
+        points: From ``coloured_points``, in the ego frame of the targets.
+        targets: See ``evaluate.targets``.
+
+    Returns:
+        Means of the per-image values (see ``SparseScore.as_dict``); empty where no point is visible.
+    """
+    rows = []
+    for target in targets:
+        for camera, image in zip(target, render(target), strict=True):
+            score = sparse_metrics(image, camera, points)
+            if score is not None:
+                rows.append(score.as_dict())
+    return mean_of(rows)
+
+
+def _unmasked(camera: Camera, seen: VisiblePoints) -> VisiblePoints:
+    if camera.mask is None:
+        return seen
+    keep = colours_at(camera.mask.astype(np.float32), seen.uv) > 0.99
+    return VisiblePoints(seen.indices[keep], seen.uv[keep], seen.depth_m[keep])
+
+
+def _check_images(rig: Rig, images: Sequence[Image]) -> None:
+    if len(images) != len(rig):
+        raise SampleError(f"images: expected one for each of the rig's {len(rig)} cameras, got {len(images)}")
+    for camera, image in zip(rig, images, strict=True):
+        if image.shape != (*camera.size, 3):
+            raise SampleError(f"camera {camera.name!r}: expected an image of {(*camera.size, 3)}, got {image.shape}")

@@ -1,0 +1,88 @@
+"""FAVS Stage 1, geometric transformation: homographies from calibration alone, and their check.
+
+Convention: H maps *source* pixels to *target* pixels, p_target ~ H p_source (the paper's H maps camera 1 to camera 2).
+The paper's R_i = ``cam2ego[:3, :3].T`` takes ego directions to camera i. Both cameras must be pinhole cameras; the
+sampling of the package goes the other way and covers every lens and surface (``arbiview_aug.render.plan``). For pinhole
+cameras on the far surface the two agree, which ``tests/favs`` pins.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.errors import CalibrationError
+
+MAX_AREA_RATIO = 16.0
+"""A view more than 4 times enlarged or reduced along each side carries no usable texture."""
+
+
+def h_geom(source: Camera, target: Camera) -> FloatArray:
+    """(3, 3) rotation-only homography H_geom = K2 R2 R1⁻¹ K1⁻¹ (Sec. FAVS, Stage 1): exact at infinite depth."""
+    _require_pinhole(source, target)
+    return target.K @ _relative_rotation(source, target) @ np.linalg.inv(source.K)
+
+
+def h_planar(source: Camera, target: Camera, normal: FloatArray, distance_m: float) -> FloatArray:
+    """(3, 3) homography of a scene plane: H_planar = K2 (R - t nᵀ / d) K1⁻¹ (Sec. FAVS, Stage 1).
+
+    R = R2 R1⁻¹ and t, the source's centre in the target's frame, take source to target: X2 = R X1 + t. The paper's
+    minus sign means the plane n·X1 = -d: ``normal`` points from the plane towards the camera, d > 0 is the distance.
+
+    Args:
+        source: Camera 1.
+        target: Camera 2.
+        normal: (3,) unit normal in the source camera's frame, from the plane towards the source.
+        distance_m: Distance of the source's centre from the plane, metres, > 0.
+    """
+    _require_pinhole(source, target)
+    if not distance_m > 0:
+        raise CalibrationError(f"h_planar: distance_m: expected a positive distance, got {distance_m!r}")
+    t = target.cam2ego[:3, :3].T @ (source.center_m - target.center_m)
+    R = _relative_rotation(source, target)
+    return target.K @ (R - np.outer(t, normal) / distance_m) @ np.linalg.inv(source.K)
+
+
+def check_homography(H: FloatArray, size: tuple[int, int], max_area_ratio: float = MAX_AREA_RATIO) -> bool:
+    """The paper's validity = check_homography(H, corners): no excessive distortion of the four image corners.
+
+    True where all four corners stay in front (one sign of the third coordinate), form a convex quadrilateral of the
+    same orientation, and enclose between 1 / ``max_area_ratio`` and ``max_area_ratio`` times the image's area.
+    H and -H are the same homography, so the sign is taken from the image centre.
+
+    Args:
+        H: (3, 3).
+        size: (h, w) of the source image.
+        max_area_ratio: Largest enlargement or reduction of area.
+    """
+    if H.shape != (3, 3) or not np.isfinite(H).all():
+        return False
+    h, w = size
+    corners = np.array([[0, 0, 1], [w - 1, 0, 1], [w - 1, h - 1, 1], [0, h - 1, 1]], dtype=np.float64)
+    x = corners @ H.T
+    third = x[:, 2] * np.sign(H[2] @ [(w - 1) / 2, (h - 1) / 2, 1])
+    if third.min() <= 1e-9 * np.abs(H).max():
+        return False
+    quad = x[:, :2] / x[:, 2:]
+    sides = np.roll(quad, -1, axis=0) - quad
+    following = np.roll(sides, -1, axis=0)
+    turns = sides[:, 0] * following[:, 1] - sides[:, 1] * following[:, 0]
+    if turns.min() <= 0:  # y is down: corners in this order turn positively in an unmirrored image
+        return False
+    area = cv2.contourArea(quad.astype(np.float32)) / max((w - 1) * (h - 1), 1)
+    return bool(1 / max_area_ratio <= area <= max_area_ratio)
+
+
+def _relative_rotation(source: Camera, target: Camera) -> FloatArray:
+    """R2 R1⁻¹: camera 1's directions in camera 2's frame."""
+    return target.cam2ego[:3, :3].T @ source.cam2ego[:3, :3]
+
+
+def _require_pinhole(*cameras: Camera) -> None:
+    for camera in cameras:
+        if camera.lens != "pinhole":
+            raise CalibrationError(
+                f"camera {camera.name!r}: a homography needs a pinhole lens, got {camera.lens}; use .undistorted()"
+            )

@@ -1,0 +1,302 @@
+"""FAVS Stage 2, feature matching: a source's warp is matched to the reference and its homography corrected.
+
+The reference is the primary camera's warp, so everything happens in target pixels: M takes the source's warp onto the
+reference, and H_feature = M · H_geometric. Matching needs only the region that both see: cropped overlaps.
+
+Convention: as in ``geometric_transformation``, H maps source pixels to target pixels. Grey images are uint8.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.favs.config import PaperConfig
+from arbiview_aug.favs.stage1_geometry import check_homography
+
+GreyImage = npt.NDArray[np.uint8]
+Case = Literal["feature", "blended", "geometric"]
+
+REFERENCE_WIDTH_PX = 800
+"""The target width at which ``PaperConfig`` states its lengths."""
+
+_NEIGHBOURS = 2  # the ratio test compares the nearest with the second-nearest
+_FLANN_LINEAR = 0  # exact, and nothing is random: 39 ms for the fullest overlap, where kd-trees take 16 and only guess
+
+
+class Region(NamedTuple):
+    """A rectangle of corner coordinates, inclusive: pixels (x0, y0) to (x1, y1)."""
+
+    x0: int
+    y0: int
+    x1: int
+    y1: int
+
+    @property
+    def corners(self) -> FloatArray:
+        """(4, 2) corner pixels, clockwise from the first."""
+        return np.array(
+            [(self.x0, self.y0), (self.x1, self.y0), (self.x1, self.y1), (self.x0, self.y1)], dtype=np.float64
+        )
+
+
+class Matches(NamedTuple):
+    """good_matches: (n, 2) pixels in the source's warp and in the reference, both target pixels."""
+
+    warped: FloatArray
+    reference: FloatArray
+
+
+NO_MATCHES = Matches(np.zeros((0, 2)), np.zeros((0, 2)))
+
+
+@dataclass(frozen=True)
+class FeatureReport:
+    """What stage 2 found for one source.
+
+    Attributes:
+        H_base: (3, 3) the homography that goes on to stage 3.
+        case: Which of the paper's three cases gave it.
+        alpha: α, the share of H_geometric in it: 0 for ``feature``, 1 for ``geometric``.
+        good_matches: Matches that passed the ratio test.
+        inliers: Those that agree with M; 0 without one.
+        consistency_px: Corner motion between the two homographies, None without H_feature.
+        reason: Why this case, in words.
+        matches: The matches that stage 3 may cluster: the inliers of M, else all good ones.
+    """
+
+    H_base: FloatArray
+    case: Case
+    alpha: float
+    good_matches: int
+    inliers: int
+    consistency_px: float | None
+    reason: str
+    matches: Matches
+
+    @property
+    def quality(self) -> float:
+        """Matching quality in [0, 1]: share of inliers among the good matches, times the share of H_feature."""
+        return (1 - self.alpha) * self.inliers / max(self.good_matches, 1)
+
+
+# --- equations --------------------------------------------------------------------------------------------------------
+def normalised(H: FloatArray) -> FloatArray:
+    """H with det H = 1. H is known up to scale and sign, and only so do sums of homographies mean anything.
+
+    The real cube root keeps the determinant's sign, so that -H, whose determinant has the other sign, gives the same.
+
+    Args:
+        H: (3, 3), regular.
+    """
+    return H / np.cbrt(np.linalg.det(H))
+
+
+def consistency(H_geometric: FloatArray, H_feature: FloatArray, corners: FloatArray) -> float:
+    """consistency(H_geometric, H_feature): the largest motion in pixels of a corner between the two.
+
+    Entries of H are no measure: a change of 1e-4 in one may be nothing and in another half the image.
+
+    Args:
+        H_geometric: (3, 3).
+        H_feature: (3, 3).
+        corners: (n, 2) *target* pixels around what the source shows: its own corners may project to infinity.
+    """
+    M = normalised(H_feature) @ np.linalg.inv(normalised(H_geometric))
+    moved = np.concatenate([corners, np.ones((len(corners), 1))], 1) @ M.T
+    if moved[:, 2].min() <= 0:
+        return float("inf")
+    return float(np.linalg.norm(moved[:, :2] / moved[:, 2:] - corners, axis=1).max())
+
+
+def blend_weight(consistency_px: float, consistent_px: float, inconsistent_px: float) -> float:
+    """α by the degree of consistency: 0 up to ``consistent_px``, 1 from ``inconsistent_px``, linear between."""
+    return float(np.clip((consistency_px - consistent_px) / (inconsistent_px - consistent_px), 0.0, 1.0))
+
+
+def h_base(H_geometric: FloatArray, H_feature: FloatArray, alpha: float) -> FloatArray:
+    """H_base = α H_geometric + (1 - α) H_feature, both normalised; α = 0 and α = 1 are the paper's outer cases."""
+    return alpha * normalised(H_geometric) + (1 - alpha) * normalised(H_feature)
+
+
+# --- matching ---------------------------------------------------------------------------------------------------------
+def overlap_region(one: BoolArray, two: BoolArray, margin_px: int) -> Region | None:
+    """Bounding box of what both (h, w) coverages hold, grown by a margin inside the image; None without overlap."""
+    rows, columns = (np.flatnonzero((one & two).any(axis)) for axis in (1, 0))
+    if not len(rows):
+        return None
+    h, w = one.shape
+    return Region(
+        max(int(columns[0]) - margin_px, 0),
+        max(int(rows[0]) - margin_px, 0),
+        min(int(columns[-1]) + margin_px, w - 1),
+        min(int(rows[-1]) + margin_px, h - 1),
+    )
+
+
+def match_features(
+    warped: GreyImage, reference: GreyImage, usable: BoolArray, ratio: float, max_features: int
+) -> Matches:
+    """SIFT on both images, FLANN, and Lowe's ratio test d1 / d2 < ``ratio`` (Sec. FAVS, Stage 2).
+
+    FLANN's linear index is exact; its kd-trees would depend on the state of OpenCV's random generator. SIFT repeats
+    bit for bit within ``environment.repeatable_opencv`` only.
+
+    Args:
+        warped: (h, w) the source's warp.
+        reference: (h, w) the reference.
+        usable: (h, w) where keypoints count: the black beyond a warp's border has corners of its own.
+        ratio: 0.75 in the paper.
+        max_features: Strongest keypoints to keep.
+    """
+    sift = cv2.SIFT_create(nfeatures=max_features)  # type: ignore[attr-defined]
+    inside = usable.astype(np.uint8) * 255
+    found = [sift.detectAndCompute(image, inside) for image in (warped, reference)]
+    (points_1, descriptors_1), (points_2, descriptors_2) = found
+    # Blank images have no descriptors, and a search for two neighbours needs two.
+    if descriptors_1 is None or descriptors_2 is None or len(descriptors_2) < _NEIGHBOURS:
+        return NO_MATCHES
+    matcher = cv2.FlannBasedMatcher({"algorithm": _FLANN_LINEAR}, {})
+    pairs = matcher.knnMatch(descriptors_1, descriptors_2, k=_NEIGHBOURS)
+    good = [pair[0] for pair in pairs if len(pair) == _NEIGHBOURS and pair[0].distance < ratio * pair[1].distance]
+    if not good:
+        return NO_MATCHES
+    return Matches(
+        np.array([points_1[m.queryIdx].pt for m in good], dtype=np.float64),
+        np.array([points_2[m.trainIdx].pt for m in good], dtype=np.float64),
+    )
+
+
+def estimate_homography(matches: Matches, ransac_px: float) -> tuple[FloatArray, BoolArray] | None:
+    """RANSAC(good_matches), as MAGSAC: (3, 3) M from warp to reference and the (n,) inliers; None where there is none.
+
+    Points on one line, or all in one place, determine no homography. MAGSAC draws from a generator of its own, which
+    starts alike in every call.
+    """
+    if len(matches.warped) < 4:
+        return None
+    try:
+        M, inlier = cv2.findHomography(
+            matches.warped, matches.reference, cv2.USAC_MAGSAC, ransac_px, maxIters=5000, confidence=0.999
+        )
+    except cv2.error:  # some versions raise on degenerate points, others return None
+        return None
+    if M is None or M.shape != (3, 3) or not np.isfinite(M).all() or abs(np.linalg.det(M)) < 1e-9:
+        return None
+    return np.asarray(M, np.float64), np.asarray(inlier).reshape(-1) > 0
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+def is_valid(H: FloatArray, visible: Region, scale: float, max_area_ratio: float) -> bool:
+    """check_homography on the corners of what the target shows of a source: others may lie behind the target.
+
+    Args:
+        H: (3, 3).
+        visible: That part, in source pixels.
+        scale: Source focal length over target focal length: a target of fewer pixels is no distortion.
+        max_area_ratio: The bound.
+    """
+    shift = np.array([[1.0, 0.0, visible.x0], [0.0, 1.0, visible.y0], [0.0, 0.0, 1.0]])
+    size = visible.y1 - visible.y0 + 1, visible.x1 - visible.x0 + 1
+    return check_homography(np.diag([scale, scale, 1.0]) @ H @ shift, size, max_area_ratio)
+
+
+def optimise_transformation(
+    H_geometric: FloatArray,
+    warped: GreyImage,
+    reference: GreyImage,
+    coverages: tuple[BoolArray, BoolArray],
+    visible: Region,
+    focal_ratio: float,
+    config: PaperConfig,
+) -> FeatureReport:
+    """Stage 2 for one source: match its warp to the reference, accept or not, and the three cases of H_base.
+
+    Args:
+        H_geometric: (3, 3) from stage 1.
+        warped: (h, w) the source warped by it.
+        reference: (h, w) the primary camera's warp.
+        coverages: (h, w) where each of the two shows its source.
+        visible: What the target shows of the source, in source pixels.
+        focal_ratio: Source focal length over target focal length.
+        config: Settings.
+    """
+    scale = warped.shape[1] / REFERENCE_WIDTH_PX
+    if not is_valid(H_geometric, visible, focal_ratio, config.max_area_ratio):
+        return unmatched(H_geometric, "H_geometric distorts this source's corners too much to match it")
+    region = overlap_region(*coverages, round(config.overlap_margin_px * scale))
+    if region is None:
+        return unmatched(H_geometric, "no overlap with the primary camera")
+    least = config.min_overlap_px * scale
+    if min(region.x1 - region.x0, region.y1 - region.y0) < least:
+        return unmatched(H_geometric, f"the overlap with the primary camera is narrower than {least:.0f} px")
+    crop = slice(region.y0, region.y1 + 1), slice(region.x0, region.x1 + 1)
+    usable = (coverages[0] & coverages[1])[crop]
+    found = match_features(warped[crop], reference[crop], usable, config.ratio, config.max_features)
+    offset = np.array([region.x0, region.y0])
+    matches = Matches(found.warped + offset, found.reference + offset)
+    return accept(H_geometric, matches, _bounding_box(coverages[0]), visible, focal_ratio, scale, config)
+
+
+def accept(
+    H_geometric: FloatArray,
+    matches: Matches,
+    shown: Region,
+    visible: Region,
+    focal_ratio: float,
+    scale: float,
+    config: PaperConfig,
+) -> FeatureReport:
+    """The three acceptance criteria and the three cases of H_base (Sec. FAVS, Stage 2).
+
+    Args:
+        H_geometric: (3, 3) from stage 1.
+        matches: good_matches.
+        shown: Bounding box of the source's warp, target pixels.
+        visible: The same in source pixels.
+        focal_ratio: Source focal length over target focal length.
+        scale: Target width over ``REFERENCE_WIDTH_PX``.
+        config: Settings.
+    """
+    count = len(matches.warped)
+    if count < config.min_matches:
+        return unmatched(H_geometric, f"{count} good matches, fewer than {config.min_matches}", matches)
+    estimate = estimate_homography(matches, config.ransac_px * scale)
+    if estimate is None:
+        return unmatched(H_geometric, f"{count} good matches determine no homography", matches)
+    M, inlier = estimate
+    H_feature = M @ H_geometric
+    kept = Matches(matches.warped[inlier], matches.reference[inlier])
+    inliers = int(inlier.sum())
+    if not is_valid(H_feature, visible, focal_ratio, config.max_area_ratio):
+        reason = f"H_feature from {inliers} of {count} matches distorts the corners too much"
+        return FeatureReport(normalised(H_geometric), "geometric", 1.0, count, inliers, None, reason, kept)
+    moved_px = consistency(H_geometric, H_feature, shown.corners)
+    near, limit = config.consistent_px * scale, config.inconsistent_px * scale
+    alpha = blend_weight(moved_px, near, limit)
+    base = h_base(H_geometric, H_feature, alpha)
+    evidence = f"{inliers} of {count} matches move the corners by {moved_px:.1f} px"
+    case: Case
+    if alpha == 0:
+        case, reason = "feature", f"consistent: {evidence}, at most {near:.1f}"
+    elif alpha < 1:
+        case, reason = "blended", f"partially consistent: {evidence}, alpha {alpha:.2f}"
+    else:
+        case, reason = "geometric", f"inconsistent: {evidence}, not below {limit:.1f}"
+    return FeatureReport(base, case, alpha, count, inliers, moved_px, reason, kept)
+
+
+def unmatched(H_geometric: FloatArray, reason: str, matches: Matches = NO_MATCHES) -> FeatureReport:
+    """H_geometric as it is, with the reason."""
+    return FeatureReport(normalised(H_geometric), "geometric", 1.0, len(matches.warped), 0, None, reason, matches)
+
+
+def _bounding_box(coverage: BoolArray) -> Region:
+    box = overlap_region(coverage, coverage, 0)
+    assert box is not None  # sources without coverage are no candidates
+    return box

@@ -1,0 +1,229 @@
+"""FAVS Stage 3, object alignment: clusters of matches are objects, and their mean offset shifts the homography.
+
+DBSCAN finds the clusters in target pixels; each is an object {center, bbox, confidence, type}. ΔT minimises
+Σ w_j ‖c2_j − (H_base c1_j + ΔT)‖², which is the weighted mean of the residuals, and H_aligned = T(β ΔT) · H_base.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.favs.config import PaperConfig
+from arbiview_aug.favs.stage2_features import REFERENCE_WIDTH_PX, Matches
+
+
+@dataclass(frozen=True)
+class Detection:
+    """A detector's box in a source image, which gives the objects in it their type.
+
+    Attributes:
+        box: (x0, y0, x1, y1) in source pixels.
+        type: Its class; ``PaperConfig.type_weights`` says what it weighs.
+    """
+
+    box: tuple[float, float, float, float]
+    type: str
+
+
+@dataclass(frozen=True)
+class SceneObject:
+    """object_j = {center_j, bbox_j, confidence_j, type_j} (Sec. FAVS, Stage 3).
+
+    Attributes:
+        center_source: c1: (2,) centroid in the source image.
+        center_target: c2: (2,) centroid in the reference, target pixels.
+        bbox: (x0, y0, x1, y1) around its points in the reference.
+        confidence: In (0, 1]: how far the object moves as a whole.
+        type: ``ground``, ``upright``, ``far``, or a detector's class.
+        density_factor: In (0, 1): how densely its points lie.
+        points: n_j.
+    """
+
+    center_source: FloatArray
+    center_target: FloatArray
+    bbox: tuple[float, float, float, float]
+    confidence: float
+    type: str
+    density_factor: float
+    points: int
+
+    def weight(self, config: PaperConfig) -> float:
+        """w_j = confidence_j × type_weight_j × density_factor_j."""
+        return self.confidence * config.type_weight(self.type) * self.density_factor
+
+
+@dataclass(frozen=True)
+class AlignmentReport:
+    """What stage 3 found for one source.
+
+    Attributes:
+        H_aligned: (3, 3) T(β ΔT) · H_base.
+        shift_px: (2,) ΔT, zero where it was declined.
+        objects: The objects it was averaged over.
+        reason: In words.
+    """
+
+    H_aligned: FloatArray
+    shift_px: FloatArray
+    objects: tuple[SceneObject, ...]
+    reason: str
+
+
+# --- equations --------------------------------------------------------------------------------------------------------
+def mean_offset(c1: FloatArray, c2: FloatArray, weights: FloatArray, H_base: FloatArray) -> FloatArray:
+    """ΔT = argmin Σ w_j ‖c2_j − (H_base c1_j + ΔT)‖² = Σ w_j (c2_j − H_base c1_j) / Σ w_j.
+
+    Args:
+        c1: (m, 2) object centres in the source.
+        c2: (m, 2) in the target.
+        weights: (m,) >= 0, not all 0.
+        H_base: (3, 3).
+    """
+    return weights @ (c2 - apply(H_base, c1)) / weights.sum()
+
+
+def aligned(H_base: FloatArray, shift_px: FloatArray, beta: float) -> FloatArray:
+    """H_aligned = T(β ΔT) · H_base: a translation in the target's pixels."""
+    T = np.eye(3)
+    T[:2, 2] = beta * np.asarray(shift_px)
+    return T @ H_base
+
+
+def confidence(offsets: FloatArray, spread_px: float) -> float:
+    """confidence_j = 1 / (1 + (s / spread_px)²), s the RMS distance of the (n, 2) offsets from their mean."""
+    squared = ((offsets - offsets.mean(0)) ** 2).sum(1).mean()
+    return float(1 / (1 + squared / spread_px**2))
+
+
+def density_factor(points: FloatArray, radius_px: float, min_samples: int) -> float:
+    """density_factor_j = ρ / (ρ + min_samples), ρ the number of (n, 2) points in a square of side ``radius_px``.
+
+    A cluster as dense as DBSCAN just accepts has 1/2. Clusters smaller than the square count as it.
+    """
+    width, height = np.maximum(np.ptp(points, axis=0), radius_px)
+    density = len(points) * radius_px**2 / (width * height)
+    return float(density / (density + min_samples))
+
+
+def apply(H: npt.NDArray[np.floating], points: FloatArray) -> FloatArray:
+    """Pixels (n, 2) through a homography."""
+    x = np.concatenate([points, np.ones((len(points), 1))], 1) @ H.T
+    return x[:, :2] / x[:, 2:]
+
+
+# --- objects ----------------------------------------------------------------------------------------------------------
+def clusters(points: FloatArray, radius_px: float, min_samples: int) -> npt.NDArray[np.int64]:
+    """clusters = DBSCAN(keypoints, ε, min_samples): (n,) cluster numbers, -1 for noise."""
+    if len(points) < min_samples:
+        return np.full(len(points), -1, np.int64)
+    from sklearn.cluster import DBSCAN  # more than a second to import: only who aligns objects pays for it
+
+    return np.asarray(DBSCAN(eps=radius_px, min_samples=min_samples).fit_predict(points), np.int64)
+
+
+def geometric_type(bbox: tuple[float, float, float, float], target: Camera, ground_z_m: float, reach_m: float) -> str:
+    """Type of a cluster without a detector, by the road's plane.
+
+    ``ground``: even its top edge meets the road within ``reach_m``. ``far``: its bottom edge lies above the horizon.
+    ``upright``: anything between: it stands on the road and rises above it, as vehicles and pedestrians do.
+
+    Args:
+        bbox: (x0, y0, x1, y1), target pixels.
+        target: The target camera.
+        ground_z_m: The road's height in its ego frame.
+        reach_m: Distance along the ray.
+    """
+    x = (bbox[0] + bbox[2]) / 2
+    top, bottom = target.unproject(np.array([(x, bbox[1]), (x, bbox[3])])).directions[:, 2]
+    height_m = float(target.center_m[2]) - ground_z_m
+    if bottom >= 0:
+        return "far"
+    return "ground" if top < 0 and height_m <= -top * reach_m else "upright"
+
+
+def find_objects(
+    matches: Matches,
+    H_geometric: FloatArray,
+    H_base: FloatArray,
+    target: Camera,
+    ground_z_m: float,
+    config: PaperConfig,
+    detections: Sequence[Detection] = (),
+) -> list[SceneObject]:
+    """The objects among one source's matches.
+
+    Args:
+        matches: Target pixels, the source's warped by ``H_geometric``.
+        H_geometric: (3, 3) that the source was warped by.
+        H_base: (3, 3) from stage 2: offsets are what it leaves.
+        target: The target camera.
+        ground_z_m: The road's height in its ego frame.
+        config: Settings.
+        detections: Boxes in the source image; the smallest one around an object's centre gives its type.
+    """
+    scale = target.width_px / REFERENCE_WIDTH_PX
+    radius_px = config.cluster_radius_px * scale
+    label = clusters(matches.reference, radius_px, config.min_samples)
+    in_source = apply(np.linalg.inv(H_geometric), matches.warped) if len(label) else matches.warped
+    found = []
+    for k in range(label.max(initial=-1) + 1):
+        p1: FloatArray = in_source[label == k]
+        p2: FloatArray = matches.reference[label == k]
+        x0, y0, x1, y1 = (float(v) for v in (*p2.min(0), *p2.max(0)))
+        c1: FloatArray = p1.mean(0)
+        found.append(
+            SceneObject(
+                center_source=c1,
+                center_target=p2.mean(0),
+                bbox=(x0, y0, x1, y1),
+                confidence=confidence(p2 - apply(H_base, p1), config.cluster_spread_px * scale),
+                type=_detected_type(c1, detections)
+                or geometric_type((x0, y0, x1, y1), target, ground_z_m, config.ground_reach_m),
+                density_factor=density_factor(p2, radius_px, config.min_samples),
+                points=len(p1),
+            )
+        )
+    return found
+
+
+def _detected_type(center: FloatArray, detections: Sequence[Detection]) -> str:
+    around = [d for d in detections if d.box[0] <= center[0] <= d.box[2] and d.box[1] <= center[1] <= d.box[3]]
+    return min(around, key=lambda d: (d.box[2] - d.box[0]) * (d.box[3] - d.box[1])).type if around else ""
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+def align_objects(
+    objects: Sequence[SceneObject], H_base: FloatArray, width_px: int, config: PaperConfig
+) -> AlignmentReport:
+    """Stage 3 for one source: ΔT over its objects, bounded, and H_aligned.
+
+    Args:
+        objects: From ``find_objects``.
+        H_base: (3, 3) from stage 2.
+        width_px: Width of the target.
+        config: Settings.
+    """
+    if not objects:
+        return declined(H_base, "no cluster of matches: nothing to align")
+    weights = np.array([o.weight(config) for o in objects])
+    if weights.sum() <= 0:
+        return declined(H_base, f"{len(objects)} clusters, none of a type that counts", objects)
+    c1, c2 = (np.stack([getattr(o, name) for o in objects]) for name in ("center_source", "center_target"))
+    shift = mean_offset(c1, c2, weights, H_base)
+    length, limit = float(np.linalg.norm(shift)), config.max_shift_px * width_px / REFERENCE_WIDTH_PX
+    if not length <= limit:
+        return declined(H_base, f"{len(objects)} objects ask for {length:.1f} px, more than {limit:.1f}", objects)
+    kinds = ", ".join(sorted({o.type for o in objects}))
+    reason = f"{len(objects)} objects ({kinds}) shift it by {config.beta:g} x ({shift[0]:+.1f}, {shift[1]:+.1f}) px"
+    return AlignmentReport(aligned(H_base, shift, config.beta), shift, tuple(objects), reason)
+
+
+def declined(H_base: FloatArray, reason: str, objects: Sequence[SceneObject] = ()) -> AlignmentReport:
+    """H_base as it is, with the reason."""
+    return AlignmentReport(H_base, np.zeros(2), tuple(objects), reason)

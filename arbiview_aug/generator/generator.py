@@ -1,0 +1,160 @@
+"""The generator: denoiser and autoencoder of one configuration; made, loaded, saved, and asked for missing pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from arbiview_aug.environment import optional_package
+from arbiview_aug.errors import GeneratorError
+from arbiview_aug.generator.autoencoder import Autoencoder
+from arbiview_aug.generator.batches import complete_batch
+from arbiview_aug.generator.checkpoint import CONFIG_FILE, check_tensors, read_checkpoint, read_config, write_checkpoint
+from arbiview_aug.generator.completion import complete
+from arbiview_aug.generator.conditioning import input_channels
+from arbiview_aug.generator.config import GeneratorConfig, paper
+from arbiview_aug.generator.correspondence import LEVELS
+from arbiview_aug.generator.denoiser import Denoiser
+from arbiview_aug.generator.networks import GeneratorNetworks
+from arbiview_aug.generator.sampler import noise_schedule
+from arbiview_aug.generator.stable_diffusion import empty_prompt as embedded_empty_prompt
+from arbiview_aug.generator.stable_diffusion import load_part
+
+_SHIPPED = Path(__file__).with_name("weights")
+
+
+def has_shipped() -> bool:
+    """Whether the package was installed with its weights."""
+    return (_SHIPPED / CONFIG_FILE).is_file()
+
+
+def shipped_weights() -> str:
+    """Name of the file of the package's weights, after their content.
+
+    Raises:
+        GeneratorError: The package was installed without its data.
+    """
+    return read_config(_SHIPPED)[1]
+
+
+def _networks() -> tuple[Any, Any]:
+    """diffusers' classes of a U-Net and an autoencoder.
+
+    Importing them imports ``torch._dynamo``, which torch 2.6 cannot do while tensors are made on meta.
+    """
+    diffusers = optional_package("diffusers", "generator")
+    return diffusers.UNet2DConditionModel, diffusers.AutoencoderKL
+
+
+class Generator(GeneratorNetworks):
+    """Completes target views where no camera saw anything (Sec. CVC-SSL).
+
+    ``from_pretrained`` loads one, ``from_config`` makes an untrained one, ``from_stable_diffusion`` one on top of
+    Stable Diffusion. ``to`` moves it to a GPU or to bfloat16.
+    """
+
+    # --- made ---------------------------------------------------------------------------------------------------------
+    @classmethod
+    def from_config(cls, config: GeneratorConfig) -> Generator:
+        """An untrained generator, its weights drawn from torch's RNG."""
+        unet_class, vae_class = _networks()
+        latent = config.autoencoder.latent_channels
+        unet = unet_class(**config.unet.arguments(input_channels(latent), latent))
+        vae = vae_class(**config.autoencoder.arguments()) if config.autoencoder.widths else None
+        signal = None
+        if config.residual:
+            with torch.device("cpu"):  # also where the weights are on meta
+                schedule = noise_schedule(prediction=config.prediction, zero_snr=config.zero_snr)
+            signal = schedule.alphas_cumprod.double().sqrt().float()
+        denoiser = Denoiser(unet, len(LEVELS), config.prompt_tokens, config.unet.cross_view, signal)
+        return cls(config, denoiser, Autoencoder(vae, config.autoencoder.scale, config.autoencoder.patch))
+
+    @classmethod
+    def from_stable_diffusion(
+        cls,
+        where: str | Path,
+        config: GeneratorConfig | None = None,
+        *,
+        empty_prompt: torch.Tensor | None = None,
+    ) -> Generator:
+        """An untrained generator on Stable Diffusion's weights: it computes what Stable Diffusion does.
+
+        Args:
+            where: A folder or hub id in diffusers' layout.
+            config: ``paper()`` unless given; the weights must be those of its networks.
+            empty_prompt: (prompt tokens, width) the text encoder's last hidden state for ""; from the folder's text
+                encoder, for which transformers is needed, where None.
+
+        Raises:
+            GeneratorError: Weights that are missing, extra, or of another architecture.
+        """
+        config = config or paper()
+        latent = config.autoencoder.latent_channels
+        if not config.autoencoder.widths:
+            raise GeneratorError("from_stable_diffusion: expected a config with an autoencoder, got one on pixels")
+        unet = load_part("UNet2DConditionModel", where, "unet", config.unet.arguments(latent, latent))
+        shape = config.autoencoder.arguments()
+        del shape["scaling_factor"]  # the file's counts
+        vae = load_part("AutoencoderKL", where, "vae", shape)
+        config = replace(config, autoencoder=replace(config.autoencoder, scale=float(vae.config.scaling_factor)))
+        if empty_prompt is None and config.prompt_tokens:
+            empty_prompt = embedded_empty_prompt(where)
+        denoiser = Denoiser(unet, len(LEVELS), config.prompt_tokens, config.unet.cross_view)
+        if empty_prompt is not None:
+            expected = tuple(denoiser.context.empty_prompt.shape)
+            if tuple(empty_prompt.shape) != expected:
+                raise GeneratorError(f"empty_prompt: expected shape {expected}, got {tuple(empty_prompt.shape)}")
+            denoiser.context.empty_prompt.copy_(empty_prompt)
+        return cls(config, denoiser, Autoencoder(vae, config.autoencoder.scale, config.autoencoder.patch)).eval()
+
+    # --- folders ------------------------------------------------------------------------------------------------------
+    @classmethod
+    def from_pretrained(cls, folder: str | Path) -> Generator:
+        """The generator of a folder by ``save_pretrained``, in float32 on the CPU, ready to run, its weights frozen.
+
+        Raises:
+            GeneratorError: No such folder; settings or weights that are missing, extra or of another shape.
+        """
+        data, tensors = read_checkpoint(Path(folder))
+        config = GeneratorConfig.from_dict(data.get("generator", {}), f"{folder}/config.json")
+        _networks()
+        with torch.device("meta"):
+            made = cls.from_config(config)
+        check_tensors(made.state_dict(), tensors, str(folder))
+        made.load_state_dict(
+            {name: t.float() if t.is_floating_point() else t for name, t in tensors.items()}, assign=True
+        )
+        # As a part of a user's module they must not be found by its optimiser, or waited for by DDP.
+        return made.eval().requires_grad_(False)
+
+    @classmethod
+    def shipped(cls) -> Generator:
+        """The ``compact`` generator that comes with the package; see ``weights/README.md`` for what it was trained on.
+
+        Raises:
+            GeneratorError: The package was installed without its data.
+        """
+        return cls.from_pretrained(_SHIPPED)
+
+    def save_pretrained(self, folder: str | Path, *, dtype: torch.dtype | None = None) -> None:
+        """Write the generator to a folder of its own; a checkpoint that is there is replaced once the new one is whole.
+
+        Args:
+            folder: Made if it is not there.
+            dtype: Of the stored weights; as they are where None. float16 halves a file, and is loaded as float32.
+
+        Raises:
+            OSError: The disk is full, or the folder cannot be written.
+        """
+        tensors = self.state_dict()
+        if dtype is not None:
+            tensors = {name: t.to(dtype) if t.is_floating_point() else t for name, t in tensors.items()}
+        scaled = replace(self.config.autoencoder, scale=self.autoencoder.scale)
+        write_checkpoint(Path(folder), {"generator": replace(self.config, autoencoder=scaled).to_dict()}, tensors)
+
+    # --- used ---------------------------------------------------------------------------------------------------------
+    complete_views = complete
+    complete_batch = complete_batch

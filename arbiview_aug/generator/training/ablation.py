@@ -1,0 +1,160 @@
+"""What each part is worth: the same steps with one thing changed, scored on held-out streets, as one table."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from arbiview_aug.generator import Generator
+from arbiview_aug.generator.completion import shown_condition
+from arbiview_aug.generator.denoiser import REGRESSION, Rows
+from arbiview_aug.generator.geometry import FrameGeometry
+from arbiview_aug.generator.training.config import PseudoViewConfig, TrainConfig, overridden
+from arbiview_aug.generator.training.data import Frames
+from arbiview_aug.generator.training.held_out import gains, held_out_scores
+from arbiview_aug.generator.training.losses import Perceptual
+from arbiview_aug.generator.training.measure import hole_psnr, sampled
+from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
+from arbiview_aug.generator.training.step import without_attention
+from arbiview_aug.generator.training.trainer import Trainer
+
+_AS_WRITTEN = (
+    "pseudo_views.transplanted=0",
+    "pseudo_views.leave_one_out=0",
+    "pseudo_views.virtual=0",
+    "pseudo_views.real_sources=0",
+    "generator.prefilled=false",
+)
+
+ARMS: dict[str, tuple[str, ...]] = {
+    "as written": _AS_WRITTEN,
+    "+ transplanted masks": (*_AS_WRITTEN[1:],),
+    "+ pre-filled condition": (*_AS_WRITTEN[1:-1],),
+    "all additions": (),
+    "without L_geo": ("loss.geo=0",),
+    "without attention": ("attention=false",),
+}
+"""Settings of each arm, over the run's own."""
+
+SEEN_ITEMS = 32
+"""Held-out real views whose condition is masked where a source branch shows the pixel: what attention can fill."""
+
+
+def wrong_rig(geometry: FrameGeometry) -> FrameGeometry:
+    """Each frame with the homographies of the next one; its rays and poses stay its own."""
+    rolled = [[type(c)(*(value.roll(1, 0) for value in c)) for c in reads] for reads in geometry[4:]]
+    return FrameGeometry(*geometry[:4], *rolled)
+
+
+@torch.no_grad()
+def correct_correspondences(generator: Generator, batch: Batch) -> float:
+    """Share of the attention's rows whose largest weight lies on the tap nearest to H p_i."""
+    encode = generator.autoencoder.encode
+    condition = encode(shown_condition(generator.config, batch.condition, batch.known)).float()
+    sources = batch.geometry.source_views(encode(batch.sources).float(), batch.seen, batch.seen)
+    read = generator.denoiser.read_sources(sources, batch.geometry.source_windows())
+    rows: list[Rows] = []
+    t = torch.full((len(condition),), REGRESSION, device=condition.device)
+    views = batch.geometry.target_views(condition, batch.known, batch.confidence)
+    generator.denoiser(condition, t, views, batch.geometry.target_windows(), read, rows)
+    right = torch.cat([(row.predicted.argmax(1) == row.target.argmax(1)).float() for row in rows])
+    return float(right.mean())
+
+
+def seen_scores(generator: Generator, batch: Batch, steps: int) -> dict[str, float]:
+    """Mean PSNR in the holes of a batch, by the homographies used; the best of one-step and sample is not picked."""
+    changes: dict[str, Callable[[FrameGeometry], FrameGeometry]] = {
+        "attention": lambda geometry: geometry,
+        "no attention": without_attention,
+        "wrong rig": wrong_rig,
+    }
+    scores = {"telea": float(hole_psnr(batch.condition, batch.truth, batch.holes).nanmean())}
+    for name, change in changes.items():
+        changed = batch._replace(geometry=change(batch.geometry))
+        for way, count in (("one step", 1), ("sample", steps)):
+            made = sampled(generator, changed, steps=count, seed=0)
+            scores[f"{way}, {name}"] = float(hole_psnr(made, batch.truth, batch.holes).nanmean())
+    return scores
+
+
+def seen_batch(frames: Frames, indices: Sequence[int], config: TrainConfig, masks: torch.Tensor) -> Batch:
+    """The items that ``SEEN_ITEMS`` speaks of."""
+    settings = PseudoViewConfig(
+        transplanted=1.0, hidden=0.0, leave_one_out=0.0, virtual=0.0, real_sources=0.0, moved=config.pseudo_views.moved
+    )
+    items = PseudoViews(frames, indices, settings, config.generator, masks, seed=77)
+    return collate([items[k] for k in range(SEEN_ITEMS)])
+
+
+def ablate(
+    config: TrainConfig,
+    frames: Frames,
+    make: Callable[[TrainConfig], Generator],
+    output: Path,
+    *,
+    arms: Sequence[str] = tuple(ARMS),
+    views: int = 64,
+    perceptual: Perceptual | None = None,
+    show: bool = True,
+    say: Callable[[str], None] = print,
+) -> dict[str, dict[str, Any]]:
+    """Train and score each arm; what is done already is not done again. Writes ``ablation.json``.
+
+    SIGTERM and SIGINT end it: the arm that is trained goes on from there.
+
+    Args:
+        config: Of the run that the arms change.
+        frames: Synthetic streets.
+        make: Gives a fresh generator of an arm's settings, the same each time.
+        output: A folder with one for each arm.
+        arms: Of ``ARMS``.
+        views: Held-out views for the scores.
+        perceptual: As for ``Trainer``.
+        show: Progress bars.
+        say: Gets the table.
+    """
+    split = frames.split(config.seed)
+    indices = (split.held_out or split.validation or split.training)[:views]
+    table: dict[str, dict[str, Any]] = {}
+    for arm in arms:
+        changed = overridden(config, ARMS[arm])
+        folder = output / arm.replace(" ", "_").replace("+", "with")
+        trainer = Trainer(changed, frames, make(changed), folder, perceptual=perceptual, show=show, say=say)
+        if not trainer.train():
+            return table  # stopped: an arm half trained is not scored
+        if not trainer.is_main:
+            trainer.accelerator.wait_for_everyone()
+            continue
+        generator = Generator.from_pretrained(folder / "generator").to(trainer.device)
+        batch = seen_batch(frames, indices, changed, trainer.items.masks).to(trainer.device)
+        scores = held_out_scores(generator, frames, indices, steps=config.generator.steps, mean_of=0, show=show)
+        table[arm] = {
+            "against Telea": {name: gain._asdict() for name, gain in gains(scores).items()},
+            "seen by a source": seen_scores(generator, batch, config.generator.steps),
+            "top-1": correct_correspondences(generator, batch),
+        }
+        output.mkdir(parents=True, exist_ok=True)
+        (output / "ablation.json").write_text(json.dumps(table, indent=1) + "\n")
+        say(f"{arm}: {json.dumps(table[arm])}")
+        trainer.accelerator.wait_for_everyone()
+    say(text_of(table))
+    return table
+
+
+def text_of(table: dict[str, dict[str, Any]]) -> str:
+    """The table for people: dB inside the holes."""
+    right = f"seen by a source:{'with':>8}{'without':>9}{'wrong rig':>11}"
+    head = f"{'arm':<24}{'one step':>10}{'sample':>9}  | {right}  | top-1"
+    lines = ["PSNR inside the holes; left: against Telea's, held-out targets; right: one-step", head]
+    for arm, row in table.items():
+        gain, seen = row["against Telea"], row["seen by a source"]
+        ways = [seen[f"one step, {name}"] for name in ("attention", "no attention", "wrong rig")]
+        lines.append(
+            f"{arm:<24}{gain['one_step']['mean']:>+10.2f}{gain['sample']['mean']:>+9.2f}  |                  "
+            f"{ways[0]:>8.2f}{ways[1]:>9.2f}{ways[2]:>11.2f}  | {row['top-1']:.0%}"
+        )
+    return "\n".join(lines)

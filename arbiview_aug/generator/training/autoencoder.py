@@ -1,0 +1,165 @@
+"""The stage before: a small KL autoencoder of one's own, for configurations that start from nothing."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils.data import DataLoader, Dataset
+from tqdm import tqdm
+
+from arbiview_aug.errors import GeneratorError, TrainingError
+from arbiview_aug.generator import Generator
+from arbiview_aug.generator.checkpoint import CONFIG_FILE, check_tensors, read_checkpoint, write_checkpoint
+from arbiview_aug.generator.training.checkpointing import Average, StopRequests, has_state, load_state, save_state
+from arbiview_aug.generator.training.config import AutoencoderTraining, TrainConfig
+from arbiview_aug.generator.training.data import Frames, item_workers
+from arbiview_aug.generator.training.losses import Perceptual
+from arbiview_aug.generator.training.masks import one_of
+
+FOLDER, UNFINISHED = "autoencoder", "autoencoder-state"
+_SCALE_IMAGES = 64
+"""Images whose latents' deviation sets the scale: 64 of 32 x 56 x 4 numbers, 0.1 % of its value."""
+
+_MESSAGE_EVERY = 250
+
+
+def train_autoencoder(
+    config: TrainConfig,
+    frames: Frames,
+    generator: Generator,
+    output: Path,
+    *,
+    perceptual: Perceptual | None = None,
+    show: bool = True,
+    say: Callable[[str], None] = print,
+) -> bool:
+    """Give a generator a trained autoencoder: that of ``output``, or one that is trained and saved there.
+
+    L1 + KL, and VGG's distance where there are weights (Rombach et al. 2022, without their discriminator). Afterwards
+    latents are scaled to unit variance, as the diffusion expects. Saved and resumed as the run itself.
+
+    Args:
+        config: Settings; does nothing where latents are pixels.
+        frames: The data; training scenes are used.
+        generator: Whose autoencoder is trained in place.
+        output: The run's folder.
+        perceptual: None leaves the term out.
+        show: Progress bar.
+        say: Gets messages for people.
+
+    Returns:
+        Whether it is done; False where SIGTERM or SIGINT stopped it: its state is saved.
+
+    Raises:
+        TrainingError: The saved one has another architecture; a loss is not finite.
+        OSError: It could not be saved.
+    """
+    stage, vae = config.autoencoder, generator.autoencoder.vae
+    if stage is None or vae is None:
+        return True
+    folder, unfinished = output / FOLDER, output / UNFINISHED
+    if (folder / CONFIG_FILE).is_file():
+        _load(generator, folder)
+        return True
+    training = frames.split(config.seed).training
+    device = generator.denoiser.regression.weight.device
+    if perceptual is not None:
+        perceptual.to(device)
+    optimiser = torch.optim.AdamW(vae.parameters(), lr=stage.lr)
+    average = Average(vae, 0.0)  # of the state's format: the weights themselves
+    done = load_state(unfinished, config, vae, average, optimiser) if has_state(unfinished) else 0
+    vae.train()
+    batches = _Batches(frames, training, stage.batch, config.seed)
+    loader: DataLoader[torch.Tensor] = DataLoader(
+        batches, batch_size=None, sampler=range(done, stage.steps), **item_workers(config.workers)
+    )
+    bar = tqdm(loader, desc="autoencoder", unit="step", initial=done, total=stage.steps, disable=not show)
+    with StopRequests() as stop:
+        for step, on_cpu in enumerate(bar, done):
+            rng = torch.Generator().manual_seed((2 * config.seed + 1) * 2**32 + step)
+            images = on_cpu.to(device).float() / 255
+            terms = _terms(vae, images, stage, perceptual, rng, bf16=config.precision == "bf16")
+            numbers = torch.stack(list(terms.values())).detach().tolist()
+            values = dict(zip(terms, numbers, strict=True))
+            wrong = [name for name, value in values.items() if not math.isfinite(value)]
+            if wrong:
+                raise TrainingError(
+                    f"autoencoder, step {step}: loss term {wrong[0]} is {values[wrong[0]]}; lower its lr"
+                )
+            torch.stack(list(terms.values())).sum().backward()
+            torch.nn.utils.clip_grad_norm_(vae.parameters(), 1.0)
+            optimiser.step()
+            optimiser.zero_grad(set_to_none=True)
+            bar.set_postfix({name: f"{value:.4f}" for name, value in values.items()})
+            if step % _MESSAGE_EVERY == 0:
+                say(f"autoencoder, step {step}: L1 {255 * values['l1']:.2f} grey levels")
+            if stop.asked or (step + 1) % config.save_every == 0:
+                average.update(vae, step)
+                save_state(unfinished, config, step + 1, vae, average, optimiser)
+            if stop.asked:
+                say(f"stopped after step {step + 1} of the autoencoder; saved: the same command goes on from there")
+                return False
+    vae.eval()
+    with torch.no_grad():
+        images = _Batches(frames, training, _SCALE_IMAGES, config.seed)[stage.steps].to(device).float() / 255
+        deviation = torch.cat([vae.encode(part * 2 - 1).latent_dist.mode() for part in images.split(8)]).std()
+    generator.autoencoder.scale = float(1 / deviation)
+    write_checkpoint(folder, {"scale": generator.autoencoder.scale, "training": asdict(stage)}, vae.state_dict())
+    shutil.rmtree(unfinished, ignore_errors=True)
+    return True
+
+
+def _terms(
+    vae: Any,
+    images: torch.Tensor,
+    stage: AutoencoderTraining,
+    perceptual: Perceptual | None,
+    rng: torch.Generator,
+    bf16: bool,
+) -> dict[str, torch.Tensor]:
+    """``l1``, ``kl`` and, where there are weights, ``perceptual``, weighted, of images (n, 3, H, W) in [0, 1]."""
+    with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
+        posterior = vae.encode(images * 2 - 1).latent_dist
+        noise = torch.randn(posterior.mean.shape, generator=rng).to(images.device)
+        made = vae.decode(posterior.mean + posterior.std * noise).sample
+    made = made.float() / 2 + 0.5
+    terms = {"l1": (made - images).abs().mean(), "kl": stage.kl * posterior.kl().float().mean()}
+    if perceptual is not None:
+        terms["perceptual"] = stage.perceptual * perceptual(made, images).mean()
+    return terms
+
+
+def _load(generator: Generator, folder: Path) -> None:
+    vae = generator.autoencoder.vae
+    assert vae is not None
+    try:
+        data, tensors = read_checkpoint(folder)
+        check_tensors(vae.state_dict(), tensors, str(folder))
+    except GeneratorError as error:
+        raise TrainingError(f"{error}; delete {folder} to train another autoencoder") from None
+    vae.load_state_dict(tensors)
+    generator.autoencoder.scale = float(data["scale"])
+
+
+class _Batches(Dataset[torch.Tensor]):
+    """Batch k, from (seed, k) alone: (count, 3, H, W) uint8, half of them mirrored.
+
+    All images of a frame that is drawn: its files are decoded together.
+    """
+
+    def __init__(self, frames: Frames, indices: list[int], count: int, seed: int) -> None:
+        self.frames, self.indices, self.count, self.seed = frames, indices, count, seed
+
+    def __getitem__(self, step: int) -> torch.Tensor:
+        rng = torch.Generator().manual_seed(2 * self.seed * 2**32 + step)
+        images: list[torch.Tensor] = []
+        while len(images) < self.count:
+            drawn = self.frames[self.indices[one_of(rng, len(self.indices))]].images
+            images += [image.flip(-1) if one_of(rng, 2) else image for image in drawn]
+        return torch.stack(images[: self.count]).cpu()

@@ -1,0 +1,190 @@
+"""Frames to train on: any of the package's readers, at the training size, split by scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import torch
+from torch.utils.data import DataLoader, Dataset, get_worker_info
+from tqdm import tqdm
+
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets.frame_folder import SEQUENCE_FILE, FrameFolder
+from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
+from arbiview_aug.datasets.registry import open_data
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.errors import TrainingError
+from arbiview_aug.generator.training.checkpointing import ignore_stop_requests
+from arbiview_aug.image_ops import resized
+from arbiview_aug.lru_cache import LRUCache
+
+SHARES = (0.6, 0.2)
+"""Of the scenes, for training and for validation; the rest are held out (Sec. Dataset)."""
+
+_BLOCKS = 10
+"""Scenes that one drive without scenes is cut into."""
+
+HELD_BYTES = 4 * 2**30
+"""Memory for frames, of all workers together: 8 000 of six 128 x 224 images."""
+
+
+class TrainingFrame(NamedTuple):
+    """The images of one moment.
+
+    Attributes:
+        images: N tensors (3, h, w) uint8, at the training size.
+        rig: Their N cameras at that size, with masks of the own car.
+        token: Names it.
+    """
+
+    images: list[torch.Tensor]
+    rig: Rig
+    token: str
+
+
+class Split(NamedTuple):
+    """Indices of frames."""
+
+    training: list[int]
+    validation: list[int]
+    held_out: list[int]
+
+
+class Frames:
+    """Frames of a data set at the training size, held in memory once they are read.
+
+    Args:
+        dataset: A map-style data set of this package.
+        size: (h, w).
+        scenes: For each frame the name of its scene.
+    """
+
+    def __init__(self, dataset: Dataset[dict[str, Any]], size: tuple[int, int], scenes: Sequence[str]) -> None:
+        self.dataset, self.size, self.scenes = dataset, size, list(scenes)
+        self._held: LRUCache[int, TrainingFrame] = LRUCache(HELD_BYTES, _bytes_of)
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def __getitem__(self, index: int) -> TrainingFrame:
+        worker = get_worker_info()
+        if worker is not None:
+            self._held.limit = HELD_BYTES // worker.num_workers
+        return self._held.get(index, lambda: self._read(index))
+
+    def _read(self, index: int) -> TrainingFrame:
+        sample = self.dataset[index]
+        rig: Rig = sample["rig"].resized(self.size)
+        return TrainingFrame([resized(image, self.size) for image in sample["images"]], rig, str(sample["token"]))
+
+    def prepare(self, indices: Sequence[int], *, workers: int = 0, show: bool = True) -> None:
+        """Read frames before workers fork: they share the memory.
+
+        Args:
+            indices: Which.
+            workers: Processes that read; 0 reads here.
+            show: Progress bar.
+        """
+        read: DataLoader[TrainingFrame] = DataLoader(
+            self,  # type: ignore[arg-type]
+            batch_size=None,
+            sampler=indices,
+            num_workers=workers,
+            multiprocessing_context=forked(workers),
+            collate_fn=_as_it_is,
+        )
+        for index, frame in zip(indices, tqdm(read, desc="frames", unit="frame", disable=not show), strict=True):
+            if workers:  # out of the memory that processes share: each tensor there keeps a file open
+                frame = frame._replace(images=[image.clone() for image in frame.images])
+            self._held.get(index, partial(_as_it_is, frame))
+
+    def check_fits(self, indices: Sequence[int]) -> None:
+        """Refuse frames that cannot all be held.
+
+        Raises:
+            TrainingError: With the fix.
+        """
+        needed = len(indices) * _bytes_of(self[indices[0]])
+        if needed > HELD_BYTES:
+            raise TrainingError(
+                f"scenes: expected frames of at most {HELD_BYTES / 2**30:g} GiB together, since workers cannot render "
+                f"on a GPU, got {needed / 2**30:.1f} GiB; take fewer, or workers=0"
+            )
+
+    def split(self, seed: int = 0) -> Split:
+        """60/20/20 by scenes: no scene is in two parts. Depends on the seed and the scenes' names alone.
+
+        A data set of one or two scenes has no held-out ones.
+        """
+        names = sorted(set(self.scenes))
+        order = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed)).tolist()
+        first = max(1, round(SHARES[0] * len(names)))
+        second = first + round(SHARES[1] * len(names))
+        part = {names[k]: (place >= first) + (place >= second) for place, k in enumerate(order)}
+        parts: tuple[list[int], list[int], list[int]] = ([], [], [])
+        for index, scene in enumerate(self.scenes):
+            parts[part[scene]].append(index)
+        return Split(*parts)
+
+
+def _bytes_of(frame: TrainingFrame) -> int:
+    return sum(image.nbytes for image in frame.images)
+
+
+def forked(workers: int) -> str | None:
+    """How workers start: as copies of this process, which share the frames it holds; newer Pythons would not."""
+    return "fork" if workers else None
+
+
+def item_workers(count: int) -> dict[str, Any]:
+    """Arguments of a ``DataLoader`` whose workers make items, each with one thread; 0 makes them in this process."""
+    started = one_thread_worker if count else None
+    return {"num_workers": count, "multiprocessing_context": forked(count), "worker_init_fn": started}
+
+
+def one_thread_worker(worker: int) -> None:
+    """Starts a worker: one thread, and signals are the parent's to answer."""
+    cv2.setNumThreads(0)
+    torch.set_num_threads(1)
+    ignore_stop_requests()
+
+
+def _as_it_is(value: Any) -> Any:
+    return value
+
+
+def open_frames(
+    data: str, size: tuple[int, int], *, scenes: int, seed: int = 0, device: torch.device | str = "cpu"
+) -> Frames:
+    """The frames that ``--data`` names.
+
+    Args:
+        data: ``synthetic``, ``nuscenes:ROOT`` or ``frames:DIR``.
+        size: (h, w) of the images.
+        scenes: How many synthetic streets.
+        seed: Of the streets.
+        device: Where streets are rendered; on a GPU prepare the frames, since workers cannot render there.
+
+    Raises:
+        TrainingError: None of these.
+        DataError: The folder holds no such data.
+    """
+    kind, _, folder = data.partition(":")
+    if data == "synthetic":
+        drive = SyntheticDrive(demo_source_rig(size), num_frames=scenes, seed=seed, lidar=False, device=device)
+        return Frames(drive, size, [str(k) for k in range(scenes)])
+    if kind not in ("nuscenes", "frames") or not folder:
+        raise TrainingError(f"--data {data}: expected synthetic, nuscenes:ROOT or frames:DIR")
+    found = open_data(Path(folder))
+    found.load_points = False
+    if isinstance(found, NuScenesDataset):
+        return Frames(found, size, found.scene_tokens)
+    assert isinstance(found, FrameFolder)
+    if not (found.root / SEQUENCE_FILE).is_file():
+        return Frames(found, size, found.tokens)
+    # A drive is cut into blocks: frames next to each other show the same street.
+    return Frames(found, size, [f"block {_BLOCKS * k // len(found)}" for k in range(len(found))])

@@ -1,0 +1,311 @@
+"""The run: steps, averaging, logs, validation, checkpoints; one process or many, by accelerate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils.data import DataLoader
+from tqdm import tqdm
+
+from arbiview_aug.environment import optional_package
+from arbiview_aug.errors import TrainingError
+from arbiview_aug.generator import Generator
+from arbiview_aug.generator.completion import shown_condition
+from arbiview_aug.generator.conditioning import pooled
+from arbiview_aug.generator.training.checkpointing import (
+    Average,
+    StopRequests,
+    has_state,
+    load_state,
+    put_back,
+    save_state,
+)
+from arbiview_aug.generator.training.config import TrainConfig
+from arbiview_aug.generator.training.data import Frames, item_workers
+from arbiview_aug.generator.training.losses import Perceptual
+from arbiview_aug.generator.training.masks import mask_bank
+from arbiview_aug.generator.training.measure import hole_psnr, picture, sampled, save_png
+from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
+from arbiview_aug.generator.training.step import Step, draw
+
+_LOG_EVERY = 10
+_DEVIATION_ITEMS = 32
+_LEAST_DEVIATION = 0.02
+"""2.5 grey levels: nothing is known better after it was rendered twice."""
+
+_SEEDS = {"items": 1, "validation": 2, "masks": 3, "draws": 4}
+"""Told apart, so that validation never sees training's draws."""
+
+
+class Trainer:
+    """Trains a generator's denoiser.
+
+    The output folder gets ``generator/`` (averaged weights, for ``Generator.from_pretrained``), ``state/`` (to resume
+    from), ``logs/`` (TensorBoard) and ``validation/`` (PNG).
+
+    Args:
+        config: Settings.
+        frames: The data.
+        generator: To train in place; its autoencoder is ready and stays as it is.
+        output: Folder; where it holds a state, the run goes on from there.
+        perceptual: None switches L_perceptual off.
+        show: Progress bar.
+        say: Gets messages for people.
+
+    Raises:
+        TrainingError: The output holds a run with other settings, or the generator was made by others.
+        ImportError: accelerate or tensorboard is not installed.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        frames: Frames,
+        generator: Generator,
+        output: str | Path,
+        *,
+        perceptual: Perceptual | None = None,
+        show: bool = True,
+        say: Callable[[str], None] = print,
+    ) -> None:
+        accelerate = optional_package("accelerate", "generator")
+        self.config, self.frames, self.output = config, frames, Path(output)
+        self.accelerator = accelerate.Accelerator(mixed_precision=config.precision, cpu=not torch.cuda.is_available())
+        self.is_main: bool = self.accelerator.is_main_process
+        self.show, self._say = show and self.is_main, say
+        self.device = self.accelerator.device
+        scaled = replace(config.generator.autoencoder, scale=generator.config.autoencoder.scale)
+        if generator.config != replace(config.generator, autoencoder=scaled, one_step=generator.config.one_step):
+            raise TrainingError("Trainer: expected a generator of the run's own settings, got another's")
+        self.generator = generator.to(self.device)
+        generator.config = replace(generator.config, one_step=config.loss.regression > 0)
+        generator.autoencoder.requires_grad_(False)
+        generator.denoiser.gradient_checkpointing = config.checkpointing
+        self.split = frames.split(config.seed)
+        self.perceptual = None if perceptual is None or not config.loss.perceptual else perceptual.to(self.device)
+        step = Step(config, generator.denoiser, generator.autoencoder, self.perceptual)
+        self.optimiser = torch.optim.AdamW(
+            [p for p in step.parameters() if p.requires_grad], lr=config.lr, weight_decay=config.weight_decay
+        )
+        self.average = Average(generator.denoiser, config.ema)
+        self.done = 0
+        if has_state(self.state_folder):
+            self.done = load_state(self.state_folder, config, generator.denoiser, self.average, self.optimiser)
+            self.say(f"going on after step {self.done} of {self.state_folder}")
+        # Not placed: AdamW's step counters belong on the CPU, else each is waited for.
+        placed = [True, False]
+        self.model, self._optimiser = self.accelerator.prepare(step, self.optimiser, device_placement=placed)
+        self.step = step
+        self._stop = StopRequests()
+        masks = mask_bank(
+            frames[self.split.training[0]].rig, config.pseudo_views.mask_bank, config.seed + _SEEDS["masks"]
+        )
+        self.items = self._items(self.split.training, masks, "items")
+        if config.generator.residual:
+            self._measure_deviation()
+        self.validation = self._items(self.split.validation or self.split.training, masks, "validation")
+        if not self.split.validation:
+            self.say("too few scenes for a validation part: validating on training scenes, with other draws")
+
+    @property
+    def state_folder(self) -> Path:
+        """Where the state is."""
+        return self.output / "state"
+
+    def say(self, message: str) -> None:
+        """A message for people, once."""
+        if self.is_main:
+            self._say(message)
+
+    def _items(self, indices: list[int], masks: torch.Tensor, what: str) -> PseudoViews:
+        config = self.config
+        device = "cpu" if config.workers else self.device
+        seed = 10 * config.seed + _SEEDS[what]
+        return PseudoViews(self.frames, indices, config.pseudo_views, config.generator, masks, seed, device)
+
+    @torch.no_grad()
+    def _measure_deviation(self) -> None:
+        """What the condition lacks of the image inside the holes and outside, of the first items: the same whenever."""
+        encode = self.generator.autoencoder.encode
+        sums = torch.zeros(2, 2, dtype=torch.float64)
+        for k in range(_DEVIATION_ITEMS):
+            batch = self.items[k].to(self.device)
+            shown = shown_condition(self.config.generator, batch.condition, batch.known)
+            lacks = (encode(batch.truth) - encode(shown)).float().square().mean(2)
+            known, valid = (pooled(m, (lacks.shape[-2], lacks.shape[-1])) > 0.99 for m in (batch.known, batch.valid))
+            for row, where in enumerate((valid & ~known, valid & known)):
+                sums[row] += torch.stack([lacks[where].sum(), where.sum()]).cpu()
+        found = (sums[:, 0] / sums[:, 1].clamp(min=1)).sqrt().clamp(min=_LEAST_DEVIATION)
+        self.generator.denoiser.deviation.copy_(found)
+
+    # --- the loop -----------------------------------------------------------------------------------------------------
+    def train(self) -> bool:
+        """Train to the last step, or until SIGTERM or SIGINT, and save the state; returns whether it is done.
+
+        Raises:
+            TrainingError: A loss is not finite; the last saved state is from before.
+            OSError: The state at the end could not be saved.
+        """
+        config = self.config
+        writer = self._writer() if self.is_main else None
+        bar = tqdm(total=config.steps, initial=self.done, desc="train", unit="step", disable=not self.show)
+        try:
+            with self._stop:
+                for batch in self._batches():
+                    terms = self.train_step(batch)
+                    self.done += 1
+                    bar.update()
+                    last = self.done == config.steps
+                    if writer is not None and (self.done % _LOG_EVERY == 0 or last):
+                        self._log(writer, bar, terms)
+                    if self.done % config.validate_every == 0 or last:
+                        self._validate(writer)
+                    if self._should_stop():
+                        break
+                    if self.done % config.save_every == 0 and not last:
+                        self._save_or_warn()
+                self.save()
+        finally:
+            bar.close()
+            if writer is not None:
+                writer.close()
+        if self.done < config.steps:
+            self.say(f"stopped after step {self.done} of {config.steps}; saved: the same command goes on from there")
+        return self.done == config.steps
+
+    def train_step(self, batch: Batch) -> dict[str, float]:
+        """One update; returns the loss terms.
+
+        Raises:
+            TrainingError: A term is not finite; names it, the step and the batch. Nothing was updated.
+        """
+        config = self.config
+        number = self.done * self.accelerator.num_processes + self.accelerator.process_index
+        rng = torch.Generator().manual_seed((10 * config.seed + _SEEDS["draws"]) * 2**32 + number)
+        draws = draw(config, len(batch.tokens), batch.truth.shape[1], rng)
+        on_device = draws._replace(
+            t=draws.t.to(self.device), eps=draws.eps.to(self.device), drop=draws.drop.to(self.device)
+        )
+        for group in self.optimiser.param_groups:
+            group["lr"] = learning_rate(config, self.done)
+        with_perceptual = self.perceptual is not None and self.done % config.loss.perceptual_every == 0
+        terms = self.model(batch.to(self.device), on_device, with_perceptual)
+        total = self.step.total(terms)
+        numbers = torch.stack([*terms.values(), total]).detach().tolist()  # one wait for a GPU
+        values = dict(zip((*terms, "total"), numbers, strict=True))
+        self._check_finite(values, batch)
+        self.accelerator.backward(total)
+        if config.clip:
+            self.accelerator.clip_grad_norm_(self.model.parameters(), config.clip)
+        self._optimiser.step()
+        self._optimiser.zero_grad(set_to_none=True)
+        self.average.update(self.generator.denoiser, self.done)
+        return values
+
+    def _check_finite(self, values: Mapping[str, float], batch: Batch) -> None:
+        wrong = [name for name, value in values.items() if not math.isfinite(value)]
+        if wrong:
+            tokens = ", ".join(batch.tokens)
+            raise TrainingError(
+                f"step {self.done}: loss term {wrong[0]} is {values[wrong[0]]}; the batch: {tokens}. The last saved "
+                "state is from before; try a lower lr, or bf16 off"
+            )
+
+    def _batches(self) -> Iterator[Batch]:
+        config, world = self.config, self.accelerator.num_processes
+        first = range(self.done * world + self.accelerator.process_index, config.steps * world, world)
+        numbers = [range(n * config.batch, (n + 1) * config.batch) for n in first]
+        return iter(
+            DataLoader(
+                self.items,
+                batch_sampler=numbers,  # type: ignore[arg-type]
+                collate_fn=collate,
+                **item_workers(config.workers),
+            )
+        )
+
+    # --- stopping and saving ------------------------------------------------------------------------------------------
+    def _should_stop(self) -> bool:
+        if self.accelerator.num_processes == 1:
+            return self._stop.asked
+        asked = torch.tensor(float(self._stop.asked), device=self.device)
+        return bool(self.accelerator.reduce(asked, "sum") > 0)  # all processes stop after the same step
+
+    def save(self) -> None:
+        """Write the state, and the generator with averaged weights.
+
+        Raises:
+            OSError: One could not be written; what was there is as it was.
+        """
+        try:
+            if self.is_main:
+                denoiser = self.generator.denoiser
+                save_state(self.state_folder, self.config, self.done, denoiser, self.average, self.optimiser)
+                with_average = self.average.put_into(denoiser)
+                try:
+                    self.generator.save_pretrained(self.output / "generator")
+                finally:
+                    put_back(denoiser, with_average)
+        finally:  # the others wait, whatever became of it
+            self.accelerator.wait_for_everyone()
+
+    def _save_or_warn(self) -> None:
+        try:
+            self.save()
+        except OSError as error:
+            self.say(f"step {self.done}: not saved, going on with the last good state: {error}")
+
+    # --- logs ---------------------------------------------------------------------------------------------------------
+    def _writer(self) -> Any:
+        tensorboard = optional_package("torch.utils.tensorboard", "generator")
+        return tensorboard.SummaryWriter(str(self.output / "logs"), purge_step=self.done or None)
+
+    def _log(self, writer: Any, bar: Any, terms: Mapping[str, float]) -> None:
+        for name, value in terms.items():
+            writer.add_scalar(f"loss/{name}", value, self.done)
+        writer.add_scalar("lr", learning_rate(self.config, self.done - 1), self.done)
+        bar.set_postfix({name: f"{value:.3f}" for name, value in terms.items()})
+
+    def _validate(self, writer: Any) -> None:
+        """Samples of fixed items by the averaged weights: PSNR inside the holes, and a picture."""
+        if self.is_main:
+            scores, image = self.validated()
+            for name, value in scores.items():
+                writer.add_scalar(f"hole_psnr/{name}", value, self.done)
+            writer.add_image("validation", image, self.done, dataformats="HWC")
+            try:
+                save_png(self.output / "validation" / f"{self.done:06d}.png", image)
+            except OSError as error:
+                self.say(str(error))
+            numbers = ", ".join(f"{name} {value:.2f}" for name, value in scores.items())
+            self.say(f"step {self.done}: PSNR inside the holes, dB: {numbers}")
+        self.accelerator.wait_for_everyone()
+
+    def validated(self) -> tuple[dict[str, float], Any]:
+        """Mean PSNR inside the holes of the validation items by way of filling, and their picture (h, w, 3) uint8."""
+        config, denoiser = self.config, self.generator.denoiser
+        batch = collate([self.validation[k] for k in range(config.validation_items)]).to(self.device)
+        before = self.average.put_into(denoiser)
+        try:
+            one = sampled(self.generator, batch, steps=1, seed=0)
+            some = sampled(self.generator, batch, steps=max(2, config.generator.steps), seed=0)
+        finally:
+            put_back(denoiser, before)
+        ways = {"condition": batch.condition, "one_step": one, f"{max(2, config.generator.steps)}_steps": some}
+        if not config.loss.regression:
+            del ways["one_step"]
+        scores = {name: float(hole_psnr(image, batch.truth, batch.holes).nanmean()) for name, image in ways.items()}
+        return scores, picture(batch, some)
+
+
+def learning_rate(config: TrainConfig, step: int) -> float:
+    """Linear warm-up, then a cosine to 0 at the last step (Sec. Training Parameters); a function of the step alone."""
+    if step < config.warmup:
+        return config.lr * (step + 1) / config.warmup
+    done = (step - config.warmup) / max(1, config.steps - config.warmup)
+    return config.lr * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))

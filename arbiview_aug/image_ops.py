@@ -1,0 +1,80 @@
+"""image_ops."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+
+
+def at_level(uv: npt.NDArray[np.floating], level: int) -> Any:
+    """Pixels (..., 2) in an image halved ``level`` times: halving keeps outer edges, x' = (x + 0.5) / 2^level - 0.5."""
+    return (uv + 0.5) / 2**level - 0.5 if level else uv
+
+
+def level_size(size: tuple[int, int], level: int) -> tuple[int, int]:
+    """(h, w) after ``level`` halvings; an odd last row or column is left out."""
+    return size[0] >> level, size[1] >> level
+
+
+def interleaved(image: torch.Tensor) -> np.ndarray | None:
+    """The (H, W, 3) numpy view of a (3, H, W) tensor whose memory is channels-last, else None."""
+    array = image.permute(1, 2, 0)
+    return array.numpy() if array.is_contiguous() else None
+
+
+def halved(image: np.ndarray, level: int, dst: np.ndarray | None = None) -> np.ndarray:
+    """The image (H, W[, 3]) after ``level`` halvings by 2x2 means; written into ``dst`` where that is given."""
+    for k in range(level):
+        h, w = image.shape[0] // 2, image.shape[1] // 2
+        last = dst if k == level - 1 else None
+        image = cv2.resize(image[: 2 * h, : 2 * w], (w, h), dst=last, interpolation=cv2.INTER_AREA)
+    if dst is not None and level == 0:
+        dst[...] = image
+    return image
+
+
+def resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    """A (3, H, W) image at (h, w), antialiased; a copy where the size is right already.
+
+    On the CPU as target views are read, halved and then bilinear: a network cannot tell the two by their sharpness,
+    and it takes a tenth of the time. Differentiable, or on other devices, by torch.
+    """
+    if image.device.type == "cpu" and not image.requires_grad:
+        return _resized_by_opencv(image, size)
+    if tuple(image.shape[-2:]) == size:
+        return image.clone()
+    out = torch.nn.functional.interpolate(
+        image[None].float(), size=size, mode="bilinear", antialias=True, align_corners=False
+    )[0]
+    return out.round().clamp(0, 255).to(image.dtype) if image.dtype == torch.uint8 else out.to(image.dtype)
+
+
+def _resized_by_opencv(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    work = image if image.dtype == torch.uint8 else image.float()
+    level = 0
+    while all(
+        n % 2 ** (level + 1) == 0 and 1.02 * n / 2 ** (level + 1) >= to
+        for n, to in zip(image.shape[1:], size, strict=True)
+    ):
+        level += 1  # of an odd side halving would lose the last row
+    out = torch.empty((3, *size), dtype=work.dtype)
+    array = interleaved(work)
+    if array is not None:
+        small = halved(array, level)
+        cv2.split(small if small.shape[:2] == size else cv2.resize(small, size[::-1]), list(out.numpy()))
+    else:
+        for plane, to in zip(work.contiguous().numpy(), out.numpy(), strict=True):
+            cv2.resize(halved(plane, level), size[::-1], dst=to)
+    return out.to(image.dtype)
+
+
+def nearest_resized(label: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    """A (..., H, W) label map at (h, w): the label at each new pixel's centre."""
+    h, w = label.shape[-2:]
+    y = ((torch.arange(size[0], device=label.device) + 0.5) * h / size[0]).long().clamp(max=h - 1)
+    x = ((torch.arange(size[1], device=label.device) + 0.5) * w / size[1]).long().clamp(max=w - 1)
+    return label[..., y[:, None], x]

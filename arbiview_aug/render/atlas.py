@@ -1,0 +1,195 @@
+"""Reading images at maps: the atlas of source images, fixed-point maps, and their OpenCV and torch executions.
+
+Convention: a map holds, for every target pixel, the (x, y) of the atlas pixel to read; pixel centres are integers.
+Maps are OpenCV's fixed-point pairs: ``xy`` (h, w, 2) int16 whole pixels and ``frac`` (h, w) uint16 with 32nds of a
+pixel, (frac & 31) in x and (frac >> 5) in y. The torch path reads the very same positions, so both executions agree.
+``OUTSIDE`` marks pixels that read nothing and come out black.
+
+An atlas holds the source images that a plan reads, below and beside each other, some of them halved: one
+``cv2.remap`` then serves a target that sees several sources.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from arbiview_aug.cameras.validation import MAX_SIZE_PX
+from arbiview_aug.errors import CalibrationError
+from arbiview_aug.image_ops import at_level, level_size
+
+OUTSIDE = -16
+"""Whole-pixel coordinate of a map entry that reads nothing: far enough that no bilinear tap touches the atlas."""
+
+_MAX_ROWS = 32000  # remap needs int16 coordinates, and sizes below 32767
+
+
+@dataclass(frozen=True)
+class FixedMap:
+    """A fixed-point sampling map: ``xy`` (h, w, 2) int16 and ``frac`` (h, w) uint16 (see the module's convention)."""
+
+    xy: npt.NDArray[np.int16]
+    frac: npt.NDArray[np.uint16]
+
+    @classmethod
+    def from_float(cls, uv: npt.NDArray[np.float32]) -> FixedMap:
+        """Round a float map (h, w, 2) to 32nds of a pixel."""
+        return cls(*cv2.convertMaps(uv, None, cv2.CV_16SC2))  # type: ignore[call-overload]
+
+    @classmethod
+    def in_slot(cls, uv: npt.NDArray[np.float32], slot: Slot) -> FixedMap:
+        """A float map (h, w, 2) in the image of a slot, as positions in the atlas.
+
+        Rounded first: float32 has 1/512 px left in an atlas's last rows, whole pixels are added exactly.
+        """
+        fixed = cls.from_float(uv)
+        for axis, first in enumerate((slot.x, slot.y)):
+            if first:
+                fixed.xy[..., axis] += np.int16(first)
+        return fixed
+
+    @classmethod
+    def outside(cls, size: tuple[int, int]) -> FixedMap:
+        """A map (h, w) that reads nothing."""
+        return cls(np.full((*size, 2), OUTSIDE, np.int16), np.zeros(size, np.uint16))
+
+    def put(self, part: FixedMap, where: npt.NDArray[np.uint8]) -> None:
+        """Take another map's positions where ``where`` (h, w) is not 0."""
+        cv2.copyTo(part.xy, where, self.xy)
+        cv2.copyTo(part.frac, where, self.frac)
+
+    def part(self, rows: slice, columns: slice) -> FixedMap:
+        """A rectangle of it, the same memory."""
+        return FixedMap(self.xy[rows, columns], self.frac[rows, columns])
+
+    def copy(self) -> FixedMap:
+        """The same map in memory of its own."""
+        return FixedMap(self.xy.copy(), self.frac.copy())
+
+    def rows(self, y0: int, y1: int) -> FixedMap:
+        """Rows y0 to y1, the same memory."""
+        return FixedMap(self.xy[y0:y1], self.frac[y0:y1])
+
+    def rounded(self) -> FixedMap:
+        """The same map at the nearest whole pixels."""
+        nearest = np.stack([(self.frac & 31) >= 16, (self.frac >> 5) >= 16], -1).astype(np.int16)
+        return FixedMap(self.xy + nearest, np.zeros_like(self.frac))
+
+    def to_float(self) -> npt.NDArray[np.float32]:
+        """The (h, w, 2) positions that are read."""
+        fraction = np.stack([self.frac & 31, self.frac >> 5], -1).astype(np.float32) / np.float32(32)
+        return np.asarray(self.xy + fraction, np.float32)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held."""
+        return self.xy.nbytes + self.frac.nbytes
+
+
+@dataclass(frozen=True)
+class Slot:
+    """Where one source image lies in the atlas: halved ``level`` times, first pixel at (``x``, ``y``)."""
+
+    source: int
+    level: int
+    y: int
+    x: int
+    size: tuple[int, int]
+
+    def from_source(self, uv: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+        """Atlas positions of source pixels (..., 2)."""
+        half = at_level(uv, self.level)
+        return half + np.array([self.x, self.y]) if self.x or self.y else half
+
+    def to_source(self, at: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+        """The inverse of ``from_source``."""
+        return (at - (self.x, self.y) + 0.5) * 2**self.level - 0.5
+
+    def alone(self) -> Slot:
+        """The same image in an atlas of its own: what it sees must not depend on the images above it."""
+        return Slot(self.source, self.level, 0, 0, self.size)
+
+
+@dataclass(frozen=True)
+class AtlasLayout:
+    """The places of the source images that a plan reads.
+
+    Attributes:
+        slots: One for each (source, level) in use.
+        size: (h, w) of the atlas.
+        is_stack: All sources at full size below each other: an (N, H, W, 3) block of images *is* the atlas.
+    """
+
+    slots: tuple[Slot, ...]
+    size: tuple[int, int]
+    is_stack: bool
+
+    @classmethod
+    def for_sources(cls, sizes: Sequence[tuple[int, int]], used: Sequence[tuple[int, int]]) -> AtlasLayout:
+        """Lay out the used (source, level) pairs: below each other, in further columns where rows run out.
+
+        Raises:
+            CalibrationError: There are no more columns: 29 images of 7680x4320 px, read at their full size.
+        """
+        used = sorted(set(used))
+        is_stack = (
+            len(set(sizes)) == 1
+            and len(used) > 0
+            and all(level == 0 for _, level in used)
+            and len(sizes) * sizes[0][0] <= _MAX_ROWS
+        )
+        if is_stack:
+            h, w = sizes[0]
+            stacked = tuple(Slot(s, 0, s * h, 0, (h, w)) for s, _ in used)
+            return cls(stacked, (h * len(sizes), w), True)
+        slots, y, x, column_width, rows = [], 0, 0, 0, 0
+        for source, level in used:
+            h, w = level_size(sizes[source], level)
+            if y and y + h > _MAX_ROWS:
+                x, y, column_width = x + column_width, 0, 0
+            slots.append(Slot(source, level, y, x, (h, w)))
+            y, column_width = y + h, max(column_width, w)
+            rows = max(rows, y)
+        columns = x + column_width
+        if columns > MAX_SIZE_PX:
+            raise CalibrationError(
+                f"rig: expected source images that fit {_MAX_ROWS} rows and {MAX_SIZE_PX} columns together, got "
+                f"{len(slots)} to read at once, up to {max(h for h, _ in sizes)}x{max(w for _, w in sizes)}; resize "
+                "them, and their cameras by Rig.resized"
+            )
+        return cls(tuple(slots), (max(rows, 1), max(columns, 1)), False)
+
+    def without_others(self, read: Collection[tuple[int, int]]) -> AtlasLayout:
+        """The same places for the (source, level) pairs that are read: images that win no pixel are not copied."""
+        return replace(self, slots=tuple(slot for slot in self.slots if (slot.source, slot.level) in read))
+
+    def slot(self, source: int, level: int) -> Slot:
+        """The place of one source at one level."""
+        return next(s for s in self.slots if (s.source, s.level) == (source, level))
+
+
+# --- OpenCV -----------------------------------------------------------------------------------------------------------
+class Scratch:
+    """Buffers that are reused from frame to frame, one set a thread: fresh ones cost more than the work in them."""
+
+    def __init__(self) -> None:
+        self._local = threading.local()
+
+    def get(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> np.ndarray:
+        """A buffer of this shape and type with undefined, but finite content: bilinear taps of weight 0 read it."""
+        buffers = self._local.__dict__
+        held = buffers.get(name)
+        if held is None or held.shape != shape or held.dtype != dtype:
+            buffers[name] = held = np.zeros(shape, dtype)
+        return held
+
+    def __reduce__(self) -> tuple[type[Scratch], tuple[()]]:
+        return Scratch, ()
+
+
+# --- torch ------------------------------------------------------------------------------------------------------------

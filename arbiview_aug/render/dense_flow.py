@@ -1,0 +1,78 @@
+"""Dense optical flow between two images of one view: how far to trust it, and when not to ask for it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from arbiview_aug.cameras.lens import BoolArray
+
+ROUND_TRIP_PX = 0.75
+"""Flow there and back that misses by this much counts half: it has been to something else."""
+
+_BLANK_GREY = 2.0  # spread of grey levels below which an image is blank, or black night
+
+_REPEATS = 0.7
+"""Correlation of an overlap with itself, shifted sideways, from which on its texture repeats: gratings have 0.9 and
+more, the overlaps of three real frames 0.35 at most."""
+
+
+def why_ambiguous(one: npt.NDArray[np.float32], two: npt.NDArray[np.float32], both: BoolArray) -> str:
+    """Why matches between two views (h, w, 3) in [0, 255] would say nothing where both see (h, w); "" where they do."""
+    if min(float(view[both].std()) for view in (one, two)) < _BLANK_GREY:
+        return "one of the images shows nothing"
+    if max(_repetition(view, both) for view in (one, two)) > _REPEATS:
+        return "the texture repeats itself: matches would be ambiguous"
+    return ""
+
+
+def dense_flow(
+    one: npt.NDArray[np.float32], two: npt.NDArray[np.float32], both: BoolArray
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Optical flow (h, w, 2) from one view to the other, and how far to trust it, (h, w) in [0, 1].
+
+    The views are brought to one brightness. What only one of them shows is filled by the mean of both, blurred, so that
+    nothing moves there.
+    """
+    grey = [cv2.cvtColor(view, cv2.COLOR_RGB2GRAY) for view in (one, two)]
+    log = [np.log(np.maximum(view[both], 4)) for view in grey]
+    half = np.exp(np.median(log[0] - log[1]) / 2)
+    grey = [grey[0] / half, grey[1] * half]
+    inside = both.astype(np.float32)
+    around = cv2.GaussianBlur((grey[0] + grey[1]) / 2 * inside, (0, 0), 6) / np.maximum(
+        cv2.GaussianBlur(inside, (0, 0), 6), 1e-3
+    )
+    first, second = (np.clip(np.where(both, view, around), 0, 255).astype(np.uint8) for view in grey)
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis.setFinestScale(0)
+    dis.setVariationalRefinementIterations(0)  # half the time, and depth is smoothed anyway
+    there: Any = dis.calc(first, second, None)  # type: ignore[call-overload]
+    back: Any = dis.calc(second, first, None)  # type: ignore[call-overload]
+    h, w = both.shape
+    x, y = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
+    x, y = x + there[..., 0], y + there[..., 1]
+    returned = cv2.remap(back, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1e3, 1e3))
+    found = cv2.remap(inside, x, y, cv2.INTER_NEAREST)
+    miss = np.linalg.norm(there + returned, axis=-1)
+    return there, np.where(both & (found > 0), 1 / (1 + (miss / ROUND_TRIP_PX) ** 4), 0).astype(np.float32)
+
+
+def _repetition(image: npt.NDArray[np.float32], inside: BoolArray) -> float:
+    """Highest correlation of a view (h, w, 3) with itself, shifted along its rows beyond where it first fell to 0.3."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    window = inside.astype(np.float32)
+    size = cv2.getOptimalDFTSize(2 * inside.shape[1])
+    mean = cv2.blur(grey * window, (33, 33)) / np.maximum(cv2.blur(window, (33, 33)), 1e-3)
+    detail = (grey - mean) * window
+    spectra = [np.fft.rfft(values, size, axis=1) for values in (detail, detail**2, window)]
+    products = ((0, 0), (1, 2), (2, 1), (2, 2))
+    shifted, here, there, pixels = (
+        np.fft.irfft((spectra[a] * spectra[b].conj()).sum(axis=0), size)[: inside.shape[1] // 2] for a, b in products
+    )
+    correlation = shifted / np.sqrt(np.maximum(here, 1e-6) * np.maximum(there, 1e-6))
+    correlation = correlation[pixels > pixels[0] / 4]  # fewer say nothing
+    fallen = np.flatnonzero(correlation < 0.3)
+    return float(correlation[fallen[0] :].max()) if len(fallen) else 0.0

@@ -1,0 +1,93 @@
+"""sample.check."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+from arbiview_aug.errors import SampleError
+from arbiview_aug.sample.inputs import CALIBRATION_KEYS
+
+PIXEL_BOUND_KEYS = (
+    "boxes_2d",
+    "labels_2d",
+    "detections",
+    "centers_2d",
+    "depths",
+    "depth",
+    "depth_m",
+    "keypoints_2d",
+    "source_camera",
+    "source_frame",
+    "confidence",
+    "generated",
+    "sources",
+)
+"""Keys known to speak of the source's pixels: dropped, because they would be stale in the target's views."""
+
+
+EGO_KEYS = ("points", "boxes_3d", "ego2world")
+"""Keys known to be in the ego frame: they pass, or move with ``label_frame="target"``."""
+
+
+_MOST_NESTED = 64  # entries of a list that are looked at: longer lists are tokens or numbers
+
+
+def check_other_keys(
+    sample: Mapping[str, Any],
+    sizes: Sequence[tuple[int, ...]],
+    label_keys: Sequence[str],
+    pass_keys: Sequence[str],
+) -> list[str]:
+    """Which keys hold label maps; refuses whatever else may speak of the source's pixels.
+
+    Args:
+        sample: The sample dict.
+        sizes: The (h, w) of its images.
+        label_keys: Named by the user as label maps.
+        pass_keys: Named by the user as harmless.
+
+    Raises:
+        SampleError: A tensor of the images' height and width, or a torchvision tv_tensor, that nobody named.
+    """
+    absent = [key for key in label_keys if key not in sample]
+    if absent:
+        raise SampleError(f"label_keys: expected {', '.join(absent)} in the sample, got {', '.join(map(str, sample))}")
+    labels = list(label_keys)
+    for key, value in sample.items():
+        if key in (*CALIBRATION_KEYS, *PIXEL_BOUND_KEYS, *EGO_KEYS, *labels, *pass_keys):
+            continue
+        first = value[0] if isinstance(value, list | tuple) and value else value
+        if _tv_tensor(first) == "Mask":
+            labels.append(key)
+            continue
+        for leaf in _leaves(value):
+            if kind := _tv_tensor(leaf):
+                raise SampleError(
+                    f"{key}: a tv_tensors.{kind} speaks of the source's pixels and would be stale; "
+                    f"drop it, or name it in pass_keys=({key!r},)"
+                )
+            shape = tuple(getattr(leaf, "shape", ()))
+            if any(pair in sizes for pair in pairwise(shape)):
+                raise SampleError(
+                    f"{key}: shape {shape} looks like a map over the source's pixels and would be stale; name it in "
+                    f"label_keys=({key!r},) to render it, or in pass_keys=({key!r},) to keep it as it is"
+                )
+    return labels
+
+
+def _tv_tensor(value: Any) -> str:
+    kind = type(value)
+    return kind.__name__ if kind.__module__.startswith("torchvision.tv_tensors") else ""
+
+
+def _leaves(value: Any) -> Iterator[Any]:
+    if isinstance(value, Mapping):
+        for entry in value.values():
+            yield from _leaves(entry)
+    elif isinstance(value, list | tuple):
+        for entry in value[:_MOST_NESTED]:
+            yield from _leaves(entry)
+    else:
+        yield value

@@ -1,0 +1,274 @@
+"""Labelled 3D boxes as solids on the street: the geometry that keeps an object's height when cameras move.
+
+A static surface paints an object onto the road and the wall behind it: its base lands right, its roof stretches away.
+With boxes in the sample a ray meets the first face of a box, and the street where it passes them all. What a box hides
+from a source is not read from that source: the object's own colours would be smeared behind it. Where no other source
+sees it, it is a hole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.coarse_grid import Grid
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.errors import SampleError
+from arbiview_aug.scene.box_raster import draw_boxes
+from arbiview_aug.scene.box_raster import silhouettes as pinhole_silhouettes
+from arbiview_aug.scene.static import Far
+from arbiview_aug.scene.surface import (
+    MAX_INVERSE_DISTANCE,
+    Fragments,
+    LayeredSurface,
+    OcclusionMap,
+    Points,
+    StaticSurface,
+    Surface,
+)
+
+_CHUNK = 1 << 15  # points tested at once: they stay in the cache, however many there are
+_LENS_STEP_PX = 8  # cells in which rays of a lens are cast or not
+
+_UNLABELLED = 0.45
+"""Share of the street's uncertainty left by labels: poles, trees and houses have none. Fitted on synthetic streets
+(seeds 100 to 105), as is the next."""
+
+_BOX_ERROR = 0.08
+"""Mean error of a box face's inverse distance, as a share of it: objects are rounder than their boxes."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoxSurface(LayeredSurface):
+    """Boxes standing on the street.
+
+    Plans are built from ``drawn`` and ``occlusion_map``; ``inverse_distance`` and ``occludes`` say the same of single
+    rays, and are their plain reference.
+
+    Attributes:
+        street: What there is without them.
+        boxes: (B, 7) centre x, y, z, length, width, height (metres), yaw (radians), in the ego frame.
+    """
+
+    smooth: ClassVar[bool] = True  # away from the boxes; near them every pixel is ``detailed``
+    street: Surface
+    boxes: FloatArray
+    _shadows: dict[Camera, OcclusionMap] = field(default_factory=dict, repr=False)
+
+    @property
+    def background(self) -> Surface:
+        """The street."""
+        return self.street
+
+    # --- images -------------------------------------------------------------------------------------------------------
+    def drawn(self, camera: Camera) -> Fragments:
+        """The pixels of a camera that show boxes."""
+        return self._drawn(camera, self.boxes)
+
+    def occlusion_map(self, camera: Camera) -> OcclusionMap:
+        """What boxes hide from a source, by ``occludes``; kept for the next target."""
+        if camera not in self._shadows:
+            pixel_rad = float(1 / camera.K[0, 0])
+            index, first, face = self._drawn(camera, self._enlarged(camera.center_m, pixel_rad))
+            beyond, solid = np.zeros(camera.size, np.float32), np.full(camera.size, -1, np.int32)
+            beyond.reshape(-1)[index] = first / (1 + 2 * pixel_rad)  # a lookup at the nearest pixel
+            solid.reshape(-1)[index] = face // 6
+            self._shadows[camera] = OcclusionMap(beyond, solid)
+        return self._shadows[camera]
+
+    def facing(self, origin: FloatArray, face: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int32], FloatArray]:
+        """The boxes of faces (n,), and by how many metres ``origin`` lies before the faces' planes; see ``solids``."""
+        before_m = np.empty((len(self.boxes), 6))
+        local, half = _in_box_frames(self.boxes, origin), self.boxes[:, 3:6] / 2
+        before_m[:, 0::2], before_m[:, 1::2] = -local - half, local - half
+        return face // 6, before_m.reshape(-1)[face]
+
+    def _enlarged(self, origin: FloatArray, pixel_rad: float) -> FloatArray:
+        """The boxes wider by half a pixel: what pixels that touch them show is mixed with their colours.
+
+        Not below, where what they stand on is seen before them: they are lifted instead. A margin in metres for loose
+        labels (3 cm) is not worth it: on synthetic streets moved sideways it took the share of marked pixels that are
+        holes from 97 to 82 %.
+        """
+        boxes = self.boxes.copy()
+        more_m = pixel_rad / 2 * np.linalg.norm(boxes[:, :3] - origin, axis=-1)
+        boxes[:, 2] += more_m
+        boxes[:, 3:5] += 2 * more_m[:, None]
+        return boxes
+
+    def _drawn(self, camera: Camera, boxes: FloatArray) -> Fragments:
+        """Rasterised, or for a lens by casting the rays near the boxes."""
+        if camera.lens == "pinhole":
+            return draw_boxes(camera, boxes)
+        scene = BoxSurface(self.street, boxes)
+        grid = Grid(camera.size, _LENS_STEP_PX)
+        rays, valid = camera.unproject(grid.nodes())
+        spacing = np.where(valid[:, 1:] & valid[:, :-1], np.linalg.norm(np.diff(rays, axis=1), axis=-1), 0)
+        near = valid & scene.detailed(camera.center_m, rays, 2 * float(spacing.max(initial=0.0)))
+        cells = cv2.dilate(near.astype(np.uint8), np.ones((3, 3), np.uint8))[:-1, :-1] > 0
+        ny, nx = grid.shape
+        index = np.flatnonzero(grid.cells_to_pixels(cells, (0, ny - 1, 0, nx - 1)))
+        v, u = np.divmod(index, camera.width_px)
+        directions, known = camera.unproject(np.stack([u, v], -1))
+        nearest, face = scene._boxes_ahead(camera.center_m, directions)
+        shown = known & (nearest > 0)
+        return Fragments(index[shown], nearest[shown], face[shown])
+
+    # --- rays ---------------------------------------------------------------------------------------------------------
+    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        """The first box along a ray, else the street, 1/m (...,): the street is a guess, a box is not under it."""
+        first = self._boxes_ahead(origin, directions)[0]
+        return np.where(first > 0, first, self.street.inverse_distance(origin, directions))
+
+    def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
+        """Mean error (...,) in 1/m: of a box against the object in it, of the street with what has no label."""
+        on_street = inverse_distance <= self.street.inverse_distance(origin, directions)
+        street = _UNLABELLED * self.street.uncertainty(origin, directions, inverse_distance)
+        return np.where(on_street, street, _BOX_ERROR * inverse_distance)
+
+    def occludes(
+        self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
+    ) -> BoolArray:
+        """Whether a box stands between ``origin`` and points at these inverse distances along unit rays.
+
+        A static street is a guess, a box a label: what such a street says lies before a box lies behind it in truth.
+        """
+        first = BoxSurface(self.street, self._enlarged(origin, pixel_rad))._boxes_ahead(origin, directions)[0]
+        return first > (0 if isinstance(self.street, StaticSurface) else inverse_distance * (1 + 2 * pixel_rad))
+
+    def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
+        """Rays (...,) that pass a box within an angle, where nothing may be interpolated."""
+        near = np.zeros(directions.shape[:-1], bool)
+        for _, towards, angle in self._outside(origin):
+            near |= directions @ towards >= np.cos(min(angle + margin_rad, np.pi))
+        return near
+
+    def _outside(self, origin: FloatArray) -> Iterator[tuple[int, FloatArray, float]]:
+        """Boxes that do not hold the origin (the vehicle with the camera does), towards which, within what angle."""
+        holding = (np.abs(_in_box_frames(self.boxes, origin)) <= self.boxes[:, 3:6] / 2).all(axis=-1)
+        for row in np.flatnonzero(~holding).tolist():
+            box = self.boxes[row]
+            towards = box[:3] - origin
+            distance_m, radius_m = float(np.linalg.norm(towards)), float(np.linalg.norm(box[3:6])) / 2
+            angle = float(np.arcsin(radius_m / distance_m)) if distance_m > radius_m else np.pi
+            yield row, towards / max(distance_m, 1e-9), angle
+
+    def _boxes_ahead(self, origin: FloatArray, directions: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int32]]:
+        """Inverse distance (...,) to the first box face along each ray, 0 where there is none; the face's number."""
+        rays = directions.reshape(-1, 3)
+        q, number = np.zeros(len(rays)), np.full(len(rays), -1, np.int32)
+        for row, towards, angle in self._outside(origin):
+            near = np.flatnonzero(rays @ towards >= np.cos(min(angle + 1e-6, np.pi)))
+            nearest, side = _first_face(self.boxes[row], origin, rays[near])
+            first = nearest > q[near]
+            q[near[first]], number[near[first]] = nearest[first], 6 * row + side[first]
+        return q.reshape(directions.shape[:-1]), number.reshape(directions.shape[:-1])
+
+
+def silhouettes(camera: Camera, boxes: FloatArray) -> list[npt.NDArray[np.int64]]:
+    """For each box (B, 7) the pixels whose rays meet it, into the flattened image (h, w), whatever stands before it."""
+    if camera.lens == "pinhole":
+        return pinhole_silhouettes(camera, boxes)
+    return [BoxSurface(Far(), box[None]).drawn(camera).pixel for box in boxes]
+
+
+def meets(box: FloatArray, origin: FloatArray, directions: FloatArray) -> BoolArray:
+    """Which rays (..., 3) from a point outside a box (7,) meet it: the plain reference of ``silhouettes``."""
+    first, _ = _first_face(box, origin, directions.reshape(-1, 3))
+    return (first > 0).reshape(directions.shape[:-1])
+
+
+def _first_face(
+    box: FloatArray, origin: FloatArray, directions: FloatArray
+) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Inverse distance to where rays (n, 3) enter a box, 0 where they miss it; which side they enter (slab method)."""
+    near, far, rays = _slabs(box, origin, directions)
+    axis = near.argmax(axis=-1)
+    enter, leave = near.max(axis=-1), far.min(axis=-1)
+    hit = (leave >= enter) & (enter > 0)
+    side = 2 * axis + (np.take_along_axis(rays, axis[:, None], axis=-1)[:, 0] < 0)
+    return np.where(hit, 1 / np.maximum(enter, 1 / MAX_INVERSE_DISTANCE), 0.0), side
+
+
+def beyond(box: FloatArray, origin: FloatArray, directions: FloatArray) -> FloatArray:
+    """Inverse distance (n,) at which rays (n, 3) that meet a box (7,) leave it, 1/m."""
+    _, far, _ = _slabs(box, origin, directions)
+    return np.asarray(1 / np.maximum(far.min(axis=-1), 1 / MAX_INVERSE_DISTANCE))
+
+
+def _slabs(box: FloatArray, origin: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Distances (n, 3) at which rays (n, 3) enter and leave what lies between a box's opposite faces; its rays."""
+    rays = _in_box_frame(box, directions)
+    rays = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
+    start, half = _in_box_frame(box, origin - box[:3]), box[3:6] / 2
+    one, two = (-half - start) / rays, (half - start) / rays
+    return np.minimum(one, two), np.maximum(one, two), rays
+
+
+def points_in(boxes: FloatArray, points: Points, air_m: float = 0.0) -> list[npt.NDArray[np.int64]]:
+    """For each box (B, 7) the points (P, 3) that lie in it, or no farther than ``air_m`` beside its faces."""
+    found: list[list[npt.NDArray[np.int64]]] = [[np.zeros(0, np.int64)] for _ in boxes]
+    reach_m = np.hypot(boxes[:, 3], boxes[:, 4]) / 2 + 2 * air_m
+    for first in range(0, len(points), _CHUNK):
+        chunk = points[first : first + _CHUNK]
+        x, y = chunk[:, :2].T.astype(np.float64, order="C")
+        for box, reach, numbers in zip(boxes, reach_m.tolist(), found, strict=True):
+            near = np.flatnonzero((np.abs(x - box[0]) <= reach) & (np.abs(y - box[1]) <= reach))
+            inside = np.abs(_in_box_frame(box, chunk[near] - box[:3])) <= box[3:6] / 2 + air_m
+            numbers.append(first + near[inside.all(axis=1)])
+    return [np.concatenate(numbers) for numbers in found]
+
+
+def is_over(box: FloatArray, point: FloatArray, air_m: float = 0.0) -> bool:
+    """Whether a point (3,) stands over, in or under the footprint of a box (7,), or within ``air_m`` beside it."""
+    return bool((np.abs(_in_box_frame(box, point - box[:3]))[:2] <= box[3:5] / 2 + air_m).all())
+
+
+def _in_box_frame(box: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Ego-frame vectors (..., 3) along the box's length, width and height."""
+    c, s = np.cos(box[6]), np.sin(box[6])
+    return vectors @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _in_box_frames(boxes: FloatArray, origin: FloatArray) -> FloatArray:
+    """One point (B, 3) in the frames of all boxes."""
+    c, s = np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
+    x, y, z = (origin - boxes[:, :3]).T
+    return np.stack([c * x + s * y, c * y - s * x, z], axis=-1)
+
+
+def checked_boxes(boxes: Any) -> FloatArray:
+    """(B, 7) float64 boxes of a sample.
+
+    Raises:
+        SampleError: Another shape, numbers that are not finite, negative sizes.
+    """
+    array = np.asarray(boxes.detach().cpu() if hasattr(boxes, "detach") else boxes, dtype=np.float64)
+    if array.size == 0:
+        return np.zeros((0, 7))
+    if array.ndim != 2 or array.shape[1] < 7:
+        expected = "(B, >= 7): centre x y z, length, width, height, yaw"
+        raise SampleError(f"boxes_3d: expected shape {expected}, got {array.shape}")
+    array = array[:, :7]
+    if not np.isfinite(array).all() or (array[:, 3:6] <= 0).any():
+        bad = int(np.flatnonzero(~np.isfinite(array).all(1) | (array[:, 3:6] <= 0).any(1))[0])
+        raise SampleError(f"boxes_3d[{bad}]: expected finite numbers and positive sizes, got {array[bad].tolist()}")
+    return array
+
+
+STAYED_M = 0.4
+"""What a label moves by less stayed: labels of parked vehicles waver by decimetres, and so much is left out anyhow."""
+
+
+def moved_boxes(one: FloatArray, two: FloatArray) -> FloatArray:
+    """The boxes (M, 7) of both frames (B, 7) that have no counterpart at the same place in the other."""
+    if not len(one) or not len(two):
+        return np.concatenate([one, two])
+    apart_m = np.linalg.norm(one[:, None, :3] - two[None, :, :3], axis=-1)
+    return np.concatenate([one[apart_m.min(axis=1) > STAYED_M], two[apart_m.min(axis=0) > STAYED_M]])

@@ -1,0 +1,314 @@
+"""Measured points as a surface: LiDAR or depth maps, with labelled boxes before them and the street behind.
+
+No sensor's place is assumed: points are z-buffered and made dense anew for each centre that is asked about
+(``arbiview_aug.scene.panorama``), a target's to find what it sees and a source's to find what is hidden from it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from arbiview_aug.cameras.camera import Camera, Rays
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.errors import SampleError
+from arbiview_aug.scene.boxes import BoxSurface, meets, silhouettes
+from arbiview_aug.scene.panorama import CELL_RAD, Layer, Panorama, PanoramaWindow, angles, panorama
+from arbiview_aug.scene.scanned_objects import ScannedObject, scanned_objects
+from arbiview_aug.scene.surface import (
+    MAX_INVERSE_DISTANCE,
+    DenseSurface,
+    Fragments,
+    OcclusionMap,
+    Points,
+    StaticSurface,
+)
+
+OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
+"""(x, y) ranges in the ego frame whose returns are the own car's: a car's about the middle of its rear axle."""
+
+_STEEP = 0.9
+"""Sine of the elevation up to which azimuths are interpolated over 0.2 degrees: 64 degrees."""
+
+_NO_BOX = -2  # in shadows: a point's, no box's
+
+_MEASURED_SPREAD = 0.05
+"""Spread of a measured inverse distance, as a share of it: half of STEP, below which densification follows a slope."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloudSurface(DenseSurface):
+    """Points made dense over the street. Points of the own car are left out.
+
+    Attributes:
+        street: What there is where nothing was measured.
+        points: (P, 3) in the ego frame, finite, metres.
+        objects: Whose points are among them: nothing behind these is seen through gaps between their points.
+    """
+
+    smooth: ClassVar[bool] = False
+    street: StaticSurface
+    points: Points
+    objects: tuple[ScannedObject, ...] = ()
+    _panoramas: dict[bytes, list[Panorama]] = field(default_factory=dict, repr=False)
+    _shadows: dict[Camera, OcclusionMap] = field(default_factory=dict, repr=False)
+    _rays: dict[Camera, _Located] = field(default_factory=dict, repr=False)
+    _seen: dict[Camera, list[_Seen]] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "points", self.points[~own_car(self.points)])
+
+    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        """The points' dense surface, 1/m (...,)."""
+        view, row, column = self._view(origin, directions)
+        known = self.street.inverse_distance(origin, directions) + view.residual(row, column)
+        for one in self._objects_on(origin, directions):
+            one.fill(known)
+        return np.asarray(np.clip(known, 0.0, MAX_INVERSE_DISTANCE), np.float64)
+
+    def image(self, camera: Camera) -> Layer:
+        """The points' dense surface at all pixels, 1/m (h, w).
+
+        The street is interpolated between rays a panorama's cell apart: to 0.02 px for a metre of parallax.
+        """
+        rays = self._located(camera)
+        street = self.street.inverse_distance(camera.center_m, rays.directions).astype(np.float32)
+        known = rays.to_pixels(street) + rays.view.residual(rays.to_pixels(rays.row), rays.to_pixels(rays.column))
+        for one in self._objects_in(camera):
+            one.fill(known)
+        return np.clip(known, 0, np.float32(MAX_INVERSE_DISTANCE), out=known)
+
+    def occlusion_map(self, camera: Camera) -> OcclusionMap:
+        """What is hidden from a source, by ``occludes``; kept for the next target."""
+        if camera not in self._shadows:
+            none = np.broadcast_to(np.int32(-1), camera.size)
+            self._shadows[camera] = OcclusionMap(self.before_image(camera), none)
+        return self._shadows[camera]
+
+    def before_image(self, camera: Camera, *, widened: bool = True) -> Layer:
+        """``occlusion_depth`` at all pixels of a camera (h, w), interpolated between rays a panorama's cell apart."""
+        rays = self._located(camera)
+        before = rays.to_pixels(rays.view.occlusion_depth(rays.row, rays.column)).copy()
+        for one in self._objects_in(camera):
+            one.hide(before, widened)
+        return np.asarray(before)
+
+    def occludes(
+        self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
+    ) -> BoolArray:
+        """Whether what was measured for certain stands between ``origin`` and scene points (...,).
+
+        What is nearer by a tenth of its distance and 0.3 m, as in the evaluation's visibility; and only within
+        measured outlines: where the LiDAR is silent nothing hides.
+        """
+        return np.asarray(inverse_distance < self.occlusion_depth(origin, directions))
+
+    def occlusion_depth(self, origin: FloatArray, directions: FloatArray, *, widened: bool = True) -> FloatArray:
+        """Inverse distances (...,) beyond which ``occludes`` says that points are hidden, 1/m.
+
+        Args:
+            origin: (3,) the rays' common start.
+            directions: (..., 3) unit rays.
+            widened: Objects reach half a scan line's spacing above their highest points: they may, and a source that
+                shows them there must not be read for what is behind. Otherwise they end with their points.
+        """
+        view, row, column = self._view(origin, directions)
+        before = view.occlusion_depth(row, column).astype(np.float64)
+        for one in self._objects_on(origin, directions):
+            one.hide(before, widened)
+        return before
+
+    def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
+        """Small where a point is near, the street's elsewhere: 1/m (...,)."""
+        view, row, column = self._view(origin, directions)
+        unknown = self.street.uncertainty(origin, directions, inverse_distance)
+        return np.where(view.is_measured(row, column), _MEASURED_SPREAD * inverse_distance, unknown)
+
+    def _objects_on(self, origin: FloatArray, directions: FloatArray) -> list[_Seen]:
+        """What rays (..., 3) see of the objects."""
+        rays = directions.reshape(-1, 3)
+        met = [np.flatnonzero(meets(one.box, origin, rays)) for one in self.objects]
+        return [_Seen(ray, *one.seen(origin, rays[ray])) for one, ray in zip(self.objects, met, strict=True)]
+
+    def _objects_in(self, camera: Camera) -> list[_Seen]:
+        """What a camera's pixels see of the objects; kept for the next question."""
+        if camera not in self._seen:
+            boxes = np.array([one.box for one in self.objects]).reshape(-1, 7)
+            found = []
+            for one, pixel in zip(self.objects, silhouettes(camera, boxes), strict=True):
+                v, u = np.divmod(pixel, camera.width_px)
+                directions, _ = camera.unproject(np.stack([u, v], -1))
+                found.append(_Seen(pixel, *one.seen(camera.center_m, directions)))
+            self._seen[camera] = found
+        return self._seen[camera]
+
+    def _located(self, camera: Camera) -> _Located:
+        """Rays to interpolate a camera's pixels between; kept for the next question unless they are all pixels'."""
+        if camera in self._rays:
+            return self._rays[camera]
+        step = max(1, round(CELL_RAD * float(camera.K[0, 0])))
+        if step > 1:
+            directions, valid = _spaced_rays(camera, step)
+            # A lens may have no rays next to its image; azimuths bend near the zenith.
+            if valid.all() and float(np.abs(directions[..., 2]).max()) <= _STEEP:
+                rays = _Located(camera.size, step, directions, *self._view(camera.center_m, directions))
+                if not rays.view.window.is_whole:  # columns jump somewhere in a panorama that goes all around
+                    self._rays[camera] = rays
+                    return rays
+        directions, valid = _spaced_rays(camera, 1)
+        directions = np.where(valid[..., None], directions, camera.cam2ego[:3, 2])
+        return _Located(camera.size, 1, directions, *self._view(camera.center_m, directions))
+
+    def _view(self, origin: FloatArray, directions: FloatArray) -> tuple[Panorama, Layer, Layer]:
+        """The panorama around a centre that holds the rays, and their rows and columns in it."""
+        azimuth, elevation = angles(directions)
+        asked = (
+            PanoramaWindow.around(azimuth, elevation)
+            if directions.size
+            else PanoramaWindow(0.0, CELL_RAD, 0.0, CELL_RAD)
+        )
+        held = self._panoramas.setdefault(np.asarray(origin, np.float64).tobytes(), [])
+        view = next((p for p in held if p.window.holds(asked)), None)
+        if view is None:
+            view = panorama(asked.widened(), origin, self.points, self.street)
+            held.append(view)
+        return view, *view.window.cells(azimuth, elevation)
+
+
+class _Seen(NamedTuple):
+    """What rays see of an object: ``ScannedObject.seen`` of the rays of these numbers (n,).
+
+    Where the points around say that a ray goes on behind the object, it is the object that it meets.
+    """
+
+    ray: npt.NDArray[np.int64]
+    own: FloatArray
+    beyond: FloatArray
+
+    def fill(self, known: FloatArray | Layer) -> None:
+        """Put the object into inverse distances."""
+        flat = known.reshape(-1)
+        behind = (self.own > 0) & (flat[self.ray] < self.beyond)
+        flat[self.ray[behind]] = self.own[behind]
+
+    def hide(self, before: FloatArray | Layer, widened: bool) -> None:
+        """Put what it hides into ``occlusion_depth``."""
+        flat = before.reshape(-1)
+        beyond = self.beyond if widened else np.where(self.own > 0, self.beyond, 0)
+        flat[self.ray] = np.maximum(flat[self.ray], beyond)
+
+
+class _Located(NamedTuple):
+    """Rays of a camera about as far apart as a panorama's cells, and where they lie in one.
+
+    Attributes:
+        size: (h, w) of the image.
+        step: Their spacing in pixels; they start one step before the centre of the image's first block.
+        directions: (ny, nx, 3) unit rays in the ego frame; the optical axis where there is none.
+        view: The panorama.
+        row: (ny, nx) in it.
+        column: (ny, nx).
+    """
+
+    size: tuple[int, int]
+    step: int
+    directions: FloatArray
+    view: Panorama
+    row: Layer
+    column: Layer
+
+    def to_pixels(self, values: Layer) -> Any:
+        """Bilinear interpolation (ny, nx) to all pixels (h, w)."""
+        s, (h, w) = self.step, self.size
+        enlarged: Any = values
+        if s > 1:
+            enlarged = cv2.resize(values, None, fx=s, fy=s, interpolation=cv2.INTER_LINEAR)
+        return enlarged[s : s + h, s : s + w]
+
+
+def _spaced_rays(camera: Camera, step: int) -> Rays:
+    """Rays in the ego frame, from one step before the centre of the image's first block to one behind the last's."""
+    v, u = (step * np.arange(-1.0, -(-n // step) + 1) + (step - 1) / 2 for n in camera.size)
+    return camera.unproject(np.stack(np.meshgrid(u, v), -1))
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloudWithBoxes(BoxSurface):
+    """Labelled boxes among points made dense: a box decides within its silhouette, what was measured before it wins.
+
+    An object of few points is its box; they are left out of the panoramas, where they would blur over its outline. One
+    of many is what they say (``measured``).
+
+    Attributes:
+        street: The points' surface; ``among`` leaves out those within boxes.
+        boxes: (B, 7), as in ``BoxSurface``.
+    """
+
+    street: PointCloudSurface
+
+    @classmethod
+    def among(cls, street: StaticSurface, points: Points, boxes: FloatArray) -> PointCloudWithBoxes:
+        """Boxes (B, 7) among points (P, 3)."""
+        objects, boxes, in_box = scanned_objects(boxes, points)
+        return cls(PointCloudSurface(street, points[~in_box], objects), boxes)
+
+    def drawn(self, camera: Camera) -> Fragments:
+        """The pixels of a camera that show boxes with nothing measured before them."""
+        pixel, first, face = super().drawn(camera)
+        shown = first >= self.street.before_image(camera, widened=False).reshape(-1)[pixel]
+        return Fragments(pixel[shown], first[shown], face[shown])
+
+    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        """The first box along a ray with nothing measured before it, else the points' surface, 1/m (...,)."""
+        first = self._boxes_ahead(origin, directions)[0]
+        shown = (first > 0) & (first >= self.street.occlusion_depth(origin, directions, widened=False))
+        return np.where(shown, first, self.street.inverse_distance(origin, directions))
+
+    def occlusion_map(self, camera: Camera) -> OcclusionMap:
+        """What boxes hide from a source, and what was measured."""
+        new = camera not in self._shadows
+        shadows = super().occlusion_map(camera)
+        if new:
+            measured = self.street.before_image(camera)
+            nearer = measured > shadows.beyond
+            np.copyto(shadows.beyond, measured, where=nearer)
+            np.copyto(shadows.solid, _NO_BOX, where=nearer)
+        return shadows
+
+    def occludes(
+        self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
+    ) -> BoolArray:
+        """Whether a box, or what was measured, stands before points (...,)."""
+        by_box = super().occludes(origin, directions, inverse_distance, pixel_rad)
+        return by_box | self.street.occludes(origin, directions, inverse_distance, pixel_rad)
+
+    def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
+        """Small where a point is near, the street's elsewhere: 1/m (...,)."""
+        return self.street.uncertainty(origin, directions, inverse_distance)
+
+
+def own_car(points: Points) -> BoolArray:
+    """(P,) points within ``OWN_CAR_M``."""
+    (x0, x1), (y0, y1) = OWN_CAR_M
+    x, y = points[:, 0], points[:, 1]
+    return np.asarray((x > x0) & (x < x1) & (y > y0) & (y < y1))
+
+
+def checked_points(points: Points, key: str = "points") -> Points:
+    """(P, 3) finite points of a sample's (P, >= 3); rows that are not finite are dropped, and nothing is copied if all
+    are.
+
+    Raises:
+        SampleError: Another shape.
+    """
+    if points.size == 0:
+        return np.zeros((0, 3))
+    if points.ndim != 2 or points.shape[1] < 3:
+        raise SampleError(f"{key}: expected shape (P, >= 3), x y z in the ego frame, got {points.shape}")
+    xyz = points[:, :3]
+    finite = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
+    return xyz if finite.all() else xyz[finite]

@@ -1,0 +1,142 @@
+"""Labelled objects that were measured well enough to show their shape: their outlines, ray by ray.
+
+A box is larger than what it holds: over a bonnet, beside a head, it hides what a camera sees. Where points say what the
+object's shape is, they decide, and the label says only which points are one object's: from the road to its highest
+points nothing shines through it, however far apart the scan lines are.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.scene.boxes import beyond, is_over, points_in
+from arbiview_aug.scene.panorama import NEAREST_M, SIDE_RAD, Layer, angles, spread, wrapped
+from arbiview_aug.scene.surface import Points
+
+BOX_AIR_M = 0.2
+"""Points this far outside a box are its object's too: mirrors, and the noise of points and labels. This far over its
+floor they may be the road's."""
+
+SCANNED_POINTS = 50
+"""So many points show a shape. On synthetic streets seen from 0.7 m higher, objects of 30 to 100 points: errors of 8.6
+grey levels on 83 % of their pixels by boxes alone, 8.3 on 86 % with this limit, 8.8 on 90 % with a limit of 30."""
+
+_CELL_RAD = math.radians(0.5)
+"""Of an object's own raster: spinning LiDARs sample 0.1 to 0.4 degrees along their lines."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScannedObject:
+    """A label and the points in it.
+
+    Attributes:
+        box: (7,) as in ``Objects``.
+        points: (n, 3) over the road, ego frame, metres.
+    """
+
+    box: FloatArray
+    points: FloatArray
+    _rasters: dict[bytes, _Raster | None] = field(default_factory=dict, repr=False)
+
+    def seen(self, origin: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What rays (n, 3) that meet its box make of it.
+
+        Returns:
+            Its inverse distance where a ray passes below its highest points, and that beyond which it hides what is
+            behind it, half a scan line's spacing higher too; (n,) 1/m, 0 where the ray passes it.
+        """
+        if not len(directions):
+            return np.zeros(0), np.zeros(0)
+        key = np.asarray(origin, np.float64).tobytes()
+        if key not in self._rasters:
+            self._rasters[key] = _raster(self.box, self.points, np.asarray(origin, np.float64))
+        raster = self._rasters[key]
+        if raster is None:
+            return np.zeros(len(directions)), np.zeros(len(directions))
+        met, hides = raster.seen(directions)
+        # No point of the object lies farther along a ray than where it leaves the box with air around it.
+        widened = self.box + 2 * BOX_AIR_M * np.array([0, 0, 0, 1, 1, 1, 0])
+        return met, np.where(hides, beyond(widened, origin, directions), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Raster:
+    """An object's points as one centre sees them.
+
+    Attributes:
+        azimuth_rad: Of the first column.
+        elevation_rad: Of the first row.
+        nearest: (rows, columns) inverse distances, those between points from the nearest cell.
+        top_rad: (columns,) elevation of the highest points.
+    """
+
+    azimuth_rad: float
+    elevation_rad: float
+    nearest: Layer
+    top_rad: Layer
+
+    def seen(self, directions: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+        """Inverse distances where rays (n, 3) pass below the highest points; which pass so, or just above them."""
+        azimuth, elevation = angles(directions)
+        column = wrapped(azimuth - self.azimuth_rad) / _CELL_RAD
+        h, w = self.nearest.shape
+        # Its outline runs half a cell beyond the outermost points.
+        across = (column >= -0.5) & (column <= w - 0.5)
+        top = np.interp(column, np.arange(w), self.top_rad)
+        row = np.clip(np.round((elevation - self.elevation_rad) / _CELL_RAD), 0, h - 1).astype(np.intp)
+        own = self.nearest[row, np.clip(np.round(column), 0, w - 1).astype(np.intp)]
+        return np.where(across & (elevation <= top), own, 0.0), across & (elevation <= top + SIDE_RAD)
+
+
+def scanned_objects(
+    boxes: FloatArray, points: Points
+) -> tuple[tuple[ScannedObject, ...], FloatArray, npt.NDArray[np.bool_]]:
+    """Objects that show their shape, and those that are their boxes.
+
+    Args:
+        boxes: (B, 7) all labels.
+        points: (P, 3) all that was measured.
+
+    Returns:
+        The objects of enough points, the boxes of the others, and which points (P,) lie in the latter.
+    """
+    objects, is_box, in_box = [], np.ones(len(boxes), bool), np.zeros(len(points), bool)
+    for row, (box, number) in enumerate(zip(boxes, points_in(boxes, points, BOX_AIR_M), strict=True)):
+        own = points[number]
+        own = own[own[:, 2] > box[2] - box[5] / 2 + BOX_AIR_M]
+        if len(own) >= SCANNED_POINTS:
+            objects.append(ScannedObject(box, np.asarray(own, np.float64)))
+            is_box[row] = False
+        else:
+            in_box[number] = True
+    return tuple(objects), boxes[is_box], in_box
+
+
+def _raster(box: FloatArray, points: FloatArray, origin: FloatArray) -> _Raster | None:
+    """None where the centre is over the object or in it, or all but touches its points: it has no outline there."""
+    if is_over(box, origin, BOX_AIR_M):
+        return None
+    away = points - origin
+    length = np.linalg.norm(away, axis=1)
+    away, length = away[length >= NEAREST_M], length[length >= NEAREST_M]
+    if not len(away):
+        return None
+    azimuth, elevation = angles(away / length[:, None])
+    # Less than half a turn, about the azimuth of its middle: the footprint is convex, and the centre beside it.
+    middle = math.atan2(box[1] - origin[1], box[0] - origin[0])
+    offset = wrapped(azimuth - middle)
+    left, low = float(offset.min()), float(elevation.min())
+    column, row = (np.round(a / _CELL_RAD).astype(np.intp) for a in (offset - left, elevation - low))
+    nearest = np.zeros((int(row.max()) + 1, int(column.max()) + 1), np.float32)
+    np.maximum.at(nearest, (row, column), 1 / length)
+    top = np.full(nearest.shape[1], -np.inf)
+    np.maximum.at(top, column, elevation)
+    there = np.flatnonzero(np.isfinite(top))
+    top = np.interp(np.arange(len(top)), there, top[there])
+    _, (nearest,) = spread(nearest > 0, nearest)
+    return _Raster(middle + left, low, nearest, top.astype(np.float32))

@@ -1,0 +1,161 @@
+"""A render plan, or a rendering by ``quality="paper"``, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.favs.renderer import PaperRendering, SourceReport
+from arbiview_aug.render.harmonise import PhotometricReport
+from arbiview_aug.render.overlap_depth import OverlapDepth
+from arbiview_aug.render.plan import RenderPlan
+from arbiview_aug.render.requirements import harm_remedies
+from arbiview_aug.render.view_plan import SourceUse
+from arbiview_aug.temporal.fill import Fills
+from arbiview_aug.temporal.motion_depth import MotionDepth
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Why a plan is what it is; ``str`` prints it, ``as_dict`` gives plain data.
+
+    Attributes:
+        plan: The plan.
+        harmonisation: The sources' gains and why, where harmonisation was asked for.
+        depth: What became of each pair of neighbours, where depth from overlap was asked for and matters.
+        motion: What motion said of the distances, where it was asked.
+        fills: What other frames of the drive show of the holes, where the sample has any.
+        harm: How a detector suffers from the surface, where that is static and cameras move.
+    """
+
+    plan: RenderPlan
+    harmonisation: PhotometricReport | None = None
+    depth: OverlapDepth | None = None
+    motion: MotionDepth | None = None
+    fills: Fills | None = None
+    harm: str | None = None
+
+    def as_dict(self) -> list[dict[str, Any]]:
+        """One entry for each target camera: coverage, share to invent, and its sources with surface and reason.
+
+        With other frames of the drive also ``filled``: the share that they show besides, no more than which is filled.
+        """
+        shares = [0.0] * len(self.plan.targets) if self.fills is None else self.fills.shares(self.plan)
+        entries = []
+        for camera, target, share in zip(self.plan.target, self.plan.targets, shares, strict=True):
+            entry = _entry(camera, target.coverage, [self._source(pair) for pair in target.pairs])
+            entries.append(entry if self.fills is None else entry | {"filled": share})
+        return entries
+
+    def _source(self, pair: SourceUse) -> dict[str, Any]:
+        return {
+            "camera": self.plan.source[pair.source].name,
+            "share": pair.share,
+            "surface": pair.surface,
+            "reason": pair.reason,
+            "baseline_m": pair.baseline_m,
+            "parallax_px": pair.parallax_px,
+            "halved": pair.level,
+        }
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.plan.source.name or 'source'} -> {self.plan.target.name or 'target'}: "
+            f"{len(self.plan.source)} cameras to {len(self.plan.target)}"
+        ]
+        if self.harmonisation is not None:
+            lines.append(f"  {self.harmonisation}")
+        if self.harm is not None:
+            lines += [f"  {self.harm}", f"  better: {harm_remedies(self.plan.source, self.plan.target)}"]
+        if self.depth is not None:
+            lines.extend(f"  {line}" for line in str(self.depth).splitlines())
+        if self.motion is not None:
+            lines.append(f"  {self.motion}")
+        if self.fills is not None:
+            lines.extend(f"  {line}" for line in self.fills.lines(self.plan))
+        return "\n".join([*lines, *_lines(self.as_dict(), _source_line)])
+
+    __repr__ = __str__
+
+
+@dataclass(frozen=True)
+class PaperExplanation:
+    """What the published stages did to a frame; ``str`` prints it, ``as_dict`` gives plain data.
+
+    Attributes:
+        rendering: The frame.
+    """
+
+    rendering: PaperRendering
+
+    def as_dict(self) -> list[dict[str, Any]]:
+        """One entry for each target camera: coverage, share to invent, and what each stage made of its sources."""
+        return [
+            _entry(camera, view.coverage, [self._source(report, camera.center_m) for report in view.reports])
+            for camera, view in zip(self.rendering.target, self.rendering.targets, strict=True)
+        ]
+
+    def _source(self, report: SourceReport, center_m: FloatArray) -> dict[str, Any]:
+        camera = self.rendering.source[report.source]
+        return {
+            "camera": camera.name,
+            "share": report.share,
+            "surface": "far",
+            "primary": report.primary,
+            "baseline_m": float(np.linalg.norm(camera.center_m - center_m)),
+            "matches": report.features.good_matches,
+            "inliers": report.features.inliers,
+            "consistency_px": report.features.consistency_px,
+            "alpha": report.features.alpha,
+            "features": report.features.reason,
+            "shift_px": report.objects.shift_px.tolist(),
+            "objects": report.objects.reason,
+        }
+
+    def __str__(self) -> str:
+        rendering = self.rendering
+        lines = [
+            f"{rendering.source.name or 'source'} -> {rendering.target.name or 'target'}: {len(rendering.source)} "
+            f"cameras to {len(rendering.target)}, stages 1 to 4 as published, far surface"
+        ]
+        return "\n".join([*lines, *_lines(self.as_dict(), _stages)])
+
+    __repr__ = __str__
+
+
+def _entry(camera: Camera, coverage: BoolArray, sources: list[dict[str, Any]]) -> dict[str, Any]:
+    covered = float(coverage.mean())
+    return {"camera": camera.name, "coverage": covered, "to_invent": 1 - covered, "sources": sources}
+
+
+def _lines(entries: list[dict[str, Any]], words: Callable[[dict[str, Any]], str]) -> Iterator[str]:
+    for entry in entries:
+        to_invent = entry["to_invent"]
+        note = f", {to_invent:.1%} that no camera saw: masked, or for a generator to invent" if to_invent else ""
+        if entry.get("filled"):
+            note = f", up to {entry['filled']:.1%} more by other frames of the drive{note}"
+        yield f"  {entry['camera']}: {entry['coverage']:.1%} covered{note}"
+        if not entry["sources"]:
+            yield "    no source camera looks there"
+        for source in entry["sources"]:
+            yield f"    {source['share']:6.1%} from {source['camera']}{words(source)}"
+
+
+def _stages(source: dict[str, Any]) -> str:
+    if source["primary"]:
+        return ": the primary camera, the reference of the others"
+    return f": features: {source['features']}; objects: {source['objects']}"
+
+
+def _source_line(source: dict[str, Any]) -> str:
+    why = [source["reason"]]
+    if source["parallax_px"]:
+        why.append(f"about {source['parallax_px']:.1f} px of parallax where depth is unknown")
+    if source["halved"]:
+        why.append(f"read at 1/{2 ** source['halved']} size")
+    return f" over the {source['surface']} surface ({', '.join(why)})"

@@ -1,0 +1,200 @@
+"""``ResizeRig`` and ``CropRig``: samples in other sizes, with the calibration that then belongs to them.
+
+A resize or crop that does not know of cameras (torchvision's, kornia's) leaves ``K`` as it was: every projection is
+wrong from then on, and nothing fails. These move pixels, ``K``, masks and label maps together, under the one pixel
+convention of ``Camera.resize`` and ``Camera.crop``: outer edges stay on outer edges. Lenses are described in normalised
+coordinates and stay as they are.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from arbiview_aug.cameras.camera import Camera, resize_matrix
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.errors import SampleError, WarnOnce
+from arbiview_aug.image_ops import nearest_resized, resized
+from arbiview_aug.sample.batching import is_readable, like, rewrapped
+from arbiview_aug.sample.check import PIXEL_BOUND_KEYS, check_other_keys
+from arbiview_aug.sample.inputs import MOTION_KEY, numbers, read_frames
+
+_MAPS = (
+    "coverage",
+    "ignore",
+    "source_camera",
+    "source_frame",
+    "confidence",
+    "generated",
+    "depth",
+    "depth_m",
+)
+"""Keys known to hold maps (..., N, H, W) over the images' pixels: read at the nearest pixel."""
+
+
+class _PixelTransform(torch.nn.Module, ABC):
+    """What resizing and cropping share: which entries of a sample follow the pixels, and which cannot."""
+
+    def __init__(self, label_keys: Sequence[str], pass_keys: Sequence[str]) -> None:
+        super().__init__()
+        self.label_keys, self.pass_keys = tuple(label_keys), tuple(pass_keys)
+        self._warn = WarnOnce()
+
+    def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
+        """The sample in its other size.
+
+        Args:
+            sample: As ``RigRetarget`` takes or gives it, batched or not; it is not changed.
+
+        Returns:
+            A new dict. 2D boxes and the like (``project_boxes_3d`` makes them anew), and other frames of the drive, are
+            dropped with a warning.
+
+        Raises:
+            SampleError: As ``RigRetarget`` raises; ``CropRig``: a window that leaves an image.
+        """
+        images = sample.get("images")
+        sizes = [tuple(image.shape[-2:]) for image in read_frames(sample, None)[0].images]
+        labels = check_other_keys(sample, sizes, self.label_keys, self.pass_keys)
+        out = dict(sample)
+        for key in (*PIXEL_BOUND_KEYS, MOTION_KEY, "neighbours"):
+            if key in out and key not in (*_MAPS, *labels, *self.pass_keys):
+                del out[key]
+                self._warn(key, f"{type(self).__name__} drops {key}: it speaks of pixels that have moved")
+        out["images"] = rewrapped(_each(images, self._image, 3), images)
+        for key in {*_MAPS, *labels} & out.keys() - {*self.pass_keys}:
+            out[key] = rewrapped(_each(_checked_maps(key, out[key]), self._map, 2), out[key])
+        if isinstance(sample.get("rig"), Rig):
+            out["rig"] = sample["rig"].with_cameras([self._camera(camera) for camera in sample["rig"]])
+        if sample.get("K") is not None:
+            K = np.stack([self._matrix(*size) for size in sizes]) @ numbers("K", sample["K"])
+            out["K"] = like(torch.from_numpy(K), sample["K"])
+        return out
+
+    @abstractmethod
+    def _image(self, image: torch.Tensor) -> torch.Tensor:
+        """A (3, H, W) image."""
+
+    @abstractmethod
+    def _map(self, label: torch.Tensor) -> torch.Tensor:
+        """A (H, W) map."""
+
+    @abstractmethod
+    def _camera(self, camera: Camera) -> Camera:
+        """The camera of the changed image."""
+
+    @abstractmethod
+    def _matrix(self, h: int, w: int) -> FloatArray:
+        """(3, 3) pixel of an (h, w) image to pixel of the changed image."""
+
+
+class ResizeRig(_PixelTransform):
+    """Resizes all images of a sample, antialiased, and K, rig, masks and label maps with them.
+
+    Args:
+        size: (h, w) of every output image.
+        label_keys: Keys that hold label maps (..., N, H, W), besides ``tv_tensors.Mask``.
+        pass_keys: Keys to keep although they look bound to pixels.
+    """
+
+    def __init__(self, size: tuple[int, int], *, label_keys: Sequence[str] = (), pass_keys: Sequence[str] = ()) -> None:
+        super().__init__(label_keys, pass_keys)
+        self.size = _checked_pair("size", size, 1)
+
+    def extra_repr(self) -> str:
+        """Settings, for ``repr``."""
+        return f"size={self.size}"
+
+    def _image(self, image: torch.Tensor) -> torch.Tensor:
+        return resized(image, self.size)
+
+    def _map(self, label: torch.Tensor) -> torch.Tensor:
+        return nearest_resized(label, self.size)
+
+    def _camera(self, camera: Camera) -> Camera:
+        return camera.resize(self.size)
+
+    def _matrix(self, h: int, w: int) -> FloatArray:
+        return resize_matrix((h, w), self.size)
+
+
+class CropRig(_PixelTransform):
+    """Cuts one window out of all images of a sample, and out of K, rig, masks and label maps with them.
+
+    Args:
+        top: First row.
+        left: First column.
+        size: (h, w) of the window, which must lie within every image.
+        label_keys: Keys that hold label maps (..., N, H, W), besides ``tv_tensors.Mask``.
+        pass_keys: Keys to keep although they look bound to pixels.
+    """
+
+    def __init__(
+        self,
+        top: int,
+        left: int,
+        size: tuple[int, int],
+        *,
+        label_keys: Sequence[str] = (),
+        pass_keys: Sequence[str] = (),
+    ) -> None:
+        super().__init__(label_keys, pass_keys)
+        self.top, self.left = _checked_pair("top, left", (top, left), 0)
+        self.size = _checked_pair("size", size, 1)
+
+    def extra_repr(self) -> str:
+        """Settings, for ``repr``."""
+        return f"top={self.top}, left={self.left}, size={self.size}"
+
+    def _window(self, image: torch.Tensor) -> torch.Tensor:
+        (h, w), (to_h, to_w) = image.shape[-2:], self.size
+        if self.top + to_h > h or self.left + to_w > w:
+            raise SampleError(
+                f"CropRig: expected a window within the image of (h, w) = {(h, w)}, got rows {self.top} to "
+                f"{self.top + to_h}, columns {self.left} to {self.left + to_w}"
+            )
+        return image[..., self.top : self.top + to_h, self.left : self.left + to_w]
+
+    def _image(self, image: torch.Tensor) -> torch.Tensor:
+        return self._window(image)
+
+    def _map(self, label: torch.Tensor) -> torch.Tensor:
+        return self._window(label)
+
+    def _camera(self, camera: Camera) -> Camera:
+        return camera.crop(self.top, self.left, self.size)
+
+    def _matrix(self, h: int, w: int) -> FloatArray:
+        return np.array([[1.0, 0.0, -self.left], [0.0, 1.0, -self.top], [0.0, 0.0, 1.0]])
+
+
+def _each(value: Any, change: Callable[[torch.Tensor], torch.Tensor], dims: int) -> torch.Tensor:
+    """The images (dims dimensions) of a (..., N, *image) tensor, or of a list of (..., *image) ones, changed."""
+    if isinstance(value, list | tuple):
+        changed = [_each(v, change, dims) for v in value]
+        return torch.stack(changed, dim=changed[0].ndim - dims)
+    plain = value.as_subclass(torch.Tensor)
+    lead = plain.shape[: plain.ndim - dims]
+    parts = [change(image) for image in plain.reshape(-1, *plain.shape[plain.ndim - dims :])]
+    return torch.stack(parts).reshape(*lead, *parts[0].shape)
+
+
+def _checked_maps(key: str, value: Any) -> Any:
+    if not all(map(is_readable, value if isinstance(value, list | tuple) else [value])):
+        raise SampleError(f"{key}: expected maps over the images' pixels as tensors, got {type(value).__name__}")
+    return value
+
+
+def _checked_pair(name: str, value: Any, least: int) -> tuple[int, int]:
+    try:
+        one, two = (int(n) if n == int(n) else -1 for n in value)
+    except (TypeError, ValueError, OverflowError):
+        one = two = -1
+    if min(one, two) < least:
+        raise ValueError(f"{name}: expected two whole numbers of pixels from {least}, got {value!r}")
+    return one, two

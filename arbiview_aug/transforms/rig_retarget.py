@@ -1,0 +1,480 @@
+"""``RigRetarget``: samples of one vehicle in, samples as another vehicle's cameras would have seen them out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import cv2
+import torch
+
+from arbiview_aug.cameras.framing import Fit, Framing, framing
+from arbiview_aug.cameras.key_names import hint
+from arbiview_aug.cameras.random_rig import RandomRig
+from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.environment import warn_about_cv2_wheels
+from arbiview_aug.errors import SampleError, WarnOnce
+from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
+from arbiview_aug.favs.renderer import PaperRendering, check_pinhole
+from arbiview_aug.generator import Generator
+from arbiview_aug.generator.batches import SOURCES_KEY, complete_frame, frame_names
+from arbiview_aug.generator.fillers import Holes, fill_holes
+from arbiview_aug.image_ops import resized
+from arbiview_aug.render.harmonise import Harmonise, Harmoniser, PhotometricReport
+from arbiview_aug.render.labels import target_labels, warn_of_misnamed
+from arbiview_aug.render.plan import PlanCache, RenderPlan
+from arbiview_aug.render.refinement import RefinementCache
+from arbiview_aug.render.requirements import needs_geometry
+from arbiview_aug.sample.batching import barred, framed, gathered, leading_shape, lens_names, like, rewrapped, stacked
+from arbiview_aug.sample.check import PIXEL_BOUND_KEYS, check_other_keys
+from arbiview_aug.sample.inputs import CALIBRATION_KEYS, Frame, read_frames
+from arbiview_aug.scene.scene import Scene
+from arbiview_aug.scene.surface import SurfaceName
+from arbiview_aug.temporal.fill import Reach
+from arbiview_aug.transforms.explain import Explanation, PaperExplanation
+from arbiview_aug.transforms.outputs import (
+    calibration_entries,
+    move_to_target,
+    seen_entries,
+    source_sample,
+    untouched_entries,
+)
+from arbiview_aug.transforms.planner import Execution, FramePlanner
+from arbiview_aug.transforms.settings import (
+    OUTPUTS,
+    RenderPath,
+    checked_names,
+    checked_params,
+    checked_size,
+    completion_of,
+    is_number,
+    one_of,
+)
+
+Made = RenderPlan | PaperRendering | list[Framing]
+"""What a frame's views are made by: a plan, the published stages; or each camera's image is only brought to size."""
+
+_MIXED_P = 0.5
+"""With half of the samples untouched or more, views over a static street do not harm a detector
+(``integrations/cross_rig``). Other shares have not been measured."""
+
+
+class RigRetarget(torch.nn.Module):
+    """Re-renders a sample's cameras as a target rig's, and keeps everything that depends on them consistent.
+
+    A sample is a dict with ``images``, (..., N, 3, H, W) or a list of (..., 3, Hi, Wi), uint8 or float in [0, 1]; and
+    its calibration: ``rig`` (wins, carries lenses, masks, names and the road's height), else ``source_rig=``, else
+    ``K`` (..., N, 3, 3) and ``cam2ego`` (..., N, 4, 4), with ``lens``, ``distortion`` and ``ground_z_m`` where present.
+    ``coverage`` and ``ignore`` of an earlier retargeting mask its images.
+
+    The output holds the same keys, except ``rig``, with ``images`` (..., M, 3, h, w) of the input's dtype (a list where
+    target sizes differ), ``K`` and ``cam2ego`` of the target cameras (in the source's ego frame, both roads
+    coinciding), ``ground_z_m`` of that frame, and ``coverage`` (..., M, h, w) bool, True where some source saw the
+    pixel. ``distortion`` (..., M, 8) and ``lens`` come with targets that have lenses; ``ignore`` (..., M, h, w) bool,
+    True on the target's own car body, where its cameras have masks; ``retarget_params``, plain numbers, where anything
+    was drawn. A batch shares one draw.
+
+    Label maps are rendered by the winning source's nearest label. ``points`` and ``boxes_3d`` are in the ego frame and
+    stay. Keys that are known to speak of pixels (``arbiview_aug.sample.check.PIXEL_BOUND_KEYS``) are dropped; unknown
+    ones pass as the same objects, except maps of the images' height and width, which raise unless named.
+
+    Args:
+        target_rig: A ``Rig``, the name of a shipped one, a rig file, or a ``RandomRig``.
+        source_rig: The rig of every sample that carries none.
+        path: ``favs``: stitching, with what no source sees as ``holes`` says. ``inpaint``: that is filled by Telea's
+            inpainting at full size. ``diffusion``: by a generator (``arbiview_aug.generator``); targets that are whole
+            never ask it.
+        holes: What pixels become that no source sees, after ``neighbours`` filled theirs. ``fill``: those that lie in
+            some source's image, where an object or the source's own car hides them, are continued from their borders,
+            and so are those outside all images up to an eighth of the view's shorter side; farther outside they become
+            the mean colour of what the frame's views show. ``mean``: all become that colour. ``black``: they stay
+            black. But for ``black``, and with the other paths, the output has ``generated`` (..., M, h, w) bool, True
+            where a pixel was made up. ``coverage`` is False there, ``confidence`` 0, ``source_camera`` -1 and labels
+            ``label_fill``; what sources see stays as it is, bit for bit. Other paths replace it: leave it at ``fill``.
+        generator: For ``diffusion``: ``Generator.from_pretrained(DIR)``; None loads the weights that ship with the
+            package, trained on synthetic streets alone. On a GPU it needs ``num_workers=0``, or
+            ``generator.complete_batch`` after collating.
+        steps: Of the generator: 1 (regression), 4, 10, 50; its own number where None.
+        guidance: Classifier-free guidance; the generator's own where None, 1 is none.
+        min_confidence: τ: pixels that are seen with less confidence are made up as well.
+        seed: Of what is made up, beside the frame (its ``token``, else its images) and the camera.
+        quality: ``draft``, ``fast``, ``accurate``, or a ``FavsConfig``; ``paper`` or a ``PaperConfig``: stages 1 to 4
+            as published, on the CPU, for pinhole cameras. Its objects take their types from the sample, where it has
+            ``detections`` (for each camera ``{"boxes": (n, 4), "labels": [n names]}`` in source pixels, as
+            torchvision's detectors return them) or else ``boxes_3d``, with ``box_names`` (a name each) where there are
+            any.
+        surface: ``far``, ``ground``, ``street``; ``objects``: the sample's ``boxes_3d`` stand on the street, so that
+            objects keep their height when cameras move; ``lidar``: its ``points`` (ego frame) or ``depth_m`` (..., N,
+            H, W; z-depth in metres, 0 or NaN where unknown), with ``boxes_3d`` for objects of few points; ``motion``:
+            what its ``neighbours`` show of distances (``arbiview_aug.motion``; seconds a frame), or ``motion_depth_m``
+            of the ``depth`` command, with its ``boxes_3d``; the street where that is declined, with a warning;
+            ``auto``: for each pair of cameras ``far`` where their centres coincide, else the best that the sample
+            offers: ``lidar``, else ``objects``, else ``street`` (``paper``: always ``far``). Cameras that move over
+            the street alone harm a detector: a warning says so, once, unless ``p`` mixes half untouched samples in.
+            Plans over points and boxes are made anew for every frame.
+        strict: Raise SampleError instead of that warning.
+        harmonise: Bring the sources to one exposure (``arbiview_aug.render.harmonise``): True or a ``HarmoniseConfig``
+            estimates a gain for each camera in every frame; numbers are gains to use as they are. Off by default.
+            Samples that ``p`` skips keep their colours.
+        refinement: For ``quality="accurate"``, whose depth from overlap depends on the images: None computes it, and
+            plans anew, for every frame; a ``RefinementCache`` reuses both where its key says that the scene is the
+            same.
+        neighbours: What other frames of the drive may fill, where the sample has ``neighbours`` (their format:
+            ``arbiview_aug.sample.neighbours``): ``ground``, the road near the cameras that no source sees now; ``all``,
+            whatever the surface says; None does not read them. Never what the current frame sees. ``paper`` has none.
+        size: (h, w) of every output image; the target cameras are brought to it by ``fit``, and ``K`` says so.
+        fit: ``crop``: the aspect is kept, what then exceeds the size is cut at the top and at both sides. ``pad``: the
+            aspect is kept, black bars above and at both sides fill the size; there ``coverage`` is False, ``ignore``
+            True, label maps hold ``label_fill``, and nothing is filled in. ``stretch``: the aspect is not kept.
+        p: Probability of retargeting. A skipped sample keeps its own cameras, brought to ``size`` by ``fit``, with full
+            coverage; so ``p < 1`` needs ``size`` and equal camera counts; where these differ, mix by
+            ``arbiview_aug.MixedDataset``. The output then always has ``lens``, ``distortion`` and ``ignore``, whichever
+            rig they come from: batches collate.
+        rng: A generator for the draws instead of torch's global one; only outside DataLoader workers.
+        label_frame: ``source``: output poses, points and boxes are in the source's ego frame. ``target``: they (and
+            ``ego2world``) are moved into the target's, and ``ego2ego`` (..., 4, 4) is returned.
+        label_keys: Keys that hold label maps (..., N, H, W) or lists of them, besides ``tv_tensors.Mask``.
+        label_fill: Value of label pixels that no source sees now (False for bool maps); images of neighbouring frames
+            and of generators bring no labels.
+        pass_keys: Keys to keep although they look bound to the source's pixels.
+        outputs: Further outputs: ``source_camera`` (..., M, h, w) int8, -1 where uncovered; ``source_frame`` (..., M,
+            h, w) int8, 0 for the current frame, n + 1 for number n of the neighbours, -1 where uncovered;
+            ``confidence`` (..., M, h, w) float32 in [0, 1], exp(-e / 10) for an expected error of e grey levels of
+            255: 1 where the source is exact, 0 where uncovered (``arbiview_aug.render.confidence``; not with
+            ``paper``); ``sources``, what the frame was rendered from, as a sample, for ``Generator.complete_batch``.
+        execution: ``opencv`` (CPU), ``torch`` (any device, differentiable); ``auto`` takes OpenCV for CPU images that
+            need no gradient.
+        cache_bytes: Memory for plans; the least recently used go first.
+
+    Raises:
+        ValueError: Impossible settings.
+        CalibrationError: A target rig that cannot be loaded.
+    """
+
+    def __init__(
+        self,
+        target_rig: Rig | RandomRig | str | Path,
+        *,
+        source_rig: Rig | str | Path | None = None,
+        path: RenderPath = "favs",
+        holes: Holes = "fill",
+        generator: Generator | None = None,
+        steps: int | None = None,
+        guidance: float | None = None,
+        min_confidence: float = 0.0,
+        seed: int = 0,
+        quality: Quality | FavsConfig | PaperConfig = "fast",
+        surface: SurfaceName = "auto",
+        strict: bool = False,
+        harmonise: Harmonise = None,
+        refinement: RefinementCache | None = None,
+        neighbours: Reach | None = "ground",
+        size: tuple[int, int] | None = None,
+        fit: Fit = "crop",
+        p: float = 1.0,
+        rng: torch.Generator | None = None,
+        label_frame: Literal["source", "target"] = "source",
+        label_keys: Sequence[str] = (),
+        label_fill: float = 255,
+        pass_keys: Sequence[str] = (),
+        outputs: Sequence[str] = (),
+        execution: Execution = "auto",
+        cache_bytes: int = 512 * 2**20,
+    ) -> None:
+        super().__init__()
+        warn_about_cv2_wheels()
+        one_of("path", path, get_args(RenderPath))
+        one_of("holes", holes, get_args(Holes))
+        if path != "favs" and holes != "fill":
+            raise ValueError(f"holes: path={path!r} fills them itself: expected 'fill', the default, got {holes!r}")
+        one_of("surface", surface, get_args(SurfaceName))
+        one_of("fit", fit, get_args(Fit))
+        one_of("label_frame", label_frame, ("source", "target"))
+        one_of("execution", execution, get_args(Execution))
+        if neighbours is not None:
+            one_of("neighbours", neighbours, get_args(Reach))
+        for name in checked_names("outputs", outputs):
+            one_of("outputs", name, OUTPUTS)
+        if not isinstance(strict, bool):
+            raise ValueError(f"strict: expected True or False, got {strict!r}")
+        if not is_number(p) or not 0 <= p <= 1:
+            raise ValueError(f"p: expected a probability from 0 to 1, got {p!r}")
+        if p < 1 and size is None:
+            raise ValueError("p < 1: expected size=(h, w), so that skipped samples collate with retargeted ones")
+        if not is_number(label_fill):
+            raise ValueError(f"label_fill: expected a number, got {label_fill!r}")
+        if not is_number(cache_bytes) or not cache_bytes >= 0:
+            raise ValueError(f"cache_bytes: expected a number of bytes from 0, got {cache_bytes!r}")
+        if rng is not None and not isinstance(rng, torch.Generator):
+            raise ValueError(f"rng: expected a torch.Generator or None, got {type(rng).__name__}")
+        if refinement is not None and not isinstance(refinement, RefinementCache):
+            raise ValueError(f"refinement: expected a RefinementCache or None, got {type(refinement).__name__}")
+        self.target: Rig | RandomRig
+        if isinstance(target_rig, Rig | RandomRig):
+            self.target = target_rig
+        else:
+            self.target = load_rig(target_rig)
+        self.source_rig = source_rig if isinstance(source_rig, Rig) or source_rig is None else load_rig(source_rig)
+        self.config = favs_config(quality)
+        self._trusts = False
+        if isinstance(self.config, PaperConfig):
+            check_pinhole(self.target if isinstance(self.target, Rig) else self.target.base)
+            if "confidence" in outputs:
+                raise ValueError("outputs: quality='paper' has no 'confidence': it moves pixels by what it matches")
+            if min_confidence:
+                raise ValueError("min_confidence: quality='paper' has no confidence, expected 0")
+        elif "confidence" in outputs or min_confidence or path == "diffusion":  # the generator is told of it
+            self._trusts, self.config = True, replace(self.config, certainty=True)
+        self.path, self.holes, self.p, self.rng = path, holes, float(p), rng
+        self.completion = completion_of(path, generator, steps, guidance, min_confidence, seed)
+        self.generator = None if self.completion is None else self.completion.generator  # moves with this module
+        self.size, self.fit = None if size is None else checked_size(size), fit
+        self.label_frame, self.label_fill = label_frame, label_fill
+        self.label_keys = checked_names("label_keys", label_keys)
+        self.pass_keys, self.outputs = checked_names("pass_keys", pass_keys), tuple(outputs)
+        self._warn = WarnOnce()
+        # Rigs drawn for each sample never come back: only the last plan is kept.
+        once = isinstance(self.target, RandomRig) and self.target.per == "sample"
+        self.stitcher = FramePlanner(
+            self.config,
+            surface,
+            Harmoniser(harmonise),
+            refinement,
+            execution,
+            cache_bytes=0 if once else cache_bytes,
+            reach=neighbours,
+            mixed=p <= _MIXED_P,
+            strict=strict,
+            warn=self._warn,
+        )
+        self._fixed_target = self._sized(self.target) if isinstance(self.target, Rig) else None
+        base = self.target.base if isinstance(self.target, RandomRig) else self.target
+        base = base if self.size is None else base.resized(self.size, fit)
+        # Which keys there are depends on the settings alone.
+        self._lenses = p < 1 or any(camera.lens != "pinhole" for camera in base)
+        self._masks = p < 1 or any(camera.mask is not None for camera in base)
+        self._limited_process: int | None = None
+
+    def extra_repr(self) -> str:
+        """Target and settings, for ``repr``."""
+        target = self.target if isinstance(self.target, RandomRig) else (self.target.name or "unnamed rig")
+        how = self.stitcher
+        settings = (
+            f"path={self.path}, holes={self.holes}, surface={how.surface}, harmonise={how.harmoniser}, "
+            f"size={self.size}, fit={self.fit}, p={self.p:g}"
+        )
+        held = "" if how.refinement is None else f"refinement={how.refinement!r}, "
+        return f"target={target}, {settings}, {held}{self.config}"
+
+    # --- the transform --------------------------------------------------------------------------------------------
+    def forward(self, sample: Mapping[str, Any], params: Mapping[str, float] | None = None) -> dict[str, Any]:
+        """Retarget one sample, or a batch with leading dimensions.
+
+        Args:
+            sample: The sample dict; it is not changed.
+            params: ``retarget_params`` of an earlier output, to replay its draw.
+
+        Returns:
+            A new dict.
+        """
+        self._limit_threads()
+        frames = read_frames(sample, self.source_rig)
+        lead = leading_shape(sample["images"])
+        sizes = {tuple(image.shape[-2:]) for frame in frames for image in frame.images}
+        calibrated = sample.get("rig") is not None or self.source_rig is not None
+        static = self.stitcher.surface in ("far", "ground", "street") and self.label_frame == "source"
+        warn_of_misnamed(sample, calibrated, static, (*self.label_keys, *self.pass_keys), self._warn)
+        labels = check_other_keys(sample, list(sizes), self.label_keys, self.pass_keys)
+        target, skip, drawn = self._draw(sample, frames, params)
+        parts, made = self._parts(sample, frames, lead, target, skip)
+        out = self._kept(sample, labels)
+        out["images"] = rewrapped(gathered([part["images"] for part in parts], lead), sample["images"])
+        for key in ("K", "cam2ego"):
+            out[key] = like(gathered([part[key] for part in parts], lead), sample.get(key))
+        beside = out["K"].device if isinstance(out["K"], torch.Tensor) else None
+        grounds = [part["ground_z_m"] for part in parts]
+        if lead:
+            out["ground_z_m"] = torch.tensor(grounds, dtype=torch.float64, device=beside).reshape(lead)
+        else:
+            out["ground_z_m"] = grounds[0]
+        for key in ("coverage", "ignore", "distortion", "generated", *self.outputs):
+            if key in parts[0]:
+                out[key] = gathered([part[key] for part in parts], lead)
+        if "distortion" in out:
+            out["distortion"] = out["distortion"].to(beside or "cpu")
+        if SOURCES_KEY in self.outputs:
+            out[SOURCES_KEY] = source_sample(sample["images"], frames, lead)
+        if "lens" in parts[0]:
+            out["lens"] = lens_names([part["lens"] for part in parts], lead)
+        for key in labels:
+            out[key] = target_labels(key, sample[key], frames, lead, made, self.label_fill, self.size)
+        if drawn:
+            out["retarget_params"] = drawn
+        if self.label_frame == "target":
+            moves = [torch.from_numpy(frame.rig.ego2ego(target)) for frame in frames]
+            move_to_target(out, gathered(moves, lead), lead)
+            out["ground_z_m"] = torch.full_like(out["ground_z_m"], target.ground_z_m) if lead else target.ground_z_m
+        return out
+
+    def _draw(
+        self, sample: Mapping[str, Any], frames: Sequence[Frame], params: Mapping[str, float] | None
+    ) -> tuple[Rig, bool, dict[str, float]]:
+        """All randomness of a call: the target rig, whether to skip, and the parameters that say so."""
+        if self.rng is not None and torch.utils.data.get_worker_info() is not None:
+            raise SampleError("rng: a generator repeats itself in every DataLoader worker; leave rng=None there")
+        given = None if params is None else checked_params(params)
+        drawn: dict[str, float] = {}
+        if self.p < 1:
+            if given is None:
+                drawn["skipped"] = float(torch.rand((), generator=self.rng).item() >= self.p)
+            else:
+                drawn["skipped"] = given.pop("skipped", 0.0)
+        if isinstance(self.target, RandomRig):
+            rig_params = self.target.draw_for(sample, self.rng) if given is None else given
+            target = self._sized(self.target.rig(rig_params))
+            drawn.update(rig_params)
+        else:
+            assert self._fixed_target is not None
+            target = self._fixed_target
+            if given:
+                raise SampleError(f"params: expected none for a fixed target rig, got {', '.join(given)}")
+        counts = {len(frame.rig) for frame in frames} - {len(target)}
+        if self.p < 1 and counts:
+            raise SampleError(
+                f"p < 1: expected the target to have the source's {counts.pop()} cameras, got {len(target)}; "
+                "batches could not be collated; mix on the level of the data set (arbiview_aug.MixedDataset)"
+            )
+        return target, bool(drawn.get("skipped")), drawn
+
+    def _sized(self, target: Rig) -> Rig:
+        """The cameras that are rendered: at ``size``, without its bars."""
+        if self.size is None or self.fit != "pad":
+            return target if self.size is None else target.resized(self.size, self.fit)
+        return target.with_cameras([c.resize(framing(c.name, c.size, self.size, "pad").scaled) for c in target])
+
+    def _kept(self, sample: Mapping[str, Any], labels: Sequence[str]) -> dict[str, Any]:
+        """The entries that go with any images, as the same objects."""
+        kept = (*labels, *self.pass_keys)
+        stale = [key for key in sample if key in PIXEL_BOUND_KEYS and key not in kept]
+        # What an earlier retargeting made up its coverage masks already.
+        dropped = [key for key in stale if key not in self.outputs and key != "generated"]
+        if dropped:
+            meant = "" if "depth_m" in sample else hint(dropped, ("depth_m",))
+            words = f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels{meant}"
+            self._warn(f"dropped {dropped}", words)
+        rendered = ("images", "K", "cam2ego")  # their places in the dict are kept
+        return {k: v for k, v in sample.items() if k in rendered or k not in (*CALIBRATION_KEYS, *stale)}
+
+    # --- images ---------------------------------------------------------------------------------------------------
+    def _parts(
+        self, sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...], target: Rig, skip: bool
+    ) -> tuple[list[dict[str, Any]], list[Made]]:
+        """Images, calibration and masks of each frame, rendered or resized; and what they were made by."""
+        if skip and self.size:
+            done = [self._resized(frame, self.size) for frame in frames]
+            return [part for part, _ in done], [framings for _, framings in done]
+        views = self.stitcher.views(sample, frames, lead, target)
+        self.stitcher.judge(views)
+        seams: list[list[torch.Tensor]] | None = [] if self._trusts else None
+        names = [] if self.completion is None else frame_names(sample, frames, lead, self.completion)
+        parts = []
+        for b, images in enumerate(self.stitcher.render(frames, views, seams)):
+            made = views[b].made
+            filled, patches = self.stitcher.filled(frames[b], views[b], images)
+            part: dict[str, Any] = {"images": stacked(filled)}
+            part |= seen_entries(made, filled, patches, None if seams is None else seams[b], self.outputs)
+            if self.completion is None and self.holes != "black":
+                occluded = [view.occluded for view in made.targets]
+                part["images"] = stacked(fill_holes(filled, part["coverage"], occluded, self.holes))
+                part["generated"] = stacked([~seen for seen in part["coverage"]])
+            shown = made.target
+            if self.size is not None and self.fit == "pad":
+                shown = made.target.resized(self.size, "pad")
+                for key, views_of in part.items():
+                    empty = -1 if key.startswith("source") else 0
+                    part[key] = torch.stack([barred(view, self.size, empty) for view in views_of])
+            part |= calibration_entries(shown, images[0].device, lenses=self._lenses, masks=self._masks)
+            if self.completion is not None:
+                complete_frame(part, shown, frames[b], names[b], self.completion)
+            parts.append(part)
+        return parts, [view.made for view in views]
+
+    def _resized(self, frame: Frame, size: tuple[int, int]) -> tuple[dict[str, Any], list[Framing]]:
+        """A frame that keeps its cameras: they saw all of it; and how each came to the size."""
+        device = frame.images[0].device
+        framings = [framing(camera.name, camera.size, size, self.fit) for camera in frame.rig]
+        rig = frame.rig.resized(size, self.fit)
+        part = calibration_entries(rig, device, lenses=self._lenses, masks=self._masks)
+        images = [framed(resized(image, f.scaled), f) for image, f in zip(frame.images, framings, strict=True)]
+        part["images"] = stacked(images)
+        seen = [framed(torch.ones(f.scaled, dtype=torch.bool, device=device), f) for f in framings]
+        part.update(untouched_entries(torch.stack(seen), self.outputs))
+        if self.completion is not None or self.holes != "black":
+            part["generated"] = torch.zeros_like(part["coverage"])
+        return part, framings
+
+    @property
+    def plans(self) -> PlanCache:
+        """The plans that are held for calibrations that come back."""
+        return self.stitcher.plans
+
+    def plan(self, source: Rig, target: Rig, scene: Scene | None = None) -> RenderPlan:
+        """The cached render plan of a pair of rigs in a scene.
+
+        Raises:
+            ValueError: With ``quality="paper"``.
+        """
+        return self.stitcher.plan(source, target, scene)
+
+    def prepare(self, source: Rig | None = None) -> RenderPlan:
+        """Build the plan for a source rig before DataLoader workers fork: they share its memory.
+
+        Args:
+            source: The rig of the samples; ``source_rig`` by default.
+
+        Raises:
+            ValueError: No source rig, a random target, ``quality="paper"``, or a surface that is made of every frame.
+        """
+        source = source or self.source_rig
+        if source is None or self._fixed_target is None:
+            raise ValueError("prepare: expected a source rig and a fixed target rig")
+        surface, config, target = self.stitcher.surface, self.stitcher.config, self._fixed_target
+        of_frames = surface in ("objects", "lidar", "motion")
+        if of_frames and isinstance(config, FavsConfig) and needs_geometry(source, target, surface, config):
+            raise ValueError(
+                f"prepare: expected a surface whose plans come back, got {surface!r}: the boxes, points or depth of "
+                "every frame make its own"
+            )
+        return self.plan(source, self._fixed_target)
+
+    # --- words ------------------------------------------------------------------------------------------------------
+    def explain(self, sample: Mapping[str, Any]) -> Explanation | PaperExplanation:
+        """How a sample would be rendered: sources, surfaces and why, coverage, expected parallax; print it.
+
+        With ``quality="paper"``: what each stage made of each source.
+
+        A random target is explained for one draw. As of a call, plans and refinements that it makes are held, what it
+        warns of is not said again, and the draw advances the RNG.
+        """
+        frames, lead = read_frames(sample, self.source_rig), leading_shape(sample["images"])
+        target, _, _ = self._draw(sample, frames[:1], None)
+        view = self.stitcher.views(sample, frames, lead, target)[0]
+        if isinstance(view.made, PaperRendering):
+            return PaperExplanation(view.made)
+        gains = self.harmonisation(sample) if self.stitcher.harmoniser.is_on else None
+        return Explanation(view.made, gains, view.depth, view.motion, view.fills, view.harm)
+
+    def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
+        """The gains that a sample's source images would get, and why; of a batch, its first frame."""
+        frame = read_frames(sample, self.source_rig)[0]
+        return self.stitcher.harmoniser.report(frame.rig, frame.images)
+
+    # --- processes --------------------------------------------------------------------------------------------------
+    def _limit_threads(self) -> None:
+        """OpenCV keeps all its threads in DataLoader workers, where they would fight for the cores."""
+        if self._limited_process != os.getpid() and torch.utils.data.get_worker_info() is not None:
+            cv2.setNumThreads(0)
+            self._limited_process = os.getpid()

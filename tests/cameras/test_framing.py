@@ -1,0 +1,212 @@
+"""Views of another shape: what ``crop``, ``pad`` and ``stretch`` keep, cut and add, and that ``K`` says so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import ArbiviewError, CalibrationError, Camera, Rig, RigRetarget, load_rig
+from arbiview_aug.cameras.framing import Fit, Framing, framing
+from arbiview_aug.generator.batches import complete_batch
+from arbiview_aug.sample.batching import framed
+
+OWN = (24, 48)
+WIDE, TALL = (16, 64), (40, 32)
+FITS: tuple[Fit, ...] = get_args(Fit)
+
+
+def rig(masked: bool = False, lens: str = "pinhole") -> Rig:
+    """Three overlapping cameras, which stand as one, so that any turn renders exactly."""
+    h, w = OWN
+    mask = np.ones(OWN, bool)
+    mask[-4:, :20] = False
+    lenses: dict[str, Any] = {} if lens == "pinhole" else {"lens": lens, "distortion": (0.05, -0.02, 0.01, 0.0)}
+    cameras = [
+        Camera.looking(name=f"c{k}", azimuth_deg=40.0 * k, width_px=w, height_px=h, horizontal_fov_deg=70, **lenses)
+        for k in range(3)
+    ]
+    return Rig([replace(c, mask=mask) for c in cameras] if masked else cameras, name="three")
+
+
+def sample(masked: bool = False) -> dict[str, Any]:
+    rng = torch.Generator().manual_seed(0)
+    coarse = torch.rand(3, 3, 6, 12, generator=rng)
+    images = torch.nn.functional.interpolate(coarse, size=OWN, mode="bicubic").clamp(0, 1)
+    labels = torch.randint(0, 9, (3, *OWN), generator=rng, dtype=torch.uint8)
+    return {"images": images, "classes": labels, "rig": rig(masked), "token": "a"}
+
+
+def transform(size: tuple[int, int], fit: Fit, **settings: Any) -> RigRetarget:
+    given = {"outputs": ("source_camera", "source_frame", "confidence"), "label_keys": ("classes",), **settings}
+    return RigRetarget(rig().turned(yaw_deg=9), size=size, fit=fit, **given)
+
+
+# --- by how much, and where -------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("to", "fit", "expected"),
+    [
+        ((256, 704), "crop", Framing((469, 704), 213, 0, (256, 704))),  # 704 / 1920 of 1280 rows is 469.3
+        ((256, 704), "pad", Framing((256, 384), 0, -160, (256, 704))),
+        ((256, 704), "stretch", Framing((256, 704), 0, 0, (256, 704))),
+        ((640, 301), "crop", Framing((640, 960), 0, 329, (640, 301))),
+        ((640, 301), "pad", Framing((201, 301), -439, 0, (640, 301))),
+        ((853, 1280), "crop", Framing((853, 1280), 0, 0, (853, 1280))),  # 853.3 rows
+    ],
+)
+def test_the_last_row_stays_and_the_columns_are_centred(to: tuple[int, int], fit: Fit, expected: Framing) -> None:
+    assert framing("front", (1280, 1920), to, fit) == expected
+
+
+def test_the_readmes_views_keep_their_aspect() -> None:
+    target = load_rig("waymo")
+
+    def squeeze(size_of: RigRetarget) -> float:
+        """By how much a view is narrower than it is low, or the reverse, at most."""
+        found = size_of._fixed_target
+        assert found is not None and set(found.sizes) == {(128, 352)}
+        ratios = found.K[:, 0, 0] / found.K[:, 1, 1] / (target.K[:, 0, 0] / target.K[:, 1, 1])
+        return float(np.maximum(ratios, 1 / ratios).max())
+
+    assert squeeze(RigRetarget(target, size=(128, 352))) < 1.003  # half a pixel of rounding
+    assert squeeze(RigRetarget(target, size=(128, 352), fit="stretch")) > 1.8
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "radtan", "fisheye"])
+@pytest.mark.parametrize("to", [WIDE, TALL, (60, 61)])
+@pytest.mark.parametrize("fit", FITS)
+def test_k_says_where_points_fall(fit: Fit, to: tuple[int, int], lens: str) -> None:
+    source = rig(lens=lens)[0]
+    f, made = framing("c", source.size, to, fit), source.resize(to, fit)
+    points = source.center_m + np.array([[5.0, 1.0, 0.3], [9.0, -2.0, -1.0], [3.0, 0.1, 1.0]])
+    sy, sx = f.scaled[0] / OWN[0], f.scaled[1] / OWN[1]
+    # Outer edges at -0.5 stay edges of what is scaled; then the window's first pixel becomes (0, 0).
+    expected = (source.project(points).uv + 0.5) * (sx, sy) - 0.5 - (f.left, f.top)
+    np.testing.assert_allclose(made.project(points).uv, expected, atol=1e-9)
+    np.testing.assert_array_equal(made.cam2ego, source.cam2ego)
+    assert made.size == to and (made.lens, made.distortion) == (source.lens, source.distortion)
+
+
+def test_masks_follow_and_bars_are_no_scene() -> None:
+    (camera, *_), f = rig(masked=True), framing("c", OWN, TALL, "pad")
+    made, bare = camera.resize(TALL, "pad"), rig()[0].resize(TALL, "pad")
+    assert f.top == -24 and made.mask is not None and bare.mask is not None
+    assert not made.mask[:24].any() and not bare.mask[:24].any() and bare.mask[24:].all()
+    np.testing.assert_array_equal(made.mask[24:], camera.resize(f.scaled).mask)
+    cut = camera.resize(WIDE, "crop")
+    np.testing.assert_array_equal(cut.mask, camera.resize((32, 64)).mask[16:])
+    assert rig()[0].resize(WIDE, "crop").mask is None
+
+
+# --- one result where nothing is to be decided ------------------------------------------------------------------------
+@pytest.mark.parametrize("params", [None, {"skipped": 1.0}])
+@pytest.mark.parametrize("size", [OWN, (12, 24), (36, 72)])
+def test_all_fits_agree_bit_by_bit_where_the_aspect_is_equal(size: tuple[int, int], params: Any) -> None:
+    p = 1.0 if params is None else 0.5
+    outs = [transform(size, fit, p=p)(sample(), params) for fit in FITS]
+    for other in outs[1:]:
+        assert outs[0].keys() == other.keys()
+        for key, value in outs[0].items():
+            same = torch.equal(value, other[key]) if isinstance(value, torch.Tensor) else value == other[key]
+            assert same, key
+
+
+# --- views ------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("skipped", [0.0, 1.0])
+@pytest.mark.parametrize("size", [WIDE, TALL])
+def test_a_crop_is_the_window_of_the_scaled_view(size: tuple[int, int], skipped: float) -> None:
+    params = {"skipped": skipped}
+    f = framing("c", OWN, size, "crop")
+    cut = transform(size, "crop", p=0.5, holes="black")(sample(masked=True), params)
+    whole = transform(f.scaled, "stretch", p=0.5, holes="black")(sample(masked=True), params)
+    exact = bool(skipped)  # a target's maps are interpolated on another grid
+    for key in ("images", "classes", "coverage", "source_camera", "confidence", "ignore"):
+        expected = framed(whole[key], f)
+        if exact:
+            assert torch.equal(cut[key], expected), key
+        else:
+            off = (cut[key].float() - expected.float()).abs()
+            assert off.mean() < (2e-3 if key == "images" else 0.05 if key == "classes" else 0.02), key
+    shift = torch.tensor([[0, 0, f.left], [0, 0, f.top], [0, 0, 0]])
+    assert torch.equal(cut["K"], whole["K"] - shift)
+
+
+@pytest.mark.parametrize("skipped", [0.0, 1.0])
+@pytest.mark.parametrize("size", [WIDE, TALL])
+def test_bars_are_black_unseen_and_ignored(size: tuple[int, int], skipped: float) -> None:
+    params = {"skipped": skipped}
+    f = framing("c", OWN, size, "pad")
+    padded = transform(size, "pad", p=0.5)(sample(masked=True), params)
+    whole = transform(f.scaled, "stretch", p=0.5)(sample(masked=True), params)
+    fills = {"images": 0, "coverage": 0, "ignore": 1, "classes": 255, "source_camera": -1, "source_frame": -1}
+    for key, fill in {**fills, "confidence": 0}.items():
+        assert torch.equal(padded[key], framed(whole[key], f, fill)), key
+    bars = framed(torch.zeros(f.scaled), f, 1).bool()
+    assert 0 < bars.sum() == size[0] * size[1] - f.scaled[0] * f.scaled[1]
+    assert not padded["images"][..., bars].any() and not padded["coverage"][:, bars].any()
+    assert padded["ignore"][:, bars].all()
+
+
+@pytest.mark.filterwarnings("ignore:the target rig")
+def test_no_filler_touches_bars() -> None:
+    given = {key: value for key, value in sample().items() if key != "classes"}
+    size, f = (40, 64), framing("c", OWN, (40, 64), "pad")
+    wide = Rig([replace(c, K=c.K * [[0.5, 1, 1], [1, 0.5, 1], [1, 1, 1]]) for c in rig()])  # holes above and below
+    bars = framed(torch.zeros(f.scaled), f, 1).bool()
+    for path in ("favs", "inpaint"):
+        out = RigRetarget(wide, size=size, fit="pad", path=path)(given)  # type: ignore[arg-type]
+        assert out["generated"].any() and not out["generated"][:, bars].any() and not out["images"][..., bars].any()
+        assert not torch.logical_or(out["coverage"], out["generated"])[:, bars].any()
+        assert torch.logical_or(out["coverage"], out["generated"])[:, ~bars].all()
+    later = RigRetarget(wide, size=size, fit="pad", outputs=("sources", "confidence"))(given)
+    assert torch.equal(complete_batch(None, later)["images"], out["images"])  # after collating as well
+    # Black does not bleed in from the bars: they are not read.
+    whole = RigRetarget(wide, size=f.scaled, fit="stretch", path="inpaint")(given)
+    assert (out["images"] - framed(whole["images"], f)).abs().max() < 0.1
+
+
+def test_which_keys_there_are_depends_on_the_settings_alone() -> None:
+    assert "ignore" not in transform(WIDE, "crop")(sample()) and "ignore" in transform(WIDE, "pad")(sample())
+    masked = transform(OWN, "pad")(sample())
+    assert "ignore" not in masked
+
+
+def test_gradients_pass_through_a_window() -> None:
+    for fit in FITS:
+        given = sample()
+        given["images"].requires_grad_()
+        for params in ({"skipped": 0.0}, {"skipped": 1.0}):
+            out = transform(TALL, fit, p=0.5)(given, params)
+            (gradient,) = torch.autograd.grad(out["images"].sum(), given["images"])
+            assert torch.isfinite(gradient).all() and gradient.any()
+
+
+# --- extremes ---------------------------------------------------------------------------------------------------------
+@pytest.mark.filterwarnings("ignore:the target rig")
+@pytest.mark.parametrize("skipped", [0.0, 1.0])
+@pytest.mark.parametrize("fit", FITS)
+@pytest.mark.parametrize("size", [(1, 1), (1, 48), (24, 1), (1, 400), (400, 1), (48, 96), (100, 49), (3, 2)])
+def test_extreme_sizes_are_finite(size: tuple[int, int], fit: Fit, skipped: float) -> None:
+    out = transform(size, fit, p=0.5)(sample(masked=True), {"skipped": skipped})
+    assert out["images"].shape == (3, 3, *size) and torch.isfinite(out["images"]).all()
+    assert out["coverage"].shape == out["ignore"].shape == (3, *size) and torch.isfinite(out["K"]).all()
+    assert (out["K"][:, 0, 0] > 0).all() and (out["K"][:, 1, 1] > 0).all()
+
+
+def test_what_would_be_cut_from_too_large_an_image_is_refused_by_name() -> None:
+    words = r"camera 'c0': size=\(30000, 2\), fit='crop': .*32766 .*\(30000, 60000\)"
+    with pytest.raises(CalibrationError, match=words):
+        framing("c0", (1, 2), (30000, 2), "crop")
+    with pytest.raises(ArbiviewError, match=r"camera 'c0': size=\(20000, 2\), fit='crop'"):
+        RigRetarget(rig(), size=(20000, 2))
+    assert rig()[0].resize((20000, 2), "pad").size == (20000, 2)
+
+
+def test_an_unknown_fit_is_refused() -> None:
+    with pytest.raises(ValueError, match="fit: expected one of crop, pad, stretch, got 'cover'"):
+        RigRetarget(rig(), size=OWN, fit="cover")  # type: ignore[arg-type]
+    with pytest.raises(CalibrationError, match="camera 'c0': fit: expected one of crop, pad, stretch, got None"):
+        rig().resized(OWN, None)  # type: ignore[arg-type]

@@ -1,0 +1,234 @@
+"""Keys under other names: "did you mean …", and no false alarm."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import warnings
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import CalibrationError, Camera, Rig, RigRetarget, SampleError, load_rig
+from arbiview_aug.cameras.key_names import USUAL_NAMES, meant_by, misnamed
+from arbiview_aug.datasets import FrameFolder
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+
+BOXES = torch.tensor([[8.0, 1.0, 0.8, 4.0, 2.0, 1.6, 0.1]])
+RIG = Rig(
+    [Camera.looking(name="front", azimuth_deg=0, width_px=16, height_px=12, horizontal_fov_deg=70)], ground_z_m=-0.2
+)
+
+
+def sample(**more: Any) -> dict[str, Any]:
+    return {"images": torch.zeros(1, 3, 12, 16), "K": torch.tensor(RIG.K), "cam2ego": torch.tensor(RIG.cam2ego), **more}
+
+
+def warned(given: dict[str, Any], calls: int = 2, **settings: Any) -> list[str]:
+    """What is said of keys in so many calls."""
+    retarget = RigRetarget(RIG.turned(yaw_deg=3), **settings)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(calls):
+            retarget(given)
+    return [str(w.message) for w in caught if "did you mean" in str(w.message)]
+
+
+# --- samples ----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("key", "value", "meant"),
+    [
+        ("gt_boxes", BOXES, "boxes_3d"),
+        ("gt_bboxes_3d", BOXES, "boxes_3d"),
+        ("boxes3d", BOXES.numpy(), "boxes_3d"),
+        ("boxes", BOXES, "boxes_3d"),
+        ("boxes", [BOXES], "boxes_3d"),
+        ("boxes_3D", BOXES, "boxes_3d"),
+        ("lidar_points", torch.rand(5, 3), "points"),
+        ("pts", torch.rand(5, 4), "points"),
+        ("Points", torch.rand(5, 4), "points"),
+        ("depth_map", torch.rand(1, 6, 8), "depth_m"),
+        ("distortions", torch.zeros(1, 4), "distortion"),
+        ("lenses", ["fisheye"], "lens"),
+        ("ground_z", 0.3, "ground_z_m"),
+        ("neighbors", [], "neighbours"),
+    ],
+)
+def test_a_key_that_nobody_reads_is_named_once(key: str, value: Any, meant: str) -> None:
+    (words,) = warned(sample(**{key: value}))
+    assert f"the sample's {key!r} is not read; did you mean {meant!r}?" in words
+
+
+@pytest.mark.parametrize(
+    ("more", "settings"),
+    [
+        ({"gt_boxes": BOXES, "boxes_3d": BOXES}, {}),  # the right key is there as well
+        ({"gt_boxes": BOXES}, {"pass_keys": ("gt_boxes",)}),  # the user knows
+        ({"gt_boxes": BOXES}, {"surface": "street"}),  # nothing would read it
+        ({"boxes": torch.rand(3, 4)}, {}),  # torchvision's, in pixels
+        ({"boxes": [torch.rand(3, 4)]}, {}),
+        ({"boxes": 3, "lidar": "0001.bin", "depth_map": "0001.png"}, {}),
+        ({"lenses": ["radtan"], "ground_z": 1.0, "rig": RIG}, {}),  # the rig says it
+        ({"lenses": ["radtan"], "ground_z": 1.0}, {"source_rig": RIG}),
+        ({"token": "a", "timestamp": 1, "time_s": 0.1, "labels": [1], "labels_3d": [1], "boxes_2d": []}, {}),
+        ({"gt_names": ["car"], "box_names": ["car"], "keypoints": 1, "joints": 1, "ego2cam": 1, "lidar2ego": 1}, {}),
+    ],
+)
+def test_no_false_alarm(more: dict[str, Any], settings: dict[str, Any]) -> None:
+    assert not warned(sample(**more), **settings)
+
+
+def test_depth_that_is_dropped_is_named() -> None:
+    (words,) = warned(sample(depth=torch.rand(1, 12, 16)))
+    assert "drops depth: they speak of the source's pixels; found 'depth': did you mean 'depth_m'?" in words
+    assert not warned(sample(depth=torch.rand(1, 12, 16), depth_m=torch.zeros(1, 12, 16)))
+
+
+def test_labels_that_would_not_be_moved_are_named() -> None:
+    (words,) = warned(sample(gt_boxes=BOXES), surface="street", label_frame="target")
+    assert "'boxes_3d'" in words
+
+
+def test_our_own_samples_are_understood() -> None:
+    drive = SyntheticDrive(demo_source_rig((16, 44)), num_frames=1)
+    first = drive[0]
+    out = RigRetarget(first["rig"].turned(yaw_deg=3), outputs=("confidence", "source_camera"))(first)
+    for given in (first, out):
+        assert not misnamed(given, (*USUAL_NAMES,))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"K": "intrinsics"}, "missing K; found 'intrinsics': did you mean 'K'?"),
+        ({"K": "intrinsic"}, "missing K; found 'intrinsic': did you mean 'K'?"),
+        ({"cam2ego": "extrinsics"}, "missing cam2ego; found 'extrinsics': did you mean 'cam2ego'?"),
+        ({"cam2ego": "cam_to_ego"}, "found 'cam_to_ego': did you mean 'cam2ego'?"),
+        ({"cam2ego": "cam2egos"}, "found 'cam2egos': did you mean 'cam2ego'?"),
+        ({"K": "intrinsics", "cam2ego": "camera2ego"}, "'K'?; found 'camera2ego': did you mean 'cam2ego'?"),
+        ({"images": "imgs"}, "got imgs, K, cam2ego; found 'imgs': did you mean 'images'?"),
+    ],
+)
+def test_errors_name_what_was_found_instead(change: dict[str, str], words: str) -> None:
+    given = {change.get(key, key): value for key, value in sample().items()}
+    with pytest.raises(SampleError) as caught:
+        RigRetarget(RIG)(given)
+    assert words in str(caught.value)
+
+
+def test_surfaces_that_lack_their_geometry_name_it() -> None:
+    for surface, key, words in (("objects", "gt_boxes", "'boxes_3d'"), ("lidar", "pts", "'points'")):
+        with pytest.raises(SampleError, match=f"found '{key}': did you mean {words}"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            RigRetarget(RIG.shifted(z_m=1), surface=surface)(sample(**{key: BOXES}))  # type: ignore[arg-type]
+
+
+def test_the_table_is_of_other_names() -> None:
+    for name, others in USUAL_NAMES.items():
+        assert all(meant_by(other, (name,)) == name for other in others) and name not in others
+
+
+# --- calib.json and rig files -----------------------------------------------------------------------------------------
+def write_frame(folder: Path, calib: dict[str, Any], camera: dict[str, Any]) -> Path:
+    folder.mkdir()
+    whole = RIG.to_dict()
+    entry = {**whole["cameras"][0], "file": "front.png", **camera}
+    text = {**whole, "cameras": [{k: v for k, v in entry.items() if v != "absent"}], **calib}
+    (folder / "calib.json").write_text(json.dumps({k: v for k, v in text.items() if v != "absent"}))
+    cv2.imwrite(str(folder / "front.png"), np.zeros((12, 16, 3), np.uint8))
+    return folder
+
+
+def read(folder: Path) -> list[str]:
+    """What is said when a frame is read, twice."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        data = FrameFolder(folder)
+        assert data[0]["rig"].names == data[0]["rig"].names
+        pickle.loads(pickle.dumps(data))
+    return [str(w.message) for w in caught]
+
+
+@pytest.mark.parametrize(
+    ("calib", "camera", "words"),
+    [
+        ({"gt_boxes": BOXES.tolist()}, {}, "'gt_boxes' is not read; did you mean 'boxes_3d'?"),
+        ({"boxes_3D": BOXES.tolist()}, {}, "'boxes_3D' is not read; did you mean 'boxes_3d'?"),
+        ({"lidar_points": "points.npy"}, {}, "'lidar_points' is not read; did you mean 'lidar'?"),
+        ({"ego_to_world": np.eye(4).tolist()}, {}, "'ego_to_world' is not read; did you mean 'ego2world'?"),
+        ({}, {"masks": "front_mask.png"}, "'masks' is not read; did you mean 'mask'?"),
+    ],
+)
+def test_calibration_files_warn_once(calib: dict[str, Any], camera: dict[str, Any], words: str, tmp_path: Path) -> None:
+    (said,) = read(write_frame(tmp_path / "a", calib, camera))
+    assert "calib.json" in said and words in said
+
+
+@pytest.mark.parametrize(
+    ("calib", "camera", "words"),
+    [
+        ({}, {"K": "absent", "intrinsics": RIG.K[0].tolist()}, "missing K; found 'intrinsics': did you mean 'K'?"),
+        ({}, {"cam2ego": "absent", "cam_to_ego": 1}, "missing cam2ego; found 'cam_to_ego': did you mean 'cam2ego'?"),
+        ({}, {"file": "absent", "filename": "front.png"}, "found 'filename': did you mean 'file'?"),
+        ({}, {"distortion": "absent", "distortions": [0.1, 0, 0, 0]}, "'distortions' is not read: did you mean"),
+        ({}, {"distortion": "absent", "dist_coeffs": {"model": "radtan"}}, "'dist_coeffs' is not read: did you mean"),
+        ({"ground_z_m": "absent", "ground_z": -0.3}, {}, "'ground_z' is not read: did you mean 'ground_z_m'?"),
+        ({"cameras": "absent", "cams": []}, {}, "found 'cams': did you mean 'cameras'?"),
+    ],
+)
+def test_lost_geometry_is_refused(calib: dict[str, Any], camera: dict[str, Any], words: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError) as caught:
+        read(write_frame(tmp_path / "a", calib, camera))
+    assert words in str(caught.value) and "calib.json" in str(caught.value)
+
+
+def test_notes_stay_notes(tmp_path: Path) -> None:
+    calib = {"license": "as you like", "timestamp": 1, "labels": [1], "boxes_2d": [], "lidar_points": 1200}
+    camera = {"timestamp": 1, "distortions": [0, 0, 0, 0], "lens": "6 mm", "cam2ego_static": RIG.cam2ego[0].tolist()}
+    assert not read(write_frame(tmp_path / "a", calib, {**camera, "distortion": "absent"}))
+    both = {"distortion": None, "dist_coeffs": [0.1, 0, 0, 0]}  # null says it: a pinhole camera
+    assert not read(write_frame(tmp_path / "b", {"ground_z": 3}, both))
+
+
+def test_rig_files_are_read_as_strictly() -> None:
+    data = RIG.to_dict()
+    del data["ground_z_m"]
+    with pytest.raises(CalibrationError, match="'ground_z' is not read: did you mean 'ground_z_m'"):
+        Rig.from_dict({**data, "ground_z": -0.2})
+
+
+# --- lenses -----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("alias", "lens"), [("opencv_radtan", "radtan"), ("opencv_fisheye", "fisheye")])
+def test_opencvs_lenses_by_their_other_names(alias: Any, lens: str, tmp_path: Path) -> None:
+    coefficients = (0.1, -0.02, 0.003, 0.001)
+    data = RIG.to_dict()
+    data["cameras"][0]["distortion"] = {"model": lens, "coeffs": list(coefficients)}
+    expected = Rig.from_dict(data)
+    data["cameras"][0]["distortion"]["model"] = alias
+    (tmp_path / "rig.yaml").write_text(json.dumps(data))
+    loaded = load_rig(tmp_path / "rig.yaml")
+    assert loaded == expected and loaded[0].lens == lens
+    assert loaded.to_dict()["cameras"][0]["distortion"]["model"] == lens
+    assert load_rig(loaded.save(tmp_path / "again.json")) == expected
+    folder = write_frame(tmp_path / "a", {}, {"distortion": data["cameras"][0]["distortion"]})
+    assert FrameFolder(folder)[0]["rig"] == expected
+    camera = Camera.looking(
+        name="front",
+        azimuth_deg=0,
+        width_px=16,
+        height_px=12,
+        K=RIG.K[0],
+        lens=alias,
+        distortion=coefficients,
+    )
+    assert camera == expected[0]
+    padded = torch.tensor([[*coefficients, 0, 0, 0, 0]])
+    given = sample(lens=[alias], distortion=padded, ground_z_m=-0.2)
+    target = RIG.turned(yaw_deg=3)
+    assert RigRetarget(target).plan(expected, target).source == expected
+    named, alike = (RigRetarget(target)({**given, "lens": [name]}) for name in (alias, lens))
+    assert torch.equal(named["coverage"], alike["coverage"]) and named["coverage"].any()

@@ -1,0 +1,164 @@
+"""Lenses against OpenCV's own projection, and there and back."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from arbiview_aug.cameras.camera import UNPROJECT_TOLERANCE_PX, Camera
+from arbiview_aug.cameras.lens import _radtan, _radtan_jacobian, fold_limit
+from arbiview_aug.errors import CalibrationError
+
+K = np.array([[410.0, 0.0, 318.0], [0.0, 405.0, 242.0], [0.0, 0.0, 1.0]])
+
+LENSES = {
+    "pinhole": ("pinhole", ()),
+    "radtan4": ("radtan", (-0.32, 0.11, 0.0011, -0.0007)),
+    "radtan5": ("radtan", (-0.256123, 0.092545, -0.00213, 0.000464, -0.01231)),
+    "radtan8": ("radtan", (0.9, 0.12, 0.0004, -0.0003, 0.002, 1.25, 0.35, 0.02)),
+    "fisheye": ("fisheye", (-0.0703, 0.0039, -0.0033, 0.0006)),
+    "fisheye_without_distortion": ("fisheye", (0.0, 0.0, 0.0, 0.0)),
+}
+
+
+def make(name: str, **changes: object) -> Camera:
+    lens, distortion = LENSES[name]
+    values: dict = dict(
+        name="c", width_px=640, height_px=480, azimuth_deg=25.0, elevation_deg=-8.0, roll_deg=3.0, K=K, lens=lens
+    )
+    return Camera.looking(**{**values, "distortion": distortion, **changes})
+
+
+@pytest.fixture(params=LENSES)
+def camera(request: pytest.FixtureRequest) -> Camera:
+    return make(request.param)
+
+
+def points_in_view(camera: Camera, count: int = 400) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    uv = rng.uniform([0, 0], [camera.width_px - 1, camera.height_px - 1], (count, 2))
+    rays = camera.unproject(uv)
+    assert rays.valid.all()
+    return camera.center_m + rays.directions * rng.uniform(1, 50, (count, 1))
+
+
+def test_project_agrees_with_opencv(camera: Camera) -> None:
+    points = points_in_view(camera)
+    R = camera.cam2ego[:3, :3].T
+    rvec, tvec = cv2.Rodrigues(R)[0], -R @ camera.center_m
+    if camera.lens == "fisheye":
+        want = cv2.fisheye.projectPoints(points[None], rvec, tvec, camera.K, np.array(camera.distortion))[0]
+    else:
+        want = cv2.projectPoints(points, rvec, tvec, camera.K, np.array(camera.distortion or (0.0,) * 4))[0]
+    got = camera.project(points)
+    assert got.valid.all()
+    np.testing.assert_allclose(got.uv, want.reshape(-1, 2), atol=1e-6)
+
+
+def test_unproject_round_trip(camera: Camera) -> None:
+    grid = camera.resize((60, 80)).pixel_grid()
+    rays = camera.resize((60, 80)).unproject(grid)
+    assert rays.valid.all()
+    np.testing.assert_allclose(np.linalg.norm(rays.directions, axis=-1), 1, atol=1e-12)
+    again = camera.resize((60, 80)).project(camera.center_m + 7 * rays.directions)
+    assert np.abs(again.uv - grid).max() <= UNPROJECT_TOLERANCE_PX
+
+
+@pytest.mark.parametrize("shape", [(), (2,), (1, 2), (0,)])
+def test_leading_dimensions(camera: Camera, shape: tuple[int, ...]) -> None:
+    points = np.broadcast_to([20.0, 9.0, 0.5], (*shape, 3))
+    projection = camera.project(points)
+    assert projection.uv.shape == (*shape, 2)
+    assert projection.depth_m.shape == projection.valid.shape == shape
+    rays = camera.unproject(projection.uv)
+    assert rays.directions.shape == (*shape, 3) and rays.valid.shape == shape
+
+
+def test_points_behind_are_invalid_and_finite() -> None:
+    for name in LENSES:
+        camera = make(name, azimuth_deg=0.0, elevation_deg=0.0, roll_deg=0.0)
+        behind = camera.center_m + np.array([[-5.0, 0, 0], [-5.0, 1.0, 0.3], [0.0, 0.0, 0.0]])
+        got = camera.project(behind)
+        assert np.isfinite(got.uv).all()
+        if camera.lens == "fisheye":  # a fisheye may see past 90 degrees, never straight back, nor its own centre
+            assert got.valid.tolist() == [False, True, False]
+        else:
+            assert not got.valid.any()
+
+
+def test_beside_the_camera_only_a_fisheye_sees() -> None:
+    beside = np.array([0.0, 5.0, 1.5])  # 90 degrees to the left
+    assert make("fisheye", azimuth_deg=0.0, elevation_deg=0.0).project(beside).valid
+    assert not make("pinhole", azimuth_deg=0.0, elevation_deg=0.0).project(beside).valid
+
+
+@pytest.mark.parametrize(
+    ("lens", "distortion", "limit"),
+    [
+        ("radtan", (-0.3, 0.0, 0.0, 0.0), 1 / np.sqrt(0.9)),  # 1 - 3 * 0.3 r^2 = 0
+        ("radtan", (0.0, 0.0, 0.0, 0.0, -0.1), (1 / 0.7) ** (1 / 6)),  # 1 - 7 * 0.1 r^6 = 0
+        ("radtan", (0.0, 0.0, 0.0, 0.0, 0.0, -0.25, 0.0, 0.0), 2.0),  # pole of 1 / (1 - r^2 / 4)
+        ("fisheye", (-0.2, 0.0, 0.0, 0.0), 1 / np.sqrt(0.6)),  # 1 - 3 * 0.2 theta^2 = 0
+        ("fisheye", (0.1, 0.0, 0.0, 0.0), np.pi),
+        ("pinhole", (), np.inf),
+        ("radtan", (0.1, 0.0, 0.0, 0.0, 1e-310), np.inf),  # no overflow from a coefficient next to zero
+        ("radtan", (-1e-310, 0.0, 0.0, 0.0), np.inf),
+    ],
+)
+def test_fold_limit(lens: str, distortion: tuple[float, ...], limit: float) -> None:
+    assert fold_limit(lens, distortion) == pytest.approx(limit)
+
+
+@pytest.mark.parametrize(("lens", "distortion"), [("radtan", (-0.3, 0.0, 0.0, 0.0)), ("fisheye", (-0.2, 0, 0, 0))])
+def test_folded_branch_is_invalid(lens: str, distortion: tuple[float, ...]) -> None:
+    camera = make("pinhole", azimuth_deg=0.0, elevation_deg=0.0, roll_deg=0.0, lens=lens, distortion=distortion)
+    angle = np.radians([30.0, 70.0 if lens == "fisheye" else 45.0, 85.0])
+    rays = camera.center_m + np.stack([np.cos(angle), -np.sin(angle), 0 * angle], -1)
+    got = camera.project(rays)
+    limit = camera.fold_limit if lens == "fisheye" else np.arctan(camera.fold_limit)
+    assert got.valid.tolist() == (angle < limit).tolist()
+    assert got.valid[0] and not got.valid[2]
+    # Without the limit the last ray would fall inside the image, as a ghost.
+    assert np.isfinite(got.uv).all()
+    # Pixels beyond the largest image radius have no ray.
+    assert not camera.unproject(np.array([3000.0, 242.0])).valid
+    assert camera.unproject(np.array([330.0, 242.0])).valid
+
+
+def test_a_ghost_would_appear_without_the_fold_limit() -> None:
+    distortion = (-0.3, 0.0, 0.0, 0.0)
+    a = np.array([1.75])  # 60 degrees off axis, past the fold at 46.5
+    x, _ = _radtan(distortion, a, 0 * a)
+    assert 0 < 410 * x[0] + 318 < 640
+    camera = make("pinhole", azimuth_deg=0.0, elevation_deg=0.0, roll_deg=0.0, lens="radtan", distortion=distortion)
+    assert not camera.project(camera.center_m + np.array([1.0, -1.75, 0.0])).valid
+
+
+def test_radtan_jacobian_agrees_with_differences() -> None:
+    rng = np.random.default_rng(1)
+    distortion = LENSES["radtan8"][1]
+    a, b, h = rng.uniform(-0.6, 0.6, 50), rng.uniform(-0.6, 0.6, 50), 1e-6
+    aa, ab, bb = _radtan_jacobian(distortion, a, b)
+    right, left = _radtan(distortion, a + h, b), _radtan(distortion, a - h, b)
+    up, down = _radtan(distortion, a, b + h), _radtan(distortion, a, b - h)
+    np.testing.assert_allclose(aa, (right[0] - left[0]) / 2 / h, atol=1e-8)
+    np.testing.assert_allclose(ab, (right[1] - left[1]) / 2 / h, atol=1e-8)
+    np.testing.assert_allclose(ab, (up[0] - down[0]) / 2 / h, atol=1e-8)
+    np.testing.assert_allclose(bb, (up[1] - down[1]) / 2 / h, atol=1e-8)
+
+
+@pytest.mark.parametrize("coefficient", [1e6, -1e6])
+@pytest.mark.parametrize("lens", ["radtan", "fisheye"])
+def test_absurd_coefficients_stay_finite(lens: str, coefficient: float) -> None:
+    camera = make("pinhole", lens=lens, distortion=(coefficient, 0.0, 0.0, 0.0))
+    with np.errstate(all="ignore"):
+        rays = camera.resize((24, 32)).unproject(camera.resize((24, 32)).pixel_grid())
+    assert np.isfinite(rays.directions).all()
+
+
+@pytest.mark.parametrize("coefficient", [1e300, -1e12])
+@pytest.mark.parametrize("lens", ["radtan", "fisheye"])
+def test_impossible_coefficients_are_refused(lens: str, coefficient: float) -> None:
+    with pytest.raises(CalibrationError, match=r"distortion: expected finite numbers up to 1e\+06"):
+        make("pinhole", lens=lens, distortion=(coefficient, 0.0, 0.0, 0.0))

@@ -1,0 +1,124 @@
+"""``python -m arbiview_aug bench ablation``: its rows are settings that work, and its figures tell them apart."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from arbiview_aug.__main__ import main
+from arbiview_aug.cli.bench.ablation import NOTES, ROWS, STEPS, SYNTHETIC, Step, markdown, measure, step_figures
+from arbiview_aug.favs.config import PaperConfig, favs_config
+
+
+def test_no_two_rows_are_alike_and_steps_need_all() -> None:
+    assert len(set(ROWS.values())) == len(ROWS)
+    assert {row for step in STEPS.values() for row in (step.row, step.without)} == set(ROWS)
+    configs = [favs_config(row.quality) for row in ROWS.values()]
+    switched = {name for name in PaperConfig.__dataclass_fields__ if name.startswith("use_")}
+    off = {name for c in configs for name in switched if isinstance(c, PaperConfig) and not getattr(c, name)}
+    assert off == switched - {"use_detections"}, "each stage and weight of the paper is off somewhere"
+
+
+@pytest.mark.parametrize(
+    ("step", "changed"),
+    [
+        ("stage 2, matching", {"use_feature_matching"}),
+        ("w_quality", {"use_quality_weight"}),
+        ("bilinear, not nearest", {"interpolation"}),
+        ("blended seams", {"seam_width"}),
+        ("antialiasing", {"antialias"}),
+        ("depth from overlap", {"overlap_depth"}),
+        ("street, not far", {"surface"}),
+        ("boxes on the street", {"surface"}),
+        ("harmonising", {"harmonise"}),
+    ],
+)
+def test_a_step_changes_one_thing(step: str, changed: set[str]) -> None:
+    one, two = (ROWS[name] for name in (STEPS[step].row, STEPS[step].without))
+    configs = [vars(favs_config(row.quality)) for row in (one, two)]
+    found = {name for name, value in configs[0].items() if value != configs[1][name]}
+    found |= {name for name in one._fields if name != "quality" and getattr(one, name) != getattr(two, name)}
+    assert found == changed
+
+
+def test_figures_of_a_step() -> None:
+    rows = {
+        "with": {
+            "turned": {"db": 30.0},
+            "raised": {"db": 20.0},
+            "ms": [12.0, 14.0, 16.0],
+            "plan_ms": [40.0, 40.0, 40.0],
+        },
+        "without": {"turned": {"db": 29.0}, "raised": {"db": 20.5}, "ms": [10.0, 10.0, 10.0], "plan_ms": [5.0] * 3},
+        "noisy": {"turned": {"db": 29.0}, "raised": {"db": 20.5}, "ms": [13.0, 14.0, 15.0], "plan_ms": [5.0] * 3},
+    }
+    found = step_figures(Step("with", "without"), rows, "db")
+    assert found["ms"] == 14 and found["added_ms"] == {"median_ms": 4, "q1_ms": 3, "q3_ms": 5}
+    assert found["turned"] == {"psnr_db": 30, "gain_db": 1, "gain_db_per_ms": 0.25}
+    assert found["raised"] == {"psnr_db": 20, "gain_db": -0.5, "gain_db_per_ms": -0.125}
+    replanned = step_figures(Step("with", "without", replanned=True), rows, "db")
+    assert replanned["ms"] == 54 and replanned["added_ms"]["median_ms"] == 44, "its plan is paid in every frame"
+    assert step_figures(Step("with", "noisy"), rows, "db")["turned"]["gain_db_per_ms"] is None, "-1, 0 and 1 ms"
+
+
+def test_the_table() -> None:
+    move = {"psnr_db": 28.514, "gain_db": -0.001, "gain_db_per_ms": -0.0001}
+    step = {"ms": 22.84, "added_ms": {"median_ms": 1.94}, "turned": move, "raised": {**move, "gain_db": 1.5}}
+    slow = {**step, "ms": 410.2, "turned": {**move, "gain_db_per_ms": None}}
+    sets = {
+        "here": {
+            "steps": {"blended seams": step, "harmonising": slow},
+            "overlap": [{"overlap_raw_psnr_db": 15.15}, {}],
+        },
+        "there": {"steps": {"harmonising": slow}, "overlap": []},
+    }
+    text = markdown({"data": sets})
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
+    assert cells[0][2:] == ["here: turned", "raised", "ms", "mdB a ms", "there: turned", "raised", "ms", "mdB a ms"]
+    assert cells[2] == ["blended seams", "fast", "28.51 (+0.00)", "28.51 (+1.50)", "22.8 (+1.9)", "+0 / +0", *"----"]
+    assert cells[3][:6] == ["harmonising", "fast, harmonised", "28.51 (+0.00)", "28.51 (+1.50)", "410 (+2)", "no time"]
+    assert len(cells) == 4, "rows without figures are left out"
+    assert text.startswith(NOTES) and text.endswith("in dB, here 15.15 to -.")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_street_tells_the_surfaces_apart() -> None:
+    report = json.loads(json.dumps(measure([], list(STEPS), size=(64, 176))))
+    street = report["data"][SYNTHETIC]
+    assert list(street["rows"]) == list(ROWS) and list(street["steps"]) == list(STEPS), "it has boxes and the truth"
+    steps, rows = street["steps"], street["rows"]
+    for name in ("street, not far", "ground, not far", "boxes on the street"):
+        assert steps[name]["turned"]["gain_db"] > 0.3 and steps[name]["raised"]["gain_db"] > 0.3, name
+    assert steps["antialiasing"]["turned"]["gain_db"] > 0 < steps["bilinear, not nearest"]["turned"]["gain_db"]
+    stages_1_and_4, far = rows["paper without stages 2 and 3"]["turned"], rows["fast, far"]["turned"]
+    assert abs(stages_1_and_4["true_psnr_db"] - far["true_psnr_db"]) < 1
+    assert all(min(row["ms"]) > 0 and row["turned"]["true_rmse"] > row["turned"]["true_mae"] for row in rows.values())
+    assert steps["depth from overlap"]["ms"] > 2 * steps["depth from overlap, held"]["ms"]
+    printed = markdown(report)
+    assert all(f"| {name} " in printed for name in STEPS) and f"{steps['blended seams']['ms']:.1f} (" in printed
+
+
+@pytest.mark.slow
+def test_command(nuscenes_root: Path, fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "new" / "ablation.json"
+    arguments = ["bench", "ablation", "--reduce", "4", "--output", str(path)]
+    assert main([*arguments, "--data", str(nuscenes_root), "--json", "--only", "harmonising"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report == json.loads(path.read_text()) and list(report["data"]) == ["nuscenes-one"]
+    found = report["data"]["nuscenes-one"]
+    assert list(found["rows"]) == ["fast", "fast, harmonised"] and found["size"] == [225, 400]
+    assert found["rows"]["fast"]["turned"]["even_psnr_db"] == found["steps"]["harmonising"]["turned"]["psnr_db"] + (
+        -found["steps"]["harmonising"]["turned"]["gain_db"]
+    )
+    before, after = (of["overlap_raw_psnr_db"] for of in found["overlap"])
+    assert after > before + 3
+    assert main([*arguments, "--data", str(fisheye_root)]) == 2
+    assert "expected LiDAR points to score by, got none" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main([*arguments, "--only", "no such step"])
+    with pytest.raises(SystemExit, match="2"):
+        main([*arguments, "--data", str(nuscenes_root), str(nuscenes_root)])
+    assert "expected folders of different names" in capsys.readouterr().err

@@ -1,0 +1,93 @@
+"""``python -m arbiview_aug bench loader``: that it runs; and, as a release check, two workers against one."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import multiprocessing
+import os
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from arbiview_aug import RetargetedDataset, RigRetarget
+from arbiview_aug.__main__ import main
+from arbiview_aug.cli.bench.loader import PLAIN, Repeated, counted, loader_rates
+
+EXPECTED = 1.7
+QUIET = 1.9  # two processes that only count do this much more than one where nobody else is working
+QUIET_LOAD = 1.0  # before the measurement, over a minute
+FRAMES = 48
+EPOCHS = 3
+
+
+@pytest.fixture
+def samples(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
+    return importlib.import_module("worker_samples")
+
+
+def test_repeated() -> None:
+    frames = [{"name": name, "points": torch.zeros(2, 4)} for name in "abc"]
+    repeated = Repeated(frames, 7)
+    found = [repeated[k] for k in range(len(repeated))]
+    assert "".join(sample["name"] for sample in found) == "abcabca"
+    heights = [float(sample["points"][0, 2]) for sample in found]
+    assert heights[0] == heights[2] == 0 < heights[3] == heights[5] < heights[6] < 1e-3
+    assert all(float(frame["points"].abs().max()) == 0 for frame in frames)
+
+
+def test_rates(samples: ModuleType) -> None:
+    plain = samples.Frames(4)
+    datasets = {PLAIN: plain, "retargeted": RetargetedDataset(plain, RigRetarget(samples.rig().turned(yaw_deg=20)))}
+    before = set(multiprocessing.active_children())
+    rates = loader_rates(datasets, (0, 1), 2)
+    assert [(rate.name, rate.workers) for rate in rates] == [(name, n) for name in datasets for n in (0, 1)]
+    for rate in rates:
+        assert 0 < rate.frames_per_s <= rate.best_per_s and rate.ms.q1_ms <= rate.ms.median_ms <= rate.ms.q3_ms
+        assert (rate.unique_mib is None) == (rate.workers == 0)
+        if rate.unique_mib is not None:
+            assert rate.peak_mib is not None and 0 < rate.unique_mib < rate.peak_mib
+    assert set(multiprocessing.active_children()) <= before  # none is left behind
+
+
+def test_command(tmp_path: Path, nuscenes_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "new" / "loader.json"
+    arguments = ["bench", "loader", "--data", str(nuscenes_root), "--surface", "street", "--size", "32x88"]
+    tiny = ["--reduce", "4", "--workers", "0", "1", "--frames", "3", "--epochs", "1"]
+    assert main([*arguments, *tiny, "--output", str(path)]) == 0
+    report = json.loads(path.read_text())
+    assert report["data"] == "nuscenes-one" and report["target"] == "waymo" and report["size"] == [32, 88]
+    assert [rate["name"] for rate in report["rates"]] == [PLAIN, PLAIN, *["retargeted, street"] * 2]
+    printed = capsys.readouterr().out
+    assert "frames/s" in printed and "load" in printed and f"report: {path}" in printed
+    with pytest.raises(SystemExit, match="2"):
+        main([*arguments, "--workers", "-1"])
+
+
+@pytest.mark.release
+def test_two_workers_against_one(
+    samples: ModuleType, capsys: pytest.CaptureFixture[str], report_bound: Callable[..., None]
+) -> None:
+    """Four 800x450 images a frame to four of 704x256."""
+    source = samples.rig((450, 800))
+    retarget = RigRetarget(source.turned(yaw_deg=20), source_rig=source, size=(256, 704))
+    retarget.prepare()
+    dataset = RetargetedDataset(samples.Frames(FRAMES, (450, 800)), retarget)
+    load, machine = os.getloadavg()[0], [counted(2) / counted(1)]
+    rates = loader_rates({"retargeted": dataset}, (0, 1, 2), EPOCHS)
+    machine.append(counted(2) / counted(1))
+    best = {rate.workers: rate.best_per_s for rate in rates}
+    scaling, given = best[2] / best[1], min(machine)
+    report = (
+        f"frames/s: {', '.join(f'{n} workers {rate:.1f}' for n, rate in best.items())}; two against one {scaling:.2f}; "
+        f"two counting processes against one at least {given:.2f}; load {load:.1f} on {os.cpu_count()} cores"
+    )
+    with capsys.disabled():
+        print("\n" + report)
+    if (os.cpu_count() or 1) < 2 or given < QUIET or load > QUIET_LOAD:
+        pytest.skip(f"the machine is busy, so the bound says nothing: {report}")
+    report_bound("frames/s, two workers over one", scaling, at_least=EXPECTED)

@@ -1,0 +1,61 @@
+"""How benchmarks measure."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from arbiview_aug.cli.bench.timing import peak_mib, quartiles, timed_rounds, write_json
+from arbiview_aug.errors import DataError
+
+
+def test_quartiles() -> None:
+    assert quartiles(np.array([5.0, 1, 4, 2, 3])) == (3, 2, 4)
+
+
+def test_rounds_run_all_in_turn_and_time_the_second_call() -> None:
+    order: list[str] = []
+
+    def busy() -> None:
+        order.append("busy")
+        if order.count("busy") % 2 == 0:  # each is warmed by a call before
+            end = time.process_time() + 0.02
+            while time.process_time() < end:
+                pass
+
+    times = timed_rounds({"busy": busy, "idle": lambda: order.append("idle")}, 3, "test")
+    assert order == ["busy", "busy", "idle", "idle"] * 3
+    assert (times["busy"] >= 20).all() and (times["idle"] < 10).all()
+
+
+def test_what_takes_long_runs_less_often() -> None:
+    def clock(run: Callable[[], Any]) -> float:
+        return float(run())
+
+    work = {"long": lambda: 10.0, "short": lambda: 0.0}
+    times = timed_rounds(work, 8, "test", enough_ms=45, clock=clock)
+    assert len(times["long"]) == 5 and len(times["short"]) == 8
+    assert len(timed_rounds(work, 8, "test", enough_ms=5, clock=clock)["long"]) == 3
+
+
+def test_peak_memory_is_seen_although_it_is_given_back() -> None:
+    def large() -> None:
+        np.ones(64 * 2**20, np.uint8)
+
+    found = peak_mib(large)
+    if found is None:
+        pytest.skip("this system does not tell the peak of a process")
+    assert 60 < found < 100
+    small = peak_mib(lambda: None)
+    assert small is not None and small < 32  # the kernel counts in batches, for each core
+
+
+def test_report_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="expected a file that can be written to"):
+        write_json({}, tmp_path / "file" / "report.json")

@@ -1,0 +1,335 @@
+"""Conversions that are killed, run out of space or meet broken files: whole files or none, and they go on."""
+
+from __future__ import annotations
+
+import errno
+import multiprocessing
+import os
+import random
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from arbiview_aug.__main__ import main
+from arbiview_aug.cli.convert import command as converting
+from tests.cli.convert.drives import SURROUND, command, tree, write_frames, write_nuscenes
+from tests.helpers import sampled
+
+SEED, KILLS, PARTIAL = 0, 24, 5
+MANY = 120
+"""Frames, of which 40 at most are there when the kill comes: a slow machine kills late."""
+
+
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    root = tmp_path_factory.mktemp("sources")
+    return {"frames": write_frames(root / "frames", 6), "nuscenes": write_nuscenes(root / "nuscenes")}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(sources: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, bytes]]:
+    root = tmp_path_factory.mktemp("undisturbed")
+    for kind, source in sources.items():
+        assert main(command(f"{kind}:{source}", root / kind)) == 0
+    return {kind: tree(root / kind) for kind in sources}
+
+
+@pytest.mark.parametrize(("written", "kind"), sampled([0, 3, 40, 95], ["frames", "nuscenes"]))
+def test_a_full_disk(
+    kind: str,
+    written: int,
+    sources: dict[str, Path],
+    undisturbed: dict[str, dict[str, bytes]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """From the first file on, in the midst of a sample, and in the tables: a message, and what is there is whole."""
+    flushed, flush = [0], os.fsync
+
+    def full(file: int) -> None:
+        flushed[0] += 1
+        if flushed[0] > written:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        flush(file)
+
+    asked = command(f"{kind}:{sources[kind]}", tmp_path / "new")
+    monkeypatch.setattr(os, "fsync", full)
+    assert main(asked) in (1, 2)
+    said = capsys.readouterr().err
+    assert "No space left on device; free some space and run it again" in said and "Traceback" not in said
+    found = tree(tmp_path / "new")
+    assert found.items() <= undisturbed[kind].items() and len(found) < len(undisturbed[kind])
+    monkeypatch.setattr(os, "fsync", flush)
+    assert main(asked) == 0
+    assert tree(tmp_path / "new") == undisturbed[kind]
+
+
+@pytest.mark.parametrize("code", [errno.EROFS, errno.EACCES, errno.EDQUOT])
+def test_an_output_that_may_not_be_written(
+    code: int,
+    sources: dict[str, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def refused(one: Path, two: Path) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "replace", refused)
+    assert main(command(sources["frames"], tmp_path / "new")) == 2
+    assert os.strerror(code) in capsys.readouterr().err
+    assert tree(tmp_path / "new") == {}
+
+
+def test_an_output_that_cannot_be_a_folder(
+    sources: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert main(command(sources["frames"], tmp_path / "file" / "new")) == 2
+    assert "expected a folder that can be written to, got Not a directory" in capsys.readouterr().err
+
+
+def test_a_truncated_image(
+    sources: dict[str, Path],
+    undisturbed: dict[str, dict[str, bytes]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    shutil.copytree(sources["frames"], tmp_path / "frames")
+    image = tmp_path / "frames" / "0002" / "01.jpg"
+    sound = image.read_bytes()
+    image.write_bytes(sound[: len(sound) // 2])
+    reported, skipped, stopped = (command(tmp_path / "frames", tmp_path / name) for name in ("a", "b", "c"))
+    assert main([*stopped, "--on-error", "fatal"]) == 1
+    assert "0002: failed: camera" in capsys.readouterr().err
+    assert not (tmp_path / "c" / "0003").exists() and (tmp_path / "c" / "0001").exists()
+    assert main([*skipped, "--on-error", "skip"]) == 0
+    assert "got a truncated file" in capsys.readouterr().err
+    assert (tmp_path / "b" / "conversion" / "provenance.json").exists() and not (tmp_path / "b" / "0002").exists()
+    assert "0002" not in (tmp_path / "b" / "sequence.json").read_text()
+    assert main(reported) == 1
+    assert "5 samples converted, 1 failed" in capsys.readouterr().out
+    assert not (tmp_path / "a" / "sequence.json").exists()
+    image.write_bytes(sound)
+    for asked, folder in ((reported, "a"), (skipped, "b"), (stopped, "c")):
+        assert main(asked) == 0
+        assert tree(tmp_path / folder) == undisturbed["frames"]
+
+
+def test_nothing_that_can_be_converted(
+    sources: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(sources["frames"] / "0000", tmp_path / "frame")
+    (tmp_path / "frame" / "00.jpg").write_bytes(b"")
+    assert main(command(tmp_path / "frame", tmp_path / "new", "--on-error", "skip")) == 2
+    assert "expected at least one sample that can be converted" in capsys.readouterr().err
+
+
+def test_an_interrupt_says_how_to_go_on(
+    sources: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(converting, "_run", interrupted)
+    assert main(command(sources["frames"], tmp_path / "new")) == 130
+    assert "run it again to go on" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["frames", "nuscenes"])
+def test_shards_write_the_same_bytes(
+    kind: str,
+    sources: dict[str, Path],
+    undisturbed: dict[str, dict[str, bytes]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """In any order; the last one finishes. One that was killed may go on in other shards."""
+    asked = command(f"{kind}:{sources[kind]}", tmp_path / "new")
+    for shard in ("2", "0"):
+        assert main([*asked, "--num-shards", "3", "--shard-index", shard]) == 0
+        assert "samples of other shards are not there yet" in capsys.readouterr().out
+    (tmp_path / "new" / "conversion" / "samples" / ".x.json.1-01234567-1-89abcdef.part").write_bytes(b"{")
+    assert main([*asked, "--num-shards", "3", "--shard-index", "1"]) == 0
+    assert tree(tmp_path / "new") == undisturbed[kind]
+    with pytest.raises(SystemExit):
+        main([*asked, "--num-shards", "3", "--shard-index", "3"])
+
+
+def test_processes_write_the_same_bytes(
+    sources: dict[str, Path], undisturbed: dict[str, dict[str, bytes]], tmp_path: Path
+) -> None:
+    assert main(command(f"nuscenes:{sources['nuscenes']}", tmp_path / "new", "--workers", "2")) == 0
+    assert tree(tmp_path / "new") == undisturbed["nuscenes"]
+
+
+# --- killed -----------------------------------------------------------------------------------------------------------
+def started(commands: Sequence[Sequence[str]]) -> list[multiprocessing.process.BaseProcess]:
+    """Each in a process of its own."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["arbiview_aug.cli.convert.command"])
+    found: list[multiprocessing.process.BaseProcess] = [context.Process(target=main, args=(one,)) for one in commands]
+    for process in found:
+        process.start()
+    return found
+
+
+def killed(commands: Sequence[Sequence[str]], after_s: float) -> int:
+    """Start the commands, kill those that still run after a while; gives how many."""
+    processes = started(commands)
+    time.sleep(after_s)
+    alive = [process for process in processes if process.is_alive()]
+    for process in alive:
+        process.kill()
+    for process in processes:
+        process.join()
+    return len(alive)
+
+
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(
+    ("kind", "shards"),
+    [
+        pytest.param("frames", 1, marks=pytest.mark.slow),
+        pytest.param("nuscenes", 3, marks=pytest.mark.slow),
+        pytest.param("frames", 3, marks=pytest.mark.release),
+        pytest.param("nuscenes", 1, marks=pytest.mark.release),
+    ],
+)
+def test_killed_at_any_moment_it_goes_on(kind: str, shards: int, tmp_path: Path) -> None:
+    """At least 40 samples and 20 kills, in six outputs or fewer, from the first file to the last table."""
+    if kind == "frames":
+        source = write_frames(tmp_path / "source", 42)
+    else:
+        source = write_nuscenes(tmp_path / "source", 21)
+    SURROUND.with_cameras(SURROUND.cameras[:2]).shifted(x_m=0.3).save(tmp_path / "two.json")
+    target = ("--target", str(tmp_path / "two.json"))
+    (whole,) = started([command(source, tmp_path / "whole", *target)])  # starts the server, which takes the longest
+    whole.join()
+    begun = time.monotonic()
+    (again,) = started([command(source, tmp_path / "again", *target)])
+    again.join()
+    took_s = time.monotonic() - begun
+    expected = tree(tmp_path / "whole")
+    assert whole.exitcode == again.exitcode == 0 and tree(tmp_path / "again") == expected
+    draw, kills, outputs, partial = random.Random(SEED), 0, 0, 0
+    while kills < KILLS or partial < PARTIAL:
+        outputs += 1
+        output = tmp_path / f"killed-{outputs}"
+        asked = command(source, output, *target)
+        for _ in range(KILLS // 4):
+            own = [[*asked, "--num-shards", str(shards), "--shard-index", str(k)] for k in range(shards)]
+            kills += killed(own, draw.uniform(0.05, 1) * took_s / (1 if draw.random() < 0.5 else 3))
+            found = tree(output) if output.exists() else {}
+            half = [
+                name for name, content in found.items() if not name.endswith(".part") and expected.get(name) != content
+            ]
+            assert not half, half
+            partial += 0 < len(found) < len(expected)
+        for process in started([asked]):
+            process.join()
+            assert process.exitcode == 0
+        assert tree(output) == expected
+    print(
+        f"{kind}, {shards} shards: {kills} kills in {outputs} outputs, {partial} times in between; a run {took_s:.1f} s"
+    )
+
+
+def children_of(pid: int | None) -> list[Any]:
+    """All processes that one has started, and theirs."""
+    return pytest.importorskip("psutil").Process(pid).children(recursive=True)
+
+
+def _runs(process: Any) -> bool:
+    try:
+        return process.is_running() and process.status() != "zombie"
+    except pytest.importorskip("psutil").NoSuchProcess:
+        return False
+
+
+def all_end(processes: Sequence[Any], within_s: float = 60) -> bool:
+    """Whether all end within a time; one that nobody has asked for its exit code has ended."""
+    deadline = time.monotonic() + within_s
+    while any(map(_runs, processes)):
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+@pytest.mark.slow
+def test_killed_with_its_workers_it_goes_on(tmp_path: Path) -> None:
+    """Workers die with their parent: nobody writes into the next run."""
+    source = write_frames(tmp_path / "source", MANY)
+    assert main(command(source, tmp_path / "whole")) == 0
+    asked = command(source, tmp_path / "new", "--workers", "2")
+    for records in sorted(random.Random(SEED).sample(range(1, 36), 4)):
+        (process,) = started([asked])
+        while len(list((tmp_path / "new" / "conversion" / "samples").glob("*.json"))) < records:
+            assert process.is_alive()
+            time.sleep(0.005)
+        workers = children_of(process.pid)
+        process.kill()
+        process.join()
+        assert all_end(workers)
+        assert len(tree(tmp_path / "new")) < len(tree(tmp_path / "whole"))
+    assert main(asked) == 0
+    assert tree(tmp_path / "new") == tree(tmp_path / "whole")
+
+
+@pytest.mark.slow
+def test_ray_writes_the_same_bytes(
+    sources: dict[str, Path],
+    undisturbed: dict[str, dict[str, bytes]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'arbiview_aug[distributed]'")
+    monkeypatch.setenv("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    try:
+        asked = command(f"nuscenes:{sources['nuscenes']}", tmp_path / "new", "--runner", "ray")
+        asked[asked.index("--workers") + 1] = "2"
+        assert main(asked) == 0
+    finally:
+        ray.shutdown()
+    assert tree(tmp_path / "new") == undisturbed["nuscenes"]
+
+
+def settled(root: Path) -> dict[str, bytes]:
+    """The files, once nobody writes any more: Ray's actors outlive their driver by a moment."""
+    names: set[str] = set()
+    while names != (names := {str(path) for path in root.rglob("*")}):
+        time.sleep(3)
+    return tree(root)
+
+
+@pytest.mark.slow
+def test_ray_killed_goes_on(tmp_path: Path) -> None:
+    """The driver dies, and its actors with it; the next run finishes what is missing."""
+    pytest.importorskip("ray", reason="Ray is not installed: pip install 'arbiview_aug[distributed]'")
+    source = write_frames(tmp_path / "source", MANY)
+    assert main(command(source, tmp_path / "whole")) == 0
+    expected = tree(tmp_path / "whole")
+    asked = command(source, tmp_path / "new", "--runner", "ray")
+    asked[asked.index("--workers") + 1] = "2"
+    environment = {key: value for key, value in os.environ.items() if key != "RAY_ADDRESS"}
+    environment["RAY_ENABLE_UV_RUN_RUNTIME_ENV"] = "0"
+    for records in (2, 20):
+        with subprocess.Popen([sys.executable, "-m", "arbiview_aug", *asked], env=environment) as running:
+            while len(list((tmp_path / "new" / "conversion" / "samples").glob("*.json"))) < records:
+                assert running.poll() is None
+                time.sleep(0.005)
+            running.kill()
+        found = settled(tmp_path / "new")
+        whole = {name: content for name, content in found.items() if not name.endswith(".part")}
+        assert all(expected[name] == content for name, content in whole.items()) and len(whole) < len(expected)
+    subprocess.run([sys.executable, "-m", "arbiview_aug", *asked], env=environment, check=True)
+    assert tree(tmp_path / "new") == expected

@@ -1,0 +1,298 @@
+"""Frame folders converted: what our reader finds in them is what was rendered."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import RigRetarget, load_rig
+from arbiview_aug.__main__ import main
+from arbiview_aug.cli.convert import command as command_module
+from arbiview_aug.cli.convert.views import coverage_of
+from arbiview_aug.datasets import FrameFolder, WithMotionDepth
+from arbiview_aug.datasets.motion_depth import DepthFolder
+from arbiview_aug.errors import DataError
+from arbiview_aug.temporal.motion_depth import MotionDepth
+from tests.cli.convert.drives import SIZE, command, tree, write_frames
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_frames(tmp_path_factory.mktemp("frames") / "drive", 3)
+
+
+@pytest.fixture(scope="module")
+def output(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("converted") / "new"
+    asked = command(source, folder, "--images", "png", "--report", "1")
+    asked[asked.index("argoverse2")] = "waymo"  # with lenses
+    assert main(asked) == 0
+    return folder
+
+
+def test_the_reader_finds_what_was_rendered(source: Path, output: Path) -> None:
+    old, new = FrameFolder(source), FrameFolder(output)
+    assert new.tokens == old.tokens == ["0000", "0001", "0002"]
+    retarget = RigRetarget(load_rig("waymo"), size=(24, 40), surface="street", outputs=("confidence",))
+    for before, after in zip((old[k] for k in range(3)), (new[k] for k in range(3)), strict=True):
+        out = retarget(before)
+        assert torch.equal(after["images"], out["images"])
+        assert torch.allclose(after["cam2ego"], out["cam2ego"]) and torch.allclose(after["K"], out["K"])
+        assert after["rig"].ground_z_m == before["rig"].ground_z_m == -0.1
+        assert after["rig"].names == load_rig("waymo").names and after["rig"][0].lens == "radtan"
+        assert after["rig"] == load_rig("waymo").resized((24, 40), "crop").in_frame_of(before["rig"])
+        for key in ("points", "boxes_3d", "ego2world"):
+            assert torch.equal(after[key], before[key])
+        assert after["time_s"] == before["time_s"]
+        calib = json.loads((output / after["token"] / "calib.json").read_text())
+        assert calib["license"] == "as you like"
+        for k, camera in enumerate(calib["cameras"]):
+            image = output / after["token"] / camera["file"]
+            assert np.array_equal(coverage_of(image), out["coverage"][k].numpy())
+            assert (image.parent / camera["confidence"]).is_file()
+
+
+def test_points_are_the_same_file(source: Path, output: Path) -> None:
+    assert (output / "0001" / "lidar.npy").samefile(source / "0001" / "lidar.npy")
+
+
+def test_provenance_names_versions_settings_and_sources(source: Path, output: Path) -> None:
+    said = json.loads((output / "conversion" / "provenance.json").read_text())
+    assert said["versions"]["torch"] == torch.__version__.split("+")[0] or said["versions"]["torch"]
+    assert said["settings"]["quality"] == "fast" and said["settings"]["target"]["name"] == "waymo"
+    sums = said["sources"]["0002"]
+    assert set(sums) == {"0002/calib.json", "0002/00.jpg", "0002/01.jpg", "0002/lidar.npy"}
+    for name, digest in sums.items():
+        assert hashlib.sha256((source / name).read_bytes()).hexdigest() == digest
+    assert said["skipped"] == {}
+
+
+def test_a_report_shows_what_was_written(output: Path) -> None:
+    page = (output / "conversion" / "report.html").read_text()
+    assert "drive as waymo would have seen it" in page and "1 of 3 frames" in page and "converted" in page
+
+
+def test_fits_and_bars(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = FrameFolder(source)[0]
+    for fit in ("pad", "stretch"):
+        assert main(command(source, tmp_path / fit, "--images", "png", "--fit", fit)) == 0
+        after = FrameFolder(tmp_path / fit)[0]
+        expected = load_rig("argoverse2").resized((24, 40), fit).in_frame_of(before["rig"])
+        assert np.allclose(after["rig"].K, expected.K) and after["rig"][0].size == (24, 40)
+        if fit == "pad":
+            for camera, image, wanted in zip(after["rig"], after["images"], expected, strict=True):
+                assert np.array_equal(camera.mask, wanted.mask) and not camera.mask.all()
+                assert not image[:, torch.from_numpy(~camera.mask)].any()
+    assert main(command(source, tmp_path / "pad", "--images", "png", "--fit", "crop")) != 0
+    assert "got settings.fit 'crop' instead of 'pad'" in capsys.readouterr().err
+
+
+def test_masks_of_the_targets_own_car(source: Path, tmp_path: Path) -> None:
+    mask = np.ones(SIZE, bool)
+    mask[20:] = False
+    rig = FrameFolder(source)[0]["rig"]
+    rig.with_cameras([replace(rig[0], mask=mask), rig[1]]).save(tmp_path / "rig.json")
+    asked = command(source, tmp_path / "new")
+    asked[asked.index("argoverse2")] = str(tmp_path / "rig.json")
+    del asked[asked.index("--size") : asked.index("--size") + 2]
+    assert main(asked) == 0
+    found = FrameFolder(tmp_path / "new")[0]["rig"]
+    assert np.array_equal(found[0].mask, mask) and found[1].mask.all()
+
+
+def test_what_was_made_up_is_said(source: Path, tmp_path: Path) -> None:
+    assert main(command(source / "0001", tmp_path / "new", "--path", "inpaint")) == 0
+    calib = json.loads((tmp_path / "new" / "0001" / "calib.json").read_text())
+    for camera in calib["cameras"]:
+        made_up = cv2.imread(str(tmp_path / "new" / "0001" / camera["generated"]), cv2.IMREAD_GRAYSCALE) > 0
+        covered = coverage_of(tmp_path / "new" / "0001" / camera["file"])
+        assert not (made_up & covered).any()
+        assert made_up.any() or covered.all() or not covered.any()
+
+
+def test_depth_from_motion_is_read(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(source, tmp_path / "drive")
+    asked = command(tmp_path / "drive", tmp_path / "new", "--images", "png", "--surface", "motion")
+    assert main(asked) == 2 and "expected depth from motion in" in capsys.readouterr().err
+    depths = DepthFolder(tmp_path / "drive" / "motion_depth")
+    old = FrameFolder(tmp_path / "drive")
+    for k, token in enumerate(old.tokens):
+        rig = old[k]["rig"]
+        depths.write(token, rig, MotionDepth(tuple(np.full(c.size, 6.0 + k, np.float32) for c in rig), "made"))
+    assert main(asked) == 0
+    retarget = RigRetarget(load_rig("argoverse2"), size=(24, 40), surface="motion", outputs=("confidence",))
+    static = RigRetarget(load_rig("argoverse2"), size=(24, 40), surface="street")
+    new, samples = FrameFolder(tmp_path / "new"), WithMotionDepth(old, depths.root)
+    for k in range(len(old)):
+        assert torch.equal(new[k]["images"], retarget(samples[k])["images"])
+        assert not torch.equal(new[k]["images"], static(old[k])["images"])
+    read = json.loads((tmp_path / "new" / "conversion" / "provenance.json").read_text())["sources"]["0001"]
+    assert "motion_depth/0001.npz" in read
+    depths.path("0002").unlink()
+    (tmp_path / "drive" / "motion_depth").rename(tmp_path / "elsewhere")
+    moved = command(tmp_path / "drive", tmp_path / "newer", "--surface", "motion")
+    assert main([*moved, "--motion-depth", str(tmp_path / "elsewhere")]) == 1
+    assert "expected depth from motion of frame '0002', found none" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(command(source, tmp_path / "other", "--motion-depth", str(tmp_path / "elsewhere")))
+    assert "expected it with --surface motion" in capsys.readouterr().err
+
+
+def test_impossible_settings(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for asked in (["--path", "diffusion", "--generator", str(tmp_path / "none")], ["--size", "40000x8"]):
+        assert main(command(source, tmp_path / "new", *asked)) == 2
+        assert "expected" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_one_frame_alone(source: Path, tmp_path: Path) -> None:
+    assert main(command(f"frames:{source / '0001'}", tmp_path / "new")) == 0
+    assert FrameFolder(tmp_path / "new").tokens == ["0001"]
+
+
+def test_neighbours_fill_by_a_switch(source: Path, tmp_path: Path) -> None:
+    for n in (0, 1):
+        assert main(command(source, tmp_path / str(n), "--neighbours", str(n))) == 0
+    alone, filled = (FrameFolder(tmp_path / str(n))[1] for n in (0, 1))
+    paths = [tmp_path / str(n) / "0001" for n in (0, 1)]
+    covered = [sum(coverage_of(file).sum() for file in sorted(path.glob("??.jpg"))) for path in paths]
+    assert covered[1] > covered[0] and not torch.equal(alone["images"], filled["images"])
+
+
+def test_a_second_run_changes_nothing(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command(source, tmp_path / "new")) == 0
+    before = tree(tmp_path / "new")
+    assert main(command(source, tmp_path / "new")) == 0
+    assert tree(tmp_path / "new") == before
+    assert "0 samples converted, 3 there before" in capsys.readouterr().out
+
+
+def test_what_was_broken_is_made_again(source: Path, tmp_path: Path) -> None:
+    assert main(command(source, tmp_path / "new")) == 0
+    before = tree(tmp_path / "new")
+    (tmp_path / "new" / "0000" / "00.jpg").write_bytes(b"cut")
+    (tmp_path / "new" / "0001" / "01.coverage.png").unlink()
+    (tmp_path / "new" / "0002" / ".00.jpg.2-01234567-1-89abcdef.part").write_bytes(b"left behind")
+    assert main(command(source, tmp_path / "new")) == 0
+    assert tree(tmp_path / "new") == before
+
+
+@pytest.mark.parametrize("where", ["", "below", "around"])
+def test_it_does_not_write_into_its_source(source: Path, where: str, capsys: pytest.CaptureFixture[str]) -> None:
+    before = tree(source)
+    output = {"": source, "below": source / "new", "around": source.parent}[where]
+    assert main(command(source, output)) == 2
+    assert "expected a folder apart from the source" in capsys.readouterr().err
+    assert tree(source) == before
+
+
+def test_it_does_not_write_into_somebody_elses(
+    source: Path, output: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("years of work")
+    assert main(command(source, tmp_path / "mine")) == 2
+    assert "got thesis.tex and no conversion/settings.json" in capsys.readouterr().err
+    (tmp_path / "file").write_text("")
+    assert main(command(source, tmp_path / "file")) == 2
+    before = tree(output)
+    assert main(command(source, output, "--quality", "draft")) == 2
+    assert "quality 'draft' instead of 'fast'" in capsys.readouterr().err
+    assert tree(output) == before
+
+
+def test_a_frame_must_not_be_called_as_the_conversions_folder(source: Path, tmp_path: Path) -> None:
+    (tmp_path / "drive").mkdir()
+    (tmp_path / "drive" / "conversion").symlink_to(source / "0000")
+    assert main(command(tmp_path / "drive", tmp_path / "new")) == 2
+    assert not (tmp_path / "new").exists()
+    with pytest.raises(DataError):
+        FrameFolder(tmp_path / "new")
+
+
+def test_points_that_are_links_are_followed(source: Path, tmp_path: Path) -> None:
+    """As caches of downloads have them: relative links, which lead nowhere from elsewhere; within the data."""
+    shutil.copytree(source, tmp_path / "drive")
+    (tmp_path / "drive" / "blobs").mkdir()
+    for folder in sorted((tmp_path / "drive").glob("0*")):
+        (folder / "lidar.npy").rename(tmp_path / "drive" / "blobs" / folder.name)
+        (folder / "lidar.npy").symlink_to(Path("..", "blobs", folder.name))
+    assert main(command(tmp_path / "drive", tmp_path / "new")) == 0
+    linked = tmp_path / "new" / "0001" / "lidar.npy"
+    assert not linked.is_symlink() and linked.samefile(tmp_path / "drive" / "blobs" / "0001")
+
+
+@pytest.mark.parametrize("surface", ["lidar", "motion"])
+def test_a_report_of_surfaces_that_read_what_scores(source: Path, tmp_path: Path, surface: str) -> None:
+    shutil.copytree(source, tmp_path / "drive")
+    old = FrameFolder(source)
+    for k, token in enumerate(old.tokens):
+        rig = old[k]["rig"]
+        depth = MotionDepth(tuple(np.full(c.size, 6.0, np.float32) for c in rig), "made")
+        DepthFolder(tmp_path / "drive" / "motion_depth").write(token, rig, depth)
+    asked = command(tmp_path / "drive", tmp_path / "new", "--surface", surface, "--report", "1")
+    assert main(asked) == 0
+    page = (tmp_path / "new" / "conversion" / "report.html").read_text()
+    assert "ring_front_center" in page and "Not everything could be scored" not in page
+
+
+def test_a_source_that_changed_is_converted_again(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Another drive of the same name, a corrected calibration: sizes and calibrations tell."""
+    shutil.copytree(source, tmp_path / "drive")
+    asked = command(tmp_path / "drive", tmp_path / "new")
+    assert main(asked) == 0
+    calib = tmp_path / "drive" / "0000" / "calib.json"
+    calib.write_text(calib.read_text().replace('"cam2ego": [', '"cam2ego":  [', 1))
+    shutil.copy(source / "0000" / "00.jpg", tmp_path / "drive" / "0001" / "00.jpg")
+    capsys.readouterr()
+    assert main(asked) == 0
+    assert "2 samples converted, 1 there before" in capsys.readouterr().out
+    assert main(command(tmp_path / "drive", tmp_path / "whole")) == 0
+    assert tree(tmp_path / "new") == tree(tmp_path / "whole")
+
+
+def test_a_neighbour_that_was_mended_fills_again(source: Path, tmp_path: Path) -> None:
+    """What was converted while it could not be read is made anew: the same bytes as undisturbed."""
+    asked = ("--neighbours", "1", "--on-error", "skip")
+    assert main(command(source, tmp_path / "whole", *asked)) == 0
+    shutil.copytree(source, tmp_path / "drive")
+    image = tmp_path / "drive" / "0000" / "00.jpg"
+    sound = image.read_bytes()
+    image.write_bytes(b"cut")
+    assert main(command(tmp_path / "drive", tmp_path / "new", *asked)) == 0
+    record = tmp_path / "new" / "conversion" / "samples" / "0001.json"
+    assert json.loads(record.read_text())["without"] == ["0000"]
+    image.write_bytes(sound)
+    assert main(command(tmp_path / "drive", tmp_path / "new", *asked)) == 0
+    assert "without" not in json.loads(record.read_text())
+    assert tree(tmp_path / "new") == tree(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("content", [b"PK\x03\x04 no array", b"\x93NUMPY\x01\x00\x06\x00(((((\n", b""])
+def test_broken_points_are_one_frames_error(
+    source: Path, tmp_path: Path, content: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(source, tmp_path / "drive")
+    (tmp_path / "drive" / "0001" / "lidar.npy").write_bytes(content)
+    assert main(command(tmp_path / "drive", tmp_path / "new", "--on-error", "skip")) == 0
+    said = capsys.readouterr()
+    assert "2 samples converted, 1 skipped" in said.out and "0001: skipped: points " in said.err
+
+
+def test_records_that_nobody_wrote_here(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As where actors see another folder under the output's path."""
+    monkeypatch.setattr(command_module, "_run", lambda *_: iter(()))
+    assert main(command(source, tmp_path / "new")) == 2
+    assert "expected the records of all 3 samples, found 3 missing" in capsys.readouterr().err

@@ -1,0 +1,263 @@
+"""nuScenes roots converted: tables that hold together, and what our reader finds in them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import RigRetarget, load_rig
+from arbiview_aug.__main__ import main
+from arbiview_aug.cli.convert.nuscenes_rows import token_of, view_stem
+from arbiview_aug.datasets import NuScenesDataset
+from tests.cli.convert.drives import chained, command, read_tables, tree, write_nuscenes
+
+LEFT_OUT = "goes-sample-1"
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_nuscenes(tmp_path_factory.mktemp("nuscenes"))
+
+
+@pytest.fixture(scope="module")
+def output(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("converted") / "new"
+    assert main(command(source, folder, "--images", "png")) == 0
+    return folder
+
+
+def test_the_reader_finds_what_was_rendered(source: Path, output: Path) -> None:
+    old, new = NuScenesDataset(source), NuScenesDataset(output)
+    assert new.tokens == old.tokens and new.channels == sorted(load_rig("argoverse2").names)
+    retarget = RigRetarget(load_rig("argoverse2"), size=(24, 40), surface="street")
+    order = [load_rig("argoverse2").names.index(channel) for channel in new.channels]
+    for index in (0, 4):
+        before, after = old[index], new[index]
+        out = retarget(before)
+        assert torch.equal(after["images"], out["images"][order])
+        # In the ego frame at the LiDAR's time, while the vehicle of the first scene moves at 8 m/s.
+        assert torch.allclose(after["cam2ego"], out["cam2ego"][order], atol=1e-9)
+        assert torch.allclose(after["K"], out["K"][order])
+        assert after["time_s"] == before["time_s"] and after["box_tokens"] == before["box_tokens"]
+        for key in ("points", "boxes_3d", "ego2world"):
+            assert torch.equal(after[key], before[key])
+
+
+def test_the_tables_hold_together(source: Path, output: Path) -> None:
+    old, new = read_tables(source), read_tables(output)
+    assert set(new) == set(old) - {"image_annotations"}
+    for table in ("category", "instance", "map", "sample", "scene", "visibility"):
+        assert new[table] == old[table]
+    tokens = {table: {row["token"] for row in rows} for table, rows in new.items()}
+    for row in new["sample_data"]:
+        assert row["sample_token"] in tokens["sample"] and row["ego_pose_token"] in tokens["ego_pose"]
+        assert row["calibrated_sensor_token"] in tokens["calibrated_sensor"] and (output / row["filename"]).is_file()
+    assert {row["sensor_token"] for row in new["calibrated_sensor"]} == tokens["sensor"]
+    assert len(tokens["sample_data"]) == len(new["sample_data"]) and chained(new["sample_data"])
+    used = {row["ego_pose_token"] for row in new["sample_data"]}
+    assert tokens["ego_pose"] == used
+
+
+def test_new_cameras_record_when_the_lidar_did(output: Path) -> None:
+    tables = read_tables(output)
+    sensor_of = {row["token"]: row["sensor_token"] for row in tables["calibrated_sensor"]}
+    channels = {row["token"]: row["channel"] for row in tables["sensor"]}
+    by_sample: dict[str, dict[str, dict]] = {}
+    for row in tables["sample_data"]:
+        if row["is_key_frame"]:
+            channel = channels[sensor_of[row["calibrated_sensor_token"]]]
+            by_sample.setdefault(row["sample_token"], {})[channel] = row
+    assert len(by_sample) == 6
+    for rows in by_sample.values():
+        lidar, camera = rows["LIDAR_TOP"], rows["ring_front_center"]
+        assert camera["timestamp"] == lidar["timestamp"] and camera["ego_pose_token"] == lidar["ego_pose_token"]
+        assert (camera["height"], camera["width"], camera["fileformat"]) == (24, 40, "png")
+        assert camera["token"] == token_of(camera["sample_token"], "ring_front_center")
+        for mask in ("coverage", "confidence"):
+            assert (output / camera["filename"]).with_suffix(f".{mask}.png").is_file()
+    first = by_sample["goes-sample-0"]["ring_front_center"]
+    assert first["prev"] == "" and first["next"] == token_of("goes-sample-1", "ring_front_center")
+
+
+def test_other_sensors_are_linked(source: Path, output: Path) -> None:
+    rows = [row for row in read_tables(source)["sample_data"] if row["filename"].endswith(".bin")]
+    assert len(rows) > 12  # LiDAR and radar, sweeps too
+    assert all((output / row["filename"]).samefile(source / row["filename"]) for row in rows)
+    assert (output / "maps" / "map.png").samefile(source / "maps" / "map.png")
+
+
+def test_visibility_is_at_most_what_people_saw(source: Path, output: Path) -> None:
+    old, new = (read_tables(root)["sample_annotation"] for root in (source, output))
+    levels = [(a["visibility_token"], b["visibility_token"]) for a, b in zip(old, new, strict=True)]
+    assert all("1" <= b <= a for a, b in levels) and any(b < a for a, b in levels) and any(b == "4" for _, b in levels)
+    stripped = [{k: v for k, v in row.items() if k != "visibility_token"} for row in old]
+    assert stripped == [{k: v for k, v in row.items() if k != "visibility_token"} for row in new]
+
+
+def test_names_that_are_no_file_names() -> None:
+    assert view_stem("a__LIDAR_TOP__12.pcd.bin", "CAM") == "samples/CAM/a__CAM__12"
+    assert view_stem("000012.bin", "/camera/front") == "samples/%2Fcamera%2Ffront/000012__%2Fcamera%2Ffront"
+    assert view_stem("1532402927.147951.bin", "CAM") == "samples/CAM/1532402927.147951__CAM"
+
+
+def test_lidar_files_of_one_name(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Samples would write over each other's images."""
+    files = [path.relative_to(source) for path in (files[-1] for files in map(NuScenesDataset(source).files, (1, 4)))]
+    moved = [path.parent / f"scene-{k}" / "000012.bin" for k, path in enumerate(files)]
+    names = {str(path): str(new) for path, new in zip(files, moved, strict=True)}
+
+    def change(rows: list[dict]) -> None:
+        for row in rows:
+            row["filename"] = names.get(row["filename"], row["filename"])
+
+    root = _changed(source, tmp_path / "source", "sample_data", change)
+    for path, new in zip(files, moved, strict=True):
+        (root / new).parent.mkdir()
+        (root / path).rename(root / new)
+    assert main(command(root, tmp_path / "new")) == 2
+    assert "got 2 of the name 000012.bin" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("key", ["ego_pose_token", "filename", "is_key_frame"])
+def test_rows_without_what_is_needed(
+    source: Path, tmp_path: Path, key: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a radar, which nothing reads before the tables are written."""
+
+    def change(rows: list[dict]) -> None:
+        del next(row for row in rows if "RADAR" in row["filename"])[key]
+
+    root = _changed(source, tmp_path / "source", "sample_data", change)
+    assert main(command(root, tmp_path / "new")) == 2
+    assert f"key '{key}'" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_sample_that_is_left_out_leaves_no_trace(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its LiDAR frame is a sweep of the next; chains and counts go on without it."""
+    shutil.copytree(source, tmp_path / "source")
+    (tmp_path / "source" / NuScenesDataset(source).files(1)[2].relative_to(source)).write_bytes(b"\xff\xd8 cut off")
+    assert main(command(tmp_path / "source", tmp_path / "new")) == 1
+    assert not (tmp_path / "new" / "v1.0-mini").exists()
+    assert main(command(tmp_path / "source", tmp_path / "new", "--on-error", "skip")) == 0
+    said = capsys.readouterr().err
+    assert said.count(f"{LEFT_OUT}: failed: camera ") == 1 and said.count(f"{LEFT_OUT}: skipped: camera ") == 1
+    old, new = read_tables(source), read_tables(tmp_path / "new")
+    assert {row["token"] for row in old["sample"]} - {row["token"] for row in new["sample"]} == {LEFT_OUT}
+    assert not any(LEFT_OUT in json.dumps(rows) for rows in new.values())
+    for table in ("sample", "sample_annotation", "sample_data"):
+        assert chained(new[table])
+    (scene,) = [row for row in new["scene"] if row["token"] == "goes"]
+    assert scene["nbr_samples"] == 2 and scene["last_sample_token"] == "goes-sample-2"
+    annotations = {row["token"]: row for row in new["sample_annotation"]}
+    for row in new["instance"]:
+        of = [a for a in annotations.values() if a["instance_token"] == row["token"]]
+        assert len(of) == row["nbr_annotations"] and row["first_annotation_token"] in annotations
+    (sweep,) = [row for row in new["sample_data"] if row["token"] == "goes-LIDAR_TOP-1-0"]
+    assert sweep["sample_token"] == "goes-sample-2" and not sweep["is_key_frame"]
+    one, two = ({row["token"] for row in rows["sample_data"] if "LIDAR_TOP" in row["token"]} for rows in (old, new))
+    assert one == two
+    assert NuScenesDataset(tmp_path / "new")[1]["token"] == "goes-sample-2"
+    provenance = json.loads((tmp_path / "new" / "conversion" / "provenance.json").read_text())
+    assert list(provenance["skipped"]) == [LEFT_OUT]
+
+
+def test_a_mended_sample_comes_back(source: Path, output: Path, tmp_path: Path) -> None:
+    shutil.copytree(source, tmp_path / "source")
+    (broken,) = [tmp_path / "source" / NuScenesDataset(source).files(1)[2].relative_to(source)]
+    sound = broken.read_bytes()
+    broken.write_bytes(b"")
+    assert main(command(tmp_path / "source", tmp_path / "new", "--images", "png", "--on-error", "skip")) == 0
+    broken.write_bytes(sound)
+    assert main(command(tmp_path / "source", tmp_path / "new", "--images", "png")) == 0
+    expected, found = tree(output), tree(tmp_path / "new")
+    assert set(found) == set(expected)
+    named = {"conversion/settings.json", "conversion/provenance.json"}  # the roots have other names
+    assert {name for name in found if found[name] != expected[name]} == named
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "message"),
+    [
+        ("sample_data", "sample_token", "table sample: expected the token 'nobody' that row"),
+        ("sample_data", "sample_token", "sample_data: expected sample_token as a token of 1 to 255 letters, got '' in"),
+        ("sample_data", "ego_pose_token", "table ego_pose: expected the token 'nobody' that"),
+        ("sample_data", "calibrated_sensor_token", "table calibrated_sensor: expected the token 'nobody' that"),
+        ("sample_annotation", "visibility_token", "table visibility: expected the token 'nobody' that"),
+        ("sample_annotation", "instance_token", "table instance: expected the token 'nobody' that"),
+        ("sample", "scene_token", "table scene: expected the token 'nobody' that"),
+    ],
+)
+def test_a_token_that_leads_nowhere(
+    source: Path, tmp_path: Path, table: str, key: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Found before anything is written, in rows of sweeps too."""
+
+    def change(rows: list[dict]) -> None:
+        row = next(row for row in rows if not row.get("is_key_frame") or table != "sample_data")
+        row[key] = "" if "''" in message else "nobody"
+
+    root = _changed(source, tmp_path / "source", table, change)
+    assert main(command(root, tmp_path / "new")) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_lidar_files_that_are_missing(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A keyframe's is an error of its sample; sweeps that were not copied are a note."""
+    shutil.copytree(source, tmp_path / "source")
+    shutil.rmtree(tmp_path / "source" / "sweeps" / "RADAR_FRONT")
+    lidar = tmp_path / "source" / NuScenesDataset(source).files(2)[-1].relative_to(source)
+    content = lidar.read_bytes()
+    lidar.unlink()
+    assert main(command(tmp_path / "source", tmp_path / "new")) == 1
+    assert "goes-sample-2: failed: points " in capsys.readouterr().err
+    lidar.write_bytes(content)
+    assert main(command(tmp_path / "source", tmp_path / "new")) == 0
+    assert "20 files that sample_data names are not in the source" in capsys.readouterr().err
+
+
+def test_lenses_are_refused_by_name(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = command(source, tmp_path / "new")
+    asked[asked.index("argoverse2")] = "fisheye_surround"
+    assert main(asked) == 2
+    said = capsys.readouterr().err
+    assert "Front (fisheye)" in said and "Rig.undistorted()" in said
+    assert not (tmp_path / "new").exists()
+
+
+def test_names_of_other_sensors_are_refused(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = load_rig("argoverse2").to_dict()
+    rig["cameras"][0]["name"] = "LIDAR_TOP"
+    (tmp_path / "rig.json").write_text(json.dumps(rig))
+    asked = command(source, tmp_path / "new")
+    asked[asked.index("argoverse2")] = str(tmp_path / "rig.json")
+    assert main(asked) == 2
+    assert "got LIDAR_TOP; rename" in capsys.readouterr().err
+
+
+def _changed(source: Path, root: Path, table: str, change: Callable[[list[dict]], None]) -> Path:
+    shutil.copytree(source, root)
+    path = root / "v1.0-mini" / f"{table}.json"
+    rows = json.loads(path.read_text())
+    change(rows)
+    path.write_text(json.dumps(rows))
+    return root
+
+
+def test_quaternions_come_back() -> None:
+    from arbiview_aug.datasets.nuscenes.tables import quaternion_from_rotation, rotation_from_quaternion
+
+    rng = np.random.default_rng(0)
+    for q in [*rng.normal(size=(50, 4)), [0, 1, 0, 0], [1e-9, 0, 0, 1], [1, 0, 0, 0]]:
+        R = rotation_from_quaternion(q)
+        assert np.abs(rotation_from_quaternion(quaternion_from_rotation(R)) - R).max() < 1e-14

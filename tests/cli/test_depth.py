@@ -1,0 +1,156 @@
+"""``python -m arbiview_aug depth``: files beside the data, resumed, and read again by a dataset."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import DataError, RetargetedDataset, Rig, RigRetarget
+from arbiview_aug.__main__ import main
+from arbiview_aug.datasets import FrameFolder, Neighbours, WithMotionDepth
+from arbiview_aug.datasets.frame_writer import write_frame
+from arbiview_aug.datasets.motion_depth import FOLDER, DepthFolder
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.errors import SampleError
+
+RIG = demo_source_rig((64, 176))
+RIG = RIG.with_cameras([RIG[0], RIG[1]])
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three frames of one street, 1.2 m apart, and one of another."""
+    root = tmp_path_factory.mktemp("drive")
+    drive = SyntheticDrive(RIG, num_frames=2, seed=5, lidar=False, neighbours=Neighbours())
+    before, after = drive[0]["neighbours"]
+    for name, frame in (("000", before), ("001", drive[0]), ("002", after), ("other", drive[1])):
+        write_frame(root / name, {k: frame[k] for k in frame if k != "boxes_3d"})
+        calib = json.loads((root / name / "calib.json").read_text())
+        calib["ego2world"] = frame["ego2world"].tolist()
+        (root / name / "calib.json").write_text(json.dumps(calib))
+    (root / "sequence.json").write_text(json.dumps({"frames": ["000", "001", "002"]}))
+    return root
+
+
+@pytest.fixture(scope="module")
+def made(recorded: Path) -> Path:
+    assert main(["depth", "--data", str(recorded)]) == 0
+    return recorded / FOLDER
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+def test_every_frame_gets_a_file_and_a_line_if_it_has_no_depth(made: Path, recorded: Path, capsys) -> None:
+    assert set(contents(made)) == {"000.npz", "001.npz", "002.npz", "other.npz"}
+    assert main(["depth", "--data", str(recorded), "--output", str(recorded / "again")]) == 0
+    out = capsys.readouterr().out
+    assert "3 of 4 frames have depth" in out and "0 were there before" in out
+    assert "other: depth from motion: none, no frame 0.4 to 3 m before or after it" in out
+
+
+def test_it_goes_on_where_it_was(made: Path, recorded: Path, tmp_path: Path, capsys) -> None:
+    """Also after a file was cut short; by more than one process to the same bytes."""
+    output, whole = tmp_path / "depth", contents(made)
+    output.mkdir()
+    (output / "000.npz").write_bytes(whole["000.npz"])
+    (output / "001.npz").write_bytes(whole["001.npz"][:100])
+    assert main(["depth", "--data", str(recorded), "--output", str(output), "--workers", "2"]) == 0
+    assert "1 were there before" in capsys.readouterr().out
+    again = contents(output)
+    assert set(again) == set(whole)
+    for name in whole:
+        with np.load(made / name) as one, np.load(output / name) as two:
+            assert all(np.array_equal(one[key], two[key]) for key in one.files)
+
+
+def test_what_cannot_be_read_is_named(recorded: Path, tmp_path: Path, capsys) -> None:
+    root = tmp_path / "drive"
+    (root / "a").mkdir(parents=True)
+    for path in (recorded / "000").iterdir():
+        (root / "a" / path.name).write_bytes(path.read_bytes())
+    next((root / "a").glob("*.jpg")).write_bytes(b"no picture")
+    assert main(["depth", "--data", str(root)]) == 1
+    assert "a: failed: " in capsys.readouterr().err
+    assert main(["depth", "--data", str(tmp_path / "nowhere")]) == 2
+
+
+def test_samples_carry_it(made: Path, recorded: Path) -> None:
+    data = WithMotionDepth(FrameFolder(recorded), made)
+    sample = data[1]
+    assert len(data) == 4 and sample["motion_depth_m"].shape == (2, 64, 176)
+    assert sample["motion_depth_m"].dtype == torch.float32 and (sample["motion_depth_m"] > 0).float().mean() > 0.3
+    motion = RigRetarget(RIG.shifted(y_m=0.5), surface="motion", outputs=("source_camera",))
+    out = RetargetedDataset(data, motion)[1]
+    street = RigRetarget(RIG.shifted(y_m=0.5), surface="street")(sample)
+    assert not torch.equal(out["images"], street["images"]) and "motion_depth_m" not in out
+    online = motion(FrameFolder(recorded, neighbours=Neighbours())[1])
+    both = (out["coverage"] & online["coverage"])[:, None].expand_as(out["images"])
+    difference = (out["images"].float() - online["images"].float()).abs()[both]
+    assert difference.mean() < 0.5  # half precision; the road is filled from other frames besides
+
+
+def test_files_that_do_not_fit_are_named(made: Path, recorded: Path, tmp_path: Path) -> None:
+    depths, rig = DepthFolder(made), FrameFolder(recorded)[0]["rig"]
+    with pytest.raises(DataError, match=r"missing\.npz: expected depth from motion of frame 'missing', found none"):
+        depths.read("missing", rig)
+    with pytest.raises(DataError, match=r"000\.npz: expected depth of this calibration"):
+        depths.read("000", rig.turned(yaw_deg=1))
+    with pytest.raises(DataError, match=r"000\.npz: expected depth of this calibration"):
+        depths.read("000", Rig([rig[0]]))
+    (tmp_path / "x.npz").write_bytes(b"nothing")
+    with pytest.raises(DataError, match=r"x\.npz: expected depth from motion, got "):
+        DepthFolder(tmp_path).read("x", rig)
+    assert DepthFolder(tmp_path).path("a/b").parent == tmp_path
+    with pytest.raises(SampleError, match="expected 'rig' and 'token'"):
+        WithMotionDepth([{"images": 0}], made)[0]
+
+
+def test_what_was_found_from_less_is_found_again(recorded: Path, tmp_path: Path, capsys) -> None:
+    """A neighbour that could not be read, a drive without its sequence: once mended, the next run does them again."""
+    root = tmp_path / "drive"
+    shutil.copytree(recorded, root)
+    sequence = (root / "sequence.json").read_text()
+    (root / "sequence.json").unlink()
+    asked = ["depth", "--data", str(root)]
+    assert main(asked) == 0 and "0 of 4 frames have depth" in capsys.readouterr().out
+    (root / "sequence.json").write_text(sequence)
+    image = sorted((root / "002").glob("*.jpg"))[0]
+    sound = image.read_bytes()
+    image.write_bytes(b"no picture")
+    assert main(asked) == 1 and "1 were there before" in capsys.readouterr().out
+    image.write_bytes(sound)
+    assert main(asked) == 0
+    kept = capsys.readouterr().out.partition(" were there before")[0]
+    assert int(kept.split()[-1]) < 3, "those that had lost their neighbour, and the one that could not be read"
+    assert main(asked) == 0 and "4 were there before" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("device", ["gpu", "cuda:99", "meta"])
+def test_devices_that_are_not_there(recorded: Path, device: str, capsys) -> None:
+    assert main(["depth", "--data", str(recorded), "--device", device]) == 2
+    assert "--device: expected cpu" in capsys.readouterr().err
+
+
+def test_a_broken_frame_is_no_neighbour(recorded: Path, tmp_path: Path) -> None:
+    shutil.copytree(recorded, tmp_path / "drive")
+    (tmp_path / "drive" / "002" / "calib.json").write_text("{")
+    with pytest.warns(UserWarning, match="002.*this frame is no neighbour"):
+        drive = FrameFolder(tmp_path / "drive", neighbours=Neighbours())
+    assert drive[1]["neighbours"] and all(frame["token"] != "002" for frame in drive[1]["neighbours"])
+    with pytest.raises(DataError, match="002"):
+        drive[2]
+
+
+@pytest.mark.parametrize("broken", [{"format": [1, 2]}, {"words": None}, {"format": None}, {"K": [1]}, {"depth_00": 3}])
+def test_files_of_nonsense_are_named(made: Path, recorded: Path, tmp_path: Path, broken: dict) -> None:
+    """Arrays that are missing or of other shapes."""
+    with np.load(made / "000.npz") as file:
+        held = {name: file[name] for name in file.files} | {name: np.array(value) for name, value in broken.items()}
+    np.savez(tmp_path / "000.npz", **{name: value for name, value in held.items() if broken.get(name, 0) is not None})
+    with pytest.raises(DataError, match=r"000\.npz: expected depth"):
+        DepthFolder(tmp_path).read("000", FrameFolder(recorded)[0]["rig"])

@@ -1,0 +1,172 @@
+"""``python -m arbiview_aug evaluate``, at a tiny size; its numbers against the protocol in code."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+import pytest
+
+from arbiview_aug.__main__ import main
+from arbiview_aug.datasets import FrameFolder
+from arbiview_aug.evaluate.images import as_arrays, as_tensors
+from arbiview_aug.transforms.rig_retarget import RigRetarget
+
+AGREEMENT_DB = 0.01
+
+
+def run(arguments: list[str], folder: Path) -> dict:
+    assert main(["evaluate", *arguments, "--output", str(folder)]) == 0
+    return json.loads((folder / "evaluate.json").read_text())
+
+
+def test_synthetic_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = run(["--size", "48x132", "--quality", "fast", "draft", "--surface", "street", "far"], tmp_path)
+    printed = capsys.readouterr().out
+    assert "Against the true views" in printed and "Agreement of neighbours" in printed
+    rows = ["fast, street", "fast, far", "draft, street", "draft, far"]
+    assert list(found["means"]) == list(found["agreement"]) == rows
+    street, far = found["means"]["fast, street"], found["means"]["fast, far"]
+    assert street["true_covered_ground_psnr_db"] > far["true_covered_ground_psnr_db"] + 3
+    assert {"true_hole_object_share", "true_covered_sky_psnr_db", "seen"} <= set(street)
+    assert "raw_psnr_db" not in street, "where the truth is known, LiDAR need not score"
+    assert len(found["views"]) == 4 * 5 and {row["camera"] for row in found["views"]} >= {"front", "side_left"}
+    kinds = {pair["kind"] for pair in found["pairs"]}
+    assert kinds == {"overlap", "consistency"}
+    assert f"{street['true_covered_psnr_db']:.2f}" in printed
+    picture = cv2.imread(str(tmp_path / "van-fast-street.png"))
+    assert picture is not None and picture.std() > 20
+    assert "<h2>van</h2>" in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_numbers_agree_with_the_protocol(
+    referee: ModuleType, nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The command's sparse figures, against the protocol's metrics of the same renderings."""
+    common = ["--data", str(nuscenes_root), "--reduce", "2", "--surface", "street"]
+    found = run([*common, "--yaws", "22"], tmp_path)
+    assert "every other degree" not in capsys.readouterr().out
+    sample = FrameFolder(nuscenes_root, reduce=2)[0]
+    rig, points = sample["rig"], sample["points"].numpy()[:, :3].astype(float)
+    cameras = {
+        c.name: {"K": c.K, "cam2ego": c.cam2ego, "image": image, "mask": np.ones(c.size, np.uint8)}
+        for c, image in zip(rig, as_arrays(sample["images"]), strict=True)
+    }
+    mean = found["means"]["fast, street"]
+    for exposure, protocol in (("raw", cameras), ("even", referee.equalised(cameras, points))):
+
+        def render(targets: list, protocol: dict = protocol) -> list[np.ndarray]:
+            images = as_tensors([c["image"] for c in protocol.values()])
+            return as_arrays(
+                RigRetarget(rig.turned(yaw_deg=22), surface="street", holes="black")({**sample, "images": images})[
+                    "images"
+                ]
+            )
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            want = referee.score(render, protocol, points, [referee.rotated_targets(protocol, 22.0)])
+        assert mean[f"{exposure}_psnr_db"] == pytest.approx(want["psnr"], abs=AGREEMENT_DB)
+        assert mean[f"{exposure}_mae"] == pytest.approx(want["mae"], abs=0.01)
+        assert mean[f"{exposure}_rmse"] == pytest.approx(want["rmse"], abs=0.02)
+        assert mean[f"{exposure}_ssim"] == pytest.approx(want["ssim"], abs=1e-4)
+        assert mean[f"{exposure}_points"] == pytest.approx(want["n"])
+
+
+@pytest.mark.slow
+def test_points_that_methods_may_read_do_not_score(
+    nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    common = ["--data", str(nuscenes_root), "--reduce", "4", "--target", "waymo", "--size", "80x144"]
+    whole = run([*common, "--surface", "street"], tmp_path / "street")
+    held = run([*common, "--surface", "auto"], tmp_path / "auto")
+    assert held["scored_on_other_points"] and not whole["scored_on_other_points"]
+    assert "Methods get the points of every other degree of azimuth" in capsys.readouterr().out
+    ratio = held["means"]["fast, auto"]["raw_points"] / whole["means"]["fast, street"]["raw_points"]
+    assert 0.4 < ratio < 0.7
+
+
+@pytest.mark.slow
+def test_json_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [
+        "evaluate",
+        "--size",
+        "24x66",
+        "--yaws=-11,11",
+        "--surface",
+        "far",
+        "--json",
+        "--output",
+        str(tmp_path),
+    ]
+    assert main(arguments) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == json.loads((tmp_path / "evaluate.json").read_text())
+    assert list(printed["means"]) == ["fast, far: yaw -11", "fast, far: yaw +11", "fast, far: all"]
+    first, second, both = (row["true_psnr_db"] for row in printed["means"].values())
+    assert both == pytest.approx((first + second) / 2)
+
+
+def test_lenses_that_a_method_cannot_take(
+    fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--data", str(fisheye_root), "--target", "ddad", "--size", "60x100", "--surface", "far"]
+    found = run([*arguments, "--quality", "fast", "paper"], tmp_path)
+    printed = capsys.readouterr().out
+    assert list(found["means"]) == ["fast, far"] and "note: paper, far: " in printed and "pinhole" in printed
+    assert "no truth and no LiDAR points" in printed
+    assert main(["evaluate", *arguments, "--quality", "paper", "--output", str(tmp_path)]) == 2
+    assert "pinhole" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_figures(nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "--figure", "--size", "40x110", "--output", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.count("picture: ") == 5
+    heights = {k: cv2.imread(str(tmp_path / f"figure{k}.png")).shape[0] for k in range(2, 7)}
+    # Figure 2 has two configurations of four rows each below the recorded row, the others one.
+    assert heights[3] == heights[4] == heights[5] == heights[6]
+    assert heights[2] / heights[3] == pytest.approx(9 / 5, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--data", "no such folder"], "data no such folder: expected a folder, found none"),
+        (["--target", "tesla"], "expected a file or one of the shipped rigs"),
+        (["--output", "file/below"], "--output file/below: expected a folder that can be written to"),
+    ],
+)
+def test_errors_are_one_line(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    assert main(["evaluate", *arguments]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("python -m arbiview_aug evaluate: ") and message in said and len(said.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--yaws", "left"],
+        ["--target", "waymo", "--yaws", "paper"],
+        ["--paper", "--figure"],
+        ["--paper", "--yaws", "yaw"],
+        ["--figure", "--surface", "far"],
+    ],
+)
+def test_wrong_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["evaluate", *arguments])
+    assert "error: argument" in capsys.readouterr().err

@@ -1,0 +1,90 @@
+"""``python -m arbiview_aug``: the dispatcher, and the check of the environment."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+import warnings
+from importlib import metadata
+
+import pytest
+
+from arbiview_aug import environment
+from arbiview_aug.__main__ import COMMANDS, main, version
+
+
+@pytest.fixture(autouse=True)
+def nobody_was_warned(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(environment, "_warned", False)
+
+
+def wheels(monkeypatch: pytest.MonkeyPatch, **installed: str) -> None:
+    def fake(name: str) -> str:
+        try:
+            return installed[name.replace("-", "_")]
+        except KeyError:
+            raise metadata.PackageNotFoundError(name) from None
+
+    monkeypatch.setattr(metadata, "version", fake)
+
+
+def test_two_cv2_wheels_warn_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    wheels(monkeypatch, opencv_python="4.10.0", opencv_contrib_python_headless="5.0.0")
+    message = (
+        r"opencv-python 4.10.0 and opencv-contrib-python-headless 5.0.0 are installed together: .*"
+        r"pip uninstall -y opencv-python opencv-contrib-python-headless && pip install opencv-contrib-python-headless"
+    )
+    with pytest.warns(RuntimeWarning, match=message):
+        environment.warn_about_cv2_wheels()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        environment.warn_about_cv2_wheels()
+
+
+def test_one_cv2_wheel_is_fine(monkeypatch: pytest.MonkeyPatch) -> None:
+    for installed in ({"opencv_python_headless": "4.12.0"}, {}):
+        wheels(monkeypatch, **installed)
+        monkeypatch.setattr(environment, "_warned", False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            environment.warn_about_cv2_wheels()
+    assert environment.installed_cv2_wheels() == {}
+
+
+def test_the_command_line_warns(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    wheels(monkeypatch, opencv_python="4.10.0", opencv_python_headless="4.10.0")
+    with pytest.warns(RuntimeWarning, match="are installed together"):
+        assert main(["inspect", "no such rig"]) == 2
+
+
+def test_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in COMMANDS)
+    assert main([]) == 2
+    assert main(["paint"]) == 2
+    assert "unknown command 'paint'" in capsys.readouterr().err
+
+
+def test_version(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    wheels(monkeypatch, arbiview_aug="0.1.0")
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == "arbiview_aug 0.1.0\n"
+    wheels(monkeypatch)
+    assert version() == "(not installed)"
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_a_module(name: str) -> None:
+    assert importlib.util.find_spec(COMMANDS[name][0]) is not None
+
+
+def test_the_dispatcher_imports_no_command_and_nothing_optional() -> None:
+    modules = ["sklearn", "torchvision", "diffusers", "arbiview_aug.cli.rigs", "arbiview_aug.evaluate.report.pictures"]
+    code = (
+        "import sys; from arbiview_aug.__main__ import main; main(['--version']); "
+        f"sys.exit(', '.join(m for m in {modules} if m in sys.modules) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=500)
+    assert done.returncode == 0 and not done.stderr, done.stderr

@@ -1,0 +1,50 @@
+"""``python -m arbiview_aug inspect``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import pytest
+
+from arbiview_aug.cameras.rig import load_rig
+from arbiview_aug.cli.rigs import differences, main
+
+
+def test_prints_tables_and_differences_and_writes_the_picture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "rigs.png"
+    assert main(["nuscenes", "waymo", "--output", str(output)]) == 0
+    printed = capsys.readouterr().out
+    assert repr(load_rig("nuscenes")) in printed and repr(load_rig("waymo")) in printed
+    assert "From nuscenes to waymo:" in printed and f"picture: {output}" in printed
+    assert cv2.imread(str(output)) is not None
+
+
+def test_differences_are_over_the_road() -> None:
+    """Argoverse 2's origin is 0.33 m above the road: its front camera is 0.22 m higher, not 0.11 m lower."""
+    table = differences(load_rig("nuscenes"), load_rig("argoverse2"))
+    row = next(line for line in table.splitlines() if "ring_front_center" in line).split()
+    assert row[:2] == ["ring_front_center", "CAM_FRONT"]
+    assert row[4:7] == ["-0.07", "-0.01", "+0.22"]
+
+
+def test_same_rig_has_no_differences() -> None:
+    rig = load_rig("ddad")
+    for camera, line in zip(rig, differences(rig, rig).splitlines()[2:], strict=True):
+        assert line.split()[:2] == [camera.name, camera.name]
+        assert "0.0 deg    +0.00  +0.00  +0.00" in line
+
+
+def test_files_and_folders(tmp_path: Path) -> None:
+    load_rig("waymo").save(tmp_path / "calib.json")
+    arguments = ["--output", str(tmp_path / "rig.png")]
+    assert main([str(tmp_path), *arguments]) == main([str(tmp_path / "calib.json"), *arguments]) == 0
+
+
+def test_unknown_rig_and_unwritable_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["tesla"]) == 2
+    assert "expected a file or one of the shipped rigs" in capsys.readouterr().err
+    assert main(["waymo", "--output", str(tmp_path / "rig.words")]) == 2
+    assert "expected a name ending in .png" in capsys.readouterr().err

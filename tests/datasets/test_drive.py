@@ -1,0 +1,177 @@
+"""Which frames of a drive are neighbours, and that they are read late or, broken, not at all."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import DataError, Rig, RigRetarget
+from arbiview_aug.datasets import FrameFolder, LazyFrame, Neighbours, NuScenesDataset
+from arbiview_aug.datasets.drive import Drive, parts_of_clock, travelled_m
+from arbiview_aug.datasets.frame_writer import write_drive
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+
+SIZE = (64, 176)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "expected"),
+    [
+        (Neighbours(), [2, 5]),
+        (Neighbours(count=2), [2, 1, 5, 6]),
+        (Neighbours(direction="past", count=5), [2, 1, 0]),
+        (Neighbours(direction="future", step_m=2.5), [6]),
+        (Neighbours(step_m=100.0), []),
+    ],
+)
+def test_frames_are_picked_by_distance(wanted: Neighbours, expected: list[int]) -> None:
+    """It stood still between 3 and 4."""
+    travelled_m = np.array([0.0, 1.0, 2.5, 4.0, 4.0, 5.5, 7.0])
+    assert wanted.picked(travelled_m, 4) == expected
+
+
+@pytest.mark.parametrize("bad", [{"count": 0}, {"count": 1.5}, {"step_m": 0}, {"step_m": np.nan}, {"direction": "up"}])
+def test_settings_are_checked(bad: dict) -> None:
+    with pytest.raises(ValueError, match="neighbours: "):
+        Neighbours(**bad)
+
+
+def test_standing_still_has_no_neighbours() -> None:
+    """Though its poses waver: their steps alone would add up to 4 m."""
+    positions_m = 0.005 * np.random.default_rng(0).standard_normal((500, 3))
+    assert np.linalg.norm(np.diff(positions_m, axis=0), axis=1).sum() > 4
+    drive = Drive(positions_m, np.zeros(500, np.int64))
+    assert drive.neighbours(250, Neighbours()) == []
+
+
+def test_travel_is_counted_in_small_steps_too() -> None:
+    """A crawl of 1 cm a frame, on a bend."""
+    angle = np.arange(0, np.pi / 2, 0.001)
+    travelled = travelled_m(10 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1))
+    assert abs(travelled - 10 * angle).max() < 0.11 and (np.diff(travelled) >= 0).all()
+
+
+def test_nothing_is_a_neighbour_across_a_clock_that_goes_back() -> None:
+    times_s = dict(zip("abcdef", [0.0, 1.0, 2.0, 0.5, 1.5, 2.5], strict=True))
+    with pytest.warns(UserWarning, match="here: the clock goes back from frame 'c' to 'd'"):
+        parts = parts_of_clock("abcdef", times_s, "here")
+    drive, wanted = Drive(np.arange(6.0)[:, None] * [1, 0, 0], parts), Neighbours(step_m=1.0, count=9)
+    assert drive.neighbours(2, wanted) == [1, 0] and drive.neighbours(4, wanted) == [3, 5]
+
+
+@pytest.mark.parametrize("reader", [FrameFolder, NuScenesDataset])
+def test_another_type_is_refused(reader: type, tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="neighbours: expected Neighbours or None, got int"):
+        reader(tmp_path, neighbours=2)
+
+
+def test_a_lazy_frame_decodes_once_and_only_when_asked() -> None:
+    calls = []
+    frame = LazyFrame({"token": "a"}, lambda: calls.append(1) or "pixels")
+    assert frame["token"] == "a" and set(frame) == {"token", "images"} and len(frame) == 2 and not calls
+    assert frame["images"] == "pixels" == frame["images"] and len(calls) == 1
+
+
+# --- a street that moves ----------------------------------------------------------------------------------------------
+def test_a_synthetic_drive_moves_on() -> None:
+    drive = SyntheticDrive(demo_source_rig(SIZE), num_frames=4, lidar=False, neighbours=Neighbours(count=2, step_m=1.5))
+    sample = drive[1]
+    here = sample["ego2world"].numpy()
+    travel_m = [(np.linalg.solve(here, n["ego2world"].numpy()))[:3, 3] for n in sample["neighbours"]]
+    assert np.allclose(travel_m, [[-1.5, 0, 0], [-3, 0, 0], [1.5, 0, 0], [3, 0, 0]], atol=1e-9)
+    still, moved = 0, 0
+    for neighbour in sample["neighbours"]:
+        ego2ego = np.linalg.solve(here, neighbour["ego2world"].numpy())
+        then = neighbour["boxes_3d"].numpy()[:, :3] @ ego2ego[:3, :3].T + ego2ego[:3, 3]
+        off_m = np.linalg.norm(then - sample["boxes_3d"].numpy()[:, :3], axis=1)
+        still, moved = still + (off_m < 1e-3).sum(), moved + (off_m > 0.05).sum()
+    assert still > 10 and moved > 10
+    images = sample["neighbours"][0]["images"]
+    assert images.shape == sample["images"].shape and not torch.equal(images, sample["images"])
+
+
+def test_neighbours_change_no_scene() -> None:
+    plain, moving = (
+        SyntheticDrive(demo_source_rig(SIZE), num_frames=2, lidar=False, neighbours=n) for n in (None, Neighbours())
+    )
+    assert torch.equal(plain[1]["images"], moving[1]["images"]) and "neighbours" not in plain[1]
+
+
+# --- frame folders ----------------------------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three frames of one street, 1.3 m apart, as folders."""
+    root = tmp_path_factory.mktemp("drive")
+    rig = demo_source_rig(SIZE)
+    sample = SyntheticDrive(rig, num_frames=1, lidar=False, neighbours=Neighbours(step_m=1.3))[0]
+    write_drive(root, [sample, *sample["neighbours"]])
+    return root
+
+
+def low(rig: Rig) -> Rig:
+    return rig.turned(pitch_deg=-12)
+
+
+@pytest.mark.slow
+def test_folders_fill_the_road(recorded: Path) -> None:
+    folder = FrameFolder(recorded, neighbours=Neighbours())
+    assert [len(folder[k]["neighbours"]) for k in range(3)] == [1, 2, 1]
+    sample = folder[1]
+    assert sample["time_s"] == 0 and [n["token"] for n in sample["neighbours"]] == ["0000", "0002"]
+    out = RigRetarget(low(sample["rig"]), outputs=("source_frame",))(sample)
+    alone = RigRetarget(low(sample["rig"]), neighbours=None)(sample)
+    gained = out["coverage"] & ~alone["coverage"]
+    assert gained.float().mean() > 0.03 and ((out["source_frame"] > 0) == gained).all()
+
+
+@pytest.mark.parametrize("broken", ["image", "corrupt", "calibration"])
+def test_a_broken_neighbour_is_named_and_left_out(recorded: Path, tmp_path: Path, broken: str) -> None:
+    root = tmp_path / "drive"
+    shutil.copytree(recorded, root)
+    victim = next((root / "0002").glob("*.png"), None) or next((root / "0002").glob("*.jpg"))
+    if broken == "image":
+        victim.unlink()
+    elif broken == "corrupt":
+        victim.write_bytes(victim.read_bytes()[:200])
+    folder = FrameFolder(root, neighbours=Neighbours())
+    if broken == "calibration":
+        calib = json.loads((root / "0002" / "calib.json").read_text())
+        calib["cameras"][0]["K"] = [[0, 0, 0]] * 3
+        (root / "0002" / "calib.json").write_text(json.dumps(calib))
+    retarget, sample = RigRetarget(low(folder[1]["rig"]), outputs=("source_frame",)), folder[1]
+    with pytest.warns(UserWarning, match="neighbour '0002' is left out: .*rendered without it"):
+        out = retarget(sample)
+    assert set(out["source_frame"].unique().tolist()) == {-1, 0, 1}
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("[]", "expected {'frames'"),
+        ('{"frames": ["0000", "nowhere"]}', "got 'nowhere'"),
+        ('{"frames": ["0000", "0000"]}', "each frame once"),
+        ('{"frames": [{"name": "0000", "time_s": "soon"}]}', "ValueError"),
+        ('{"frames": [{"name": "0000", "time_s": NaN}]}', "finite number"),
+    ],
+)
+def test_a_wrong_sequence_is_refused(recorded: Path, tmp_path: Path, text: str, why: str) -> None:
+    root = tmp_path / "drive"
+    shutil.copytree(recorded, root)
+    (root / "sequence.json").write_text(text)
+    with pytest.raises(DataError, match=r"sequence\.json") as caught:
+        FrameFolder(root)
+    assert why in str(caught.value)
+
+
+def test_images_are_read_where_they_fill_something(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = FrameFolder(recorded, neighbours=Neighbours())
+    sample = folder[1]
+    read = []
+    monkeypatch.setattr(cv2, "imread", lambda *a, **k: read.append(a) or np.zeros((1, 1, 3), np.uint8))
+    monkeypatch.setattr(FrameFolder, "_images", lambda *a: read.append(a))
+    RigRetarget(sample["rig"].turned(yaw_deg=0))(sample)  # nothing is missing
+    assert not read

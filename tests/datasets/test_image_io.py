@@ -1,0 +1,231 @@
+"""Decoding: layout, half pixels of the reduced decode, and files that must not pass as pictures."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug.datasets import image_io as images_module
+from arbiview_aug.datasets.image_io import decode_images, read_header, reduced_camera
+from arbiview_aug.errors import DataError
+from tests.helpers import camera
+
+
+def ramp(height_px: int, width_px: int) -> np.ndarray:
+    """(h, w, 3) float RGB whose channels are different linear functions of the pixel."""
+    y, x = np.mgrid[:height_px, :width_px].astype(np.float64)
+    # Odd slopes, so that rounding to whole grey levels averages out.
+    return np.stack([20 + 0.5173 * x + 0.2119 * y, 40 + 0.31 * x + 0.41 * y, 220 - 0.41 * x - 0.31 * y], -1)
+
+
+def write(path: Path, rgb: np.ndarray) -> Path:
+    parameters = [cv2.IMWRITE_JPEG_QUALITY, 100, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    pixels = rgb.round().astype(np.uint8)[..., ::-1]
+    assert cv2.imwrite(str(path), pixels, parameters if path.suffix == ".jpg" else [])
+    return path
+
+
+@pytest.fixture
+def jpeg(tmp_path: Path) -> Path:
+    return write(tmp_path / "front.jpg", ramp(90, 160))
+
+
+# --- what comes back --------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_rgb_in_channels_last_memory_of_one_block(tmp_path: Path, suffix: str) -> None:
+    files = [write(tmp_path / f"{k}{suffix}", ramp(90, 160) / (k + 1)) for k in range(3)]
+    images = decode_images(files)
+    assert isinstance(images, torch.Tensor)
+    assert images.shape == (3, 3, 90, 160) and images.dtype == torch.uint8
+    assert images.permute(0, 2, 3, 1).is_contiguous()
+    for k in range(3):
+        error = images[k].permute(1, 2, 0).numpy() - ramp(90, 160) / (k + 1)
+        assert np.abs(error).max() <= (6 if suffix == ".jpg" else 0.51)
+
+
+def test_different_sizes_give_a_list(tmp_path: Path) -> None:
+    files = [write(tmp_path / "a.jpg", ramp(90, 160)), write(tmp_path / "b.png", ramp(64, 100))]
+    images = decode_images(files, reduce=2)
+    assert isinstance(images, list)
+    assert [tuple(image.shape) for image in images] == [(3, 45, 80), (3, 32, 50)]
+    assert all(image.permute(1, 2, 0).is_contiguous() for image in images)
+
+
+def test_real_frame_equals_a_plain_decode(nuscenes_root: Path) -> None:
+    files = sorted(nuscenes_root.glob("samples/CAM_*/*.jpg"))
+    images = decode_images(files)
+    for image, file in zip(images, files, strict=True):
+        expected = cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB)
+        assert np.array_equal(image.permute(1, 2, 0).numpy(), expected)
+
+
+def test_without_the_rgb_flag_of_newer_opencv(jpeg: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = [jpeg, write(tmp_path / "b.png", ramp(90, 160))]
+    expected = decode_images(files)
+    monkeypatch.setattr(images_module, "_RGB_FLAG", None)
+    monkeypatch.setattr(images_module, "_FLAGS", cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_COLOR)
+    monkeypatch.setattr(
+        images_module,
+        "_REDUCED_FLAGS",
+        {1: 0, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4},
+    )
+    images = decode_images(files)
+    assert isinstance(images, torch.Tensor) and isinstance(expected, torch.Tensor)
+    assert torch.equal(images, expected)
+
+
+def test_exif_orientation_does_not_turn_the_image_away_from_its_calibration(jpeg: Path) -> None:
+    upright = decode_images([jpeg])
+    # APP1 with one EXIF tag: Orientation (0x0112) = 6, turn by 90 degrees to show.
+    tag = b"\x12\x01\x03\x00\x01\x00\x00\x00\x06\x00\x00\x00"
+    exif = b"Exif\x00\x00II*\x00\x08\x00\x00\x00\x01\x00" + tag + b"\x00\x00\x00\x00"
+    data = jpeg.read_bytes()
+    jpeg.write_bytes(data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:])
+    assert cv2.imread(str(jpeg)).shape[:2] == (160, 90)  # OpenCV's default would turn it
+    turned = decode_images([jpeg], sizes=[(90, 160)])
+    assert isinstance(upright, torch.Tensor) and isinstance(turned, torch.Tensor)
+    assert torch.equal(upright, turned)
+
+
+# --- reduced decode ---------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+@pytest.mark.parametrize("reduce", [2, 4])
+@pytest.mark.parametrize("size", [(100, 200), (101, 203), (102, 206), (103, 201)])
+def test_convention_reduced_pixels_and_camera_agree(
+    tmp_path: Path, suffix: str, reduce: int, size: tuple[int, int]
+) -> None:
+    """The ramp's value at a reduced pixel is the ramp at the full pixel that sees the same ray."""
+    grey = ramp(*size)[..., :1].repeat(3, axis=-1)
+    image = decode_images([write(tmp_path / f"ramp{suffix}", grey)], reduce=reduce)[0].permute(1, 2, 0).numpy()
+    full, small = camera(size=size), reduced_camera(camera(size=size), reduce)
+    assert image.shape == (*small.size, 3) == (-(-size[0] // reduce), -(-size[1] // reduce), 3)
+
+    inside = np.s_[1:-1, 1:-1]  # the last row and column may reach past the image
+    uv = small.pixel_grid()[inside]
+    back = full.project(small.unproject(uv).directions + small.center_m).uv
+    expected = 20 + 0.5173 * back[..., 0] + 0.2119 * back[..., 1]
+    error = image[inside][..., 0] - expected
+    # Half a pixel would be 0.36. Averaging PNGs by two rounds halves up: + 0.125.
+    assert abs(error.mean()) < (0.06 if suffix == ".jpg" else 0.18)
+    assert np.abs(error).max() < 1.5
+
+
+def test_convention_reduced_camera_is_not_a_resize_for_odd_sizes() -> None:
+    """Right: x' = x / 2 - 1/4 exactly. Wrong: the ratio of sizes, 102 / 203, off by 0.25 px at the right border."""
+    full = camera(size=(101, 203))
+    small = reduced_camera(full, 2)
+    A = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
+    np.testing.assert_allclose(small.K, A @ full.K, atol=1e-12)
+    wrong = full.resize(small.size)
+    assert abs(wrong.K[0, 0] - small.K[0, 0]) > 1e-3
+    whole = camera(size=(100, 200))
+    np.testing.assert_allclose(reduced_camera(whole, 4).K, whole.resize((25, 50)).K, atol=1e-9)
+
+
+def test_a_reduced_mask_is_scene_where_all_of_its_pixels_are() -> None:
+    mask = np.ones((5, 7), bool)
+    mask[3, 2] = mask[0, 6] = False
+    small = reduced_camera(camera(size=(5, 7), mask=mask), 2)
+    expected = np.ones((3, 4), bool)
+    expected[1, 1] = expected[0, 3] = False
+    assert small.mask is not None
+    np.testing.assert_array_equal(small.mask, expected)
+
+
+def test_reduce_is_checked(jpeg: Path) -> None:
+    with pytest.raises(ValueError, match="reduce: expected 1, 2 or 4, got 3"):
+        decode_images([jpeg], reduce=3)  # type: ignore[arg-type]
+
+
+# --- bad files --------------------------------------------------------------------------------------------------------
+def test_missing_image(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"camera 'left': image .*gone\.jpg: expected an image file, found none"):
+        decode_images([tmp_path / "gone.jpg"], names=["left"])
+
+
+def test_a_folder_is_no_image(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="expected a readable image file, got"):
+        decode_images([tmp_path])
+
+
+def test_empty_file(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").touch()
+    with pytest.raises(DataError, match="got an empty file"):
+        decode_images([tmp_path / "a.jpg"])
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+@pytest.mark.parametrize("share", [0.01, 0.1, 0.5, 0.99])
+def test_truncated_file(tmp_path: Path, suffix: str, share: float) -> None:
+    file = write(tmp_path / f"a{suffix}", ramp(90, 160))
+    data = file.read_bytes()
+    file.write_bytes(data[: max(3, int(len(data) * share))])
+    with pytest.raises(DataError, match=r"camera 'a': image .*a\.(jpg|png): expected a.* got a "):
+        decode_images([file])
+
+
+def test_truncated_real_jpeg_which_opencv_would_fill_with_grey(nuscenes_root: Path, tmp_path: Path) -> None:
+    data = next(nuscenes_root.glob("samples/CAM_FRONT/*.jpg")).read_bytes()
+    file = tmp_path / "half.jpg"
+    file.write_bytes(data[: len(data) // 2])
+    assert cv2.imread(str(file)) is not None
+    with pytest.raises(DataError, match="expected a complete JPEG, got a truncated file"):
+        decode_images([file])
+
+
+def test_a_file_whose_rest_is_zeros_is_truncated(jpeg: Path) -> None:
+    data = jpeg.read_bytes()
+    jpeg.write_bytes(data[: len(data) // 2] + bytes(len(data) - len(data) // 2))
+    with pytest.raises(DataError, match="truncated file"):
+        decode_images([jpeg])
+
+
+def test_bytes_after_the_end_and_fill_bytes_are_no_fault(jpeg: Path) -> None:
+    expected = decode_images([jpeg])
+    data = jpeg.read_bytes()
+    jpeg.write_bytes(data[:2] + b"\xff\xff" + data[2:] + b"\0" * 100)
+    padded = decode_images([jpeg])
+    assert isinstance(expected, torch.Tensor) and isinstance(padded, torch.Tensor)
+    assert torch.equal(expected, padded)
+
+
+def test_a_thumbnail_in_the_header_does_not_hide_a_truncation(jpeg: Path) -> None:
+    data = jpeg.read_bytes()
+    thumbnail = b"\xff\xd8\xff\xd9"
+    whole = data[:2] + b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail + data[2:]
+    jpeg.write_bytes(whole)
+    assert read_header(jpeg).size == (90, 160)
+    jpeg.write_bytes(whole[:-20])
+    with pytest.raises(DataError, match="truncated file"):
+        decode_images([jpeg])
+
+
+def test_undecodable_files_with_sound_ends(jpeg: Path, tmp_path: Path) -> None:
+    """OpenCV hands such a JPEG's given array back untouched, as if it had worked."""
+    data = bytearray(jpeg.read_bytes())
+    table = data.find(b"\xff\xc4")
+    data[table + 5 : table + 21] = b"\xff" * 16
+    jpeg.write_bytes(data)
+    with pytest.raises(DataError, match="got a JPEG that cannot be decoded"):
+        decode_images([jpeg])
+    png = write(tmp_path / "a.png", ramp(90, 160))
+    data = bytearray(png.read_bytes())
+    data[len(data) // 2] ^= 255
+    png.write_bytes(data)
+    with pytest.raises(DataError, match="got a PNG that cannot be decoded"):
+        decode_images([png])
+
+
+def test_another_format(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_text("<html>404</html>")
+    with pytest.raises(DataError, match="expected a JPEG or PNG, got a file that begins with b'<html>40'"):
+        decode_images([tmp_path / "a.jpg"])
+
+
+def test_size_that_is_not_the_calibrations(jpeg: Path) -> None:
+    with pytest.raises(DataError, match=r"camera 'front': .*expected 200x100 \(w x h\) as calibrated, got 160x90"):
+        decode_images([jpeg], sizes=[(100, 200)])
+    with pytest.raises(DataError, match="width and height look swapped"):
+        decode_images([jpeg], sizes=[(160, 90)], reduce=2)

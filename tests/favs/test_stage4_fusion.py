@@ -1,0 +1,29 @@
+"""FAVS Stage 4: hand-computed weights and the weighted average."""
+
+import numpy as np
+
+from arbiview_aug.favs.stage4_fusion import distance_weight, fuse, gradient_weight, primary_weight, quality_weight
+
+
+def test_weights_by_hand() -> None:
+    assert np.allclose(distance_weight(np.array([-3.0, 0.0, 25.0, 100.0, 200.0]), 100.0, 2.0), [0, 0, 0.0625, 1, 1])
+    assert np.allclose(distance_weight(np.array([0.0, 50.0]), 100.0, 0.0), [1, 1])  # γ = 0 switches it off
+    assert np.allclose(gradient_weight(np.array([0.0, 10.0, 30.0]), 10.0), [1, 0.5, 0.25])
+    assert np.allclose(quality_weight(np.array([0.0, 3.0, 0.0]), np.array([2.0, 1.0, 0.5])), [1, 0.25, 0.5])
+    assert primary_weight(True, 8.0) == 8.0 and primary_weight(False, 8.0) == 1.0
+
+
+def test_fuse_is_the_weighted_average() -> None:
+    images = np.array([[[[10.0, 0, 0]]], [[[30.0, 0, 8]]]])
+    fused, covered = fuse(images, np.array([[[1.0]], [[3.0]]]))
+    assert np.allclose(fused, [[[25.0, 0, 6.0]]]) and covered.all()
+
+
+def test_fuse_at_the_edges_of_numbers() -> None:
+    images = np.array([[[[10.0, 10, 10]]], [[[30.0, 30, 30]]]])
+    nothing, covered = fuse(images, np.zeros((2, 1, 1)))
+    assert np.all(nothing == 0) and not covered.any()
+    subnormal, covered = fuse(images, np.full((2, 1, 1), 5e-324))
+    assert np.allclose(subnormal, 20) and covered.all()
+    huge, _ = fuse(images, np.full((2, 1, 1), 1e308))
+    assert np.allclose(huge, 20)

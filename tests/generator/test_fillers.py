@@ -1,0 +1,281 @@
+"""Pixels that no source sees: filled by default, marked, and never mistaken for what was seen."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader, default_collate
+
+from arbiview_aug import Rig, RigRetarget
+from arbiview_aug.generator import fillers as holes_module
+from arbiview_aug.generator.fillers import fill_holes, mean_colour
+from arbiview_aug.render.plan import RenderPlan, build_plan
+from arbiview_aug.sample.inputs import read_frames
+from arbiview_aug.transforms.resize import CropRig, ResizeRig
+from tests.helpers import camera, ring, street_sample
+
+SETTINGS = ("fill", "mean", "black")
+MAPS = ("source_camera", "source_frame", "confidence")
+
+
+@pytest.fixture(scope="module")
+def street() -> dict[str, Any]:
+    return street_sample()
+
+
+def raised(sample: dict[str, Any]) -> Rig:
+    """Cameras from which roofs, and the road behind cars, come into view."""
+    return sample["rig"].shifted(z_m=0.7)
+
+
+def gradient(height: int, width: int) -> torch.Tensor:
+    """(1, 3, h, w) uint8, brighter from row to row."""
+    rows = torch.linspace(40, 200, height).round().to(torch.uint8)
+    return rows[:, None].expand(1, 3, height, width).contiguous()
+
+
+# --- what is filled, and how ------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("execution", ["opencv", "torch"])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.float16, torch.bfloat16])
+def test_only_holes_differ_and_they_are_marked(street: dict[str, Any], dtype: torch.dtype, execution: str) -> None:
+    images = street["images"] if dtype == torch.uint8 else (street["images"].float() / 255).to(dtype)
+    outs = {
+        how: RigRetarget(raised(street), surface="objects", holes=how, outputs=MAPS, execution=execution)(  # type: ignore[arg-type]
+            street | {"images": images}
+        )
+        for how in SETTINGS
+    }
+    black = outs["black"]
+    hole = ~black["coverage"]
+    pixels = hole[:, None].expand_as(images)
+    assert hole.any(dim=(1, 2)).all() and not black["images"][pixels].any() and "generated" not in black
+    for how in ("fill", "mean"):
+        out = outs[how]
+        assert torch.equal(out["generated"], hole) and out["images"].dtype == dtype
+        assert torch.equal(out["images"][~pixels], black["images"][~pixels])
+        for key in ("coverage", *MAPS):
+            assert torch.equal(out[key], black[key])
+        assert (out["source_camera"][hole] == -1).all() and not out["confidence"][hole].any()
+    made = outs["mean"]["images"].movedim(1, -1)[hole].float()
+    assert (made == made[0]).all()
+    expected = black["images"].movedim(1, -1)[~hole].float().mean(0)
+    assert (made[0] - expected).abs().max() < (1.5 if dtype == torch.uint8 else 0.01)
+    assert outs["fill"]["images"][pixels].float().std() > 0
+
+
+def test_filled_holes_are_nearer_to_the_truth_than_black_ones() -> None:
+    from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+
+    drive = SyntheticDrive(demo_source_rig((64, 176)), num_frames=1)
+    target = raised(drive[0])
+    truth = drive.render(0, target).images
+    assert isinstance(truth, torch.Tensor)
+    errors = {}
+    for how in SETTINGS:
+        out = RigRetarget(target, surface="objects", holes=how)(drive[0])  # type: ignore[arg-type]
+        hole = ~out["coverage"][:, None].expand_as(truth)
+        errors[how] = float((out["images"].float() - truth.float())[hole].square().mean())
+    assert errors["fill"] < 0.6 * errors["mean"] < 0.6 * errors["black"]
+
+
+def test_far_outside_the_sources_views_take_the_mean_colour() -> None:
+    source = Rig([camera(size=(64, 64))])
+    upwards = source.turned(pitch_deg=40)
+    out = RigRetarget(upwards, holes="fill")({"images": gradient(64, 64), "rig": source})
+    image, seen = out["images"][0].float(), out["coverage"][0]
+    column = seen[:, 32]
+    border = int(column.nonzero().min())
+    assert 24 < border < 64 and not column[:border].any()
+    mean = out["images"][0][:, seen].float().mean(1)
+    far = image[:, : border - 2 * 8 - 2, 32]
+    assert far.shape[1] > 4 and (far - mean[:, None]).abs().max() <= 1
+    beside = image[:, border - 3 : border, 32]
+    assert (beside - image[:, border, 32][:, None]).abs().max() < 15 < (mean - image[:, border, 32]).abs().min()
+
+
+def test_what_the_own_car_hides_is_continued() -> None:
+    hood = np.ones((64, 64), bool)
+    hood[44:, 10:54] = False
+    source = Rig([replace(camera(size=(64, 64)), mask=hood)])
+    target = Rig([camera(size=(64, 64))])
+    for quality in ("fast", "paper"):
+        out = RigRetarget(target, quality=quality)({"images": gradient(64, 64), "rig": source})  # type: ignore[arg-type]
+        hidden = ~torch.from_numpy(hood)
+        assert torch.equal(out["generated"][0], hidden)
+        mean = out["images"][0][:, ~hidden].float().mean()
+        made = out["images"][0][:, hidden].float()
+        assert made.min() > mean + 20  # the road around it, not the frame's mean colour
+
+
+# --- which of them lie in a source's image ----------------------------------------------------------------------------
+@pytest.mark.parametrize("size", [(64, 80), (128, 160), (256, 320)])
+@pytest.mark.parametrize("lens", ["pinhole", "radtan", "fisheye"])
+def test_occluded_pixels_are_those_that_an_image_contains(size: tuple[int, int], lens: str) -> None:
+    distortion = {"pinhole": (), "radtan": (-0.1, 0.01, 0.0, 0.0, 0.0), "fisheye": (-0.02, 0.003, 0.0, 0.0)}[lens]
+    mask = np.ones((128, 160), bool)
+    mask[100:] = False
+    source = Rig([replace(camera(size=(128, 160), lens=lens, distortion=distortion), mask=mask)])
+    target = Rig([camera(size=size, azimuth_deg=15)]).turned(pitch_deg=-10)
+    (view,) = build_plan(source, target, surface="far").targets
+    v, u = np.indices(size, dtype=np.float64)
+    rays, _ = target[0].unproject_cam(np.stack([u, v], -1))
+    points = rays @ target[0].cam2ego[:3, :3].T @ source[0].cam2ego[:3, :3]
+    uv, _, valid = source[0].project_cam(points)
+    expected = valid & source[0].contains(uv) & ~view.coverage
+    assert view.occluded is not None and expected.any() and (~view.coverage & ~view.occluded).any()
+    assert np.count_nonzero(view.occluded != expected) < 0.002 * expected.size
+
+
+def test_what_objects_hide_is_occluded_and_what_nobody_looks_at_is_not(street: dict[str, Any]) -> None:
+    for surface in ("objects", "lidar"):
+        out = RigRetarget(raised(street), surface=surface)  # type: ignore[arg-type]
+        (rendered,) = out.stitcher.views(street, read_frames(street, None), (), raised(street))
+        plan = rendered.made
+        assert isinstance(plan, RenderPlan)
+        for view in plan.targets:
+            assert view.occluded is None or not (view.occluded & view.coverage).any()
+        occluded = [view.occluded for view in plan.targets if view.occluded is not None]
+        assert sum(int(part.sum()) for part in occluded) > 500
+        assert not any(part[0].mean() > 0.5 for part in occluded)  # over the top edge nobody looks
+
+
+def test_plans_without_holes_hold_no_map_of_them() -> None:
+    source = ring()
+    assert all(view.occluded is None for view in build_plan(source, source).targets)
+
+
+# --- the transform ----------------------------------------------------------------------------------------------------
+def test_a_whole_target_asks_for_no_filling(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(holes_module, "mean_colour", None)
+    source = ring()
+    images = torch.randint(0, 255, (6, 3, 72, 96), dtype=torch.uint8)
+    out = RigRetarget(source)({"images": images, "rig": source})
+    assert out["coverage"].all() and not out["generated"].any() and torch.equal(out["images"], images)
+
+
+@pytest.mark.parametrize("execution", ["opencv", "torch"])
+def test_frames_of_a_batch_are_filled_as_alone(street: dict[str, Any], execution: str) -> None:
+    retarget = RigRetarget(raised(street), surface="street", execution=execution)  # type: ignore[arg-type]
+    frames = [street | {"images": images} for images in (street["images"], street["images"].flip(-1))]
+    keys = ("images", "K", "cam2ego")
+    rig = street["rig"]
+    alone = [retarget({key: frame[key] for key in keys if key in frame} | {"rig": rig}) for frame in frames]
+    batch = {
+        "images": torch.stack([frame["images"] for frame in frames]),
+        "K": torch.from_numpy(rig.K).expand(2, -1, -1, -1),
+        "cam2ego": torch.from_numpy(rig.cam2ego).expand(2, -1, -1, -1),
+    }
+    out = retarget(batch)
+    for k in range(2):
+        for key in ("images", "coverage", "generated"):
+            assert torch.equal(out[key][k], alone[k][key])
+
+
+@pytest.mark.parametrize("how", SETTINGS)
+def test_skipped_samples_collate_and_have_nothing_made_up(street: dict[str, Any], how: Any) -> None:
+    retarget = RigRetarget(raised(street), surface="street", size=(48, 132), p=0.5, holes=how)
+    outs = [retarget(street, params={"skipped": skipped}) for skipped in (0.0, 1.0)]
+    for out in outs:
+        out.pop("retarget_params")
+    assert list(outs[0]) == list(outs[1]) and ("generated" in outs[0]) == (how != "black")
+    if how != "black":
+        assert outs[0]["generated"].any() and not outs[1]["generated"].any()
+        default_collate([{key: out[key] for key in ("images", "coverage", "generated")} for out in outs])
+
+
+def test_gradients_of_seen_pixels_stay() -> None:
+    source = Rig([camera(size=(64, 64))])
+    images = (gradient(64, 64).float() / 255).requires_grad_()
+    target = source.turned(yaw_deg=30)
+    out = RigRetarget(target)({"images": images, "rig": source})
+    gradients = []
+    for how in ("fill", "black"):
+        out = RigRetarget(target, holes=how)({"images": images, "rig": source})  # type: ignore[arg-type]
+        weights = torch.arange(out["images"].numel()).reshape(out["images"].shape) % 7
+        gradients.append(torch.autograd.grad((out["images"] * weights).sum(), images)[0])
+    assert gradients[0].any() and torch.equal(*gradients)
+
+
+def test_views_of_several_sizes() -> None:
+    source = ring()
+    turned = source.turned(pitch_deg=-30)
+    target = turned.with_cameras([turned[0].resize((36, 48)), *turned.cameras[1:]])
+    sample = {"images": torch.randint(0, 255, (6, 3, 72, 96), dtype=torch.uint8), "rig": source}
+    out = RigRetarget(target)(sample)
+    assert [tuple(view.shape) for view in out["generated"]] == [(36, 48), *[(72, 96)] * 5]
+    for image, made in zip(out["images"], out["generated"], strict=True):
+        assert made.any() and image[:, made].any()
+
+
+class _Frames(torch.utils.data.Dataset[Any]):
+    def __init__(self, sample: dict[str, Any], retarget: RigRetarget) -> None:
+        self.sample, self.retarget = sample, retarget
+
+    def __len__(self) -> int:
+        return 2
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        out = self.retarget(self.sample)
+        return {key: out[key] for key in ("images", "coverage", "generated")}
+
+
+def test_in_workers_and_after_pickling(street: dict[str, Any]) -> None:
+    retarget = RigRetarget(raised(street), surface="street")
+    expected = retarget(street)
+    again = pickle.loads(pickle.dumps(retarget))
+    assert again.holes == "fill" and "holes=fill" in repr(again)
+    assert torch.equal(again(street)["images"], expected["images"])
+    for batch in DataLoader(_Frames(street, retarget), num_workers=1):
+        assert torch.equal(batch["images"][0], expected["images"])
+        assert torch.equal(batch["generated"][0], expected["generated"])
+
+
+def test_made_up_pixels_are_never_sources(street: dict[str, Any]) -> None:
+    first = RigRetarget(raised(street), surface="street")(street)
+    other = dict(first) | {"images": torch.where(first["generated"][:, None], 255, first["images"])}
+    back = RigRetarget(street["rig"], surface="street", holes="black")
+    out, changed = back(first), back(other)
+    assert torch.equal(out["images"], changed["images"]) and "generated" not in out
+
+
+def test_marks_follow_resizing_and_cropping(street: dict[str, Any]) -> None:
+    out = RigRetarget(raised(street), surface="street")(street)
+    small = CropRig(0, 8, (24, 72))(ResizeRig((32, 88))(out))
+    assert small["generated"].shape == small["coverage"].shape == (6, 24, 72) and small["generated"].any()
+    assert not (small["generated"] & small["coverage"]).any()
+
+
+def test_settings_that_contradict_each_other() -> None:
+    with pytest.raises(ValueError, match="holes: expected one of fill, mean, black, got 'grey'"):
+        RigRetarget(ring(), holes="grey")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="holes: path='inpaint' fills them itself: expected 'fill', the default"):
+        RigRetarget(ring(), path="inpaint", holes="black")
+    assert RigRetarget(ring(), path="inpaint", holes="fill").path == "inpaint"
+
+
+# --- the functions ----------------------------------------------------------------------------------------------------
+def test_the_mean_colour_is_that_of_what_is_seen_in_all_views() -> None:
+    views = [torch.zeros((3, 8, 8), dtype=torch.uint8), torch.full((3, 8, 8), 90, dtype=torch.uint8)]
+    seen = [torch.zeros((8, 8), dtype=torch.bool), torch.ones((8, 8), dtype=torch.bool)]
+    seen[0][:4] = True
+    np.testing.assert_allclose(mean_colour(views, seen), 60)
+    (first, second) = fill_holes([view.clone() for view in views], seen, [None, None], "mean")
+    assert (first[:, 4:] == 60).all() and not first[:, :4].any() and torch.equal(second, views[1])
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (5, 3), (70, 131), (257, 129)])
+def test_any_size_and_any_hole_is_filled(size: tuple[int, int]) -> None:
+    rng = np.random.default_rng(0)
+    for share in (0.0, 0.01, 0.5, 0.99, 1.0):
+        seen = torch.from_numpy(rng.random(size) < share)
+        view = torch.full((3, *size), 77, dtype=torch.uint8) * seen
+        for occluded in (None, (~seen).numpy()):
+            (out,) = fill_holes([view.clone()], [seen], [occluded], "fill")
+            nothing_sampled = bool((out[:, ~seen] == 128).all())
+            assert nothing_sampled or not (~seen).any() or (out[:, ~seen].int() - 77).abs().max() <= 10
+            assert (out[:, seen] == 77).all()

@@ -1,0 +1,96 @@
+"""The command: from arguments to a folder, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from arbiview_aug.generator import Generator
+from arbiview_aug.generator.training import command
+from arbiview_aug.train import main
+from tests.generator.training.small import frames
+
+SMALLER = [
+    f"--set={setting}"
+    for setting in (
+        "generator.image_size=[16, 24]",
+        "generator.unet.widths=[32]",
+        "generator.unet.transformers=[false]",
+        "generator.unet.cross_view=[true]",
+        "scenes=5",
+        "steps=2",
+        "batch=2",
+        "validation_items=2",
+        "pseudo_views.mask_bank=2",
+    )
+]
+
+
+@pytest.fixture
+def drawn_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawn pictures instead of streets, which take half a second each."""
+    monkeypatch.setattr(command, "open_frames", lambda *_, **__: frames())
+
+
+def test_train_and_resume(drawn_frames: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    common = ["--config", "tiny", "--output", str(tmp_path), "--quiet", *SMALLER]
+    assert main(common) == 0
+    assert Generator.from_pretrained(tmp_path / "generator").config.image_size == (16, 24)
+    assert main(common) == 0
+    assert "going on after step 2" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_train_evaluate_ablate_on_streets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    common = ["--config", "tiny", "--output", str(tmp_path), "--quiet", *SMALLER]
+    assert main(common) == 0
+    assert main(["evaluate", *common, "--views", "1"]) == 0
+    out = capsys.readouterr().out
+    assert "held-out views; Telea" in out and "one_step" in out and "mean" in out
+    assert main(["ablate", *common, "--views", "1"]) == 0
+    assert {"as written", "without attention"} < set(json.loads((tmp_path / "ablation.json").read_text()))
+    assert "wrong rig" in capsys.readouterr().out
+
+
+def test_an_autoencoder_comes_first(drawn_frames: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    smaller = [
+        *SMALLER,
+        "--set=generator.autoencoder.widths=[16, 16]",
+        "--set=generator.unet.context_width=32",
+        "--set=autoencoder.steps=2",
+        "--set=autoencoder.batch=2",
+        "--set=loss.perceptual=0",
+        "--set=precision=no",
+        "--set=workers=0",
+    ]
+    common = ["--config", "small", "--output", str(tmp_path), "--quiet", *smaller]
+    assert main([*common, "--stage", "autoencoder"]) == 0
+    first = (tmp_path / "autoencoder" / "config.json").read_text()
+    assert not (tmp_path / "generator").exists()
+    assert main(common) == 0
+    assert (tmp_path / "autoencoder" / "config.json").read_text() == first
+    made = Generator.from_pretrained(tmp_path / "generator")
+    assert made.config.autoencoder.scale == pytest.approx(made.autoencoder.scale) and made.autoencoder.scale != 1.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--set", "step=1"], "expected one of generator"),
+        (["--data", "kitti"], "expected synthetic, nuscenes:ROOT or frames:DIR"),
+        (["--config", "paper"], "expected --weights"),
+        (["--weights", "somewhere"], "expected none for --config tiny"),
+        (["evaluate"], "expected a generator's folder"),
+        (["--stage", "autoencoder"], "--config tiny has none of its own"),
+    ],
+)
+def test_what_cannot_be_used_is_said_in_one_line(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = ["--set", "scenes=1", "--set", "generator.image_size=[8, 16]", "--quiet", "--output", str(tmp_path / "o")]
+    no_vgg = ["--set", "loss.perceptual=0"]
+    assert main([*arguments, *few, *no_vgg]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1

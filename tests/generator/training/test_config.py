@@ -1,0 +1,60 @@
+"""Settings: presets, overrides, plain data and back."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from arbiview_aug.errors import GeneratorError, TrainingError
+from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden, paper, tiny
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_presets_survive_json(name: str) -> None:
+    config = CONFIGS[name]()
+    assert config.generator.name == name
+    assert TrainConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+
+
+def test_the_papers_settings() -> None:
+    config = paper()
+    assert (config.lr, config.batch, config.loss.geo, config.loss.perceptual) == (1e-4, 8, 0.1, 0.01)
+    assert config.pseudo_views.transplanted == config.pseudo_views.virtual == config.loss.regression == 0.0
+    assert config.generator.frozen_unet and config.generator.prediction == "epsilon"
+
+
+def test_overrides() -> None:
+    changed = overridden(tiny(), ["steps=7", "loss.geo=0", "generator.unet.layers=2", "pseudo_views.yaw_deg=[1, 2]"])
+    assert (changed.steps, changed.loss.geo, changed.generator.unet.layers) == (7, 0.0, 2)
+    assert changed.pseudo_views.yaw_deg == (1.0, 2.0)
+    assert overridden(tiny(), ["loss.geo_mode=frobenius_sum", "attention=false"]).attention is False
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("step=7", "expected one of generator, .*got 'step'"),
+        ("loss.nothing=1", "got 'nothing'"),
+        ("steps", "expected KEY=VALUE"),
+        ("steps=1.5", "expected int"),
+        ("steps=true", "expected int"),
+        ("loss=1", "expected dict"),
+        ("lr.x=1", "no settings of its own"),
+        ("steps=0", "steps: expected a whole number above 0"),
+        ("precision=fp16", "never fp16"),
+        ("loss.geo_mode=sum", "expected normalised or frobenius_sum"),
+        ("pseudo_views.virtual=2", "expected a probability"),
+        ("loss.regression=1", "regression in"),
+    ],
+)
+def test_wrong_overrides_are_refused(setting: str, message: str) -> None:
+    with pytest.raises(TrainingError, match=message):
+        overridden(tiny(), [setting])
+
+
+def test_unknown_keys_of_plain_data_are_refused() -> None:
+    with pytest.raises(TrainingError, match="got strange"):
+        TrainConfig.from_dict({**tiny().to_dict(), "strange": 1})
+    with pytest.raises(GeneratorError, match="multiples of 32"):
+        overridden(tiny(), ["generator.unet.widths=[5, 5, 5]"])

@@ -1,0 +1,46 @@
+"""Frames at the training size, and their split by scenes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from arbiview_aug.errors import TrainingError
+from arbiview_aug.generator.training.data import Frames, open_frames
+from tests.generator.training.small import SIZE, Pictures, frames
+
+
+def test_frames_have_the_size_that_was_asked_for_and_are_read_once() -> None:
+    found = frames()
+    assert [tuple(image.shape) for image in found[1].images] == [(3, *SIZE)] * 6
+    assert found[1].rig.sizes == [SIZE] * 6
+    assert found[1] is found[1]
+
+
+def test_scenes_are_never_split() -> None:
+    names = [f"scene {k // 3}" for k in range(60)]
+    split = Frames(Pictures(60), SIZE, names).split(seed=1)
+    parts = [{names[k] for k in part} for part in split]
+    assert [len(part) for part in parts] == [12, 4, 4]
+    assert not (parts[0] & parts[1] or parts[1] & parts[2] or parts[0] & parts[2])
+    assert sorted(index for part in split for index in part) == list(range(60))
+    assert split == Frames(Pictures(60), SIZE, names).split(seed=1) != Frames(Pictures(60), SIZE, names).split(seed=2)
+
+
+@pytest.mark.parametrize(("count", "sizes"), [(1, [1, 0, 0]), (2, [1, 0, 1]), (3, [2, 1, 0]), (5, [3, 1, 1])])
+def test_few_scenes_are_for_training_first(count: int, sizes: list[int]) -> None:
+    assert [len(part) for part in frames(count).split()] == sizes
+
+
+def test_unknown_data_are_refused(tmp_path: Path) -> None:
+    for data in ("kitti", "frames:", "nuscenes"):
+        with pytest.raises(TrainingError, match="expected synthetic, nuscenes:ROOT or frames:DIR"):
+            open_frames(data, SIZE, scenes=1)
+
+
+def test_streets() -> None:
+    found = open_frames("synthetic", (8, 14), scenes=2)
+    assert len(found) == 2 and len(found[0].images) == 6
+    assert found[0].images[0].dtype == torch.uint8

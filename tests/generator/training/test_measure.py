@@ -1,0 +1,163 @@
+"""Scores inside holes, their intervals, pictures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+import torch
+
+from arbiview_aug.errors import GeneratorError, TrainingError
+from arbiview_aug.generator import Generator
+from arbiview_aug.generator.completion import shown_condition
+from arbiview_aug.generator.training.ablation import correct_correspondences, seen_scores, text_of, wrong_rig
+from arbiview_aug.generator.training.data import open_frames
+from arbiview_aug.generator.training.held_out import gains, held_out_scores
+from arbiview_aug.generator.training.measure import bootstrap, hole_psnr, picture, sampled, save_png
+from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
+from arbiview_aug.generator.training.step import without_attention
+from tests.generator.small import ring, stirred
+from tests.generator.training.small import config, frames
+from tests.generator.training.test_pseudo_views import HOLE
+
+
+@pytest.fixture(scope="module")
+def batch() -> Batch:
+    made = PseudoViews(frames(), [0, 1], config().pseudo_views, config().generator, HOLE, seed=0)
+    return collate([made[k] for k in range(3)])
+
+
+@pytest.fixture(scope="module")
+def generator() -> Generator:
+    torch.manual_seed(0)
+    made = Generator.from_config(config().generator)
+    stirred(made.denoiser)
+    return made.eval()
+
+
+def test_only_holes_count() -> None:
+    truth = torch.rand(2, 1, 3, 4, 6)
+    made = truth.clone()
+    holes = torch.zeros(2, 1, 4, 6, dtype=torch.bool)
+    holes[0, :, :, :3] = True
+    made[:, :, :, :, :3] += 0.1
+    made[:, :, :, :, 3:] += 0.7
+    psnr = hole_psnr(made, truth, holes)
+    assert float(psnr[0]) == pytest.approx(20.0, abs=1e-3) and math.isnan(float(psnr[1]))
+
+
+def test_intervals_hold_the_mean() -> None:
+    values = torch.randn(200, generator=torch.Generator().manual_seed(0)).add(1).tolist()
+    interval = bootstrap(values)
+    assert interval.low < interval.mean < interval.high
+    assert interval.high - interval.low == pytest.approx(4 / 200**0.5, rel=0.2)
+    assert bootstrap([2.0] * 5) == (2.0, 2.0, 2.0)
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_samples_repeat_and_leave_known_pixels(batch: Batch, generator: Generator, steps: int) -> None:
+    made = sampled(generator, batch, steps=steps, seed=1)
+    assert torch.equal(made, sampled(generator, batch, steps=steps, seed=1))
+    known = batch.known[:, :, None].expand_as(made)
+    assert torch.equal(made[known], batch.favs[known])
+    assert bool(torch.isfinite(made).all())
+
+
+def test_switches_of_the_attention_are_felt(batch: Batch, generator: Generator) -> None:
+    made = [
+        sampled(generator, batch._replace(geometry=change(batch.geometry)), steps=1, seed=0)
+        for change in (lambda geometry: geometry, without_attention, wrong_rig)
+    ]
+    assert not torch.equal(made[0], made[1]) and not torch.equal(made[0], made[2])
+    everything = wrong_rig(wrong_rig(wrong_rig(batch.geometry)))  # three items: around once
+    assert torch.equal(sampled(generator, batch._replace(geometry=everything), steps=1, seed=0), made[0])
+
+
+def test_scores_of_the_attention(batch: Batch, generator: Generator) -> None:
+    scores = seen_scores(generator, batch, steps=2)
+    homographies = ("attention", "no attention", "wrong rig")
+    assert set(scores) == {"telea", *(f"{way}, {name}" for way in ("one step", "sample") for name in homographies)}
+    assert all(math.isfinite(value) for value in scores.values())
+    assert scores["one step, attention"] != scores["one step, wrong rig"]
+    assert 0 < correct_correspondences(generator, batch) < 1
+
+
+@pytest.mark.slow
+def test_held_out_streets_are_scored_against_their_truth(generator: Generator) -> None:
+    streets = open_frames("synthetic", config().generator.image_size, scenes=1)
+    scores = held_out_scores(generator, streets, [0], seeds=(0, 1), steps=2, mean_of=2, show=False)
+    assert set(scores) == {"telea", "one_step", "sample", "mean", "sample_energy"}
+    assert all(len(values) == 2 and all(map(math.isfinite, values)) for values in scores.values())
+    assert set(gains(scores)) == {"one_step", "sample", "mean"}
+    twice = {"telea": [0.0] * 8, "one_step": [1.0, 2.0, 3.0, 4.0] * 2}  # two views that say the same of each street
+    once = {name: values[:4] for name, values in twice.items()}
+    assert gains(twice, seeds=2) == gains(once) != gains(twice)
+    again = held_out_scores(generator, streets, [0], seeds=(0,), steps=2, mean_of=0, show=False)
+    assert again["sample"] == scores["sample"][:1] and "mean" not in again
+    untrained = Generator.from_config(config().generator)
+    of_telea = held_out_scores(untrained, streets, [0], steps=2, mean_of=0, show=False)
+    assert of_telea["one_step"] == pytest.approx(of_telea["telea"], abs=0.05)  # starts as what it is given
+
+
+def test_other_frames_have_no_truth(generator: Generator) -> None:
+    with pytest.raises(TrainingError, match="expected synthetic streets"):
+        held_out_scores(generator, frames(), [0], show=False)
+
+
+def test_pictures(batch: Batch, tmp_path: Path) -> None:
+    image = picture(batch, batch.truth)
+    save_png(tmp_path / "a" / "grid.png", image)
+    back = cv2.imread(str(tmp_path / "a" / "grid.png"))
+    assert back.shape == image.shape and image.shape[1] >= 7 * 112
+    assert (back[..., ::-1] == image).all()
+
+
+def test_the_table_names_every_arm() -> None:
+    gain = {"mean": 1.0, "low": 0.0, "high": 2.0}
+    seen = {f"one step, {name}": 20.0 for name in ("attention", "no attention", "wrong rig")}
+    row = {"against Telea": {"one_step": gain, "sample": gain}, "seen by a source": seen, "top-1": 0.5}
+    text = text_of({"as written": row, "all additions": row})
+    assert "as written" in text and "all additions" in text and "+1.00" in text and "50%" in text
+
+
+def test_an_ablation_that_is_stopped_scores_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from arbiview_aug.generator.training import ablation
+
+    monkeypatch.setattr(ablation.Trainer, "train", lambda self: False)
+    settings = config()
+    made = ablation.ablate(
+        settings, frames(), lambda arm: Generator.from_config(arm.generator), tmp_path, show=False, say=print
+    )
+    assert made == {} and not (tmp_path / "ablation.json").exists()
+
+
+def test_holes_of_the_condition_as_they_were_in_training(batch: Batch) -> None:
+    """Grey for a generator of Algorithm 1 as written, inpainted for the others; what is known stays."""
+    settings = config().generator
+    grey = shown_condition(replace(settings, prefilled=False), batch.condition, batch.known)
+    known = batch.known[:, :, None].expand_as(grey)
+    assert bool((~batch.known).any()) and bool((grey[~known] == 0.5).all())
+    assert torch.equal(grey[known], batch.condition[known])
+    assert shown_condition(settings, batch.condition, batch.known) is batch.condition
+    made = []
+    for prefilled in (False, True):
+        torch.manual_seed(0)
+        generator = stirred(Generator.from_config(replace(settings, prefilled=prefilled)))
+        made.append(sampled(generator, batch, steps=2, seed=0))
+    assert not torch.equal(*made)
+
+
+def test_one_step_of_a_generator_that_was_not_trained_for_it() -> None:
+    settings = replace(config().generator, one_step=False, name="of samples")
+    generator = Generator.from_config(settings)
+    rig = ring(3)
+    black = torch.zeros(3, 3, *rig[0].size)
+    asked: dict[str, Any] = {"coverage": torch.zeros(3, *rig[0].size, dtype=torch.bool), "targets": rig}
+    with pytest.raises(GeneratorError, match="the one-step regression of generator 'of samples' was not trained"):
+        generator.complete_views(black, source_images=black, sources=rig, steps=1, **asked)
+    done = generator.complete_views(black, source_images=black, sources=rig, steps=2, **asked)
+    assert done.denoised == [0, 1, 2]

@@ -1,0 +1,160 @@
+"""Training items: what they show, what they must not show, that they come from their number alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from arbiview_aug.generator.training import pseudo_views
+from arbiview_aug.generator.training.config import PseudoViewConfig
+from arbiview_aug.generator.training.masks import mask_bank
+from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate, favs
+from arbiview_aug.render.torch_backend import render_torch
+from tests.generator.training.small import SIZE, config, frames
+
+AS_WRITTEN: Mapping[str, Any] = {
+    "transplanted": 0.0,
+    "hidden": 0.0,
+    "leave_one_out": 0.0,
+    "virtual": 0.0,
+    "real_sources": 0.0,
+    "moved": 0.0,
+    "mask_bank": 4,
+}
+HOLE = torch.ones(1, *SIZE, dtype=torch.bool)
+HOLE[:, 4:10, 6:14] = False
+
+
+def items(masks: torch.Tensor = HOLE, seed: int = 0, **changes: Any) -> PseudoViews:
+    settings = PseudoViewConfig(**{**AS_WRITTEN, **changes})
+    return PseudoViews(frames(), [0, 1, 2], settings, config().generator, masks, seed)
+
+
+def flat(item: Batch) -> list[torch.Tensor]:
+    geometry = item.geometry
+    return [*item[:8], *geometry[:4], *(value for reads in geometry[4:] for c in reads for value in c)]
+
+
+def test_an_item_is_its_number() -> None:
+    every = {
+        "transplanted": 0.5,
+        "hidden": 0.5,
+        "leave_one_out": 0.3,
+        "virtual": 0.5,
+        "real_sources": 0.5,
+        "moved": 0.5,
+    }
+    first, second = items(**every), items(**every)
+    for k in (3, 0, 17):
+        torch.manual_seed(k)
+        a, b = first[k], second[k]
+        assert a.tokens == b.tokens
+        assert all(torch.equal(x, y) for x, y in zip(flat(a), flat(b), strict=True))
+    assert not torch.equal(items(**every)[0].truth, items(seed=1, **every)[0].truth)
+
+
+def test_shapes_and_ranges() -> None:
+    made = items(transplanted=0.8, hidden=0.5, leave_one_out=0.2, virtual=0.4, real_sources=0.4, moved=0.5)
+    batch = collate([made[k] for k in range(12)])
+    h, w = SIZE
+    assert batch.truth.shape == batch.favs.shape == batch.condition.shape == (12, 1, 3, h, w)
+    assert batch.sources.shape == (12, 2, 3, h, w) and batch.seen.shape == (12, 2, h, w)
+    assert batch.geometry.target_pose.shape == (12, 1, 16)
+    for value in (batch.truth, batch.favs, batch.condition, batch.sources, batch.confidence):
+        assert bool(torch.isfinite(value).all()) and float(value.min()) >= 0 and float(value.max()) <= 1
+    assert bool((batch.confidence[~batch.known] == 0).all()) and bool((batch.favs.sum(2)[~batch.known] == 0).all())
+    known = batch.known[:, :, None].expand_as(batch.truth)
+    assert torch.equal(batch.condition[known], batch.favs[known])
+    assert bool(batch.holes.flatten(1).any(1).float().mean() > 0.5)
+    assert not bool((batch.holes & ~batch.valid).any())
+
+
+def test_as_written_the_pair_holds_nearly_all_of_the_real_view() -> None:
+    made = items(yaw_deg=(5.0, 15.0), pitch_deg=0.0, focal=(0.9, 1.0))
+    batch = collate([made[k] for k in range(12)])
+    assert float(batch.known.float().mean()) > 0.85  # of 16 rows, borders that are warped twice take one or two
+    error = ((batch.favs - batch.truth).abs().mean(2) * batch.known).sum() / batch.known.sum()
+    assert float(error) < 0.05  # warped twice; where cameras overlap, their pictures differ
+
+
+def test_k_pairs_share_their_real_view() -> None:
+    made = items(pairs=2)
+    a, b, c = made[0], made[1], made[2]
+    assert torch.equal(a.truth, b.truth) and not torch.equal(a.sources, b.sources)
+    assert a.tokens[0].rsplit("/", 1)[0] == b.tokens[0].rsplit("/", 1)[0]
+    assert not torch.equal(a.truth, c.truth)
+
+
+def answer_is_shown(k: int, **changes: Any) -> tuple[bool, bool]:
+    """Whether another content of the hole of the real view changes the condition, and the source branches."""
+    made = items(**changes)
+    plain = made[k]
+    name = plain.tokens[0].split("/")[1]
+    for frame in made.frames._held._values.values():
+        place = frame.rig.names.index(name)
+        image = frame.images[place].clone()
+        image[:, ~HOLE[0]] = 255 - image[:, ~HOLE[0]]
+        frame.images[place] = image
+    changed = made[k]
+    assert not torch.equal(plain.truth, changed.truth)
+    return not torch.equal(plain.condition, changed.condition), not torch.equal(plain.sources, changed.sources)
+
+
+@pytest.mark.parametrize("k", range(4))
+def test_hidden_holes_are_shown_nowhere(k: int) -> None:
+    assert answer_is_shown(k, transplanted=1.0, hidden=1.0) == (False, False)
+    assert answer_is_shown(k, transplanted=1.0, hidden=1.0, real_sources=1.0) == (False, False)
+    assert answer_is_shown(k, leave_one_out=1.0) == (False, False)
+
+
+def test_holes_that_are_not_hidden_are_shown_by_the_sources() -> None:
+    shown = [answer_is_shown(k, transplanted=1.0, hidden=0.0) for k in range(4)]
+    assert all(branches for _, branches in shown)
+    assert all(answer_is_shown(k, transplanted=0.0) == (True, True) for k in range(2))
+
+
+def test_real_sources_never_hold_the_answer() -> None:
+    for k in range(4):
+        assert answer_is_shown(k, transplanted=1.0, hidden=0.0, real_sources=1.0)[1] is False
+
+
+def test_leaving_the_real_view_out_leaves_little() -> None:
+    batch = collate([items(leave_one_out=1.0)[k] for k in range(12)])
+    assert float(batch.known.float().mean()) < 0.6
+
+
+def test_virtual_targets_are_valid_where_the_real_view_is() -> None:
+    batch = collate([items(virtual=1.0, focal=(0.7, 0.8))[k] for k in range(8)])
+    assert 0.3 < float(batch.valid.float().mean()) < 0.95
+    assert bool((batch.truth.sum(2)[~batch.valid] == 0).all())
+
+
+def test_masks_have_holes_of_all_sizes_and_repeat() -> None:
+    rig = frames()[0].rig
+    bank = mask_bank(rig, 6, seed=3)
+    assert bank.shape == (6, *SIZE) and bank.dtype == torch.bool
+    holes = (~bank).float().mean((1, 2))
+    assert float(holes.min()) >= 0.02 and float(holes.max()) <= 0.75
+    assert torch.equal(bank, mask_bank(rig, 6, seed=3)) and not torch.equal(bank, mask_bank(rig, 6, seed=4))
+
+
+def test_favs_by_torch_is_favs_by_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
+    frame = frames()[0]
+    target = replace(frame.rig[0].turned(yaw_deg=20), name="t")
+    by_opencv = favs(frame.images, frame.rig, [target])
+
+    def of_a_batch(plan, images, seams):
+        batched: list[torch.Tensor] = []
+        views = render_torch(plan, [image[None] for image in images], seams=batched)
+        seams.extend(seam[0] for seam in batched)
+        return [view[0] for view in views]
+
+    images = [image.float() / 255 for image in frame.images]
+    monkeypatch.setattr(pseudo_views, "render_opencv", of_a_batch)
+    by_torch = favs(images, frame.rig, [target])
+    assert torch.equal(by_opencv.covered, by_torch.covered)
+    assert float((by_opencv.images - by_torch.images).abs().max()) < 0.02

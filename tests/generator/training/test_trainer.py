@@ -1,0 +1,312 @@
+"""The run: resumed bit for bit, stopped by signals and by losses that are not finite, not harmed by a full disk."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch.overrides import TorchFunctionMode
+
+from arbiview_aug.errors import TrainingError
+from arbiview_aug.generator import Generator
+from arbiview_aug.generator.checkpoint import read_checkpoint
+from arbiview_aug.generator.denoiser import REGRESSION
+from arbiview_aug.generator.training import checkpointing
+from arbiview_aug.generator.training.config import LossConfig, tiny
+from arbiview_aug.generator.training.data import one_thread_worker
+from arbiview_aug.generator.training.losses import Perceptual
+from arbiview_aug.generator.training.pseudo_views import collate
+from arbiview_aug.generator.training.trainer import Trainer, learning_rate
+from tests.generator.training.small import config, frames
+from tests.generator.training.test_losses import features
+
+
+def run(folder: Path, **changes: Any) -> Trainer:
+    """A trainer of a generator that starts from the same weights each time."""
+    settings = config(**changes)
+    torch.manual_seed(0)
+    said: list[str] = []
+    made = Trainer(settings, frames(), Generator.from_config(settings.generator), folder, show=False, say=said.append)
+    made.said = said  # type: ignore[attr-defined]
+    return made
+
+
+def tensors(folder: Path) -> dict[str, torch.Tensor]:
+    return read_checkpoint(folder / "state")[1]
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def stop_after(made: Trainer, steps: int) -> None:
+    """Send the process what a scheduler sends, during a step."""
+    plain = made.train_step
+
+    def step(batch: Any) -> dict[str, float]:
+        if made.done == steps - 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return plain(batch)
+
+    made.train_step = step  # type: ignore[method-assign]
+
+
+def test_a_stopped_run_goes_on_bit_for_bit(tmp_path: Path) -> None:
+    whole = run(tmp_path / "whole")
+    assert whole.train()
+    before = signal.getsignal(signal.SIGTERM)
+    first = run(tmp_path / "parts")
+    stop_after(first, 3)
+    assert not first.train() and first.done == 3
+    assert "stopped after step 3 of 4" in first.said[-1]  # type: ignore[attr-defined]
+    assert signal.getsignal(signal.SIGTERM) == before
+    torch.manual_seed(99)  # no draw comes from the global generator
+    second = run(tmp_path / "parts")
+    assert second.done == 3
+    assert second.train()
+    assert same(tensors(tmp_path / "whole"), tensors(tmp_path / "parts"))
+    trained = Generator.from_pretrained(tmp_path / "parts" / "generator")
+    average = tensors(tmp_path / "parts")
+    for name, value in trained.denoiser.named_parameters():
+        assert torch.equal(value, average[f"average.{name}"])
+    assert any((tmp_path / "parts" / "logs").iterdir())
+    assert (tmp_path / "parts" / "validation" / "000004.png").is_file()
+
+
+@pytest.mark.slow
+def test_workers_change_nothing(tmp_path: Path) -> None:
+    for workers in (0, 2):
+        run(tmp_path / str(workers), steps=2, workers=workers).train()
+    assert same(tensors(tmp_path / "0"), tensors(tmp_path / "2"))
+
+
+def test_a_full_disk_leaves_the_last_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = run(tmp_path, steps=2)
+    made.train()
+    good = tensors(tmp_path)
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("arbiview_aug.generator.checkpoint._synchronise", full)
+    with torch.no_grad():
+        next(iter(made.generator.denoiser.parameters())).add_(1)
+    made._save_or_warn()
+    assert "No space left" in made.said[-1]  # type: ignore[attr-defined]
+    with pytest.raises(OSError, match="No space left"):
+        made.save()
+    assert same(tensors(tmp_path), good)
+    Generator.from_pretrained(tmp_path / "generator")
+    (tmp_path / "state" / ".weights.1.tmp").write_bytes(b"half of it")  # a killed process leaves these
+    monkeypatch.undo()
+    assert run(tmp_path, steps=2).done == 2
+
+
+def test_a_loss_that_is_not_finite_names_the_term_and_the_batch(tmp_path: Path) -> None:
+    made = run(tmp_path, loss=LossConfig(perceptual=0.0, regression=0.0))
+    batch = next(made._batches())
+    weights = {name: value.clone() for name, value in made.generator.denoiser.state_dict().items()}
+    batch = batch._replace(truth=torch.full_like(batch.truth, float("nan")))
+    with pytest.raises(TrainingError, match=r"step 0: loss term main is nan; the batch: frame \d.*frame \d"):
+        made.train_step(batch)
+    assert all(torch.equal(weights[name], value) for name, value in made.generator.denoiser.state_dict().items())
+
+
+def test_a_state_of_other_settings_is_refused(tmp_path: Path) -> None:
+    run(tmp_path, steps=2).train()
+    with pytest.raises(TrainingError, match="other settings of steps, lr"):
+        run(tmp_path, lr=0.5)
+    run(tmp_path, steps=2, workers=1, save_every=7)  # those may change
+
+
+def test_a_state_that_is_no_state_is_refused(tmp_path: Path) -> None:
+    made = run(tmp_path, steps=2)
+    (tmp_path / "state").mkdir()
+    (tmp_path / "state" / "config.json").write_text("{}")
+    assert checkpointing.has_state(made.state_folder)
+    with pytest.raises(TrainingError, match="expected the state of a training run"):
+        run(tmp_path, steps=2)
+
+
+def test_the_average_is_kept_apart_from_what_is_trained(tmp_path: Path) -> None:
+    made = run(tmp_path, steps=3)
+    made.train()
+    name, value = next(iter(made.average.values.items()))
+    parameter = dict(made.generator.denoiser.named_parameters())[name]
+    assert not torch.equal(parameter, value)
+
+
+def test_the_learning_rate_warms_up_and_falls_to_nothing() -> None:
+    settings = config(steps=100, warmup=10, lr=1.0)
+    rates = [learning_rate(settings, step) for step in range(101)]
+    assert rates[0] == pytest.approx(0.1) and rates[9] == pytest.approx(1.0) and rates[100] == pytest.approx(0.0)
+    assert all(a >= b for a, b in itertools.pairwise(rates[9:]))
+
+
+def test_signals_of_workers_are_left_to_the_trainer() -> None:
+    before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
+    threads = torch.get_num_threads()
+    try:
+        one_thread_worker(0)
+        assert signal.getsignal(signal.SIGTERM) == signal.SIG_IGN
+    finally:
+        torch.set_num_threads(threads)
+        for number, handler in zip((signal.SIGTERM, signal.SIGINT), before, strict=True):
+            signal.signal(number, handler)
+
+
+@pytest.mark.slow
+def test_a_frozen_unet_stays_as_it_is(tmp_path: Path) -> None:
+    frozen = replace(config().generator, frozen_unet=True)
+    made = run(tmp_path, generator=frozen, steps=2)
+    before = {name: value.clone() for name, value in made.generator.denoiser.state_dict().items()}
+    made.train()
+    moved = {
+        name for name, value in made.generator.denoiser.state_dict().items() if not torch.equal(value, before[name])
+    }
+    assert moved and all(name.startswith(("cross_view", "context", "regression", "unet.conv_in")) for name in moved)
+    assert not any("down_blocks" in name for name in tensors(tmp_path))
+    assert run(tmp_path, generator=frozen, steps=2).done == 2
+
+
+@pytest.mark.parametrize("checkpointing", [False, True])
+def test_bfloat16_and_recomputed_blocks_train(tmp_path: Path, checkpointing: bool) -> None:
+    from accelerate.state import AcceleratorState  # one precision a process, but for this
+
+    AcceleratorState._reset_state(reset_partial_state=True)
+    try:
+        made = run(tmp_path, steps=2, precision="bf16", checkpointing=checkpointing)
+        assert made.train()
+    finally:
+        AcceleratorState._reset_state(reset_partial_state=True)
+    assert all(value.dtype == torch.float32 for name, value in tensors(tmp_path).items())
+    assert all(bool(torch.isfinite(value).all()) for value in tensors(tmp_path).values())
+
+
+class GpuAutocast(TorchFunctionMode):
+    """What CUDA's autocast does in float32 and the CPU's does not, after its list of ops."""
+
+    WIDE = ("sum", "prod", "cumsum", "norm", "pow", "softmax", "layer_norm", "group_norm", "exp", "log", "rsqrt")
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        is_half = isinstance(out, torch.Tensor) and out.dtype == torch.bfloat16
+        return out.float() if is_half and getattr(func, "__name__", "") in self.WIDE else out
+
+
+@pytest.mark.parametrize("dense", [False, True])
+def test_bfloat16_as_on_a_gpu_trains(tmp_path: Path, dense: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sums come back in float32 there, and go into ops that take one type."""
+    monkeypatch.setattr("arbiview_aug.generator.attention.pays_dense", lambda at: dense)
+    settings = config(steps=1, checkpointing=False)
+    torch.manual_seed(0)
+    generator = Generator.from_config(settings.generator)
+    made = Trainer(settings, frames(), generator, tmp_path, show=False, say=lambda _: None)
+    with GpuAutocast(), torch.autocast("cpu", torch.bfloat16):
+        assert all(math.isfinite(value) for value in made.train_step(next(made._batches())).values())
+
+
+def test_what_was_trained_is_said_to_whoever_loads_it(tmp_path: Path) -> None:
+    for share in (0.0, 0.3):
+        made = run(tmp_path / str(share), steps=1, loss=LossConfig(perceptual=0.0, regression=share))
+        made.save()
+        loaded = Generator.from_pretrained(tmp_path / str(share) / "generator")
+        assert loaded.config.one_step == (share > 0)
+        assert not any(parameter.requires_grad for parameter in loaded.parameters())
+
+
+def test_a_generator_of_other_settings_is_refused(tmp_path: Path) -> None:
+    """It would say that it was trained as it was not: with inpainted conditions, say."""
+    settings = config()
+    other = Generator.from_config(replace(settings.generator, prefilled=False))
+    with pytest.raises(TrainingError, match="expected a generator of the run's own settings"):
+        Trainer(settings, frames(), other, tmp_path, show=False)
+
+
+def test_the_settings_of_a_run_are_found_again(tmp_path: Path) -> None:
+    """``evaluate`` must not score a run on the streets of another split or size."""
+    assert checkpointing.saved_config(tmp_path / "state", tiny()) == tiny()
+    made = run(tmp_path, seed=7)
+    made.save()
+    assert checkpointing.saved_config(tmp_path / "state", tiny()) == made.config
+
+
+def test_others_are_not_left_waiting_where_saving_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = run(tmp_path)
+    waited: list[int] = []
+    monkeypatch.setattr(made.accelerator, "wait_for_everyone", lambda: waited.append(1))
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("arbiview_aug.generator.training.trainer.save_state", full)
+    made._save_or_warn()
+    assert waited == [1]
+
+
+@pytest.mark.slow
+def test_recomputing_blocks_changes_no_step(tmp_path: Path) -> None:
+    plain, again = run(tmp_path / "a", steps=1), run(tmp_path / "b", steps=1, checkpointing=True)
+    for made in (plain, again):
+        made.train_step(next(made._batches()))
+    for a, b in zip(plain.generator.denoiser.parameters(), again.generator.denoiser.parameters(), strict=True):
+        assert torch.allclose(a, b, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_perceptual_term_comes_every_nth_step(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    settings = config(loss=LossConfig(perceptual=0.01, perceptual_every=2, perceptual_below_t=1000, regression=0.0))
+    vgg = Perceptual(features())
+    generator = Generator.from_config(settings.generator)
+    made = Trainer(settings, frames(), generator, tmp_path, perceptual=vgg, show=False, say=lambda _: None)
+    batches = made._batches()
+    terms = []
+    for _ in range(3):
+        terms.append(made.train_step(next(batches)))
+        made.done += 1
+    assert [("perceptual" in of_step) for of_step in terms] == [True, False, True]
+    weighted = terms[0]["main"] + 0.1 * terms[0]["geo"] + 0.01 * terms[0]["perceptual"]
+    assert terms[0]["total"] == pytest.approx(weighted, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_what_the_condition_lacks_is_measured_and_shipped(tmp_path: Path) -> None:
+    """It sets the scale of a residual generator's diffusion: the same for the same data; it is saved."""
+    one, two = (run(tmp_path / name, steps=1) for name in ("one", "two"))
+    inside, outside = one.generator.denoiser.deviation.tolist()
+    assert torch.equal(one.generator.denoiser.deviation, two.generator.denoiser.deviation)
+    assert 0.02 <= outside < inside < 1 and (inside, outside) != pytest.approx((0.3, 0.1))
+    assert one.train()
+    kept = Generator.from_pretrained(tmp_path / "one" / "generator").denoiser.deviation
+    assert torch.equal(kept, one.generator.denoiser.deviation)
+
+
+def test_an_untrained_network_errs_by_one_unit_at_all_times(tmp_path: Path) -> None:
+    """In its unit the error of the linear guess does not depend on t: no time starves."""
+    made = run(tmp_path, batch=8, loss=LossConfig(perceptual=0.0, known=1.0))
+    batch = collate([made.items[k] for k in range(8)])
+    truth, condition = batch.truth * 2 - 1, batch.condition * 2 - 1
+    views = batch.geometry.target_views(condition, batch.known, batch.confidence)
+    read = made.generator.denoiser.read_sources(
+        batch.geometry.source_views(batch.sources, batch.seen, batch.seen), batch.geometry.source_windows()
+    )
+    eps = torch.randn(truth.shape, generator=torch.Generator().manual_seed(0))
+    found = []
+    for t in (50, 300, 600, 999, REGRESSION):
+        times = torch.full((8, 1), t)
+        at = times[:, 0].clamp(max=999)
+        x = condition if t == REGRESSION else made.step.diffusion.noisy(truth, eps, at)
+        with torch.no_grad():
+            got = made.generator.denoiser(x, times, views, batch.geometry.target_windows(), read)
+        wanted = truth if t == REGRESSION else made.step.diffusion.target(truth, eps, at)
+        unit = made.generator.denoiser.unit(times, views)
+        found.append(float((((got - wanted) / unit) ** 2)[batch.valid[:, :, None].expand_as(got)].mean()))
+    assert 0.4 < min(found) and max(found) < 2.5, found

@@ -1,0 +1,345 @@
+"""Executing plans: identity, agreement of the executions, agreement with a warp by H_geom, labels, gradients."""
+
+import pickle
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.favs.config import FavsConfig, draft
+from arbiview_aug.favs.stage1_geometry import h_geom
+from arbiview_aug.render.atlas import AtlasLayout, FixedMap, Scratch
+from arbiview_aug.render.labels import render_labels
+from arbiview_aug.render.opencv_backend import render_opencv
+from arbiview_aug.render.plan import RenderPlan, build_plan
+from arbiview_aug.render.torch_backend import maps_on, render_torch
+
+SURFACES = ["far", "ground", "street", "auto"]
+
+
+def noise_images(rig: Rig, seed: int = 0, grain_px: int = 8) -> list[torch.Tensor]:
+    """Smooth random pictures of a grain in pixels: 32 is about as rough as a street, 8 far rougher."""
+    rng = np.random.default_rng(seed)
+    images = []
+    for camera in rig:
+        h, w = camera.size
+        coarse = rng.uniform(0, 255, (h // grain_px + 2, w // grain_px + 2, 3)).astype(np.float32)
+        image = cv2.resize(coarse, (w, h), interpolation=cv2.INTER_CUBIC)
+        images.append(torch.from_numpy(np.clip(image, 0, 255).astype(np.uint8)).permute(2, 0, 1))
+    return images
+
+
+def by(execution: str, plan: RenderPlan, images: list[torch.Tensor]) -> list[torch.Tensor]:
+    if execution == "opencv":
+        return render_opencv(plan, images)
+    return [view[0] for view in render_torch(plan, [image[None] for image in images])]
+
+
+def differences(a: list[torch.Tensor], b: list[torch.Tensor]) -> np.ndarray:
+    return np.concatenate([(x.int() - y.int()).abs().flatten().numpy() for x, y in zip(a, b, strict=True)])
+
+
+@pytest.mark.parametrize("name", ["nuscenes", "waymo", "fisheye_surround"])
+@pytest.mark.parametrize("execution", ["opencv", "torch"])
+@pytest.mark.parametrize("surface", SURFACES)
+def test_target_equal_to_source_gives_the_source_back(name: str, surface: str, execution: str) -> None:
+    rig = load_rig(name).resized(0.25)
+    images = noise_images(rig)
+    plan = build_plan(rig, rig, surface=surface)
+    for camera, image, view, target in zip(rig, images, by(execution, plan, images), plan.targets, strict=True):
+        # Where the lens can be inverted: past its fold a pixel has no ray.
+        seen = camera.unproject(camera.pixel_grid()).valid
+        assert (target.coverage == seen)[1:-1, 1:-1].all()
+        error = (view.int() - image.int()).abs().numpy()[:, target.coverage]
+        assert error.mean() <= 0.5
+
+
+@pytest.mark.parametrize("name", ["nuscenes", "ddad", "argoverse2"])
+def test_pinhole_on_the_far_surface_equals_a_warp_by_h_geom(name: str) -> None:
+    rig = load_rig(name).resized(0.5)
+    check_warp(rig, noise_images(rig, grain_px=32))
+
+
+def test_a_warp_by_h_geom_on_real_images(nuscenes_root) -> None:
+    from arbiview_aug.datasets import FrameFolder
+
+    sample = FrameFolder(nuscenes_root)[0]
+    check_warp(sample["rig"], list(sample["images"]))
+
+
+def check_warp(rig: Rig, images: list[torch.Tensor]) -> None:
+    target = rig.turned(yaw_deg=14, pitch_deg=-3, roll_deg=2)
+    for k in range(len(rig)):
+        one = rig.with_cameras([rig[k]])
+        plan = build_plan(one, target.with_cameras([target[k]]), surface="far")
+        view = render_opencv(plan, [images[k]])[0].permute(1, 2, 0).numpy()
+        h, w = target[k].size
+        warped = cv2.warpPerspective(images[k].permute(1, 2, 0).numpy(), h_geom(rig[k], target[k]), (w, h))
+        inner = cv2.erode(plan.targets[0].coverage.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        error = np.abs(view.astype(int) - warped.astype(int))[inner]
+        assert error.mean() <= 0.05 and np.quantile(error, 0.999) <= 1
+
+
+@pytest.mark.parametrize("reduce", [4, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("quality", ["draft", "fast"])
+def test_executions_agree_on_real_images(nuscenes_root, ddad_root, quality: str, reduce: int) -> None:
+    from arbiview_aug.datasets import FrameFolder
+    from arbiview_aug.favs.config import favs_config
+
+    for root in (nuscenes_root, ddad_root):
+        sample = FrameFolder(root, reduce=reduce)[0]
+        rig, images = sample["rig"], list(sample["images"])
+        lifted = rig.resized((256, 704)).shifted(z_m=0.5)
+        for target in (rig.turned(yaw_deg=22), load_rig("waymo").resized(0.3 / reduce), lifted):
+            plan = build_plan(rig, target, config=favs_config(quality))
+            error = differences(by("opencv", plan, images), by("torch", plan, images))
+            assert error.mean() <= 0.05 and np.quantile(error, 0.999) <= 1
+
+
+def test_memory_layouts_and_dtypes_give_the_same_views() -> None:
+    rig = load_rig("nuscenes").resized(0.2)
+    target = rig.turned(yaw_deg=15).resized(0.45)
+    images = noise_images(rig)
+    for target in (rig.turned(yaw_deg=15), rig.turned(yaw_deg=15).resized(0.45)):
+        plan, scratch = build_plan(rig, target), Scratch()
+        expected = render_opencv(plan, images)
+        block = torch.stack(images).contiguous(memory_format=torch.channels_last)  # one block: used without a copy
+        planar = [image.contiguous() for image in images]
+        for given in (block, planar, list(block)):
+            assert differences(expected, render_opencv(plan, list(given), scratch)).max() <= 1
+        floats = render_opencv(plan, [image.float() / 255 for image in planar])
+        assert differences(expected, [(v * 255).round() for v in floats]).max() <= 1
+        half = render_opencv(plan, [(image.float() / 255).half() for image in planar])
+        assert half[0].dtype == torch.float16
+        assert differences(expected, [(v.float() * 255).round() for v in half]).max() <= 1
+
+
+def test_slices_of_one_numpy_array_render_like_any_images() -> None:
+    rig = load_rig("nuscenes").resized(0.1)
+    plan = build_plan(rig, rig.turned(yaw_deg=5))
+    block = np.stack([image.permute(1, 2, 0).numpy() for image in noise_images(rig)])  # [N, H, W, 3]
+    slices = [torch.from_numpy(image).permute(2, 0, 1) for image in block]  # adjacent, each with a storage of its own
+    expected = render_opencv(plan, [image.contiguous() for image in slices])
+    assert differences(expected, render_opencv(plan, slices)).max() == 0
+
+
+def test_no_view_depends_on_memory_that_no_image_fills(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images of different widths leave gaps in the atlas; a bilinear tap of weight 0 there times NaN is NaN."""
+    narrow, wide = load_rig("nuscenes").resized((45, 80)), load_rig("nuscenes").resized((90, 160))
+    rig = narrow.with_cameras([*list(narrow)[:3], *list(wide)[3:]])
+    plan = build_plan(rig, rig)
+    images = [image / 255 for image in noise_images(rig)]
+    monkeypatch.setattr(np, "empty", lambda shape, dtype: np.full(shape, np.nan, dtype))  # what it may hold
+    views = render_opencv(plan, images)
+    assert all(view.isfinite().all() for view in views)
+
+
+def test_results_do_not_share_memory_with_buffers() -> None:
+    rig = load_rig("nuscenes").resized(0.1)
+    plan, scratch = build_plan(rig, rig.turned(yaw_deg=5)), Scratch()
+    first = render_opencv(plan, noise_images(rig, 0), scratch)
+    kept = [view.clone() for view in first]
+    render_opencv(plan, noise_images(rig, 1), scratch)
+    assert all(torch.equal(a, b) for a, b in zip(first, kept, strict=True))
+
+
+def test_torch_execution_is_differentiable_in_the_images() -> None:
+    rig = load_rig("nuscenes").resized(0.05)
+    plan = build_plan(rig, rig.turned(yaw_deg=20))
+    images = [torch.rand(1, 3, *c.size, dtype=torch.float32, requires_grad=True) for c in rig]
+    views = render_torch(plan, images)
+    sum(view.sum() for view in views).backward()
+    assert all(image.grad is not None and image.grad.abs().sum() > 0 for image in images)
+
+
+def test_batches_equal_single_frames() -> None:
+    rig = load_rig("nuscenes").resized(0.1)
+    plan = build_plan(rig, rig.turned(yaw_deg=20))
+    frames = [noise_images(rig, seed) for seed in (0, 1)]
+    batch = render_torch(plan, [torch.stack(pair) for pair in zip(*frames, strict=True)])
+    for b, images in enumerate(frames):
+        single = render_torch(plan, [image[None] for image in images])
+        assert all(torch.equal(x[b], y[0]) for x, y in zip(batch, single, strict=True))
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("autocast", [False, True])
+def test_half_precision_images_keep_float32_positions(dtype: torch.dtype, autocast: bool) -> None:
+    rig = load_rig("nuscenes").resized(0.2)
+    plan = build_plan(rig, rig.turned(yaw_deg=12))
+    images = [(image[None].float() / 255).to(dtype) for image in noise_images(rig)]
+    with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+        views = render_torch(plan, images)
+    exact = render_torch(plan, [image.float() for image in images])  # the same values
+    assert all(view.dtype == dtype for view in views)
+    assert all(torch.equal(view, other.to(dtype)) for view, other in zip(views, exact, strict=True))
+    maps = maps_on(plan, torch.device("cpu"))[0]
+    assert maps.grid.dtype == torch.float32 and (maps.blend is None or maps.blend.grid.dtype == torch.float32)
+    # What half precision would have done: pixels elsewhere.
+    seen = maps.source >= 0
+    rows = (maps.grid.bfloat16().float() - maps.grid)[seen][:, 1].abs() * plan.layout.size[0] / 2
+    assert rows.max() > 0.5
+
+
+def test_maps_are_moved_to_a_device_once() -> None:
+    rig = load_rig("nuscenes").resized(0.2)
+    plan, device = build_plan(rig, rig.turned(yaw_deg=12)), torch.device("cpu")
+    before = plan.nbytes
+    maps = maps_on(plan, device)
+    assert maps_on(plan, device) is maps and plan.nbytes == before + sum(view.nbytes for view in maps)
+    again = pickle.loads(pickle.dumps(plan))
+    assert not again.on_devices and again.nbytes == before
+    for view, target in zip(maps, plan.targets, strict=True):
+        second = np.zeros(target.coverage.shape, int)
+        for band in target.bands:
+            h, w = band.weight.shape
+            second[band.y : band.y + h, band.x : band.x + w] += band.weight > 0
+        assert second.max() == 1 and view.blend is not None  # or the order of the bands would matter
+        assert np.array_equal(np.flatnonzero(second), np.sort(view.blend.pixel.numpy()))
+
+
+def test_uncovered_pixels_are_black() -> None:
+    rig = load_rig("nuscenes").resized(0.2)
+    plan = build_plan(rig, rig.turned(pitch_deg=25))
+    white = [torch.full((3, *c.size), 255, dtype=torch.uint8) for c in rig]
+    for execution in ("opencv", "torch"):
+        for view, target in zip(by(execution, plan, white), plan.targets, strict=True):
+            assert 0.2 < target.coverage.mean() < 0.9
+            assert (view.numpy()[:, ~target.coverage] == 0).all()
+            assert (view.numpy()[:, target.coverage] >= 254).all()  # no border bleeds in
+
+
+def test_seams_are_blended_and_draft_does_not() -> None:
+    rig = load_rig("nuscenes").resized(0.4)
+    grey = [torch.full((3, *c.size), 60 + 30 * k, dtype=torch.uint8) for k, c in enumerate(rig)]
+
+    def largest_step(plan: RenderPlan) -> float:
+        view = render_opencv(plan, grey)[0].numpy()[0].astype(int)
+        inner = cv2.erode(plan.targets[0].coverage.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+        row = view[view.shape[0] // 2][inner[view.shape[0] // 2]]
+        return float(np.abs(np.diff(row)).max())
+
+    target = rig.turned(yaw_deg=22)
+    assert largest_step(build_plan(rig, target, config=draft())) >= 30
+    assert largest_step(build_plan(rig, target)) <= 30
+
+
+def test_labels_come_from_the_winning_source_at_the_nearest_pixel() -> None:
+    rig = load_rig("nuscenes").resized(0.2)
+    for target in (rig.turned(yaw_deg=22), rig.turned(yaw_deg=22).resized(0.4)):
+        plan = build_plan(rig, target)
+        labels = [torch.full(c.size, k, dtype=torch.uint8) for k, c in enumerate(rig)]
+        for view, label in zip(plan.targets, render_labels(plan, labels, 255), strict=True):
+            expected = np.where(view.coverage, view.source_camera, 255)
+            assert np.array_equal(label.numpy(), expected.astype(np.uint8))
+    plan = build_plan(rig, rig)
+    columns = [torch.arange(c.width_px).expand(2, *c.size) for c in rig]  # a channel dimension passes through
+    assert torch.equal(render_labels(plan, columns, -1)[0], columns[0])
+
+
+def test_halving_when_minifying_beats_direct_sampling(nuscenes_root) -> None:
+    """Truth: rendered at four times the size and averaged."""
+    from arbiview_aug.datasets import FrameFolder
+
+    sample = FrameFolder(nuscenes_root)[0]
+    rig, images = sample["rig"], list(sample["images"])
+    small = rig.turned(yaw_deg=4).resized((256, 704))
+    fine = render_opencv(
+        build_plan(rig, small.resized((1024, 2816)), config=FavsConfig(interpolation="linear")), images
+    )
+
+    def psnr(antialias: bool) -> float:
+        plan = build_plan(rig, small, config=FavsConfig(antialias=antialias, interpolation="linear"))
+        errors = []
+        for view, truth, target in zip(render_opencv(plan, images), fine, plan.targets, strict=True):
+            mean = cv2.resize(truth.permute(1, 2, 0).numpy(), (704, 256), interpolation=cv2.INTER_AREA)
+            inner = cv2.erode(target.coverage.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+            errors.append(((view.permute(1, 2, 0).numpy().astype(float) - mean)[inner] ** 2).mean())
+        return float(10 * np.log10(255**2 / np.mean(errors)))
+
+    assert psnr(True) > psnr(False) + 2
+
+
+def zoomed(rig: Rig, factor: float) -> Rig:
+    """The same cameras with longer focal lengths."""
+    return rig.with_cameras([replace(c, K=np.diag([factor, factor, 1.0]) @ c.K + shift(c, factor)) for c in rig])
+
+
+def shift(camera: Camera, factor: float) -> np.ndarray:
+    """Keeps the principal point."""
+    return np.array([[0, 0, camera.K[0, 2]], [0, 0, camera.K[1, 2]], [0, 0, 0]]) * (1 - factor)
+
+
+@pytest.mark.parametrize(("factor", "expected"), [(0.5, "linear"), (0.9, "linear"), (1.0, "linear"), (1.37, "cubic")])
+def test_only_magnified_views_are_read_by_cubics(factor: float, expected: str) -> None:
+    rig = load_rig("nuscenes").resized(0.25)
+    target = zoomed(rig, factor).turned(yaw_deg=3)
+    assert {view.interpolation for view in build_plan(rig, target).targets} == {expected}
+    assert {view.interpolation for view in build_plan(rig, target, config=draft()).targets} == {"nearest"}
+
+
+@pytest.mark.slow
+def test_magnified_views_are_sharper() -> None:
+    """65 to 50 degrees: what took the detector of ``integrations/cross_rig`` from 77 to 91 % of the gap."""
+    rig = demo_source_rig((96, 256))
+    target, drive = zoomed(rig, 1.37), SyntheticDrive(rig, num_frames=3, seed=7, lidar=False)
+    streets = [(list(drive[k]["images"]), drive.render(k, target).images.float()) for k in range(len(drive))]
+    psnr = []
+    for interpolation in ("linear", "cubic"):
+        plan = build_plan(rig, target, config=FavsConfig(interpolation=interpolation))
+        views = [torch.stack(render_opencv(plan, images)).float() for images, _ in streets]
+        errors = [(view - truth).square().mean().item() for view, (_, truth) in zip(views, streets, strict=True)]
+        psnr.append(10 * np.log10(255**2 / np.mean(errors)))
+    assert psnr[1] > psnr[0] + 0.4
+
+
+@pytest.mark.parametrize("execution", ["opencv", "torch"])
+def test_cubics_do_not_reach_beyond_a_source_or_onto_its_mask(execution: str) -> None:
+    """Sources of one colour each, the own car of another: nothing is mixed, anywhere up to the last pixel."""
+    rig = load_rig("nuscenes").resized(0.25)
+    mask = np.ones(rig[0].size, bool)
+    mask[-40:, 100:300] = False
+    rig = rig.with_cameras([replace(camera, mask=mask) for camera in rig])
+    colours = [30, 220, 60, 190, 90, 160]
+    images = [torch.full((3, *mask.shape), colour, dtype=torch.uint8) for colour in colours]
+    for image in images:
+        image[:, torch.from_numpy(~mask)] = 255 - image[0, 0, 0]
+    plan = build_plan(rig, zoomed(rig, 1.3).turned(yaw_deg=20), surface="far", config=FavsConfig(seam_width=0))
+    for view, target in zip(by(execution, plan, images), plan.targets, strict=True):
+        assert target.interpolation == "cubic" and target.edge is not None and len(target.edge.pixel) > 50
+        assert len(target.sources) > 1 and not target.coverage.all()
+        for source in target.sources:
+            own = view[:, torch.from_numpy(target.source_camera == source)]
+            assert (own == colours[source]).all()
+
+
+def test_executions_agree_on_cubics() -> None:
+    rig = load_rig("nuscenes").resized(0.25)
+    plan, images = build_plan(rig, zoomed(rig, 1.3).turned(yaw_deg=8)), noise_images(rig)
+    off = differences(by("opencv", plan, images), by("torch", plan, images))
+    assert off.mean() < 0.1 and off.max() <= 2
+    as_floats = [image.float() / 255 for image in images]
+    for execution in ("opencv", "torch"):
+        views = by(execution, plan, as_floats)
+        assert all(0 <= view.min() and view.max() <= 1 for view in views)
+        assert differences([255 * view for view in views], by(execution, plan, images)).max() <= 1
+
+
+def test_atlas_spills_into_columns_where_rows_run_out() -> None:
+    layout = AtlasLayout.for_sources([(4320, 7680)] * 12, [(s, 0) for s in range(12)])
+    assert layout.size[0] <= 32767 and layout.size[1] <= 32767
+    boxes = [(s.y, s.y + s.size[0], s.x, s.x + s.size[1]) for s in layout.slots]
+    for i, a in enumerate(boxes):
+        for b in boxes[:i]:
+            assert a[1] <= b[0] or b[1] <= a[0] or a[3] <= b[2] or b[3] <= a[2]
+
+
+def test_fixed_maps_keep_32nds_of_a_pixel() -> None:
+    uv = np.array([[[0.0, 10.0], [1599.5, 899.25], [3.3, 5399.71]]], np.float32)
+    assert np.abs(FixedMap.from_float(uv).to_float() - uv).max() <= 1 / 64 + 1e-4
+    assert np.array_equal(FixedMap.from_float(uv).rounded().to_float(), [[[0, 10], [1600, 899], [3, 5400]]])

@@ -1,0 +1,298 @@
+"""Depth from overlap: found where it is, declined where nothing says so, and never a harm."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.overlap import half_way_view
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.errors import SampleError
+from arbiview_aug.favs.config import accurate, favs_config
+from arbiview_aug.render.overlap_depth import LIMITS, MIN_RISE_DB, OverlapDepth, overlap_depth
+from arbiview_aug.render.plan import RenderPlan, build_plan
+from arbiview_aug.render.refinement import RefinementCache
+from arbiview_aug.scene.box_raster import draw_boxes
+from arbiview_aug.scene.corrected import CorrectedSurface, Correction
+from arbiview_aug.scene.scene import Scene
+from arbiview_aug.scene.static import Street
+from arbiview_aug.scene.surface import StaticSurface
+from arbiview_aug.transforms.rig_retarget import RigRetarget
+from tests import helpers
+
+SIZE = (225, 400)
+
+
+def camera(name: str, azimuth_deg: float, y_m: float, fov_deg: float = 80.0) -> Camera:
+    return helpers.camera(name, azimuth_deg, size=SIZE, position_m=(1.5, y_m, 1.6), horizontal_fov_deg=fov_deg)
+
+
+RIG = Rig([camera("left", 25, 0.5), camera("right", -25, -0.5)])
+TARGET = RIG.shifted(z_m=0.4).turned(yaw_deg=10)
+NEARER = Street(half_length_m=20, half_width_m=10)
+"""A street whose wall is at half the assumed distance."""
+
+
+def colour(points: FloatArray) -> FloatArray:
+    """A texture (..., 3) in [0, 1] fixed in space: waves that no two of are alike, as long as some decimetres."""
+    rng = np.random.default_rng(3)
+    waves = rng.normal(size=(3, 24)) * rng.uniform(0.5, 4, size=24)
+    phases = rng.uniform(0, 6, size=(24, 3))
+    angles = points @ waves  # [..., 24]
+    return 0.5 + 0.1 * sum(np.sin(angles[..., k, None] + phases[k]) for k in range(24)).clip(-5, 5)
+
+
+def photographs(surface: StaticSurface, rig: Rig = RIG) -> torch.Tensor:
+    """(N, 3, h, w) uint8 of a textured surface."""
+    images = []
+    for cam in rig:
+        rays = cam.unproject(cam.pixel_grid()).directions
+        q = np.maximum(surface.inverse_distance(cam.center_m, rays), 1e-6)
+        images.append(np.round(colour(cam.center_m + rays / q[..., None]) * 255).astype(np.uint8))
+    return torch.from_numpy(np.stack(images).transpose(0, 3, 1, 2).copy())
+
+
+@pytest.fixture(scope="module")
+def nearer() -> tuple[torch.Tensor, OverlapDepth]:
+    images = photographs(NEARER)
+    return images, overlap_depth(RIG, images)
+
+
+def test_finds_a_nearer_wall(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
+    _, depth = nearer
+    (report,), (correction,) = depth.reports, depth.corrections
+    assert report.accepted and report.db_after > report.db_before + 3
+    view = half_way_view(RIG[0], RIG[1], SIZE)
+    refined, assumed = CorrectedSurface(Street(), depth.corrections), Street()
+    ahead = view.unproject(np.stack(np.meshgrid(np.linspace(170, 230, 7), np.linspace(60, 100, 5)), -1)).directions
+    truth = NEARER.inverse_distance(view.center_m, ahead)
+    error = np.abs(refined.inverse_distance(view.center_m, ahead) / truth - 1)
+    assert np.abs(assumed.inverse_distance(view.center_m, ahead) / truth - 1).min() > 0.4
+    assert np.median(error) < 0.1
+    assert LIMITS[0] <= correction.change.min() and correction.change.max() <= LIMITS[1]
+
+
+def test_helps_at_the_target(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
+    images, _ = nearer
+    truth = photographs(NEARER, TARGET).float()
+
+    def mse(quality: str) -> float:
+        out = RigRetarget(TARGET, source_rig=RIG, surface="street", quality=quality)({"images": images})  # type: ignore[arg-type]
+        seen = out["coverage"][:, None].expand_as(truth)
+        return float((out["images"].float() - truth)[seen].square().mean())
+
+    assert mse("accurate") < 0.8 * mse("fast")
+
+
+def test_a_right_street_is_left_alone() -> None:
+    images = photographs(Street())
+    depth = overlap_depth(RIG, images)
+    assert depth.corrections == () and depth.matched == 1
+    assert "would not help" in str(depth)
+
+
+def noise(seed: int, low: int = 0, high: int = 255) -> torch.Tensor:
+    return torch.randint(low, high + 1, (2, 3, *SIZE), dtype=torch.uint8, generator=torch.Generator().manual_seed(seed))
+
+
+def grating(period_px: float, shift_px: float) -> torch.Tensor:
+    """Stripes across both images, out of step between them."""
+    x = torch.arange(SIZE[1], dtype=torch.float64)
+    rows = [127 + 120 * torch.sin(2 * torch.pi * (x + k * shift_px) / period_px) for k in (0, 1)]
+    return torch.stack(rows)[:, None, None, :].expand(2, 3, *SIZE).round().to(torch.uint8).contiguous()
+
+
+USELESS = {
+    "blank": torch.full((2, 3, *SIZE), 90, dtype=torch.uint8),
+    "black": torch.zeros((2, 3, *SIZE), dtype=torch.uint8),
+    "saturated": torch.full((2, 3, *SIZE), 255, dtype=torch.uint8),
+    "night": noise(1, 0, 6),
+    "noise": noise(2),
+    "stripes": grating(20, 6),
+    "narrow stripes": grating(9, 3),
+    "shuffled": photographs(NEARER).flip(0),
+    "of two places": torch.stack([photographs(NEARER)[0], photographs(Street(half_width_m=9)).flip(-1)[1]]),
+}
+
+
+@pytest.mark.parametrize("name", USELESS)
+def test_declines_what_says_nothing(name: str) -> None:
+    """Bit for bit the unrefined picture, and a reason."""
+    sample = {"images": USELESS[name]}
+    refining = RigRetarget(TARGET, source_rig=RIG, surface="street", quality="accurate")
+    plain = RigRetarget(TARGET, source_rig=RIG, surface="street", quality=replace(accurate(), overlap_depth=False))
+    assert torch.equal(refining(sample)["images"], plain(sample)["images"])
+    (report,) = refining.explain(sample).depth.reports  # type: ignore[union-attr]
+    assert not report.accepted and report.reason
+
+
+def test_one_colour_of_light_more_or_less_is_no_depth(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
+    """Exposure: the same distances within flow's noise."""
+    images, depth = nearer
+    darker = torch.stack([images[0], (images[1].float() * 0.6).to(torch.uint8)])
+    changed = overlap_depth(RIG, darker)
+    both = depth.corrections[0].share > 0.99
+    assert np.median(np.abs(changed.corrections[0].change - depth.corrections[0].change)[both]) < 0.05
+
+
+def test_no_matching_without_overlap() -> None:
+    apart = Rig([camera("front", 0, 0, 60), camera("back", 180, 0, 60)])
+    depth = overlap_depth(apart, photographs(Street(), apart))
+    assert depth.matched == 0 and not depth.reports
+    assert "no two cameras overlap" in str(depth)
+
+
+def test_not_where_every_pixel_is_exact(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One centre for all cameras: a homography is exact, no depth is asked for."""
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("matched without need")
+
+    monkeypatch.setattr("arbiview_aug.transforms.planner.overlap_depth", refuse)
+    one = Rig([camera("left", 25, 0), camera("right", -25, 0)])
+    sample = {"images": noise(0)}
+    RigRetarget(one.turned(yaw_deg=5), source_rig=one, quality="accurate")(sample)
+    for surface in ("far", "ground"):
+        RigRetarget(TARGET, source_rig=RIG, quality="accurate", surface=surface)(sample)  # type: ignore[arg-type]
+
+
+def test_the_order_of_cameras_does_not_matter(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
+    images, depth = nearer
+    turned = overlap_depth(RIG.with_cameras([RIG[1], RIG[0]]), images.flip(0))
+    assert [c.key for c in turned.corrections] == [c.key for c in depth.corrections]
+    assert overlap_depth(RIG, images).corrections[0].key == depth.corrections[0].key
+
+
+def test_floats_say_the_same(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
+    images, depth = nearer
+    floats = overlap_depth(RIG, images.float() / 255)
+    assert np.abs(floats.corrections[0].change - depth.corrections[0].change).max() < 0.05
+
+
+def test_labelled_objects_are_not_measured(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
+    """One that fills the overlap leaves nothing to measure."""
+    images, depth = nearer
+    view = half_way_view(RIG[0], RIG[1], SIZE)
+    box = np.array([[15.0, 0.0, 1.0, 4, 1.5, 2, 0]])
+    shown = draw_boxes(view, box).pixel
+    assert len(shown) > 200
+    (correction,) = overlap_depth(RIG, images, box).corrections
+    assert correction.key != depth.corrections[0].key
+    full = np.array([[12.0, 0.0, 0.0, 1, 40, 40, 0]])
+    (report,) = overlap_depth(RIG, images, full).reports
+    assert not report.accepted and "too little" in report.reason
+    none = overlap_depth(RIG, images, np.zeros((0, 7)))
+    assert none.corrections[0].key == depth.corrections[0].key
+
+
+def test_boxes_matter_where_they_are_solids(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
+    images, _ = nearer
+    sample = {"images": images, "boxes_3d": np.array([[12.0, 0.0, 0.0, 1, 40, 40, 0]])}
+    for surface, accepted in (("objects", False), ("auto", False), ("street", True)):
+        depth = RigRetarget(TARGET, source_rig=RIG, quality="accurate", surface=surface).explain(sample).depth  # type: ignore[arg-type]
+        assert depth is not None and depth.reports[0].accepted is accepted
+
+
+# --- the surface ------------------------------------------------------------------------------------------------------
+def test_a_correction_reaches_as_far_as_its_share() -> None:
+    view = camera("view", 0, 0)
+    half = np.zeros(SIZE, np.float32)
+    half[:, :200] = 1
+    refined = CorrectedSurface(Street(), (Correction(view, np.full(SIZE, 0.25, np.float32), half),))
+    rays = view.unproject(np.array([[100.0, 50], [300, 50], [100, 200]])).directions
+    behind = np.array([[-1.0, 0, 0]])
+    q, base = (s.inverse_distance(view.center_m, rays) for s in (refined, Street()))
+    np.testing.assert_allclose(q / base, [1.25, 1, 1.25], rtol=1e-6)
+    assert refined.inverse_distance(view.center_m, behind) == Street().inverse_distance(view.center_m, behind)
+
+
+def test_a_correction_belongs_to_the_scene_not_to_a_ray() -> None:
+    """From another centre, the change is read where the corrected point lies in the view."""
+    view = camera("view", 0, 0)
+    ramp = np.tile(np.linspace(0, 0.4, SIZE[1], dtype=np.float32), (SIZE[0], 1))
+    refined = CorrectedSurface(Street(), (Correction(view, ramp, np.ones(SIZE, np.float32)),))
+    origin = view.center_m + np.array([0.3, 0.8, 0.5])
+    rays = camera("other", 3, 0).unproject(np.array([[200.0, 90], [150, 120], [230, 60]])).directions
+    q, base = (s.inverse_distance(origin, rays) for s in (refined, Street()))
+    uv, _, valid = view.project(origin + rays / q[:, None])
+    assert valid.all()
+    np.testing.assert_allclose(q / base - 1, uv[:, 0] / (SIZE[1] - 1) * 0.4, atol=2e-3)
+
+
+def test_maps_over_corrections_err_by_an_eighth_of_a_pixel(
+    nearer: tuple[torch.Tensor, OverlapDepth], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not by a 64th: the distances are not known that well, and every bend would be evaluated pixel by pixel."""
+    scene = Scene(corrections=nearer[1].corrections)
+
+    def built(slack: float) -> RenderPlan:
+        monkeypatch.setattr(CorrectedSurface, "slack", slack)
+        return build_plan(RIG, TARGET, surface="street", scene=scene)
+
+    quick, thorough = built(CorrectedSurface.tolerance_scale), built(1.0)
+    assert quick.counters["cells_exact"] < 0.6 * thorough.counters["cells_exact"]
+    for one, two in zip(quick.targets, thorough.targets, strict=True):
+        same = (one.source_camera == two.source_camera) & one.coverage
+        off_px = np.abs(one.at.to_float() - two.at.to_float()).max(-1)[same]
+        assert same.mean() > 0.99 * one.coverage.mean() and np.quantile(off_px, 0.99) <= 1 / 8
+
+
+def test_two_corrections_count_by_their_shares() -> None:
+    view, ray = camera("view", 0, 0), np.array([[1.0, 0, 0.1]]) / np.hypot(1, 0.1)
+    one, two = (
+        Correction(view, np.full(SIZE, c, np.float32), np.full(SIZE, s, np.float32)) for c, s in ((0.4, 1), (-0.2, 0.5))
+    )
+    q = CorrectedSurface(Street(), (one, two)).inverse_distance(view.center_m, ray)
+    base = Street().inverse_distance(view.center_m, ray)
+    np.testing.assert_allclose(q / base, 1 + (0.4 - 0.1) / 1.5, rtol=1e-6)
+
+
+# --- reuse ------------------------------------------------------------------------------------------------------------
+def test_a_cache_computes_each_scene_once(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
+    images, _ = nearer
+    cache = RefinementCache(key="token")
+    retarget = RigRetarget(TARGET, source_rig=RIG, surface="street", quality="accurate", refinement=cache)
+    first = retarget({"images": images, "token": "a"})["images"]
+    again = retarget({"images": images, "token": "a"})["images"]
+    assert (cache.hits, cache.misses, len(retarget.plans)) == (1, 1, 1)
+    assert torch.equal(first, again)
+    retarget({"images": images, "token": "b"})
+    assert cache.misses == 2
+    batch = {"images": torch.stack([images, images]), "token": ["a", "c"]}
+    assert torch.equal(retarget(batch)["images"][0], first)
+    assert (cache.hits, cache.misses) == (2, 3)
+    with pytest.raises(SampleError, match="'token'"):
+        retarget({"images": images})
+    with pytest.raises(SampleError, match="2 frames"):
+        retarget({**batch, "token": "a"})
+    assert pickle.loads(pickle.dumps(cache)).key == "token"
+
+
+def test_a_cache_forgets_the_oldest(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
+    _, depth = nearer
+    cache = RefinementCache(max_bytes=2 * depth.nbytes)
+    for name in "abca":
+        cache.get((b"", name), lambda: depth)
+    assert cache.misses == 4
+
+
+def test_a_cache_needs_something_to_hold() -> None:
+    with pytest.raises(ValueError, match="accurate"):
+        RigRetarget(TARGET, refinement=RefinementCache())
+
+
+def test_the_plan_knows_its_corrections(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
+    _, depth = nearer
+    assert Scene().key != Scene(corrections=depth.corrections).key
+    assert Scene(corrections=depth.corrections).best == "street"
+
+
+def test_the_preset() -> None:
+    assert favs_config("accurate") == accurate()
+    assert accurate().overlap_depth and MIN_RISE_DB > 0

@@ -1,0 +1,176 @@
+"""What a target requires: a source that serves it alone changes no pixel, and where no depth decides none is asked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import assume, event, given, settings
+from hypothesis import strategies as st
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.favs.config import FavsConfig, draft
+from arbiview_aug.render import view_planner
+from arbiview_aug.render.plan import RenderPlan, build_plan
+from arbiview_aug.render.requirements import MOVED_M, baselines_m, covers_target_exactly, needs_geometry, static_harm
+
+FAST = FavsConfig()
+
+
+def ring(size: tuple[int, int] = (90, 160)) -> Rig:
+    return load_rig("nuscenes").resized(size)
+
+
+def zoomed(camera: Camera, factor: float, size: tuple[int, int] | None = None) -> Camera:
+    K = camera.K.copy()
+    K[:2, :2] *= factor
+    changed = replace(camera, K=K, mask=None)
+    return changed if size is None else changed.resize(size)
+
+
+def built_without(source: Rig, target: Rig, config: FavsConfig, monkeypatch: pytest.MonkeyPatch) -> RenderPlan:
+    """The plan for which every source was looked at."""
+    with monkeypatch.context() as patch:
+        patch.setattr(view_planner, "serves_alone", lambda *_: False)
+        return build_plan(source, target, config=config)
+
+
+def same(one: RenderPlan, two: RenderPlan) -> bool:
+    for a, b in zip(one.targets, two.targets, strict=True):
+        maps = np.array_equal(a.at.xy, b.at.xy) and np.array_equal(a.at.frac, b.at.frac)
+        if not (maps and np.array_equal(a.source_camera, b.source_camera) and len(a.bands) == len(b.bands)):
+            return False
+    return one.layout.size == two.layout.size
+
+
+@pytest.mark.parametrize("config", [FAST, draft(), FavsConfig(distance_gamma=1.5)], ids=["fast", "draft", "gamma"])
+@pytest.mark.parametrize(
+    "view", [lambda c: c, lambda c: zoomed(c, 1.2), lambda c: zoomed(c, 1.4).turned(yaw_deg=2, pitch_deg=1)]
+)
+def test_no_pixel_changes_where_one_source_serves_alone(
+    view: Callable[[Camera], Camera], config: FavsConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = ring()
+    target = rig.with_cameras([view(camera) for camera in rig])
+    plan, whole = build_plan(rig, target, config=config), built_without(rig, target, config, monkeypatch)
+    assert plan.counters["served_alone"] == len(rig) and plan.counters["pairs_far"] == len(rig)
+    assert "pairs_street" not in plan.counters and whole.counters["pairs_street"] > 0
+    assert same(plan, whole) and all(seen.all() for seen in plan.coverage)
+
+
+@settings(max_examples=60)
+@given(
+    yaw=st.floats(-12, 12),
+    pitch=st.floats(-8, 8),
+    roll=st.floats(-6, 6),
+    zoom=st.floats(1.0, 2.5),
+    size=st.sampled_from([(90, 160), (71, 131), (45, 80), (37, 64), (150, 260)]),
+    source_size=st.sampled_from([(90, 160), (89, 159), (225, 401)]),
+    masked=st.booleans(),
+    exact=st.booleans(),
+)
+def test_a_source_that_serves_alone_covers_every_pixel(
+    yaw: float,
+    pitch: float,
+    roll: float,
+    zoom: float,
+    size: tuple[int, int],
+    source_size: tuple[int, int],
+    masked: bool,
+    exact: bool,
+) -> None:
+    source = ring(source_size)[0]
+    if masked:
+        mask = np.ones(source.size, bool)
+        mask[-source.height_px // 8 :, source.width_px // 3 : -source.width_px // 3] = False
+        source = replace(source, mask=mask)
+    if exact:
+        yaw = pitch = roll = 0.0
+    target = zoomed(source, zoom, size).turned(yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
+    assume(covers_target_exactly(source, target, FAST))
+    event(f"masked {masked}, exact {exact}")
+    rig = Rig([source])
+    for surface in ("auto", "street"):
+        assert build_plan(rig, rig.with_cameras([target]), surface=surface).targets[0].coverage.all()
+
+
+def test_what_does_not_serve_alone() -> None:
+    source = ring()[0]
+    fish = load_rig("fisheye_surround")[0]
+    hidden = np.ones(source.size, bool)
+    hidden[40:50, 70:90] = False
+    assert covers_target_exactly(source, source, FAST)
+    for one, target, config in (
+        (source, source.turned(yaw_deg=0.5), FAST),  # looks past its border
+        (source, zoomed(source, 0.99), FAST),
+        (source, source.turned(yaw_deg=180), FAST),
+        (source, zoomed(source, 1.5).shifted(x_m=2e-6), FAST),  # another centre
+        (replace(source, mask=hidden), zoomed(source, 1.5), FAST),
+        (source, source, FavsConfig(primary_bonus=1.0)),  # exactness counts for nothing
+        (source, source, FavsConfig(distance_gamma=8.0)),  # at the border others weigh more
+        (fish, fish, FAST),  # past its fold a lens sees nothing
+        (ring((91, 161))[0], ring((91, 161))[0].resize((45, 80)), FAST),  # halving drops the last row and column
+    ):
+        assert not covers_target_exactly(one, target, config)
+    assert covers_target_exactly(ring((92, 160))[0], ring((92, 160))[0].resize((46, 80)), FAST)
+
+
+def test_two_sources_at_one_centre_share_the_view() -> None:
+    """A telephoto camera beside a wide one that sees everything keeps the middle: it has the resolution."""
+    wide = ring()[0]
+    rig = Rig([wide, replace(zoomed(wide, 3.0), name="tele"), replace(wide.shifted(y_m=0.5), name="beside")])
+    target = Rig([zoomed(wide, 1.5)])
+    plan = build_plan(rig, target)
+    assert plan.counters["served_alone"] == 1 and set(np.unique(plan.targets[0].source_camera)) == {0, 1}
+
+
+def test_geometry_is_needed_where_a_pixel_can_move() -> None:
+    rig = ring()
+    cut = rig.with_cameras([zoomed(camera, 1.3) for camera in rig])
+    front_and_back = rig.with_cameras([rig[0], rig[3]])
+    one_centre = rig.with_cameras([c.moved(moved_to_origin(c)) for c in rig])
+    needed = {
+        (rig, rig): False,
+        (rig, cut): False,
+        (rig, rig.turned(yaw_deg=10)): True,  # neighbours elsewhere see the rest
+        (rig, cut.shifted(z_m=0.5)): True,
+        (rig.with_cameras([rig[0]]), rig.with_cameras([rig[0].turned(yaw_deg=10)])): False,
+        (front_and_back, front_and_back.turned(yaw_deg=10)): False,  # no neighbour can see what is missing
+        (front_and_back, front_and_back.turned(yaw_deg=90)): True,
+        (one_centre, one_centre.turned(yaw_deg=30)): False,
+    }
+    for (source, target), expected in needed.items():
+        assert needs_geometry(source, target, "auto", FAST) == expected, (source.names, target.names)
+    # What is asked for by name is left out only where it cannot matter.
+    assert not needs_geometry(rig, cut, "lidar", FAST)
+    assert needs_geometry(front_and_back, front_and_back.turned(yaw_deg=10), "lidar", FAST)
+    nearly = rig.shifted(x_m=1e-5)
+    assert needs_geometry(rig, nearly, "lidar", FAST)
+
+
+def moved_to_origin(camera: Camera) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, 3] = -camera.center_m + (0, 0, 1.5)
+    return T
+
+
+def test_baselines_align_the_roads() -> None:
+    rig = ring()
+    lifted = Rig([c.shifted(z_m=-0.4) for c in rig], ground_z_m=-0.4)
+    assert np.allclose(np.diag(baselines_m(rig, lifted)), 0, atol=1e-9)
+
+
+def test_a_static_surface_harms_where_cameras_move_and_pixels_depend_on_the_street() -> None:
+    rig = ring()
+    for surface in ("far", "ground", "street"):
+        assert "stand up to 0.60 m" in str(static_harm(rig, rig.shifted(z_m=0.6), surface, FAST))
+        assert static_harm(rig, rig.shifted(z_m=0.9 * MOVED_M), surface, FAST) is None
+        assert static_harm(rig, rig.turned(yaw_deg=20), surface, FAST) is None
+    for surface in ("objects", "lidar", "motion"):
+        assert static_harm(rig, rig.shifted(z_m=0.6), surface, FAST) is None
+    one = Rig([rig[0]])
+    assert static_harm(one, one.turned(yaw_deg=180).shifted(z_m=0.6), "street", FAST) is None  # nothing is seen
+    assert "stand up to 0.60 m" in str(static_harm(rig, Rig([rig[0], rig[1].shifted(z_m=0.6)]), "street", FAST))

@@ -1,0 +1,172 @@
+"""Bad samples: each is refused with a message that names the entry, what was expected and how to mend it.
+
+Bad input that other modules refuse is tested with them: rotations, NaN K, lenses and their coefficients in
+``test_camera``; empty rigs and malicious YAML in ``test_rig``; missing and truncated images in
+``datasets/test_images``; missing tables and unknown tokens in ``datasets/test_nuscenes``; stale pixel-bound keys and
+rigs that see nothing of the sources in ``test_transforms``. What a sample's own tensors
+can bring of these is here as well.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import ArbiviewError, Camera, Rig, RigRetarget, SampleError, SampleTypeError
+from arbiview_aug.sample.inputs import read_frames
+
+H, W = 36, 64
+
+
+def rig(count: int = 2) -> Rig:
+    cameras = [
+        Camera.looking(name=f"c{k}", azimuth_deg=90.0 * k, width_px=W, height_px=H, horizontal_fov_deg=100)
+        for k in range(count)
+    ]
+    return Rig(cameras)
+
+
+def sample(**changes: Any) -> dict[str, Any]:
+    """A good sample of two cameras, with changes; None removes a key."""
+    good = {
+        "images": torch.zeros((2, 3, H, W), dtype=torch.uint8),
+        "K": torch.from_numpy(rig().K),
+        "cam2ego": torch.from_numpy(rig().cam2ego),
+    }
+    return {key: value for key, value in {**good, **changes}.items() if value is not None}
+
+
+def edited(key: str, index: Any, value: float) -> dict[str, Any]:
+    changed = sample()[key].clone()
+    changed[index] = value
+    return sample(**{key: changed})
+
+
+def with_distortion(coefficients: Any, lens: Any = None) -> dict[str, Any]:
+    return sample(distortion=torch.tensor(coefficients, dtype=torch.float64), lens=lens)
+
+
+def test_the_good_sample_is_good() -> None:
+    (frame,) = read_frames(sample(), None)
+    assert len(frame.images) == 2 and frame.rig.sizes == [(H, W)] * 2
+
+
+IMAGES: dict[str, tuple[Any, str]] = {
+    "no images": (None, "sample: expected a key 'images', got K, cam2ego"),
+    "no cameras": (torch.zeros(0, 3, H, W), "images: expected at least one image, got none"),
+    "an empty list": ([], "images: expected at least one image, got none"),
+    "an empty batch": (torch.zeros(0, 2, 3, H, W), r"images: expected at least one frame, got .* \(0,\)"),
+    "one image": (torch.zeros(3, H, W), r"images: expected shape \(..., N, 3, H, W\), got \(3, 36, 64\)"),
+    "grey": (torch.zeros(2, 1, H, W), r"images\[0\]: expected an RGB image .* got shape \(1, 36, 64\); expand grey"),
+    "grey, two dimensions": ([torch.zeros(H, W)] * 2, r"images\[0\]: .* got shape \(36, 64\); expand grey"),
+    "RGBA": (torch.zeros(2, 4, H, W), r"got shape \(4, 36, 64\); drop the alpha channel: image\[:3\]"),
+    "HWC": (torch.zeros(2, H, W, 3), r"got shape \(36, 64, 3\); permute\(2, 0, 1\) puts the channels first"),
+    "no pixels": (torch.zeros(2, 3, 0, W), r"images\[0\]: expected pixels, got shape \(3, 0, 64\)"),
+    "integers": (torch.zeros((2, 3, H, W), dtype=torch.int32), r"expected uint8 or float, got torch.int32; convert"),
+    "0 to 255 as float": (torch.full((2, 3, H, W), 200.0), r"floats in \[0, 1\], got 200 to 200; divide by 255"),
+    "normalised": (torch.full((2, 3, H, W), -1.5), r"got -1.5 to -1.5; normalise after retargeting, not before"),
+    "NaN": (torch.full((2, 3, H, W), torch.nan), r"floats in \[0, 1\], got nan to nan; .*nan_to_num"),
+    "infinity": (torch.full((2, 3, H, W), torch.inf), r"got inf to inf; .*nan_to_num"),
+    "two dtypes": ([torch.zeros(3, H, W), torch.zeros((3, H, W), dtype=torch.uint8)], "one dtype and device, got sev"),
+    "another count": (torch.zeros(3, 3, H, W), r"K: expected shape \(3, 3, 3\) for 3 images, got \(2, 3, 3\)"),
+    "ragged batch": ([torch.zeros(2, 3, H, W), torch.zeros(3, 3, H, W)], r"images: expected the .* dimensions \(2,\)"),
+}
+
+
+@pytest.mark.parametrize("case", IMAGES)
+def test_bad_images(case: str) -> None:
+    images, message = IMAGES[case]
+    with pytest.raises(ArbiviewError, match=message):
+        read_frames(sample(images=images), None)
+
+
+def test_images_that_are_no_tensors() -> None:
+    fix = r"use torch.from_numpy\(array\).permute\(2, 0, 1\) for an \(H, W, 3\) RGB array"
+    array = np.zeros((H, W, 3), np.uint8)
+    with pytest.raises(SampleTypeError, match=rf"images: expected torch tensors, got ndarray; {fix}"):
+        read_frames(sample(images=np.stack([array] * 2)), None)
+    with pytest.raises(SampleTypeError, match=rf"images\[0\]: expected torch tensors, got ndarray; {fix}"):
+        read_frames(sample(images=[array] * 2), None)
+    with pytest.raises(SampleTypeError, match=r"images: expected torch tensors, got str; use a \(N, 3, H, W\) tensor"):
+        read_frames(sample(images="front.jpg"), None)
+    with pytest.raises(SampleTypeError, match="sample: expected a dict, got list"):
+        read_frames([sample()], None)
+
+
+def test_pil_images() -> None:
+    image = pytest.importorskip("PIL.Image").new("RGB", (W, H))
+    with pytest.raises(SampleTypeError, match=r"images\[0\]: expected torch tensors, got Image; use .*pil_to_tensor"):
+        read_frames(sample(images=[image, image]), None)
+
+
+HALF = torch.from_numpy(rig().K) * torch.tensor([[0.5], [0.5], [1.0]])
+CALIBRATION: dict[str, tuple[dict[str, Any], str]] = {
+    "none": (sample(K=None, cam2ego=None), "expected calibration, 'rig' or 'K' and 'cam2ego', missing K, cam2ego"),
+    "no poses": (sample(cam2ego=None), "missing cam2ego; or pass source_rig= to the transform"),
+    "no rotation": (edited("cam2ego", (1, 0, 0), 2.0), "'camera 1': cam2ego: expected a rotation .* the nearest"),
+    "NaN K": (edited("K", (0, 0, 0), torch.nan), "camera 'camera 0': K: expected finite numbers, got NaN"),
+    "NaN principal point": (edited("K", (1, 0, 2), torch.nan), "camera 'camera 1': K: expected finite numbers"),
+    "negative focal length": (edited("K", (0, 1, 1), -5.0), "camera 'camera 0': K: expected positive focal lengths"),
+    "K of a larger image": (sample(K=HALF * torch.tensor([[5.0], [5.0], [1.0]])), r"K\[0\]: .* inside the image of"),
+    "K of a smaller image": (sample(K=HALF), r"K\[0\]: .* near the middle of the image of \(h, w\) = \(36, 64\)"),
+    "swapped in K": (edited("K", (1, 1, 2), 40.0), r"K\[1\]: .*inside the image .*K of another image size\?"),
+    "K of one camera": (sample(K=torch.eye(3)), r"K: expected shape \(2, 3, 3\) for 2 images, got \(3, 3\)"),
+    "text": (sample(K="pinhole"), "K: expected a tensor of numbers, got str"),
+    "unknown lens": (with_distortion(np.zeros((2, 4)), ["cubic"] * 2), "lens: expected one of pinhole, .* got 'cubic'"),
+    "one lens": (sample(lens=["radtan"]), r"lens: expected a list of 2 names, one a camera, got \['radtan'\]"),
+    "a lens for all": (sample(lens="radtan"), "lens: expected a list of 2 names"),
+    "a number for a lens": (sample(lens=5), "lens: expected a list of 2 names, one a camera, got 5"),
+    "more cameras than int8 counts": (
+        {"images": torch.zeros(129, 3, 1, 1), "rig": Rig([c.resize((1, 1)) for c in rig(129)])},
+        "images: expected at most 128 cameras, got 129",
+    ),
+    "no coefficients": (sample(lens=["radtan"] * 2), r"distortion: expected shape \(2, up to 8\) .* got none"),
+    "coefficients of one": (with_distortion([0.1] * 4, ["radtan"] * 2), r"distortion: expected shape \(2, up to 8\)"),
+    "three coefficients": (with_distortion([[0.1] * 3] * 2, ["radtan"] * 2), "expected 4 or 5 or 8 coeff.* got 3"),
+    "five for a fisheye": (with_distortion([[0.1] * 5] * 2, ["fisheye"] * 2), "expected 4 coefficients .* got 5"),
+    "no lens": (with_distortion([[0.1] * 4] * 2), "distortion: expected 'lens' beside it, one of pinhole, radtan"),
+    "road": (sample(ground_z_m=float("nan")), "ground_z_m: expected a finite height"),
+    "rig file": (sample(rig="nuscenes"), r"rig: expected an arbiview_aug.Rig, got str; use load_rig\(path\)"),
+    "rig of three": (sample(rig=rig(3)), "images: expected 3 images for cameras c0, c1, c2, got 2"),
+    "rig of another size": (sample(rig=rig().resized(0.5)), r"camera 'c0': .*\(18, 32\), as calibrated, got \(36"),
+    "swapped": (sample(images=torch.zeros(2, 3, W, H), rig=rig()), r"'c0': .* got \(64, 36\); height and width"),
+    "swapped, no rig": (sample(images=torch.zeros(2, 3, W, H)), r"K\[0\]: .*; height and width are swapped"),
+    "coverage": (sample(coverage=0.7), "coverage: expected a bool map of the size of each image, .* rename the key"),
+    "ignore": (sample(ignore=torch.zeros(2, 5, 5, dtype=torch.bool)), "ignore: expected a bool map of the size"),
+}
+
+
+@pytest.mark.parametrize("case", CALIBRATION)
+def test_bad_calibration(case: str) -> None:
+    bad, message = CALIBRATION[case]
+    with pytest.raises(ArbiviewError, match=message):
+        read_frames(bad, None)
+    with pytest.raises(ArbiviewError, match=message):
+        RigRetarget(rig())(bad)
+
+
+def test_calibration_without_the_images_leading_dimensions() -> None:
+    images = torch.zeros((3, 2, 3, H, W), dtype=torch.uint8)
+    with pytest.raises(SampleError, match=r"K: expected shape \(2, 3, 3\) for 2 images, got \(3, 3\)"):
+        read_frames(sample(images=images), None)
+    wide = torch.zeros((2, 3, 2, 3, H, W), dtype=torch.uint8)
+    with pytest.raises(SampleError, match=r"K: expected shape \(2, 3, 3\) for 2 images, got \(3,\)"):
+        read_frames(sample(images=wide), None)
+
+
+def test_unusual_but_right_calibrations() -> None:
+    # A camera whose principal point is off its middle in one direction alone, as after a crop.
+    assert read_frames(edited("K", (0, 1, 2), 2.0), None)
+    # Beyond that a rig says that it is meant.
+    moved = rig()[0].crop(0, 0, (10, 10))
+    assert read_frames({"images": torch.zeros(1, 3, 10, 10), "rig": Rig([moved])}, None)
+    # Coefficients padded with zeros, as this package writes them.
+    padded = torch.zeros(2, 8)
+    padded[0, :4] = torch.tensor([0.01, 0.0, 0.0, 0.0])
+    (frame,) = read_frames(sample(distortion=padded, lens=["fisheye", "pinhole"]), None)
+    assert [len(camera.distortion) for camera in frame.rig] == [4, 0]
+    assert read_frames(sample(distortion=torch.zeros(2, 5)), None)[0].rig[0].lens == "pinhole"
+    assert read_frames(sample(K=sample()["K"].tolist(), cam2ego=sample()["cam2ego"].numpy()), None)

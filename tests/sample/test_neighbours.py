@@ -1,0 +1,212 @@
+"""What a sample says of other frames of its drive: good ones in their places, bad ones named and left out."""
+
+import warnings
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import RigRetarget, SampleError, SampleTypeError
+from arbiview_aug.datasets import Neighbours
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
+from arbiview_aug.sample.inputs import read_frames
+from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames
+
+RIG = demo_source_rig((64, 176))
+
+
+@pytest.fixture(scope="module")
+def recorded() -> dict[str, Any]:
+    drive = SyntheticDrive(RIG, num_frames=1, lidar=False, neighbours=Neighbours(count=2, direction="past"))
+    sample = drive[0]
+    return sample | {"neighbours": [dict(neighbour) for neighbour in sample["neighbours"]]}
+
+
+@pytest.fixture
+def sample(recorded: dict[str, Any]) -> dict[str, Any]:
+    return recorded | {"neighbours": [dict(neighbour) for neighbour in recorded["neighbours"]]}
+
+
+def read(sample: dict[str, Any]) -> tuple[list[Neighbour], list[str]]:
+    said: list[str] = []
+    (found,) = neighbours_of_frames(sample, read_frames(sample, None), (), lambda _, message: said.append(message))
+    return found, said
+
+
+def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, *, yaw_deg: float = 0.0, pitch_deg: float = 0.0) -> np.ndarray:
+    out = np.eye(4)
+    a, b = np.radians([yaw_deg, pitch_deg])
+    turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+    out[:3, :3] = turn @ np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    out[:3, 3] = x, y, z
+    return out
+
+
+def test_cameras_and_boxes_are_where_they_were(sample: dict[str, Any]) -> None:
+    found, said = read(sample)
+    assert not said and [n.number for n in found] == [0, 1] and [n.travel_m for n in found] == pytest.approx([1.2, 2.4])
+    for camera, then in zip(RIG, found[1].rig, strict=True):
+        assert np.allclose(then.center_m, camera.center_m - [2.4, 0, 0], atol=1e-6)
+    parked = np.linalg.norm(found[0].boxes[:, :3] - sample["boxes_3d"].numpy()[:, :3], axis=1) < 1e-3
+    assert parked.sum() > 5 and not parked.all()
+    assert np.allclose(found[0].boxes[parked, 6], sample["boxes_3d"].numpy()[parked, 6], atol=1e-4)
+
+
+def test_a_pose_between_the_frames_says_the_same(sample: dict[str, Any]) -> None:
+    by_world, _ = read(sample)
+    here = sample.pop("ego2world").numpy()
+    for neighbour in sample["neighbours"]:
+        neighbour["ego2ego"] = np.linalg.solve(here, neighbour.pop("ego2world").numpy())
+    found, said = read(sample)
+    assert not said and all(np.allclose(a.rig.cam2ego, b.rig.cam2ego) for a, b in zip(found, by_world, strict=True))
+
+
+def test_the_nearest_comes_first_and_keeps_its_number(sample: dict[str, Any]) -> None:
+    sample["neighbours"].reverse()
+    found, _ = read(sample)
+    assert [n.number for n in found] == [1, 0]
+
+
+def test_velocities_stand_in_for_missing_boxes(sample: dict[str, Any]) -> None:
+    first = sample["neighbours"][0]
+    for neighbour in sample["neighbours"]:
+        del neighbour["boxes_3d"]
+    assert all(n.boxes is None for n in read(sample)[0])
+    boxes = torch.tensor([[10.0, 2.0, 0.8, 4.0, 1.8, 1.6, 0.0, 8.0, -1.0], [20.0, 2.0, 0.8, 4.0, 1.8, 1.6, 0, 0, 0]])
+    found, _ = read(sample | {"boxes_3d": boxes})
+    seconds = first["time_s"]
+    assert seconds < 0
+    assert np.allclose(found[0].boxes[:, :2], [[10 + 8 * seconds, 2 - seconds], [20, 2]], atol=1e-5)
+
+
+def test_the_same_place_says_nothing(sample: dict[str, Any]) -> None:
+    sample["neighbours"] = [sample["neighbours"][0] | {"ego2ego": pose(0.01), "time_s": -1.0}]
+    assert read(sample) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"ego2world": None}, "it has none"),
+        ({"ego2ego": np.full((4, 4), np.nan)}, "finite"),
+        ({"ego2ego": np.eye(3)}, "shape"),
+        ({"ego2ego": 2 * np.eye(4)}, "a rotation"),
+        ({"ego2ego": pose(200.0)}, "a pose jumped"),
+        ({"ego2ego": pose(5.0, z=4.0)}, "climb"),
+        ({"ego2ego": pose(5.0, pitch_deg=20.0)}, "tilt"),
+        ({"ego2ego": pose(30.0), "time_s": 0.1}, "clock"),
+        ({"time_s": np.nan}, "time_s"),
+        ({"time_s": "soon"}, "time_s"),
+        ({"rig": demo_target_rig((64, 176))}, "cameras"),
+        ({"rig": demo_source_rig((32, 88))}, "as calibrated"),
+        ({"rig": RIG.turned(yaw_deg=30)}, "another rig"),
+        ({"boxes_3d": np.zeros((2, 5))}, "boxes_3d"),
+        ("nothing", "a mapping"),
+    ],
+)
+def test_what_cannot_be_is_named_and_left_out(sample: dict[str, Any], change: Any, why: str) -> None:
+    second = sample["neighbours"][1]
+    sample["neighbours"][1] = change if isinstance(change, str) else second | change
+    found, said = read(sample)
+    assert [n.number for n in found] == [0]
+    name = "1" if isinstance(change, str) else repr(second["token"])
+    assert len(said) == 1 and said[0].startswith(f"neighbour {name} is left out: ") and why in said[0], said
+
+
+@pytest.mark.parametrize(
+    "images",
+    [None, torch.zeros(6, 3, 64, 100, dtype=torch.uint8), torch.rand(6, 3, 64, 176), np.zeros((6, 3, 64, 176))],
+)
+def test_images_that_do_not_fit_are_named_and_left_out(sample: dict[str, Any], images: Any) -> None:
+    good = sample["neighbours"][:1]
+    target = RIG.turned(pitch_deg=-10)
+    expected = RigRetarget(target)(sample | {"neighbours": good})
+    sample["neighbours"][1]["images"] = images
+    with pytest.warns(UserWarning, match=r"neighbour '.*' is left out: .*images"):
+        out = RigRetarget(target)(sample)
+    assert torch.equal(out["images"], expected["images"]) and torch.equal(out["coverage"], expected["coverage"])
+
+
+def test_another_container_is_refused(sample: dict[str, Any]) -> None:
+    with pytest.raises(SampleTypeError, match="neighbours: expected a list of frames, got Tensor"):
+        RigRetarget(RIG.turned(yaw_deg=5))(sample | {"neighbours": torch.zeros(2)})
+
+
+def test_too_many_are_refused(sample: dict[str, Any]) -> None:
+    with pytest.raises(SampleError, match="at most 120 for a frame, got 200"):
+        RigRetarget(RIG)(sample | {"neighbours": sample["neighbours"] * 100})
+
+
+def test_a_batch_has_a_list_for_each_frame(sample: dict[str, Any]) -> None:
+    retarget = RigRetarget(RIG.turned(pitch_deg=-10), outputs=("source_frame",))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        one, alone = retarget(sample), retarget(sample | {"neighbours": []})
+        keys = ("images", "K", "cam2ego", "ego2world")
+        batch = {key: torch.stack([sample[key]] * 2) for key in keys} | {"rig": RIG, "time_s": torch.zeros(2)}
+        batch |= {"boxes_3d": [sample["boxes_3d"]] * 2, "neighbours": [sample["neighbours"], []]}
+        both = retarget(batch)
+    for key in ("images", "coverage", "source_frame"):
+        assert torch.equal(both[key], torch.stack([one[key], alone[key]]))
+    assert (one["source_frame"] > 0).any()
+    with pytest.raises(SampleTypeError, match="a list of 2 lists"):
+        retarget(batch | {"neighbours": sample["neighbours"]})
+
+
+def test_lenses_and_masks_of_the_rig_that_all_samples_share(sample: dict[str, Any]) -> None:
+    """K and cam2ego say nothing of them: without its mask the own bonnet would be read as road."""
+    mask = np.ones((64, 176), bool)
+    mask[50:] = False
+    lens = {"lens": "radtan", "distortion": (0.05, 0.0, 0.0, 0.0)}
+    rig = RIG.with_cameras([replace(camera, mask=mask, **lens) for camera in RIG])
+    bare = {key: value for key, value in sample.items() if key not in ("rig", "K", "cam2ego")}
+    for neighbour in bare["neighbours"]:
+        neighbour.pop("rig", None)
+        neighbour |= {"K": rig.K, "cam2ego": rig.cam2ego}
+    said: list[str] = []
+    (found,) = neighbours_of_frames(bare, read_frames(bare, rig), (), lambda _, message: said.append(message))
+    assert not said and len(found) == 2
+    for camera in found[0].rig:
+        assert camera.lens == "radtan" and np.array_equal(camera.mask, mask)
+
+
+def test_a_box_whose_velocity_nobody_knows(sample: dict[str, Any]) -> None:
+    """It may have driven anywhere: as if nobody had labelled the other frame."""
+    boxes = torch.zeros(2, 9)
+    boxes[:, 3:6], boxes[1, 0] = 2, 20
+    for unknown in (False, True):
+        boxes[1, 7] = float("nan") if unknown else 1
+        given = sample | {"boxes_3d": boxes}
+        for neighbour in given["neighbours"]:
+            neighbour.pop("boxes_3d", None)
+        (found, *_), _ = read(given)
+        assert (found.boxes is None) == (found.moved is None) == unknown
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "why"),
+    [
+        ("ego2world", np.zeros((4, 4)), "expected a pose, got a last row"),
+        ("boxes_3d", [[1.0, 2.0], [3.0]], "boxes_3d: expected"),
+        ("boxes_3d", "cars", "boxes_3d: expected"),
+    ],
+)
+def test_what_numpy_would_trip_over_is_named(sample: dict[str, Any], key: str, value: Any, why: str) -> None:
+    sample["neighbours"][0].pop("ego2ego", None)
+    sample["neighbours"][0][key] = value
+    found, said = read(sample)
+    assert [n.number for n in found] == [1] and why in said[0]
+
+
+def test_frames_of_two_leading_dimensions(sample: dict[str, Any]) -> None:
+    retarget = RigRetarget(demo_target_rig((64, 176)), surface="street", outputs=("source_frame",))
+    alone = retarget(sample)
+    batch = {key: sample[key].expand(2, 3, *sample[key].shape) for key in ("images", "ego2world")}
+    batch |= {"rig": RIG, "time_s": torch.full((2, 3), float(sample["time_s"]))}
+    batch |= {"boxes_3d": [sample["boxes_3d"]] * 6, "neighbours": [sample["neighbours"]] * 6}
+    both = retarget(batch)
+    for b in np.ndindex(2, 3):
+        assert torch.equal(both["source_frame"][b], alone["source_frame"])
+        assert torch.equal(both["images"][b], alone["images"])

@@ -1,0 +1,341 @@
+"""Boxes as solids: rays by hand, what they hide, and objects that keep their height when cameras rise."""
+
+import dataclasses
+import warnings
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import Rig, RigRetarget, SampleError
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig
+from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.render.opencv_backend import render_opencv
+from arbiview_aug.render.plan import build_plan
+from arbiview_aug.scene.boxes import BoxSurface, checked_boxes
+from arbiview_aug.scene.scene import Scene
+from arbiview_aug.scene.static import Street
+
+EYE = np.array([0.0, 0.0, 1.5])
+CAR = np.array([[10.0, 0.0, 0.75, 4.0, 2.0, 1.5, 0.0]])
+
+
+def unit(*vector: float) -> np.ndarray:
+    return np.array(vector) / np.linalg.norm(vector)
+
+
+def test_rays_meet_the_nearest_face() -> None:
+    scene = BoxSurface(Street(), CAR)
+    rays = np.stack([unit(8, 0, -0.5), unit(8, 0.9, -0.5), unit(8, 1.1, -0.5), unit(8, 0, 0.5), unit(-1, 0, -0.1)])
+    q = scene.inverse_distance(EYE, rays)
+    distance = np.linalg.norm([8, 0, -0.5])
+    assert 1 / q[0] == pytest.approx(distance) and 1 / q[1] == pytest.approx(np.linalg.norm([8, 0.9, -0.5]))
+    assert np.allclose(q[2:], Street().inverse_distance(EYE, rays[2:]))  # beside, above, behind
+
+
+def test_a_box_that_reaches_below_the_road_is_not_cut_off_by_it() -> None:
+    sunk = CAR + np.array([0, 0, -0.3, 0, 0, 0, 0])
+    ray = unit(8, 0, -1.6)[None]
+    assert Street().inverse_distance(EYE, ray) > 1 / np.linalg.norm([8, 0, -1.6])  # a guess
+    assert 1 / BoxSurface(Street(), sunk).inverse_distance(EYE, ray)[0] == pytest.approx(np.linalg.norm([8, 0, -1.6]))
+
+
+def test_a_turned_box_shows_its_corner() -> None:
+    turned = CAR.copy()
+    turned[0, 6] = np.pi / 2  # 2 m deep now
+    q = BoxSurface(Street(), turned).inverse_distance(EYE, unit(9, 0, -0.5)[None])
+    assert 1 / q[0] == pytest.approx(np.linalg.norm([9, 0, -0.5]))
+
+
+def test_the_vehicle_with_the_camera_is_no_obstacle() -> None:
+    around = np.array([[0.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0]])
+    rays = np.stack([unit(1, 0, -0.1), unit(0, 1, -0.3)])
+    assert np.allclose(BoxSurface(Street(), around).inverse_distance(EYE, rays), Street().inverse_distance(EYE, rays))
+
+
+def test_boxes_hide_whatever_a_static_street_says_of_the_distance() -> None:
+    scene = BoxSurface(Street(), CAR)
+    rays = np.stack([unit(8, 0, -0.5), unit(8, 0, -0.5), unit(8, 0, 0.5), unit(8, 1.5, -0.5)])
+    hidden = scene.occludes(EYE, rays, 1 / np.array([12.0, 7.0, 12.0, 12.0]), 0.001)
+    assert hidden.tolist() == [True, True, False, False]  # behind, before (a wall, by guess), above, beside
+
+
+def test_hiding_boxes_are_half_a_pixel_wider() -> None:
+    scene, beside = BoxSurface(Street(), CAR), unit(8, 1.03, -0.5)[None]  # 3 cm beside the front corner, 10 m away
+    assert scene.occludes(EYE, beside, np.zeros(1), 0.004).tolist() == [False]
+    assert scene.occludes(EYE, beside, np.zeros(1), 0.01).tolist() == [True]
+
+
+def crowd(count: int) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    place, size = rng.uniform(-30, 30, (count, 2)), rng.uniform(0.3, 5, (count, 3))
+    return np.column_stack([place, rng.uniform(-1, 3, count), size, rng.uniform(-3, 3, count)])
+
+
+@pytest.mark.parametrize("lens", [{}, {"lens": "fisheye", "distortion": (0.02, -0.01, 0.0, 0.0)}])
+def test_drawn_boxes_equal_cast_rays(lens: dict) -> None:
+    camera = Camera.looking(
+        name="c", azimuth_deg=20, elevation_deg=-10, roll_deg=7, position_m=(0.5, -0.2, 1.6), width_px=173,
+        height_px=97, horizontal_fov_deg=80,
+    )  # fmt: skip
+    camera = dataclasses.replace(camera, **lens)
+    scene = BoxSurface(Street(), crowd(60))
+    q, face = scene._boxes_ahead(camera.center_m, camera.unproject(camera.pixel_grid()).directions)
+    drawn = scene.drawn(camera)
+    assert np.array_equal(drawn.pixel, np.flatnonzero(q)) and len(drawn.pixel) > 3000
+    assert np.allclose(drawn.inverse_distance, q.flat[drawn.pixel], rtol=1e-5)
+    assert (drawn.face == face.flat[drawn.pixel]).mean() > 0.999  # corners belong to two
+    # What a source's image shows of boxes, half a pixel wider, is what they hide from it.
+    shadow = scene.occlusion_map(camera).beyond.ravel() > 0
+    rays = camera.unproject(camera.pixel_grid()).directions.reshape(-1, 3)
+    hidden = scene.occludes(camera.center_m, rays, np.zeros(len(rays)), float(1 / camera.K[0, 0]))
+    assert np.array_equal(shadow, hidden)
+
+
+def test_faces_know_how_far_a_camera_is_before_them() -> None:
+    box, metres = BoxSurface(Street(), CAR).facing(np.array([0.0, 3.0, 2.0]), np.arange(6, dtype=np.int32))
+    assert box.tolist() == [0] * 6
+    assert metres.tolist() == [8.0, -12.0, -4.0, 2.0, -2.0, 0.5]  # rear, front, right, left, bottom, top
+
+
+@pytest.mark.parametrize("size", [(96, 128), (40, 60)])  # on the coarse grid, and pixel by pixel
+@pytest.mark.parametrize(
+    "boxes",
+    [
+        np.array([[0.0, 0, 1, 4, 2, 3, 0]]),  # around the camera
+        np.array([[1.0, 0, 1.5, 2, 2, 2, 0]]),  # touching its centre
+        np.array([[5.0, 0, -3, 4, 2, 2, 0]]),  # under the road
+        np.array([[5.0, 0, 1, 1e-3, 1e-3, 1e-3, 0]]),
+        np.array([[700.0, 0, 1, 1e3, 1e3, 1e3, 0.3]]),
+        np.array([[9.0, 1, 1, 4, 2, 2, 1e9]]),
+        np.array([[1e9, 0, 1, 4, 2, 2, 0], [1e-9, 0, 1.5, 1e-9, 1e-9, 1e-9, 0]]),
+        np.repeat(np.array([[9.0, 1, 1, 4, 2, 2, 0.2]]), 5, axis=0),
+        crowd(2000),
+        np.zeros((0, 7)),
+    ],
+    ids=["around", "touching", "below", "1 mm", "1 km", "yaw 1e9", "1e9 m", "identical", "2000", "none"],
+)
+@pytest.mark.filterwarnings("error")
+def test_extreme_boxes_render_finite_maps(boxes: np.ndarray, size: tuple[int, int]) -> None:
+    camera = Camera.looking(
+        name="c", azimuth_deg=0, position_m=(0.0, 0.0, 1.5), width_px=size[1], height_px=size[0], horizontal_fov_deg=80
+    )
+    rig = Rig([camera])
+    plan = build_plan(rig, rig.shifted(y_m=0.3, z_m=0.4), surface="objects", scene=Scene(checked_boxes(boxes)))
+    image = torch.full((3, *size), 200, dtype=torch.uint8)
+    view = render_opencv(plan, [image])[0]
+    assert bool((view[:, torch.from_numpy(plan.coverage[0])] == 200).all())
+    assert all(np.isfinite(r.parallax_px) for r in plan.targets[0].pairs)
+
+
+def test_any_number_of_rays_gives_the_same_answers() -> None:
+    rng = np.random.default_rng(0)
+    boxes = np.column_stack(
+        [rng.uniform(-30, 30, (20, 2)), np.full(20, 0.8), rng.uniform(1, 5, (20, 3)), rng.uniform(-3, 3, 20)]
+    )
+    rays = rng.normal(size=(37, 41, 3))
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    scene = BoxSurface(Street(), boxes)
+    together = scene.inverse_distance(EYE, rays)
+    alone = np.array([scene.inverse_distance(EYE, ray[None])[0] for ray in rays.reshape(-1, 3)[::7]])
+    assert np.allclose(together.reshape(-1)[::7], alone)
+    assert scene.inverse_distance(EYE, np.zeros((0, 3))).shape == (0,)
+
+
+@pytest.fixture(scope="module")
+def street() -> tuple[SyntheticDrive, Rig]:
+    rig = demo_source_rig((128, 352))
+    return SyntheticDrive(rig, num_frames=3, seed=0, lidar=False), rig
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("move", [{"z_m": 0.7}, {"y_m": 1.0}])
+def test_vehicles_are_truer_than_over_a_static_surface(street: tuple[SyntheticDrive, Rig], move: dict) -> None:
+    drive, rig = street
+    gain = []
+    for i in range(3):
+        sample = drive[i]
+        truth = drive.render(i, rig.shifted(**move))
+        vehicle = truth.classes.numpy() == SceneClass.VEHICLE
+        error = {}
+        for surface in ("street", "objects"):
+            plan = build_plan(rig, rig.shifted(**move), surface=surface, scene=Scene(checked_boxes(sample["boxes_3d"])))
+            views = torch.stack(render_opencv(plan, list(sample["images"]))).float()
+            squared = ((views - truth.images.float()) ** 2).mean(1).numpy()
+            error[surface] = squared[vehicle & np.stack(plan.coverage)].mean()
+        gain.append(10 * np.log10(error["street"] / error["objects"]))
+    assert min(gain) > 3 and np.mean(gain) > 5
+
+
+def test_what_a_car_hid_is_a_hole_and_not_its_colour() -> None:
+    """A lifted camera looks over a red box onto grey ground that no source saw."""
+    camera = Camera.looking(
+        name="front", azimuth_deg=0, position_m=(0.0, 0.0, 1.5), width_px=320, height_px=192, horizontal_fov_deg=70
+    )
+    rig = Rig([camera])
+    directions = camera.unproject(camera.pixel_grid()).directions
+    hit = BoxSurface(Street(), CAR)._boxes_ahead(camera.center_m, directions)[0] > 0
+    image = np.where(hit[..., None], np.array([220, 20, 20]), np.array([90, 90, 90])).astype(np.uint8)
+    plan = build_plan(rig, rig.shifted(z_m=1.5), surface="objects", scene=Scene(CAR))
+    view = render_opencv(plan, [torch.from_numpy(image).permute(2, 0, 1)])[0].permute(1, 2, 0).numpy()
+    target, coverage = plan.target[0], plan.coverage[0]
+    rays = target.unproject(target.pixel_grid()).directions
+    on_car = BoxSurface(Street(), CAR)._boxes_ahead(target.center_m, rays)[0] > 0
+    beside = cv2.dilate(on_car.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
+    red = (view[..., 0] > 150) & coverage
+    assert not red[beside].any()  # no colour of the object outside its silhouette by more than 2 px
+    # Ground just behind the car, well inside what its roof hid from the lower camera.
+    behind, _, _ = target.project(np.array([28.0, 0.0, 0.0]))
+    u, v = np.round(behind).astype(int)
+    assert not coverage[v, u]
+    assert red[on_car & coverage].mean() > 0.9
+
+
+@pytest.mark.parametrize("size", [(128, 352), (64, 176)])
+def test_coarse_grid_equals_pixel_by_pixel_evaluation(size: tuple[int, int]) -> None:
+    """64x176 reads halved images: their shadows are drawn at that size."""
+    source = demo_source_rig((128, 352))
+    boxes = checked_boxes(SyntheticDrive(source, num_frames=1, seed=0, lidar=False).scene(0).boxes_ego(0.0))
+    target = source.shifted(z_m=0.7).resized(size)
+    coarse = build_plan(source, target, surface="objects", scene=Scene(boxes))
+    exact = build_plan(source, target, surface="objects", scene=Scene(boxes), config=FavsConfig(grid_step_px=1))
+    for a, b in zip(coarse.targets, exact.targets, strict=True):
+        assert (a.coverage != b.coverage).mean() < 0.001
+        same = (a.source_camera == b.source_camera) & a.coverage
+        assert same.mean() > 0.5
+        apart = np.abs(a.at.to_float() - b.at.to_float())[same]
+        assert np.quantile(apart, 0.999) < 1 / 32 + 1 / 64
+
+
+def test_in_a_sample() -> None:
+    rig = demo_source_rig((64, 176))
+    images = torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8)
+    sample = {"images": images, "rig": rig, "boxes_3d": torch.zeros(0, 7)}
+    lifted = rig.shifted(z_m=0.5)
+    empty = RigRetarget(lifted, surface="objects")(sample)
+    # That there is no object makes the street less uncertain: weights of the seams differ, and nothing else.
+    assert torch.equal(empty["coverage"], RigRetarget(lifted, surface="street")(sample)["coverage"])
+    retarget = RigRetarget(lifted, surface="objects")
+    with_car = retarget(sample | {"boxes_3d": torch.from_numpy(CAR).float()})
+    assert with_car["coverage"].sum() < empty["coverage"].sum()
+    assert "objects surface" in str(retarget.explain(sample | {"boxes_3d": torch.from_numpy(CAR)}))
+    batch = {"images": images.expand(2, 6, 3, 64, 176), "rig": rig, "boxes_3d": torch.from_numpy(CAR).expand(2, 1, 7)}
+    assert torch.equal(retarget(batch)["images"][1], with_car["images"])
+    with pytest.raises(SampleError, match=r"surface='objects': expected 'boxes_3d'"):
+        retarget({"images": images, "rig": rig})
+    with pytest.raises(SampleError, match=r"boxes_3d: expected shape \(B, >= 7\)"):
+        retarget(sample | {"boxes_3d": torch.zeros(2, 5)})
+    with pytest.raises(SampleError, match=r"boxes_3d\[0\]: expected finite numbers and positive sizes"):
+        retarget(sample | {"boxes_3d": torch.full((1, 7), float("nan"))})
+
+
+def test_auto_takes_boxes_where_there_are_some_and_warns_where_cameras_move_without() -> None:
+    rig = demo_source_rig((64, 176))
+    sample = {"images": torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8), "rig": rig}
+    boxes = {"boxes_3d": torch.from_numpy(CAR)}
+    lifted = RigRetarget(rig.shifted(z_m=0.5))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert torch.equal(
+            lifted(sample | boxes)["images"], RigRetarget(lifted.target, surface="objects")(sample | boxes)["images"]
+        )
+        RigRetarget(rig.shifted(z_m=0.1))(sample)  # little harm
+        RigRetarget(rig.shifted(z_m=0.5), surface="street")(sample)  # asked for
+    ahead = RigRetarget(rig.shifted(x_m=0.5))
+    with pytest.warns(UserWarning, match=r"target cameras stand up to 0\.50 m from the nearest source camera") as said:
+        bare = ahead(sample)
+    assert said[0].filename == __file__  # the user's line, not one of ours
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ahead(sample)  # said once
+    assert torch.equal(bare["images"], RigRetarget(ahead.target, surface="street")(sample)["images"])
+
+
+@pytest.mark.parametrize("change", ["narrow", "lower", "higher", "turned"])
+def test_auto_renders_the_target_that_was_asked_for(change: str) -> None:
+    """Whatever differs, and although nothing is known of what stands on the street: a warning says what that does."""
+    rig = demo_source_rig((64, 176))
+    sample = {"images": torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8), "rig": rig}
+    target = rig.shifted(z_m=-0.5 if change == "lower" else 0.5)
+    if change == "narrow":
+        target = target.with_cameras([c.crop(8, 16, (40, 120)) for c in target])
+    if change == "turned":
+        target = target.turned(yaw_deg=10)
+    retarget = RigRetarget(target)
+    with pytest.warns(UserWarning) as said:
+        out = retarget(sample)
+    message = str(said[0].message)
+    assert len(said) == 1 and message.startswith("target cameras stand up to 0.50 m from the nearest source camera")
+    assert "3 to 5 points of IoU worse than one trained on untouched images" in message
+    assert all(word in message for word in ("'points'", "'boxes_3d'", "arbiview_aug depth", "p=0.5"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert torch.equal(retarget(sample)["images"], out["images"])  # said once
+        assert torch.equal(RigRetarget(target, surface="street")(sample)["images"], out["images"])
+    assert np.allclose(out["cam2ego"], target.cam2ego) and np.allclose(out["K"], target.K)
+
+
+def test_strict_refuses_what_auto_warns_of() -> None:
+    rig = demo_source_rig((64, 176))
+    sample = {"images": torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8), "rig": rig}
+    strict = RigRetarget(rig.shifted(z_m=0.5), strict=True)
+    for _ in range(2):  # not once: no sample passes
+        with pytest.raises(SampleError, match=r"strict=True: target cameras stand up to 0\.50 m .* Better: 'points'"):
+            strict(sample)
+    assert "objects lean and stretch" in str(strict.explain(sample))  # that says why, and does not raise
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        strict(sample | {"boxes_3d": torch.from_numpy(CAR)})
+        RigRetarget(rig.shifted(z_m=0.1), strict=True)(sample)
+        RigRetarget(rig.turned(yaw_deg=20), strict=True)(sample)
+        RigRetarget(rig.shifted(z_m=0.5), surface="street", strict=True)(sample)  # asked for
+        RigRetarget(rig.shifted(z_m=0.5), size=(64, 176), p=0.5, strict=True)(sample, params={"skipped": 0.0})
+    with pytest.raises(ValueError, match="strict: expected True or False, got 'yes'"):
+        RigRetarget(rig, strict="yes")  # type: ignore[arg-type]
+
+
+def test_the_warning_names_the_mixing_that_works() -> None:
+    """``p < 1`` needs equal camera counts; half untouched samples silence the warning, fewer do not."""
+    rig = demo_source_rig((64, 176))
+    sample = {"images": torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8), "rig": rig}
+    raised = rig.shifted(z_m=0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mixed = RigRetarget(raised, size=(64, 176), p=0.5)(sample, params={"skipped": 0.0})
+    assert np.allclose(mixed["cam2ego"], raised.cam2ego)
+    with pytest.warns(UserWarning, match=r"mixing with untouched samples \(p=0\.5\)"):
+        RigRetarget(raised, size=(64, 176), p=0.9)(sample, params={"skipped": 0.0})
+    with pytest.warns(UserWarning, match=r"mixing with untouched samples \(arbiview_aug\.MixedDataset, since camera"):
+        RigRetarget(Rig(raised.cameras[:5]))(sample)
+
+
+def test_cameras_are_where_they_were_asked_for_if_no_pixel_depends_on_the_street() -> None:
+    """Nothing is seen of the target: its boxes are not even read, and that says nothing of the street."""
+    one = Rig([demo_source_rig((64, 176))[0]])
+    behind = one.turned(yaw_deg=180).shifted(z_m=0.5)
+    sample = {"images": torch.zeros((1, 3, 64, 176)), "rig": one, "boxes_3d": torch.from_numpy(CAR)}
+    with pytest.warns(UserWarning, match="cannot be reached") as told:
+        out = RigRetarget(behind)(sample)
+    assert len(told) == 1 and np.allclose(out["cam2ego"], behind.cam2ego)
+
+
+def test_auto_plans_once_where_objects_cannot_matter() -> None:
+    one = Rig([demo_source_rig((64, 176))[0]])
+    turned = RigRetarget(one.turned(yaw_deg=10))
+    for x in (6.0, 7.0, 8.0):
+        boxes = torch.from_numpy(CAR + np.array([x, 0, 0, 0, 0, 0, 0]))
+        turned({"images": torch.zeros((1, 3, 64, 176)), "rig": one, "boxes_3d": boxes})
+    assert (turned.plans.misses, turned.plans.hits) == (1, 2)
+
+
+def test_boxes_of_a_batch_may_differ_in_number() -> None:
+    rig = demo_source_rig((64, 176))
+    images = torch.randint(0, 255, (2, 6, 3, 64, 176), dtype=torch.uint8)
+    retarget = RigRetarget(rig.shifted(z_m=0.5))
+    batch = retarget({"images": images, "rig": rig, "boxes_3d": [torch.zeros(0, 7), torch.from_numpy(CAR)]})
+    alone = retarget({"images": images[1], "rig": rig, "boxes_3d": torch.from_numpy(CAR)})
+    assert torch.equal(batch["images"][1], alone["images"])
+    with pytest.raises(SampleError, match=r"boxes_3d: expected a tensor \(2,\) \+ \(n, \.\.\.\), or a list of 2"):
+        retarget({"images": images, "rig": rig, "boxes_3d": [torch.zeros(0, 7)]})

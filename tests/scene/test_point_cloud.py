@@ -1,0 +1,365 @@
+"""Measured points as a surface: planes and boxes with known answers, outlines, hiding, and points of every bad kind."""
+
+import time
+import tracemalloc
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import RigRetarget, SampleError, load_rig
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.datasets.synthetic import demo_source_rig
+from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.render.plan import build_plan
+from arbiview_aug.render.target_rays import TargetRays
+from arbiview_aug.scene.depth_maps import points_of_depth
+from arbiview_aug.scene.panorama import REACH_RAD
+from arbiview_aug.scene.point_cloud import PointCloudSurface, PointCloudWithBoxes, checked_points
+from arbiview_aug.scene.scene import Scene
+from arbiview_aug.scene.static import Street
+from tests import helpers
+
+EYE = np.array([2.0, 0.0, 1.5])
+PIXEL_RAD = 0.002
+
+
+def wall(x_m: float, y_m: tuple[float, float], z_m: tuple[float, float], spacing_rad: float = 0.004) -> np.ndarray:
+    """Points on the plane x = x_m, ``spacing_rad`` apart as seen from the eye."""
+    step = spacing_rad * abs(x_m - EYE[0])
+    y, z = np.meshgrid(np.arange(*y_m, step), np.arange(*z_m, step))
+    return np.stack([np.full(y.size, x_m), y.ravel(), z.ravel()], -1)
+
+
+def towards(points: np.ndarray, eye: np.ndarray = EYE) -> tuple[np.ndarray, np.ndarray]:
+    """Unit rays and inverse distances of points."""
+    away = points - eye
+    length = np.linalg.norm(away, axis=-1)
+    return away / length[..., None], 1 / length
+
+
+NEAR, FAR = wall(12.0, (-2, 2), (0.0, 2.0)), wall(32.0, (-20, 20), (-1.0, 8.0))
+
+
+def test_a_wall_is_where_its_points_are() -> None:
+    rays, q = towards(np.array([[12.0, y, z] for y in (-1.33, 0.01, 1.47) for z in (0.6, 1.02, 1.63)]))
+    assert np.allclose(PointCloudSurface(Street(), NEAR).inverse_distance(EYE, rays), q, rtol=0.02)
+
+
+@pytest.mark.parametrize("eye", [EYE, EYE + np.array([0.5, 0.3, 0.7]), np.array([-2.0, 0.0, 1.5])])
+def test_any_centre_sees_the_same_wall(eye: np.ndarray) -> None:
+    rays, q = towards(np.array([[12.0, y, 1.02] for y in (-1.33, 0.01, 1.47)]), eye)
+    assert np.allclose(PointCloudSurface(Street(), NEAR).inverse_distance(eye, rays), q, rtol=0.02)
+
+
+def test_walls_behind_are_as_good_as_walls_ahead() -> None:
+    """Azimuth wraps there."""
+    mirrored = NEAR * np.array([-1.0, 1.0, 1.0])
+    rays, q = towards(np.array([[-12.0, y, 1.02] for y in (-1.33, -0.01, 0.01, 1.47)]))
+    assert np.allclose(PointCloudSurface(Street(), mirrored).inverse_distance(EYE, rays), q, rtol=0.02)
+
+
+def test_a_road_stays_a_plane_between_scan_lines() -> None:
+    azimuth, radius = np.meshgrid(np.radians(np.arange(0, 360, 0.5)), [6.0, 8.0, 12.0, 20.0])
+    rings = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.zeros_like(radius)], -1).reshape(-1, 3)
+    street = Street(half_length_m=500, half_width_m=500)
+    rays, q = towards(np.array([[EYE[0] + d, y, 0.0] for d in (7.3, 9.7, 15.1) for y in (-1.0, 0.4)]))
+    assert np.allclose(PointCloudSurface(street, rings).inverse_distance(EYE, rays), q, rtol=2e-3)
+
+
+def test_outlines_do_not_melt() -> None:
+    """Across the edge of a wall before a wall every ray meets one of the two, and the edge is where it was."""
+    surface = PointCloudSurface(Street(), np.concatenate([NEAR, FAR]))
+    y = np.linspace(0.5, 3.5, 301)
+    rays, q = towards(np.stack([np.full_like(y, 12.0), y, np.full_like(y, 1.5)], -1))
+    got = surface.inverse_distance(EYE, rays)
+    on_near, on_far = np.abs(got / q - 1) < 0.02, np.abs(got / (q / 3) - 1) < 0.02
+    assert (on_near ^ on_far).all()
+    edge = y[on_near].max()
+    assert np.array_equal(on_near, y <= edge)  # one edge
+    assert abs(edge - 2.0) / 10 < np.radians(0.4)
+
+
+def test_what_shines_through_gaps_is_dropped() -> None:
+    """Scan lines 1.3 degrees apart on a near wall, and points of a far one between them."""
+    lines = np.concatenate([wall(12.0, (-2, 2), (z, z + 0.01)) for z in np.arange(0.0, 2.5, 0.227)])
+    rays, q = towards(wall(12.0, (-1.5, 1.5), (0.4, 1.8)))
+    got = PointCloudSurface(Street(), np.concatenate([lines, FAR])).inverse_distance(EYE, rays)
+    assert np.allclose(got, q, rtol=0.04)
+
+
+def test_silence_is_the_street() -> None:
+    surface, street = PointCloudSurface(Street(), NEAR), Street()
+    beyond = 2 / 10 + np.tan(REACH_RAD) + 0.1
+    rays, _ = towards(EYE + np.array([[1.0, beyond, 0.2], [1.0, -beyond, -0.3], [-1.0, 0.0, -0.1]]))
+    assert np.allclose(surface.inverse_distance(EYE, rays), street.inverse_distance(EYE, rays), rtol=1e-6)
+    empty = PointCloudSurface(street, np.zeros((0, 3)))
+    assert np.allclose(empty.inverse_distance(EYE, rays), street.inverse_distance(EYE, rays), rtol=1e-6)
+    assert not empty.occludes(EYE, rays, np.zeros(3), PIXEL_RAD).any()
+
+
+def test_measured_rays_are_more_certain() -> None:
+    rays, q = towards(np.array([[12.0, 0.0, 1.0], [12.0, 12.0, 1.0]]))
+    on_wall, beside = PointCloudSurface(Street(), NEAR).uncertainty(EYE, rays, q)
+    assert on_wall < 0.01 < beside
+
+
+def test_a_wall_hides_what_is_behind_it() -> None:
+    surface = PointCloudSurface(Street(), NEAR)
+    rays, q = towards(np.array([[12.0, 0.3, 1.1]] * 4))
+    distance = 1 / q[0]
+    at = np.array([distance - 2, distance, distance + 0.5, distance + 3.0])
+    assert surface.occludes(EYE, rays, 1 / at, PIXEL_RAD).tolist() == [False, False, False, True]
+    assert surface.occludes(EYE, rays[:1], np.zeros(1), PIXEL_RAD).tolist() == [True]
+    beside, _ = towards(np.array([[12.0, 3.0, 1.1], [12.0, 0.0, 3.0]]))
+    assert surface.occludes(EYE, beside, np.zeros(2), PIXEL_RAD).tolist() == [False, False]  # silent: nothing hides
+
+
+def test_the_own_car_is_no_obstacle() -> None:
+    bonnet = np.array([[x, y, 1.0] for x in np.arange(2.5, 3.9, 0.05) for y in np.arange(-0.8, 0.8, 0.05)])
+    rays, _ = towards(np.array([[12.0, 0.0, 1.0], [6.0, 0.3, 0.0]]))
+    got = PointCloudSurface(Street(), np.concatenate([bonnet, NEAR])).inverse_distance(EYE, rays)
+    assert np.allclose(got, PointCloudSurface(Street(), NEAR).inverse_distance(EYE, rays))
+
+
+def test_a_box_decides_within_its_silhouette_and_its_points_not_beyond() -> None:
+    box = np.array([[13.0, 0.0, 1.0, 2.0, 3.0, 2.0, 0.0]])  # its back is x = 12, y within 1.5, the top at 2
+    mirror = wall(12.1, (1.5, 1.65), (1.0, 1.2))
+    own = wall(12.0, (-1.5, 1.5), (0.0, 2.0))
+    own = own[:: len(own) // 30]  # too few to show a shape
+    surface = PointCloudWithBoxes.among(Street(), np.concatenate([own, mirror, FAR]), box)
+    assert len(surface.boxes) == 1
+    inside, q = towards(np.array([[12.0, y, z] for y in (-1.49, 1.49) for z in (0.3, 1.99)]))
+    assert np.allclose(surface.inverse_distance(EYE, inside), q, rtol=1e-6)
+    outside, q = towards(np.array([[12.0, y, z] for y, z in ((-1.51, 1.5), (1.51, 1.5), (0.0, 2.01))]))
+    assert np.allclose(surface.inverse_distance(EYE, outside), q / 3, rtol=0.02)
+    assert surface.occludes(EYE, inside, np.full(4, 1 / 30), PIXEL_RAD).all()
+
+
+# --- extremes ---------------------------------------------------------------------------------------------------------
+def test_points_of_every_bad_kind() -> None:
+    rays = np.random.default_rng(0).normal(size=(40, 50, 3))
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    bad = {
+        "one": np.array([[12.0, 0.0, 1.0]]),
+        "at the centre": np.array([EYE, EYE + 1e-9, EYE + 1e-3]),
+        "duplicates": np.repeat(NEAR[:5], 1000, axis=0),
+        "very far": np.array([[1e8, 0.0, 0.0], [0.0, 1e30, 0.0]]),
+        "straight above and below": EYE + np.array([[0.0, 0.0, 3.0], [0.0, 0.0, -1.4]]),
+        "everywhere": np.random.default_rng(1).normal(size=(5000, 3)) * 20,
+    }
+    for name, points in bad.items():
+        surface = PointCloudSurface(Street(), points)
+        q = surface.inverse_distance(EYE, rays)
+        assert np.isfinite(q).all() and (q >= 0).all() and (q <= 100).all(), name
+        assert surface.occludes(EYE, rays, q, PIXEL_RAD).shape == (40, 50)
+        assert np.isfinite(surface.uncertainty(EYE, rays, q)).all(), name
+    assert surface.inverse_distance(EYE, np.zeros((0, 3))).shape == (0,)
+
+
+def test_duplicates_and_order_change_nothing() -> None:
+    rng, rays = np.random.default_rng(0), towards(wall(12.0, (-3, 3), (0.0, 3.0), 0.02))[0]
+    points = np.concatenate([NEAR, FAR])
+    once = PointCloudSurface(Street(), points).inverse_distance(EYE, rays)
+    shuffled = rng.permutation(np.concatenate([points, points]))
+    assert np.allclose(PointCloudSurface(Street(), shuffled).inverse_distance(EYE, rays), once, atol=1e-6)
+
+
+def test_parts_of_a_view_agree_with_the_whole() -> None:
+    surface = PointCloudSurface(Street(), np.concatenate([NEAR, FAR]))
+    rays = towards(wall(12.0, (-3, 3), (0.0, 3.0), 0.08))[0]
+    parts = np.concatenate(
+        [PointCloudSurface(Street(), surface.points).inverse_distance(EYE, r) for r in rays[:, None]]
+    )
+    around = np.random.default_rng(0).normal(size=(500, 3))
+    around /= np.linalg.norm(around, axis=-1, keepdims=True)
+    whole = surface.inverse_distance(EYE, np.concatenate([around, rays]))[500:]
+    assert np.allclose(parts, whole, rtol=0.02)
+
+
+def test_only_the_nearest_point_of_a_direction_counts() -> None:
+    """However many lie behind it, in whatever order; more points than are worked on at once."""
+    rng = np.random.default_rng(0)
+    azimuth, elevation = rng.uniform(-np.pi, np.pi, 50_000), rng.uniform(-0.4, 0.4, 50_000)
+    rays = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1)
+    away = rays * rng.uniform(6, 30, (len(rays), 1))  # outside the own car
+    near, behind = EYE + away, EYE + 2 * away
+    asked = rays[:2000]
+    for part in (asked, asked[asked[:, 0] > 0.8]):  # a narrow window too
+        once = PointCloudSurface(Street(), near).inverse_distance(EYE, part)
+        many = PointCloudSurface(Street(), rng.permutation(np.concatenate([behind, near, behind])))
+        assert np.array_equal(many.inverse_distance(EYE, part), once)
+
+
+def test_points_are_taken_as_they_were_recorded() -> None:
+    """float32 is neither copied nor rounded again."""
+    points = np.concatenate([NEAR, FAR]).astype(np.float32)
+    rays = towards(wall(12.0, (-3, 3), (0.0, 3.0), 0.02))[0]
+    assert checked_points(points) is not points and np.shares_memory(checked_points(points), points)
+    one, two = (
+        PointCloudSurface(Street(), cloud).inverse_distance(EYE, rays) for cloud in (points, points.astype(float))
+    )
+    assert np.array_equal(one, two)
+
+
+def test_millions_of_points() -> None:
+    points = np.random.default_rng(0).uniform((-60, -60, 0), (60, 60, 5), (2_000_000, 3))
+    rays, _ = towards(wall(12.0, (-3, 3), (0.0, 3.0), 0.02))
+    assert np.isfinite(PointCloudSurface(Street(), points).inverse_distance(EYE, rays)).all()
+
+
+@pytest.mark.slow
+def test_ten_million_points_for_six_cameras(report_bound: Callable[..., None]) -> None:
+    """Measured: 4 s of CPU time and 0.19 GiB besides the points themselves (160 MB)."""
+    rng = np.random.default_rng(0)
+    rig = load_rig("nuscenes").resized((256, 704))
+    azimuth, elevation = rng.uniform(-np.pi, np.pi, 10**7), np.radians(rng.uniform(-30, 10, 10**7))
+    radius = np.minimum(2 + rng.gamma(2, 12, 10**7), 1.8 / np.maximum(np.sin(-elevation), 1e-3))
+    points = torch.empty(10**7, 4)
+    level = radius * np.cos(elevation)
+    for k, values in enumerate((level * np.cos(azimuth), level * np.sin(azimuth), 1.8 + radius * np.sin(elevation))):
+        points[:, k] = torch.from_numpy(values)
+    del azimuth, elevation, radius, level
+    boxes = np.concatenate([rng.uniform(-40, 40, (60, 2)), np.tile([0.8, 4.5, 1.9, 1.6, 0.3], (60, 1))], 1)
+    sample = {"images": torch.zeros(6, 3, 256, 704, dtype=torch.uint8), "rig": rig, "points": points}
+    retarget = RigRetarget(rig.shifted(z_m=0.6), surface="lidar")
+    for more in ({}, {"boxes_3d": torch.from_numpy(boxes)}):
+        tracemalloc.start()
+        start = time.process_time()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # points at random hide most of the views
+            out = retarget(sample | more)
+        taken_s, held = time.process_time() - start, tracemalloc.get_traced_memory()[1] / 2**30
+        tracemalloc.stop()
+        print(f"ten million points, {'with' if more else 'without'} boxes: {taken_s:.1f} s, {held:.2f} GiB")
+        assert out["coverage"].any()
+        assert held < 0.5
+        report_bound("s of CPU, ten million points", taken_s, at_most=30)
+
+
+def test_points_are_checked() -> None:
+    assert len(checked_points(np.array([[1.0, 2, 3, 9], [np.nan, 0, 0, 9], [0, np.inf, 0, 9], [1, 1, 1, np.nan]]))) == 2
+    assert checked_points(np.zeros(0)).shape == (0, 3)
+    with pytest.raises(SampleError, match=r"points: expected shape \(P, >= 3\), x y z in the ego frame, got \(4, 2\)"):
+        checked_points(np.zeros((4, 2)))
+
+
+# --- depth maps and samples -------------------------------------------------------------------------------------------
+camera = partial(helpers.camera, size=(192, 320), position_m=tuple(EYE), horizontal_fov_deg=70.0)
+
+
+def test_depth_is_along_the_axis() -> None:
+    view = camera()
+    depth = np.full(view.size, 10.0)
+    depth[:20], depth[20:40], depth[40:60] = 0.0, np.nan, np.inf
+    points = points_of_depth(view, depth)
+    assert np.allclose(points[:, 0], EYE[0] + 10) and len(points) == 320 * 132
+    with pytest.raises(SampleError, match=r"depth_m: camera 'front': expected a map of \(192, 320\), got \(3, 4\)"):
+        points_of_depth(view, np.zeros((3, 4)))
+
+
+VIEWS = {
+    "ahead": camera(),
+    "skewed": camera().resize((200, 300)).__class__(
+        name="skewed", width_px=300, height_px=200, K=[[300.0, 4.0, 140.0], [0.0, 280.0, 90.0], [0.0, 0.0, 1.0]],
+        cam2ego=camera().cam2ego,
+    ),
+    "steep": camera().turned(pitch_deg=60.0),
+    "behind": camera().turned(yaw_deg=175.0, roll_deg=20.0),
+    "radtan": replace(camera(size=(480, 800)), lens="radtan", distortion=(-0.1, 0.02, 1e-3, -1e-3)),
+    "fisheye": Camera.looking(
+        name="wide", azimuth_deg=0, position_m=tuple(EYE), width_px=160, height_px=120, horizontal_fov_deg=170,
+        lens="fisheye", distortion=(0.02, -0.01, 0.0, 0.0),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("all_around", [False, True])
+@pytest.mark.parametrize("name", VIEWS)
+def test_images_say_what_single_rays_say(name: str, all_around: bool) -> None:
+    view = VIEWS[name]
+    points = np.concatenate([NEAR, FAR, FAR * [-1, 1, 1], [[x, y, 9.0] for x in range(12) for y in range(-5, 6)]])
+    surface = PointCloudSurface(Street(), points)
+    if all_around:
+        surface.inverse_distance(EYE, np.array([[1.0, 0, 0], [-1.0, 0, 0], [0.0, 1.0, 0], [0.0, -1.0, 0]]))
+    rays, valid = view.unproject(view.pixel_grid())
+    q, before = surface.inverse_distance(EYE, rays[valid]), surface.occlusion_depth(EYE, rays[valid])
+    # Rounding decides on which side of an outline a pixel lies.
+    off = np.abs(surface.image(view)[valid] - q)
+    assert np.quantile(off, 0.99) < 2e-5 and (off > 1e-3).mean() < 0.003
+    # Shadows are interpolated over a panorama's cell: their outlines are half a cell wider or narrower.
+    off = np.abs(surface.occlusion_map(view).beyond[valid] - before)
+    assert np.median(off) < 1e-5 and (off > 1e-3).mean() < 0.03
+
+
+def test_coarse_grid_equals_pixel_by_pixel_evaluation() -> None:
+    rig = demo_source_rig((128, 352))
+    scene = Scene(points=np.concatenate([NEAR, FAR]))
+    plans = [
+        build_plan(rig, rig.shifted(z_m=0.7), surface="lidar", scene=scene, config=FavsConfig(grid_step_px=step))
+        for step in (8, 1)
+    ]
+    for a, b in zip(*(plan.targets for plan in plans), strict=True):
+        assert (a.coverage != b.coverage).mean() < 0.003
+        same = (a.source_camera == b.source_camera) & a.coverage
+        assert same.mean() > 0.98 * a.coverage.mean()
+        assert np.quantile(np.abs(a.at.xy[same].astype(int) - b.at.xy[same]), 0.99) <= 1
+
+
+def test_only_pixels_that_a_pair_may_read_are_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Turned cameras are exact over most of the view: points matter where neighbours see the rest."""
+    rig, scene = demo_source_rig((128, 352)), Scene(points=np.concatenate([NEAR, FAR]))
+    target = rig.turned(yaw_deg=15)
+    part = build_plan(rig, target, surface="lidar", scene=scene)
+    ask = TargetRays.ask
+    monkeypatch.setattr(TargetRays, "ask", lambda self, surface, nodes: ask(self, surface, whole(self)))
+    every = build_plan(rig, target, surface="lidar", scene=scene)
+    pixels = len(rig) * 128 * 352
+    assert 0 < part.counters["dense_pixels"] < 0.6 * pixels and every.counters["dense_pixels"] == pixels
+    for a, b in zip(part.targets, every.targets, strict=True):
+        assert (a.source_camera != b.source_camera).mean() < 1e-3
+        assert (a.at.xy != b.at.xy).mean() < 1e-3
+
+
+def whole(rays: TargetRays) -> tuple[int, int, int, int]:
+    ny, nx = rays.grid.shape
+    return 0, ny - 1, 0, nx - 1
+
+
+def test_in_a_sample() -> None:
+    rig = demo_source_rig((64, 176))
+    images = torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8)
+    sample = {"images": images, "rig": rig}
+    retarget = RigRetarget(rig.shifted(z_m=0.5), surface="lidar")
+    street = RigRetarget(rig.shifted(z_m=0.5), surface="street")(sample)
+    nothing = torch.full((3, 4), float("nan"))
+    assert torch.equal(retarget(sample | {"points": nothing})["images"], street["images"])
+    points = torch.from_numpy(NEAR).float()
+    seen = retarget(sample | {"points": points})
+    assert seen["points"] is points and not torch.equal(seen["images"], street["images"])
+    assert "lidar surface" in str(retarget.explain(sample | {"points": points}))
+    batch = {"images": images.expand(2, 6, 3, 64, 176), "rig": rig, "points": [points, points]}
+    assert torch.equal(retarget(batch)["images"][1], seen["images"])
+    with pytest.raises(SampleError, match=r"surface='lidar': expected 'points' \(P, >= 3\)"):
+        retarget(sample)
+    with pytest.raises(SampleError, match=r"points: expected shape"):
+        retarget(sample | {"points": torch.zeros(5, 2)})
+
+
+def test_depth_maps_in_a_sample() -> None:
+    rig = demo_source_rig((64, 176))
+    sample = {"images": torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8), "rig": rig}
+    retarget = RigRetarget(rig.shifted(z_m=0.5), surface="lidar")
+    depth = torch.zeros(6, 64, 176)
+    depth[0] = 9.0
+    with pytest.warns(UserWarning, match="depth_m"):
+        mapped = retarget(sample | {"depth_m": depth})
+    assert "depth_m" not in mapped  # it would be the source's
+    points = torch.from_numpy(points_of_depth(rig[0], np.full((64, 176), 9.0)))
+    assert torch.equal(mapped["images"], retarget(sample | {"points": points})["images"])
+    with pytest.raises(SampleError, match=r"depth_m: expected 6 maps"):
+        retarget(sample | {"depth_m": depth[:2]})

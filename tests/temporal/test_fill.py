@@ -1,0 +1,249 @@
+"""Holes filled from neighbouring frames: with real pixels, without repainting, and not where something moved."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import Rig, RigRetarget
+from arbiview_aug.datasets import Neighbours
+from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig
+from arbiview_aug.temporal.change import ChangeRisk
+from arbiview_aug.temporal.merge import Candidate, merged
+
+RIG = demo_source_rig((96, 256))
+
+
+def low() -> Rig:
+    return RIG.turned(pitch_deg=-12)
+
+
+@pytest.fixture(scope="module")
+def drive() -> SyntheticDrive:
+    return SyntheticDrive(RIG, num_frames=8, seed=5, neighbours=Neighbours(count=2, step_m=1.5))
+
+
+@pytest.fixture(scope="module")
+def sample(drive: SyntheticDrive) -> dict[str, Any]:
+    sample = drive[1]
+    return sample | {"neighbours": [dict(neighbour) for neighbour in sample["neighbours"]]}
+
+
+@pytest.fixture(scope="module")
+def filled(sample: dict[str, Any]) -> dict[str, Any]:
+    return RigRetarget(low(), outputs=("source_frame", "source_camera", "confidence"))(sample)
+
+
+@pytest.fixture(scope="module")
+def alone(sample: dict[str, Any]) -> dict[str, Any]:
+    return RigRetarget(low(), neighbours=None, outputs=("source_frame", "source_camera", "confidence"))(sample)
+
+
+def test_the_current_frame_is_never_repainted(filled: dict[str, Any], alone: dict[str, Any]) -> None:
+    seen = alone["coverage"]
+    assert (filled["coverage"] | ~seen).all()
+    for key in ("images", "source_camera", "source_frame"):
+        now, before = filled[key], alone[key]
+        same = (now == before).all(1) if key == "images" else now == before
+        assert same[seen].all(), key
+
+
+def test_outputs_say_where_pixels_come_from(filled: dict[str, Any], alone: dict[str, Any]) -> None:
+    gained = filled["coverage"] & ~alone["coverage"]
+    assert gained.float().mean() > 0.05
+    assert ((filled["source_frame"] > 0) == gained).all() and int(filled["source_frame"].max()) <= 4
+    assert (filled["source_frame"][~filled["coverage"]] == -1).all()
+    assert (filled["source_camera"][gained] >= 0).all() and (filled["confidence"][gained] > 0).all()
+    assert torch.equal(filled["generated"], ~filled["coverage"])
+    assert "neighbours" not in filled
+
+
+def test_filled_pixels_are_the_roads(drive: SyntheticDrive, filled: dict[str, Any]) -> None:
+    truth = drive.render(1, low())
+    there = filled["source_frame"] > 0
+    road = there & ((truth.classes == SceneClass.GROUND) | (truth.classes == SceneClass.SIDEWALK))
+    assert road.sum() > 0.98 * there.sum()
+    error = (filled["images"].float() - truth.images.float()).square().mean(1)[there].mean()
+    assert 10 * np.log10(255**2 / float(error)) > 27
+
+
+def test_both_executions_fill_alike(sample: dict[str, Any], filled: dict[str, Any]) -> None:
+    out = RigRetarget(low(), execution="torch", outputs=("source_frame",))(sample)
+    same = out["source_frame"] == filled["source_frame"]
+    assert same.float().mean() > 0.999
+    off = (out["images"].int() - filled["images"].int()).abs().amax(1)[same]
+    assert float((off > 2).float().mean()) < 1e-3
+
+
+@pytest.mark.slow
+def test_floats_fill_as_bytes_do(sample: dict[str, Any], filled: dict[str, Any]) -> None:
+    floats = sample | {"images": sample["images"].float() / 255}
+    floats["neighbours"] = [n | {"images": n["images"].float() / 255} for n in sample["neighbours"]]
+    out = RigRetarget(low())(floats)
+    assert (out["coverage"] == filled["coverage"]).float().mean() > 0.999
+    assert (255 * out["images"] - filled["images"]).abs().mean() < 0.5
+
+
+@pytest.mark.slow
+def test_gradients_reach_the_current_images(sample: dict[str, Any]) -> None:
+    images = (sample["images"].float() / 255).requires_grad_()
+    near = [n | {"images": n["images"].float() / 255} for n in sample["neighbours"]]
+    out = RigRetarget(low())(sample | {"images": images, "neighbours": near})
+    out["images"].sum().backward()
+    assert images.grad is not None and images.grad.isfinite().all() and images.grad.abs().sum() > 0
+
+
+def test_explain_says_what_travel_adds(sample: dict[str, Any], alone: dict[str, Any], filled: dict[str, Any]) -> None:
+    explanation = RigRetarget(low()).explain(sample)
+    shares = [entry["filled"] for entry in explanation.as_dict()]
+    gained = (filled["coverage"] & ~alone["coverage"]).float().mean((1, 2)).tolist()
+    assert all(up_to >= share for up_to, share in zip(shares, gained, strict=True)) and sum(shares) < 1.3 * sum(gained)
+    assert str(explanation).count("m of travel: ") == 4 and "more by other frames of the drive" in str(explanation)
+    assert "filled" not in RigRetarget(low(), neighbours=None).explain(sample).as_dict()[0]
+
+
+@pytest.mark.slow
+def test_a_labelled_object_is_not_read(sample: dict[str, Any], alone: dict[str, Any]) -> None:
+    """A box over all that a neighbour sees of the road: then, nothing of it may fill anything."""
+    wall = torch.tensor([[-8.0, 0.0, 1.0, 6.0, 40.0, 2.0, 0.0], [9.0, 0.0, 1.0, 6.0, 40.0, 2.0, 0.0]])
+    everywhere = [
+        n | {"boxes_3d": torch.cat([wall, wall + torch.tensor([0, 9, 0, 0, 0, 0, 1.57])])} for n in sample["neighbours"]
+    ]
+    out = RigRetarget(low())(sample | {"neighbours": everywhere})
+    gained = (out["coverage"] & ~alone["coverage"]).float().mean()
+    plain = (RigRetarget(low())(sample)["coverage"] & ~alone["coverage"]).float().mean()
+    assert gained < 0.4 * plain
+
+
+@pytest.mark.slow
+def test_all_fills_more_than_the_ground(sample: dict[str, Any], filled: dict[str, Any]) -> None:
+    out = RigRetarget(RIG.turned(yaw_deg=3, pitch_deg=6), neighbours="all")(sample)
+    ground = RigRetarget(RIG.turned(yaw_deg=3, pitch_deg=6))(sample)
+    assert out["coverage"].float().mean() >= ground["coverage"].float().mean()
+    with pytest.raises(ValueError, match="neighbours: expected one of ground, all"):
+        RigRetarget(RIG, neighbours="sky")
+
+
+# --- the merge --------------------------------------------------------------------------------------------------------
+H, W = 24, 40
+FREE = torch.zeros(H, W, dtype=torch.bool)
+FREE[8:] = True
+SEAM = torch.zeros(H, W, dtype=torch.bool)
+SEAM[4:8] = True
+ROAD = torch.full((3, H, W), 90, dtype=torch.uint8)
+HOLE = torch.where(FREE, 0, ROAD)
+
+
+def candidate(
+    level: int,
+    blur: int = 0,
+    doubt: ChangeRisk = ChangeRisk.UNLABELLED,
+    later: bool = False,
+    shows: torch.Tensor | None = None,
+) -> Candidate:
+    whole = torch.ones(H, W, dtype=torch.bool) if shows is None else shows
+    image = torch.full((3, H, W), level, dtype=torch.uint8)
+    return Candidate(image, whole, *(torch.full((H, W), n, dtype=torch.uint8) for n in (blur, doubt)), later)
+
+
+def test_exposure_follows_the_seam() -> None:
+    pixels, chosen = merged(HOLE, FREE, SEAM, [candidate(98)], 2)
+    assert (chosen[FREE] == 0).all() and (pixels[:, FREE].int() - 90).abs().max() <= 1
+    assert torch.equal(pixels[:, ~FREE], HOLE[:, ~FREE])
+
+
+def test_the_sharper_of_two_that_agree_is_taken() -> None:
+    _, chosen = merged(HOLE, FREE, SEAM, [candidate(90, blur=3), candidate(91, blur=1)], 2)
+    assert (chosen[FREE] == 1).all()
+    _, chosen = merged(HOLE, FREE, SEAM, [candidate(90, blur=1), candidate(91, blur=1)], 2)
+    assert (chosen[FREE] == 0).all()
+
+
+def passing(level: int, doubt: ChangeRisk = ChangeRisk.UNLABELLED, later: bool = False) -> Candidate:
+    """The road at the seam, something else farther in."""
+    one = candidate(90, doubt=doubt, later=later)
+    one.image[:, 12:] = level
+    return one
+
+
+def test_two_that_contradict_each_other_leave_a_hole() -> None:
+    for doubt in ChangeRisk:
+        _, chosen = merged(HOLE, FREE, SEAM, [passing(200, doubt), candidate(90, doubt=doubt)], 2)
+        assert (chosen[16:] == -1).all() and (chosen[8:10] == 0).all()
+
+
+def test_where_labels_vouch_the_majority_is_believed() -> None:
+    for doubt in ChangeRisk:
+        several = [passing(200, doubt), candidate(90, doubt=doubt), candidate(92, doubt=doubt)]
+        _, chosen = merged(HOLE, FREE, SEAM, several, 2)
+        assert (chosen[16:] == (1 if doubt == ChangeRisk.NONE else -1)).all()
+
+
+def test_one_alone_is_believed_unless_something_moved_beside_it() -> None:
+    nothing = torch.zeros(H, W, dtype=torch.bool)
+    for doubt in ChangeRisk:
+        several = [candidate(90, doubt=doubt), candidate(90, shows=nothing), candidate(90, shows=nothing)]
+        for of in (several, several[:2]):
+            _, chosen = merged(HOLE, FREE, SEAM, of, 2)
+            assert (chosen[FREE] == (0 if doubt <= ChangeRisk.SHADED or len(of) == 2 else -1)).all()
+
+
+def test_without_labels_two_of_one_side_are_not_enough() -> None:
+    nothing = candidate(90, shows=torch.zeros(H, W, dtype=torch.bool))
+    for several in ([passing(200), passing(200), nothing], [passing(200), passing(200), passing(200)]):
+        _, chosen = merged(HOLE, FREE, SEAM, several, 2)
+        assert (chosen[16:] == (0 if several[2] is not nothing else -1)).all()
+
+
+def test_what_is_there_before_and_after_stood_still() -> None:
+    """Whatever farther frames show: a lorry may pass for as long as they last."""
+    lorry = [passing(200), passing(200), passing(200, later=True)]
+    _, chosen = merged(HOLE, FREE, SEAM, [candidate(90), candidate(90, later=True), *lorry], 2)
+    assert (chosen[16:] == 0).all()
+    _, chosen = merged(HOLE, FREE, SEAM, [candidate(90), *lorry[:2], lorry[2], candidate(90, later=True)], 2)
+    assert (chosen[16:] == -1).all()
+
+
+def test_what_the_current_frame_alone_shows_goes_on_into_the_hole() -> None:
+    view = HOLE.clone()
+    view[:, 4:8, :16] = 200
+    for doubt in ChangeRisk:
+        several = [candidate(90, doubt=doubt), candidate(90, doubt=doubt, later=True)]
+        _, chosen = merged(view, FREE, SEAM, several, 2)
+        assert (chosen[8:12, 24:] == 0).all()
+        assert (chosen[8:, :14] == (-1 if doubt == ChangeRisk.UNLABELLED else 0)).all()
+
+
+def test_an_exposure_that_is_another_object_is_not_taken_on() -> None:
+    """What passes at the seam of one neighbour alone neither recolours the road nor outvotes the others."""
+    blue = candidate(90, doubt=ChangeRisk.NONE)
+    blue.image[:, :8] = torch.tensor([20, 40, 100], dtype=torch.uint8)[:, None, None]
+    pixels, _ = merged(HOLE, FREE, SEAM, [blue], 2)
+    assert (pixels[:, FREE] == 90).all()
+
+
+def test_a_neighbour_without_a_seam_follows_those_that_have_one() -> None:
+    """A camera twice as bright that sees the far half of the hole alone and the near one with another."""
+    near, far = torch.ones(H, W, dtype=torch.bool), torch.zeros(H, W, dtype=torch.bool)
+    near[18:], far[10:] = False, True
+    several = [candidate(90, doubt=ChangeRisk.NONE, shows=near), candidate(180, doubt=ChangeRisk.NONE, shows=far)]
+    pixels, chosen = merged(HOLE, FREE, SEAM, several, 2)
+    assert (chosen[18:] == 1).all() and (pixels[:, FREE].int() - 90).abs().max() <= 1
+
+
+@pytest.mark.slow
+def test_labels_stand_in_holes_where_nothing_else_needs_geometry() -> None:
+    """One camera that turns: no pixel of its own depends on labels, but what the neighbour may fill does."""
+    rig = RIG.with_cameras([RIG[0]])
+    drive = SyntheticDrive(rig, num_frames=1, seed=5, lidar=False, neighbours=Neighbours(count=2, step_m=4))
+    target = rig.turned(yaw_deg=-45)
+    sample = drive[0]
+    ahead = torch.tensor([[7.0, -5.0, 0.9, 4.5, 2.0, 1.8, 0.0]])  # in the hole, on the road that a neighbour shows
+    sample |= {"boxes_3d": ahead, "neighbours": [dict(one) | {"boxes_3d": ahead[:0]} for one in sample["neighbours"]]}
+    by_auto, by_boxes = (
+        RigRetarget(target, surface=surface, outputs=("source_frame",))(sample) for surface in ("auto", "objects")
+    )
+    empty = RigRetarget(target, surface="objects", outputs=("source_frame",))(sample | {"boxes_3d": ahead[:0]})
+    assert torch.equal(by_auto["source_frame"], by_boxes["source_frame"])
+    assert (empty["source_frame"] > 0).sum() > (by_auto["source_frame"] > 0).sum() > 0

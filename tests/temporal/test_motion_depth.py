@@ -1,0 +1,151 @@
+"""Depth from motion on streets that stand still: how right, how dense, and when it declines."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import RigRetarget
+from arbiview_aug.datasets import Neighbours
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.errors import SampleError
+from arbiview_aug.sample.inputs import read_frames
+from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames
+from arbiview_aug.temporal.motion_depth import MotionDepth, motion_depth
+from tests.helpers import Standing
+
+SIDE = demo_source_rig((96, 256))
+SIDE = SIDE.with_cameras([SIDE[0], SIDE[1]])  # front and front left: two cameras are quick
+
+
+@pytest.fixture(scope="module")
+def drive() -> SyntheticDrive:
+    return Standing(SIDE, num_frames=4, seed=5, lidar=False, neighbours=Neighbours())
+
+
+@pytest.fixture(scope="module")
+def sample(drive: SyntheticDrive) -> dict[str, Any]:
+    found = drive[1]
+    del found["boxes_3d"]
+    found["neighbours"] = [
+        {k: torch.as_tensor(n[k]) if k == "images" else n[k] for k in n if k != "boxes_3d"} for n in found["neighbours"]
+    ]
+    return found
+
+
+def found(sample: dict[str, Any], **changes: Any) -> MotionDepth:
+    (frame,) = read_frames(sample, None)
+    near = neighbours_of_frames(sample, [frame], (), lambda topic, message: pytest.fail(message))[0]
+    settings: dict[str, Any] = {"neighbours": near, "boxes": None, "load": lambda n: n.images(frame.images)}
+    return motion_depth(frame.rig, frame.images, **(settings | changes))
+
+
+def turned(sample: dict[str, Any], degrees: float) -> dict[str, Any]:
+    """With neighbours whose poses are wrong."""
+    entries = []
+    for k, entry in enumerate(sample["neighbours"]):
+        pose = entry["ego2world"].numpy().copy()
+        pose[:3, :3] = pose[:3, :3] @ cv2.Rodrigues(np.radians(degrees) * np.eye(3)[2 - k])[0]
+        entries.append({**entry, "ego2world": torch.from_numpy(pose)})
+    return {**sample, "neighbours": entries}
+
+
+def right(drive: SyntheticDrive, depth: MotionDepth) -> tuple[float, float]:
+    """Share of the pixels nearer than 80 m, 6 degrees off the motion, that have a depth; and of those that are within a
+    tenth of the truth."""
+    kept = good = pixels = 0
+    for camera, one, true in zip(drive.rig, depth.depth_m, drive.render(1).depth_m, strict=True):
+        rays, _ = camera.unproject(camera.pixel_grid())
+        aside = np.abs(rays[..., 0]) < np.cos(np.radians(6))
+        ask = aside & (true.numpy() < 80)
+        kept, pixels = kept + (ask & (one > 0)).sum(), pixels + ask.sum()
+        good += (ask & (one > 0) & (np.abs(one - true.numpy()) <= 0.1 * true.numpy())).sum()
+    return kept / pixels, good / kept
+
+
+@pytest.fixture(scope="module")
+def exact(sample: dict[str, Any]) -> MotionDepth:
+    return found(sample)
+
+
+def test_most_pixels_have_the_right_depth(drive: SyntheticDrive, exact: MotionDepth) -> None:
+    density, share = right(drive, exact)
+    assert density > 0.6 and share > 0.9
+    assert "synthetic-5-1" in str(exact) and "%" in str(exact)
+
+
+@pytest.mark.slow
+def test_wrong_poses_are_mended_or_declined(drive: SyntheticDrive, sample: dict[str, Any], exact: MotionDepth) -> None:
+    mended = found(turned(sample, 0.3))
+    assert "poses mended by" in mended.words
+    density, share = right(drive, mended)
+    assert density > right(drive, exact)[0] - 0.05 and share > 0.9
+    lost = found(turned(sample, 4.0))
+    assert lost.density == 0 and "the static street stands" in str(lost)
+    assert "the pose of frame" in lost.words or "too little of frame" in lost.words
+
+
+@pytest.mark.slow
+def test_one_side_is_asked_twice(drive: SyntheticDrive, sample: dict[str, Any]) -> None:
+    density, share = right(drive, found({**sample, "neighbours": sample["neighbours"][:1]}))
+    assert density > 0.4 and share > 0.85
+
+
+def test_without_frames_nearby_it_declines(sample: dict[str, Any]) -> None:
+    assert "no frame 0.4 to 3 m before or after" in found({**sample, "neighbours": []}).words
+    assert found(sample, load=lambda neighbour: None).density == 0
+
+
+def test_a_lost_frame_leaves_the_other_side(sample: dict[str, Any]) -> None:
+    (frame,) = read_frames(sample, None)
+
+    def load(neighbour: Neighbour) -> Any:
+        return None if "-0." in neighbour.name else neighbour.images(frame.images)
+
+    one = found(sample, load=load)
+    assert one.density > 0.2 and "-0." not in one.words and " and " not in one.words.partition(";")[0]
+
+
+def test_labelled_objects_are_left_out(sample: dict[str, Any], exact: MotionDepth) -> None:
+    box = np.array([[8.0, 6.0, 1.0, 4.0, 2.0, 2.0, 0.0]])
+    less = found(sample, boxes=box)
+    u, v = np.rint(SIDE[1].project(box[:, :3]).uv[0]).astype(int)
+    assert not less.depth_m[1][v - 5 : v + 5, u - 5 : u + 5].any()
+    assert less.density < exact.density
+
+
+def test_as_a_surface(drive: SyntheticDrive, sample: dict[str, Any], exact: MotionDepth) -> None:
+    target = SIDE.shifted(y_m=1.0)
+    motion = RigRetarget(target, surface="motion", neighbours=None)
+    online = motion(sample)
+    offline = motion({**sample, "neighbours": [], "motion_depth_m": torch.from_numpy(np.stack(exact.depth_m))})
+    assert torch.equal(online["images"], offline["images"])
+    assert "motion_depth_m" not in offline and "neighbours" not in online
+    true = drive.render(1, target).images.float()
+    static = RigRetarget(target, surface="street")(sample)
+    both = (online["coverage"] & static["coverage"])[:, None]
+    errors = [float(((out["images"] - true) ** 2 * both).sum()) for out in (online, static)]
+    assert errors[0] < 0.6 * errors[1]  # 2.2 dB
+    assert "depth from motion: " in str(motion.explain(sample))
+    assert "over the motion surface" in str(motion.explain(sample))
+
+
+def test_where_it_is_declined_the_street_stands_with_a_warning(sample: dict[str, Any]) -> None:
+    target = SIDE.shifted(y_m=0.5)
+    motion = RigRetarget(target, surface="motion")
+    with pytest.warns(UserWarning, match="depth from motion: none, no frame .* the static street stands"):
+        out = motion({**sample, "neighbours": []})
+    assert torch.equal(out["images"], RigRetarget(target, surface="street")(sample | {"neighbours": []})["images"])
+
+
+def test_what_it_needs_is_said(sample: dict[str, Any]) -> None:
+    bare = {key: value for key, value in sample.items() if key != "neighbours"}
+    motion = RigRetarget(SIDE.shifted(y_m=0.5), surface="motion")
+    with pytest.raises(SampleError, match=r"surface='motion': expected 'neighbours' .* 'motion_depth_m'"):
+        motion(bare)
+    with pytest.raises(SampleError, match=r"motion_depth_m: camera 'front': expected a map of \(96, 256\)"):
+        motion({**bare, "motion_depth_m": torch.zeros(2, 10, 10)})
+    same = RigRetarget(SIDE, surface="motion")(bare)  # nothing depends on distances: nothing is needed
+    assert torch.equal(same["images"], sample["images"])

@@ -1,0 +1,65 @@
+"""Files that are whole or not there."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from arbiview_aug import atomic_io
+from arbiview_aug.atomic_io import link_whole, remove_parts, whole_file, write_whole
+from arbiview_aug.errors import OutputError
+
+
+def names(root: Path) -> list[str]:
+    return sorted(path.name for path in root.rglob("*") if path.is_file())
+
+
+def test_nothing_is_left_of_what_fails(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"before")
+    with pytest.raises(ZeroDivisionError), whole_file(tmp_path / "a") as file:
+        file.write(b"half")
+        raise ZeroDivisionError
+    assert (tmp_path / "a").read_bytes() == b"before" and names(tmp_path) == ["a"]
+    with pytest.raises(OutputError, match="expected a file that can be written, got File exists"):
+        write_whole({tmp_path / "b": b"1", tmp_path / "a" / "c": b"2"})
+    assert names(tmp_path) == ["a"]
+
+
+def test_what_is_written_is_there(tmp_path: Path) -> None:
+    write_whole({tmp_path / "deep" / "a": b"1", tmp_path / "b": b"2"}, owner="7")
+    assert (tmp_path / "deep" / "a").read_bytes() == b"1" and names(tmp_path) == ["a", "b"]
+
+
+def test_links_and_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a").write_bytes(b"points")
+    link_whole(tmp_path / "a", tmp_path / "b")
+    assert (tmp_path / "b").samefile(tmp_path / "a")
+
+    def other_disk(*_: object) -> None:
+        raise OSError(atomic_io.errno.EXDEV, "Invalid cross-device link")
+
+    monkeypatch.setattr(os, "link", other_disk)
+    (tmp_path / "c").write_bytes(b"cut")
+    link_whole(tmp_path / "a", tmp_path / "c")
+    assert (tmp_path / "c").read_bytes() == b"points" and not (tmp_path / "c").samefile(tmp_path / "a")
+    with pytest.raises(FileNotFoundError):
+        link_whole(tmp_path / "nothing", tmp_path / "d")
+    assert names(tmp_path) == ["a", "b", "c"]
+
+
+def test_only_what_nobody_writes_is_removed(tmp_path: Path) -> None:
+    """A living process's files stay unless they are of an owner that is ours alone; a dead one's go."""
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    host = atomic_io._host()
+    mine, others, shared = (f".x.{owner}-{host}-{os.getpid()}-01234567.part" for owner in ("4", "5", ""))
+    left = f".x.-{host}-{dead.pid}-01234567.part"
+    elsewhere = f".x.5-ffffffff-{dead.pid}-01234567.part"
+    for name in (mine, others, shared, left, elsewhere, ".hidden.part", "x"):
+        (tmp_path / name).write_bytes(b"")
+    remove_parts(tmp_path, lambda owner: int(owner) % 2 == 0)
+    assert set(names(tmp_path)) == {others, shared, elsewhere, ".hidden.part", "x"}

@@ -1,0 +1,87 @@
+"""What a plan says of itself."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from arbiview_aug import RandomRig, Rig, RigRetarget, load_rig
+from arbiview_aug.scene.surface import SurfaceName
+from arbiview_aug.transforms.explain import Explanation
+
+
+def nuscenes(scale: float = 0.1) -> Rig:
+    return load_rig("nuscenes").resized(scale)
+
+
+def explained(target: Rig | RandomRig, source: Rig | None = None) -> Explanation:
+    source = source or nuscenes()
+    images = [torch.zeros((3, *size), dtype=torch.uint8) for size in source.sizes]
+    return RigRetarget(target).explain({"images": images, "rig": source})
+
+
+def test_entries_are_plain_data_and_add_up() -> None:
+    entries = json.loads(json.dumps(explained(nuscenes().turned(yaw_deg=22)).as_dict()))
+    assert [entry["camera"] for entry in entries] == nuscenes().names
+    for k, entry in enumerate(entries):
+        assert entry["coverage"] + entry["to_invent"] == pytest.approx(1)
+        assert sum(source["share"] for source in entry["sources"]) == pytest.approx(entry["coverage"], abs=1e-9)
+        shares = [source["share"] for source in entry["sources"]]
+        assert shares == sorted(shares, reverse=True)
+        own = next(source for source in entry["sources"] if source["camera"] == nuscenes().names[k])
+        assert own["surface"] == "far" and own["reason"] == "centres coincide: exact"
+        assert own["baseline_m"] < 1e-6 and own["parallax_px"] < 1e-3
+        others = [source for source in entry["sources"] if source is not own]
+        assert others and {other["surface"] for other in others} == {"street"}
+        assert all(other["baseline_m"] > 0.3 and other["parallax_px"] > 0 for other in others)
+
+
+def test_in_words() -> None:
+    ahead = nuscenes().shifted(x_m=0.6)
+    text = str(explained(ahead))
+    assert text.splitlines()[0].endswith("6 cameras to 6")
+    for name in nuscenes().names:
+        assert f"  {name}: " in text and f" from {name} over the street surface (centres 0.60 m apart, about" in text
+    assert "px of parallax where depth is unknown" in text
+    assert repr(explained(ahead)) == text
+
+
+@pytest.mark.parametrize("surface", ["auto", "street", "far"])
+def test_what_a_static_street_does_to_a_detector_is_said_with_what_helps(surface: SurfaceName) -> None:
+    source = nuscenes()
+    sample = {"images": [torch.zeros((3, *size), dtype=torch.uint8) for size in source.sizes], "rig": source}
+
+    def text(target: Rig, **more: torch.Tensor) -> str:
+        return str(RigRetarget(target, surface=surface).explain(sample | more))
+
+    _, harm, better, *_ = text(source.shifted(z_m=0.6)).splitlines()
+    assert harm.startswith("  target cameras stand up to 0.60 m from the nearest source camera")
+    assert "points of IoU worse than one trained on untouched images" in harm
+    assert better.startswith("  better: 'points'") and better.endswith("mixing with untouched samples (p=0.5)")
+    for fine in (text(source.shifted(z_m=0.1)), text(source.turned(yaw_deg=20))):
+        assert "IoU" not in fine and "better:" not in fine
+    assert ("IoU" in text(source.shifted(z_m=0.6), boxes_3d=torch.zeros(0, 7))) == (surface != "auto")
+
+
+def test_what_has_to_be_invented() -> None:
+    one = nuscenes().with_cameras([nuscenes()[0]])
+    half = explained(one.turned(yaw_deg=20), one)
+    assert 0 < half.as_dict()[0]["to_invent"] < 1
+    assert "that no camera saw: masked, or for a generator to invent" in str(half)
+    with pytest.warns(UserWarning, match="cannot be reached"):
+        none = explained(one.turned(yaw_deg=180), one)
+    assert none.as_dict() == [{"camera": one[0].name, "coverage": 0.0, "to_invent": 1.0, "sources": []}]
+    assert "0.0% covered, 100.0% that no camera saw" in str(none) and "no source camera looks there" in str(none)
+
+
+def test_halved_sources_are_named() -> None:
+    text = str(explained(nuscenes().resized(0.25)))
+    assert "(centres coincide: exact, read at 1/4 size)" in text
+
+
+def test_a_random_rig_is_explained_for_one_draw() -> None:
+    torch.manual_seed(0)
+    texts = {str(explained(RandomRig(nuscenes(), yaw_deg=15))) for _ in range(2)}
+    assert len(texts) == 2

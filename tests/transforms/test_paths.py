@@ -1,0 +1,210 @@
+"""What fills the holes of retargeted views: nothing, inpainting, a generator; in the transform and after collating."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader, default_collate
+
+from arbiview_aug import Rig, RigRetarget, SampleError
+from arbiview_aug.errors import GeneratorError
+from arbiview_aug.generator import CompletedLoader, Generator
+from arbiview_aug.generator.inpainting import telea
+from tests.generator.small import ring, small_config, stirred
+
+
+@pytest.fixture(autouse=True)
+def no_warnings() -> Iterator[None]:
+    """Of targets that nobody covers: they are wanted here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+@pytest.fixture(scope="module")
+def generator() -> Generator:
+    pytest.importorskip("diffusers")
+    torch.manual_seed(0)
+    made = Generator.from_config(small_config())
+    stirred(made.denoiser)
+    return made.eval()
+
+
+SOURCE = ring(3, horizontal_fov_deg=70)
+TARGET = ring(3, horizontal_fov_deg=70, yaw_deg=40, name="t")
+
+
+def a_sample(token: str = "one", seed: int = 0, rig: Rig = SOURCE) -> dict[str, Any]:
+    rng = torch.Generator().manual_seed(seed)
+    images = torch.randint(256, (len(rig), 3, *rig.sizes[0]), generator=rng, dtype=torch.uint8)
+    return {"images": images, "rig": rig, "token": token}
+
+
+def on(mask: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
+    return mask[..., None, :, :].expand_as(images)
+
+
+# --- in the transform -------------------------------------------------------------------------------------------------
+def test_inpainting_fills_what_nobody_sees_and_nothing_else() -> None:
+    seen = RigRetarget(TARGET, holes="black")(a_sample())
+    filled = RigRetarget(TARGET, path="inpaint")(a_sample())
+    holes = ~seen["coverage"]
+    assert holes.any() and torch.equal(filled["generated"], holes) and torch.equal(filled["coverage"], ~holes)
+    assert torch.equal(filled["images"][on(~holes, filled["images"])], seen["images"][on(~holes, seen["images"])])
+    for image, view, hole in zip(filled["images"], seen["images"], holes, strict=True):
+        assert torch.equal(image, telea(view, hole))
+    assert "generated" not in seen
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_a_generator_fills_what_nobody_sees_and_nothing_else(generator: Generator, dtype: torch.dtype) -> None:
+    sample = a_sample()
+    if dtype == torch.float32:
+        sample["images"] = sample["images"].float() / 255
+    seen = RigRetarget(TARGET)(sample)
+    retarget = RigRetarget(TARGET, path="diffusion", generator=generator, steps=2)
+    made = retarget(sample)
+    holes = ~seen["coverage"]
+    assert made["images"].dtype == dtype and torch.equal(made["generated"], holes)
+    assert torch.equal(made["images"][on(~holes, made["images"])], seen["images"][on(~holes, seen["images"])])
+    assert (made["images"][on(holes, made["images"])] > 0).any()
+    assert torch.equal(retarget(sample)["images"], made["images"])
+    other = RigRetarget(TARGET, path="diffusion", generator=generator, steps=2, seed=1)
+    assert not torch.equal(other(sample)["images"], made["images"])
+    assert not torch.equal(retarget({**sample, "token": "two"})["images"], made["images"])
+
+
+def test_whole_targets_never_ask_the_generator(generator: Generator) -> None:
+    before = generator.calls
+    out = RigRetarget(SOURCE, path="diffusion", generator=generator)(a_sample())
+    assert generator.calls == before and not out["generated"].any() and out["coverage"].all()
+    narrow = Rig([replace(c, K=c.K * [[2], [2], [1]]) for c in SOURCE])
+    assert RigRetarget(narrow, path="diffusion", generator=generator)(a_sample())["coverage"].all()
+    assert generator.calls == before
+
+
+def test_the_own_car_stays_and_is_not_generated(generator: Generator) -> None:
+    mask = np.ones(TARGET[0].size, bool)
+    mask[-8:] = False
+    target = Rig([replace(c, mask=mask) for c in TARGET])
+    for path in ("inpaint", "diffusion"):
+        how = {"generator": generator} if path == "diffusion" else {}
+        out = RigRetarget(target, path=path, **how)(a_sample())
+        assert out["generated"].any() and not (out["generated"] & out["ignore"]).any()
+
+
+def test_doubtful_pixels_are_made_up_as_well(generator: Generator) -> None:
+    plain = RigRetarget(TARGET, outputs=("confidence",))(a_sample())
+    least = float(plain["confidence"][plain["coverage"]].median())
+    outputs = ("confidence", "source_camera", "source_frame")
+    out = RigRetarget(TARGET, path="inpaint", min_confidence=least, outputs=outputs)(a_sample())
+    doubtful = plain["confidence"] < least
+    assert (doubtful & plain["coverage"]).any()
+    assert torch.equal(out["generated"], doubtful | ~plain["coverage"])
+    assert torch.equal(out["coverage"], ~out["generated"])
+    assert (out["confidence"][out["generated"]] == 0).all()
+    assert (out["source_camera"][out["generated"]] == -1).all() and (out["source_frame"][out["generated"]] == -1).all()
+
+
+def test_pixels_that_are_seen_keep_their_gradients(generator: Generator) -> None:
+    sample = a_sample()
+    images = (sample["images"].float() / 255).requires_grad_()
+    out = RigRetarget(TARGET, path="diffusion", generator=generator, steps=1)({**sample, "images": images})
+    out["images"].sum().backward()
+    assert images.grad is not None and (images.grad != 0).any()
+
+
+def test_skipped_samples_collate_with_completed_ones(generator: Generator) -> None:
+    size = SOURCE.sizes[0]
+    outs = []
+    for p in (0.0, 1e-9, 1.0):
+        retarget = RigRetarget(TARGET, path="diffusion", generator=generator, steps=1, p=p, size=size)
+        outs.append(retarget(a_sample()))
+    kept = ("images", "coverage", "generated")
+    batch = default_collate([{key: out[key] for key in kept} for out in outs])
+    assert not batch["generated"][0].any() and batch["generated"][2].any()
+
+
+def test_what_was_made_up_is_masked_when_retargeted_again() -> None:
+    once = RigRetarget(TARGET, path="inpaint", outputs=("sources", "confidence"))(a_sample())
+    again = RigRetarget(TARGET.undistorted(), holes="black")(once)
+    assert torch.equal(again["coverage"], once["coverage"])
+    assert "generated" not in again and "sources" not in again
+
+
+# --- after collating --------------------------------------------------------------------------------------------------
+def loader(workers: int, **settings: Any) -> DataLoader[Any]:
+    retarget = RigRetarget(TARGET, outputs=("sources", "confidence"), **settings)
+    data = [a_sample(f"frame {k}", k) for k in range(4)]
+    return DataLoader(_Retargeted(data, retarget), batch_size=2, num_workers=workers)
+
+
+class _Retargeted(torch.utils.data.Dataset[Any]):
+    def __init__(self, data: list[dict[str, Any]], retarget: RigRetarget) -> None:
+        self.data, self.retarget = data, retarget
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        return self.retarget(self.data[index])
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_batches_are_completed_as_samples_are(generator: Generator, workers: int) -> None:
+    completed = CompletedLoader(loader(workers), generator, steps=2)
+    assert len(completed) == 2
+    alone = RigRetarget(TARGET, path="diffusion", generator=generator, steps=2, outputs=("confidence",))
+    for b, batch in enumerate(completed):
+        assert "sources" not in batch and batch["images"].dtype == torch.uint8
+        for k in range(2):
+            one = alone(a_sample(f"frame {2 * b + k}", 2 * b + k))
+            for key in ("generated", "coverage", "confidence", "images"):
+                assert torch.equal(batch[key][k], one[key]), key
+
+
+def test_one_sample_and_no_generator() -> None:
+    out = RigRetarget(TARGET, outputs=("sources", "confidence"))(a_sample())
+    done = CompletedLoader([out], None)
+    inpainted = RigRetarget(TARGET, path="inpaint")(a_sample())
+    assert torch.equal(next(iter(done))["images"], inpainted["images"])
+
+
+def test_a_generator_on_the_cpu_works_in_workers(generator: Generator) -> None:
+    retarget = RigRetarget(TARGET, path="diffusion", generator=generator, steps=1)
+    data = [a_sample(f"frame {k}", k) for k in range(2)]
+    batches = list(DataLoader(_Retargeted(data, retarget), batch_size=1, num_workers=2, multiprocessing_context="fork"))
+    for k, batch in enumerate(batches):
+        assert torch.equal(batch["images"][0], retarget(data[k])["images"])
+
+
+# --- messages ---------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"path": "magic"}, "favs, inpaint, diffusion"),
+        ({"steps": 4}, "path='diffusion', got path='favs'"),
+        ({"path": "inpaint", "guidance": 2.0}, "path='diffusion', got path='inpaint'"),
+        ({"seed": 3}, "got path='favs'"),
+        ({"path": "diffusion", "generator": "weights"}, "from_pretrained"),
+        ({"path": "diffusion", "steps": 0}, "steps: expected a whole number from 1, got 0"),
+        ({"path": "inpaint", "min_confidence": 2}, "from 0 to 1, got 2"),
+        ({"path": "inpaint", "min_confidence": 0.5, "quality": "paper"}, "quality='paper' has no confidence"),
+    ],
+)
+def test_impossible_settings(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message.replace("(", r"\(")):
+        RigRetarget(TARGET, **settings)
+
+
+def test_batches_that_lack_something(generator: Generator) -> None:
+    with pytest.raises(SampleError, match=r"expected sources, confidence in the batch: .*outputs="):
+        generator.complete_batch(RigRetarget(TARGET)(a_sample()))
+    with pytest.raises(GeneratorError, match="steps >= 1"):
+        generator.complete_batch(RigRetarget(TARGET, outputs=("sources", "confidence"))(a_sample()), steps=0)
