@@ -14,8 +14,8 @@ from arbiview_aug.cli.convert.nuscenes_rows import Remaining
 from arbiview_aug.datasets import NuScenesDataset
 from arbiview_aug.datasets.nuscenes.tables import Tables
 from arbiview_aug.errors import DataError
+from tests.cli.convert import damage as damaging
 from tests.cli.convert.damage import ALLOWED, LEFT_OUT, VERSION, Damage, Range, damages
-from tests.convert import damage as damaging
 
 Rows = list[dict[str, Any]]
 
