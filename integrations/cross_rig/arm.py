@@ -28,7 +28,9 @@ class Arm:
             and after it, with boxes where it reads boxes.
         mixed: Half of the frames drawn are raw ones.
         augmented: Frames are scaled and cropped at random as they are drawn.
-        filled: What no camera saw is inpainted, or made up by the package's generator, and counts as seen.
+        holes: Pixels that no camera saw: black, filled as ``RigRetarget`` does by default, or completed by the package's
+            generator.
+        masked: The network masks them by ``coverage``. Otherwise every pixel counts as seen, as in stock detectors.
         random: Targets are drawn around B, one for each frame.
         stays: B's cameras stay in the very centres of those of A that look most alike, or at their heights.
         truth: To find out where the rest is lost: B's true pixels where something is covered, or where nothing is
@@ -42,7 +44,8 @@ class Arm:
     reads: tuple[Geometry, ...] = ()
     mixed: bool = False
     augmented: bool = False
-    filled: Literal["telea", "generator"] | None = None
+    holes: Literal["black", "fill", "generator"] = "black"
+    masked: bool = True
     random: bool = False
     stays: Literal["centre", "height"] | None = None
     truth: Literal["covered", "holes"] | None = None
@@ -54,6 +57,6 @@ class Arm:
 
     def views_spec(self) -> dict[str, Any]:
         """What its images depend on, besides rigs and code: arms that differ in how they draw share them."""
-        settings = {"kind": self.kind, "surface": self.surface, "reads": list(self.reads), "filled": self.filled}
+        settings = {"kind": self.kind, "surface": self.surface, "reads": list(self.reads), "holes": self.holes}
         extra = {"random": RANDOM if self.random else None, "stays": self.stays, "truth": self.truth}
         return settings | {name: value for name, value in extra.items() if value is not None}

@@ -61,7 +61,9 @@ class Run:
         labels = images.original() if job.arm.renders else images
         state = labels.store().stacked("state", self.settings.train_frames)
         counts = covered_cells(Grid(), images.rig)
-        return FrameSet(images.store(), images.rig, state, counts, retargeted=job.arm.renders)
+        return FrameSet(
+            images.store(), images.rig, state, counts, retargeted=job.arm.renders, masked=job.arm.masked
+        )
 
     def true_set(self, split: Split, change: str | None, num_frames: int) -> FrameSet:
         """Frames as a rig really sees them."""
@@ -86,7 +88,10 @@ class Run:
         The frames must be there.
         """
         count, images = self.settings.train_frames, self.images(job)
-        names = ("images", "coverage", "K", "cam2ego") if job.arm.renders else ("images", "state")
+        names: tuple[str, ...] = ("images", "state")
+        if job.arm.renders:
+            # Without a mask, coverage has no part in the training.
+            names = ("images", *(("coverage",) if job.arm.masked else ()), "K", "cam2ego")
         raw = self._content(self.source("train"), count)
         return content_hash(
             {

@@ -19,7 +19,6 @@ from arbiview_aug import Camera, Rig
 from arbiview_aug.datasets import LazyFrame, Neighbours
 from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.completion import inpainted
 from arbiview_aug.generator.generator import shipped_weights
 from integrations.cross_rig.arm import Arm
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, fill
@@ -78,7 +77,7 @@ class Source:
             arm = self.arm
             renderer = "transforms" if arm.kind == "retarget" else "evaluate.baselines"
             # What fills holes changes no pixel that a camera saw.
-            unused = () if arm.filled == "generator" else _FILLING
+            unused = () if arm.holes == "generator" else _FILLING
             spec |= {
                 "source": source_rig(self.size).content_key.hex(),
                 "arm": arm.views_spec(),
@@ -86,12 +85,8 @@ class Source:
                 # What an arm says of its views is in ``arm``; another arm's needs may change without it.
                 "views": code_hash("integrations.cross_rig.views", without=("integrations.cross_rig.arm",)),
             }
-            if arm.filled == "generator":
+            if arm.holes == "generator":
                 spec["weights"] = shipped_weights()
-            elif arm.filled is not None:
-                spec["filling"] = code_hash("arbiview_aug.generator.inpainting") + code_hash(
-                    "arbiview_aug.generator.completion"
-                )
             if "neighbours" in arm.reads:
                 spec["neighbours"] = vars(NEIGHBOURS)
         return FrameStore(self.root, spec)
@@ -101,9 +96,10 @@ class Source:
         return Source(root=self.root, size=self.size, split=self.split)
 
     def rendered(self) -> Source:
-        """The same views as they were rendered: without what is put into their holes, or over them."""
+        """The same views as ``RigRetarget`` renders them: without the generator's pixels, or the truth's."""
         assert self.arm is not None
-        return replace(self, arm=replace(self.arm, filled=None, truth=None))
+        holes = "black" if self.arm.holes == "generator" else self.arm.holes
+        return replace(self, arm=replace(self.arm, holes=holes, truth=None))
 
     def needs(self) -> list[Source]:
         """The sets that must be there before this one can be made."""
@@ -240,7 +236,7 @@ class _ChangedFrames:
         self.arm, self.width, self.rig = source.arm, source.size[1], source.original().rig
         self.store, self.truth = source.rendered().store(), source.true().store()
         self.original = source.original().store()
-        self.generator = Generator.shipped() if self.arm.filled == "generator" else None
+        self.generator = Generator.shipped() if self.arm.holes == "generator" else None
 
     def __call__(self, index: int) -> Arrays:
         start = time.process_time()
@@ -250,15 +246,14 @@ class _ChangedFrames:
             shown = covered if self.arm.truth == "covered" else ~covered
             arrays["images"] = np.where(shown[:, None], self.truth.read(index, "images"), arrays["images"])
             covered = covered | shown
-        if self.arm.filled:
-            arrays["images"] = self._filled(index, arrays, covered)
-            covered = np.ones_like(covered)
+        if self.generator is not None:
+            arrays["images"] = self._completed(self.generator, index, arrays, covered)
         arrays["coverage"] = np.packbits(covered, axis=-1)
         arrays["cpu_s"] = (arrays["cpu_s"] + time.process_time() - start).astype(np.float32)
         return arrays
 
-    def _filled(self, index: int, arrays: Arrays, covered: np.ndarray) -> np.ndarray:
-        """(M, 3, h, w) uint8 views with their holes filled."""
+    def _completed(self, generator: Generator, index: int, arrays: Arrays, covered: np.ndarray) -> np.ndarray:
+        """(M, 3, h, w) uint8 views with their holes completed by the generator."""
         h, w = covered.shape[-2:]
         poses = zip(arrays["K"], arrays["cam2ego"], strict=True)
         target = Rig(
@@ -269,9 +264,6 @@ class _ChangedFrames:
             ground_z_m=self.rig.ground_z_m,
         )
         views, seen = torch.from_numpy(arrays["images"].copy()), torch.from_numpy(covered)
-        if self.generator is None:
-            done = inpainted(views, seen, target)
-        else:
-            images = torch.from_numpy(self.original.read(index, "images").copy())
-            done = self.generator.complete_views(views, seen, target, images, self.rig, steps=1, frame=index)
+        images = torch.from_numpy(self.original.read(index, "images").copy())
+        done = generator.complete_views(views, seen, target, images, self.rig, steps=1, frame=index)
         return np.stack([view.numpy() for view in done.images])

@@ -2,7 +2,8 @@
 
 After SimpleBEV (Harley et al., ICRA 2023): each voxel averages the features that it projects to, without a depth
 distribution. Whatever no source saw takes no part: such pixels hold the mean colour on the way in, and features are
-averaged with the weight of what was covered, so that a black hole cannot become a cue.
+averaged with the weight of what was covered, so that a black hole cannot become a cue. With full coverage every pixel
+is lifted, as in stock detectors.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ def _of_change(arms: Results, rendering: Mapping[str, float]) -> dict[str, Any]:
     for name in (n for n in ARMS if n in arms):
         heights = np.array([arms[name][s]["by_height"] for s in seeds]).sum((0, 1))
         trained = [arms[name][s]["trained"] for s in seeds]
-        rows[name] = asdict(scores[name]) | {
+        rows[name] = {"title": ARMS[name].title} | asdict(scores[name]) | {
             "by_distance_iou": iou(cells[name].sum((0, 1))).tolist(),
             "by_height_recall": (heights[:, 0] / np.maximum(heights[:, 1], 1)).tolist(),
             "thresholds": [arms[name][s]["threshold"] for s in seeds],
@@ -70,12 +70,17 @@ def _of_change(arms: Results, rendering: Mapping[str, float]) -> dict[str, Any]:
 
 
 def markdown(report: Mapping[str, Any]) -> str:
-    """The tables, one for each change."""
+    """The tables, one for each change.
+
+    A report whose figures have no ``low`` and ``high`` is written without intervals.
+    """
     s = report["settings"]
+    rows = [row for change in report["changes"].values() for row in change["arms"].values()]
+    shown = ", [95 % interval] over seeds and frames" if all("low" in row["iou"] for row in rows) else ""
     lines = [
         f"{s['train_frames']} training and {s['test_frames']} test frames at {s['size'][0]}×{s['size'][1]}, "
         f"{s['schedule']['steps']} steps of {s['schedule']['batch']}, {report['tests_done']} of {report['tests']} "
-        "tests done. IoU of vehicle cells in %, [95 % interval] over seeds and frames; recovered: (arm − raw) / "
+        f"tests done. IoU of vehicle cells in %{shown}; recovered: (arm − raw) / "
         "(oracle − raw), where oracle − raw is at least 5 points; loading: CPU ms that the arm adds to a frame that "
         "is drawn.",
     ]
@@ -90,7 +95,7 @@ def markdown(report: Mapping[str, Any]) -> str:
         lines += ["| " + " | ".join(head) + " |", "| --- |" + " ---: |" * (len(head) - 1)]
         for arm, row in change["arms"].items():
             same = change["same_frames"].get(arm)
-            title = ARMS[arm].title + (f" (the frames of {ARMS[same].title})" if same else "")
+            title = row["title"] + (f" (the frames of {change['arms'][same]['title']})" if same else "")
             cells = [title, _text(row["iou"], 1), _text(row["over_raw"], 1, sign=True)]
             cells.append(_text(row["share"], 0))
             cells += [f"{100 * value:.1f}" for value in (*row["by_distance_iou"], *row["by_height_recall"])]
@@ -103,7 +108,10 @@ def _text(value: Mapping[str, float] | None, digits: int, *, sign: bool = False)
     if value is None:
         return "–"
     form = f"{'+' if sign else ''}.{digits}f"
-    return f"{100 * value['value']:{form}} [{100 * value['low']:{form}}, {100 * value['high']:{form}}]"
+    text = f"{100 * value['value']:{form}}"
+    if "low" not in value:
+        return text
+    return f"{text} [{100 * value['low']:{form}}, {100 * value['high']:{form}}]"
 
 
 def save_plot(report: Mapping[str, Any], path: Path) -> None:
@@ -115,7 +123,8 @@ def save_plot(report: Mapping[str, Any], path: Path) -> None:
     changes = {name: change["arms"] for name, change in report["changes"].items() if change["arms"]}
     if not changes:
         return
-    names = [name for name in ARMS if any(name in arms for arms in changes.values())]
+    titles = {name: row["title"] for arms in changes.values() for name, row in arms.items()}
+    names = list(titles)
     figure = Figure(figsize=(2 + 3 * len(changes), 1.4 + 0.32 * len(names)), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, len(changes), sharey=True, squeeze=False)[0]
@@ -126,11 +135,12 @@ def save_plot(report: Mapping[str, Any], path: Path) -> None:
         for k, name in enumerate(names):
             if name not in arms:
                 continue
-            middle, low, high = (100 * arms[name]["iou"][part] for part in ("value", "low", "high"))
+            score = arms[name]["iou"]
+            middle, low, high = (100 * score.get(part, score["value"]) for part in ("value", "low", "high"))
             panel.errorbar(middle, k, xerr=[[max(middle - low, 0)], [max(high - middle, 0)]], fmt="o", color="#1f77b4")
         panel.set_title(CHANGES[change].title, fontsize=10)
         panel.set_xlabel("IoU, %")
         panel.grid(True, axis="x", alpha=0.2)
-    panels[0].set_yticks(range(len(names)), [ARMS[name].title for name in names])
+    panels[0].set_yticks(range(len(names)), list(titles.values()))
     panels[0].invert_yaxis()
     figure.savefig(path)

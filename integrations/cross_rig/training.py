@@ -53,6 +53,7 @@ class FrameSet:
         state: (F, cells, cells) of ``labels``.
         counts: (cells, cells) bool, the cells that count.
         retargeted: Whether the store has coverage and calibration.
+        masked: Whether its coverage is used; otherwise every pixel counts as seen.
     """
 
     store: FrameStore
@@ -60,17 +61,18 @@ class FrameSet:
     state: npt.NDArray[np.uint8]
     counts: npt.NDArray[np.bool_]
     retargeted: bool = False
+    masked: bool = True
 
     def frame(self, index: int) -> _Frame:
         """One frame's arrays."""
         images = self.store.read(index, "images")
-        if not self.retargeted:
-            covered = np.ones((len(images), *images.shape[-2:]), bool)
-            K, cam2ego = self.rig.K.astype(np.float32), self.rig.cam2ego.astype(np.float32)
-        else:
-            packed = self.store.read(index, "coverage")
-            covered = np.unpackbits(packed, axis=-1, count=images.shape[-1]).astype(bool)
+        covered = np.ones((len(images), *images.shape[-2:]), bool)
+        K, cam2ego = self.rig.K.astype(np.float32), self.rig.cam2ego.astype(np.float32)
+        if self.retargeted:
             K, cam2ego = self.store.read(index, "K"), self.store.read(index, "cam2ego")
+            if self.masked:
+                packed = self.store.read(index, "coverage")
+                covered = np.unpackbits(packed, axis=-1, count=images.shape[-1]).astype(bool)
         return _Frame(images, covered, K, cam2ego, self.state[index], self.counts)
 
 

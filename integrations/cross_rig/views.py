@@ -39,7 +39,11 @@ class ViewMaker:
         # Motion is asked for distances alone, so that the arm shows what these do.
         reach: Reach | None = None if arm.surface == "motion" else "ground"
         self.retarget = RigRetarget(
-            self.random or target, source_rig=source, surface=arm.surface, neighbours=reach, holes="black"
+            self.random or target,
+            source_rig=source,
+            surface=arm.surface,
+            neighbours=reach,
+            holes="fill" if arm.holes == "fill" else "black",  # the generator completes black views
         )
 
     def __call__(self, index: int, frame: Mapping[str, Any]) -> Arrays:

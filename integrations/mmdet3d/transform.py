@@ -22,7 +22,8 @@ class RigRetargetMultiView:
         lidar2ego: (4, 4) the LiDAR's pose, where the dataset does not give it (DETR3D, PETR).
         ground_z_m: Height of the road in the source's ego frame: 0 in nuScenes and Waymo, -0.33 in Argoverse 2.
         img_norm: Means and standard deviations (three each) of BEVDet's normalisation.
-        settings: Any of ``RigRetarget``'s: ``size``, ``surface``, ``quality``, ``p``, ``harmonise``, ``outputs``.
+        settings: Any of ``RigRetarget``'s: ``size``, ``surface``, ``quality``, ``p``, ``harmonise``, ``holes``,
+            ``outputs``.
 
     Raises:
         CalibrationError: A target with lenses, or that cannot be loaded.

@@ -23,3 +23,14 @@ def test_tables_are_the_reports(path):
     readme = (FOLDER / "README.md").read_text()
     (block,) = re.findall(rf"<!-- {path.stem}: .*?-->\n(.*?)<!-- /{path.stem} -->", readme, re.DOTALL)
     assert block == markdown(report)
+
+
+def test_reports_without_intervals_are_written_as_points():
+    report = json.loads((FOLDER / "results" / "holes.json").read_text())
+    assert "[95 % interval]" in markdown(report)
+    for change in report["changes"].values():
+        for row in change["arms"].values():
+            for figure in filter(None, (row["iou"], row["over_raw"], row["share"])):
+                del figure["low"], figure["high"]
+    text = markdown(report)
+    assert "[" not in text and "interval" not in text

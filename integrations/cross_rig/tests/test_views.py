@@ -37,7 +37,8 @@ def test_every_arm_renders(frame, name):
     coverage = np.unpackbits(views["coverage"], axis=-1, count=SIZE[1]).astype(bool)
     assert views["images"].shape == (5, 3, *SIZE) and views["images"].dtype == np.uint8
     assert coverage.shape == (5, *SIZE) and coverage.mean() > 0.4
-    assert not views["images"].transpose(0, 2, 3, 1)[~coverage].any()
+    uncovered = views["images"].transpose(0, 2, 3, 1)[~coverage]
+    assert uncovered.all(-1).mean() > 0.5 if ARMS[name].holes == "fill" else not uncovered.any()
     if ARMS[name].random:
         assert not np.allclose(views["K"], target.K)
         again = ViewMaker(ARMS[name], source, target)(0, frame)
