@@ -28,8 +28,8 @@ class Arm:
             and after it, with boxes where it reads boxes.
         mixed: Half of the frames drawn are raw ones.
         augmented: Frames are scaled and cropped at random as they are drawn.
-        holes: Pixels that no camera saw: black, filled as ``RigRetarget`` does by default, or completed by the package's
-            generator.
+        holes: Pixels that no camera saw are black, filled as ``RigRetarget`` does by default, or completed by the
+            package's generator.
         masked: The network masks them by ``coverage``. Otherwise every pixel counts as seen, as in stock detectors.
         random: Targets are drawn around B, one for each frame.
         stays: B's cameras stay in the very centres of those of A that look most alike, or at their heights.

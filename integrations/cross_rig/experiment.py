@@ -61,9 +61,7 @@ class Run:
         labels = images.original() if job.arm.renders else images
         state = labels.store().stacked("state", self.settings.train_frames)
         counts = covered_cells(Grid(), images.rig)
-        return FrameSet(
-            images.store(), images.rig, state, counts, retargeted=job.arm.renders, masked=job.arm.masked
-        )
+        return FrameSet(images.store(), images.rig, state, counts, retargeted=job.arm.renders, masked=job.arm.masked)
 
     def true_set(self, split: Split, change: str | None, num_frames: int) -> FrameSet:
         """Frames as a rig really sees them."""

@@ -32,8 +32,13 @@ _FORMAT = 1
 NEIGHBOURS = Neighbours()
 """One frame before and one after, 1.2 m away."""
 
-_FILLING = ("arbiview_aug.generator", "arbiview_aug.generator.batches", "arbiview_aug.transforms.settings")
-"""What ``RigRetarget`` asks to fill holes."""
+_COMPLETING = ("arbiview_aug.generator", "arbiview_aug.generator.batches", "arbiview_aug.transforms.settings")
+_UNUSED: dict[str, tuple[str, ...]] = {
+    "black": (*_COMPLETING, "arbiview_aug.generator.fillers"),
+    "fill": _COMPLETING,
+    "generator": (),
+}
+"""By ``Arm.holes``, what ``RigRetarget`` asks to fill holes and does not need for these."""
 
 _MAX_FRAMES = 1 << 20
 """Length of the streets' datasets: a set of frames grows without becoming another."""
@@ -76,12 +81,10 @@ class Source:
         if self.arm is not None:
             arm = self.arm
             renderer = "transforms" if arm.kind == "retarget" else "evaluate.baselines"
-            # What fills holes changes no pixel that a camera saw.
-            unused = () if arm.holes == "generator" else _FILLING
             spec |= {
                 "source": source_rig(self.size).content_key.hex(),
                 "arm": arm.views_spec(),
-                "renderer": code_hash(f"arbiview_aug.{renderer}", without=unused),
+                "renderer": code_hash(f"arbiview_aug.{renderer}", without=_UNUSED[arm.holes]),
                 # What an arm says of its views is in ``arm``; another arm's needs may change without it.
                 "views": code_hash("integrations.cross_rig.views", without=("integrations.cross_rig.arm",)),
             }

@@ -57,7 +57,9 @@ def _of_change(arms: Results, rendering: Mapping[str, float]) -> dict[str, Any]:
     for name in (n for n in ARMS if n in arms):
         heights = np.array([arms[name][s]["by_height"] for s in seeds]).sum((0, 1))
         trained = [arms[name][s]["trained"] for s in seeds]
-        rows[name] = {"title": ARMS[name].title} | asdict(scores[name]) | {
+        rows[name] = {
+            "title": ARMS[name].title,
+            **asdict(scores[name]),
             "by_distance_iou": iou(cells[name].sum((0, 1))).tolist(),
             "by_height_recall": (heights[:, 0] / np.maximum(heights[:, 1], 1)).tolist(),
             "thresholds": [arms[name][s]["threshold"] for s in seeds],

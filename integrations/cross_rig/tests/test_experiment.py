@@ -92,7 +92,9 @@ def test_arms_with_the_same_frames_are_one_training(done):
 @pytest.mark.slow
 def test_true_pixels_replace_what_was_rendered(done):
     """The two arms of the diagnosis: the truth where something was seen, or where nothing was."""
-    more = replace(done, settings=replace(TINY, changes=("up70",), arms=("auto", "true_covered", "true_holes", "oracle")))
+    more = replace(
+        done, settings=replace(TINY, changes=("up70",), arms=("auto", "true_covered", "true_holes", "oracle"))
+    )
     assert list(run(more, 1, lambda line: None))[-1] == 0
     auto, covered, holes, oracle = (more.training_set(job).frame(1) for job in jobs(more.settings))
     seen = np.broadcast_to(auto.coverage[:, None], auto.images.shape)
