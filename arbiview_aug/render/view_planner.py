@@ -186,7 +186,7 @@ class ViewPlanner:
         h, w = self.camera.size
         fixed = FixedMap.outside((h, w))
         winner = np.full((h, w), -1, np.int8)
-        hidden = np.zeros((h, w), np.uint8)
+        in_image: npt.NDArray[np.uint8] | None = None
         certain = np.zeros((h, w), np.uint8) if self.config.certainty else None
         weights = self._seam_weights()
         shared = np.count_nonzero([weight > 0 for weight in weights], axis=0) > 1
@@ -210,7 +210,8 @@ class ViewPlanner:
                 own = np.full(wins.shape, region.source, np.int8)
                 cv2.copyTo(own, wins, winner[top:bottom, left:right])
                 if part.in_image is not None:
-                    hidden[top:bottom, left:right] |= part.in_image
+                    in_image = np.zeros((h, w), np.uint8) if in_image is None else in_image
+                    in_image[top:bottom, left:right] |= part.in_image
                 if certain is not None and part.certainty is not None:
                     cv2.copyTo(part.certainty, wins, certain[top:bottom, left:right])
             for part in seen:
@@ -223,9 +224,8 @@ class ViewPlanner:
             fixed = fixed.rounded()
         edge = self._edge(fixed, winner, layout) if interpolation == "cubic" else None
         reports = tuple(self._reports(winner, won_px))
-        occluded = (hidden > 0) & (winner < 0)
         return ViewPlan(
-            fixed, winner, tuple(bands), reports, interpolation, certain, edge, occluded if occluded.any() else None
+            fixed, winner, tuple(bands), reports, interpolation, certain, edge, _occluded(winner, in_image)
         )
 
     def _interpolation(self, won_px: Counter[int]) -> str:
@@ -353,6 +353,14 @@ class ViewPlanner:
                 share=won_px[region.source] / winner.size,
                 level=region.level,
             )
+
+
+def _occluded(winner: npt.NDArray[np.int8], in_image: npt.NDArray[np.uint8] | None) -> BoolArray | None:
+    """Pixels (h, w) without a winner that lie in some source's image; None where there are none."""
+    if in_image is None:
+        return None
+    occluded = (winner < 0) & (in_image > 0)
+    return occluded if occluded.any() else None
 
 
 def _within(box: Box, part: Box) -> tuple[slice, slice]:
