@@ -292,7 +292,8 @@ def test_half_precision_shows_what_float32_shows(quality: Any, dtype: torch.dtyp
     """The images are rounded, the geometry is not: within two roundings of the same values in float32."""
     rig = ring()
     images = [image.to(dtype) for image in pictures(rig)]
-    retarget = RigRetarget(rig.turned(yaw_deg=20), quality=quality, surface="auto" if quality == "paper" else "street")
+    surface: Any = "auto" if quality == "paper" else "street"
+    retarget = RigRetarget(rig.turned(yaw_deg=20), quality=quality, surface=surface, holes="black")
     half = retarget({"images": images, "rig": rig})["images"]
     single = retarget({"images": [image.float() for image in images], "rig": rig})["images"]
     assert half.dtype == dtype

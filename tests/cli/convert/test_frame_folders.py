@@ -58,6 +58,8 @@ def test_the_reader_finds_what_was_rendered(source: Path, output: Path) -> None:
             image = output / after["token"] / camera["file"]
             assert np.array_equal(coverage_of(image), out["coverage"][k].numpy())
             assert (image.parent / camera["confidence"]).is_file()
+            made_up = cv2.imread(str(image.parent / camera["generated"]), cv2.IMREAD_GRAYSCALE) > 0
+            assert np.array_equal(made_up, out["generated"][k].numpy())
 
 
 def test_points_are_the_same_file(source: Path, output: Path) -> None:
@@ -67,7 +69,8 @@ def test_points_are_the_same_file(source: Path, output: Path) -> None:
 def test_provenance_names_versions_settings_and_sources(source: Path, output: Path) -> None:
     said = json.loads((output / "conversion" / "provenance.json").read_text())
     assert said["versions"]["torch"] == torch.__version__.split("+")[0] or said["versions"]["torch"]
-    assert said["settings"]["quality"] == "fast" and said["settings"]["target"]["name"] == "waymo"
+    assert said["settings"]["quality"] == "fast" and said["settings"]["holes"] == "fill"
+    assert said["settings"]["target"]["name"] == "waymo"
     sums = said["sources"]["0002"]
     assert set(sums) == {"0002/calib.json", "0002/00.jpg", "0002/01.jpg", "0002/lidar.npy"}
     for name, digest in sums.items():
