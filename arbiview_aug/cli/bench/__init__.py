@@ -1,11 +1,6 @@
 """``python -m arbiview_aug bench [WHAT]``: measurements that anyone can repeat, on their own data too.
 
-``trade``, the default: speed against accuracy of all settings (``bench.trade``). ``speed``: milliseconds against bare
-``cv2.remap`` calls (``bench.speed``). ``ablation``: each stage and setting on and off, dB and milliseconds
-(``bench.ablation``). ``device``: batches by torch, on a GPU where there is one (``bench.device``). ``loader``: frames
-per second out of a ``DataLoader`` (``bench.loader``). ``scene``: what is not done where a scene does not require it
-(``bench.scene``). ``neighbours``: what other frames of the drive cost (``bench.neighbours``). ``generator``: what
-made-up pixels cost, and how true they are (``bench.generator``).
+Each benchmark is a module of this package; ``BENCHMARKS`` says what it measures.
 """
 
 from __future__ import annotations
@@ -20,7 +15,6 @@ BENCHMARKS = {
     "device": "batches by torch, on a GPU where there is one: milliseconds, share of copy bandwidth",
     "ablation": "each stage and setting on and off: dB and milliseconds",
     "loader": "frames per second of a DataLoader, memory per worker",
-    "scene": "only what a scene requires is done: counters and milliseconds",
     "neighbours": "what other frames of the drive cost, and what they fill",
     "generator": "holes left black, inpainted, generated: milliseconds and PSNR",
 }

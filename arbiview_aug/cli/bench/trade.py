@@ -1,9 +1,8 @@
 """``python -m arbiview_aug bench [trade]``: how much accuracy a millisecond buys, on the user's data or ours.
 
-Sweeps settings (``bench.sweep``), marks the Pareto front of time and accuracy, puts others beside them
-(``bench.others``), draws one plot, and recommends a setting for ``--budget-ms`` or ``--min-psnr``, measured again
-before it is named. Decibels do not tell what a detector learns: static surfaces are not recommended where cameras move
-(``required.static_harm``).
+Measures a sweep of settings (``bench.sweep``), marks the Pareto front of time and accuracy, draws one plot, and
+recommends a setting for ``--budget-ms`` or ``--min-psnr``, measured again before it is named. Decibels do not tell what
+a detector learns: static surfaces are not recommended where cameras move (``required.static_harm``).
 """
 
 from __future__ import annotations
@@ -31,20 +30,16 @@ from arbiview_aug.cli.bench.front import (
     pareto_front,
     within_budget,
 )
-from arbiview_aug.cli.bench.others import OURS, ROW_SPLIT, STITCHING, every_move, lost_moves, same_rotation
 from arbiview_aug.cli.bench.plot import save_plot
 from arbiview_aug.cli.bench.sweep import REFERENCE, REPEATS, Execution, Sweep, settings
 from arbiview_aug.cli.bench.timing import Quartiles, machine, machine_line, write_json
 from arbiview_aug.environment import one_thread, versions
-from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.favs.config import FavsConfig, Quality
 from arbiview_aug.render.requirements import HELPFUL_DATA, STATIC_SURFACES, static_harm
 from arbiview_aug.scene.surface import SurfaceName
 
 SIZE = (256, 704)
-MOVES = ("paper", "yaw", "vehicles", "truck")
-"""Sets of targets (``evaluate.targets.named_targets``) for ``--moves``."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -88,7 +83,6 @@ def _parser() -> argparse.ArgumentParser:
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument("--budget-ms", type=float, metavar="MS", help="recommend the most accurate within it")
     limit.add_argument("--min-psnr", type=float, metavar="DB", help="recommend the fastest that reaches it")
-    parser.add_argument("--moves", action="store_true", help="also UniDrive's and OpenCV's renderers at every move")
     parser.add_argument("--output", default="output", metavar="DIR", help="(default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the JSON instead of the tables")
     parser.set_defaults(executions=executions)
@@ -135,8 +129,6 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
         "settings": [{**one.as_dict(), "front": one.setting.name in front} for one in found],
         "steps": [point.name for point in distinct_steps(points)],
         "advice": None if advice is None else _advice(advice, points),
-        "same_rotation": _rotations(data, source, arguments),
-        "moves": every_move(data, arguments.frames, REFERENCE, MOVES) if arguments.moves else None,
         "machine": machine(load_before),
         "versions": versions(),
     }
@@ -149,21 +141,6 @@ def _advice(advice: Advice, points: Sequence[Point]) -> dict[str, Any]:
     measured = None if point is None else {"psnr_db": point.psnr_db, **point.time._asdict()}
     words = {"setting": point and point.name, "reason": advice.reason, "left_out": left_out}
     return {**words, "measured": measured, "again": again}
-
-
-def _rotations(data: Recorded, source: Rig, arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """kornia beside ours at full size, and at the views' size from half; none for other lenses or mixed sizes."""
-    found = []
-    for reduce, of_views in ((1, False), (2, True)):
-        sample = data.sample(0, reduce)  # type: ignore[arg-type]
-        if not isinstance(sample["images"], torch.Tensor):
-            return []
-        view = arguments.size if of_views else sample["rig"].sizes[0]
-        try:
-            found.append(same_rotation(sample["rig"], sample["images"], view, arguments.repeats))
-        except SampleError:
-            return []
-    return found
 
 
 # --- the tables -------------------------------------------------------------------------------------------------------
@@ -207,39 +184,8 @@ def table(report: Mapping[str, Any]) -> str:
     ]
     if len(rows) > len(shown):
         lines += ["", f"{len(rows) - len(shown)} more settings, none of them on the front, are in the JSON."]
-    if report["same_rotation"]:
-        lines += ["", " ".join(map(_rotation, report["same_rotation"]))]
-    if report["moves"]:
-        lines += ["", _moves(report["moves"])]
     if report["advice"]:
         lines += ["", advice_line(report["advice"])]
-    return "\n".join(lines)
-
-
-def _rotation(found: Mapping[str, Any]) -> str:
-    ms = {name: f"{time['median_ms']:.1f} ms" for name, time in found["times"].items()}
-    ours = ", ".join(f"{name} {ms[name]} ({ratio:.2f} of it)" for name, ratio in found["ratio"].items())
-    return (
-        f"Turned by {found['yaw_deg']:g} degrees at {found['size'][1]}x{found['size'][0]}: kornia's warp_perspective "
-        f"{ms['kornia warp_perspective']}; ours, {ours}; mean difference {found['mean_difference']:.2f} grey levels."
-    )
-
-
-def _moves(moves: Mapping[str, Mapping[str, Any]]) -> str:
-    names = list(next(iter(moves.values())))
-    cell = "{psnr_db:.2f} / {common_psnr_db:.2f} ({ours_common_psnr_db:.2f})"
-    rows = [[move, *(cell.format(**row[name]) for name in names)] for move, row in moves.items()]
-    lines = [
-        f"dB: all pixels / those that {OURS} covers as well (and {OURS} there)",
-        "",
-        markdown_table(["", *names], rows),
-        "",
-    ]
-    for other in (ROW_SPLIT, STITCHING):
-        for metric, what in (("psnr_db", "all pixels"), ("common_psnr_db", "common pixels")):
-            lost = lost_moves(moves, metric, other)
-            better = f"{OURS} against {other}, {what}: better at {len(moves) - len(lost)} of {len(moves)} moves"
-            lines.append(f"{better}; not at {'; '.join(lost)}" if lost else better)
     return "\n".join(lines)
 
 

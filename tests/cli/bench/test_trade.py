@@ -13,13 +13,10 @@ import numpy as np
 import pytest
 
 from arbiview_aug.__main__ import main
-from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.cli.bench.data import recorded
-from arbiview_aug.cli.bench.others import OURS, ROW_SPLIT, STITCHING, every_move, lost_moves, same_rotation
 from arbiview_aug.cli.bench.sweep import Setting, settings
-from arbiview_aug.cli.bench.trade import _moves, table
-from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.errors import SampleError
+from arbiview_aug.cli.bench.trade import table
+from arbiview_aug.datasets.synthetic import demo_source_rig
 
 SIZE = (64, 176)
 STEPS, ATTEMPTS, BUDGET_MS = 4, 3, 400
@@ -66,13 +63,12 @@ def test_the_sweep(report: dict[str, Any]) -> None:
     best = max((row for row in rows.values() if row["surface"] == "objects"), key=lambda row: row["psnr_db"])
     assert report["advice"]["setting"] == best["name"]
     assert report["advice"]["again"]["median_ms"] > 0
-    assert report["moves"] is None
     printed = table(report)
     assert all(f"| {name}" in printed for name, row in rows.items() if row["front"])
     assert f"Recommended, the most accurate within 1000 ms a frame: {best['name']}" in printed
     assert "Static surfaces (far, ground, street) are not recommended here: target cameras stand up to 0." in printed
     assert "than one trained on untouched images (integrations/cross_rig). Better: 'points', 'depth_m' or" in printed
-    assert "kornia's warp_perspective" in printed and "more settings, none of them on the front" in printed
+    assert "more settings, none of them on the front" in printed
 
 
 def test_what_nothing_keeps_to_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -117,45 +113,17 @@ def test_real_frames_are_scored_by_points_that_nobody_read(nuscenes_root: Path) 
     assert not read & {tuple(p) for p in score[0].points.round(6)}
 
 
-def test_kornia_renders_the_same_rotation() -> None:
-    rig = demo_source_rig(SIZE)
-    images = SyntheticDrive(rig, num_frames=1, lidar=False)[0]["images"]
-    found = same_rotation(rig, images, SIZE, 1)
-    assert found["mean_difference"] < 0.6, "half a grey level is rounding"
-    assert all(time["median_ms"] > 0 for time in found["times"].values())
-    with pytest.raises(SampleError, match="expected pinhole cameras"):
-        same_rotation(load_rig("waymo"), images, SIZE, 1)
-
-
-@pytest.fixture(scope="module")
-def moves() -> dict[str, dict[str, Any]]:
-    with recorded(None, size=SIZE) as data:
-        return every_move(data, 1, 1, ("truck", "yaw"))
-
-
-@pytest.mark.slow
-def test_rivals_at_every_move(moves: dict[str, dict[str, Any]]) -> None:
-    assert list(moves) == ["frame 0: truck", *(f"frame 0: yaw {yaw:+g}" for yaw in (11, -11, 22, -22, 35))]
-    assert lost_moves(moves, "common_psnr_db", ROW_SPLIT) == []
-    assert lost_moves(moves, "common_psnr_db", STITCHING) == []
-    first = {name: {"psnr_db": 20.0 + k} for k, name in enumerate((OURS, ROW_SPLIT))}
-    printed = _moves(moves)
-    assert f"{OURS} against {ROW_SPLIT}, common pixels: better at 6 of 6 moves\n" in printed
-    assert f"{OURS} against {STITCHING}, common pixels: better at 6 of 6 moves" in printed
-    assert lost_moves({"turned": first}, "psnr_db") == ["turned 20.00 against 21.00 dB"]
-
-
 @pytest.mark.release
 def test_the_trade_on_a_real_frame(nuscenes_root: Path, tmp_path: Path, report_bound: Callable[..., None]) -> None:
-    """Steps to choose from, a budget that LiDAR keeps, kornia slower, decoding dearer, row split worse at each move."""
+    """Steps to choose from, a budget that LiDAR keeps, decoding dearer than rendering."""
     only = ["--reduce", "2", "--execution", "opencv", "--budget-ms", f"{BUDGET_MS}", "--output", str(tmp_path)]
     command = ["bench", "--data", str(nuscenes_root), *only]
-    assert main([*command, "--moves"]) == 0
+    assert main(command) == 0
     report = json.loads((tmp_path / "trade.json").read_text())
     for _ in range(ATTEMPTS - 1):  # noise hides steps, it never makes any
         if len(report["steps"]) < STEPS:
             assert main(command) == 0
-            report = {**json.loads((tmp_path / "trade.json").read_text()), "moves": report["moves"]}
+            report = json.loads((tmp_path / "trade.json").read_text())
     rows = {row["name"]: row for row in report["settings"]}
     print(table(report))
     assert len(rows) >= 8
@@ -165,8 +133,4 @@ def test_the_trade_on_a_real_frame(nuscenes_root: Path, tmp_path: Path, report_b
         assert two["psnr_db"] >= one["psnr_db"] + 0.2 and two["q1_ms"] > one["q3_ms"]
     report_bound("ms, the recommended setting", report["advice"]["again"]["median_ms"], at_most=BUDGET_MS)
     report_bound("rendering over decoding, fast", rows["fast, street, 1/2, opencv"]["decode_ratio"], at_most=1)
-    rotations = max(ratio for rotation in report["same_rotation"] for ratio in rotation["ratio"].values())
-    report_bound("ours over kornia, the same rotation", rotations, at_most=1)
     assert "lidar" in report["advice"]["setting"]
-    for metric in ("psnr_db", "common_psnr_db"):
-        assert len(report["moves"]) == 16 and lost_moves(report["moves"], metric) == []

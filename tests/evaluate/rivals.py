@@ -1,4 +1,4 @@
-"""Others on the same work, in the same run: kornia's warp, UniDrive's row split, OpenCV's stitching."""
+"""Other methods on the same work: kornia's warp, UniDrive's row split, OpenCV's stitching."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ from arbiview_aug.evaluate.frames import scores
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.metrics import mean_of
-from arbiview_aug.evaluate.opencv_stitching import opencv_stitching
+from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.evaluate.targets import named_targets, without_masks
 from arbiview_aug.favs.stage1_geometry import h_geom
 from arbiview_aug.render.atlas import Scratch
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import RenderPlan, build_plan
+from tests.evaluate.opencv_stitching import opencv_stitching
 
 YAW_DEG = 22.0
 OURS, ROW_SPLIT, STITCHING = "fast, street", "row split (UniDrive)", "OpenCV stitching"
@@ -160,3 +161,30 @@ def lost_moves(found: Mapping[str, Mapping[str, Any]], metric: str, other: str =
         if ours <= row[other][metric]:
             lost.append(f"{move} {ours:.2f} against {row[other][metric]:.2f} dB")
     return lost
+
+
+def rotation_line(found: Mapping[str, Any]) -> str:
+    ms = {name: f"{time['median_ms']:.1f} ms" for name, time in found["times"].items()}
+    ours = ", ".join(f"{name} {ms[name]} ({ratio:.2f} of it)" for name, ratio in found["ratio"].items())
+    return (
+        f"Turned by {found['yaw_deg']:g} degrees at {found['size'][1]}x{found['size'][0]}: kornia's warp_perspective "
+        f"{ms['kornia warp_perspective']}; ours, {ours}; mean difference {found['mean_difference']:.2f} grey levels."
+    )
+
+
+def moves_table(moves: Mapping[str, Mapping[str, Any]]) -> str:
+    names = list(next(iter(moves.values())))
+    cell = "{psnr_db:.2f} / {common_psnr_db:.2f} ({ours_common_psnr_db:.2f})"
+    rows = [[move, *(cell.format(**row[name]) for name in names)] for move, row in moves.items()]
+    lines = [
+        f"dB: all pixels / those that {OURS} covers as well (and {OURS} there)",
+        "",
+        markdown_table(["", *names], rows),
+        "",
+    ]
+    for other in (ROW_SPLIT, STITCHING):
+        for metric, what in (("psnr_db", "all pixels"), ("common_psnr_db", "common pixels")):
+            lost = lost_moves(moves, metric, other)
+            better = f"{OURS} against {other}, {what}: better at {len(moves) - len(lost)} of {len(moves)} moves"
+            lines.append(f"{better}; not at {'; '.join(lost)}" if lost else better)
+    return "\n".join(lines)
