@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from arbiview_aug.cameras.framing import Fit, framing
-from arbiview_aug.cameras.lens import BoolArray, FloatArray, Lens, distort, fold_limit, intrinsics_for_fov, undistort
+from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, Lens, LensName, intrinsics_for_fov
 from arbiview_aug.cameras.rotations import CAMERA_AXES_IN_EGO, rotation_x, rotation_z
 from arbiview_aug.cameras.validation import (
     MAX_SIZE_PX,
@@ -88,7 +88,7 @@ class Camera:
     height_px: int
     K: FloatArray
     cam2ego: FloatArray
-    lens: Lens = "pinhole"
+    lens: LensName = "pinhole"
     distortion: tuple[float, ...] = ()
     mask: BoolArray | None = None
 
@@ -118,7 +118,7 @@ class Camera:
         height_px: int,
         horizontal_fov_deg: float | None = None,
         K: Any = None,
-        lens: Lens = "pinhole",
+        lens: LensName = "pinhole",
         distortion: tuple[float, ...] = (),
         mask: Any = None,
     ) -> Camera:
@@ -168,7 +168,7 @@ class Camera:
         if horizontal_fov_deg is None:
             return camera
         size = camera.width_px, camera.height_px
-        return replace(camera, K=intrinsics_for_fov(name, horizontal_fov_deg, *size, camera.lens, camera.distortion))
+        return replace(camera, K=intrinsics_for_fov(name, horizontal_fov_deg, *size, camera.lens_model))
 
     # --- derived ----------------------------------------------------------------------------------------------------
     @property
@@ -210,12 +210,14 @@ class Camera:
         return digest.digest()
 
     @cached_property
-    def fold_limit(self) -> float:
-        """Where the lens's radial function stops rising: past it, points fold back into the image.
+    def lens_model(self) -> Lens:
+        """The lens with this camera's coefficients."""
+        return LENSES[self.lens](self.distortion)
 
-        tan(angle off axis) for pinhole and radtan, the angle in radians for fisheye.
-        """
-        return fold_limit(self.lens, self.distortion)
+    @property
+    def is_rectilinear(self) -> bool:
+        """Whether the lens keeps straight lines straight: a pinhole."""
+        return self.lens_model.is_rectilinear
 
     @cached_property
     def half_angle_rad(self) -> float:
@@ -228,8 +230,7 @@ class Camera:
     @property
     def cone_rad(self) -> float:
         """Angle off the optical axis beyond which no point falls into the image."""
-        fold = self.fold_limit if self.lens == "fisheye" else math.atan(self.fold_limit)
-        return min(self.half_angle_rad, fold)
+        return min(self.half_angle_rad, self.lens_model.fold_rad)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Camera):
@@ -242,7 +243,7 @@ class Camera:
     def __repr__(self) -> str:
         h_fov, v_fov = self.fov_deg
         x, y, z = self.center_m
-        lens = "" if self.lens == "pinhole" else f" {self.lens}"
+        lens = "" if self.is_rectilinear else f" {self.lens}"
         mask = "" if self.mask is None else f" mask {1 - self.mask.mean():.0%} own car"
         return (
             f"Camera({self.name} {self.width_px}x{self.height_px}{lens} fov {h_fov:.1f}x{v_fov:.1f} deg "
@@ -259,7 +260,7 @@ class Camera:
     def project_cam(self, points_cam: FloatArray) -> Projection:
         """Pixels of camera-frame points (..., 3); directions without a distance do as well."""
         x, y, z = points_cam[..., 0], points_cam[..., 1], points_cam[..., 2]
-        xd, yd, valid = distort(self.lens, self.distortion, self.fold_limit, x, y, z)
+        xd, yd, valid = self.lens_model.distort(x, y, z)
         u = self.K[0, 0] * xd + self.K[0, 1] * yd + self.K[0, 2]
         v = self.K[1, 1] * yd + self.K[1, 2]
         return Projection(np.stack([u, v], -1), z, valid)
@@ -277,8 +278,8 @@ class Camera:
         """As ``unproject``, in the camera frame."""
         yd = (uv[..., 1] - self.K[1, 2]) / self.K[1, 1]
         xd = (uv[..., 0] - self.K[0, 2] - self.K[0, 1] * yd) / self.K[0, 0]
-        directions = undistort(self.lens, self.distortion, self.fold_limit, xd, yd)
-        if self.lens == "pinhole":
+        directions = self.lens_model.undistort(xd, yd)
+        if self.is_rectilinear:
             x, y, z = np.moveaxis(directions, -1, 0)  # a reduction over so short an axis takes ten times as long
             return Rays(directions, np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
         again = self.project_cam(directions)
@@ -363,7 +364,7 @@ class Camera:
 
     def undistorted(self) -> Camera:
         """The pinhole camera with the same K, size and pose; the mask is re-sampled to it."""
-        if self.lens == "pinhole":
+        if self.is_rectilinear:
             return self
         pinhole = replace(self, lens="pinhole", distortion=(), mask=None)
         if self.mask is None:

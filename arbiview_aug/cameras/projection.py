@@ -80,7 +80,7 @@ def beyond_image(source: Camera, points: FloatArray, uv: FloatArray, valid: Bool
     in computer graphics): a cell with one bit in common holds no pixel of the image.
     """
     h, w = source.size
-    if source.lens == "pinhole":
+    if source.is_rectilinear:
         K, z = source.K, points[..., 2]
         x = K[0, 0] * points[..., 0] + K[0, 1] * points[..., 1] + K[0, 2] * z
         y = K[1, 1] * points[..., 1] + K[1, 2] * z

@@ -191,7 +191,7 @@ class Rig:
                     "width": c.width_px,
                     "height": c.height_px,
                     "K": c.K.tolist(),
-                    "distortion": None if c.lens == "pinhole" else {"model": c.lens, "coeffs": list(c.distortion)},
+                    "distortion": None if c.is_rectilinear else {"model": c.lens, "coeffs": list(c.distortion)},
                     "cam2ego": c.cam2ego.tolist(),
                 }
                 for c in self.cameras

@@ -6,11 +6,11 @@ All functions take the camera's name first and raise ``CalibrationError``; what 
 from __future__ import annotations
 
 import math
-from typing import Any, cast, get_args
+from typing import Any, cast
 
 import numpy as np
 
-from arbiview_aug.cameras.lens import COEFFICIENT_COUNTS, BoolArray, FloatArray, Lens
+from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, LensName, canonical_name
 from arbiview_aug.cameras.rotations import nearest_rotation
 from arbiview_aug.errors import CalibrationError
 
@@ -18,9 +18,6 @@ ROTATION_TOLERANCE = 1e-4
 """Largest entry of |R Rᵀ - I| that is still a rotation: published calibrations carry 5 to 7 digits."""
 
 _MAX_COEFFICIENT = 1e6  # real lenses stay below 1e3, and near 1e300 their polynomials overflow
-
-LENS_ALIASES = {"opencv_radtan": "radtan", "opencv_fisheye": "fisheye"}
-"""Names of lenses that are read, and what they are called here."""
 
 MAX_SIZE_PX = 32766
 """Largest image side: OpenCV's remap needs sizes below 32767."""
@@ -124,24 +121,25 @@ def checked_pose(name: str, value: Any) -> FloatArray:
     return cam2ego
 
 
-def checked_lens(name: str, value: Any) -> Lens:
-    """The name of a lens model; one of ``LENS_ALIASES`` by its own name."""
-    value = LENS_ALIASES.get(value, value) if isinstance(value, str) else value
-    if not isinstance(value, str) or value not in get_args(Lens):
-        raise _error(name, "lens", f"one of {', '.join(get_args(Lens))}", repr(value))
-    return cast(Lens, value)
+def checked_lens(name: str, value: Any) -> LensName:
+    """The name of a lens model; aliases become the lens's own name."""
+    value = canonical_name(value) if isinstance(value, str) else value
+    if not isinstance(value, str) or value not in LENSES:
+        raise _error(name, "lens", f"one of {', '.join(LENSES)}", repr(value))
+    return cast(LensName, value)
 
 
-def checked_distortion(name: str, lens: Lens, value: Any) -> tuple[float, ...]:
+def checked_distortion(name: str, lens: str, value: Any) -> tuple[float, ...]:
     """As many coefficients as the lens takes, at most 1e6."""
     try:
         coefficients = tuple(float(k) + 0.0 for k in value)
     except (TypeError, ValueError, OverflowError):
         raise _error(name, "distortion", "a sequence of numbers", repr(value)) from None
-    counts = COEFFICIENT_COUNTS[lens]
+    counts = LENSES[lens].coefficient_counts
     if len(coefficients) not in counts:
         expected = " or ".join(map(str, counts)) + f" coefficients for a {lens} lens"
-        fix = "name the lens: lens='radtan' or lens='fisheye'" if lens == "pinhole" else ""
+        others = " or ".join(f"lens={other!r}" for other in LENSES if LENSES[other].coefficient_counts != (0,))
+        fix = f"name the lens: {others}" if counts == (0,) else ""
         raise _error(name, "distortion", expected, str(len(coefficients)), fix)
     if not all(abs(k) <= _MAX_COEFFICIENT for k in coefficients):  # also catches NaN
         raise _error(name, "distortion", f"finite numbers up to {_MAX_COEFFICIENT:g}", repr(coefficients))

@@ -93,7 +93,7 @@ def row_split(source: Rig, images: Sequence[Image], target: Rig) -> list[Rendere
     Raises:
         SampleError: Lenses other than pinhole.
     """
-    if any(camera.lens != "pinhole" for camera in (*source, *target)):
+    if any(not camera.is_rectilinear for camera in (*source, *target)):
         raise SampleError("row_split: expected pinhole cameras; use Rig.undistorted()")
     views: list[RenderedView] = []
     for camera in target:

@@ -110,7 +110,7 @@ def visible_points(camera: Camera, points: FloatArray, *, cell_px: int = 8, tole
     """
     h, w = camera.size
     uv, depth, valid = camera.project(points[:, :3])
-    if camera.lens == "fisheye":  # z is no depth for a lens that sees sideways
+    if camera.lens_model.sees_behind:  # z is no depth for a lens that sees sideways
         depth = np.linalg.norm(points[:, :3] - camera.center_m, axis=1)
     inside = (uv >= 0).all(1) & (uv[:, 0] < w - 1) & (uv[:, 1] < h - 1)
     index = np.flatnonzero(valid & (depth > NEAREST_M) & inside)

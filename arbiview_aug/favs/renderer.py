@@ -153,7 +153,7 @@ def check_pinhole(*rigs: Rig) -> None:
     """Refuse lenses: a homography maps straight lines to straight lines."""
     for rig in rigs:
         for camera in rig:
-            if camera.lens != "pinhole":
+            if not camera.is_rectilinear:
                 raise CalibrationError(
                     f"camera {camera.name!r}: quality='paper' renders by homographies and needs a pinhole lens, got "
                     f"{camera.lens}; use .undistorted()"

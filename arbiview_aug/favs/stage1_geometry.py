@@ -82,7 +82,7 @@ def _relative_rotation(source: Camera, target: Camera) -> FloatArray:
 
 def _require_pinhole(*cameras: Camera) -> None:
     for camera in cameras:
-        if camera.lens != "pinhole":
+        if not camera.is_rectilinear:
             raise CalibrationError(
                 f"camera {camera.name!r}: a homography needs a pinhole lens, got {camera.lens}; use .undistorted()"
             )

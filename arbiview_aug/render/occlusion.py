@@ -44,7 +44,7 @@ class VisibleFragments(NamedTuple):
         offset_m = rays.camera.center_m - source.center_m
         solid, before_m = surface.facing(source.center_m, face)
         turned = before_m > 0
-        if source.lens == "pinhole":
+        if source.is_rectilinear:
             # Most solids lie beside most sources: two half-spaces are cheaper than a projection.
             K, to_source = source.K, source.cam2ego[:3, :3].T
             sides = np.stack([K[0], (source.width_px - 1) * K[2] - K[0]]) @ to_source

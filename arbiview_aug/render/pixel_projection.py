@@ -28,7 +28,7 @@ Planes = tuple[Layer, Layer, Layer]
 def pixel_rays(camera: Camera) -> Planes:
     """Rays of all pixels: a pinhole's have z = 1, those of lenses unit length; 0 where there is none."""
     h, w = camera.size
-    if camera.lens != "pinhole":
+    if not camera.is_rectilinear:
         planes = _interpolated_rays(camera)
         if planes is None:
             rays, valid = camera.unproject_cam(camera.pixel_grid())
@@ -111,7 +111,7 @@ def project_pixels(
     from_source += np.multiply(z, z, out=work)
     np.maximum(np.sqrt(from_source, out=from_source), np.float32(1e-30), out=from_source)
     np.divide(q, from_source, out=from_source)
-    if source.lens == "pinhole":
+    if source.is_rectilinear:
         invalid = z <= 1e-6
         K, shrink, first = source.K.astype(np.float32), 2.0**-slot.level, slot.from_source(source.K[:2, 2])
         np.copyto(z, np.float32(1), where=invalid)

@@ -118,7 +118,7 @@ def covers_target_exactly(source: Camera, target: Camera, config: FavsConfig) ->
         target: A camera to render, in the same ego frame.
         config: Settings: how sources are weighed, halved and interpolated.
     """
-    if source.lens != "pinhole" or target.lens != "pinhole":
+    if not source.is_rectilinear or not target.is_rectilinear:
         return False
     if float(np.linalg.norm(source.center_m - target.center_m)) >= SAME_CENTER_M:
         return False

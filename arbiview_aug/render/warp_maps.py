@@ -162,7 +162,7 @@ class WarpMap:
         all_valid = corners[0] & corners[1] & corners[2] & corners[3]
         touched = (corners[0] | corners[1] | corners[2] | corners[3]).astype(np.uint8)
         near = cv2.dilate(touched, np.ones((3, 3), np.uint8)) > 0
-        if self.source.lens != "pinhole":
+        if not self.source.is_rectilinear:
             near |= self._cells_near_lens(points)
         return use & all_valid, use & ~all_valid & near
 

@@ -86,11 +86,11 @@ def outline(camera: Camera, box: FloatArray) -> Outline | None:
     corners = (_CORNERS * box[3:6]) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + box[:3]
     x = (corners - camera.center_m) @ camera.cam2ego[:3, :3]
     one, two = x[_EDGES[:, 0]], x[_EDGES[:, 1]]
-    if camera.lens != "fisheye":  # which sees what is beside it, and behind
+    if not camera.lens_model.sees_behind:  # which sees what is beside it, and behind
         ahead = np.maximum(one[:, 2], two[:, 2]) >= _NEAR_M
         one, two = one[ahead], two[ahead]
         one, two = _cut(one, two), _cut(two, one)
-    steps = np.linspace(0, 1, 2 if camera.lens == "pinhole" else _LENS_STEPS)[:, None, None]
+    steps = np.linspace(0, 1, 2 if camera.is_rectilinear else _LENS_STEPS)[:, None, None]
     points = (1 - steps) * one + steps * two
     pixels, _, valid = camera.project_cam(points)  # [steps, edges, 2]
     if not valid.any():
@@ -108,7 +108,8 @@ def outline(camera: Camera, box: FloatArray) -> Outline | None:
     if not len(within) or not (within.max(axis=0) > within.min(axis=0)).all():
         return None
     around = [pixels[valid], within]
-    if camera.lens == "radtan":  # past where its polynomial folds back the box goes on, as a pinhole would see it
+    if not (camera.is_rectilinear or camera.lens_model.sees_behind):
+        # Past the fold of its polynomial the box goes on as a pinhole would see it.
         beyond = points[~valid & (points[..., 2] > 0)] @ camera.K.T
         around.append(beyond[:, :2] / beyond[:, 2:])
     whole = np.concatenate(around)

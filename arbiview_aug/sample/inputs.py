@@ -11,9 +11,8 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.key_names import hint
-from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, canonical_name
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cameras.validation import LENS_ALIASES
 from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.sample.batching import leading_shape, split
 from arbiview_aug.sample.images import check_container, checked_images
@@ -293,9 +292,9 @@ def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> li
     coefficients = None if distortion is None else _numbers("distortion", distortion, index)
     if names is None:
         if coefficients is not None and coefficients.any():
+            known = ", ".join(LENSES)
             raise SampleError(
-                "distortion: expected 'lens' beside it, one of pinhole, radtan, fisheye a camera"
-                + hint(sample, ("lens",))
+                f"distortion: expected 'lens' beside it, one of {known} a camera{hint(sample, ('lens',))}"
             )
         return [("pinhole", ())] * count
     if not isinstance(names, list | tuple) or len(names) != count:
@@ -303,15 +302,15 @@ def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> li
     lenses = [_entry(name, index) for name in names]
     if not all(isinstance(lens, str) for lens in lenses):
         raise SampleTypeError(f"lens: expected names, one a camera, got {lenses!r}")
-    lenses = [LENS_ALIASES.get(lens, lens) for lens in lenses]
-    if all(lens == "pinhole" for lens in lenses):
-        return [("pinhole", ())] * count
+    lenses = [canonical_name(lens) for lens in lenses]
+    if all(lens in LENSES and LENSES[lens].coefficient_counts == (0,) for lens in lenses):
+        return [(lens, ()) for lens in lenses]
     if coefficients is None or coefficients.ndim != 2 or len(coefficients) != count:
         got = f"none{hint(sample, ('distortion',))}" if coefficients is None else f"shape {coefficients.shape}"
         raise SampleError(f"distortion: expected shape ({count}, up to 8) for the lenses {lenses}, got {got}")
     result = []
     for lens, row in zip(lenses, coefficients.tolist(), strict=True):
-        needed = {"pinhole": 0, "fisheye": 4}.get(lens, len(row))
+        needed = LENSES[lens].coefficient_counts[-1] if lens in LENSES else len(row)
         result.append((lens, tuple(row) if any(row[needed:]) else tuple(row[:needed])))
     return result
 

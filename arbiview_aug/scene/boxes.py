@@ -104,7 +104,7 @@ class BoxSurface(LayeredSurface):
 
     def _drawn(self, camera: Camera, boxes: FloatArray) -> Fragments:
         """Rasterised, or for a lens by casting the rays near the boxes."""
-        if camera.lens == "pinhole":
+        if camera.is_rectilinear:
             return draw_boxes(camera, boxes)
         scene = BoxSurface(self.street, boxes)
         grid = Grid(camera.size, _LENS_STEP_PX)
@@ -173,7 +173,7 @@ class BoxSurface(LayeredSurface):
 
 def silhouettes(camera: Camera, boxes: FloatArray) -> list[npt.NDArray[np.int64]]:
     """For each box (B, 7) the pixels whose rays meet it, into the flattened image (h, w), whatever stands before it."""
-    if camera.lens == "pinhole":
+    if camera.is_rectilinear:
         return pinhole_silhouettes(camera, boxes)
     return [BoxSurface(Far(), box[None]).drawn(camera).pixel for box in boxes]
 

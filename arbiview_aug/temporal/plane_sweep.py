@@ -171,7 +171,7 @@ class _Positions:
         self.road, self.level = (torch.from_numpy(a).to(device) for a in (family.road, family.level))
 
     def __call__(self, wall: float) -> torch.Tensor:
-        if self.source.lens != "pinhole":
+        if not self.source.is_rectilinear:
             rays = pixel_rays(self.family.camera)
             length = np.sqrt(rays[0] ** 2 + rays[1] ** 2 + rays[2] ** 2)
             q = self.family.inverse_distance(np.float32(wall)) * length

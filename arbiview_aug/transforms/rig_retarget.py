@@ -254,7 +254,7 @@ class RigRetarget(torch.nn.Module):
         base = self.target.base if isinstance(self.target, RandomRig) else self.target
         base = base if self.size is None else base.resized(self.size, fit)
         # Which keys there are depends on the settings alone.
-        self._lenses = p < 1 or any(camera.lens != "pinhole" for camera in base)
+        self._lenses = p < 1 or any(not camera.is_rectilinear for camera in base)
         self._masks = p < 1 or any(camera.mask is not None for camera in base)
         self._limited_process: int | None = None
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.lens import Lens
+from arbiview_aug.cameras.lens import LensName
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.synthetic import SyntheticDrive
@@ -23,7 +23,7 @@ PLACES = ((0.0, (2.0, 0.0, 1.0)), (90.0, (1.0, 0.9, 1.0)), (180.0, (-1.0, 0.0, 1
 COEFFICIENTS = (-0.06, -0.002, -0.0004, 0.0)
 
 
-def surround(size: tuple[int, int], fov_deg: float, lens: Lens, distortion: tuple[float, ...], pitch: float) -> Rig:
+def surround(size: tuple[int, int], fov_deg: float, lens: LensName, distortion: tuple[float, ...], pitch: float) -> Rig:
     return Rig(
         [
             Camera.looking(

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from typing import get_args
+
 import cv2
 import numpy as np
 import pytest
+import torch
 
+from arbiview_aug import Rig, RigRetarget
+from arbiview_aug.cameras import lens as lens_module
 from arbiview_aug.cameras.camera import UNPROJECT_TOLERANCE_PX, Camera
-from arbiview_aug.cameras.lens import _radtan, _radtan_jacobian, fold_limit
+from arbiview_aug.cameras.lens import BoolArray, FloatArray, Lens, LensName, RadTan
 from arbiview_aug.errors import CalibrationError
 
 K = np.array([[410.0, 0.0, 318.0], [0.0, 405.0, 242.0], [0.0, 0.0, 1.0]])
@@ -107,7 +113,7 @@ def test_beside_the_camera_only_a_fisheye_sees() -> None:
     ],
 )
 def test_fold_limit(lens: str, distortion: tuple[float, ...], limit: float) -> None:
-    assert fold_limit(lens, distortion) == pytest.approx(limit)
+    assert lens_module.LENSES[lens](distortion).fold_limit == pytest.approx(limit)
 
 
 @pytest.mark.parametrize(("lens", "distortion"), [("radtan", (-0.3, 0.0, 0.0, 0.0)), ("fisheye", (-0.2, 0, 0, 0))])
@@ -116,7 +122,7 @@ def test_folded_branch_is_invalid(lens: str, distortion: tuple[float, ...]) -> N
     angle = np.radians([30.0, 70.0 if lens == "fisheye" else 45.0, 85.0])
     rays = camera.center_m + np.stack([np.cos(angle), -np.sin(angle), 0 * angle], -1)
     got = camera.project(rays)
-    limit = camera.fold_limit if lens == "fisheye" else np.arctan(camera.fold_limit)
+    limit = camera.lens_model.fold_rad
     assert got.valid.tolist() == (angle < limit).tolist()
     assert got.valid[0] and not got.valid[2]
     # Without the limit the last ray would fall inside the image, as a ghost.
@@ -129,7 +135,7 @@ def test_folded_branch_is_invalid(lens: str, distortion: tuple[float, ...]) -> N
 def test_a_ghost_would_appear_without_the_fold_limit() -> None:
     distortion = (-0.3, 0.0, 0.0, 0.0)
     a = np.array([1.75])  # 60 degrees off axis, past the fold at 46.5
-    x, _ = _radtan(distortion, a, 0 * a)
+    x, _ = RadTan(distortion)._polynomial(a, 0 * a)
     assert 0 < 410 * x[0] + 318 < 640
     camera = make("pinhole", azimuth_deg=0.0, elevation_deg=0.0, roll_deg=0.0, lens="radtan", distortion=distortion)
     assert not camera.project(camera.center_m + np.array([1.0, -1.75, 0.0])).valid
@@ -137,11 +143,11 @@ def test_a_ghost_would_appear_without_the_fold_limit() -> None:
 
 def test_radtan_jacobian_agrees_with_differences() -> None:
     rng = np.random.default_rng(1)
-    distortion = LENSES["radtan8"][1]
+    lens = RadTan(LENSES["radtan8"][1])
     a, b, h = rng.uniform(-0.6, 0.6, 50), rng.uniform(-0.6, 0.6, 50), 1e-6
-    aa, ab, bb = _radtan_jacobian(distortion, a, b)
-    right, left = _radtan(distortion, a + h, b), _radtan(distortion, a - h, b)
-    up, down = _radtan(distortion, a, b + h), _radtan(distortion, a, b - h)
+    aa, ab, bb = lens._jacobian(a, b)
+    right, left = lens._polynomial(a + h, b), lens._polynomial(a - h, b)
+    up, down = lens._polynomial(a, b + h), lens._polynomial(a, b - h)
     np.testing.assert_allclose(aa, (right[0] - left[0]) / 2 / h, atol=1e-8)
     np.testing.assert_allclose(ab, (right[1] - left[1]) / 2 / h, atol=1e-8)
     np.testing.assert_allclose(ab, (up[0] - down[0]) / 2 / h, atol=1e-8)
@@ -162,3 +168,52 @@ def test_absurd_coefficients_stay_finite(lens: str, coefficient: float) -> None:
 def test_impossible_coefficients_are_refused(lens: str, coefficient: float) -> None:
     with pytest.raises(CalibrationError, match=r"distortion: expected finite numbers up to 1e\+06"):
         make("pinhole", lens=lens, distortion=(coefficient, 0.0, 0.0, 0.0))
+
+
+def test_names_of_the_type_are_those_of_the_table() -> None:
+    assert get_args(LensName) == tuple(lens_module.LENSES)
+
+
+class Stereographic(Lens):
+    """A toy lens: r = 2 tan(angle / 2), without coefficients."""
+
+    name = "stereographic"
+    aliases = ("my_stereographic",)
+    coefficient_counts = (0,)
+    sees_behind = True
+    fold_limit = math.radians(170)
+    fold_rad = fold_limit
+
+    def distort(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        r = np.hypot(x, y)
+        angle = np.arctan2(r, z)
+        valid = (angle <= self.fold_limit) & ((r > 0) | (z > 0))
+        scale = 2 * np.tan(np.minimum(angle, self.fold_limit) / 2) / np.where(r > 0, r, 1)
+        return x * scale, y * scale, valid
+
+    def undistort(self, xd: FloatArray, yd: FloatArray) -> FloatArray:
+        r = np.hypot(xd, yd)
+        angle = 2 * np.arctan(r / 2)
+        scale = np.sin(angle) / np.where(r > 0, r, 1)
+        return np.stack([xd * scale, yd * scale, np.cos(angle)], -1)
+
+
+def test_a_lens_is_added_by_its_class_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(CalibrationError, match="lens: expected one of pinhole, radtan, fisheye, got 'stereographic'"):
+        make("pinhole", lens="stereographic")
+    monkeypatch.setitem(lens_module.LENSES, "stereographic", Stereographic)
+    camera = make("pinhole", lens="my_stereographic", K=None, horizontal_fov_deg=200.0, roll_deg=0.0)
+    assert camera.lens == "stereographic" and camera.fov_deg[0] == pytest.approx(200)
+    assert camera.unproject(camera.project(camera.center_m + np.array([[5.0, 2.0, 1.0]])).uv).valid.all()
+    rig = Rig([camera.resize((48, 64))], name="toy")
+    assert Rig.from_dict(rig.to_dict())[0] == rig[0]
+    sample = {"images": torch.rand(1, 3, 48, 64), "rig": rig}
+    same = RigRetarget(rig)(sample)
+    assert same["lens"] == ["stereographic"] and same["coverage"].all()
+    torch.testing.assert_close(same["images"], sample["images"], atol=0.02, rtol=0)
+    # Its calibration comes back as a sample's keys.
+    again = {key: same[key] for key in ("images", "K", "cam2ego", "lens", "distortion")}
+    flat = RigRetarget(Rig([make("pinhole", roll_deg=0.0).resize((24, 32))], ground_z_m=0.0))
+    seen = flat(again)
+    assert seen["coverage"].all()
+    torch.testing.assert_close(seen["images"], flat(sample)["images"], atol=0.05, rtol=0)

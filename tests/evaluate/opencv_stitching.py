@@ -35,7 +35,7 @@ def opencv_stitching(source: Rig, images: Sequence[Image], target: Rig) -> list[
     Raises:
         SampleError: Lenses other than pinhole.
     """
-    if any(camera.lens != "pinhole" for camera in (*source, *target)):
+    if any(not camera.is_rectilinear for camera in (*source, *target)):
         raise SampleError("opencv_stitching: expected pinhole cameras; use Rig.undistorted()")
     scale = float(np.median([camera.K[0, 0] for camera in source]))
     panorama, covered, corner = stitched(source, [to_bytes(image) for image in images], scale)

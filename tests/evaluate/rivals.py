@@ -51,7 +51,7 @@ def same_rotation(source: Rig, images: torch.Tensor, size: tuple[int, int], repe
     """
     from kornia.geometry.transform import warp_perspective
 
-    if any(camera.lens != "pinhole" for camera in source):
+    if any(not camera.is_rectilinear for camera in source):
         raise SampleError("the same rotation by kornia: expected pinhole cameras")
     source = without_masks(source)
     target = source.turned(yaw_deg=YAW_DEG).resized(size)

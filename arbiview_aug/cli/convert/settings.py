@@ -132,7 +132,7 @@ def check_target(settings: Settings, data: Data) -> None:
     if not isinstance(data, NuScenesDataset):
         return
     target = settings.target
-    lenses = [f"{camera.name} ({camera.lens})" for camera in target if camera.lens != "pinhole"]
+    lenses = [f"{camera.name} ({camera.lens})" for camera in target if not camera.is_rectilinear]
     if lenses:
         name = target.name or "the target"
         raise CalibrationError(
