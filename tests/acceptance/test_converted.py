@@ -37,7 +37,7 @@ def test_it_scores_as_on_the_fly(name: Any, target: Rig, nuscenes_root: Path, tm
     assert main([*asked, "--workers", "1", "--report", "1"]) == 0
     settings = Settings(root=nuscenes_root, kind=name, target=load_rig(file), output=output)
     sample = settings.open()[0]
-    retarget = RigRetarget(settings.target, holes="black")  # as the protocol has them
+    retarget = RigRetarget(settings.target)
 
     def on_the_fly(_: Mapping[str, Any], __: Rig) -> list[RenderedView]:
         return views_of(retarget(sample))
