@@ -231,8 +231,8 @@ def test_maps_over_corrections_err_by_an_eighth_of_a_pixel(
     """Not by a 64th: the distances are not known that well, and every bend would be evaluated pixel by pixel."""
     scene = Scene(corrections=nearer[1].corrections)
 
-    def built(slack: float) -> RenderPlan:
-        monkeypatch.setattr(CorrectedSurface, "slack", slack)
+    def built(tolerance_scale: float) -> RenderPlan:
+        monkeypatch.setattr(CorrectedSurface, "tolerance_scale", tolerance_scale)
         return build_plan(RIG, TARGET, surface="street", scene=scene)
 
     quick, thorough = built(CorrectedSurface.tolerance_scale), built(1.0)

@@ -34,7 +34,7 @@ def zoomed(camera: Camera, factor: float, size: tuple[int, int] | None = None) -
 def built_without(source: Rig, target: Rig, config: FavsConfig, monkeypatch: pytest.MonkeyPatch) -> RenderPlan:
     """The plan for which every source was looked at."""
     with monkeypatch.context() as patch:
-        patch.setattr(view_planner, "serves_alone", lambda *_: False)
+        patch.setattr(view_planner, "covers_target_exactly", lambda *_: False)
         return build_plan(source, target, config=config)
 
 

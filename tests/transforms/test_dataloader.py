@@ -21,7 +21,7 @@ STARTS = [(0, None), (2, "fork"), pytest.param(2, "spawn", marks=pytest.mark.slo
 @pytest.fixture
 def samples(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The datasets' module, where spawned workers find it too: they take over ``sys.path``."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
     return importlib.import_module("worker_samples")
 
 
