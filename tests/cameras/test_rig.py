@@ -176,7 +176,7 @@ def test_shipped_rigs_name_their_sources() -> None:
 
     import arbiview_aug
 
-    for path in (Path(arbiview_aug.__file__).parent / "rigs").glob("*.yaml"):
+    for path in (Path(arbiview_aug.__file__).parent / "cameras" / "rigs").glob("*.yaml"):
         data = yaml.safe_load(path.read_text())
         assert {"name", "source", "notes", "ego_frame", "ground_z_m", "ground_source", "cameras"} == set(data)
         assert data["name"] == path.stem
