@@ -61,7 +61,7 @@ def write_report(settings: Settings, data: Data, tokens: Sequence[str], count: i
     title = f"{data.root.resolve().name} as {target.name or 'the target'} would have seen it"
     notes = [f"{len(picked)} of {len(tokens)} frames, as they were written to {settings.output}."]
     if settings.path != "favs" or settings.holes != "black":
-        notes.append("Pixels that no camera saw are scored as they were filled; figures of covered ones leave them out.")
+        notes.append("Pixels that no camera saw are scored as they were filled; covered figures leave them out.")
     if settings.surface in READS_POINTS:
         notes.append("LiDAR points score views that were made with them: evaluate holds half of them out.")
     notes += [f"Not everything could be scored: {words}." for words in done.declined.values()]
