@@ -10,22 +10,22 @@ from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import ArbiviewError
 
 COMMANDS = {
-    "bench": ("arbiview_aug.cli.bench", "measure speed, on your own data too"),
+    "bench": ("arbiview_aug.cli.bench", "measure speed against accuracy, on your own data too"),
     "convert": ("arbiview_aug.cli.convert.command", "write a data set as another vehicle's cameras would have seen it"),
-    "demo": (
-        "arbiview_aug.cli.demo",
-        "the main job on a synthetic street or on real frames, with numbers and a picture",
-    ),
-    "depth": ("arbiview_aug.cli.depth", "depth from motion of a drive's frames, for surface='motion'"),
-    "evaluate": ("arbiview_aug.cli.evaluate", "how good are the views: metrics, pictures, a report in HTML"),
+    "demo": ("arbiview_aug.cli.demo", "retarget a synthetic street or real frames, with numbers and a picture"),
+    "depth": ("arbiview_aug.cli.depth", "compute depth from motion of a drive's frames, for surface='motion'"),
+    "evaluate": ("arbiview_aug.cli.evaluate", "measure the quality of rendered views: metrics, pictures, a report"),
     "inspect": ("arbiview_aug.cli.rigs", "show rigs: tables, differences, a picture"),
     "train": ("arbiview_aug.train", "train the generator that completes what no camera saw"),
 }
 """Module and one-line help of each command."""
 
+_RESUMABLE = ("convert", "depth", "train")
+_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+
 
 def usage() -> str:
-    """What can be asked for."""
+    """The commands, each with its one-line help."""
     lines = [f"  {name:<9} {summary}" for name, (_, summary) in COMMANDS.items()]
     return "\n".join(
         [
@@ -48,7 +48,12 @@ def version() -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command and return its exit status: 0 done, 2 wrong usage or data that cannot be used, said in one line."""
+    """Run a command.
+
+    Returns:
+        The exit status: 0 done, 1 as the command says, 2 wrong usage or unusable data, 130 interrupted; the last two
+        with one line on stderr.
+    """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] == ["--version"]:
         print(f"arbiview_aug {version()}")
@@ -66,6 +71,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ArbiviewError as error:
         print(f"python -m arbiview_aug {name}: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        fix = "; run it again to go on" if name in _RESUMABLE else ""
+        print(f"python -m arbiview_aug {name}: interrupted{fix}", file=sys.stderr)
+        return _INTERRUPTED
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from arbiview_aug.cli.arguments import count
+from arbiview_aug.datasets.registry import READERS
 from arbiview_aug.errors import ArbiviewError
 from arbiview_aug.generator.training.command import COMMANDS, run
 from arbiview_aug.generator.training.config import CONFIGS
@@ -25,8 +26,9 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--data",
         default="synthetic",
-        metavar="DATA",
-        help="synthetic, nuscenes:ROOT or frames:DIR (default: synthetic)",
+        metavar="KIND:PATH",
+        help=f"synthetic, or real frames with their kind: {' or '.join(f'{kind}:PATH' for kind in READERS)} "
+        "(default: %(default)s)",
     )
     made.add_argument("--output", default="output", metavar="DIR", help="(default: %(default)s)")
     made.add_argument(

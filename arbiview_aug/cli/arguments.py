@@ -3,28 +3,45 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from arbiview_aug.cameras.rig import shipped_rigs
+from arbiview_aug.datasets.registry import READERS, kinds_of, split_kind
 from arbiview_aug.errors import DataError
 
 REAL_TARGET = "waymo"
 """The rig that real frames are rendered for, where none is named."""
 
 
-def add_data(parser: argparse.ArgumentParser, default: str) -> None:
-    """``--data``; ``default`` is what there is without it."""
-    parser.add_argument(
-        "--data",
-        metavar="FOLDER",
-        help="real frames: a frame folder (calib.json and images), a folder of such folders, or a nuScenes root "
-        f"(default: {default})",
-    )
+def data(text: str) -> str:
+    """``PATH`` or ``KIND:PATH``, as ``open_data`` takes it; says on stderr which kind a path of several is taken as."""
+    kind, root = split_kind(text)
+    kinds = kinds_of(root) if kind is None else [kind]
+    if len(kinds) > 1:
+        others = " or ".join(f"--data {other}:{text}" for other in kinds[1:])
+        print(f"--data {text}: taken as a {READERS[kinds[0]].description}; otherwise: {others}", file=sys.stderr)
+    return text
+
+
+def add_data(parser: argparse.ArgumentParser, without: str | None = None, **options: Any) -> None:
+    """Add ``--data``.
+
+    Args:
+        parser: To this one.
+        without: Data that is used without it, in words; None where it is required.
+        **options: Of ``add_argument``.
+    """
+    kinds = "; ".join(f"{kind}: {reader.description}" for kind, reader in READERS.items())
+    default = "" if without is None else f" (default: {without})"
+    text = f"real frames, by their path alone or with their kind. {kinds}{default}"
+    parser.add_argument("--data", type=data, metavar="[KIND:]PATH", required=without is None, help=text, **options)
 
 
 def add_target(group: argparse._ActionsContainer) -> None:

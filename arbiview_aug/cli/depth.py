@@ -12,10 +12,10 @@ import torch
 from torch.utils.data import Dataset
 
 from arbiview_aug.atomic_io import inside
-from arbiview_aug.cli.arguments import count, device_named, gathered_warnings, writable_folder
+from arbiview_aug.cli.arguments import add_data, count, device_named, gathered_warnings, writable_folder
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.motion_depth import FOLDER, WANTED, DepthFolder
-from arbiview_aug.datasets.registry import open_data
+from arbiview_aug.datasets.registry import open_data, split_kind
 from arbiview_aug.errors import ArbiviewError, WarnOnce, described
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames, warn_lost
@@ -91,19 +91,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         description="Depth from motion of every frame of a drive, for surface='motion'. Frames that have theirs, from "
         "the frames that are their neighbours now, are left as they are: run it again to go on.",
     )
-    parser.add_argument(
-        "--data",
-        required=True,
-        metavar="FOLDER",
-        help="a folder of frame folders with a sequence.json, or a nuScenes root",
-    )
+    add_data(parser)
     parser.add_argument("--output", metavar="FOLDER", help=f"where to write (default: {FOLDER} in the data's folder)")
     parser.add_argument("--device", default="cpu", help="where to compute: cpu, cuda, cuda:1 (default: %(default)s)")
     parser.add_argument("--workers", type=count, default=1, help="processes, on the CPU (default: %(default)s)")
     arguments = parser.parse_args(argv)
     device = device_named(arguments.device)
     data: Any = open_data(arguments.data, neighbours=WANTED)
-    folder = Path(arguments.output) if arguments.output else inside(Path(arguments.data), FOLDER, "depth from motion")
+    _, root = split_kind(arguments.data)
+    folder = Path(arguments.output) if arguments.output else inside(root, FOLDER, "depth from motion")
     depths = DepthFolder(writable_folder(folder, str(folder)))
     frames = _Frames(data, data.tokens, depths, str(device))
     workers = arguments.workers if device.type == "cpu" else 1  # one process keeps a GPU busy

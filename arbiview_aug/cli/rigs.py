@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from arbiview_aug.cameras.rig import Rig, load_rig, shipped_rigs
+from arbiview_aug.cli.arguments import data
+from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE
+from arbiview_aug.datasets.registry import open_data, split_kind
 from arbiview_aug.errors import ArbiviewError
 
 
@@ -22,7 +24,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "rigs",
         nargs="+",
         metavar="RIG",
-        help=f"a shipped rig ({', '.join(shipped_rigs())}), a rig file (YAML or JSON) or a folder with calib.json",
+        help=f"a shipped rig ({', '.join(shipped_rigs())}), a rig file (YAML or JSON), or data as other commands' "
+        "--data takes it: the rig of its first frame",
     )
     parser.add_argument("--output", default="inspect.png", metavar="FILE", help="the picture (default: %(default)s)")
     arguments = parser.parse_args(argv)
@@ -75,5 +78,12 @@ def _pixels_per_deg(K: np.ndarray) -> float:
 
 
 def _load(name: str) -> Rig:
-    folder = Path(name)
-    return load_rig(folder / "calib.json" if folder.is_dir() else name)
+    kind, root = split_kind(name)
+    if kind is None and (root / CALIBRATION_FILE).is_file():  # its images need not be there
+        return load_rig(root / CALIBRATION_FILE)
+    if kind is None and not root.is_dir():
+        return load_rig(name)
+    recording = open_data(data(name))
+    recording.load_points = False
+    rig: Rig = recording[0]["rig"]
+    return rig

@@ -7,16 +7,53 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from torch.utils.data import Dataset
 
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.errors import ArbiviewError
+from arbiview_aug.errors import ArbiviewError, DataError
 from arbiview_aug.sample.neighbours import STILL_M
 
 Direction = Literal["both", "past", "future"]
+
+
+class Recording(Dataset[dict[str, Any]]):
+    """Samples on disk, each with a token; the base class of the readers.
+
+    Attributes:
+        root: The folder.
+        tokens: Unique name of each sample, in order.
+        load_points: Whether to read the LiDAR's points.
+    """
+
+    root: Path
+    tokens: list[str]
+    load_points: bool
+    _index: dict[str, int]
+
+    def __len__(self) -> int:
+        return len(self.tokens)
+
+    def by_token(self, token: str) -> dict[str, Any]:
+        """The sample with this token.
+
+        Raises:
+            DataError: No such sample.
+        """
+        if token not in self._index:
+            some = ", ".join(self.tokens[:3])
+            raise DataError(
+                f"{self.root}: expected the token of one of {len(self)} samples, got {token!r}; they are {some} …"
+            )
+        return self[self._index[token]]
+
+    def files(self, index: int) -> list[Path]:
+        """All files that a sample is read from; images first, then points, or as the reader says."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)

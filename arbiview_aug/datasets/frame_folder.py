@@ -13,14 +13,21 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.utils.data import Dataset
 
 from arbiview_aug.atomic_io import BROKEN_ARRAY, inside
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.key_names import hint, misnamed
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig, read_mask
-from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, Unreadable, check_neighbours, parts_of_clock
+from arbiview_aug.datasets.drive import (
+    Drive,
+    LazyFrame,
+    Neighbours,
+    Recording,
+    Unreadable,
+    check_neighbours,
+    parts_of_clock,
+)
 from arbiview_aug.datasets.image_io import Reduce, check_reduce, decode_images, reduced_rig
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, WarnOnce
 
@@ -59,7 +66,7 @@ class _Frame:
         return inside(self.root, name, f"{self.where}: {what}" if what else self.where)
 
 
-class FrameFolder(Dataset[dict[str, Any]]):
+class FrameFolder(Recording):
     """A folder that is a frame (it has ``calib.json``), or a folder of such folders, in the order of their names.
 
     ``calib.json`` holds (keys not named here are ignored, so notes and licences may stand beside; those that look like
@@ -122,32 +129,14 @@ class FrameFolder(Dataset[dict[str, Any]]):
         self.reduce = reduce
         self.load_points = load_points
         self._frames = _find_frames(self.root)
-        self._index = {frame.name: k for k, frame in enumerate(self._frames)}
+        self.tokens = [frame.name for frame in self._frames]
+        self._index = {token: k for k, token in enumerate(self.tokens)}
         self._last_rig: tuple[str, Rig] | None = None
         self._times_s, order = _read_sequence(self.root, self._index)
         self.neighbours = neighbours
         self._warn = WarnOnce()
         self._driven: list[str] = []
         self._drive = None if neighbours is None else self._find_drive(order)
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    @property
-    def tokens(self) -> list[str]:
-        """The frames' names in order."""
-        return [frame.name for frame in self._frames]
-
-    def by_token(self, token: str) -> dict[str, Any]:
-        """The sample of a frame by its folder's name.
-
-        Raises:
-            DataError: No such frame.
-        """
-        if token not in self._index:
-            some = ", ".join(self.tokens[:5])
-            raise DataError(f"{self.root}: expected the name of a frame, got {token!r}; the frames are {some} …")
-        return self[self._index[token]]
 
     def files(self, index: int) -> list[Path]:
         """What a frame is read from: its calibration, images, masks and points."""

@@ -1,54 +1,113 @@
-"""The reader that fits a folder."""
+"""Readers by kind, and the reader that fits a folder."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-from arbiview_aug.datasets.drive import Neighbours
+from arbiview_aug.datasets.drive import Neighbours, Recording
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, FrameFolder
 from arbiview_aug.datasets.image_io import Reduce
-from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
+from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset, table_folders
 from arbiview_aug.errors import DataError
 
-Kind = Literal["frames", "nuscenes"]
-"""Frame folders, or nuScenes tables."""
 
-_NUSCENES_VERSIONS = ("v1.0-mini", "v1.0-trainval")  # the first of these that is there, else whichever v1.0-*
+@dataclass(frozen=True)
+class Reader:
+    """One kind of data set.
+
+    Attributes:
+        description: A folder of this kind, for messages and help texts.
+        recognises: Whether a folder is of this kind.
+        open: The dataset of a folder, by the keywords ``version``, ``reduce`` and ``neighbours`` of ``open_data``.
+            Commands need ``len`` and ``dataset[index]``; a ``Recording`` also serves ``convert`` and ``depth``.
+        writer: Module and class, as ``module:Class``, that ``convert`` writes this kind with; None where it cannot.
+    """
+
+    description: str
+    recognises: Callable[[Path], bool]
+    open: Callable[..., Recording]
+    writer: str | None = None
+
+
+READERS = {
+    "frames": Reader(
+        f"frame folder ({CALIBRATION_FILE} in it or in its folders)",
+        lambda root: (root / CALIBRATION_FILE).is_file() or any(root.glob(f"*/{CALIBRATION_FILE}")),
+        lambda root, *, version, reduce, neighbours: FrameFolder(root, reduce=reduce, neighbours=neighbours),
+        writer="arbiview_aug.cli.convert.frame_folders:FrameFolders",
+    ),
+    "nuscenes": Reader(
+        "nuScenes root (with a folder of tables such as v1.0-mini)",
+        lambda root: bool(table_folders(root)),
+        lambda root, *, version, **options: NuScenesDataset(root, version or table_folders(root)[0], **options),
+        writer="arbiview_aug.cli.convert.nuscenes:NuScenes",
+    ),
+}
+"""Every kind of data set, by its name in ``KIND:PATH``. A folder that could be several is the first of them."""
+
+
+def split_kind(data: str | Path) -> tuple[str | None, Path]:
+    """Kind and folder of ``KIND:PATH``; the kind is None where only a path is given."""
+    kind, colon, folder = str(data).partition(":")
+    return (kind, Path(folder)) if colon and folder and kind in READERS else (None, Path(data))
+
+
+def data_name(data: str | Path) -> str:
+    """Name of a data set's folder, for tables."""
+    return split_kind(data)[1].resolve().name
+
+
+def kinds_of(root: Path) -> list[str]:
+    """All kinds of data set that a folder could be."""
+    return [kind for kind, reader in READERS.items() if reader.recognises(root)]
+
+
+def find_reader(data: str | Path, kind: str | None = None) -> tuple[Path, Reader]:
+    """A data set's folder and its reader.
+
+    Args:
+        data: ``PATH`` or ``KIND:PATH``.
+        kind: A key of ``READERS``; by default that of ``KIND:PATH``, else the first one that fits.
+
+    Raises:
+        DataError: There is no such folder, or no reader fits it.
+    """
+    named, root = split_kind(data)
+    kind = kind or named
+    if kind is not None and kind not in READERS:
+        raise DataError(f"data {root}: expected a kind of {', '.join(READERS)}, got {kind!r}")
+    if not root.is_dir():
+        fix = f"; the kinds of KIND:PATH are {', '.join(READERS)}" if ":" in str(root) else ""
+        raise DataError(f"data {root}: expected a folder, found none{fix}")
+    found = kinds_of(root) if kind is None else [kind]
+    if not found:
+        expected = " or ".join(f"a {reader.description}" for reader in READERS.values())
+        raise DataError(f"data {root}: expected {expected}, found none of them")
+    return root, READERS[found[0]]
 
 
 def open_data(
-    folder: str | Path,
+    data: str | Path,
     *,
-    kind: Kind | None = None,
+    kind: str | None = None,
     version: str | None = None,
     reduce: Reduce = 1,
     neighbours: Neighbours | None = None,
-) -> FrameFolder | NuScenesDataset:
-    """Frame folders (also where there are nuScenes tables beside), else nuScenes.
+) -> Recording:
+    """Open a data set with the reader that fits it.
 
     Args:
-        folder: A frame folder, a folder of such folders, or a nuScenes root.
-        kind: Which of them to open; by default whichever there is.
-        version: nuScenes' folder of tables; by default v1.0-mini or v1.0-trainval, else whichever there is.
+        data: ``PATH`` or ``KIND:PATH``, such as ``nuscenes:/data/nuscenes``: a frame folder, a folder of such folders,
+            or a nuScenes root. A path alone that could be several kinds is the first of ``READERS``.
+        kind: A key of ``READERS``, instead of ``KIND:``.
+        version: nuScenes' folder of tables; by default v1.0-mini or v1.0-trainval, else the first there is.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size.
         neighbours: Which other frames of the drive come with a sample; None for none.
 
     Raises:
-        DataError: Neither.
+        DataError: There is no such folder, or no reader fits it.
     """
-    root = Path(folder)
-    if not root.is_dir():
-        raise DataError(f"data {root}: expected a folder, found none")
-    frames = (root / CALIBRATION_FILE).is_file() or any(root.glob(f"*/{CALIBRATION_FILE}"))
-    if kind == "frames" or (kind is None and frames):
-        return FrameFolder(root, reduce=reduce, neighbours=neighbours)
-    versions = sorted(path.name for path in root.glob("v1.0-*") if path.is_dir())
-    if not versions and version is None:
-        raise DataError(
-            f"data {root}: expected a frame folder ({CALIBRATION_FILE} in it or in its folders) or a nuScenes root "
-            "(with a folder of tables such as v1.0-mini), found neither"
-        )
-    if version is None:
-        version = next((v for v in _NUSCENES_VERSIONS if v in versions), versions[0])
-    return NuScenesDataset(root, version, reduce=reduce, neighbours=neighbours)
+    root, reader = find_reader(data, kind)
+    return reader.open(root, version=version, reduce=reduce, neighbours=neighbours)

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.image_io import Reduce
+from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import CalibrationError, SampleError
 from arbiview_aug.evaluate.baselines import BASELINES
@@ -131,7 +132,7 @@ def _data_sets(
         if data is not None or folder.is_dir():
             samples = open_data(folder, reduce=REDUCE)
             count = min(frames or 1, len(samples))
-            yield folder.resolve().name, (make_frame(_bare(samples[k])) for k in range(count))
+            yield data_name(folder), (make_frame(_bare(samples[k])) for k in range(count))
     if data is None:
         drive = SyntheticDrive(
             demo_source_rig(size or SYNTHETIC_SIZE), num_frames=frames or SYNTHETIC_FRAMES, seed=SYNTHETIC_SEED

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -10,8 +9,6 @@ import cv2
 import pytest
 
 from arbiview_aug.__main__ import main
-from arbiview_aug.datasets import FrameFolder, NuScenesDataset, open_data
-from arbiview_aug.errors import DataError
 
 
 def numbers(printed: str, surface: str) -> list[float]:
@@ -84,20 +81,6 @@ def test_lenses_without_points(fisheye_root: Path, tmp_path: Path, capsys: pytes
     printed = capsys.readouterr().out
     assert "No true views and no LiDAR points" in printed
     assert numbers(printed, "far")[0] > 80 and numbers(printed, "ground")[0] > 80
-
-
-def test_frame_folders_win_over_tables(tmp_path: Path) -> None:
-    (tmp_path / "v1.0-mini").mkdir()
-    with pytest.raises(DataError, match=r"table|scene\.json|v1\.0-mini"):
-        open_data(tmp_path)
-    (tmp_path / "frame").mkdir()
-    (tmp_path / "frame" / "calib.json").write_text(json.dumps({"cameras": []}))
-    assert isinstance(open_data(tmp_path), FrameFolder)
-
-
-def test_readers(nuscenes_root: Path) -> None:
-    assert isinstance(open_data(nuscenes_root), FrameFolder)
-    assert not isinstance(open_data(nuscenes_root), NuScenesDataset)
 
 
 @pytest.mark.parametrize(

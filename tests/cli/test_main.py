@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
+import os
+import signal
 import subprocess
 import sys
 import warnings
+from functools import partial
 from importlib import metadata
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from arbiview_aug import environment
+from arbiview_aug import __main__, environment
 from arbiview_aug.__main__ import COMMANDS, main, version
 
 
@@ -88,3 +94,45 @@ def test_the_dispatcher_imports_no_command_and_nothing_optional() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=500)
     assert done.returncode == 0 and not done.stderr, done.stderr
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_an_interrupt_is_one_line_and_130(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(_: list[str]) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(__main__, "import_module", lambda _: SimpleNamespace(main=interrupted))
+    assert main([name]) == 130
+    fix = "; run it again to go on" if name in ("convert", "depth", "train") else ""
+    assert capsys.readouterr().err == f"python -m arbiview_aug {name}: interrupted{fix}\n"
+
+
+def test_a_real_interrupt(tmp_path: Path) -> None:
+    code = (
+        "import sys, threading; from arbiview_aug import __main__ as m; from arbiview_aug.cli import demo\n"
+        "demo._load = lambda _: (print('ready', flush=True), threading.Event().wait())\n"
+        "sys.exit(m.main(['demo', '--output', sys.argv[1]]))"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    # A process that pytest was started from may ignore the signal, and so would its children.
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.default_int_handler),
+    ) as process:
+        assert process.stdout is not None and process.stderr is not None
+        assert process.stdout.readline() == "ready\n"
+        os.kill(process.pid, signal.SIGINT)
+        _, said = process.communicate(timeout=300)
+    assert process.returncode == 130 and said == "python -m arbiview_aug demo: interrupted\n"
+
+
+def test_the_console_script() -> None:
+    tomllib = pytest.importorskip("tomllib")  # Python 3.11
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    module, name = project["scripts"]["arbiview_aug"].split(":")
+    assert getattr(importlib.import_module(module), name) is main

@@ -83,7 +83,7 @@ def test_a_folder_of_frames_in_the_order_of_their_names(tmp_path: Path) -> None:
     assert dataset.tokens == ["a", "b", "c"]
     assert [sample["token"] for sample in dataset] == ["a", "b", "c"]  # type: ignore[attr-defined]
     assert dataset.by_token("b")["token"] == "b"
-    with pytest.raises(DataError, match="expected the name of a frame, got 'z'; the frames are a, b, c"):
+    with pytest.raises(DataError, match="expected the token of one of 3 samples, got 'z'; they are a, b, c"):
         dataset.by_token("z")
 
 

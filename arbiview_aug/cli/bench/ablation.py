@@ -26,9 +26,11 @@ import numpy as np
 from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cli.arguments import add_data
 from arbiview_aug.cli.bench.timing import cpu_model, quartiles, write_json
 from arbiview_aug.datasets import open_data, reduced_rig
 from arbiview_aug.datasets.image_io import Reduce
+from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import one_thread
 from arbiview_aug.errors import DataError
@@ -138,14 +140,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="python -m arbiview_aug bench ablation",
         description="Each stage and setting on and off: accuracy, milliseconds on one thread, and what a ms buys.",
     )
-    parser.add_argument(
-        "--data",
-        metavar="FOLDER",
-        nargs="+",
-        type=Path,
-        default=[],
-        help="data with LiDAR, of each its first frame (default: a synthetic street)",
-    )
+    add_data(parser, "a synthetic street", nargs="+", default=[])  # with LiDAR, each its first frame
     parser.add_argument(
         "--reduce", type=int, choices=(1, 2, 4), default=2, help="decode its images at 1/N (default: %(default)s)"
     )
@@ -157,7 +152,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     steps = [name for name in STEPS if arguments.only in name]
     if not steps:
         parser.error(f"argument --only: expected part of one of {', '.join(STEPS)}")
-    if len({folder.resolve().name for folder in arguments.data}) < len(arguments.data):
+    if len({*map(data_name, arguments.data)}) < len(arguments.data):
         parser.error("argument --data: expected folders of different names")
     with one_thread(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of targets that are half outside: the paper's are
@@ -169,7 +164,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def measure(
-    data: Sequence[Path],
+    data: Sequence[str],
     steps: Sequence[str],
     *,
     reduce: Reduce = 2,
@@ -219,14 +214,12 @@ def markdown(report: Mapping[str, Any]) -> str:
 
 
 # --- what is measured -------------------------------------------------------------------------------------------------
-def _frames(
-    data: Sequence[Path], reduce: Reduce, seed: int, size: tuple[int, int]
-) -> Iterator[tuple[str, ScoredFrame]]:
+def _frames(data: Sequence[str], reduce: Reduce, seed: int, size: tuple[int, int]) -> Iterator[tuple[str, ScoredFrame]]:
     for folder in data:
         sample = open_data(folder, reduce=reduce)[0]
         if "points" not in sample:
             raise DataError(f"--data {folder}: expected LiDAR points to score by, got none")
-        yield folder.resolve().name, make_frame(sample, exposures=("even",))
+        yield data_name(folder), make_frame(sample, exposures=("even",))
     if not data:
         drive = SyntheticDrive(demo_source_rig(size), num_frames=1, seed=seed, lidar=False)
         yield SYNTHETIC, make_frame(drive[0], truth=partial(drive.render, 0), exposures=())

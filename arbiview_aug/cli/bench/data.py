@@ -17,6 +17,7 @@ from arbiview_aug.cli.arguments import REAL_TARGET
 from arbiview_aug.datasets import Neighbours, open_data
 from arbiview_aug.datasets.frame_writer import write_drive, write_frame
 from arbiview_aug.datasets.image_io import Reduce
+from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.frames import LidarReference, ScoredFrame, make_frame
@@ -34,7 +35,7 @@ class Recorded:
 
     Attributes:
         name: For tables.
-        root: The folder.
+        root: The folder, or ``KIND:PATH``.
         truth: The true views of a frame for a rig; None where nobody knows them.
     """
 
@@ -87,7 +88,7 @@ class Recorded:
 def recorded(data: str | Path | None, *, frames: int = 1, size: tuple[int, int] = (512, 1408)) -> Iterator[Recorded]:
     """A user's frames, or ``frames`` synthetic streets as JPEGs of ``size`` (h, w) in a temporary folder."""
     if data is not None:
-        yield Recorded(Path(data).resolve().name, Path(data))
+        yield Recorded(data_name(data), Path(data))
         return
     drive = SyntheticDrive(demo_source_rig(size), num_frames=frames)
     with tempfile.TemporaryDirectory() as folder:
@@ -101,7 +102,7 @@ def recorded_drive(data: str | Path | None, wanted: Neighbours, *, size: tuple[i
     """Name and folder of a user's drive; or of a synthetic one, a frame with the neighbours that are wanted, as JPEGs
     of ``size`` (h, w) in a temporary folder."""
     if data is not None:
-        yield Path(data).resolve().name, Path(data)
+        yield data_name(data), Path(data)
         return
     sample = SyntheticDrive(demo_source_rig(size), num_frames=1, lidar=False, neighbours=wanted)[0]
     with tempfile.TemporaryDirectory() as folder:

@@ -35,8 +35,10 @@ import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.cli.arguments import add_data
 from arbiview_aug.cli.bench.timing import machine, machine_line, quartiles, show, timed_rounds
-from arbiview_aug.datasets import FrameFolder, reduced_rig
+from arbiview_aug.datasets import open_data, reduced_rig
+from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.targets import without_masks
@@ -96,12 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="python -m arbiview_aug bench speed",
         description="Milliseconds on one thread, and ratios to six bare cv2.remap calls of the same output pixels.",
     )
-    parser.add_argument(
-        "--data",
-        metavar="FOLDER",
-        help="a frame folder whose images to render (default: nuscenes-one below ARBIVIEW_DATA where that is, else "
-        "random smooth images for nuScenes' rig)",
-    )
+    add_data(parser, "nuscenes-one below ARBIVIEW_DATA where that is, else random smooth images for nuScenes' rig")
     parser.add_argument("--output", default="output/speed.json", metavar="FILE", help="(default: %(default)s)")
     parser.add_argument(
         "--repeats", type=int, default=REPEATS, metavar="N", help="rounds at full size (default: %(default)s)"
@@ -145,7 +142,7 @@ def measure(
         "benchmark": "speed",
         "floor": "six cv2.remap, linear, float32 maps, x' = 0.97 x + 0.02 y + 3, y' = 0.95 y + 0.01 x + 5",
         "clock": "CPU time of the process, milliseconds",
-        "data": "random smooth images" if data is None else Path(data).name,
+        "data": "random smooth images" if data is None else data_name(data),
         "sources": [list(size) for size in rig.sizes],
         "rounds": {"full size": repeats, "small": repeats * _SMALL_ROUNDS},
         "machine": machine(load_before),
@@ -291,7 +288,7 @@ def _inputs(data: str | Path | None, full_size: tuple[int, int] | None) -> tuple
         rig = load_rig("nuscenes") if full_size is None else load_rig("nuscenes").resized(full_size)
         half_size = reduced_rig(rig, 2).sizes[0]
         return rig, _smooth_images(len(rig), rig.sizes[0]), _smooth_images(len(rig), half_size)
-    sample, half = FrameFolder(data, load_points=False)[0], FrameFolder(data, load_points=False, reduce=2)[0]
+    sample, half = open_data(data)[0], open_data(data, reduce=2)[0]
     if not isinstance(sample["images"], torch.Tensor):
         raise DataError(f"--data {data}: expected images of one size, got several")
     rig, images, halves = without_masks(sample["rig"]), sample["images"], half["images"]

@@ -16,13 +16,15 @@ import numpy as np
 from arbiview_aug.atomic_io import inside, remove_parts
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.rig import load_rig
-from arbiview_aug.cli.arguments import count, seed, size, writable_folder
+from arbiview_aug.cli.arguments import add_data, count, seed, size, writable_folder
 from arbiview_aug.cli.convert.job import Done, Jobs, OnError
 from arbiview_aug.cli.convert.ray_runner import ray_results
 from arbiview_aug.cli.convert.report import write_report
-from arbiview_aug.cli.convert.settings import FOLDER, Data, Settings, check_output, check_target
+from arbiview_aug.cli.convert.settings import FOLDER, Settings, check_output, check_target
 from arbiview_aug.cli.parallel import results
+from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.motion_depth import FOLDER as DEPTH_FOLDER
+from arbiview_aug.datasets.registry import split_kind
 from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError
 from arbiview_aug.favs.config import Quality
@@ -30,15 +32,13 @@ from arbiview_aug.generator.fillers import Holes
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.settings import RenderPath
 
-_INTERRUPTED = 130
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Convert this shard's samples that are not there yet; whoever finds all there finishes the output.
 
     Returns:
         0; 1 where samples could not be read or rendered (unless they are to be skipped) or files not be written, which
-        are named; 130 where it was interrupted.
+        are named.
     """
     parser = _parser()
     arguments = parser.parse_args(argv)
@@ -53,13 +53,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     jobs, facts = _begun(settings, data, arguments)
     tally = _Tally()
     started = time.perf_counter()
-    try:
-        for one in _run(jobs, arguments, tally):
-            if one.state == "stopped" or (one.state == "failed" and arguments.on_error == "fatal"):
-                break
-    except KeyboardInterrupt:
-        print("interrupted: run it again to go on", file=sys.stderr)
-        return _INTERRUPTED
+    for one in _run(jobs, arguments, tally):
+        if one.state == "stopped" or (one.state == "failed" and arguments.on_error == "fatal"):
+            break
     for line in dict.fromkeys(tally.warned):
         print(f"note: {line}", file=sys.stderr)
     print(tally.summary(settings.output, time.perf_counter() - started))
@@ -77,13 +73,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Writes a data set as another vehicle's cameras would have recorded it, in the source's format: "
         "nuScenes tables, or frame folders. What is there is left as it is: run it again to go on.",
     )
-    parser.add_argument(
-        "--data",
-        required=True,
-        type=_data,
-        metavar="[KIND:]DIR",
-        help="nuscenes:ROOT, frames:DIR (a frame folder or a folder of them), or a folder alone: whichever it is",
-    )
+    add_data(parser)
     parser.add_argument("--version", metavar="NAME", help="nuScenes' folder of tables (default: v1.0-mini, -trainval)")
     parser.add_argument("--target", required=True, metavar="RIG", help="the rig to render: a shipped one, or a file")
     parser.add_argument("--output", required=True, metavar="DIR", help="where to write")
@@ -138,13 +128,8 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _data(text: str) -> tuple[str | None, Path]:
-    kind, _, folder = text.partition(":")
-    return (kind, Path(folder)) if kind in ("nuscenes", "frames") and folder else (None, Path(text))
-
-
 def _settings(arguments: argparse.Namespace) -> Settings:
-    kind, root = arguments.data
+    kind, root = split_kind(arguments.data)
     root = root.absolute()  # Ray's actors have a working directory of their own
     depth, beside = arguments.motion_depth, inside(root, DEPTH_FOLDER, "depth from motion")
     if depth is None and arguments.surface == "motion" and beside.is_dir():
@@ -176,7 +161,7 @@ def _settings(arguments: argparse.Namespace) -> Settings:
     )
 
 
-def _begun(settings: Settings, data: Data, arguments: argparse.Namespace) -> tuple[Jobs, Mapping[str, Any]]:
+def _begun(settings: Settings, data: Recording, arguments: argparse.Namespace) -> tuple[Jobs, Mapping[str, Any]]:
     """The jobs of this shard, in a folder that says what it is made of; and that."""
     shard, shards = arguments.shard_index, arguments.num_shards
     try:

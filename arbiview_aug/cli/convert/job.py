@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -13,15 +14,14 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.atomic_io import checksum, inside, write_whole
 from arbiview_aug.cli.arguments import gathered_warnings
-from arbiview_aug.cli.convert.frame_folders import FrameFolders
 from arbiview_aug.cli.convert.manifest import Manifest, Record
-from arbiview_aug.cli.convert.nuscenes import NuScenes
-from arbiview_aug.cli.convert.settings import Data, Settings
+from arbiview_aug.cli.convert.settings import Settings
 from arbiview_aug.cli.convert.views import coded_views, rig_of
+from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.motion_depth import WithMotionDepth
-from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
+from arbiview_aug.datasets.registry import find_reader
 from arbiview_aug.environment import repeatable_opencv
-from arbiview_aug.errors import OutputError, described
+from arbiview_aug.errors import DataError, OutputError, described
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 OnError = Literal["report", "skip", "fatal"]
@@ -50,9 +50,17 @@ class Done(NamedTuple):
     words: tuple[str, ...] = ()
 
 
-def format_of(settings: Settings, data: Data) -> NuScenes | FrameFolders:
-    """What writes the source's format."""
-    return NuScenes(settings, data) if isinstance(data, NuScenesDataset) else FrameFolders(settings, data)
+def format_of(settings: Settings, data: Recording) -> Any:
+    """The writer of the source's format.
+
+    Raises:
+        DataError: Its reader names none.
+    """
+    _, reader = find_reader(settings.root, settings.kind)
+    if reader.writer is None:
+        raise DataError(f"--data {settings.root}: expected a kind that can be written, got a {reader.description}")
+    module, _, name = reader.writer.partition(":")
+    return getattr(import_module(module), name)(settings, data)
 
 
 class Jobs(Dataset[Done]):
@@ -65,7 +73,7 @@ class Jobs(Dataset[Done]):
         on_error: What becomes of samples that cannot be read or rendered.
     """
 
-    def __init__(self, settings: Settings, data: Data, indices: Sequence[int], on_error: OnError) -> None:
+    def __init__(self, settings: Settings, data: Recording, indices: Sequence[int], on_error: OnError) -> None:
         self.settings, self.data, self.indices, self.on_error = settings, data, indices, on_error
         self.samples = settings.samples(data)
         self.format, self.manifest = format_of(settings, data), Manifest(settings.output)

@@ -10,8 +10,9 @@ import numpy as np
 from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.convert.manifest import Manifest
-from arbiview_aug.cli.convert.settings import FOLDER, Data, Settings
+from arbiview_aug.cli.convert.settings import FOLDER, Settings
 from arbiview_aug.cli.convert.views import coverage_of
+from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.registry import open_data
 from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
@@ -43,7 +44,7 @@ def converted(settings: Settings) -> Method:
     return Method(CONVERTED, render, anew.reads_points, anew.render_alone)
 
 
-def write_report(settings: Settings, data: Data, tokens: Sequence[str], count: int) -> Evaluation:
+def write_report(settings: Settings, data: Recording, tokens: Sequence[str], count: int) -> Evaluation:
     """Score some converted frames, spread evenly over all, and write the page.
 
     Args:
@@ -70,7 +71,7 @@ def write_report(settings: Settings, data: Data, tokens: Sequence[str], count: i
     return done
 
 
-def _frames(data: Data, tokens: Sequence[str]) -> Iterator[tuple[str, ScoredFrame]]:
+def _frames(data: Recording, tokens: Sequence[str]) -> Iterator[tuple[str, ScoredFrame]]:
     """At the exposures that were recorded: the views cannot be made again at others."""
     for token in tokens:
         yield token, make_frame(data.by_token(token), exposures=("raw",))

@@ -9,12 +9,11 @@ from typing import Any, Literal
 from arbiview_aug.atomic_io import checksum, is_part
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.datasets.drive import Neighbours
-from arbiview_aug.datasets.frame_folder import FrameFolder
+from arbiview_aug.datasets.drive import Neighbours, Recording
 from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.datasets.motion_depth import WithMotionDepth
 from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
-from arbiview_aug.datasets.registry import Kind, open_data
+from arbiview_aug.datasets.registry import open_data
 from arbiview_aug.errors import CalibrationError, DataError
 from arbiview_aug.favs.config import Quality
 from arbiview_aug.generator import Generator
@@ -25,8 +24,6 @@ from arbiview_aug.transforms.settings import RenderPath
 
 FOLDER = "conversion"
 """Where an output folder holds what is about it: manifest, provenance, report."""
-
-Data = FrameFolder | NuScenesDataset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +52,7 @@ class Settings:
     """
 
     root: Path
-    kind: Kind | None = None
+    kind: str | None = None
     version: str | None = None
     target: Rig
     output: Path
@@ -77,7 +74,7 @@ class Settings:
         """The target at the size of the views, in its own ego frame."""
         return self.target if self.size is None else self.target.resized(self.size, self.fit)
 
-    def open(self) -> Data:
+    def open(self) -> Recording:
         """The source.
 
         Raises:
@@ -86,7 +83,7 @@ class Settings:
         near = Neighbours(count=self.neighbours) if self.neighbours else None
         return open_data(self.root, kind=self.kind, version=self.version, reduce=self.reduce, neighbours=near)
 
-    def samples(self, data: Data) -> Data | WithMotionDepth:
+    def samples(self, data: Recording) -> Recording | WithMotionDepth:
         """The source's samples, with depth from motion where that was found before."""
         return data if self.motion_depth is None else WithMotionDepth(data, self.motion_depth)
 
@@ -123,7 +120,7 @@ class Settings:
         }
 
 
-def check_target(settings: Settings, data: Data) -> None:
+def check_target(settings: Settings, data: Recording) -> None:
     """Refuse a target that the output's format cannot hold.
 
     Raises:

@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.utils.data import Dataset
 
 from arbiview_aug.atomic_io import inside
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, Unreadable, check_neighbours
+from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, Recording, Unreadable, check_neighbours
 from arbiview_aug.datasets.frame_folder import checked_points
 from arbiview_aug.datasets.image_io import Reduce, check_reduce, decode_images, reduced_rig
 from arbiview_aug.datasets.nuscenes.boxes import read_annotations
@@ -37,8 +36,16 @@ CAMERA_RING = (
 
 _POINT_FLOATS = 5  # x y z intensity ring
 
+_USUAL_VERSIONS = ("v1.0-mini", "v1.0-trainval")
 
-class NuScenesDataset(Dataset[dict[str, Any]]):
+
+def table_folders(root: Path) -> list[str]:
+    """Names of a root's folders of tables: v1.0-mini and v1.0-trainval first."""
+    found = sorted(path.name for path in root.glob("v1.0-*") if path.is_dir())
+    return [*(name for name in _USUAL_VERSIONS if name in found), *(n for n in found if n not in _USUAL_VERSIONS)]
+
+
+class NuScenesDataset(Recording):
     """The keyframes of a nuScenes v1.0 data set, in the order of its ``sample`` table.
 
     A sample is a dict, everything in the ego frame at the LiDAR's time: ``images`` (N, 3, h, w) uint8 RGB; ``rig``;
@@ -107,7 +114,7 @@ class NuScenesDataset(Dataset[dict[str, Any]]):
         self.reduce = reduce
         self.neighbours = neighbours
         samples = _chosen_samples(tables, split_scenes)
-        self.tokens: list[str] = [row["token"] for row in samples]
+        self.tokens = [row["token"] for row in samples]
         self.scene_tokens: list[str] = [row["scene_token"] for row in samples]
         self._index = {token: k for k, token in enumerate(self.tokens)}
         scene = {token: k for k, token in enumerate(dict.fromkeys(self.scene_tokens))}
@@ -127,22 +134,6 @@ class NuScenesDataset(Dataset[dict[str, Any]]):
         self._driven = np.empty(0, np.int64) if neighbours is None else self._with_files()
         positions_m = self._recordings.ego2global(self._driven)[:, :3, 3]
         self._drive = Drive(positions_m, self._recordings.parts[self._driven])
-
-    def __len__(self) -> int:
-        return len(self.tokens)
-
-    def by_token(self, token: str) -> dict[str, Any]:
-        """The sample with this token.
-
-        Raises:
-            DataError: No such sample, or not in the chosen scenes.
-        """
-        if token not in self._index:
-            raise DataError(
-                f"nuScenes {self.root}: expected the token of one of {len(self)} samples, got {token!r}; "
-                "is it of another version, or of a scene that split_scenes leaves out?"
-            )
-        return self[self._index[token]]
 
     def files(self, index: int) -> list[Path]:
         """What a sample is read from: each camera's image, then the LiDAR's points."""

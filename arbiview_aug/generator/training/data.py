@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
@@ -13,9 +12,9 @@ from torch.utils.data import DataLoader, Dataset, get_worker_info
 from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.datasets.frame_folder import SEQUENCE_FILE, FrameFolder
+from arbiview_aug.datasets.frame_folder import SEQUENCE_FILE
 from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
-from arbiview_aug.datasets.registry import open_data
+from arbiview_aug.datasets.registry import READERS, open_data
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator.training.checkpointing import ignore_stop_requests
@@ -163,7 +162,7 @@ def open_frames(
     """The frames that ``--data`` names.
 
     Args:
-        data: ``synthetic``, ``nuscenes:ROOT`` or ``frames:DIR``.
+        data: ``synthetic``, or ``KIND:PATH`` as ``open_data`` takes it.
         size: (h, w) of the images.
         scenes: How many synthetic streets.
         seed: Of the streets.
@@ -177,13 +176,12 @@ def open_frames(
     if data == "synthetic":
         drive = SyntheticDrive(demo_source_rig(size), num_frames=scenes, seed=seed, lidar=False, device=device)
         return Frames(drive, size, [str(k) for k in range(scenes)])
-    if kind not in ("nuscenes", "frames") or not folder:
-        raise TrainingError(f"--data {data}: expected synthetic, nuscenes:ROOT or frames:DIR")
-    found = open_data(Path(folder))
+    if kind not in READERS or not folder:
+        raise TrainingError(f"--data {data}: expected synthetic, {' or '.join(f'{name}:PATH' for name in READERS)}")
+    found = open_data(data)
     found.load_points = False
     if isinstance(found, NuScenesDataset):
         return Frames(found, size, found.scene_tokens)
-    assert isinstance(found, FrameFolder)
     if not (found.root / SEQUENCE_FILE).is_file():
         return Frames(found, size, found.tokens)
     # A drive is cut into blocks: frames next to each other show the same street.

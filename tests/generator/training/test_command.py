@@ -79,7 +79,7 @@ def test_an_autoencoder_comes_first(drawn_frames: None, tmp_path: Path, capsys: 
     ("arguments", "message"),
     [
         (["--set", "step=1"], "expected one of generator"),
-        (["--data", "kitti"], "expected synthetic, nuscenes:ROOT or frames:DIR"),
+        (["--data", "kitti"], "expected synthetic, frames:PATH or nuscenes:PATH"),
         (["--config", "paper"], "expected --weights"),
         (["--weights", "somewhere"], "expected none for --config tiny"),
         (["evaluate"], "expected a generator's folder"),
