@@ -56,7 +56,7 @@ def test_command_writes_the_report(
 
 def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "speed", "--data", str(tmp_path)]) == 2
-    assert "expected calib.json" in capsys.readouterr().err
+    assert "expected a frame folder (calib.json" in capsys.readouterr().err
     for arguments in (["speed", "--repeats", "0"], ["beauty"], ["--repeats", "0"]):
         with pytest.raises(SystemExit, match="2"):
             main(["bench", *arguments])
