@@ -53,8 +53,8 @@ def warn_about_cv2_wheels() -> None:
     )
 
 
-def optional_package(name: str, extra: str) -> Any:
-    """A package of one of this package's extras, imported.
+def optional_package(name: str, extra: str | None = None) -> Any:
+    """Import a package of one of this package's extras, or a framework that no extra installs.
 
     Raises:
         ImportError: It is not installed; with the command that installs it.
@@ -65,7 +65,8 @@ def optional_package(name: str, extra: str) -> Any:
         top = name.split(".")[0]
         if (error.name or "").split(".")[0] != top:
             raise  # it is there, but what it needs is not
-        raise ImportError(f"{top} is not installed: pip install 'arbiview_aug[{extra}]'") from None
+        wanted = f"'arbiview_aug[{extra}]'" if extra else top
+        raise ImportError(f"{top} is not installed: pip install {wanted}") from None
 
 
 @contextmanager

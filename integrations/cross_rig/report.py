@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from integrations.cross_rig.arms import ARMS
-from integrations.cross_rig.counting import DISTANCES_M, HEIGHTS_M, iou
+from integrations.cross_rig.cell_counts import DISTANCES_M, HEIGHTS_M, iou
 from integrations.cross_rig.experiment import Run, load_results, rendering_seconds, same_frames
 from integrations.cross_rig.scoring import arm_scores
 from integrations.cross_rig.settings import jobs

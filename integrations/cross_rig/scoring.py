@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from integrations.cross_rig.counting import Counts, Floats, iou
+from integrations.cross_rig.cell_counts import Counts, Floats, iou
 
 MIN_GAP = 0.05
 """Oracle minus raw below which a share says nothing: the intervals of both are about a fifth of it."""

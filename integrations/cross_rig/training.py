@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from arbiview_aug import Rig
 from integrations.cross_rig.augmentation import scaled_and_cropped
 from integrations.cross_rig.cache import FrameStore
-from integrations.cross_rig.counting import Tally, iou, tally
+from integrations.cross_rig.cell_counts import Tally, iou, tally
 from integrations.cross_rig.labels import HIDDEN, VEHICLE, Grid
 from integrations.cross_rig.model import Backbone, Batch, BevDetector
 

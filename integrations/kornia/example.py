@@ -15,7 +15,7 @@ from torchvision.transforms import v2
 
 from arbiview_aug import CropRig, ResizeRig, RigRetarget, load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from integrations.kornia.pipeline import OnImages
+from arbiview_aug.integrations.kornia import OnImages
 
 
 def torchvision_pipeline() -> v2.Compose:

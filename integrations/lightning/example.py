@@ -9,7 +9,7 @@ import torch
 
 from arbiview_aug import RigRetarget
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
-from integrations.lightning.datamodule import RetargetDataModule
+from arbiview_aug.integrations.lightning import RetargetDataModule
 
 SIZE = (64, 176)
 

@@ -12,9 +12,9 @@ import numpy as np
 
 from arbiview_aug import load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive
-from integrations.mmdet3d.made import FORMS, LIDAR2EGO, recording, source_rig
+from arbiview_aug.integrations.mmdet3d import RigRetargetMultiView
+from integrations.mmdet3d.fake_results import FORMS, LIDAR2EGO, recording, source_rig
 from integrations.mmdet3d.measure import worst_error_px
-from integrations.mmdet3d.transform import RigRetargetMultiView
 
 SIZE = (64, 176)
 
@@ -27,8 +27,6 @@ def main() -> int:
     config: dict[str, Any] = {"type": "RigRetargetMultiView", "target": target, "lidar2ego": LIDAR2EGO}
     if find_spec("mmengine"):
         from mmengine.dataset import Compose
-
-        import integrations.mmdet3d.registered  # noqa: F401 - registers the step
 
         step, how = Compose([config]), "mmengine.dataset.Compose"
     else:

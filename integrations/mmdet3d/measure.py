@@ -9,8 +9,8 @@ import numpy as np
 
 from arbiview_aug import Rig
 from arbiview_aug.cameras.lens import FloatArray
-from integrations.mmdet3d.made import LIDAR2EGO
-from integrations.mmdet3d.matrices import MATRICES, stacked
+from arbiview_aug.integrations.mmdet3d.matrices import MATRICES, stacked
+from integrations.mmdet3d.fake_results import LIDAR2EGO
 
 
 def lidar2img_of(results: Mapping[str, Any], lidar2ego: FloatArray = LIDAR2EGO) -> FloatArray:

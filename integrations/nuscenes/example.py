@@ -10,14 +10,14 @@ from tempfile import TemporaryDirectory
 import torch
 from torch.utils.data import DataLoader
 
-from arbiview_aug import Rig, RigRetarget, load_rig, project_boxes_3d
-from arbiview_aug.datasets import NuScenesDataset, RetargetedDataset
+from arbiview_aug import Rig, RigRetarget, load_rig
+from arbiview_aug.integrations.nuscenes import NuScenesDataset, RetargetedDataset, project_boxes_3d
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run through some keyframes; without ``--data`` of a small root that is made for it."""
+    """Run through some keyframes; without ``--data``, of a small synthetic root."""
     parser = argparse.ArgumentParser(prog="python -m integrations.nuscenes.example", description=__doc__)
-    parser.add_argument("--data", type=Path, help="folder with samples and tables; default: one that is made")
+    parser.add_argument("--data", type=Path, help="folder with samples and tables; default: a small synthetic one")
     parser.add_argument("--version", default="v1.0-mini", help="folder of tables")
     parser.add_argument("--target", default="waymo", help="rig, by name or file")
     parser.add_argument("--size", type=int, nargs=2, default=(128, 352), metavar=("H", "W"), help="of the views")
@@ -27,10 +27,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     target = load_rig(arguments.target).resized(tuple(arguments.size), "crop")
     if arguments.data is not None:
         return _run(arguments.data, arguments.version, target, arguments.frames, arguments.workers)
-    from integrations.nuscenes.made import made_root
+    from integrations.nuscenes.fake_root import fake_root
 
     with TemporaryDirectory() as folder:
-        return _run(made_root(Path(folder) / "root"), arguments.version, target, arguments.frames, arguments.workers)
+        return _run(fake_root(Path(folder) / "root"), arguments.version, target, arguments.frames, arguments.workers)
 
 
 def _run(root: Path, version: str, target: Rig, frames: int, workers: int) -> int:

@@ -42,18 +42,38 @@ def test_every_folder_has_readme_example_and_tests() -> None:
         assert (folder / "example.py").is_file() and list((folder / "tests").glob("test_*.py"))
 
 
-@pytest.mark.integrations
-def test_frameworks_are_no_dependencies() -> None:
-    """The package and the pure parts import none of them."""
+def test_frameworks_are_imported_where_they_are_used() -> None:
+    """Neither the package nor an adapter imports them; a missing one is one line with the command to install it."""
     code = (
-        "import sys, arbiview_aug, integrations.mmdet3d.transform, integrations.lightning.batches\n"
-        "import integrations.webdataset.shards\n"
-        "print([m for m in ('mmengine', 'lightning', 'webdataset', 'nuscenes') if m in sys.modules])"
+        "import sys, arbiview_aug\n"
+        "from arbiview_aug.integrations import kornia, lightning, mmdet3d, nuscenes, webdataset\n"
+        "print([m for m in ('lightning', 'webdataset') if m in sys.modules])\n"
+        "sys.modules |= dict.fromkeys(('lightning', 'webdataset'))\n"
+        "for use in (lambda: lightning.RetargetDataModule, lambda: webdataset.stream('no.tar', dict)):\n"
+        "    try: use()\n"
+        "    except ImportError as error: print(error)\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=500, check=True
     )
-    assert done.stdout.strip() == "[]"
+    hints = [f"{name} is not installed: pip install {name}" for name in ("lightning", "webdataset")]
+    assert done.stdout.splitlines() == ["[]", *hints]
+
+
+def test_importing_the_mmdet3d_adapter_registers_the_step(tmp_path: Path) -> None:
+    """As ``custom_imports`` does; without mmengine nothing is registered, and the import works."""
+    registry = tmp_path / "mmengine" / "registry.py"
+    registry.parent.mkdir()
+    (registry.parent / "__init__.py").write_text("")
+    registry.write_text(
+        "class TRANSFORMS:\n    def register_module(name, force, module): print(name, module.__module__)\n"
+    )
+    code = "import arbiview_aug.integrations.mmdet3d as m; m.RigRetargetMultiView, m.register"
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=500, check=True
+    )
+    assert done.stdout.split() == ["RigRetargetMultiView", "arbiview_aug.integrations.mmdet3d.transform"]
 
 
 @pytest.mark.integrations

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from integrations.mmdet3d.made import FORMS, recording, source_rig
-from integrations.mmdet3d.transform import RigRetargetMultiView
-from integrations.nuscenes.made import VERSION, made_root
+from arbiview_aug.integrations.mmdet3d import RigRetargetMultiView
+from integrations.mmdet3d.fake_results import FORMS, recording, source_rig
+from integrations.nuscenes.fake_root import VERSION, fake_root
 from integrations.snippets import snippets
 
 
@@ -37,7 +37,7 @@ def test_kornia() -> None:
 
 
 def test_nuscenes(tmp_path: Path) -> None:
-    root = made_root(tmp_path / "root")
+    root = fake_root(tmp_path / "root")
     (code,) = snippets("nuscenes", {"data/nuscenes": str(root), "v1.0-trainval": VERSION, "num_workers=8": ""})
     names: dict[str, Any] = {"train_scenes": None}
     exec(code, names)

@@ -9,7 +9,7 @@ from torch.utils.data import DataLoader
 
 from arbiview_aug import RigRetarget, load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from integrations.webdataset.shards import stream, write_shard
+from arbiview_aug.integrations.webdataset import stream, write_shard
 
 SHARDS, FRAMES = 2, 2
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from integrations.cross_rig.counting import iou, tally
+from integrations.cross_rig.cell_counts import iou, tally
 from integrations.cross_rig.labels import HIDDEN, VEHICLE
 from integrations.cross_rig.scoring import arm_scores, bootstrap_ious
 

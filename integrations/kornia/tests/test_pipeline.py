@@ -10,8 +10,8 @@ from torchvision.transforms import v2
 
 from arbiview_aug import CropRig, ResizeRig, RigRetarget
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.integrations.kornia import OnImages, check_photometric
 from integrations.kornia.example import main
-from integrations.kornia.pipeline import OnImages, check_photometric
 
 SOURCE = demo_source_rig((64, 176))
 TARGET = SOURCE.turned(pitch_deg=-12)

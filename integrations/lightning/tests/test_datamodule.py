@@ -10,9 +10,9 @@ import torch
 from arbiview_aug import RigRetarget
 from arbiview_aug.datasets import Neighbours, NuScenesDataset
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from integrations.lightning.datamodule import RetargetDataModule
+from arbiview_aug.integrations.lightning import RetargetDataModule
 from integrations.lightning.example import NearestBox, main
-from integrations.nuscenes.made import VERSION, made_root
+from integrations.nuscenes.fake_root import VERSION, fake_root
 from integrations.snippets import snippets
 
 
@@ -23,7 +23,7 @@ def test_example_trains_on_retargeted_and_validates_on_untouched_frames(capsys):
 
 
 def test_the_readmes_code_trains(tmp_path):
-    root = made_root(tmp_path / "root")
+    root = fake_root(tmp_path / "root")
     changes = {"data/nuscenes": str(root), "v1.0-trainval": VERSION, "batch_size=8": "batch_size=1"}
     (code,) = snippets("lightning", {**changes, "    num_workers=8,\n": ""})
     model = NearestBox()

@@ -8,10 +8,10 @@ pytest.importorskip("mmengine")
 from mmengine.config import Config
 from mmengine.dataset import Compose
 
-import integrations.mmdet3d.registered  # noqa: F401 - registers the step
+import arbiview_aug.integrations.mmdet3d  # noqa: F401 - registers the step
 from arbiview_aug import load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive
-from integrations.mmdet3d.made import FORMS, LIDAR2EGO, recording, source_rig
+from integrations.mmdet3d.fake_results import FORMS, LIDAR2EGO, recording, source_rig
 from integrations.mmdet3d.measure import worst_error_px
 
 SIZE = (48, 136)
@@ -24,7 +24,7 @@ def test_compose_of_a_config(form, tmp_path):
     rig = load_rig("waymo").undistorted()
     file = rig.save(tmp_path / "waymo.yaml")
     text = f"""
-custom_imports = dict(imports=["integrations.mmdet3d.registered"], allow_failed_imports=False)
+custom_imports = dict(imports=["arbiview_aug.integrations.mmdet3d"], allow_failed_imports=False)
 pipeline = [
     dict(type="RigRetargetMultiView", target={str(file)!r}, size={SIZE}, lidar2ego={LIDAR2EGO.tolist()}),
 ]

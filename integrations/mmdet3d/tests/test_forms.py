@@ -12,11 +12,11 @@ import torch
 
 from arbiview_aug import CalibrationError, CropRig, ResizeRig, Rig, RigRetarget, SampleError, SampleTypeError, load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive
-from integrations.mmdet3d.bevdet import MEAN_STD
-from integrations.mmdet3d.made import EGO2GLOBAL, FORMS, LIDAR2EGO, Recording, recording, source_rig
-from integrations.mmdet3d.matrices import MATRICES, decomposed, upper_triangular
+from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD
+from arbiview_aug.integrations.mmdet3d.matrices import MATRICES, decomposed, upper_triangular
+from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
+from integrations.mmdet3d.fake_results import EGO2GLOBAL, FORMS, LIDAR2EGO, Recording, recording, source_rig
 from integrations.mmdet3d.measure import worst_error_px
-from integrations.mmdet3d.transform import RigRetargetMultiView
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
 SIZE = (48, 136)

@@ -18,15 +18,15 @@ from arbiview_aug.datasets import NuScenesDataset
 from integrations.environments import python_of
 from integrations.nuscenes.compare import agreement, devkit_boxes
 from integrations.nuscenes.example import main
-from integrations.nuscenes.made import VERSION, made_root
+from integrations.nuscenes.fake_root import VERSION, fake_root
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: Any) -> Path:
-    return made_root(tmp_path_factory.mktemp("nuscenes") / "root")
+    return fake_root(tmp_path_factory.mktemp("nuscenes") / "root")
 
 
-def test_the_made_root_is_whole(root: Path) -> None:
+def test_the_fake_root_is_whole(root: Path) -> None:
     """Every token leads somewhere, every link has its way back: the devkit follows them all."""
     tables = {path.stem: json.loads(path.read_text()) for path in (root / VERSION).glob("*.json")}
     assert len(tables) == 13

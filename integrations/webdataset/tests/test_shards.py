@@ -13,7 +13,7 @@ import torch
 from arbiview_aug import Camera, DataError, Rig, RigRetarget
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import SampleTypeError
-from integrations.webdataset.shards import ARRAYS, stream, to_entry, to_sample, write_shard
+from arbiview_aug.integrations.webdataset import ARRAYS, stream, to_entry, to_sample, write_shard
 
 
 @pytest.fixture(scope="module")

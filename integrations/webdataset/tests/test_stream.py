@@ -8,9 +8,9 @@ pytest.importorskip("webdataset")
 
 from arbiview_aug import RigRetarget
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.integrations.webdataset import stream, write_shard
 from integrations.snippets import snippets
 from integrations.webdataset.example import main
-from integrations.webdataset.shards import stream, write_shard
 
 
 @pytest.mark.parametrize("workers", [0, 2])

@@ -17,6 +17,7 @@ import torch
 from arbiview_aug.atomic_io import BROKEN_ARRAY
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.image_io import encoded, encoded_image
+from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import DataError
 
 ARRAYS = ("points", "boxes_3d", "ego2world")
@@ -136,9 +137,5 @@ def stream(urls: str | Sequence[str], retarget: Callable[[dict[str, Any]], dict[
     Raises:
         ImportError: webdataset is not installed.
     """
-    try:
-        import webdataset as wds
-    except ImportError:
-        raise ImportError("webdataset: not installed; pip install webdataset") from None
-    shards = wds.WebDataset(urls, shardshuffle=100 if shuffle else False, empty_check=False)
+    shards = optional_package("webdataset").WebDataset(urls, shardshuffle=100 if shuffle else False, empty_check=False)
     return (shards.shuffle(shuffle) if shuffle else shards).map(to_sample).map(retarget)

@@ -13,9 +13,9 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import CalibrationError, SampleError
-from integrations.mmdet3d.images import like_given as images_like
-from integrations.mmdet3d.images import to_tensors
-from integrations.mmdet3d.matrices import MATRICES, Views, is_transposed, like_given, read_views, stacked
+from arbiview_aug.integrations.mmdet3d.images import like_given as images_like
+from arbiview_aug.integrations.mmdet3d.images import to_tensors
+from arbiview_aug.integrations.mmdet3d.matrices import MATRICES, Views, is_transposed, like_given, read_views, stacked
 
 Retarget = Callable[[dict[str, Any]], dict[str, Any]]
 

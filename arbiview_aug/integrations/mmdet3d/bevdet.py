@@ -10,8 +10,8 @@ import torch
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import SampleError
-from integrations.mmdet3d.matrices import Views, padded, upper_triangular
-from integrations.mmdet3d.results import (
+from arbiview_aug.integrations.mmdet3d.matrices import Views, padded, upper_triangular
+from arbiview_aug.integrations.mmdet3d.results import (
     STALE_KEYS,
     Retarget,
     source_rig,

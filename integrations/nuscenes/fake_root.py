@@ -13,10 +13,10 @@ from arbiview_aug.datasets.synthetic import demo_source_rig
 from tests.datasets.nuscenes_root import VERSION, Tables, streets, tables_of, write_root, write_views
 
 SPEED_MPS = 9.0
-_MAP_FILE = "maps/made.png"
+_MAP_FILE = "maps/fake.png"
 
 
-def made_root(root: Path, size: tuple[int, int] = (72, 128), keyframes: int = 2) -> Path:
+def fake_root(root: Path, size: tuple[int, int] = (72, 128), keyframes: int = 2) -> Path:
     """Write a drive of some keyframes at ``SPEED_MPS``; its sweeps are grey.
 
     Args:
@@ -76,4 +76,4 @@ def _link(rows: list[dict[str, Any]]) -> None:
         row["next"] = rows[k + 1]["token"] if k + 1 < len(rows) else ""
 
 
-__all__ = ["VERSION", "complete", "made_root"]
+__all__ = ["VERSION", "complete", "fake_root"]

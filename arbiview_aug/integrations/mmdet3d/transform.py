@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from arbiview_aug import RandomRig, Rig, RigRetarget
-from integrations.mmdet3d.bevdet import MEAN_STD, retarget_img_inputs
-from integrations.mmdet3d.results import check_no_lenses, retarget_results
+from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD, retarget_img_inputs
+from arbiview_aug.integrations.mmdet3d.results import check_no_lenses, retarget_results
 
 
 class RigRetargetMultiView:

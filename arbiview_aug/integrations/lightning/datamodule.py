@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import lightning
 import torch
 from torch.utils.data import DataLoader, Dataset
 
 from arbiview_aug import RigRetarget
-from integrations.lightning.batches import collate, on_device, packed, unpacked
+from arbiview_aug.environment import optional_package
+from arbiview_aug.integrations.lightning.batches import collate, on_device, packed, unpacked
+
+optional_package("lightning")  # or one line that says how to install it
+import lightning  # noqa: E402
 
 
 class RetargetDataModule(lightning.LightningDataModule):
