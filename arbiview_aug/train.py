@@ -6,7 +6,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from arbiview_aug.cli.arguments import count
+from arbiview_aug.cli.arguments import add_output, command_parser, count
 from arbiview_aug.datasets.registry import READERS
 from arbiview_aug.errors import ArbiviewError
 from arbiview_aug.generator.training.command import COMMANDS, run
@@ -14,36 +14,30 @@ from arbiview_aug.generator.training.config import CONFIGS
 
 
 def parser() -> argparse.ArgumentParser:
-    """The arguments."""
-    made = argparse.ArgumentParser(
-        prog="python -m arbiview_aug.train",
-        description="CVC-SSL: train a generator to reconstruct real views from pseudo views beside them. The same "
-        "command with the same --output goes on where it stopped. Several GPUs: accelerate launch -m "
-        "arbiview_aug.train …, or torchrun --nproc_per_node N -m arbiview_aug.train …",
+    """The parser of the arguments."""
+    found = command_parser(
+        "",
+        "CVC-SSL: train a generator to reconstruct real views from pseudo views beside them. The same command with the "
+        "same --output goes on where it stopped. Several GPUs: accelerate launch -m arbiview_aug.train …, or torchrun "
+        "--nproc_per_node N -m arbiview_aug.train …",
+        "--data nuscenes:ROOT --output output/tiny --set steps=100",
+        program="python -m arbiview_aug.train",
     )
-    made.add_argument("command", nargs="?", choices=COMMANDS, default="train", help="(default: %(default)s)")
-    made.add_argument("--config", choices=tuple(CONFIGS), default="tiny", help="(default: %(default)s)")
-    made.add_argument(
-        "--data",
-        default="synthetic",
-        metavar="KIND:PATH",
-        help=f"synthetic, or real frames with their kind: {' or '.join(f'{kind}:PATH' for kind in READERS)} "
-        "(default: %(default)s)",
-    )
-    made.add_argument("--output", default="output", metavar="DIR", help="(default: %(default)s)")
-    made.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="a setting, such as steps=100 or loss.geo=0"
-    )
-    made.add_argument(
-        "--stage", choices=("all", "autoencoder"), default="all", help="autoencoder: only that, where there is one"
-    )
-    made.add_argument("--weights", metavar="DIR", help="paper: Stable Diffusion 1.5, a folder or hub id")
-    made.add_argument("--vgg-weights", metavar="FILE", help="torchvision's vgg16 weights (default: cache or download)")
-    made.add_argument("--views", type=count, default=64, metavar="N", help="held-out views to score (default: 64)")
-    made.add_argument("--seeds", type=count, default=1, metavar="N", help="evaluate: targets a scene (default: 1)")
-    made.add_argument("--steps", type=count, default=4, metavar="N", help="evaluate: of a sample (default: 4)")
-    made.add_argument("--quiet", action="store_true", help="no progress bars")
-    return made
+    add = found.add_argument
+    add("command", nargs="?", choices=COMMANDS, default="train", help="what to do (default: %(default)s)")
+    add("--config", choices=tuple(CONFIGS), default="tiny", help="preset of all settings")
+    kinds = " or ".join(f"{kind}:PATH" for kind in READERS)
+    add("--data", default="synthetic", metavar="DATA", help=f"synthetic, or real frames with their kind: {kinds}")
+    add_output(found, "folder of the run")
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting, such as steps=100 or loss.geo=0")
+    add("--stage", choices=("all", "autoencoder"), default="all", help="autoencoder: that alone, if the config has one")
+    add("--weights", metavar="DIR", help="config paper: Stable Diffusion 1.5, a folder or hub id")
+    add("--vgg-weights", metavar="FILE", help="torchvision's vgg16 weights (default: cache or download)")
+    add("--views", type=count, default=64, metavar="N", help="number of held-out views to score")
+    add("--seeds", type=count, default=1, metavar="N", help="evaluate: targets a scene")
+    add("--steps", type=count, default=4, metavar="N", help="evaluate: steps of a sample")
+    add("--quiet", action="store_true", help="no progress bars")
+    return found
 
 
 def main(argv: Sequence[str] | None = None) -> int:

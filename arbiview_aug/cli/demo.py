@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import cv2
 from tqdm import tqdm
@@ -23,7 +23,10 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.arguments import (
     REAL_TARGET,
     add_data,
+    add_output,
+    add_rendering,
     add_target,
+    command_parser,
     count,
     gathered_warnings,
     seed,
@@ -123,35 +126,18 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m arbiview_aug demo",
-        description="Retarget a synthetic street, or real frames, to another vehicle's cameras: the plan in words, "
-        "metrics, time, and one contact sheet.",
+    parser = command_parser(
+        "demo",
+        "Retarget a synthetic street, or real frames, to another vehicle's cameras: the plan in words, metrics, time, "
+        "and one contact sheet.",
+        "--data FOLDER --target waymo",
     )
     add_data(parser, "a synthetic street")
     add_target(parser)
-    parser.add_argument(
-        "--output",
-        default="output",
-        metavar="DIR",
-        help=f"folder for {PICTURE_FILE}, or a picture file ending in .png or .jpg (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--quality",
-        choices=get_args(Quality),
-        default="fast",
-        help="(default: %(default)s); paper: the published method, beside fast on the other surfaces, without lenses",
-    )
-    parser.add_argument("--surface", choices=get_args(SurfaceName), default="auto", help="(default: %(default)s)")
-    parser.add_argument(
-        "--path",
-        choices=get_args(RenderPath),
-        default="favs",
-        help="what completes holes: favs (default) continues them from their borders; inpaint and diffusion are in "
-        "docs/holes.md",
-    )
-    parser.add_argument("--frames", type=count, default=1, metavar="N", help="how many (default: %(default)s)")
-    parser.add_argument("--seed", type=seed, default=0, help="of the synthetic streets (default: %(default)s)")
+    add_output(parser, f"folder for {PICTURE_FILE}, or a picture file ending in .png or .jpg")
+    add_rendering(parser)
+    parser.add_argument("--frames", type=count, default=1, metavar="N", help="number of frames")
+    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of the synthetic streets")
     parser.add_argument(
         "--size",
         type=size,
@@ -159,9 +145,7 @@ def _parser() -> argparse.ArgumentParser:
         help="render at this height and width, the target cut to this aspect; on a synthetic street the source cameras "
         "too (default: 256x704 on a synthetic street, with --data the rig's own)",
     )
-    parser.add_argument(
-        "--width", type=count, default=1800, metavar="PX", help="of the contact sheet (default: %(default)s)"
-    )
+    parser.add_argument("--width", type=count, default=1800, metavar="PX", help="width of the contact sheet")
     return parser
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ import torch
 from torch.utils.data import Dataset
 
 from arbiview_aug.atomic_io import inside
-from arbiview_aug.cli.arguments import add_data, count, device_named, gathered_warnings, writable_folder
+from arbiview_aug.cli.arguments import add_data, command_parser, count, device_named, gathered_warnings, writable_folder
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.motion_depth import FOLDER, WANTED, DepthFolder
 from arbiview_aug.datasets.registry import open_data, split_kind
@@ -86,15 +85,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0; 1 where frames could not be read or written, which are named.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m arbiview_aug depth",
-        description="Depth from motion of every frame of a drive, for surface='motion'. Frames that have theirs, from "
-        "the frames that are their neighbours now, are left as they are: run it again to go on.",
+    parser = command_parser(
+        "depth",
+        "Compute depth from motion of every frame of a drive, for surface='motion'. Frames whose depth is there, from "
+        "the same neighbours, are left as they are: run it again to go on.",
+        "--data nuscenes:ROOT --workers 4",
     )
     add_data(parser)
     parser.add_argument("--output", metavar="FOLDER", help=f"where to write (default: {FOLDER} in the data's folder)")
-    parser.add_argument("--device", default="cpu", help="where to compute: cpu, cuda, cuda:1 (default: %(default)s)")
-    parser.add_argument("--workers", type=count, default=1, help="processes, on the CPU (default: %(default)s)")
+    parser.add_argument("--device", default="cpu", help="where to compute: cpu, cuda, cuda:1")
+    parser.add_argument("--workers", type=count, default=1, metavar="N", help="processes, on the CPU")
     arguments = parser.parse_args(argv)
     device = device_named(arguments.device)
     data: Any = open_data(arguments.data, neighbours=WANTED)

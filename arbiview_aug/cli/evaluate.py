@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from tqdm import tqdm
 
@@ -21,7 +21,11 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.arguments import (
     REAL_TARGET,
     add_data,
+    add_output,
+    add_reduce,
+    add_rendering,
     add_target,
+    command_parser,
     count,
     gathered_warnings,
     seed,
@@ -42,10 +46,7 @@ from arbiview_aug.evaluate.report.sheet import frame_sheet
 from arbiview_aug.evaluate.report.tables import Table, evaluation_tables, text_table
 from arbiview_aug.evaluate.run import Evaluation, evaluate
 from arbiview_aug.evaluate.targets import named_targets, without_masks
-from arbiview_aug.favs.config import Quality
 from arbiview_aug.generator import Generator
-from arbiview_aug.scene.surface import SurfaceName
-from arbiview_aug.transforms.settings import RenderPath
 
 TARGET_SETS = ("paper", "yaw", "vehicles", "truck")
 _OWN = {
@@ -79,10 +80,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m arbiview_aug evaluate",
-        description="How good are the views? Sparse LiDAR metrics, overlap and consistency on real frames, the truth "
-        "on synthetic streets: tables, evaluate.json, pictures, and report.html, which needs no other file.",
+    parser = command_parser(
+        "evaluate",
+        "Measure the quality of rendered views: sparse LiDAR metrics, overlap and consistency on real frames, truth on "
+        "synthetic streets. Writes tables, evaluate.json, pictures, and a self-contained report.html.",
+        "--data FOLDER --target waymo --surface auto street",
     )
     add_data(parser, "synthetic streets")
     target = parser.add_mutually_exclusive_group()
@@ -94,19 +96,22 @@ def _parser() -> argparse.ArgumentParser:
         help="instead of --target: paper (its six configurations), yaw (5 turns), vehicles, truck (1 m higher), or "
         "degrees such as --yaws=-11,11",
     )
-    parser.add_argument("--quality", nargs="+", choices=get_args(Quality), default=["fast"], help="(default: fast)")
-    parser.add_argument("--surface", nargs="+", choices=get_args(SurfaceName), default=["auto"], help="(default: auto)")
+    add_rendering(parser, several=True)
+    parser.add_argument("--generator", metavar="DIR", help="generator of --path diffusion (default: the package's own)")
+    parser.add_argument("--steps", nargs="+", type=count, default=[4], metavar="N", help="steps of the generator")
     parser.add_argument(
-        "--path", nargs="+", choices=get_args(RenderPath), default=["favs"], help="what fills holes (default: favs)"
+        "--frames", type=count, metavar="N", help="number of frames (default: 1; --paper: 3 synthetic ones)"
     )
-    parser.add_argument("--generator", metavar="DIR", help="of --path diffusion (default: the package's own)")
-    parser.add_argument("--steps", nargs="+", type=count, default=[4], metavar="N", help="of it (default: 4)")
-    parser.add_argument("--frames", type=count, metavar="N", help="how many (default: 1; --paper: 3 synthetic ones)")
-    parser.add_argument("--seed", type=seed, default=0, help="of the synthetic streets (default: %(default)s)")
-    parser.add_argument("--reduce", type=int, choices=(1, 2, 4), default=1, help="decode images at 1, 1/2 or 1/4 size")
-    sizes = "of every view, the target cut to this aspect; of synthetic sources too (256x704)"
-    parser.add_argument("--size", type=size, metavar="HxW", help=sizes)
-    parser.add_argument("--output", default="output", metavar="DIR", help="(default: %(default)s)")
+    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of the synthetic streets")
+    add_reduce(parser)
+    parser.add_argument(
+        "--size",
+        type=size,
+        metavar="HxW",
+        help="render at this height and width, the target cut to this aspect; synthetic sources too (default: the "
+        "rig's own; synthetic: 256x704)",
+    )
+    add_output(parser)
     parser.add_argument("--json", action="store_true", help="print the JSON instead of the tables")
     what = parser.add_mutually_exclusive_group()
     what.add_argument(

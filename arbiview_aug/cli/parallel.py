@@ -1,9 +1,10 @@
-"""Commands that work through a data set offline: in processes that start clean, with a progress bar."""
+"""Work through a data set in clean processes, behind a progress bar."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
@@ -19,14 +20,14 @@ Result = TypeVar("Result")
 def results(
     jobs: Dataset[Result], workers: int, label: str, note: Callable[[Result], str] | None = None
 ) -> Iterator[Result]:
-    """What becomes of each job, in their order.
+    """Yield each job's result, in order.
 
     Args:
         jobs: Map-style: done where they are read. Picklable where there is more than one worker.
         workers: Processes of one thread each, from a server that has loaded nothing but this package: no thread or
             CUDA context is forked. With 1 the work is done in this process, on the threads that it has.
-        label: Names the progress bar.
-        note: What the bar says beside frames/s and the time that is left, after each job.
+        label: Title of the progress bar.
+        note: Text beside the bar after each result.
     """
     context = None
     if workers > 1:
@@ -46,13 +47,13 @@ def results(
 def with_progress(
     done: Iterable[Result], count: int, label: str, note: Callable[[Result], str] | None = None
 ) -> Iterator[Result]:
-    """Results as they come, behind a progress bar with frames/s and the time that is left.
+    """Yield results as they come, behind a progress bar with frames/s and the remaining time.
 
     Args:
         done: The results.
-        count: How many there will be.
-        label: Names the bar.
-        note: What it says besides, after each.
+        count: Number of results.
+        label: Title of the bar.
+        note: Text beside the bar after each result.
     """
     with tqdm(total=count, unit="frame", desc=label) as bar:
         for one in done:
@@ -67,16 +68,17 @@ def _as_it_is(value: Any) -> Any:
 
 
 def _begin(_: int) -> None:
-    held = one_thread()
-    held.__enter__()
-    threading.Thread(target=_end_with_parent, args=(held,), daemon=True).start()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the parent answers
+    threads = one_thread()
+    threads.__enter__()
+    threading.Thread(target=_end_with_parent, args=(threads,), daemon=True).start()
 
 
-def _end_with_parent(held: object) -> None:
-    """A killed parent says nothing: a worker would go on with the jobs that it has, beside those of the next run.
+def _end_with_parent(threads: object) -> None:
+    """End this worker with its parent: a killed one would leave it working beside those of the next run.
 
     Args:
-        held: Kept as long as the worker lives.
+        threads: Kept as long as the worker lives.
     """
     parent = multiprocessing.parent_process()
     if parent is not None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 
 import numpy as np
 
 from arbiview_aug.cameras.rig import Rig, load_rig, shipped_rigs
-from arbiview_aug.cli.arguments import data
+from arbiview_aug.cli.arguments import command_parser, data
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE
 from arbiview_aug.datasets.registry import open_data, split_kind
 from arbiview_aug.errors import ArbiviewError
@@ -17,9 +16,7 @@ from arbiview_aug.errors import ArbiviewError
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the rigs and, for two or more, what separates the others from the first; write the picture."""
-    parser = argparse.ArgumentParser(
-        prog="python -m arbiview_aug inspect", description="Show rigs: tables, differences, a picture."
-    )
+    parser = command_parser("inspect", "Show rigs: tables, differences, a picture.", "nuscenes waymo")
     parser.add_argument(
         "rigs",
         nargs="+",
@@ -27,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         help=f"a shipped rig ({', '.join(shipped_rigs())}), a rig file (YAML or JSON), or data as other commands' "
         "--data takes it: the rig of its first frame",
     )
-    parser.add_argument("--output", default="inspect.png", metavar="FILE", help="the picture (default: %(default)s)")
+    parser.add_argument("--output", default="inspect.png", metavar="FILE", help="the picture")
     arguments = parser.parse_args(argv)
     # Drawing is only needed here: --help and wrong rigs answer without it.
     from arbiview_aug.evaluate.report.pictures import save_picture

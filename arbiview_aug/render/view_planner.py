@@ -224,9 +224,7 @@ class ViewPlanner:
             fixed = fixed.rounded()
         edge = self._edge(fixed, winner, layout) if interpolation == "cubic" else None
         reports = tuple(self._reports(winner, won_px))
-        return ViewPlan(
-            fixed, winner, tuple(bands), reports, interpolation, certain, edge, _occluded(winner, in_image)
-        )
+        return ViewPlan(fixed, winner, tuple(bands), reports, interpolation, certain, edge, _occluded(winner, in_image))
 
     def _interpolation(self, won_px: Counter[int]) -> str:
         """Cubic where it is asked for and the view magnifies, by ``MAGNIFIED``, what lies at its own centre."""

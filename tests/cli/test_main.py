@@ -136,3 +136,26 @@ def test_the_console_script() -> None:
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
     module, name = project["scripts"]["arbiview_aug"].split(":")
     assert getattr(importlib.import_module(module), name) is main
+
+
+HELP = {
+    "bench": ("--data [KIND:]PATH", "--budget-ms", "--target", "speed", "loader"),
+    "convert": ("--data [KIND:]PATH", "--target RIG", "--output DIR", "--quality", "--surface", "--workers"),
+    "demo": ("--data [KIND:]PATH", "--target RIG", "--output DIR", "--quality", "--surface", "--seed N seed of"),
+    "depth": ("--data [KIND:]PATH", "--output", "--device"),
+    "evaluate": ("--data [KIND:]PATH", "--target RIG", "--output DIR", "--quality", "--yaws", "--paper"),
+    "inspect": ("RIG", "--output FILE"),
+    "train": ("--data", "--output DIR", "--config", "--set KEY=VALUE"),
+}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_is_complete(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main([name, "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.startswith("usage: python -m arbiview_aug") and "example: python -m arbiview_aug" in said
+    missing = [word for word in HELP[name] if word not in said]
+    assert not missing and "(default: " in said
+    if "[KIND:]PATH" in said:
+        assert all(kind in said for kind in ("frames: frame folder", "nuscenes: nuScenes root"))

@@ -9,6 +9,8 @@ import argparse
 from collections.abc import Sequence
 from importlib import import_module
 
+_PROG = "python -m arbiview_aug bench"
+
 BENCHMARKS = {
     "trade": "speed against accuracy of all settings, and which to use (the default)",
     "speed": "milliseconds against bare cv2.remap calls",
@@ -21,15 +23,14 @@ BENCHMARKS = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark that is named first; ``--help`` after its name explains it."""
-    parser = argparse.ArgumentParser(
-        prog="python -m arbiview_aug bench", description="Measurements, as tables and JSON."
-    )
-    words = "; ".join(f"{name}: {summary}" for name, summary in BENCHMARKS.items())
+    """Run the benchmark that is named first, else ``trade``; ``--help`` after its name explains it."""
     given = list(argv or ())
-    if not given or (given[0].startswith("-") and given[0] not in ("-h", "--help")):
+    if given[:1] in (["-h"], ["--help"]):
+        listed = "\n".join(f"  {name:<11} {summary}" for name, summary in BENCHMARKS.items())
+        print(f"usage: {_PROG} [BENCHMARK] ...\n\nMeasurements, as tables and JSON.\n\nbenchmarks:\n{listed}\n")
+    if not given or given[0].startswith("-"):
         given = ["trade", *given]
-    parser.add_argument("what", choices=BENCHMARKS, help=words)
-    parser.add_argument("rest", nargs=argparse.REMAINDER, metavar="...", help="its options")
-    arguments = parser.parse_args(given)
-    return int(import_module(f"arbiview_aug.cli.bench.{arguments.what}").main(arguments.rest))
+    parser = argparse.ArgumentParser(prog=_PROG)
+    parser.add_argument("what", choices=BENCHMARKS)
+    name = parser.parse_args(given[:1]).what
+    return int(import_module(f"arbiview_aug.cli.bench.{name}").main(given[1:]))

@@ -19,7 +19,7 @@ from typing import Any, get_args
 import torch
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.arguments import add_data, add_target, count, size, writable_folder
+from arbiview_aug.cli.arguments import add_data, add_target, command_parser, count, size, writable_folder
 from arbiview_aug.cli.bench.data import REDUCES, SOURCES_OVER_VIEWS, Recorded, recorded
 from arbiview_aug.cli.bench.front import (
     LEAST_GAIN_DB,
@@ -65,9 +65,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m arbiview_aug bench trade",
-        description="Speed against accuracy: every quality, surface, decoded size and execution, for one target rig.",
+    parser = command_parser(
+        "bench trade",
+        "Speed against accuracy: every quality, surface, decoded size and execution, for one target rig.",
+        "--data FOLDER --budget-ms 20",
     )
     add_data(parser, "synthetic streets")
     add_target(parser)

@@ -16,7 +16,17 @@ import numpy as np
 from arbiview_aug.atomic_io import inside, remove_parts
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.rig import load_rig
-from arbiview_aug.cli.arguments import add_data, count, seed, size, writable_folder
+from arbiview_aug.cli.arguments import (
+    add_data,
+    add_reduce,
+    add_rendering,
+    add_target,
+    command_parser,
+    count,
+    seed,
+    size,
+    writable_folder,
+)
 from arbiview_aug.cli.convert.job import Done, Jobs, OnError
 from arbiview_aug.cli.convert.ray_runner import ray_results
 from arbiview_aug.cli.convert.report import write_report
@@ -27,10 +37,7 @@ from arbiview_aug.datasets.motion_depth import FOLDER as DEPTH_FOLDER
 from arbiview_aug.datasets.registry import split_kind
 from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError
-from arbiview_aug.favs.config import Quality
 from arbiview_aug.generator.fillers import Holes
-from arbiview_aug.scene.surface import SurfaceName
-from arbiview_aug.transforms.settings import RenderPath
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -68,16 +75,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m arbiview_aug convert",
-        description="Writes a data set as another vehicle's cameras would have recorded it, in the source's format: "
-        "nuScenes tables, or frame folders. What is there is left as it is: run it again to go on.",
+    parser = command_parser(
+        "convert",
+        "Write a data set as another vehicle's cameras would have recorded it, in the source's format: nuScenes "
+        "tables, or frame folders. Files that are there are left as they are: run it again to go on.",
+        "--data nuscenes:ROOT --target argoverse2 --output converted --size 256x704",
     )
     add_data(parser)
     parser.add_argument("--version", metavar="NAME", help="nuScenes' folder of tables (default: v1.0-mini, -trainval)")
-    parser.add_argument("--target", required=True, metavar="RIG", help="the rig to render: a shipped one, or a file")
-    parser.add_argument("--output", required=True, metavar="DIR", help="where to write")
-    parser.add_argument("--path", choices=get_args(RenderPath), default="favs", help="(default: %(default)s)")
+    add_target(parser, required=True)
+    parser.add_argument("--output", required=True, metavar="DIR", help="folder to write to")
+    add_rendering(parser)
     parser.add_argument(
         "--holes",
         choices=get_args(Holes),
@@ -85,11 +93,13 @@ def _parser() -> argparse.ArgumentParser:
         help="what no camera saw, with --path favs: continued from its borders and marked in .generated.png (default), "
         "the mean colour, or black",
     )
-    parser.add_argument("--generator", type=Path, metavar="DIR", help="for diffusion (default: the package's own)")
-    parser.add_argument("--steps", type=count, metavar="N", help="of the generator (default: its own)")
-    parser.add_argument("--quality", choices=get_args(Quality), default="fast", help="(default: %(default)s)")
-    parser.add_argument("--surface", choices=get_args(SurfaceName), default="auto", help="(default: %(default)s)")
-    parser.add_argument("--size", type=size, metavar="HxW", help="of every view (default: the target's own)")
+    parser.add_argument(
+        "--generator", type=Path, metavar="DIR", help="generator of --path diffusion (default: the package's own)"
+    )
+    parser.add_argument("--steps", type=count, metavar="N", help="steps of the generator (default: its own)")
+    parser.add_argument(
+        "--size", type=size, metavar="HxW", help="height and width of every view (default: the target's own)"
+    )
     parser.add_argument(
         "--fit",
         choices=get_args(Fit),
@@ -97,7 +107,7 @@ def _parser() -> argparse.ArgumentParser:
         help="with --size: keep the aspect and cut at the top and the sides (default), or add black bars there; or "
         "stretch",
     )
-    parser.add_argument("--reduce", type=int, choices=(1, 2, 4), default=1, help="decode images at 1, 1/2 or 1/4 size")
+    add_reduce(parser)
     parser.add_argument(
         "--neighbours",
         type=seed,
@@ -112,11 +122,13 @@ def _parser() -> argparse.ArgumentParser:
         help=f"what the depth command wrote, for --surface motion (default: {DEPTH_FOLDER} in the data, where it is)",
     )
     parser.add_argument("--images", choices=("jpg", "png"), default="jpg", help="jpg: quality 96, 4:4:4; png: lossless")
-    parser.add_argument("--shard-index", type=seed, default=0, metavar="I", help="this shard, from 0 (default: 0)")
-    parser.add_argument("--num-shards", type=count, default=1, metavar="N", help="of so many (default: 1)")
+    parser.add_argument("--shard-index", type=seed, default=0, metavar="I", help="this shard, from 0")
+    parser.add_argument("--num-shards", type=count, default=1, metavar="N", help="number of shards")
     parser.add_argument("--runner", choices=("local", "ray"), default="local", help="processes here, or Ray actors")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    parser.add_argument("--workers", type=count, default=cores, help="processes or actors (default: one a core)")
+    parser.add_argument(
+        "--workers", type=count, default=cores, metavar="N", help="processes or actors (default: one a core)"
+    )
     parser.add_argument(
         "--on-error",
         choices=get_args(OnError),
@@ -124,7 +136,7 @@ def _parser() -> argparse.ArgumentParser:
         help="samples that cannot be read or rendered: report them, convert the others and do not finish the output "
         "(default); skip them: leave them out; or stop at once",
     )
-    parser.add_argument("--report", type=seed, default=2, metavar="N", help="frames in report.html (default: 2)")
+    parser.add_argument("--report", type=seed, default=2, metavar="N", help="number of frames in report.html")
     return parser
 
 
