@@ -17,7 +17,7 @@ from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.datasets.registry import READERS, kinds_of, split_kind
 from arbiview_aug.errors import DataError
 from arbiview_aug.favs.config import Quality
-from arbiview_aug.scene.surface import SurfaceName
+from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.transforms.settings import RenderPath
 
 REAL_TARGET = "waymo"
@@ -88,7 +88,7 @@ def add_rendering(parser: argparse.ArgumentParser, *, several: bool = False) -> 
     """Add ``--quality``, ``--surface`` and ``--path``; with ``several``, each takes one value or more."""
     for name, choices, default, text in (
         ("--quality", get_args(Quality), "fast", "renderer preset; paper: the published stages, without lenses"),
-        ("--surface", get_args(SurfaceName), "auto", "scene geometry; auto: the best that the data offers"),
+        ("--surface", tuple(SURFACES), "auto", "scene geometry; auto: the best that the data offers"),
         (
             "--path",
             get_args(RenderPath),

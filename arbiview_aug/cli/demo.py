@@ -51,6 +51,7 @@ from arbiview_aug.evaluate.report.tables import (
     text_table,
 )
 from arbiview_aug.favs.config import Quality
+from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import RenderPath
@@ -162,7 +163,7 @@ def _load(arguments: argparse.Namespace) -> _Data:
     target = None if name is None else load_rig(name)
     if target is not None and arguments.quality == "paper":  # homographies know no lens
         target = target.undistorted()
-    near = WANTED if arguments.surface == "motion" else None
+    near = WANTED if "motion" in SURFACES[arguments.surface].reads else None
     if arguments.data is not None:
         assert target is not None
         return _Data(open_data(arguments.data, neighbours=near), _resized(target, arguments.size), None)

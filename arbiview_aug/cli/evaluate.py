@@ -47,6 +47,7 @@ from arbiview_aug.evaluate.report.tables import Table, evaluation_tables, text_t
 from arbiview_aug.evaluate.run import Evaluation, evaluate
 from arbiview_aug.evaluate.targets import named_targets, without_masks
 from arbiview_aug.generator import Generator
+from arbiview_aug.scene.scene import SURFACES
 
 TARGET_SETS = ("paper", "yaw", "vehicles", "truck")
 _OWN = {
@@ -182,7 +183,7 @@ def _methods(arguments: argparse.Namespace) -> list[Method]:
 
 
 def _data(arguments: argparse.Namespace) -> Any:
-    near = WANTED if "motion" in arguments.surface else None
+    near = WANTED if any("motion" in SURFACES[name].reads for name in arguments.surface) else None
     if arguments.data is not None:
         return open_data(arguments.data, reduce=arguments.reduce, neighbours=near)
     source = demo_source_rig(**({} if arguments.size is None else {"size": arguments.size}))

@@ -23,14 +23,12 @@ from arbiview_aug.render.harmonise import Harmonise, Harmoniser
 from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.sample.inputs import read_frames, read_scenes
+from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import RenderPath
 
 Sample = Mapping[str, Any]
-
-READS_POINTS = ("auto", "lidar")
-"""Surfaces that may be made of a sample's ``points``."""
 
 OURS: tuple[Quality, ...] = ("draft", "fast", "accurate")
 """The presets that are not the published method."""
@@ -136,7 +134,7 @@ def retargeting(
         label += f", {path}" + (f" {steps}" if steps else "")
     learns = isinstance(config, FavsConfig) and config.overlap_depth
     overlaps = _LastOverlaps(surface if learns else None, Harmoniser(harmonise))
-    reads_points = surface in READS_POINTS and not isinstance(config, PaperConfig)
+    reads_points = "points" in SURFACES[surface].reads and not isinstance(config, PaperConfig)
     return Method(label, render, reads_points, render_alone if overlaps.tell or completes else None)
 
 
@@ -169,8 +167,9 @@ class _LastOverlaps:
         if self._surface is None:
             return None
         (scene,) = read_scenes(sample, read_frames(sample, None), (), self._surface)
-        surface = scene.best if self._surface == "auto" else self._surface
-        return overlap_depth(rig, images, scene.boxes if surface == "objects" else None)  # as ``Stitcher`` measures it
+        row = SURFACES[scene.best if self._surface == "auto" else self._surface]
+        boxes = scene.boxes if row.overlap_depth and "boxes" in row.reads else None
+        return overlap_depth(rig, images, boxes)  # as ``FramePlanner`` measures it
 
 
 def one_camera(sample: Sample, camera: int) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from arbiview_aug.cameras.projection import look_apart
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.favs.stage4_fusion import distance_weight
+from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.static import NEAREST_SCENE_M, worst_parallax_px
 
 SAME_CENTER_M = 1e-6
@@ -23,9 +24,6 @@ SAME_CENTER_M = 1e-6
 
 MOVED_M = 0.2
 """Farthest that a camera may move over a static surface: what stands 10 m away then shifts by about one degree."""
-
-STATIC_SURFACES = ("far", "ground", "street")
-"""Surfaces that know nothing of the objects on the street."""
 
 HELPFUL_DATA = (
     "'points', 'depth_m' or 'boxes_3d' in the samples, or depth from the frames before and after (`python -m "
@@ -89,7 +87,7 @@ def static_harm(source: Rig, target: Rig, surface: str, config: FavsConfig) -> s
         surface: The surface that is rendered over, not ``auto``.
         config: Settings.
     """
-    if surface not in STATIC_SURFACES:
+    if not SURFACES[surface].is_static:
         return None
     moved_m = float(baselines_m(source, target).min(axis=1).max())
     if moved_m <= MOVED_M or not needs_geometry(source, target, "auto", config):

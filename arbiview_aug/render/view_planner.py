@@ -26,6 +26,7 @@ from arbiview_aug.render.requirements import SAME_CENTER_M, covers_target_exactl
 from arbiview_aug.render.target_rays import TargetRays
 from arbiview_aug.render.view_plan import BilinearFallback, BlendRegion, SourceUse, ViewPlan
 from arbiview_aug.render.warp_maps import WarpMap
+from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
 from arbiview_aug.scene.surface import Surface
 
@@ -88,7 +89,8 @@ class ViewPlanner:
         self.best, self.surface_by_name = best, surface_by_name
         self.counters = counters
         # From outside, the far wall is a narrow strip with edges, which a coarse grid could step over.
-        step = config.grid_step_px if surface == "far" or is_within_wall(camera.center_m) else 1
+        coarse = is_within_wall(camera.center_m) or not SURFACES[surface].has_wall
+        step = config.grid_step_px if coarse else 1
         self.rays = TargetRays(camera, step, counters)
         self.grid = self.rays.grid
         # In content order, so that ties never depend on the order of the source list.

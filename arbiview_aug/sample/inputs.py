@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from arbiview_aug.sample.images import check_container, checked_images
 from arbiview_aug.scene.boxes import checked_boxes
 from arbiview_aug.scene.depth_maps import motion_camera, points_of_depth
 from arbiview_aug.scene.point_cloud import checked_points
-from arbiview_aug.scene.scene import Scene
+from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.surface import Points
 
 MOTION_KEY = "motion_depth_m"
@@ -103,29 +104,42 @@ def read_scenes(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[
     Raises:
         SampleError: Geometry that the surface needs is missing or impossible.
     """
-    count = len(frames)
-    boxes = sample.get("boxes_3d") if surface in ("auto", "objects", "lidar", "motion") else None
-    if boxes is None and surface == "objects":
-        raise SampleError(
-            "surface='objects': expected 'boxes_3d' (B, 7) in the sample, got none; an empty (0, 7) tensor says "
-            f"that nothing stands there{hint(sample, ('boxes_3d',))}"
-        )
-    points = _points_of_frames(sample, frames, lead) if surface in ("auto", "lidar") else None
-    if points is None and surface == "lidar":
-        raise SampleError(
-            "surface='lidar': expected 'points' (P, >= 3) in the ego frame, or 'depth_m' (N, H, W), z-depth of each "
-            f"camera in metres, in the sample, got neither{hint(sample, ('points', 'depth_m'))}"
-        )
-    motion = None
-    if surface == "motion" and sample.get(MOTION_KEY) is not None:
-        motion = _points_of_maps(MOTION_KEY, sample[MOTION_KEY], frames, lead, motion_camera)
-    if boxes is None and points is None and motion is None:
-        return [Scene()] * count
-    solid: list[FloatArray | None] = [None] * count
-    if boxes is not None:
-        solid = [checked_boxes(of_frame) for of_frame in of_frames("boxes_3d", boxes, count, lead)]
-    measured, moved = ([None] * count if found is None else found for found in (points, motion))
-    return [Scene(b, p, m) for b, p, m in zip(solid, measured, moved, strict=True)]
+    row = SURFACES[surface]
+    found: dict[str, list[Points]] = {}
+    for name in row.reads:
+        arrays = _READERS.get(name, partial(_array_of_frames, name))(sample, frames, lead)
+        if arrays is not None:
+            found[name] = arrays
+        elif name == row.needs and name != "motion":  # neighbouring frames may still give depth from motion
+            expected, keys = _NEEDED.get(name, f"{name!r} in the sample, got none"), _SAMPLE_KEYS.get(name, (name,))
+            raise SampleError(f"surface={surface!r}: expected {expected}{hint(sample, keys)}")
+    if not found:
+        return [Scene()] * len(frames)
+    scenes = []
+    for k in range(len(frames)):
+        further: dict[str, Any] = {name: arrays[k] for name, arrays in found.items()}
+        own = {name: further.pop(name) for name in _READERS if name in further}
+        scenes.append(Scene(**own, further=further))
+    return scenes
+
+
+def _array_of_frames(
+    key: str, sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...]
+) -> list[Points] | None:
+    """The numbers that a key of the sample holds for each frame; None without."""
+    return None if sample.get(key) is None else of_frames(key, sample[key], len(frames), lead)
+
+
+def _boxes_of_frames(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...]) -> list[Points] | None:
+    """(B, 7) boxes of each frame; None without."""
+    boxes = _array_of_frames("boxes_3d", sample, frames, lead)
+    return None if boxes is None else [checked_boxes(array) for array in boxes]
+
+
+def _motion_of_frames(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...]) -> list[Points] | None:
+    """(P, 3) points of each frame by depth from motion that was found offline; None without."""
+    maps = sample.get(MOTION_KEY)
+    return None if maps is None else _points_of_maps(MOTION_KEY, maps, frames, lead, motion_camera)
 
 
 def _points_of_frames(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...]) -> list[Points] | None:
@@ -141,6 +155,21 @@ def _points_of_frames(sample: Mapping[str, Any], frames: Sequence[Frame], lead: 
         for part, of_frame in zip(parts, _points_of_maps("depth_m", depth_m, frames, lead, lambda c: c), strict=True):
             part.append(of_frame)
     return [part[0] if len(part) == 1 else np.concatenate(part) for part in parts]
+
+
+_READERS: dict[str, Callable[[Mapping[str, Any], Sequence[Frame], tuple[int, ...]], list[Points] | None]] = {
+    "boxes": _boxes_of_frames,
+    "points": _points_of_frames,
+    "motion": _motion_of_frames,
+}
+"""Readers of the geometry that is more than the array of one key."""
+
+_SAMPLE_KEYS = {"boxes": ("boxes_3d",), "points": ("points", "depth_m")}
+_NEEDED = {
+    "boxes": "'boxes_3d' (B, 7) in the sample, got none; an empty (0, 7) tensor says that nothing stands there",
+    "points": "'points' (P, >= 3) in the ego frame, or 'depth_m' (N, H, W), z-depth of each camera in metres, in the "
+    "sample, got neither",
+}
 
 
 def _points_of_maps(

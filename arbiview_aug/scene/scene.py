@@ -1,8 +1,9 @@
-"""What a sample says of the geometry around the vehicle, and the surfaces that can be made of it."""
+"""What a sample says of the geometry around the vehicle, and the table ``SURFACES`` of all surfaces made of it."""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,19 +26,27 @@ class Scene:
         boxes: (B, 7) labelled objects: centre x, y, z, length, width, height (metres), yaw (radians).
         points: (P, 3) measured points, metres.
         motion: (P, 3) points that motion between frames measured, metres; none where it was declined.
+        further: Arrays of other sample keys that a row of ``SURFACES`` reads.
         corrections: What overlaps say of the street's distances.
     """
 
     boxes: FloatArray | None = None
     points: Points | None = None
     motion: Points | None = None
+    further: Mapping[str, Points] = field(default_factory=dict)
     corrections: tuple[Correction, ...] = ()
     _surfaces: dict[tuple[str, float], Surface] = field(default_factory=dict, init=False, repr=False)
+
+    def geometry(self, name: str) -> Points | None:
+        """The array of a name in ``SurfaceRow.reads``; None where it is unknown."""
+        own = {"boxes": self.boxes, "points": self.points, "motion": self.motion}
+        return own[name] if name in own else self.further.get(name)
 
     @property
     def is_empty(self) -> bool:
         """Whether nothing is known but the road."""
-        return all(known is None for known in (self.boxes, self.points, self.motion)) and not self.corrections
+        known = self.boxes is not None or self.points is not None or self.motion is not None
+        return not (known or self.further or self.corrections)
 
     @property
     def best(self) -> SurfaceName:
@@ -49,8 +58,8 @@ class Scene:
     @property
     def key(self) -> bytes:
         """Content hash: scenes with equal keys are the same."""
-        digest = hashlib.sha256()
-        for array in (self.boxes, self.points, self.motion):
+        digest = hashlib.sha256(repr(sorted(self.further)).encode())
+        for array in (self.boxes, self.points, self.motion, *(self.further[key] for key in sorted(self.further))):
             digest.update(b"none" if array is None else repr((array.shape, array.dtype.str)).encode())
             for rows in () if array is None else np.array_split(array, 1 + len(array) // _ROWS):
                 digest.update(rows.tobytes())
@@ -59,34 +68,71 @@ class Scene:
         return digest.digest()
 
     def surface(self, name: str, ground_z_m: float) -> Surface:
-        """A surface by name, over a road at ``ground_z_m``; kept, with what it holds of its own.
+        """A surface by name, over a road at ``ground_z_m``; kept, with what it caches of its own.
 
         Raises:
             ValueError: An unknown name, or geometry that the scene lacks.
         """
         key = name, ground_z_m
         if key not in self._surfaces:
-            self._surfaces[key] = self._made(name, ground_z_m)
+            row = SURFACES.get(name)
+            if row is None or (row.needs is not None and self.geometry(row.needs) is None):
+                raise ValueError(f"surface: {name!r} is unknown, or the scene has no geometry for it")
+            self._surfaces[key] = row.make(self, ground_z_m)
         return self._surfaces[key]
 
-    def _made(self, name: str, ground_z_m: float) -> Surface:
-        street: StaticSurface = Street(ground_z_m=ground_z_m)
-        if self.corrections:
-            street = CorrectedSurface(street, self.corrections)
-        if name == "far":
-            return Far()
-        if name == "ground":
-            return Ground(ground_z_m=ground_z_m)
-        if name == "street":
-            return street
-        if name == "objects" and self.boxes is not None:
-            return BoxSurface(street, self.boxes)
-        points = {"lidar": self.points, "motion": self.motion}.get(name)
-        if points is not None:
-            some_boxes = self.boxes is not None and len(self.boxes) > 0
-            if len(points) == 0:
-                return self.surface("objects" if some_boxes else "street", ground_z_m)
-            if self.boxes is not None and some_boxes:
-                return PointCloudWithBoxes.among(street, points, self.boxes)
-            return PointCloudSurface(street, points)
-        raise ValueError(f"surface: {name!r} is unknown, or the scene has no geometry for it")
+
+@dataclass(frozen=True)
+class SurfaceRow:
+    """A surface that users can ask for.
+
+    Attributes:
+        make: The surface of a scene, over a road at a height in metres.
+        reads: Geometry that it uses: ``boxes``, ``points``, ``motion``, or any other key of the sample. The rest is not
+            even read. A surface that reads nothing is static: its plans come back with the calibration.
+        needs: Geometry that it cannot be made without.
+        overlap_depth: Whether depth from overlap may correct it.
+        has_wall: Whether it ends in the far wall, whose edges a coarse grid could step over from outside.
+    """
+
+    make: Callable[[Scene, float], Surface]
+    reads: tuple[str, ...] = ()
+    needs: str | None = None
+    overlap_depth: bool = False
+    has_wall: bool = True
+
+    @property
+    def is_static(self) -> bool:
+        """Whether it knows nothing of the objects on the street."""
+        return not self.reads
+
+
+def _street(scene: Scene, ground_z_m: float) -> StaticSurface:
+    street = Street(ground_z_m=ground_z_m)
+    return CorrectedSurface(street, scene.corrections) if scene.corrections else street
+
+
+def _boxes(scene: Scene, ground_z_m: float) -> Surface:
+    assert scene.boxes is not None
+    return BoxSurface(_street(scene, ground_z_m), scene.boxes)
+
+
+def _point_cloud(points: Points | None, scene: Scene, ground_z_m: float) -> Surface:
+    assert points is not None
+    boxes = scene.boxes if scene.boxes is not None and len(scene.boxes) else None
+    if len(points) == 0:
+        return scene.surface("street" if boxes is None else "objects", ground_z_m)
+    street = _street(scene, ground_z_m)
+    return PointCloudSurface(street, points) if boxes is None else PointCloudWithBoxes.among(street, points, boxes)
+
+
+SURFACES: dict[str, SurfaceRow] = {
+    "auto": SurfaceRow(lambda scene, z_m: scene.surface(scene.best, z_m), ("boxes", "points"), overlap_depth=True),
+    "far": SurfaceRow(lambda scene, z_m: Far(), has_wall=False),
+    "ground": SurfaceRow(lambda scene, z_m: Ground(ground_z_m=z_m)),
+    "street": SurfaceRow(_street, overlap_depth=True),
+    "objects": SurfaceRow(_boxes, ("boxes",), "boxes", overlap_depth=True),
+    "lidar": SurfaceRow(lambda scene, z_m: _point_cloud(scene.points, scene, z_m), ("boxes", "points"), "points"),
+    "motion": SurfaceRow(lambda scene, z_m: _point_cloud(scene.motion, scene, z_m), ("boxes", "motion"), "motion"),
+}
+"""All surfaces by name. A new one is a class in this folder and a row here."""

@@ -25,7 +25,7 @@ from arbiview_aug.render.torch_backend import render_torch
 from arbiview_aug.sample.detections import OfCameras, detections_of_frames
 from arbiview_aug.sample.inputs import MOTION_KEY, Frame, names_of_frames, read_scenes
 from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames, warn_lost
-from arbiview_aug.scene.scene import Scene
+from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.temporal.fill import FilledPatch, Fills, Reach, fill_views, plan_fills
 from arbiview_aug.temporal.motion_depth import MotionDepth, motion_depth
@@ -120,7 +120,8 @@ class FramePlanner:
         if any(needed) or self.surface != "auto" or fills_holes:
             scenes = read_scenes(sample, frames, lead, self.surface)
         names = self._names(sample, len(frames), lead)
-        asks_motion = self.surface == "motion" and any(needed) and sample.get(MOTION_KEY) is None
+        uses_motion = "motion" in SURFACES[self.surface].reads
+        asks_motion = uses_motion and any(needed) and sample.get(MOTION_KEY) is None
         if asks_motion and sample.get("neighbours") is None:
             raise SampleError(
                 f"surface='motion': expected 'neighbours' in the sample, or {MOTION_KEY!r} from the depth command, got "
@@ -133,7 +134,7 @@ class FramePlanner:
             depth = self._depth(self.config, frame, scene, name) if needs else None
             known = scene if depth is None else replace(scene, corrections=depth.corrections)
             motion = self._motion(frame, scene, neighbours) if asks_motion and needs else None
-            if self.surface == "motion" and known.motion is None:
+            if uses_motion and known.motion is None:
                 known = replace(known, motion=np.zeros((0, 3)) if motion is None else motion.points(frame.rig))
             plan, fills = self.plan(frame.rig, target, known), None
             surface = known.best if self.surface == "auto" else self.surface
@@ -202,9 +203,9 @@ class FramePlanner:
     def _depth(self, config: FavsConfig, frame: Frame, scene: Scene, name: object) -> OverlapDepth | None:
         """Depth from overlap, where it is asked for and decides a pixel, and nothing was measured."""
         surface = scene.best if self.surface == "auto" else self.surface
-        if not config.overlap_depth or surface in ("far", "ground", "lidar", "motion"):
+        if not config.overlap_depth or not SURFACES[surface].overlap_depth:
             return None
-        boxes = scene.boxes if surface == "objects" else None
+        boxes = scene.boxes if "boxes" in SURFACES[surface].reads else None
         if self.refinement is None:
             return overlap_depth(frame.rig, frame.images, boxes)
         return self.refinement.get((frame.rig.content_key, name), lambda: overlap_depth(frame.rig, frame.images, boxes))

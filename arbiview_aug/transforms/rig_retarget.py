@@ -31,7 +31,7 @@ from arbiview_aug.render.requirements import needs_geometry
 from arbiview_aug.sample.batching import barred, framed, gathered, leading_shape, lens_names, like, rewrapped, stacked
 from arbiview_aug.sample.check import PIXEL_BOUND_KEYS, check_other_keys
 from arbiview_aug.sample.inputs import CALIBRATION_KEYS, Frame, read_frames
-from arbiview_aug.scene.scene import Scene
+from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.temporal.fill import Reach
 from arbiview_aug.transforms.explain import Explanation, PaperExplanation
@@ -190,7 +190,7 @@ class RigRetarget(torch.nn.Module):
         one_of("holes", holes, get_args(Holes))
         if path != "favs" and holes != "fill":
             raise ValueError(f"holes: path={path!r} fills them itself: expected 'fill', the default, got {holes!r}")
-        one_of("surface", surface, get_args(SurfaceName))
+        one_of("surface", surface, tuple(SURFACES))
         one_of("fit", fit, get_args(Fit))
         one_of("label_frame", label_frame, ("source", "target"))
         one_of("execution", execution, get_args(Execution))
@@ -285,7 +285,7 @@ class RigRetarget(torch.nn.Module):
         lead = leading_shape(sample["images"])
         sizes = {tuple(image.shape[-2:]) for frame in frames for image in frame.images}
         calibrated = sample.get("rig") is not None or self.source_rig is not None
-        static = self.stitcher.surface in ("far", "ground", "street") and self.label_frame == "source"
+        static = SURFACES[self.stitcher.surface].is_static and self.label_frame == "source"
         warn_of_misnamed(sample, calibrated, static, (*self.label_keys, *self.pass_keys), self._warn)
         labels = check_other_keys(sample, list(sizes), self.label_keys, self.pass_keys)
         target, skip, drawn = self._draw(sample, frames, params)
@@ -442,7 +442,7 @@ class RigRetarget(torch.nn.Module):
         if source is None or self._fixed_target is None:
             raise ValueError("prepare: expected a source rig and a fixed target rig")
         surface, config, target = self.stitcher.surface, self.stitcher.config, self._fixed_target
-        of_frames = surface in ("objects", "lidar", "motion")
+        of_frames = SURFACES[surface].needs is not None
         if of_frames and isinstance(config, FavsConfig) and needs_geometry(source, target, surface, config):
             raise ValueError(
                 f"prepare: expected a surface whose plans come back, got {surface!r}: the boxes, points or depth of "

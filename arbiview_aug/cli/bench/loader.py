@@ -22,7 +22,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from torch.utils.data import DataLoader, Dataset
@@ -35,6 +35,7 @@ from arbiview_aug.cli.bench.timing import Quartiles, machine, machine_line, quar
 from arbiview_aug.datasets import RetargetedDataset, open_data
 from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.environment import one_thread, versions
+from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
@@ -117,7 +118,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--reduce", type=int, choices=REDUCES, default=2, help="decode the images at 1/N (default: %(default)s)"
     )
-    parser.add_argument("--surface", nargs="+", choices=get_args(SurfaceName), default=["auto"], help="(default: auto)")
+    parser.add_argument("--surface", nargs="+", choices=tuple(SURFACES), default=["auto"], help="(default: auto)")
     parser.add_argument("--frames", type=count, default=FRAMES, metavar="N", help="an epoch (default: %(default)s)")
     parser.add_argument("--epochs", type=count, default=EPOCHS, metavar="N", help="(default: %(default)s)")
     parser.add_argument("--output", default="output/loader.json", metavar="FILE", help="(default: %(default)s)")

@@ -36,8 +36,8 @@ from arbiview_aug.cli.bench.timing import Quartiles, machine, machine_line, writ
 from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.favs.config import FavsConfig, Quality
-from arbiview_aug.render.requirements import HELPFUL_DATA, STATIC_SURFACES, static_harm
-from arbiview_aug.scene.surface import SurfaceName
+from arbiview_aug.render.requirements import HELPFUL_DATA, static_harm
+from arbiview_aug.scene.scene import SURFACES
 
 SIZE = (256, 704)
 
@@ -73,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     add_data(parser, "synthetic streets")
     add_target(parser)
     executions = [*get_args(Execution)] if torch.cuda.is_available() else ["opencv", "torch"]
-    surfaces = [name for name in get_args(SurfaceName) if name != "auto"]
+    surfaces = [name for name in SURFACES if name != "auto"]
     parser.add_argument("--size", type=size, default=SIZE, metavar="HxW", help="of every view (default: 256x704)")
     parser.add_argument("--frames", type=count, default=1, metavar="N", help="for accuracy (default: %(default)s)")
     parser.add_argument("--quality", nargs="+", choices=get_args(Quality), help="(default: all)")
@@ -106,7 +106,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
         executions=arguments.execution or arguments.executions,
     )
     found = sweep.measure(wanted)
-    harm = {name: static_harm(source, target, name, FavsConfig()) for name in get_args(SurfaceName)}
+    harm = {name: static_harm(source, target, name, FavsConfig()) for name in SURFACES}
     points = [replace(one.point, harm=harm[one.setting.surface]) for one in found]
     by_name = {one.setting.name: one.setting for one in found}
     advice: Advice | None = None
@@ -194,7 +194,8 @@ def advice_line(advice: Mapping[str, Any]) -> str:
     """The recommendation in a sentence; in two more, why static surfaces were left out, and the data that helps."""
     without = ""
     if advice["left_out"] is not None:
-        without = f" Static surfaces ({', '.join(STATIC_SURFACES)}) are not recommended here: {advice['left_out']}. "
+        static = ", ".join(name for name, row in SURFACES.items() if row.is_static)
+        without = f" Static surfaces ({static}) are not recommended here: {advice['left_out']}. "
         without += f"Better: {HELPFUL_DATA}."
     if advice["setting"] is None:
         return f"No recommendation: {advice['reason']}.{without}"

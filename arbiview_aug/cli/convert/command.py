@@ -38,6 +38,7 @@ from arbiview_aug.datasets.registry import split_kind
 from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError
 from arbiview_aug.generator.fillers import Holes
+from arbiview_aug.scene.scene import SURFACES
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -51,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     if arguments.shard_index >= arguments.num_shards:
         parser.error(f"argument --shard-index: expected less than {arguments.num_shards}, got {arguments.shard_index}")
-    if arguments.motion_depth is not None and arguments.surface != "motion":
+    if arguments.motion_depth is not None and "motion" not in SURFACES[arguments.surface].reads:
         parser.error(f"argument --motion-depth: expected it with --surface motion, got {arguments.surface}")
     settings = _settings(arguments)
     check_output(settings)
@@ -144,9 +145,9 @@ def _settings(arguments: argparse.Namespace) -> Settings:
     kind, root = split_kind(arguments.data)
     root = root.absolute()  # Ray's actors have a working directory of their own
     depth, beside = arguments.motion_depth, inside(root, DEPTH_FOLDER, "depth from motion")
-    if depth is None and arguments.surface == "motion" and beside.is_dir():
+    if depth is None and "motion" in SURFACES[arguments.surface].reads and beside.is_dir():
         depth = beside
-    if depth is None and arguments.surface == "motion" and not arguments.neighbours:
+    if depth is None and "motion" in SURFACES[arguments.surface].reads and not arguments.neighbours:
         raise DataError(
             f"--surface motion: expected depth from motion in {beside}, found none; make it with "
             "python -m arbiview_aug depth --data DIR, or name its folder (--motion-depth), or find it anew from "

@@ -16,10 +16,11 @@ from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.registry import open_data
 from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
-from arbiview_aug.evaluate.methods import READS_POINTS, Method, retargeting
+from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.report.html import html_report
 from arbiview_aug.evaluate.report.tables import evaluation_tables
 from arbiview_aug.evaluate.run import Evaluation, evaluate
+from arbiview_aug.scene.scene import SURFACES
 
 CONVERTED = "converted"
 """The name of the views that were written, in tables."""
@@ -28,7 +29,9 @@ CONVERTED = "converted"
 def converted(settings: Settings) -> Method:
     """The views that a conversion wrote, as a method: of its own target; others are rendered as it rendered that."""
     # The frame that scores holds its points back, and depth from motion is not read again.
-    anew = retargeting(settings.quality, "auto" if settings.surface in ("lidar", "motion") else settings.surface)
+    anew = retargeting(
+        settings.quality, "auto" if SURFACES[settings.surface].needs in ("points", "motion") else settings.surface
+    )
     manifest, target = Manifest(settings.output), settings.sized_target
     written = open_data(settings.output, kind=settings.kind, version=settings.version)
 
@@ -63,7 +66,7 @@ def write_report(settings: Settings, data: Recording, tokens: Sequence[str], cou
     notes = [f"{len(picked)} of {len(tokens)} frames, as they were written to {settings.output}."]
     if settings.path != "favs" or settings.holes != "black":
         notes.append("Pixels that no camera saw are scored as they were filled; covered figures leave them out.")
-    if settings.surface in READS_POINTS:
+    if "points" in SURFACES[settings.surface].reads:
         notes.append("LiDAR points score views that were made with them: evaluate holds half of them out.")
     notes += [f"Not everything could be scored: {words}." for words in done.declined.values()]
     page = html_report(title, done, [CONVERTED], evaluation_tables(done, [CONVERTED]), notes)

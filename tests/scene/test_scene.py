@@ -1,0 +1,64 @@
+"""The table of surfaces: its names, and a new row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, get_args
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import Camera, Rig, RigRetarget
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.errors import SampleError
+from arbiview_aug.scene.scene import SURFACES, Scene, SurfaceRow
+from arbiview_aug.scene.surface import StaticSurface, SurfaceName
+
+
+def test_names_of_the_type_are_those_of_the_table() -> None:
+    assert get_args(SurfaceName) == tuple(SURFACES)
+
+
+@dataclass(frozen=True)
+class Ramp(StaticSurface):
+    """A toy surface: a road that rises ahead, with nothing on it or above it."""
+
+    smooth: ClassVar[bool] = False
+    ground_z_m: float
+    slope: float
+
+    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        height_m = origin[2] - self.ground_z_m - self.slope * origin[0]
+        return np.clip((self.slope * directions[..., 0] - directions[..., 2]) / height_m, 0, 100)
+
+
+def test_a_surface_is_added_by_its_row_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    def ramp(scene: Scene, ground_z_m: float) -> Ramp:
+        return Ramp(ground_z_m, float(scene.further["slope"][0]))
+
+    camera = Camera.looking(
+        name="front", azimuth_deg=0, elevation_deg=-10, width_px=96, height_px=64, horizontal_fov_deg=80
+    )
+    rig = Rig([camera])
+    target = Rig([camera.shifted(z_m=0.5)])
+    sample = {"images": torch.rand(1, 3, 64, 96), "rig": rig, "slope": torch.tensor([0.1])}
+    with pytest.raises(ValueError, match=r"surface: expected one of auto, far, .*, got 'ramp'"):
+        RigRetarget(target, surface="ramp")  # type: ignore[arg-type]
+    monkeypatch.setitem(SURFACES, "ramp", SurfaceRow(ramp, reads=("slope",), needs="slope", has_wall=False))
+    retarget = RigRetarget(target, surface="ramp")  # type: ignore[arg-type]
+    rows = {slope: retarget({**sample, "slope": torch.tensor([slope])}) for slope in (0.0, 0.1)}
+    assert not torch.equal(rows[0.0]["images"], rows[0.1]["images"])
+    # A plane over a plane: the homography of the road as it rises.
+    (plan,) = retarget.explain(sample).plan.targets
+    pixel = np.array([48.0, 50.0])
+    (ray,) = target[0].unproject(pixel[None]).directions
+    origin = target[0].center_m
+    distance_m = (origin[2] - 0.1 * origin[0]) / (0.1 * ray[0] - ray[2])
+    expected = camera.project(origin + distance_m * ray).uv
+    np.testing.assert_allclose(plan.at.to_float()[50, 48], expected, atol=1 / 16)
+    del sample["slope"]
+    with pytest.raises(SampleError, match="surface='ramp': expected 'slope' in the sample, got none"):
+        retarget(sample)
+    with pytest.raises(ValueError, match="prepare: expected a surface whose plans come back, got 'ramp'"):
+        retarget.prepare(rig)
