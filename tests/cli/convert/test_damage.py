@@ -190,5 +190,5 @@ def test_some_damaged_tables(tried: Range) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_a_thousand_damaged_tables(tried: Range) -> None:
-    """As ``python -m tests.cli.convert.damage``: 4 minutes of CPU."""
+    """As ``python -m tests.cli.convert.damage``: 5 minutes of CPU."""
     some(tried, 1000, 0)
