@@ -1,4 +1,4 @@
-"""Files that are whole or not there: written beside their place, flushed to the disk, and renamed.
+"""Atomic file writing: files are written beside their place, flushed to the disk, and renamed.
 
 And the names that files of a data set may have: no name and no link leads out of its folder.
 """
@@ -28,7 +28,7 @@ BROKEN_ARRAY = (
     *(OSError, ValueError, EOFError, SyntaxError, RuntimeError, MemoryError),
     *(tokenize.TokenError, zipfile.BadZipFile, zlib.error),
 )
-"""What ``numpy.load`` raises for files that are damaged, here and there a byte: nine kinds."""
+"""Errors that ``numpy.load`` raises for damaged files."""
 
 _SEPARATOR = re.compile(r"[/\\]")
 _LONGEST_NAME = 255
@@ -39,7 +39,7 @@ _LONGEST_TOKEN = 200
 _PART = ".part"
 _IS_PART = re.compile(r"\..+\.\w*-[0-9a-f]{8}-\d+-[0-9a-f]{8}\.part")
 _FLUSHES = 16
-"""At once: a file system writes them out together. 16 files of 100 kB: 3 ms, one after the other 60 ms (ext4)."""
+"""Files flushed together: 16 files of 100 kB take 3 ms, one after the other 60 ms (ext4)."""
 
 
 def check_name(name: Any, what: str) -> None:
@@ -68,7 +68,7 @@ def check_name(name: Any, what: str) -> None:
 
 
 def inside(root: Path, name: Any, what: str) -> Path:
-    """A file below a folder: neither its name nor a link leads out of it.
+    """Resolve a file below a folder; neither its name nor a link may lead out of it.
 
     Args:
         root: The folder, which may itself be a link.
@@ -102,7 +102,7 @@ def inside(root: Path, name: Any, what: str) -> Path:
 
 
 def _followed(root: Path, path: Path, name: str, what: str) -> int:
-    """Mode of what a path with links leads to, which must be below the folder."""
+    """Mode of a path's target, which must lie below the folder."""
     base, real = os.path.realpath(root), os.path.realpath(path)
     if real != base and not real.startswith(os.path.join(base, "")):
         raise DataError(
@@ -123,7 +123,7 @@ def file_name(token: str) -> str:
 
 @contextmanager
 def whole_file(path: Path, owner: str = "") -> Iterator[BinaryIO]:
-    """A binary file to write to that takes its place when the block ends, and leaves nothing where it fails.
+    """Open a binary file that takes its place when the block ends, and vanishes if it fails.
 
     Args:
         path: The file; what is there is replaced, its folder is made.
@@ -145,7 +145,7 @@ def whole_file(path: Path, owner: str = "") -> Iterator[BinaryIO]:
 
 
 def write_whole(files: Mapping[Path, bytes], owner: str = "") -> None:
-    """Write files, each of them whole or not at all.
+    """Write files atomically.
 
     Args:
         files: Their contents by path.
@@ -210,7 +210,7 @@ def link_whole(source: Path, path: Path, owner: str = "") -> None:
 
 
 def remove_parts(root: Path, owned: Callable[[str], bool]) -> None:
-    """Remove what killed processes left half-written below a folder, and nothing that is being written.
+    """Remove files that killed processes left half-written below a folder.
 
     Args:
         root: The folder.
@@ -227,7 +227,7 @@ def remove_parts(root: Path, owned: Callable[[str], bool]) -> None:
 
 
 def is_part(path: Path) -> bool:
-    """Whether a file is one that was not finished."""
+    """True if a file is an unfinished one."""
     return _IS_PART.fullmatch(path.name) is not None
 
 
@@ -242,7 +242,7 @@ def checksum(path: Path) -> str:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Errors of the operating system as ``OutputError``, in the name of a file."""
+    """Turn errors of the operating system into ``OutputError`` that names a file."""
     try:
         yield
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Checks of the Python environment, and what in it must be switched off for results to repeat."""
+"""Checks of the Python environment, and settings that make results repeatable."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _warned = False
 
 
 def installed_cv2_wheels() -> dict[str, str]:
-    """Versions of the installed distributions that bring ``cv2``, by name."""
+    """Versions of the installed distributions that provide ``cv2``, by name."""
     found = {}
     for name in CV2_WHEELS:
         try:
@@ -36,7 +36,7 @@ def installed_cv2_wheels() -> dict[str, str]:
 
 
 def warn_about_cv2_wheels() -> None:
-    """Warn, once a process, where two wheels bring ``cv2``: they overwrite each other's files without a word."""
+    """Warn once per process if two wheels provide ``cv2``: they overwrite each other's files silently."""
     global _warned
     if _warned:
         return
@@ -71,7 +71,7 @@ def optional_package(name: str, extra: str | None = None) -> Any:
 
 @contextmanager
 def repeatable_opencv() -> Iterator[None]:
-    """OpenCV on one thread and without Intel's IPP, so that the same images give the same bits; as before afterwards.
+    """Run OpenCV on one thread without Intel's IPP, so that the same images give the same bits.
 
     The last bits of IPP's ``distanceTransform`` and ``magnitude`` depend on where in memory their buffers lie, and
     SIFT's angles on those (OpenCV 5.0, IPP 2026.0). IPP can be switched off for the calling thread only, hence the one
@@ -89,7 +89,7 @@ def repeatable_opencv() -> Iterator[None]:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """OpenCV, torch and the linear algebra behind numpy on one thread; as before afterwards."""
+    """Run OpenCV, torch and the linear algebra behind numpy on one thread."""
     import torch
     from threadpoolctl import threadpool_limits  # a dependency of scikit-learn
 
@@ -105,7 +105,7 @@ def one_thread() -> Iterator[None]:
 
 
 def versions() -> dict[str, str]:
-    """Of what results and times depend on."""
+    """Versions that results and times depend on."""
     found = {"python": platform.python_version(), "opencv": cv2.__version__}
     for name in _DISTRIBUTIONS:
         try:

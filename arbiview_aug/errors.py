@@ -1,4 +1,4 @@
-"""The errors this package raises on bad input: one base class, so that a pipeline can catch them all."""
+"""Errors that this package raises on bad input, with one base class to catch them all."""
 
 import sys
 import warnings
@@ -9,7 +9,7 @@ class ArbiviewError(Exception):
 
 
 def described(error: Exception) -> str:
-    """An error in one line: those of other packages with their type, which is half of what they say."""
+    """An error in one line; errors of other packages with their type."""
     return str(error) if isinstance(error, ArbiviewError) else f"{type(error).__name__}: {error}"
 
 
@@ -34,7 +34,7 @@ class GeneratorError(ArbiviewError, ValueError):
 
 
 class OutputError(ArbiviewError, RuntimeError):
-    """A file that cannot be written: the disk is full, or it may not be."""
+    """A file that cannot be written: full disk or missing permission."""
 
 
 class TrainingError(ArbiviewError, RuntimeError):
@@ -42,7 +42,7 @@ class TrainingError(ArbiviewError, RuntimeError):
 
 
 class WarnOnce:
-    """Warnings that are said once for each topic."""
+    """Warnings issued once per topic."""
 
     def __init__(self) -> None:
         self._said: set[str] = set()
@@ -51,7 +51,7 @@ class WarnOnce:
         return topic in self._said
 
     def __call__(self, topic: str, message: str) -> None:
-        """Say it, if nothing was said on this topic before."""
+        """Warn, unless this topic was warned of before."""
         if topic not in self._said:
             self._said.add(topic)
             warnings.warn(message, stacklevel=_callers_level())

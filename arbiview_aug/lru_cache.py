@@ -1,4 +1,4 @@
-"""Values that are kept from call to call: the least recently used go first."""
+"""Thread-safe LRU cache bounded by total value size."""
 
 from __future__ import annotations
 
@@ -12,18 +12,17 @@ V = TypeVar("V")
 
 
 class LRUCache(Generic[K, V]):
-    """Values by key, the least recently used dropped once they are too many together; the last one always stays.
+    """Thread-safe LRU cache bounded by total value size; the last value always stays.
 
-    Threads may share it: two that miss the same value at once both make it, so that none waits for another's, and all
-    get the first.
+    Threads that miss the same key at once each make the value and all get the first one: none waits.
 
     Args:
-        limit: What the held values may have together.
-        size: What one value has: bytes, or 1 to count them.
+        limit: Maximum total size.
+        size: Size of one value: bytes, or 1 to count values.
 
     Attributes:
-        hits: How many values were held when they were asked for.
-        misses: How many were not.
+        hits: Number of lookups that found their value.
+        misses: Number of lookups that made it.
     """
 
     def __init__(self, limit: int, size: Callable[[V], int]) -> None:
@@ -33,7 +32,7 @@ class LRUCache(Generic[K, V]):
         self._lock = threading.Lock()
 
     def get(self, key: K, make: Callable[[], V]) -> V:
-        """The value of this key, made if it is not held."""
+        """The value of this key, made if it is missing."""
         with self._lock:
             if key in self._values:
                 self.hits += 1
@@ -50,7 +49,7 @@ class LRUCache(Generic[K, V]):
 
     @property
     def size(self) -> int:
-        """What the held values have together."""
+        """Total size of the values."""
         with self._lock:
             return sum(map(self._size, self._values.values()))
 

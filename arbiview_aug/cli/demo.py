@@ -63,7 +63,7 @@ _TIMED_CALLS = 5
 
 @dataclass(frozen=True)
 class _Data:
-    """What the demo runs on: samples, the rig to render, and the true views where they can be known."""
+    """Samples, the rig to render, and the true views where they are known."""
 
     samples: Any
     target: Rig
@@ -175,7 +175,7 @@ def _load(arguments: argparse.Namespace) -> _Data:
 
 
 def _compared(quality: Quality, surface: SurfaceName, path: RenderPath) -> list[Method]:
-    """What was asked for, and the surfaces and fills that it is compared with."""
+    """The chosen settings, and the surfaces and fills to compare with."""
     fills: dict[str, RenderPath] = {} if path == "favs" else {"inpainted": "inpaint"}
     if path == "diffusion":
         fills["generated"] = path
@@ -191,7 +191,7 @@ def _resized(rig: Rig, to: tuple[int, int] | None) -> Rig:
 
 
 def _timings(retarget: RigRetarget, sample: dict[str, Any]) -> tuple[float, float]:
-    """Milliseconds of a frame once it is planned, and how many more the planning takes (and the first buffers)."""
+    """Milliseconds of a planned frame, and the additional ones of planning and first buffers."""
     calls = []
     for _ in range(1 + _TIMED_CALLS):
         start = time.perf_counter()

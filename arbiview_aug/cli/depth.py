@@ -22,14 +22,14 @@ from arbiview_aug.temporal.motion_depth import motion_depth
 
 
 class Done(NamedTuple):
-    """What became of a frame.
+    """Result of a frame.
 
     Attributes:
-        token: Of the frame.
-        density: Share of the pixels whose distance is known; 0 where it was declined.
-        words: How, or why not.
-        failed: It could not even be read.
-        kept: Its file was there before.
+        token: The frame's.
+        density: Share of pixels with known distance; 0 where depth was declined.
+        words: How it was found, or why not.
+        failed: Whether the frame could not be read.
+        kept: Whether its file was there before.
     """
 
     token: str
@@ -40,7 +40,7 @@ class Done(NamedTuple):
 
 
 class _Frames(Dataset[Done]):
-    """Frames whose depth is found and written where they are asked for: in a DataLoader's workers."""
+    """Frames whose depth is computed and written on access, in a DataLoader's workers."""
 
     def __init__(self, data: Any, tokens: Sequence[str], depths: DepthFolder, device: str) -> None:
         self.data, self.tokens, self.depths, self.device = data, tokens, depths, device

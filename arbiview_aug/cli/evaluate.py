@@ -1,4 +1,4 @@
-"""``python -m arbiview_aug evaluate``: how good are the views, in numbers and pictures.
+"""``python -m arbiview_aug evaluate``: the quality of rendered views, in numbers and pictures.
 
 On real frames: sparse LiDAR metrics, overlap, and consistency between rendered views; on synthetic streets: the truth.
 ``--paper`` measures the paper's tables, ``--figure`` draws its figures.
@@ -54,7 +54,7 @@ _OWN = {
     "paper": ("target", "yaws", "quality", "surface", "path", "generator", "steps", "seed", "reduce"),
     "figure": ("target", "yaws", "quality", "surface", "path", "generator", "steps", "frames"),
 }
-"""What the two modes fix themselves."""
+"""Options that the two modes fix."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -165,7 +165,7 @@ def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> 
 
 
 def _methods(arguments: argparse.Namespace) -> list[Method]:
-    """All settings asked for, with their confidence to show, where they have one."""
+    """All chosen settings, with confidence maps where they have one."""
     generator = None
     if "diffusion" in arguments.path:
         generator = (

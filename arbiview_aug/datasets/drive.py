@@ -61,7 +61,7 @@ class Neighbours:
     """Frames by distance travelled: standing still, there are none.
 
     Attributes:
-        count: At most so many in each direction.
+        count: Maximum number in each direction.
         step_m: Metres of travel from one to the next; the frames are the first at or beyond them.
         direction: ``past`` frames, ``future`` ones, or ``both``.
 
@@ -108,13 +108,13 @@ class Neighbours:
 
 
 def check_neighbours(value: Any) -> None:
-    """Refuse what is neither ``Neighbours`` nor None, with TypeError."""
+    """Raise TypeError unless the value is ``Neighbours`` or None."""
     if value is not None and not isinstance(value, Neighbours):
         raise TypeError(f"neighbours: expected Neighbours or None, got {type(value).__name__}")
 
 
 class Drive:
-    """How far a vehicle came, frame by frame.
+    """Distance travelled by a vehicle, frame by frame.
 
     Args:
         positions_m: (F, 3) of the vehicle in the world, in the order in which the frames were recorded.
@@ -132,7 +132,7 @@ class Drive:
 
 
 def travelled_m(positions_m: FloatArray) -> FloatArray:
-    """(F,) distance along a drive; what a vehicle's poses (F, 3) waver by while it stands is none."""
+    """(F,) distance along positions (F, 3); jitter of a standing vehicle's poses does not count."""
     total, found = 0.0, []
     there: list[float] | None = None
     for here in positions_m.tolist():
@@ -144,7 +144,7 @@ def travelled_m(positions_m: FloatArray) -> FloatArray:
 
 
 def parts_of_clock(names: Sequence[str], times_s: Mapping[str, float] | None, where: str) -> npt.NDArray[np.int64]:
-    """(F,) parts of a drive: where the clock goes back, with a warning, another one begins.
+    """(F,) parts of a drive; a clock that goes back begins another one, with a warning.
 
     Args:
         names: Its frames, in their order.
@@ -161,22 +161,22 @@ def parts_of_clock(names: Sequence[str], times_s: Mapping[str, float] | None, wh
 
 
 def went_back(where: str, one: str, two: str) -> str:
-    """What to say of a clock that goes back from one frame to the next."""
+    """Message for a clock that goes back from one frame to the next."""
     return f"{where}: the clock goes back from frame {one!r} to {two!r}: neither is the other's neighbour"
 
 
 class LazyFrame(Mapping[str, Any]):
-    """A neighbour whose images are decoded when they are asked for: where nothing is to be filled, never.
+    """A neighbour whose images are decoded on first access.
 
     Args:
-        known: What needs no decoding: pose, calibration, time, token.
-        load: Gives the images.
+        known: Pose, calibration, time, token.
+        load: Decodes the images.
     """
 
     def __init__(self, known: Mapping[str, Any], load: Callable[[], Any]) -> None:
         self._known, self._load = dict(known), load
         self.is_broken = False
-        """Whether something was asked for that could not be had."""
+        """Whether an access failed."""
 
     def __getitem__(self, key: str) -> Any:
         if key == "images" and key not in self._known:
@@ -198,11 +198,11 @@ class LazyFrame(Mapping[str, Any]):
 
 
 class Unreadable(LazyFrame):
-    """A neighbour that is broken: whoever asks for anything but its token is told why.
+    """A broken neighbour: every access but to its token raises the reason.
 
     Args:
         known: Its token.
-        error: What is wrong with it.
+        error: The reason.
     """
 
     def __init__(self, known: Mapping[str, Any], error: ArbiviewError) -> None:

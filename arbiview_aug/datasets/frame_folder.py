@@ -1,4 +1,4 @@
-"""Frame folders, the simplest way in: one folder a frame, with its calibration, images and what else there is."""
+"""Frame folders: one folder a frame, with calibration, images, and optional points, boxes and masks."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class _Frame:
 
     @property
     def where(self) -> str:
-        """What messages name."""
+        """Name for messages."""
         return str(self.folder / CALIBRATION_FILE)
 
     def file(self, name: str, what: str = "") -> Path:
@@ -139,7 +139,7 @@ class FrameFolder(Recording):
         self._drive = None if neighbours is None else self._find_drive(order)
 
     def files(self, index: int) -> list[Path]:
-        """What a frame is read from: its calibration, images, masks and points."""
+        """Source files of a frame: calibration, images, masks and points."""
         frame = self._frames[index]
         calib = _read_calibration(frame)
         found = [frame.folder / CALIBRATION_FILE, *(_image_file(entry, frame) for entry in calib["cameras"])]
@@ -204,7 +204,7 @@ class FrameFolder(Recording):
         return Drive(np.array(list(positions_m.values())).reshape(-1, 3), parts)
 
     def _neighbour(self, name: str) -> Mapping[str, Any]:
-        """What of a frame needs no decoding; what is broken is said where it is used."""
+        """Another frame of the drive, its images still undecoded; a broken one raises on access."""
         frame = self._frames[self._index[name]]
         known: dict[str, Any] = {"token": name}
         try:
@@ -285,7 +285,7 @@ def _read_calibration(frame: _Frame) -> dict[str, Any]:
 
 
 def _calibration_of(entry: Any) -> Any:
-    """What of a camera's entry decides the rig: timestamps and files change every frame."""
+    """Entries of a camera that decide the rig; timestamps and files change every frame."""
     if not isinstance(entry, Mapping):
         return entry
     read = ("name", "width", "height", "K", "cam2ego", "distortion")
@@ -310,7 +310,7 @@ def _mask_file(entry: Any, frame: _Frame) -> Path | None:
 
 
 def _file_of(entry: Any, key: str) -> tuple[str, Any]:
-    """What to call a camera's file in messages, and its name."""
+    """Label of a camera's file for messages, and its name."""
     if not isinstance(entry, Mapping):
         return f"camera {entry!r}: {key}", None
     return f"camera {entry.get('name')!r}: {key}", entry.get(key)

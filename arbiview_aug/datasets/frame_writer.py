@@ -1,4 +1,4 @@
-"""Samples written as frame folders, and as drives of them: what ``FrameFolder`` reads again."""
+"""Write samples as frame folders and drives, as ``FrameFolder`` reads them."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def decode_images(
 
 
 def check_reduce(reduce: int) -> None:
-    """Refuse what is not 1, 2 or 4, with ValueError."""
+    """Raise ValueError unless ``reduce`` is 1, 2 or 4."""
     if reduce not in get_args(Reduce):
         raise ValueError(f"reduce: expected 1, 2 or 4, got {reduce!r}")
 
@@ -190,7 +190,7 @@ def _read_png_header(start: bytes, label: str) -> ImageHeader:
 
 
 def _read_jpeg_header(file: BinaryIO, label: str) -> ImageHeader:
-    """Walks the segments to the frame header (SOF), which has the size, and on to the first scan (SOS)."""
+    """Walk the segments to the frame header (SOF), which has the size, and on to the first scan (SOS)."""
     size: tuple[int, int] | None = None
     file.seek(2)
     while True:

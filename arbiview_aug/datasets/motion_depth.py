@@ -1,4 +1,4 @@
-"""Depth from motion on disk: a file for each frame, beside the data set or elsewhere, and a dataset that brings it."""
+"""Depth from motion on disk: one file a frame, and a dataset wrapper that adds it to samples."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from arbiview_aug.scene.depth_maps import motion_camera
 from arbiview_aug.temporal.motion_depth import BEST_TRAVEL_M, MotionDepth
 
 FOLDER = "motion_depth"
-"""Name beside a data set."""
+"""Default folder name, in a data set's root."""
 
 WANTED = Neighbours(count=2, step_m=BEST_TRAVEL_M / 2)
 """The neighbours to open a data set with: at half the best travel and at all of it; what the recording comes nearer to
@@ -28,7 +28,7 @@ is taken."""
 
 _FORMAT = 2
 _SAME_PX, _SAME_POSE = 0.05, 1e-3
-"""By how much calibrations may differ: images decoded at half their size give the same maps."""
+"""Tolerances of calibrations, wide enough for images decoded at half their size."""
 
 
 class DepthFolder:
@@ -42,7 +42,7 @@ class DepthFolder:
         self.root = Path(root)
 
     def path(self, token: str) -> Path:
-        """Of a frame; what a file system would not have in a name is escaped.
+        """Path of a frame's file; characters that file names cannot hold are escaped.
 
         Raises:
             DataError: It is a link that leaves the folder.
@@ -50,7 +50,7 @@ class DepthFolder:
         return inside(self.root, f"{file_name(token)}.npz", f"depth from motion of frame {token!r}")
 
     def write(self, token: str, rig: Rig, depth: MotionDepth, neighbours: Sequence[str] = ()) -> None:
-        """Write a frame's depth: all of the file or nothing.
+        """Write a frame's depth atomically.
 
         Args:
             token: Of the frame.
@@ -85,7 +85,7 @@ class DepthFolder:
         return self._read(token, rig)[0]
 
     def held(self, token: str, rig: Rig, neighbours: Sequence[str]) -> MotionDepth | None:
-        """A frame's depth where it is there, fits, and was found from these frames; None otherwise."""
+        """A frame's depth if it exists, fits, and was found from these neighbours; else None."""
         try:
             depth, found_from = self._read(token, rig)
         except DataError:
@@ -117,7 +117,7 @@ class DepthFolder:
 
 
 class WithMotionDepth(Dataset[dict[str, Any]]):
-    """A map-style dataset whose samples carry what the ``depth`` command found, as ``motion_depth_m``.
+    """A map-style dataset that adds the ``depth`` command's results as ``motion_depth_m``.
 
     For ``RigRetarget(surface="motion")``; samples need a ``token`` and a ``rig`` (or ``source_rig``).
 

@@ -1,4 +1,4 @@
-"""Datasets around any other: retargeted where samples are read, so in the DataLoader's workers, or mixed."""
+"""Dataset wrappers that retarget or mix samples in the DataLoader's workers."""
 
 from __future__ import annotations
 

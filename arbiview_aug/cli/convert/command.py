@@ -42,7 +42,7 @@ from arbiview_aug.scene.scene import SURFACES
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Convert this shard's samples that are not there yet; whoever finds all there finishes the output.
+    """Convert this shard's missing samples; the shard that completes them all finishes the output.
 
     Returns:
         0; 1 where samples could not be read or rendered (unless they are to be skipped) or files not be written, which
@@ -194,7 +194,7 @@ def _begun(settings: Settings, data: Recording, arguments: argparse.Namespace) -
 
 
 def _run(jobs: Jobs, arguments: argparse.Namespace, tally: _Tally) -> Iterator[Done]:
-    """What becomes of each sample, counted."""
+    """Yield each sample's result, counted in ``tally``."""
 
     def counted(one: Done) -> str:
         tally.add(one)
@@ -210,7 +210,7 @@ def _run(jobs: Jobs, arguments: argparse.Namespace, tally: _Tally) -> Iterator[D
 
 
 class _Tally:
-    """What became of the samples so far."""
+    """Counts, coverage and time of the samples so far."""
 
     def __init__(self) -> None:
         self.states: Counter[str] = Counter()

@@ -27,7 +27,7 @@ class FrameFolders:
         self.output, self.data = settings.output, data
 
     def facts(self) -> dict[str, Any]:
-        """What the source is, as plain data."""
+        """The source's identity, as plain data."""
         return {"kind": "frames", "root": self.data.root.resolve().name, "frames": self.data.tokens}
 
     def check(self) -> None:
@@ -61,7 +61,7 @@ class FrameFolders:
             views: Of each camera the files' names, by what follows their stem.
 
         Returns:
-            Files, and what else the record is to hold.
+            Files, and further entries of the record.
         """
         calibration, *_ = files = self.data.files(index)
         source = json.loads(calibration.read_text(encoding="utf-8"))

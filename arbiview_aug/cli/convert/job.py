@@ -25,14 +25,14 @@ from arbiview_aug.errors import DataError, OutputError, described
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 OnError = Literal["report", "skip", "fatal"]
-"""What becomes of a sample that cannot be read or rendered, whatever it raises: ``report``: the others are converted,
+"""Policy for samples that cannot be read or rendered, whatever they raise: ``report``: the others are converted,
 the output is not finished; ``skip``: it is left out, and said so; ``fatal``: all stops."""
 
 State = Literal["made", "kept", "skipped", "failed", "stopped"]
 
 
 class Done(NamedTuple):
-    """What became of a sample.
+    """Result of a sample.
 
     Attributes:
         token: Of the sample.
@@ -158,7 +158,7 @@ class Jobs(Dataset[Done]):
         return float(np.mean(coverage))
 
     def _is_current(self, index: int, record: Record) -> bool:
-        """Whether a sample would be made of the same again, without reading images: by sizes and calibration.
+        """Compare a record with its source files by size and calibration, without reading images.
 
         One that was made while a neighbour could not be read is made again: that may have been mended.
         """
@@ -175,7 +175,7 @@ class Jobs(Dataset[Done]):
             return False
 
     def _read(self, index: int) -> list[Path]:
-        """What a sample was made from."""
+        """Source files of a sample."""
         files = self.data.files(index)
         if isinstance(self.samples, WithMotionDepth):
             files.append(self.samples.depths.path(self.data.tokens[index]))

@@ -1,4 +1,4 @@
-"""What has been done: a record for each sample, written when all of its files are there.
+"""Record of each converted sample, written when all of its files are there.
 
 Records make a conversion resumable by any number of processes and shards: nothing is shared between samples, and each
 record says the same whoever writes it.
@@ -53,7 +53,7 @@ class Manifest:
             )
 
     def path(self, token: str) -> Path:
-        """Of a sample's record."""
+        """Path of a sample's record."""
         return self.folder / "samples" / f"{file_name(token)}.json"
 
     def record(self, token: str) -> Record | None:
@@ -111,7 +111,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _differences(held: Any, asked: Any, where: str = "") -> Iterator[str]:
-    """Where two pieces of plain data differ, in words."""
+    """Describe where two pieces of plain data differ."""
     if isinstance(held, Mapping) and isinstance(asked, Mapping):
         for key in dict.fromkeys([*held, *asked]):
             yield from _differences(held.get(key), asked.get(key), f"{where}.{key}" if where else key)

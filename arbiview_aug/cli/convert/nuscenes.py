@@ -42,7 +42,7 @@ _TABLES = (
     *("attribute", "category", "log", "map", "visibility", "sensor", "calibrated_sensor", "ego_pose", "scene"),
     *("instance", "sample_annotation", "sample_data", "lidarseg", "panoptic", "sample"),
 )
-"""In the order in which they are written: while ``sample`` is missing, nobody takes the root for a whole one."""
+"""Tables in writing order; ``sample`` comes last, so that a root without it is not taken as complete."""
 
 _REFERENCES = (
     ("sample", "scene_token", "scene"),
@@ -91,7 +91,7 @@ class NuScenes:
         self.target = settings.target
 
     def facts(self) -> dict[str, Any]:
-        """What the source is, as plain data."""
+        """The source's identity, as plain data."""
         tables = {name: checksum(self._opened().path(name)) for name in self._tables()}
         return {
             "kind": "nuscenes",

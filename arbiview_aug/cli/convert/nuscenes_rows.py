@@ -102,7 +102,7 @@ class Remaining:
                 yield row
 
     def sample_data(self) -> Iterator[Row]:
-        """What the sensors recorded that are no cameras."""
+        """Rows of sensors other than cameras."""
         for batch in self.tables.batches("sample_data"):
             for row in batch:
                 if row["calibrated_sensor_token"] not in self._calibrated:
@@ -131,7 +131,7 @@ class Remaining:
         return {**row, **{key: value for key, value in values.items() if key in row}} if self.left_out else row
 
     def _annotations_left_out(self) -> dict[str, tuple[str, str, str]]:
-        """What came before and after each, and its instance."""
+        """Each row's predecessor, successor and instance."""
         if not self.left_out:
             return {}
         return {
@@ -180,7 +180,7 @@ class NewCameras:
         return iter(self._calibrations.values())
 
     def sample_data(self, drives: Sequence[Sequence[str]], keyframes: Mapping[str, Row]) -> Iterator[Row]:
-        """What each camera recorded: at the LiDAR's time, from its ego pose.
+        """Rows of the new cameras, at the LiDAR's time and ego pose.
 
         Args:
             drives: Tokens of samples by scene, in the order of their times.
@@ -218,7 +218,7 @@ class NewCameras:
 
 
 def view_stem(lidar: str, name: str) -> str:
-    """Where a camera's image lies, below the root, without its suffix.
+    """Path of a camera's image below the root, without its suffix.
 
     Args:
         lidar: The name of the LiDAR's file of the same sample.

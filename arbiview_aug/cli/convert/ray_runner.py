@@ -35,7 +35,7 @@ class Actor:
 
 
 def ray_results(jobs: Jobs, workers: int, label: str, note: Callable[[Done], str]) -> Iterator[Done]:
-    """What becomes of each job, in any order.
+    """Yield each job's result, in any order.
 
     Args:
         jobs: What is to be done.

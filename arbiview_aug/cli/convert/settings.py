@@ -1,4 +1,4 @@
-"""What a conversion is asked for, and what it refuses before any work."""
+"""Settings of a conversion, and the checks before any work."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import RenderPath
 
 FOLDER = "conversion"
-"""Where an output folder holds what is about it: manifest, provenance, report."""
+"""Subfolder of an output with manifest, provenance and report."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +88,7 @@ class Settings:
         return data if self.motion_depth is None else WithMotionDepth(data, self.motion_depth)
 
     def retarget(self) -> RigRetarget:
-        """The transform: made once by each process, or actor."""
+        """The transform; each process or actor makes one."""
         outputs = () if self.quality == "paper" else ("confidence",)
         return RigRetarget(
             self.target,
@@ -104,7 +104,7 @@ class Settings:
         )
 
     def rendering(self) -> dict[str, Any]:
-        """What decides the pixels, as plain data."""
+        """All settings that decide the pixels, as plain data."""
         target = self.target.to_dict()
         for entry, camera in zip(target["cameras"], self.target, strict=True):
             entry["content"] = camera.content_key.hex()  # of its mask too

@@ -1,4 +1,4 @@
-"""How much of each labelled box the new cameras show."""
+"""Visible share of each labelled box in the new cameras."""
 
 from __future__ import annotations
 

@@ -175,7 +175,7 @@ def read_annotations(
 
 
 def _in_time(of_object: IntArray, scene: npt.NDArray[np.int64], time_s: FloatArray) -> tuple[IntArray, IntArray]:
-    """Of each annotation (B,) the same object's before and after, -1 for none: the tables' ``prev`` and ``next``."""
+    """(B,) indices of each annotation's ``prev`` and ``next``, the same object before and after; -1 for none."""
     earlier, later = (np.full(len(of_object), -1, np.int32) for _ in range(2))
     order = np.lexsort((time_s, scene, of_object))
     one, two = order[:-1], order[1:]

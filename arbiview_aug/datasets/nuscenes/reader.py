@@ -52,7 +52,7 @@ class NuScenesDataset(Recording):
     ``K`` (N, 3, 3) and ``cam2ego`` (N, 4, 4) float64; ``token``, ``scene_token``; ``ego2world`` (4, 4) float64;
     ``time_s``; with ``load_points`` the ``points`` (P, 5) float32: x y z intensity ring; with ``load_boxes`` the
     ``boxes_3d`` (B, 9) float32: centre, length, width, height in metres, yaw in radians, velocity x y in m/s over the
-    ground (NaN where nobody knows), with ``box_names`` (categories) and ``box_tokens``. The numbers of points and boxes
+    ground (NaN where unknown), with ``box_names`` (categories) and ``box_tokens``. The numbers of points and boxes
     vary: batch with ``batch_size=None`` or a ``collate_fn`` that keeps them as lists. Samples of which no annotation is
     there at all have no boxes, with a warning.
 
@@ -64,7 +64,7 @@ class NuScenesDataset(Recording):
     between them. The first of ``channels`` decides which: its images in the order of their ``prev``, by the distance
     that the vehicle came. A sweep has its time and ego pose, and of each other camera the image beside it, posed as
     above; its boxes are those of the keyframes around it, moved to its time (``Annotations.at_time``). Images are
-    decoded when they are asked for.
+    decoded on access.
 
     All files lie below the root, which may be a link: names and links that leave it are refused when they are read.
 
@@ -136,7 +136,7 @@ class NuScenesDataset(Recording):
         self._drive = Drive(positions_m, self._recordings.parts[self._driven])
 
     def files(self, index: int) -> list[Path]:
-        """What a sample is read from: each camera's image, then the LiDAR's points."""
+        """Source files of a sample: each camera's image, then the LiDAR's points."""
         return [self.root / self._recordings.file(row) for row in self._recordings.keyframes[index]]
 
     def __getitem__(self, index: int) -> dict[str, Any]:
@@ -215,7 +215,7 @@ class NuScenesDataset(Recording):
         return own
 
     def _neighbour(self, row: int) -> LazyFrame:
-        """What of another frame needs no decoding; what is broken is said where it is used."""
+        """Another frame of the drive, its images still undecoded; a broken one raises on access."""
         recordings, record = self._recordings, self._recordings.rows[row]
         sample, is_keyframe = int(record["sample"]), recordings.is_keyframe(row)
         moment = int(recordings.keyframes[sample, -1]) if is_keyframe else row

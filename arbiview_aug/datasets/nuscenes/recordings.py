@@ -1,4 +1,4 @@
-"""What nuScenes' cameras and LiDAR recorded: two tables of millions of rows, as columns of numbers.
+"""nuScenes' recordings (``sample_data`` and ``ego_pose``, millions of rows) as columns of numbers.
 
 Rows as objects would take ten times the memory, and be copied into every worker, page by page.
 """
@@ -57,7 +57,7 @@ _ROW = np.dtype(
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """What each sensor recorded, sorted by channel, scene and time: so the first channel's rows come first.
+    """Recordings of all sensors, sorted by channel, scene and time.
 
     Attributes:
         channels: The cameras; the first one's exposures are the frames of a drive. The LiDAR, of keyframes, is last.
@@ -105,7 +105,7 @@ class Recordings:
         return np.asarray(1e-6 * self.rows["time_us"][rows])
 
     def is_keyframe(self, row: int) -> bool:
-        """Whether a row of the first channel is its sample's image."""
+        """True if a row of the first channel is its sample's image."""
         return bool(self.keyframes[self.rows["sample"][row], 0] == row)
 
     def around(self, row: int) -> IntArray:

@@ -270,4 +270,4 @@ def _ring(
 
 
 GROUND_CLASSES = (SceneClass.GROUND, SceneClass.SIDEWALK)
-"""What a vehicle or a person stands on."""
+"""Surfaces that a vehicle or a person stands on."""

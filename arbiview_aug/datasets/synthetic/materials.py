@@ -1,4 +1,4 @@
-"""What the surfaces of buildings, vehicles and furniture look like: one function a material, albedo out.
+"""Albedo of buildings, vehicles and furniture: one function a material.
 
 Each takes hits on one material and returns (n, 3) display RGB before light and haze; edges inside a surface are
 filtered over the pixel's footprint by ``texture``.

@@ -1,4 +1,4 @@
-"""Where rays from one point meet the scene: culling by packet, then closed-form intersections.
+"""Ray casting from one point: culling by packet, then closed-form intersections.
 
 Rays come in packets of directions that point roughly the same way (a tile of pixels, some LiDAR columns). Each packet
 is bounded by a pyramid, primitives are tested against the pyramids, and each packet meets its own candidates from near

@@ -38,7 +38,7 @@ _BATCH_PX = 1_500_000
 
 
 class CameraView(NamedTuple):
-    """What one camera sees; the last three are of the ray through each pixel's centre.
+    """Rendered view of one camera; the last three are of the ray through each pixel's centre.
 
     Attributes:
         image: (3, h, w) uint8 RGB; black where the lens sees nothing.

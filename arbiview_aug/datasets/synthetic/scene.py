@@ -19,7 +19,7 @@ IntArray = npt.NDArray[np.int64]
 
 
 class SceneClass(IntEnum):
-    """What a pixel shows. ``GROUND`` is the road plane at ``ground_z_m``; ``SIDEWALK`` is raised by the kerb."""
+    """Class of a pixel. ``GROUND`` is the road plane at ``ground_z_m``; ``SIDEWALK`` is raised by the kerb."""
 
     VOID = 0  # the lens sees nothing here
     SKY = 1
@@ -43,7 +43,7 @@ class BoxClass(IntEnum):
 
 
 class Material(IntEnum):
-    """How a surface is coloured: one function of ``shading`` each."""
+    """Materials: one function of ``shading`` each."""
 
     ROAD = 0
     SLAB = 1

@@ -48,7 +48,7 @@ class SceneTables(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """Where rays met surfaces.
+    """Hits of rays on surfaces.
 
     Attributes:
         point: (n, 3) street frame, metres.

@@ -139,7 +139,7 @@ class _World:
         self.blocks = [(-END_M, END_M)] if math.isinf(x) else [(-END_M, x - half), (x + half, END_M)]
 
     def is_clear(self, x: float, y: float, length: float, width: float, yaw: float) -> bool:
-        """Whether a footprint stays off the vehicle's own place and off other vehicles."""
+        """True if a footprint overlaps neither the ego vehicle nor another one."""
         c, s = math.cos(yaw), math.sin(yaw)
         ends = [
             (x + c * a - s * b, y + s * a + c * b)
@@ -168,7 +168,7 @@ class _World:
         return length
 
     def at_crossing(self, x: float, margin: float) -> bool:
-        """Whether x lies on the crossing street or within ``margin`` of it."""
+        """True if x lies on the crossing street or within ``margin`` of it."""
         return abs(x - self.street.crossing_x_m) < self.street.crossing_half_m + margin
 
     def side_y(self, side: int, from_kerb: float) -> float:
