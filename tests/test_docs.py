@@ -266,7 +266,7 @@ def test_the_papers_tables_are_the_commands() -> None:
 def test_the_detectors_numbers_are_the_reports() -> None:
     """``python -m integrations.cross_rig --pilot``: the first table of the benchmarks, and the README's shares."""
     report = json.loads((ROOT / "integrations" / "cross_rig" / "results" / "pilot.json").read_text())
-    variants = [report["changes"][change]["arms"] for change in ("fov50", "up70", "waymo")]
+    variants = [report["changes"][change]["variants"] for change in ("fov50", "up70", "waymo")]
     table = tables(BENCHMARKS)[0]
     for row, found in zip(table[2:], variants, strict=True):
         ious = [f"{100 * found[name]['iou']['value']:.1f}" for name in ("raw", "auto", "oracle")]

@@ -13,10 +13,10 @@ from typing import Any
 
 from arbiview_aug.cli.arguments import device_named
 from arbiview_aug.errors import DataError
-from integrations.cross_rig.arms import ARMS
 from integrations.cross_rig.experiment import Run, run
 from integrations.cross_rig.report import markdown, write_report
 from integrations.cross_rig.settings import Settings, full, jobs, large, pilot, quick
+from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.worlds import CHANGES
 
 PRESETS = {"quick": quick, "pilot": pilot, "full": full, "large": large}
@@ -69,7 +69,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--list", action="store_true", help="only say which trainings are done")
     change = parser.add_argument_group("instead of the preset's")
     change.add_argument("--changes", nargs="+", choices=CHANGES, metavar="CHANGE", help=", ".join(CHANGES))
-    change.add_argument("--arms", nargs="+", choices=ARMS, metavar="ARM", help=", ".join(ARMS))
+    change.add_argument(
+        "--variants", "--arms", nargs="+", choices=VARIANTS, metavar="VARIANT", help=", ".join(VARIANTS)
+    )
     change.add_argument("--seeds", nargs="+", type=int, metavar="SEED")
     change.add_argument("--train-frames", type=int, metavar="N")
     change.add_argument("--val-frames", type=int, metavar="N")
@@ -82,7 +84,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _settings(arguments: argparse.Namespace) -> Settings:
     settings = PRESETS[arguments.preset]()
-    names = ("changes", "arms", "seeds", "train_frames", "val_frames", "test_frames")
+    names = ("changes", "variants", "seeds", "train_frames", "val_frames", "test_frames")
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
     of_schedule = {n: getattr(arguments, n) for n in ("steps", "precision", "device") if getattr(arguments, n)}

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from integrations.cross_rig.arm import Arm
 from integrations.cross_rig.cache import code_hash, content_hash
 from integrations.cross_rig.frames import Source, make_frames, one_thread
 from integrations.cross_rig.labels import Grid, covered_cells
 from integrations.cross_rig.model import BevDetector
 from integrations.cross_rig.settings import Job, Settings, jobs
 from integrations.cross_rig.training import Draws, FrameSet, Tested, evaluate, train
+from integrations.cross_rig.variant import Variant
 from integrations.cross_rig.worlds import Split
 
 Log = Callable[[str], None]
@@ -36,9 +36,9 @@ class Run:
     output: Path
 
     # --- frames -----------------------------------------------------------------------------------------------------
-    def source(self, split: Split, change: str | None = None, arm: Arm | None = None) -> Source:
+    def source(self, split: Split, change: str | None = None, variant: Variant | None = None) -> Source:
         """A set of frames of this run."""
-        return Source(root=self.output / "frames", size=self.settings.size, split=split, change=change, arm=arm)
+        return Source(root=self.output / "frames", size=self.settings.size, split=split, change=change, variant=variant)
 
     def sources(self) -> list[tuple[Source, int]]:
         """Every set that the run needs and its length, in the order in which they can be made."""
@@ -53,15 +53,17 @@ class Run:
 
     def images(self, job: Job) -> Source:
         """What a job is trained on."""
-        return self.source("train", job.change, job.arm if job.arm.renders else None)
+        return self.source("train", job.change, job.variant if job.variant.renders else None)
 
     def training_set(self, job: Job) -> FrameSet:
         """A job's frames. What counts: objects that the rig of the recording sees, in the cells that B covers."""
         images = self.images(job)
-        labels = images.original() if job.arm.renders else images
+        labels = images.original() if job.variant.renders else images
         state = labels.store().stacked("state", self.settings.train_frames)
         counts = covered_cells(Grid(), images.rig)
-        return FrameSet(images.store(), images.rig, state, counts, retargeted=job.arm.renders, masked=job.arm.masked)
+        return FrameSet(
+            images.store(), images.rig, state, counts, retargeted=job.variant.renders, masked=job.variant.masked
+        )
 
     def true_set(self, split: Split, change: str | None, num_frames: int) -> FrameSet:
         """Frames as a rig really sees them."""
@@ -72,8 +74,8 @@ class Run:
     def draws(self, job: Job) -> Draws:
         """The batches of a job's training."""
         count = self.settings.train_frames
-        raw = self.true_set("train", None, count) if job.arm.mixed else None
-        return Draws(self.training_set(job), raw, count, job.seed, augmented=job.arm.augmented)
+        raw = self.true_set("train", None, count) if job.variant.mixed else None
+        return Draws(self.training_set(job), raw, count, job.seed, augmented=job.variant.augmented)
 
     # --- trainings and tests ----------------------------------------------------------------------------------------
     def tested_on(self, job: Job) -> tuple[str, ...]:
@@ -81,23 +83,23 @@ class Run:
         return self.settings.changes if job.change is None else (job.change,)
 
     def training_key(self, job: Job) -> str:
-        """Of everything that a training depends on; arms whose frames are the same, bit by bit, share it.
+        """Of everything that a training depends on; variants whose frames are the same, bit by bit, share it.
 
         The frames must be there.
         """
         count, images = self.settings.train_frames, self.images(job)
         names: tuple[str, ...] = ("images", "state")
-        if job.arm.renders:
+        if job.variant.renders:
             # Without a mask, coverage has no part in the training.
-            names = ("images", *(("coverage",) if job.arm.masked else ()), "K", "cam2ego")
+            names = ("images", *(("coverage",) if job.variant.masked else ()), "K", "cam2ego")
         raw = self._content(self.source("train"), count)
         return content_hash(
             {
                 "frames": images.store().digest(names, count),
                 "rig": images.rig.content_key.hex(),
-                "raw": raw if job.arm.mixed or job.arm.renders else None,  # the labels are A's
-                "mixed": job.arm.mixed,
-                "augmented": job.arm.augmented,
+                "raw": raw if job.variant.mixed or job.variant.renders else None,  # the labels are A's
+                "mixed": job.variant.mixed,
+                "augmented": job.variant.augmented,
                 "count": count,
                 "schedule": asdict(self.settings.schedule),
                 "seed": job.seed,
@@ -207,9 +209,11 @@ def run(setup: Run, workers: int, log: Log) -> Iterator[int]:
         start = time.monotonic()
         for done, todo in make_frames(source, count, workers):
             if todo and done in (0, todo):
-                what = f"{source.split} frames, {source.change or 'A'}, {source.arm.title if source.arm else 'true'}"
+                what = f"{source.split} frames, {source.change or 'A'}, " + (
+                    source.variant.title if source.variant else "true"
+                )
                 log(f"{what}: {todo} chunks" if not done else f"{what}: made in {time.monotonic() - start:.0f} s")
-    first: dict[tuple[str, str | None], Job] = {}  # arms that come to the same frames are one training
+    first: dict[tuple[str, str | None], Job] = {}  # variants that come to the same frames are one training
     for job in setup.missing():
         first.setdefault((setup.training_key(job), job.change), job)
     missing = list(first.values())
@@ -227,32 +231,32 @@ def run(setup: Run, workers: int, log: Log) -> Iterator[int]:
 
 
 def load_results(setup: Run) -> dict[str, dict[str, dict[int, dict[str, Any]]]]:
-    """The results that are there: by change, arm and seed."""
+    """The results that are there: by change, variant and seed."""
     found: dict[str, dict[str, dict[int, dict[str, Any]]]] = {}
     for job in jobs(setup.settings):
         for change, path in setup.result_paths(job).items():
             if path.is_file():
-                found.setdefault(change, {}).setdefault(job.arm.name, {})[job.seed] = json.loads(path.read_text())
+                found.setdefault(change, {}).setdefault(job.variant.name, {})[job.seed] = json.loads(path.read_text())
     return found
 
 
 def same_frames(setup: Run, change: str) -> dict[str, str]:
-    """Arms whose results are another's, since their frames are the same bit by bit: each and the first of its kind."""
+    """For each variant whose frames equal another's bit by bit, the first with the same frames."""
     first: dict[Path, str] = {}
     same = {}
     for job in jobs(setup.settings):
         path = setup.result_paths(job).get(change)
-        if path is not None and first.setdefault(path, job.arm.name) != job.arm.name:
-            same[job.arm.name] = first[path]
+        if path is not None and first.setdefault(path, job.variant.name) != job.variant.name:
+            same[job.variant.name] = first[path]
     return same
 
 
 def rendering_seconds(setup: Run, change: str) -> dict[str, float]:
-    """CPU seconds that each arm's own rendering took for a frame: the median over the frames of a change."""
+    """CPU seconds that each variant's own rendering took for a frame: the median over the frames of a change."""
     found = {}
     for job in jobs(setup.settings):
         source = setup.images(job)
-        if job.arm.renders and job.change == change and not source.store().missing(setup.settings.train_frames):
+        if job.variant.renders and job.change == change and not source.store().missing(setup.settings.train_frames):
             seconds = source.store().stacked("cpu_s", setup.settings.train_frames)
-            found[job.arm.name] = float(np.median(seconds))
+            found[job.variant.name] = float(np.median(seconds))
     return found

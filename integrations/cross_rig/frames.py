@@ -1,4 +1,4 @@
-"""The frames of the experiment on disk: A's streets, B's truth, each arm's training set."""
+"""The frames of the experiment on disk: A's streets, B's truth, each variant's training set."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from arbiview_aug.datasets import LazyFrame, Neighbours
 from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.generator import shipped_weights
-from integrations.cross_rig.arm import Arm
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, fill
 from integrations.cross_rig.labels import Grid, box_cells, visible_objects
+from integrations.cross_rig.variant import Variant
 from integrations.cross_rig.views import ViewMaker
 from integrations.cross_rig.worlds import CHANGES, STREET_SEEDS, Size, Split, source_rig
 
@@ -38,7 +38,7 @@ _UNUSED: dict[str, tuple[str, ...]] = {
     "fill": _COMPLETING,
     "generator": (),
 }
-"""By ``Arm.holes``, what ``RigRetarget`` asks to fill holes and does not need for these."""
+"""By ``Variant.holes``, what ``RigRetarget`` asks to fill holes and does not need for these."""
 
 _MAX_FRAMES = 1 << 20
 """Length of the streets' datasets: a set of frames grows without becoming another."""
@@ -53,14 +53,14 @@ class Source:
         size: (h, w) of the images.
         split: Streets.
         change: Vehicle B by its change; None: vehicle A.
-        arm: Whose training set; None: the rig's own true frames. Arms that differ in how they draw share theirs.
+        variant: Whose training set; None: the rig's own true frames. Variants that only draw differently share one.
     """
 
     root: Path
     size: Size
     split: Split
     change: str | None = None
-    arm: Arm | None = None
+    variant: Variant | None = None
 
     @property
     def rig(self) -> Rig:
@@ -78,19 +78,19 @@ class Source:
             "world": code_hash(_WORLD, within=_WORLD),
             "labels": code_hash("integrations.cross_rig.labels"),
         }
-        if self.arm is not None:
-            arm = self.arm
-            renderer = "transforms" if arm.kind == "retarget" else "evaluate.baselines"
+        if self.variant is not None:
+            variant = self.variant
+            renderer = "transforms" if variant.kind == "retarget" else "evaluate.baselines"
             spec |= {
                 "source": source_rig(self.size).content_key.hex(),
-                "arm": arm.views_spec(),
-                "renderer": code_hash(f"arbiview_aug.{renderer}", without=_UNUSED[arm.holes]),
-                # What an arm says of its views is in ``arm``; another arm's needs may change without it.
-                "views": code_hash("integrations.cross_rig.views", without=("integrations.cross_rig.arm",)),
+                "arm": variant.views_spec(),  # the key that names existing frame stores
+                "renderer": code_hash(f"arbiview_aug.{renderer}", without=_UNUSED[variant.holes]),
+                # What a variant says of its views is in ``variant``; another variant's needs may change without it.
+                "views": code_hash("integrations.cross_rig.views", without=("integrations.cross_rig.variant",)),
             }
-            if arm.holes == "generator":
+            if variant.holes == "generator":
                 spec["weights"] = shipped_weights()
-            if "neighbours" in arm.reads:
+            if "neighbours" in variant.reads:
                 spec["neighbours"] = vars(NEIGHBOURS)
         return FrameStore(self.root, spec)
 
@@ -100,16 +100,16 @@ class Source:
 
     def rendered(self) -> Source:
         """The same views as ``RigRetarget`` renders them: without the generator's pixels, or the truth's."""
-        assert self.arm is not None
-        holes = "black" if self.arm.holes == "generator" else self.arm.holes
-        return replace(self, arm=replace(self.arm, holes=holes, truth=None))
+        assert self.variant is not None
+        holes = "black" if self.variant.holes == "generator" else self.variant.holes
+        return replace(self, variant=replace(self.variant, holes=holes, truth=None))
 
     def needs(self) -> list[Source]:
         """The sets that must be there before this one can be made."""
-        if self.arm is None:
+        if self.variant is None:
             return []
         needed = [self.original()]
-        if self.arm.truth is not None:
+        if self.variant.truth is not None:
             needed.append(self.true())
         if self.rendered() != self:
             needed.append(self.rendered())
@@ -117,7 +117,7 @@ class Source:
 
     def true(self) -> Source:
         """The same streets as the rig of these images really sees them."""
-        return replace(self, arm=None)
+        return replace(self, variant=None)
 
 
 def make_frames(source: Source, num_frames: int, workers: int) -> Iterator[tuple[int, int]]:
@@ -146,10 +146,10 @@ def _make_chunk(source: Source, chunk: int) -> None:
 
 
 @lru_cache(maxsize=2)  # a worker goes from chunk to chunk of one source
-def _maker(source: Source) -> _TrueFrames | _ArmFrames | _ChangedFrames:
-    if source.arm is None:
+def _maker(source: Source) -> _TrueFrames | _VariantFrames | _ChangedFrames:
+    if source.variant is None:
         return _TrueFrames(source)
-    return _ArmFrames(source) if source.rendered() == source else _ChangedFrames(source)
+    return _VariantFrames(source) if source.rendered() == source else _ChangedFrames(source)
 
 
 def one_thread() -> None:
@@ -180,27 +180,27 @@ class _TrueFrames:
         return {**arrays, "cpu_s": np.array(time.process_time() - start, np.float32)}
 
 
-class _ArmFrames:
-    """A's frames as an arm re-renders them; points are cast anew, since that is cheaper than keeping them."""
+class _VariantFrames:
+    """A's frames as a variant re-renders them; points are cast anew, since that is cheaper than keeping them."""
 
     def __init__(self, source: Source) -> None:
-        assert source.arm is not None
-        self.arm, self.original = source.arm, source.original()
+        assert source.variant is not None
+        self.variant, self.original = source.variant, source.original()
         self.store = self.original.store()
-        self.views = ViewMaker(self.arm, self.original.rig, source.rig)
+        self.views = ViewMaker(self.variant, self.original.rig, source.rig)
         seed = STREET_SEEDS[source.split]
         self.drive = SyntheticDrive(self.original.rig, num_frames=_MAX_FRAMES, seed=seed, lidar=False)
 
     def __call__(self, index: int) -> Arrays:
         frame: dict[str, Any] = {"images": torch.from_numpy(self.store.read(index, "images").copy())}
-        if "boxes_3d" in self.arm.reads:
+        if "boxes_3d" in self.variant.reads:
             boxes = self.drive.scene(index).boxes_ego(self.original.rig.ground_z_m)
             frame["boxes_3d"] = torch.from_numpy(boxes.astype(np.float32))
-        if "points" in self.arm.reads:
+        if "points" in self.variant.reads:
             frame["points"] = self.drive.points(index)
-        if "depth_m" in self.arm.reads:
+        if "depth_m" in self.variant.reads:
             frame["depth_m"] = torch.from_numpy(self.store.read(index, "depth_m").astype(np.float32))
-        if "neighbours" in self.arm.reads:
+        if "neighbours" in self.variant.reads:
             frame |= self._neighbours(index)
         return self.views(index, frame)
 
@@ -211,7 +211,7 @@ class _ArmFrames:
             seconds = sign * NEIGHBOURS.step_m / scene.speed_mps
             later = scene.after(seconds)
             known = {"rig": rig, "ego2world": torch.from_numpy(later.ego2street), "time_s": seconds}
-            if "boxes_3d" in self.arm.reads:
+            if "boxes_3d" in self.variant.reads:
                 known["boxes_3d"] = torch.from_numpy(later.boxes_ego(rig.ground_z_m).astype(np.float32))
             near.append(LazyFrame(known, partial(self._images, index, seconds)))
         return {"neighbours": near, "ego2world": torch.from_numpy(scene.ego2street), "time_s": 0.0}
@@ -235,18 +235,18 @@ class _ChangedFrames:
     """Rendered views with something else in their holes, or over them."""
 
     def __init__(self, source: Source) -> None:
-        assert source.arm is not None
-        self.arm, self.width, self.rig = source.arm, source.size[1], source.original().rig
+        assert source.variant is not None
+        self.variant, self.width, self.rig = source.variant, source.size[1], source.original().rig
         self.store, self.truth = source.rendered().store(), source.true().store()
         self.original = source.original().store()
-        self.generator = Generator.shipped() if self.arm.holes == "generator" else None
+        self.generator = Generator.shipped() if self.variant.holes == "generator" else None
 
     def __call__(self, index: int) -> Arrays:
         start = time.process_time()
         arrays = {name: self.store.read(index, name) for name in ("images", "K", "cam2ego", "cpu_s")}
         covered = np.unpackbits(self.store.read(index, "coverage"), axis=-1, count=self.width).astype(bool)
-        if self.arm.truth is not None:
-            shown = covered if self.arm.truth == "covered" else ~covered
+        if self.variant.truth is not None:
+            shown = covered if self.variant.truth == "covered" else ~covered
             arrays["images"] = np.where(shown[:, None], self.truth.read(index, "images"), arrays["images"])
             covered = covered | shown
         if self.generator is not None:

@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from integrations.cross_rig.arms import ARMS
 from integrations.cross_rig.cell_counts import DISTANCES_M, HEIGHTS_M, iou
 from integrations.cross_rig.experiment import Run, load_results, rendering_seconds, same_frames
-from integrations.cross_rig.scoring import arm_scores
+from integrations.cross_rig.scoring import variant_scores
 from integrations.cross_rig.settings import jobs
+from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.worlds import CHANGES
 
 Results = Mapping[str, Mapping[int, Mapping[str, Any]]]
-"""Of one change: by arm and seed."""
+"""Of one change: by variant and seed."""
 
 
 def write_report(setup: Run) -> dict[str, Any]:
@@ -31,7 +31,7 @@ def write_report(setup: Run) -> dict[str, Any]:
         if name in results
     }
     total = sum(len(setup.tested_on(job)) for job in jobs(setup.settings))
-    there = sum(len(seeds) for arms in results.values() for seeds in arms.values())
+    there = sum(len(seeds) for variants in results.values() for seeds in variants.values())
     report = {
         "settings": asdict(setup.settings),
         "tests_done": there,
@@ -46,29 +46,29 @@ def write_report(setup: Run) -> dict[str, Any]:
     return report
 
 
-def _of_change(arms: Results, rendering: Mapping[str, float]) -> dict[str, Any]:
-    """Scores over the seeds that every arm has."""
-    seeds = sorted(set.intersection(*(set(by_seed) for by_seed in arms.values())))
+def _of_change(variants: Results, rendering: Mapping[str, float]) -> dict[str, Any]:
+    """Scores over the seeds that every variant has."""
+    seeds = sorted(set.intersection(*(set(by_seed) for by_seed in variants.values())))
     if not seeds:
-        return {"seeds": [], "arms": {}}
-    cells = {name: np.array([arms[name][s]["by_distance"] for s in seeds]) for name in arms}  # [S, F, bins, 3]
-    scores = arm_scores({name: array.sum(2) for name, array in cells.items()})
+        return {"seeds": [], "variants": {}}
+    cells = {name: np.array([variants[name][s]["by_distance"] for s in seeds]) for name in variants}  # [S, F, bins, 3]
+    scores = variant_scores({name: array.sum(2) for name, array in cells.items()})
     rows = {}
-    for name in (n for n in ARMS if n in arms):
-        heights = np.array([arms[name][s]["by_height"] for s in seeds]).sum((0, 1))
-        trained = [arms[name][s]["trained"] for s in seeds]
+    for name in (n for n in VARIANTS if n in variants):
+        heights = np.array([variants[name][s]["by_height"] for s in seeds]).sum((0, 1))
+        trained = [variants[name][s]["trained"] for s in seeds]
         rows[name] = {
-            "title": ARMS[name].title,
+            "title": VARIANTS[name].title,
             **asdict(scores[name]),
             "by_distance_iou": iou(cells[name].sum((0, 1))).tolist(),
             "by_height_recall": (heights[:, 0] / np.maximum(heights[:, 1], 1)).tolist(),
-            "thresholds": [arms[name][s]["threshold"] for s in seeds],
+            "thresholds": [variants[name][s]["threshold"] for s in seeds],
             "training_cpu_s": float(np.median([t["cpu_s"] for t in trained])),
-            # A mixed arm renders every other frame.
-            "loading_cpu_s": rendering.get(name, 0.0) * (0.5 if ARMS[name].mixed else 1)
+            # A mixed variant renders every other frame.
+            "loading_cpu_s": rendering.get(name, 0.0) * (0.5 if VARIANTS[name].mixed else 1)
             + float(np.median([t["augment_cpu_s"] for t in trained])),
         }
-    return {"seeds": seeds, "arms": rows}
+    return {"seeds": seeds, "variants": rows}
 
 
 def markdown(report: Mapping[str, Any]) -> str:
@@ -77,27 +77,27 @@ def markdown(report: Mapping[str, Any]) -> str:
     A report whose figures have no ``low`` and ``high`` is written without intervals.
     """
     s = report["settings"]
-    rows = [row for change in report["changes"].values() for row in change["arms"].values()]
+    rows = [row for change in report["changes"].values() for row in change["variants"].values()]
     shown = ", [95 % interval] over seeds and frames" if all("low" in row["iou"] for row in rows) else ""
     lines = [
         f"{s['train_frames']} training and {s['test_frames']} test frames at {s['size'][0]}×{s['size'][1]}, "
         f"{s['schedule']['steps']} steps of {s['schedule']['batch']}, {report['tests_done']} of {report['tests']} "
-        f"tests done. IoU of vehicle cells in %{shown}; recovered: (arm − raw) / "
-        "(oracle − raw), where oracle − raw is at least 5 points; loading: CPU ms that the arm adds to a frame that "
-        "is drawn.",
+        f"tests done. IoU of vehicle cells in %{shown}; recovered: (variant − raw) / "
+        "(oracle − raw), where oracle − raw is at least 5 points; loading: CPU ms that the variant adds to a frame "
+        "that is drawn.",
     ]
     distances = [f"{a:g}–{b:g} m" for a, b in pairwise(DISTANCES_M)]
     heights = [f"{a:g}–{b:g} m high" for a, b in pairwise(HEIGHTS_M)]
-    head = ["arm", "IoU", "over raw", "recovered %", *(f"IoU {d}" for d in distances)]
+    head = ["variant", "IoU", "over raw", "recovered %", *(f"IoU {d}" for d in distances)]
     head += [*(f"recall {h}" for h in heights), "loading"]
     for name, change in report["changes"].items():
-        if not change["arms"]:
+        if not change["variants"]:
             continue
         lines += ["", f"**{CHANGES[name].title}**, seeds {', '.join(map(str, change['seeds']))}", ""]
         lines += ["| " + " | ".join(head) + " |", "| --- |" + " ---: |" * (len(head) - 1)]
-        for arm, row in change["arms"].items():
-            same = change["same_frames"].get(arm)
-            title = row["title"] + (f" (the frames of {change['arms'][same]['title']})" if same else "")
+        for variant, row in change["variants"].items():
+            same = change["same_frames"].get(variant)
+            title = row["title"] + (f" (the frames of {change['variants'][same]['title']})" if same else "")
             cells = [title, _text(row["iou"], 1), _text(row["over_raw"], 1, sign=True)]
             cells.append(_text(row["share"], 0))
             cells += [f"{100 * value:.1f}" for value in (*row["by_distance_iou"], *row["by_height_recall"])]
@@ -117,27 +117,27 @@ def _text(value: Mapping[str, float] | None, digits: int, *, sign: bool = False)
 
 
 def save_plot(report: Mapping[str, Any], path: Path) -> None:
-    """A panel for each change: IoU of each arm with its interval; raw and oracle as lines."""
+    """A panel for each change: IoU of each variant with its interval; raw and oracle as lines."""
     # Without pyplot: no global state, and no display is looked for.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    changes = {name: change["arms"] for name, change in report["changes"].items() if change["arms"]}
+    changes = {name: change["variants"] for name, change in report["changes"].items() if change["variants"]}
     if not changes:
         return
-    titles = {name: row["title"] for arms in changes.values() for name, row in arms.items()}
+    titles = {name: row["title"] for variants in changes.values() for name, row in variants.items()}
     names = list(titles)
     figure = Figure(figsize=(2 + 3 * len(changes), 1.4 + 0.32 * len(names)), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, len(changes), sharey=True, squeeze=False)[0]
-    for panel, (change, arms) in zip(panels, changes.items(), strict=True):
+    for panel, (change, variants) in zip(panels, changes.items(), strict=True):
         for name, colour in (("raw", "#d62728"), ("oracle", "#2ca02c")):
-            if name in arms:
-                panel.axvline(100 * arms[name]["iou"]["value"], color=colour, linewidth=0.8, alpha=0.6)
+            if name in variants:
+                panel.axvline(100 * variants[name]["iou"]["value"], color=colour, linewidth=0.8, alpha=0.6)
         for k, name in enumerate(names):
-            if name not in arms:
+            if name not in variants:
                 continue
-            score = arms[name]["iou"]
+            score = variants[name]["iou"]
             middle, low, high = (100 * score.get(part, score["value"]) for part in ("value", "low", "high"))
             panel.errorbar(middle, k, xerr=[[max(middle - low, 0)], [max(high - middle, 0)]], fmt="o", color="#1f77b4")
         panel.set_title(CHANGES[change].title, fontsize=10)

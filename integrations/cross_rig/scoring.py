@@ -1,4 +1,4 @@
-"""The hierarchical bootstrap, and the share of the gap that an arm recovers."""
+"""The hierarchical bootstrap, and the share of the gap that a variant recovers."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ def bootstrap_ious(counts: Mapping[str, Counts], *, seed: int = 0, draws: int = 
     """IoUs of resampled experiments: seeds drawn with replacement, then frames, the same ones for all of them.
 
     All seeds are tested on the same frames, so that what is easy or hard about these does not average out over seeds.
-    All arms share the draws: seeds and frames are paired, so differences of arms have their own, smaller intervals.
+    All variants share the draws: seeds and frames are paired, so differences have their own, smaller intervals.
 
     Args:
-        counts: By arm, (S, F, 3); the same S and F throughout.
+        counts: By variant, (S, F, 3); the same S and F throughout.
         seed: Of the draws.
         draws: How many.
 
     Returns:
-        By arm, (draws,).
+        By variant, (draws,).
     """
     shapes = {array.shape for array in counts.values()}
     if len(shapes) != 1:
-        raise ValueError(f"bootstrap_ious: expected arms with the same seeds and frames, got {sorted(shapes)}")
+        raise ValueError(f"bootstrap_ious: expected variants with the same seeds and frames, got {sorted(shapes)}")
     (num_seeds, num_frames, _) = shapes.pop()
     rng = np.random.default_rng(seed)
-    # Every arm's columns side by side: one product of frame weights with all of them.
-    columns = np.stack(list(counts.values()), 2).astype(np.float64)  # [S, F, arms, 3]
+    # Every variant's columns side by side: one product of frame weights with all of them.
+    columns = np.stack(list(counts.values()), 2).astype(np.float64)  # [S, F, variants, 3]
     sums = np.zeros((draws, columns.shape[2], 3))
     for start in range(0, draws, _BLOCK):
         block = min(_BLOCK, draws - start)
@@ -66,13 +66,13 @@ def interval(value: float, draws: Floats) -> Interval:
 
 
 @dataclass(frozen=True)
-class ArmScore:
-    """An arm under one change.
+class VariantScore:
+    """A variant under one change.
 
     Attributes:
         iou: Of all seeds' frames together.
         over_raw: IoU minus raw's.
-        share: (arm - raw) / (oracle - raw); None where the gap is below ``MIN_GAP`` or no oracle was trained.
+        share: (variant - raw) / (oracle - raw); None where the gap is below ``MIN_GAP`` or no oracle was trained.
         seeds: IoU of each seed.
     """
 
@@ -82,8 +82,10 @@ class ArmScore:
     seeds: list[float]
 
 
-def arm_scores(counts: Mapping[str, Counts], *, raw: str = "raw", oracle: str = "oracle") -> dict[str, ArmScore]:
-    """Scores of the arms of one change, from (S, F, 3) counts by arm."""
+def variant_scores(
+    counts: Mapping[str, Counts], *, raw: str = "raw", oracle: str = "oracle"
+) -> dict[str, VariantScore]:
+    """Scores of the variants of one change, from (S, F, 3) counts by variant."""
     draws = bootstrap_ious(counts)
     values = {name: float(iou(array.sum((0, 1)))) for name, array in counts.items()}
     has_gap = raw in counts and oracle in counts and values[oracle] - values[raw] >= MIN_GAP
@@ -98,5 +100,5 @@ def arm_scores(counts: Mapping[str, Counts], *, raw: str = "raw", oracle: str = 
             gaps = np.maximum(draws[oracle] - draws[raw], 1e-3)
             share = interval((values[name] - values[raw]) / gap, (draws[name] - draws[raw]) / gaps)
         seeds = [float(value) for value in iou(array.sum(1))]
-        scores[name] = ArmScore(interval(values[name], draws[name]), over, share, seeds)
+        scores[name] = VariantScore(interval(values[name], draws[name]), over, share, seeds)
     return scores

@@ -1,12 +1,12 @@
-"""What to run: sizes, arms, changes, seeds and the schedule; the presets of the command."""
+"""What to run: sizes, variants, changes, seeds and the schedule; the presets of the command."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from integrations.cross_rig.arm import Arm
-from integrations.cross_rig.arms import ARMS, named_arms
 from integrations.cross_rig.training import Schedule
+from integrations.cross_rig.variant import Variant
+from integrations.cross_rig.variants import VARIANTS, named_variants
 from integrations.cross_rig.worlds import CHANGES, Size, named_changes
 
 
@@ -17,9 +17,9 @@ class Settings:
     Attributes:
         size: (h, w) of every image.
         train_frames, val_frames, test_frames: Of the three sets of streets.
-        seeds: Of the trainings; each arm is trained once with each.
+        seeds: Of the trainings; each variant is trained once with each.
         changes: Names of ``worlds.CHANGES``.
-        arms: Names of ``arms.ARMS``.
+        variants: Names of ``variants.VARIANTS``.
         schedule: Of every training.
 
     Raises:
@@ -32,11 +32,11 @@ class Settings:
     test_frames: int = 1000
     seeds: tuple[int, ...] = (0, 1, 2)
     changes: tuple[str, ...] = tuple(CHANGES)
-    arms: tuple[str, ...] = tuple(ARMS)
+    variants: tuple[str, ...] = tuple(VARIANTS)
     schedule: Schedule = field(default_factory=lambda: Schedule(steps=900))
 
     def __post_init__(self) -> None:
-        named_arms(self.arms)
+        named_variants(self.variants)
         named_changes(self.changes)
         for name in ("train_frames", "val_frames", "test_frames"):
             if getattr(self, name) < 1:
@@ -48,29 +48,29 @@ class Job:
     """A training.
 
     Attributes:
-        arm: How.
+        variant: How.
         change: For which vehicle B; None where B does not matter (raw frames): one training serves every change.
-        seed: Of its initialisation and its draws, the same for every arm.
+        seed: Of its initialisation and its draws, the same for every variant.
     """
 
-    arm: Arm
+    variant: Variant
     change: str | None
     seed: int
 
     @property
     def name(self) -> str:
         """For files and logs."""
-        return f"{self.arm.name}-{self.change or 'any'}-{self.seed}"
+        return f"{self.variant.name}-{self.change or 'any'}-{self.seed}"
 
 
 def jobs(settings: Settings) -> list[Job]:
-    """All trainings; a whole seed before the next, so that an interrupted run has every arm."""
+    """All trainings; a whole seed before the next, so that an interrupted run has every variant."""
     found = []
     for seed in settings.seeds:
-        arms = named_arms(settings.arms)
-        found += [Job(arm=arm, change=None, seed=seed) for arm in arms if arm.kind == "raw"]
+        variants = named_variants(settings.variants)
+        found += [Job(variant=variant, change=None, seed=seed) for variant in variants if variant.kind == "raw"]
         for change in settings.changes:
-            found += [Job(arm=arm, change=change, seed=seed) for arm in arms if arm.kind != "raw"]
+            found += [Job(variant=variant, change=change, seed=seed) for variant in variants if variant.kind != "raw"]
     return found
 
 
@@ -82,16 +82,16 @@ def quick() -> Settings:
         test_frames=60,
         seeds=(0,),
         changes=("up70",),
-        arms=("raw", "auto", "oracle"),
+        variants=("raw", "auto", "oracle"),
         schedule=Schedule(steps=250),
     )
 
 
 def pilot() -> Settings:
-    """Three changes, the arms that decide, three seeds: an evening on two cores."""
+    """Three changes, the variants that decide, three seeds: an evening on two cores."""
     return Settings(
         changes=("fov50", "up70", "waymo"),
-        arms=("raw", "scale_crop", "row_split", "street", "objects_mixed", "auto", "oracle"),
+        variants=("raw", "scale_crop", "row_split", "street", "objects_mixed", "auto", "oracle"),
     )
 
 

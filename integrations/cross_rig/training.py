@@ -24,7 +24,7 @@ _EVAL_BATCH = 4
 
 @dataclass(frozen=True, kw_only=True)
 class Schedule:
-    """The same for every arm.
+    """The same for every variant.
 
     Attributes:
         steps: Of the optimiser.
@@ -105,10 +105,10 @@ def batched(frames: list[_Frame]) -> Batch:
 
 
 class Draws:
-    """The batches of a training: which frames they hold depends on the seed alone, so that arms are paired.
+    """The batches of a training: which frames they hold depends on the seed alone, so that variants are paired.
 
     Args:
-        own: The arm's frames.
+        own: The variant's frames.
         raw: A's frames, half of which are drawn instead; None: none.
         num_frames: Of each.
         seed: Of the training.

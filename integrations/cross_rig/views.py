@@ -13,37 +13,37 @@ from arbiview_aug import Camera, RandomRig, Rig, RigRetarget
 from arbiview_aug.evaluate.baselines import row_split
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.temporal.fill import Reach
-from integrations.cross_rig.arm import RANDOM, Arm
 from integrations.cross_rig.cache import Arrays
+from integrations.cross_rig.variant import RANDOM, Variant
 
 _POSE = ("ego2world", "time_s")  # where neighbours are read
 _SAME_HEIGHT_M = 0.2
 
 
 class ViewMaker:
-    """Renders A's frames as an arm has them.
+    """Renders A's frames as a variant has them.
 
     Args:
-        arm: One that renders.
+        variant: One that renders.
         source: Vehicle A.
         target: Vehicle B, in A's ego frame.
     """
 
-    def __init__(self, arm: Arm, source: Rig, target: Rig) -> None:
-        if arm.stays == "centre":
+    def __init__(self, variant: Variant, source: Rig, target: Rig) -> None:
+        if variant.stays == "centre":
             target = at_source_centres(source, target)
-        elif arm.stays == "height":
+        elif variant.stays == "height":
             target = at_source_heights(source, target)
-        self.arm, self.source, self.target = arm, source, target
-        self.random = RandomRig(target, **RANDOM) if arm.random else None
-        # Motion is asked for distances alone, so that the arm shows what these do.
-        reach: Reach | None = None if arm.surface == "motion" else "ground"
+        self.variant, self.source, self.target = variant, source, target
+        self.random = RandomRig(target, **RANDOM) if variant.random else None
+        # Motion is asked for distances alone, so that the variant shows what these do.
+        reach: Reach | None = None if variant.surface == "motion" else "ground"
         self.retarget = RigRetarget(
             self.random or target,
             source_rig=source,
-            surface=arm.surface,
+            surface=variant.surface,
             neighbours=reach,
-            holes="fill" if arm.holes == "fill" else "black",  # the generator completes black views
+            holes="fill" if variant.holes == "fill" else "black",  # the generator completes black views
         )
 
     def __call__(self, index: int, frame: Mapping[str, Any]) -> Arrays:
@@ -51,24 +51,24 @@ class ViewMaker:
 
         Args:
             index: Of the frame: its draw depends on it alone.
-            frame: ``images`` (N, 3, h, w) uint8 and the geometry that the arm reads.
+            frame: ``images`` (N, 3, h, w) uint8 and the geometry that the variant reads.
 
         Returns:
             ``images`` (M, 3, h, w), ``coverage`` (M, h, w / 8) packed bits, ``K``, ``cam2ego`` float32 and ``cpu_s``:
-            CPU seconds that the arm's work took.
+            CPU seconds that the variant's work took.
         """
         for neighbour in frame.get(
             "neighbours", ()
-        ):  # rendered when they are asked for: the world's time, not the arm's
+        ):  # rendered when they are asked for: the world's time, not the variant's
             neighbour["images"]
         start = time.process_time()
-        if self.arm.kind == "row_split":
+        if self.variant.kind == "row_split":
             views = row_split(self.source, as_arrays(frame["images"]), self.target)
             images = np.stack([view.image for view in views]).astype(np.uint8).transpose(0, 3, 1, 2)
             coverage = np.stack([view.coverage for view in views])
             K, cam2ego = self.target.K, self.target.cam2ego
         else:
-            given = {key: frame[key] for key in ("images", *self.arm.reads, *_POSE) if key in frame}
+            given = {key: frame[key] for key in ("images", *self.variant.reads, *_POSE) if key in frame}
             drawn = None if self.random is None else self.random.draw(torch.Generator().manual_seed(index))
             out = self.retarget(given, drawn)
             images, coverage = out["images"].numpy(), out["coverage"].numpy()

@@ -30,7 +30,7 @@ _AS_WRITTEN = (
     "generator.prefilled=false",
 )
 
-ARMS: dict[str, tuple[str, ...]] = {
+VARIANTS: dict[str, tuple[str, ...]] = {
     "as written": _AS_WRITTEN,
     "+ transplanted masks": (*_AS_WRITTEN[1:],),
     "+ pre-filled condition": (*_AS_WRITTEN[1:-1],),
@@ -38,7 +38,7 @@ ARMS: dict[str, tuple[str, ...]] = {
     "without L_geo": ("loss.geo=0",),
     "without attention": ("attention=false",),
 }
-"""Settings of each arm, over the run's own."""
+"""Settings of each variant, over the run's own."""
 
 SEEN_ITEMS = 32
 """Held-out real views whose condition is masked where a source branch shows the pixel: what attention can fill."""
@@ -96,22 +96,22 @@ def ablate(
     make: Callable[[TrainConfig], Generator],
     output: Path,
     *,
-    arms: Sequence[str] = tuple(ARMS),
+    variants: Sequence[str] = tuple(VARIANTS),
     views: int = 64,
     perceptual: Perceptual | None = None,
     show: bool = True,
     say: Callable[[str], None] = print,
 ) -> dict[str, dict[str, Any]]:
-    """Train and score each arm; what is done already is not done again. Writes ``ablation.json``.
+    """Train and score each variant; what is done already is not done again. Writes ``ablation.json``.
 
-    SIGTERM and SIGINT end it: the arm that is trained goes on from there.
+    SIGTERM and SIGINT end it: the variant that is trained goes on from there.
 
     Args:
-        config: Of the run that the arms change.
+        config: Of the run that the variants change.
         frames: Synthetic streets.
-        make: Gives a fresh generator of an arm's settings, the same each time.
-        output: A folder with one for each arm.
-        arms: Of ``ARMS``.
+        make: Gives a fresh generator of a variant's settings, the same each time.
+        output: A folder with one for each variant.
+        variants: Of ``VARIANTS``.
         views: Held-out views for the scores.
         perceptual: As for ``Trainer``.
         show: Progress bars.
@@ -120,26 +120,26 @@ def ablate(
     split = frames.split(config.seed)
     indices = (split.held_out or split.validation or split.training)[:views]
     table: dict[str, dict[str, Any]] = {}
-    for arm in arms:
-        changed = overridden(config, ARMS[arm])
-        folder = output / arm.replace(" ", "_").replace("+", "with")
+    for variant in variants:
+        changed = overridden(config, VARIANTS[variant])
+        folder = output / variant.replace(" ", "_").replace("+", "with")
         trainer = Trainer(changed, frames, make(changed), folder, perceptual=perceptual, show=show, say=say)
         if not trainer.train():
-            return table  # stopped: an arm half trained is not scored
+            return table  # stopped: a variant half trained is not scored
         if not trainer.is_main:
             trainer.accelerator.wait_for_everyone()
             continue
         generator = Generator.from_pretrained(folder / "generator").to(trainer.device)
         batch = seen_batch(frames, indices, changed, trainer.items.masks).to(trainer.device)
         scores = held_out_scores(generator, frames, indices, steps=config.generator.steps, mean_of=0, show=show)
-        table[arm] = {
+        table[variant] = {
             "against Telea": {name: gain._asdict() for name, gain in gains(scores).items()},
             "seen by a source": seen_scores(generator, batch, config.generator.steps),
             "top-1": correct_correspondences(generator, batch),
         }
         output.mkdir(parents=True, exist_ok=True)
         (output / "ablation.json").write_text(json.dumps(table, indent=1) + "\n")
-        say(f"{arm}: {json.dumps(table[arm])}")
+        say(f"{variant}: {json.dumps(table[variant])}")
         trainer.accelerator.wait_for_everyone()
     say(text_of(table))
     return table
@@ -148,13 +148,13 @@ def ablate(
 def text_of(table: dict[str, dict[str, Any]]) -> str:
     """The table for people: dB inside the holes."""
     right = f"seen by a source:{'with':>8}{'without':>9}{'wrong rig':>11}"
-    head = f"{'arm':<24}{'one step':>10}{'sample':>9}  | {right}  | top-1"
+    head = f"{'variant':<24}{'one step':>10}{'sample':>9}  | {right}  | top-1"
     lines = ["PSNR inside the holes; left: against Telea's, held-out targets; right: one-step", head]
-    for arm, row in table.items():
+    for variant, row in table.items():
         gain, seen = row["against Telea"], row["seen by a source"]
         ways = [seen[f"one step, {name}"] for name in ("attention", "no attention", "wrong rig")]
         lines.append(
-            f"{arm:<24}{gain['one_step']['mean']:>+10.2f}{gain['sample']['mean']:>+9.2f}  |                  "
+            f"{variant:<24}{gain['one_step']['mean']:>+10.2f}{gain['sample']['mean']:>+9.2f}  |                  "
             f"{ways[0]:>8.2f}{ways[1]:>9.2f}{ways[2]:>11.2f}  | {row['top-1']:.0%}"
         )
     return "\n".join(lines)

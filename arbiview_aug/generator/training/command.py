@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
         ablate(
             config,
             frames,
-            lambda arm: made(arm)[0],
+            lambda variant: made(variant)[0],
             output,
             views=arguments.views,
             perceptual=perceptual,

@@ -22,7 +22,7 @@ TINY = Settings(
     test_frames=2,
     seeds=(0,),
     changes=("fov50",),
-    arms=("raw", "scale_crop", "objects_mixed", "oracle"),
+    variants=("raw", "scale_crop", "objects_mixed", "oracle"),
     schedule=Schedule(steps=3, batch=2, precision="fp32"),
 )
 
@@ -42,7 +42,7 @@ def done(tmp_path_factory) -> Run:
 
 
 def counts(setup: Run) -> dict[str, list]:
-    return {arm: by_seed[0]["by_distance"] for arm, by_seed in load_results(setup)["fov50"].items()}
+    return {variant: by_seed[0]["by_distance"] for variant, by_seed in load_results(setup)["fov50"].items()}
 
 
 @pytest.mark.slow
@@ -61,7 +61,7 @@ def test_a_killed_run_goes_on_to_the_same_numbers(done, tmp_path, monkeypatch):
     monkeypatch.setattr(experiment, "train", dying)
     with pytest.raises(KeyboardInterrupt):
         list(run(killed, 1, lambda line: None))
-    assert [job.arm.name for job in killed.missing()] == ["objects_mixed", "oracle"]
+    assert [job.variant.name for job in killed.missing()] == ["objects_mixed", "oracle"]
     trained.clear()
     assert list(run(killed, 1, lambda line: None)) == [2, 1, 0]
     assert trained == [True, False]
@@ -73,14 +73,14 @@ def test_what_is_done_is_not_done_again(done, monkeypatch):
     monkeypatch.setattr(experiment, "train", None)
     assert list(run(done, 1, lambda line: None)) == [0]
     # Other test streets: the weights are there.
-    more = replace(done, settings=replace(TINY, test_frames=1, arms=("raw",)))
+    more = replace(done, settings=replace(TINY, test_frames=1, variants=("raw",)))
     assert list(run(more, 1, lambda line: None)) == [1, 0]
 
 
 @pytest.mark.slow
-def test_arms_with_the_same_frames_are_one_training(done):
+def test_variants_with_the_same_frames_are_one_training(done):
     """Every surface is the same when the centres stay: only the far one is trained."""
-    more = replace(done, settings=replace(TINY, arms=("raw", "far", "street", "oracle")))
+    more = replace(done, settings=replace(TINY, variants=("raw", "far", "street", "oracle")))
     assert list(run(more, 1, lambda line: None)) == [1, 0]
     results = load_results(more)["fov50"]
     assert set(results) == {"raw", "far", "street", "oracle"} and results["far"] == results["street"]
@@ -91,9 +91,9 @@ def test_arms_with_the_same_frames_are_one_training(done):
 
 @pytest.mark.slow
 def test_true_pixels_replace_what_was_rendered(done):
-    """The two arms of the diagnosis: the truth where something was seen, or where nothing was."""
+    """The two variants of the diagnosis: the truth where something was seen, or where nothing was."""
     more = replace(
-        done, settings=replace(TINY, changes=("up70",), arms=("auto", "true_covered", "true_holes", "oracle"))
+        done, settings=replace(TINY, changes=("up70",), variants=("auto", "true_covered", "true_holes", "oracle"))
     )
     assert list(run(more, 1, lambda line: None))[-1] == 0
     auto, covered, holes, oracle = (more.training_set(job).frame(1) for job in jobs(more.settings))
@@ -107,9 +107,9 @@ def test_true_pixels_replace_what_was_rendered(done):
     np.testing.assert_array_equal(holes.images[~seen], oracle.images[~seen])
 
 
-def test_arms_without_a_mask_lift_every_pixel(done):
-    """Black holes: the pixels of the masked arm. Filled holes: what was seen is the same bit for bit."""
-    more = replace(done, settings=replace(TINY, changes=("up70",), arms=("auto", "auto_black", "auto_fill")))
+def test_variants_without_a_mask_lift_every_pixel(done):
+    """Black holes: the pixels of the masked variant. Filled holes: what was seen is the same bit for bit."""
+    more = replace(done, settings=replace(TINY, changes=("up70",), variants=("auto", "auto_black", "auto_fill")))
     assert list(run(more, 1, lambda line: None)) == [3, 2, 1, 0]
     masked, black, filled = jobs(more.settings)
     assert more.images(black).store().key == more.images(masked).store().key != more.images(filled).store().key
@@ -128,8 +128,8 @@ def test_report(done):
     assert json.loads((done.output / "report.json").read_text()) == json.loads(json.dumps(report))
     assert (done.output / "report.png").stat().st_size > 1000
     assert report["tests_done"] == report["tests"] == 4
-    rows = report["changes"]["fov50"]["arms"]
-    assert list(rows) == list(TINY.arms)
+    rows = report["changes"]["fov50"]["variants"]
+    assert list(rows) == list(TINY.variants)
     for name, row in rows.items():
         assert (row["loading_cpu_s"] > 0) == (name in ("scale_crop", "objects_mixed"))
         assert 0 <= row["iou"]["low"] <= row["iou"]["value"] <= row["iou"]["high"] <= 1
@@ -143,8 +143,8 @@ def test_labels_are_the_sources_within_the_targets_cells(done):
     assert raw.counts.sum() > oracle.counts.sum()
 
 
-def test_arms_are_paired(done):
-    """The same frames in the same order, whatever else an arm draws."""
+def test_variants_are_paired(done):
+    """The same frames in the same order, whatever else a variant draws."""
     first = []
     for job in jobs(TINY):
         draws = done.draws(replace(job, seed=5))
@@ -153,8 +153,8 @@ def test_arms_are_paired(done):
     np.testing.assert_array_equal(first[0], first[2])
 
 
-def test_mixed_arms_draw_raw_frames_half_of_the_time(done):
-    job = next(job for job in jobs(TINY) if job.arm.mixed)
+def test_mixed_variants_draw_raw_frames_half_of_the_time(done):
+    job = next(job for job in jobs(TINY) if job.variant.mixed)
     draws, raw_rig = done.draws(job), done.source("train").rig
     from_raw = [bool(np.isclose(draws.batch(1).K[0, 0, 0], raw_rig.K[0, 0, 0])) for _ in range(200)]
     assert 75 < sum(from_raw) < 125
@@ -162,7 +162,7 @@ def test_mixed_arms_draw_raw_frames_half_of_the_time(done):
 
 def test_presets():
     assert len(jobs(quick())) == 3
-    # Raw and scale/crop once for each seed, five arms for each change: 3 * (2 + 3 * 5).
+    # Raw and scale/crop once for each seed, five variants for each change: 3 * (2 + 3 * 5).
     assert len(jobs(pilot())) == 51
     names = [job.name for job in jobs(full())]
     assert len(names) == len(set(names)) == 3 * (2 + 6 * 25)
@@ -183,7 +183,7 @@ def test_command_lists_and_refuses(capsys, tmp_path):
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 7 and all(line.startswith("missing") for line in lines)
     with pytest.raises(SystemExit):
-        command.main(["--pilot", "--arms", "nothing"])
+        command.main(["--pilot", "--variants", "nothing"])
     capsys.readouterr()
     few = ["--pilot", "--seeds", "0", "--changes", "up70", "--output", str(tmp_path)]
     assert command.main([*few, "--device", "cuda:99"]) == 2
@@ -200,6 +200,6 @@ def test_the_large_run_is_planned_on_a_machine_without_a_gpu(tmp_path):
 def test_quick_oracle_is_above_raw(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(cache, "CHUNK_FRAMES", 20)
     assert command.main(["--quick", "--output", str(tmp_path)]) == 0
-    arms = json.loads((tmp_path / "report.json").read_text())["changes"]["up70"]["arms"]
-    assert arms["oracle"]["iou"]["value"] > arms["raw"]["iou"]["value"]
-    assert set(arms) == {"raw", "auto", "oracle"}
+    variants = json.loads((tmp_path / "report.json").read_text())["changes"]["up70"]["variants"]
+    assert variants["oracle"]["iou"]["value"] > variants["raw"]["iou"]["value"]
+    assert set(variants) == {"raw", "auto", "oracle"}

@@ -29,7 +29,7 @@ def test_reports_without_intervals_are_written_as_points():
     report = json.loads((FOLDER / "results" / "holes.json").read_text())
     assert "[95 % interval]" in markdown(report)
     for change in report["changes"].values():
-        for row in change["arms"].values():
+        for row in change["variants"].values():
             for figure in filter(None, (row["iou"], row["over_raw"], row["share"])):
                 del figure["low"], figure["high"]
     text = markdown(report)

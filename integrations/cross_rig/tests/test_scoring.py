@@ -5,7 +5,7 @@ import pytest
 
 from integrations.cross_rig.cell_counts import iou, tally
 from integrations.cross_rig.labels import HIDDEN, VEHICLE
-from integrations.cross_rig.scoring import arm_scores, bootstrap_ious
+from integrations.cross_rig.scoring import bootstrap_ious, variant_scores
 
 
 def frames(hits: np.ndarray) -> np.ndarray:
@@ -19,7 +19,7 @@ def share(p: float, count: int = 1000, seeds: int = 1) -> np.ndarray:
 
 
 def test_frame_interval_is_the_binomial_one():
-    score = arm_scores({"raw": frames(share(0.3))})["raw"]
+    score = variant_scores({"raw": frames(share(0.3))})["raw"]
     half = 1.96 * np.sqrt(0.3 * 0.7 / 1000)
     assert score.iou.value == pytest.approx(0.3)
     assert score.iou.high - 0.3 == pytest.approx(half, rel=0.1)
@@ -28,7 +28,7 @@ def test_frame_interval_is_the_binomial_one():
 
 def test_seeds_widen_the_interval():
     seeds = np.concatenate([share(0.2), share(0.3), share(0.4)])
-    draws = bootstrap_ious({"arm": frames(seeds)})["arm"]
+    draws = bootstrap_ious({"variant": frames(seeds)})["variant"]
     # The mean of three draws of three seeds, and of the frames of each, which err alone here.
     between, within = np.var([0.2, 0.3, 0.4]) / 3, np.mean([0.16, 0.21, 0.24]) / 1000 / 3
     assert draws.std() == pytest.approx(np.sqrt(between + within), rel=0.05)
@@ -37,20 +37,20 @@ def test_seeds_widen_the_interval():
 def test_frames_are_hard_for_all_seeds_alike():
     """Three seeds that are right on the very same frames say no more of other frames than one does."""
     one = share(0.3)
-    alone, three = (bootstrap_ious({"arm": frames(hits)})["arm"] for hits in (one, np.repeat(one, 3, axis=0)))
+    alone, three = (bootstrap_ious({"variant": frames(hits)})["variant"] for hits in (one, np.repeat(one, 3, axis=0)))
     assert three.std() == pytest.approx(alone.std(), rel=0.1)
 
 
-def test_arms_are_paired():
-    """An arm that is right wherever raw is, and on a fixed tenth more, is above it by exactly that."""
+def test_variants_are_paired():
+    """A variant that is right wherever raw is, and on a fixed tenth more, is above it by exactly that."""
     raw = np.random.default_rng(0).random((3, 1000)) < 0.4
     draws = bootstrap_ious({"raw": frames(raw), "same": frames(raw)})
     np.testing.assert_array_equal(draws["raw"], draws["same"])
 
 
 def test_share_recovered():
-    arms = {"raw": share(0.4, seeds=3), "arm": share(0.5, seeds=3), "oracle": share(0.6, seeds=3)}
-    score = arm_scores({name: frames(hits) for name, hits in arms.items()})["arm"]
+    variants = {"raw": share(0.4, seeds=3), "variant": share(0.5, seeds=3), "oracle": share(0.6, seeds=3)}
+    score = variant_scores({name: frames(hits) for name, hits in variants.items()})["variant"]
     assert score.share is not None and score.over_raw is not None
     assert score.share.value == pytest.approx(0.5) and score.over_raw.value == pytest.approx(0.1)
     assert score.share.low < 0.5 < score.share.high
@@ -59,13 +59,13 @@ def test_share_recovered():
 
 
 def test_no_share_of_a_small_gap_or_without_an_oracle():
-    arms = {"raw": share(0.40), "arm": share(0.42), "oracle": share(0.44)}
-    assert arm_scores({name: frames(hits) for name, hits in arms.items()})["arm"].share is None
-    del arms["oracle"]
-    assert arm_scores({name: frames(hits) for name, hits in arms.items()})["arm"].share is None
+    variants = {"raw": share(0.40), "variant": share(0.42), "oracle": share(0.44)}
+    assert variant_scores({name: frames(hits) for name, hits in variants.items()})["variant"].share is None
+    del variants["oracle"]
+    assert variant_scores({name: frames(hits) for name, hits in variants.items()})["variant"].share is None
 
 
-def test_arms_of_different_length_are_refused():
+def test_variants_of_different_length_are_refused():
     with pytest.raises(ValueError, match="same seeds and frames"):
         bootstrap_ious({"a": frames(share(0.5)), "b": frames(share(0.5, count=10))})
 

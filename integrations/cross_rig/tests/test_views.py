@@ -1,4 +1,4 @@
-"""What the arms make of A's frames."""
+"""What the variants make of A's frames."""
 
 from dataclasses import replace
 
@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from arbiview_aug.datasets.synthetic import SyntheticDrive
-from integrations.cross_rig.arms import ARMS, named_arms
 from integrations.cross_rig.augmentation import SCALE, scaled_and_cropped
-from integrations.cross_rig.frames import NEIGHBOURS, Source, _ArmFrames
+from integrations.cross_rig.frames import NEIGHBOURS, Source, _VariantFrames
+from integrations.cross_rig.variants import VARIANTS, named_variants
 from integrations.cross_rig.views import ViewMaker
 from integrations.cross_rig.worlds import CHANGES, STREET_SEEDS, named_changes, source_rig
 
@@ -29,32 +29,32 @@ def frame() -> dict:
     }
 
 
-@pytest.mark.parametrize("name", [name for name, arm in ARMS.items() if arm.renders])
+@pytest.mark.parametrize("name", [name for name, variant in VARIANTS.items() if variant.renders])
 @pytest.mark.filterwarnings("ignore")
 def test_every_arm_renders(frame, name):
     source, target = source_rig(SIZE), CHANGES["waymo"].target(SIZE)
-    views = ViewMaker(ARMS[name], source, target)(0, frame)
+    views = ViewMaker(VARIANTS[name], source, target)(0, frame)
     coverage = np.unpackbits(views["coverage"], axis=-1, count=SIZE[1]).astype(bool)
     assert views["images"].shape == (5, 3, *SIZE) and views["images"].dtype == np.uint8
     assert coverage.shape == (5, *SIZE) and coverage.mean() > 0.4
     uncovered = views["images"].transpose(0, 2, 3, 1)[~coverage]
-    assert uncovered.all(-1).mean() > 0.5 if ARMS[name].holes == "fill" else not uncovered.any()
-    if ARMS[name].random:
+    assert uncovered.all(-1).mean() > 0.5 if VARIANTS[name].holes == "fill" else not uncovered.any()
+    if VARIANTS[name].random:
         assert not np.allclose(views["K"], target.K)
-        again = ViewMaker(ARMS[name], source, target)(0, frame)
+        again = ViewMaker(VARIANTS[name], source, target)(0, frame)
         np.testing.assert_array_equal(again["images"], views["images"])
     else:
         np.testing.assert_allclose(views["K"], target.K, rtol=1e-6)
         np.testing.assert_allclose(views["cam2ego"][:, :3, :3], target.cam2ego[:, :3, :3], atol=1e-6)
         away = views["cam2ego"][:, :3, 3] - target.cam2ego[:, :3, 3]
-        np.testing.assert_allclose(away[:, 2], -0.6 if ARMS[name].stays else 0, atol=1e-6)
-        assert (np.abs(away[:, :2]).max() > 0.01) == (ARMS[name].stays == "centre")
+        np.testing.assert_allclose(away[:, 2], -0.6 if VARIANTS[name].stays else 0, atol=1e-6)
+        assert (np.abs(away[:, :2]).max() > 0.01) == (VARIANTS[name].stays == "centre")
 
 
 @pytest.mark.slow
-def test_arms_are_given_the_frames_before_and_after(tmp_path, frame):
-    source = Source(root=tmp_path, size=SIZE, split="train", change="up70", arm=ARMS["auto_neighbours"])
-    given = _ArmFrames(source)._neighbours(3)
+def test_variants_are_given_the_frames_before_and_after(tmp_path, frame):
+    source = Source(root=tmp_path, size=SIZE, split="train", change="up70", variant=VARIANTS["auto_neighbours"])
+    given = _VariantFrames(source)._neighbours(3)
     drive = SyntheticDrive(
         source_rig(SIZE), num_frames=4, seed=STREET_SEEDS["train"], lidar=False, neighbours=NEIGHBOURS
     )
@@ -64,8 +64,8 @@ def test_arms_are_given_the_frames_before_and_after(tmp_path, frame):
         for key in ("images", "ego2world", "boxes_3d"):
             assert torch.equal(one[key], two[key])
         assert one["time_s"] == two["time_s"]
-    motion = replace(source, arm=ARMS["motion"])
-    assert all("boxes_3d" not in one for one in _ArmFrames(motion)._neighbours(3)["neighbours"])
+    motion = replace(source, variant=VARIANTS["motion"])
+    assert all("boxes_3d" not in one for one in _VariantFrames(motion)._neighbours(3)["neighbours"])
 
 
 @pytest.mark.parametrize("change", ["up70", "waymo"])
@@ -73,7 +73,7 @@ def test_what_auto_picks_where_cameras_move(frame, change):
     """LiDAR with boxes."""
     source, target = source_rig(SIZE), CHANGES[change].target(SIZE)
     picked, asked = (
-        ViewMaker(replace(ARMS["auto"], surface=surface), source, target)(0, frame) for surface in ("auto", "lidar")
+        ViewMaker(replace(VARIANTS["auto"], surface=surface), source, target)(0, frame) for surface in ("auto", "lidar")
     )
     for key in ("images", "coverage", "cam2ego"):
         np.testing.assert_array_equal(picked[key], asked[key])
@@ -114,7 +114,7 @@ def test_streets_are_disjoint_and_rigs_stand_on_one_road():
 
 
 def test_unknown_names_are_refused():
-    with pytest.raises(ValueError, match=r"arms: expected some of raw, .*, got nothing"):
-        named_arms(["nothing"])
+    with pytest.raises(ValueError, match=r"variants: expected some of raw, .*, got nothing"):
+        named_variants(["nothing"])
     with pytest.raises(ValueError, match=r"changes: expected some of fov50, .*, got up7"):
         named_changes(["up7"])

@@ -116,7 +116,7 @@ def test_pictures(batch: Batch, tmp_path: Path) -> None:
     assert (back[..., ::-1] == image).all()
 
 
-def test_the_table_names_every_arm() -> None:
+def test_the_table_names_every_variant() -> None:
     gain = {"mean": 1.0, "low": 0.0, "high": 2.0}
     seen = {f"one step, {name}": 20.0 for name in ("attention", "no attention", "wrong rig")}
     row = {"against Telea": {"one_step": gain, "sample": gain}, "seen by a source": seen, "top-1": 0.5}
@@ -130,7 +130,7 @@ def test_an_ablation_that_is_stopped_scores_nothing(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(ablation.Trainer, "train", lambda self: False)
     settings = config()
     made = ablation.ablate(
-        settings, frames(), lambda arm: Generator.from_config(arm.generator), tmp_path, show=False, say=print
+        settings, frames(), lambda variant: Generator.from_config(variant.generator), tmp_path, show=False, say=print
     )
     assert made == {} and not (tmp_path / "ablation.json").exists()
 

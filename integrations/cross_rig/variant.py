@@ -1,4 +1,4 @@
-"""An arm of the experiment: one way to train a detector for vehicle B on A's frames. The list stands in ``arms``."""
+"""A variant of the experiment: one way to train a detector for vehicle B on A's frames; ``variants`` lists them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RANDOM: dict[str, Any] = {"yaw_deg": 5.0, "pitch_deg": 2.0, "height_m": 0.2, "fo
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arm:
+class Variant:
     """One way to train.
 
     Attributes:
@@ -56,7 +56,7 @@ class Arm:
         return self.kind in ("row_split", "retarget")
 
     def views_spec(self) -> dict[str, Any]:
-        """What its images depend on, besides rigs and code: arms that differ in how they draw share them."""
+        """What its images depend on, besides rigs and code: variants that differ in how they draw share them."""
         settings = {"kind": self.kind, "surface": self.surface, "reads": list(self.reads), "holes": self.holes}
         extra = {"random": RANDOM if self.random else None, "stays": self.stays, "truth": self.truth}
         return settings | {name: value for name, value in extra.items() if value is not None}

@@ -1,0 +1,106 @@
+"""The variants of the experiment, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from integrations.cross_rig.variant import Geometry, Variant
+
+_ALL: tuple[Geometry, ...] = ("points", "boxes_3d")
+VARIANTS: dict[str, Variant] = {
+    variant.name: variant
+    for variant in (
+        Variant(name="raw", title="raw A", kind="raw"),
+        Variant(name="scale_crop", title="raw A, scaled and cropped", kind="raw", augmented=True),
+        Variant(name="row_split", title="row split", kind="row_split"),
+        Variant(name="far", title="far", kind="retarget", surface="far"),
+        Variant(name="street", title="street", kind="retarget", surface="street"),
+        Variant(name="objects", title="objects", kind="retarget", surface="objects", reads=("boxes_3d",)),
+        Variant(name="points", title="lidar, no boxes", kind="retarget", surface="lidar", reads=("points",)),
+        Variant(name="auto", title="auto: LiDAR, boxes", kind="retarget", surface="auto", reads=_ALL),
+        Variant(name="same_height", title="street at A's heights", kind="retarget", surface="street", stays="height"),
+        Variant(
+            name="same_height_mixed",
+            title="street at A's heights, + raw",
+            kind="retarget",
+            surface="street",
+            stays="height",
+            mixed=True,
+        ),
+        Variant(name="same_centre", title="street at A's centres", kind="retarget", surface="street", stays="centre"),
+        Variant(name="far_mixed", title="far + raw", kind="retarget", surface="far", mixed=True),
+        Variant(name="depth", title="true depth", kind="retarget", surface="lidar", reads=("depth_m",)),
+        Variant(name="street_mixed", title="street + raw", kind="retarget", surface="street", mixed=True),
+        Variant(
+            name="objects_mixed",
+            title="objects + raw",
+            kind="retarget",
+            surface="objects",
+            reads=("boxes_3d",),
+            mixed=True,
+        ),
+        Variant(name="auto_mixed", title="auto + raw", kind="retarget", reads=_ALL, mixed=True),
+        Variant(name="auto_black", title="auto, black holes, no mask", kind="retarget", reads=_ALL, masked=False),
+        Variant(
+            name="auto_fill",
+            title="auto, filled holes, no mask",
+            kind="retarget",
+            reads=_ALL,
+            holes="fill",
+            masked=False,
+        ),
+        Variant(
+            name="auto_fill_mixed",
+            title="auto, filled holes, no mask, + raw",
+            kind="retarget",
+            reads=_ALL,
+            holes="fill",
+            masked=False,
+            mixed=True,
+        ),
+        Variant(
+            name="auto_generated",
+            title="auto, generator, no mask",
+            kind="retarget",
+            reads=_ALL,
+            holes="generator",
+            masked=False,
+        ),
+        Variant(
+            name="true_covered", title="auto's holes in B's own frames", kind="retarget", reads=_ALL, truth="covered"
+        ),
+        Variant(
+            name="true_holes", title="auto, holes filled with the truth", kind="retarget", reads=_ALL, truth="holes"
+        ),
+        Variant(
+            name="auto_neighbours",
+            title="auto, near road from other frames",
+            kind="retarget",
+            reads=(*_ALL, "neighbours"),
+        ),
+        Variant(name="motion", title="depth from motion", kind="retarget", surface="motion", reads=("neighbours",)),
+        Variant(
+            name="motion_mixed",
+            title="depth from motion, + raw",
+            kind="retarget",
+            surface="motion",
+            reads=("neighbours",),
+            mixed=True,
+        ),
+        Variant(name="random", title="RandomRig around B, auto", kind="retarget", reads=_ALL, random=True),
+        Variant(name="oracle", title="B's own frames", kind="oracle"),
+    )
+}
+"""By name, in the order of tables."""
+
+
+def named_variants(names: Sequence[str]) -> list[Variant]:
+    """Variants by name, in the order of ``VARIANTS``.
+
+    Raises:
+        ValueError: An unknown name.
+    """
+    unknown = [name for name in names if name not in VARIANTS]
+    if unknown:
+        raise ValueError(f"variants: expected some of {', '.join(VARIANTS)}, got {', '.join(unknown)}")
+    return [variant for variant in VARIANTS.values() if variant.name in names]
