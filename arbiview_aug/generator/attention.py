@@ -30,22 +30,8 @@ HEAD_WIDTH = 32
 
 DENSE_TOKENS = 512
 DENSE_SHARE = 0.65
-"""Grids of at most so many tokens of which more than this share of (token, neighbour, level) is valid are read by dense
-masked attention; all others by gathering.
-
-CPU milliseconds of reading, forward, one thread of a 2-core Xeon, 3 levels, 2 neighbours; share is what is valid:
-
-                            6 cameras in a ring, share .21    target and 2 sources 2 and 20° aside, x 8, share .8 / .57
-    width @ tokens          gather      dense                 gather          dense
-    320 @ 28 x 50           239         2840
-    640 @ 14 x 25           87          439                   798 / 600       697 / 699
-    1280 @ 7 x 13           42          130                   376 / 274       187 / 200
-    384 @ 8 x 14            17          43                    118 / 55        62 / 63
-    96 @ 8 x 14                                               17 / 13         16 / 16
-
-Gathering places that are not valid as well, as a plain implementation does, takes 1419, 785 and 185 ms for the first
-three in the ring. On a GPU neither has been measured here. Dense masks grow with the square of the tokens.
-"""
+"""Largest token grid, and smallest share of valid (token, neighbour, level) entries, at which dense masked attention
+reads faster than gathering (forward pass, one thread of a 2-core Xeon; not measured on a GPU)."""
 
 _INFINITY_FIRST = 2.0
 """Start of the learned scalar of level infinity, others 0: w = .79, .11, .11."""
@@ -107,8 +93,7 @@ class GEGLU(nn.Module):
 class CrossViewAttention(nn.Module):
     """One block: cross-view attention, then a feed-forward, both residual and both 0 at the start.
 
-    About 16 width² parameters. Of the features of every view that is read, keys and values are projected once
-    (``keys_values``) and then gathered: projecting what was gathered costs three times as much.
+    About 16 width² parameters. Keys and values of each view are projected once (``keys_values``) and then gathered.
 
     Args:
         width: Channels of the features; a multiple of 32, the width of a head.
@@ -251,5 +236,5 @@ class CrossViewAttention(nn.Module):
 
 
 def pays_dense(at: TokenWindow) -> bool:
-    """Whether dense attention is expected to be the faster way to read: see ``DENSE_TOKENS``."""
+    """Decide whether dense attention reads faster than gathering: see ``DENSE_TOKENS``."""
     return at.valid.shape[-1] <= DENSE_TOKENS and len(at.place) > DENSE_SHARE * at.valid.numel()

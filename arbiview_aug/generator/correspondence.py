@@ -27,8 +27,7 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.render.requirements import SAME_CENTER_M
 
 FACING_M = 10.0
-"""Distance of the plane that faces the camera. With 36 tokens of focal length (28 x 50 latents of a 70° camera) and a
-baseline of 1 m, a window of three tokens about infinity reaches down to 24 m, one about 10 m from 17 to 7 m."""
+"""Distance of the plane that faces the camera: at a baseline of 1 m a 3-token window about it spans 7 to 17 m."""
 
 LEVELS = ("infinity", "road", "facing")
 """The depth levels in their order; with only the first, centres coincide."""

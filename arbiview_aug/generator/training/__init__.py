@@ -5,5 +5,5 @@ Needs accelerate besides what the generator needs: ``pip install arbiview_aug[ge
 - ``config``: settings and the four configurations; ``data``: frames and their split by scenes;
 - ``pseudo_views``: Algorithm 1's items, ``masks``: holes as targets have them;
 - ``losses``, ``step``: L_main, L_geo, L_perceptual; ``autoencoder``: the stage before;
-- ``state``, ``trainer``: the run; ``measure``, ``held_out``, ``ablation``: what came of it.
+- ``checkpointing``, ``trainer``: the run; ``measure``, ``held_out``, ``ablation``: its scores.
 """

@@ -1,4 +1,4 @@
-"""What each part is worth: the same steps with one thing changed, scored on held-out streets, as one table."""
+"""Ablation study: train with one setting changed at a time and score each on held-out streets."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ SEEN_ITEMS = 32
 
 
 def wrong_rig(geometry: FrameGeometry) -> FrameGeometry:
-    """Each frame with the homographies of the next one; its rays and poses stay its own."""
+    """Give each frame the homographies of the next one; rays and poses stay its own."""
     rolled = [[type(c)(*(value.roll(1, 0) for value in c)) for c in reads] for reads in geometry[4:]]
     return FrameGeometry(*geometry[:4], *rolled)
 
@@ -82,7 +82,7 @@ def seen_scores(generator: Generator, batch: Batch, steps: int) -> dict[str, flo
 
 
 def seen_batch(frames: Frames, indices: Sequence[int], config: TrainConfig, masks: torch.Tensor) -> Batch:
-    """The items that ``SEEN_ITEMS`` speaks of."""
+    """Build the batch of ``SEEN_ITEMS`` items."""
     settings = PseudoViewConfig(
         transplanted=1.0, hidden=0.0, leave_one_out=0.0, virtual=0.0, real_sources=0.0, moved=config.pseudo_views.moved
     )
@@ -102,7 +102,7 @@ def ablate(
     show: bool = True,
     say: Callable[[str], None] = print,
 ) -> dict[str, dict[str, Any]]:
-    """Train and score each variant; what is done already is not done again. Writes ``ablation.json``.
+    """Train and score each variant; finished ones are skipped. Writes ``ablation.json``.
 
     SIGTERM and SIGINT end it: the variant that is trained goes on from there.
 
@@ -146,7 +146,7 @@ def ablate(
 
 
 def text_of(table: dict[str, dict[str, Any]]) -> str:
-    """The table for people: dB inside the holes."""
+    """Format the table: dB inside the holes."""
     right = f"seen by a source:{'with':>8}{'without':>9}{'wrong rig':>11}"
     head = f"{'variant':<24}{'one step':>10}{'sample':>9}  | {right}  | top-1"
     lines = ["PSNR inside the holes; left: against Telea's, held-out targets; right: one-step", head]

@@ -1,4 +1,4 @@
-"""The stage before: a small KL autoencoder of one's own, for configurations that start from nothing."""
+"""First training stage: a small KL autoencoder, for configurations without pretrained weights."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from arbiview_aug.generator.training.masks import one_of
 
 FOLDER, UNFINISHED = "autoencoder", "autoencoder-state"
 _SCALE_IMAGES = 64
-"""Images whose latents' deviation sets the scale: 64 of 32 x 56 x 4 numbers, 0.1 % of its value."""
+"""Images whose latents' standard deviation sets the scale, to within 0.1 %."""
 
 _MESSAGE_EVERY = 250
 

@@ -1,4 +1,4 @@
-"""What ``python -m arbiview_aug.train`` does with its arguments: data, weights, stages, then the run."""
+"""Run ``python -m arbiview_aug.train``: open the data, load weights, then train, ablate or evaluate."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _LONGEST_WAIT = timedelta(hours=3)
 
 
 def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> int:
-    """Do what was asked; returns the exit status.
+    """Run the command and return its exit status.
 
     Raises:
         ArbiviewError: Settings, data or weights that cannot be used.
@@ -88,16 +88,16 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
 
 
 def _readers(count: int) -> int:
-    """Processes that render streets: each costs a second to start, a street half a second to render."""
+    """Number of rendering processes: each takes a second to start, a street half a second to render."""
     return min(8, os.cpu_count() or 1) if count >= 16 else 0
 
 
 def _nothing(message: str) -> None:
-    """What processes but the first one say."""
+    """Discard a message: only the first process prints."""
 
 
 def check_weights(config: TrainConfig, weights: str | None) -> None:
-    """Refuse, before any work, what ``fresh`` cannot start from.
+    """Check, before any work, that weights are given exactly where ``fresh`` needs them.
 
     Raises:
         TrainingError: A frozen U-Net without weights, or weights for a configuration that starts from nothing.
@@ -134,7 +134,7 @@ def evaluate(
 
 
 def _perceptual(config: TrainConfig, weights: str | None, say: Callable[[str], None]) -> Perceptual | None:
-    """VGG16, or None where the term is off, or its weights are not to be had and none were named."""
+    """Load VGG16; None where the term is off, or no file was named and the download failed."""
     if not config.loss.perceptual:
         return None
     try:

@@ -22,7 +22,7 @@ from arbiview_aug.image_ops import resized
 from arbiview_aug.lru_cache import LRUCache
 
 SHARES = (0.6, 0.2)
-"""Of the scenes, for training and for validation; the rest are held out (Sec. Dataset)."""
+"""Shares of the scenes for training and validation; the rest are held out (Sec. Dataset)."""
 
 _BLOCKS = 10
 """Scenes that one drive without scenes is cut into."""
@@ -135,7 +135,7 @@ def _bytes_of(frame: TrainingFrame) -> int:
 
 
 def forked(workers: int) -> str | None:
-    """How workers start: as copies of this process, which share the frames it holds; newer Pythons would not."""
+    """Start method of workers: fork, so that they share this process's frames (not the default from Python 3.14)."""
     return "fork" if workers else None
 
 
@@ -146,7 +146,7 @@ def item_workers(count: int) -> dict[str, Any]:
 
 
 def one_thread_worker(worker: int) -> None:
-    """Starts a worker: one thread, and signals are the parent's to answer."""
+    """Initialise a worker: one thread; the parent handles signals."""
     cv2.setNumThreads(0)
     torch.set_num_threads(1)
     ignore_stop_requests()

@@ -38,7 +38,7 @@ def held_out_scores(
     mean_of: int = MEAN_OF,
     show: bool = True,
 ) -> dict[str, list[float]]:
-    """PSNR in dB inside the holes, by way of filling, a value for each (seed, scene).
+    """Score each filling method by PSNR (dB) inside the holes, one value for each (seed, scene).
 
     A target is drawn for each from the retarget distribution, with holes of at least 5 %; FAVS renders it from all
     cameras, as at inference, and the generator completes it. A perfect sampler is 3 dB below the posterior's mean, so
@@ -126,7 +126,7 @@ def _target(frame: TrainingFrame, rng: torch.Generator) -> tuple[Camera, torch.T
 
 
 def gains(scores: Mapping[str, Sequence[float]], seeds: int = 1) -> dict[str, Interval]:
-    """By how many dB each way is better than Telea, paired, with 95 % bootstrap intervals over streets.
+    """Paired gain in dB of each method over Telea, with 95 % bootstrap intervals over streets.
 
     Args:
         scores: By ``held_out_scores``.
@@ -138,7 +138,7 @@ def gains(scores: Mapping[str, Sequence[float]], seeds: int = 1) -> dict[str, In
 
 
 def report(scores: Mapping[str, Sequence[float]], seeds: int = 1, say: Callable[[str], None] = print) -> None:
-    """The scores in lines for people; arguments as for ``gains``."""
+    """Print the scores; arguments as for ``gains``."""
     count = len(scores["telea"])
     say(f"inside the holes of {count} held-out views; Telea {sum(scores['telea']) / count:.2f} dB; against it, dB:")
     for name, gain in gains(scores, seeds).items():

@@ -1,4 +1,4 @@
-"""Holes as targets have them: what FAVS covers of cameras drawn from the retarget distribution.
+"""Hole masks: FAVS coverage of cameras drawn from the retarget distribution.
 
 Algorithm 1 alone trains next to no hole filling: its pseudo pair holds 89 to 100 % of the real view. At inference a
 turn of the rig leaves 0.5 to 14 % of a view open, another field of view 21 to 51 %, another pitch 19 to 30 %.
@@ -23,12 +23,12 @@ _TRIES = 8
 
 
 def uniform(rng: torch.Generator, low: float, high: float) -> float:
-    """One number."""
+    """Draw a number from [low, high)."""
     return low + (high - low) * float(torch.rand((), generator=rng, dtype=torch.float64))
 
 
 def one_of(rng: torch.Generator, count: int) -> int:
-    """One of ``count`` numbers from 0."""
+    """Draw an index below ``count``."""
     return int(torch.randint(count, (), generator=rng))
 
 

@@ -36,10 +36,10 @@ from arbiview_aug.generator.training.step import Step, draw
 _LOG_EVERY = 10
 _DEVIATION_ITEMS = 32
 _LEAST_DEVIATION = 0.02
-"""2.5 grey levels: nothing is known better after it was rendered twice."""
+"""Lower bound, 2.5 grey levels: the error of rendering twice."""
 
 _SEEDS = {"items": 1, "validation": 2, "masks": 3, "draws": 4}
-"""Told apart, so that validation never sees training's draws."""
+"""Offsets of the random streams: validation never sees training's draws."""
 
 
 class Trainer:
@@ -118,7 +118,7 @@ class Trainer:
         return self.output / "state"
 
     def say(self, message: str) -> None:
-        """A message for people, once."""
+        """Print a message from the main process alone."""
         if self.is_main:
             self._say(message)
 
@@ -130,7 +130,7 @@ class Trainer:
 
     @torch.no_grad()
     def _measure_deviation(self) -> None:
-        """What the condition lacks of the image inside the holes and outside, of the first items: the same whenever."""
+        """Set the denoiser's residual deviation inside and outside holes, from the first items (reproducible)."""
         encode = self.generator.autoencoder.encode
         sums = torch.zeros(2, 2, dtype=torch.float64)
         for k in range(_DEVIATION_ITEMS):

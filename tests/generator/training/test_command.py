@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from arbiview_aug.__main__ import main as package_main
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.training import command
 from arbiview_aug.train import main
@@ -40,6 +41,15 @@ def test_train_and_resume(drawn_frames: None, tmp_path: Path, capsys: pytest.Cap
     assert Generator.from_pretrained(tmp_path / "generator").config.image_size == (16, 24)
     assert main(common) == 0
     assert "going on after step 2" in capsys.readouterr().out
+
+
+def test_both_entries_have_the_same_help(capsys: pytest.CaptureFixture[str]) -> None:
+    said = []
+    for entry, arguments in ((main, ["--help"]), (package_main, ["train", "--help"])):
+        with pytest.raises(SystemExit):
+            entry(arguments)
+        said.append(capsys.readouterr().out)
+    assert said[0] == said[1] and "python -m arbiview_aug.train" in said[0]
 
 
 @pytest.mark.slow
