@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -43,7 +43,7 @@ from arbiview_aug.render.occlusion import (
 )
 from arbiview_aug.render.pixel_projection import cropped, project_pixels
 from arbiview_aug.render.target_rays import TargetRays
-from arbiview_aug.scene.surface import DenseSurface, LayeredSurface, OcclusionMap, StaticSurface, Surface
+from arbiview_aug.scene.surface import OcclusionMap, Surface
 
 _SLACK_PX = 1e-3  # a pixel on the very border must not drop out by a rounding, of float32 at most
 _SAFETY = 1.25  # curvature between the nodes may exceed what the nodes show
@@ -71,13 +71,15 @@ class WarpMap:
     """
 
     def __init__(self, rays: TargetRays, source: Camera, surface: Surface) -> None:
-        self.rays, self.source, self.whole_surface = rays, source, surface
-        self.surface: Surface = surface.background if isinstance(surface, LayeredSurface) else surface
+        self.rays, self.source = rays, source
+        # Any: attributes, not types, say what a surface offers.
+        self.whole_surface = cast(Any, surface)
+        self.surface = cast(Any, surface).background
         self.offset_m = rays.camera.center_m - source.center_m
         self.nodes: Box | None = None
         if self._look_apart():
             return
-        self.solids = VisibleFragments.of(rays, source, surface) if isinstance(surface, LayeredSurface) else None
+        self.solids = VisibleFragments.of(rays, source, self.whole_surface) if surface.is_layered else None
         seen_solids = self.solids.nodes(rays.grid) if self.solids is not None else None
         if rays.grid.step > 1 and seen_solids is None and not self._glance():
             return
@@ -85,7 +87,7 @@ class WarpMap:
         points = source_points(source, rays.directions, q, self.offset_m)
         self.uv, _, self.valid = source.project_cam(points)
         self.valid &= rays.valid
-        self._shaded = isinstance(self.surface, DenseSurface) or self.solids is not None
+        self._shaded = self.surface.is_dense or self.solids is not None
         self._exact = np.zeros((0, 0), bool)
         self._use: BoolArray | None = None
         self._whole: BoolArray | None = None
@@ -93,23 +95,23 @@ class WarpMap:
         self._near_shadow: BoolArray | None = None
         self._clean: dict[int, npt.NDArray[np.uint8]] = {}
         self._light: dict[int, tuple[OcclusionMap, BoolArray]] = {}
-        if self._shaded and not isinstance(self.surface, StaticSurface):
+        if self._shaded and not self.surface.is_guess:
             self._from_source_q = (q / np.maximum(np.sqrt((points * points).sum(-1)), 1e-300)).astype(np.float32)
         if rays.grid.step == 1:
             self.nodes = _bounds(self.valid & source.contains(self.uv, _SLACK_PX), 0)
         else:
             self.nodes = self._classify(points)
-            if isinstance(self.surface, DenseSurface):
+            if self.surface.is_dense:
                 self._every_pixel()
         if seen_solids is not None:
             self.nodes = seen_solids if self.nodes is None else around(self.nodes, seen_solids)
-        if isinstance(self.surface, DenseSurface) and self.nodes is not None:
+        if self.surface.is_dense and self.nodes is not None:
             rays.ask(self.surface, self.nodes)
 
     def _look_apart(self) -> bool:
         """Whether the two cameras certainly have nothing in common."""
         nearest = float(self.rays.inverse_distance(self.whole_surface).max())
-        if isinstance(self.whole_surface, LayeredSurface):
+        if self.whole_surface.is_layered:
             nearest = max(nearest, float(self.rays.solids(self.whole_surface).inverse_distance.max(initial=0.0)))
         return look_apart(self.rays.camera, self.source, nearest)
 
@@ -226,9 +228,9 @@ class WarpMap:
             return self.valid
         shadows, lit = self._in_light(level)
         pixel, inside = nearest_pixel(shadows.beyond, at_level(self.uv, level))
-        beyond = 0 if isinstance(self.surface, StaticSurface) else self._from_source_q
+        beyond = 0 if self.surface.is_guess else self._from_source_q
         free = self.valid & ~(inside & (shadows.beyond[pixel] > beyond))
-        if self.solids is None or not isinstance(self.whole_surface, LayeredSurface):
+        if self.solids is None:
             return free
         on_solid = self.rays.at_nodes(255 - self.rays.solids(self.whole_surface).free) > 0
         seen = np.zeros(self.rays.camera.size, bool)
@@ -239,7 +241,6 @@ class WarpMap:
     def _in_light(self, level: int) -> tuple[OcclusionMap, BoolArray]:
         """The source's shadow images when it is halved ``level`` times, and which of ``solids`` (n,) it sees."""
         if level not in self._light:
-            assert isinstance(self.whole_surface, LayeredSurface | DenseSurface)
             shadows = self.whole_surface.occlusion_map(halved_camera(self.source, level))
             lit = np.zeros(0, bool)
             if self.solids is not None:
@@ -269,8 +270,8 @@ class WarpMap:
             y0, y1, x0, x1 = grid.pixels(nodes)
             at = slot.from_source(self.uv[y0:y1, x0:x1]).astype(np.float32)
             at[~self.valid[y0:y1, x0:x1]] = -FAR_AWAY_PX
-            q = self._from_source_q[y0:y1, x0:x1] if isinstance(self.surface, DenseSurface) else None
-        elif isinstance(self.surface, DenseSurface):
+            q = self._from_source_q[y0:y1, x0:x1] if self.surface.is_dense else None
+        elif self.surface.is_dense:
             box = grid.pixels(nodes)
             known = self.rays.dense(self.surface)[box[0] : box[1], box[2] : box[3]]
             at, q = project_pixels(cropped(self.rays.planes, box), known, self.rays.camera, source, slot)
@@ -307,7 +308,7 @@ class WarpMap:
 
     def _put_solids(self, at: npt.NDArray[np.float32], visible: npt.NDArray[np.uint8], nodes: Box, slot: Slot) -> None:
         """What lies in the shadow of solids is not seen; then the pixels that show solids."""
-        assert self.solids is not None and isinstance(self.whole_surface, LayeredSurface)
+        assert self.solids is not None
         grid = self.rays.grid
         y0, y1, x0, x1 = grid.pixels(nodes)
         shadows, lit = self._in_light(slot.level)
@@ -315,7 +316,7 @@ class WarpMap:
             t, b, le, r = grid.pixels(part)
             here = slice(t - y0, b - y0), slice(le - x0, r - x0)
             first = read_nearest(shadows.beyond, at[here])
-            beyond: Any = 0 if isinstance(self.surface, StaticSurface) else grid.upsample(self._from_source_q, part)
+            beyond: Any = 0 if self.surface.is_guess else grid.upsample(self._from_source_q, part)
             visible[here] *= first <= beyond  # not cv2.compare: to it a part of one or four pixels is a scalar
         visible &= self.rays.solids(self.whole_surface).free[y0:y1, x0:x1]
         solids = self.solids
@@ -327,7 +328,7 @@ class WarpMap:
 
     def _parts_near_shadow(self, shadow: npt.NDArray[np.float32], nodes: Box, level: int) -> Iterator[Box]:
         """The parts of a strip, between its rows of nodes, whose background may be read in a shadow."""
-        if isinstance(self.surface, DenseSurface):
+        if self.surface.is_dense:
             return  # shaded already
         if self.rays.grid.step == 1:
             yield nodes

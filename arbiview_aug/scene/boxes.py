@@ -29,7 +29,6 @@ from arbiview_aug.scene.surface import (
     LayeredSurface,
     OcclusionMap,
     Points,
-    StaticSurface,
     Surface,
 )
 
@@ -140,7 +139,7 @@ class BoxSurface(LayeredSurface):
         A static street is a guess, a box a label: what such a street says lies before a box lies behind it in truth.
         """
         first = BoxSurface(self.street, self._enlarged(origin, pixel_rad))._boxes_ahead(origin, directions)[0]
-        return first > (0 if isinstance(self.street, StaticSurface) else inverse_distance * (1 + 2 * pixel_rad))
+        return first > (0 if self.street.is_guess else inverse_distance * (1 + 2 * pixel_rad))
 
     def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
         """Rays (...,) that pass a box within an angle, where nothing may be interpolated."""

@@ -32,13 +32,22 @@ class Surface(ABC):
 
     Attributes:
         smooth: Without creases: a map over it may be interpolated by what its values on a grid show.
-        tolerance_scale: By how much more than settings say maps over it may err where they are interpolated: more than
-        1 where
-            the surface itself is not known that well.
+        tolerance_scale: Factor on the interpolation tolerance, above 1 where the surface itself is not known so well.
+        is_layered: Objects are rasterised in front of ``background``, as in ``LayeredSurface``.
+        is_dense: Evaluated at every pixel, as in ``DenseSurface``.
+        is_guess: Nothing was measured: an occluder hides what lies before it, too.
     """
 
     smooth: ClassVar[bool]
     tolerance_scale: ClassVar[float] = 1.0
+    is_layered: ClassVar[bool] = False
+    is_dense: ClassVar[bool] = False
+    is_guess: ClassVar[bool] = False
+
+    @property
+    def background(self) -> Surface:
+        """The surface behind the objects; the surface itself where there are none."""
+        return self
 
     @abstractmethod
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
@@ -105,6 +114,8 @@ class LayeredSurface(Surface):
     hidden where the source's shadow image says so.
     """
 
+    is_layered: ClassVar[bool] = True
+
     @property
     @abstractmethod
     def background(self) -> Surface:
@@ -131,6 +142,8 @@ class LayeredSurface(Surface):
 class DenseSurface(Surface):
     """A surface that may step anywhere: it is evaluated at every pixel, and never interpolated between coarse nodes."""
 
+    is_dense: ClassVar[bool] = True
+
     @abstractmethod
     def image(self, camera: Camera) -> npt.NDArray[np.float32]:
         """Inverse distances (h, w) along the rays of a camera's pixel centres, 1/m."""
@@ -142,6 +155,8 @@ class DenseSurface(Surface):
 
 class StaticSurface(Surface):
     """A surface without objects: it hides nothing from any camera; equal for the same scene."""
+
+    is_guess: ClassVar[bool] = True
 
     def occludes(
         self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
