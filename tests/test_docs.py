@@ -21,7 +21,6 @@ from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import shipped_rigs
 from arbiview_aug.cli.bench import generator, neighbours, trade
 from arbiview_aug.cli.bench.ablation import NOTES, ROWS, STEPS, markdown
-from arbiview_aug.cli.bench.sweep import settings
 from arbiview_aug.evaluate import paper_study
 from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.evaluate.methods import study_methods
@@ -219,7 +218,7 @@ def test_the_trade_is_the_commands() -> None:
     (table,) = re.findall(r"((?:^\|.*\n)+)", block, re.MULTILINE)
     head, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
     assert head == ["", "", *(heading for heading, _ in trade.COLUMNS)]
-    known = {setting.name for setting in settings(["far", "ground", "street", "lidar"])}
+    known = {setting.name for setting in trade.settings(["far", "ground", "street", "lidar"])}
     assert {name for name, *_ in rows} <= known and sum(mark == "step" for _, mark, *_ in rows) >= 4
     assert trade.NOTES in block
     fastest = min(float(row[2]) for row in rows if "lidar" in row[0])  # the others are static, and cameras move
@@ -231,7 +230,7 @@ def test_the_neighbours_table_is_the_commands() -> None:
     (table,) = tables(measured("neighbours"))
     counts = partial(neighbours.counts_of, counts=neighbours.COUNTS)
     names = [neighbours.row_name(surface, n) for surface in neighbours.NEEDS for n in counts(surface)]
-    assert table[0] == ["", *neighbours.COLUMNS] and [row[0] for row in table[2:]] == names
+    assert table[0] == ["", *(heading for heading, _ in neighbours.COLUMNS)] and [row[0] for row in table[2:]] == names
     assert all(re.fullmatch(r"[\d.]+%?", cell) for row in table[2:] for cell in row[1:])
     assert neighbours.NOTES in measured("neighbours")
 

@@ -49,12 +49,14 @@ class Method:
         reads_points: Whether it may use the sample's ``points``: then only a part of them can score it.
         render_alone: Sample, index of a source camera, one-camera target rig: the view from that source alone, but
             with what the method knows of the scene from all; None where it knows nothing but what each camera shows.
+        plans: Whether a first call takes longer than the next, because it plans.
     """
 
     name: str
     render: Callable[[Sample, Rig], list[RenderedView]]
     reads_points: bool = False
     render_alone: Callable[[Sample, int, Rig], RenderedView] | None = None
+    plans: bool = True
 
     def alone(self, sample: Sample, camera: int, target: Rig) -> RenderedView:
         """A one-camera target from one source camera alone."""
@@ -75,6 +77,7 @@ def retargeting(
     path: RenderPath = "favs",
     generator: Generator | None = None,
     steps: int | None = None,
+    transforms: int = _HELD_TRANSFORMS,
 ) -> Method:
     """``RigRetarget`` as a method; a transform, with its last plan, for each of the last target rigs.
 
@@ -90,12 +93,13 @@ def retargeting(
         path: As for ``RigRetarget``; a source camera alone is never completed.
         generator: As for ``RigRetarget``.
         steps: As for ``RigRetarget``.
+        transforms: Target rigs whose transforms are cached.
     """
     completes = path != "favs"
     if path == "diffusion" and generator is None:
         generator = Generator.shipped()  # once, not for each target
 
-    @lru_cache(_HELD_TRANSFORMS)
+    @lru_cache(transforms)
     def transform(target: Rig) -> RigRetarget:
         return RigRetarget(
             target,
@@ -135,7 +139,8 @@ def retargeting(
     learns = isinstance(config, FavsConfig) and config.overlap_depth
     overlaps = _LastOverlaps(surface if learns else None, Harmoniser(harmonise))
     reads_points = "points" in SURFACES[surface].reads and not isinstance(config, PaperConfig)
-    return Method(label, render, reads_points, render_alone if overlaps.tell or completes else None)
+    alone = render_alone if overlaps.tell or completes else None
+    return Method(label, render, reads_points, alone, plans=not isinstance(config, PaperConfig))
 
 
 class _LastOverlaps:

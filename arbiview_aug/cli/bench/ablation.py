@@ -12,9 +12,7 @@ difference between its two rows: rows take turns on each target, so that what el
 
 from __future__ import annotations
 
-import argparse
 import statistics
-import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -23,10 +21,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import add_data
+from arbiview_aug.cli.bench.study import benchmark_parser, study
 from arbiview_aug.cli.bench.timing import cpu_model, quartiles, write_json
 from arbiview_aug.datasets import open_data, reduced_rig
 from arbiview_aug.datasets.image_io import Reduce
@@ -35,10 +33,8 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import one_thread
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.agreement import source_overlap, summary
-from arbiview_aug.evaluate.frames import ScoredFrame, make_frame, scores
-from arbiview_aug.evaluate.images import RenderedView
-from arbiview_aug.evaluate.methods import Method, Sample, paper_stages, retargeting
-from arbiview_aug.evaluate.metrics import mean_of
+from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
+from arbiview_aug.evaluate.methods import Method, paper_stages, retargeting
 from arbiview_aug.evaluate.report.tables import Column, cell, markdown_table
 from arbiview_aug.evaluate.targets import UP_M, paper_targets, shifted_target
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality
@@ -66,7 +62,8 @@ class Row(NamedTuple):
     def method(self, name: str) -> Method:
         """The row as a method that holds nothing yet."""
         refinement = RefinementCache() if self.held else None
-        return retargeting(self.quality, self.surface, name, harmonise=self.harmonise, refinement=refinement)
+        options: dict[str, Any] = {"harmonise": self.harmonise, "refinement": refinement, "transforms": 1}
+        return retargeting(self.quality, self.surface, name, **options)
 
     def fits(self, frame: ScoredFrame) -> bool:
         """Whether a frame can tell what the row is worth.
@@ -136,18 +133,16 @@ NOTES = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print the table, write the JSON."""
-    parser = argparse.ArgumentParser(
-        prog="python -m arbiview_aug bench ablation",
-        description="Each stage and setting on and off: accuracy, milliseconds on one thread, and what a ms buys.",
+    parser = benchmark_parser(
+        "ablation",
+        "Each stage and setting on and off: accuracy, milliseconds on one thread, and what a ms buys.",
+        reduce=True,
+        output="output/ablation.json",
     )
     add_data(parser, "a synthetic street", nargs="+", default=[])  # with LiDAR, each its first frame
-    parser.add_argument(
-        "--reduce", type=int, choices=(1, 2, 4), default=2, help="decode its images at 1/N (default: %(default)s)"
-    )
     parser.add_argument("--seed", type=int, default=0, help="of the synthetic street (default: %(default)s)")
     parser.add_argument("--only", metavar="TEXT", default="", help="steps whose names contain it")
     parser.add_argument("--json", action="store_true", help="print JSON instead of the table")
-    parser.add_argument("--output", default="output/ablation.json", metavar="FILE", help="(default: %(default)s)")
     arguments = parser.parse_args(argv)
     steps = [name for name in STEPS if arguments.only in name]
     if not steps:
@@ -226,35 +221,15 @@ def _frames(data: Sequence[str], reduce: Reduce, seed: int, size: tuple[int, int
 
 
 def _rows(data: str, frame: ScoredFrame, names: set[str]) -> dict[str, dict[str, Any]]:
-    """Of each row the mean metrics, ``turned`` and ``raised``, and the times on each target, ``ms`` and ``plan_ms``."""
+    """Mean metrics of each row, ``turned`` and ``raised``, and its times on each target, ``ms`` and ``plan_ms``."""
     rig: Rig = frame.sample["rig"]
-    targets = [("turned", target) for target in paper_targets(rig)] + [("raised", shifted_target(rig, z_m=UP_M))]
-    keys = ("turned", "raised", "ms", "plan_ms")
-    found: dict[str, dict[str, Any]] = {row: {key: [] for key in keys} for row in ROWS if row in names}
-    with tqdm(total=len(targets) * len(found), desc=data, unit="row", leave=False) as progress:
-        for move, target in targets:
-            for name, row in found.items():
-                metrics, times = _timed(frame, name, target)
-                row[move] += metrics
-                row["ms"].append(times[-1])
-                row["plan_ms"].append(times[0] - times[-1])
-                progress.update()
-    return {name: row | {move: mean_of(row[move]) for move in ("turned", "raised")} for name, row in found.items()}
-
-
-def _timed(frame: ScoredFrame, name: str, target: Rig) -> tuple[list[dict[str, float]], list[float]]:
-    """Metrics of a row's views, and CPU ms of the first call, which plans, and of the next; the paper plans nothing."""
-    row, times = ROWS[name], []
-    method, calls = row.method(name), 1 if isinstance(row.quality, PaperConfig) else 2
-
-    def render(sample: Sample, rig: Rig) -> list[RenderedView]:
-        for _ in range(calls):
-            start = time.process_time()
-            views = method.render(sample, rig)
-            times.append(1e3 * (time.process_time() - start))
-        return views
-
-    return scores(frame, render, reduced_rig(target, row.reduce), ("even",))[1], times
+    targets = {"turned": paper_targets(rig), "raised": [shifted_target(rig, z_m=UP_M)]}
+    found: dict[str, dict[str, Any]] = {}
+    for reduce in sorted({ROWS[name].reduce for name in names}):
+        methods = [row.method(name) for name, row in ROWS.items() if name in names and row.reduce == reduce]
+        smaller = {move: [reduced_rig(target, reduce) for target in of_move] for move, of_move in targets.items()}
+        found |= study(methods, [frame], smaller, label=data)
+    return {name: found[name] for name in ROWS if name in found}
 
 
 def step_figures(step: Step, rows: Mapping[str, Any], metric: str) -> dict[str, Any]:

@@ -1,5 +1,4 @@
-"""``python -m arbiview_aug bench generator``: the right end of the trade: what made-up pixels cost, and how true they
-are.
+"""``python -m arbiview_aug bench generator``: cost and truth of generated pixels.
 
 On synthetic streets, whose true views are known, for targets with holes: the rig turned and with wider lenses. Holes
 are left black, inpainted, or generated in 1, 4, 10 and 50 steps.
@@ -9,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,15 +17,14 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.arguments import count, device_named, size, writable_folder
-from arbiview_aug.cli.bench.timing import Clock, clock_of, machine, machine_line, quartiles, show
+from arbiview_aug.cli.arguments import count, device_named, writable_folder
+from arbiview_aug.cli.bench.study import benchmark_parser, facts, study, study_table
+from arbiview_aug.cli.bench.timing import clock_of, machine_line, quartiles, show
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.environment import one_thread, versions
-from arbiview_aug.evaluate.agreement import summary, target_consistency
-from arbiview_aug.evaluate.frames import ScoredFrame, make_frame, scores
-from arbiview_aug.evaluate.methods import Method, retargeting
-from arbiview_aug.evaluate.metrics import mean_of
-from arbiview_aug.evaluate.report.tables import markdown_table
+from arbiview_aug.environment import one_thread
+from arbiview_aug.evaluate.frames import make_frame
+from arbiview_aug.evaluate.images import RenderedView
+from arbiview_aug.evaluate.methods import Method, Sample, retargeting
 from arbiview_aug.generator import Generator
 
 SIZE = (256, 448)
@@ -41,16 +39,16 @@ YAW_DEG, FOCAL = 20.0, 0.7
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print the table, write the JSON."""
-    parser = argparse.ArgumentParser(
-        prog="python -m arbiview_aug bench generator",
-        description="Holes left black, inpainted, generated: milliseconds a frame, and PSNR against the true views.",
+    parser = benchmark_parser(
+        "generator",
+        "Holes left black, inpainted, generated: milliseconds a frame, and PSNR against the true views.",
+        view_size=SIZE,
+        repeats=3,
+        output="output",
     )
     parser.add_argument("--generator", metavar="DIR", help="a trained one (default: the package's own)")
     parser.add_argument("--steps", nargs="+", type=count, default=STEPS, metavar="N", help="(default: 1 4 10 50)")
     parser.add_argument("--frames", type=count, default=2, metavar="N", help="streets (default: %(default)s)")
-    parser.add_argument("--size", type=size, default=SIZE, metavar="HxW", help="of every view (default: 256x448)")
-    parser.add_argument("--repeats", type=count, default=3, metavar="N", help="timed calls (default: %(default)s)")
-    parser.add_argument("--output", default="output", metavar="DIR", help="(default: %(default)s)")
     arguments = parser.parse_args(argv)
     folder = writable_folder(Path(arguments.output), arguments.output)
     with one_thread():
@@ -88,66 +86,61 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     make = partial(retargeting, "fast", "auto", outputs=("confidence",))
     methods = [make(name="holes black"), make(name="inpainted", path="inpaint")]
     for steps in arguments.steps:
-        if steps == 1 and not generator.config.one_step:
-            continue
-        methods.append(make(name=row_name(steps), path="diffusion", generator=generator, steps=steps))
-    clock = clock_of(device)
-    rows = {method.name: _row(method, frames, target, arguments.repeats, generator, clock) for method in methods}
-    return {
-        "benchmark": "generator",
-        "clock": CLOCKS[device.type],
-        "generator": generator.config.name,
-        "generator_size": list(generator.config.image_size),
-        "device": str(device),
-        "cameras": len(target),
-        "size": list(arguments.size),
-        "frames": arguments.frames,
-        "rows": rows,
-        "machine": machine(load_before),
-        "versions": versions(),
-    }
+        if steps > 1 or generator.config.one_step:
+            methods.append(make(name=row_name(steps), path="diffusion", generator=generator, steps=steps))
+    calls: dict[str, list[int]] = {method.name: [] for method in methods}
+    methods = [_counted(method, generator, calls[method.name]) for method in methods]
+    options: dict[str, Any] = {"repeats": arguments.repeats, "clock": clock_of(device), "consistency": True}
+    found = study(methods, frames, {"wide": [target]}, label="generator", **options)
+    rows = {}
+    for name, row in found.items():
+        means = {key: row["wide"].get(metric) for key, metric in METRICS.items()}
+        rows[name] = quartiles(np.array(row["ms"]))._asdict() | {"calls": float(np.mean(calls[name]))} | means
+    return facts(
+        "generator",
+        load_before,
+        clock=CLOCKS[device.type],
+        generator=generator.config.name,
+        generator_size=list(generator.config.image_size),
+        device=str(device),
+        cameras=len(target),
+        size=list(arguments.size),
+        frames=arguments.frames,
+        rows=rows,
+    )
 
 
-def _row(
-    method: Method, frames: Sequence[ScoredFrame], target: Rig, repeats: int, generator: Generator, clock: Clock
-) -> dict[str, float | None]:
-    """Accuracy on all frames, and the time of a frame once its plan is there."""
-    found, pairs = [], []
-    calls = generator.calls
-    for frame in frames:
-        views, of_views = scores(frame, method.render, target)
-        found += of_views
-        pairs += target_consistency(target, views)
-    calls = generator.calls - calls
-    run: Callable[[], Any] = partial(method.render, frames[-1].scored_sample, target)
-    times = quartiles(np.array([clock(run) for _ in range(repeats)]))
-    means = mean_of(found)
-    agreement = summary("consistency", pairs)
-    return {
-        **times._asdict(),
-        "calls": calls / len(frames),
-        "hole_share": means.get("true_hole_share"),
-        "hole_psnr_db": means.get("true_hole_psnr_db"),
-        "hole_mae": means.get("true_hole_mae"),
-        "hole_gradient_ratio": means.get("true_hole_gradient_ratio"),
-        "covered_psnr_db": means.get("true_covered_psnr_db"),
-        "psnr_db": means.get("true_psnr_db"),
-        "consistency_db": agreement.get("consistency_fitted_psnr_db"),
-    }
+def _counted(method: Method, generator: Generator, calls: list[int]) -> Method:
+    """The method; how often each render calls the denoiser is appended to ``calls``."""
+
+    def render(sample: Sample, target: Rig) -> list[RenderedView]:
+        before = generator.calls
+        views = method.render(sample, target)
+        calls.append(generator.calls - before)
+        return views
+
+    return replace(method, render=render)
 
 
+METRICS = {
+    "hole_share": "true_hole_share",
+    "hole_psnr_db": "true_hole_psnr_db",
+    "hole_mae": "true_hole_mae",
+    "hole_gradient_ratio": "true_hole_gradient_ratio",
+    "covered_psnr_db": "true_covered_psnr_db",
+    "psnr_db": "true_psnr_db",
+    "consistency_db": "consistency_fitted_psnr_db",
+}
 COLUMNS = (
-    ("ms", "median_ms", ".0f"),
-    ("calls", "calls", ".0f"),
-    ("holes dB", "hole_psnr_db", ".2f"),
-    ("MAE", "hole_mae", ".1f"),
-    ("sharp", "hole_gradient_ratio", ".2f"),
-    ("seen dB", "covered_psnr_db", ".2f"),
-    ("whole dB", "psnr_db", ".2f"),
-    ("agree dB", "consistency_db", ".2f"),
+    ("ms", "{median_ms:.0f}"),
+    ("calls", "{calls:.0f}"),
+    ("holes dB", "{hole_psnr_db:.2f}"),
+    ("MAE", "{hole_mae:.1f}"),
+    ("sharp", "{hole_gradient_ratio:.2f}"),
+    ("seen dB", "{covered_psnr_db:.2f}"),
+    ("whole dB", "{psnr_db:.2f}"),
+    ("agree dB", "{consistency_db:.2f}"),
 )
-
-
 NOTES = (
     "ms a frame with its plan held; calls: of the denoiser, a frame; holes dB, MAE: against the truth, where no "
     "source sees; sharp: gradient energy there against the truth; agree dB: of neighbouring views, what is made up "
@@ -159,10 +152,6 @@ def table(report: Mapping[str, Any]) -> str:
     """The report to read, in Markdown."""
     h, w = report["size"]
     rows = report["rows"]
-    cells = [
-        [name, *("-" if row[key] is None else f"{row[key]:{form}}" for _, key, form in COLUMNS)]
-        for name, row in rows.items()
-    ]
     share = next(iter(rows.values()))["hole_share"]
     size_of = "x".join(map(str, reversed(report["generator_size"])))
     lines = [
@@ -170,6 +159,6 @@ def table(report: Mapping[str, Any]) -> str:
         f"with lenses {1 / FOCAL:.2g} times as wide, {share:.0%} holes; generator {report['generator']} ({size_of}) on "
         f"{report['device']}; {machine_line(report)}. {report['clock']}. {NOTES}",
         "",
-        markdown_table(["", *(heading for heading, *_ in COLUMNS)], cells),
+        study_table([{"name": name, **row} for name, row in rows.items()], COLUMNS),
     ]
     return "\n".join(lines)

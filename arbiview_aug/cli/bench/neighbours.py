@@ -8,13 +8,11 @@ plan is held.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import os
 import statistics
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,13 +21,13 @@ import numpy as np
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.arguments import add_data, count, seed, size
-from arbiview_aug.cli.bench.data import REDUCES, as_of_another_frame, recorded_drive
-from arbiview_aug.cli.bench.timing import Quartiles, machine, machine_line, peak_mib, quartiles, show, timed_rounds
+from arbiview_aug.cli.arguments import seed
+from arbiview_aug.cli.bench.data import as_of_another_frame, recorded_drive
+from arbiview_aug.cli.bench.study import SIZE, benchmark_parser, facts, study_table
+from arbiview_aug.cli.bench.timing import machine_line, peak_mib, quartiles, show, timed_rounds
 from arbiview_aug.datasets import Neighbours, open_data
-from arbiview_aug.environment import one_thread, versions
+from arbiview_aug.environment import one_thread
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
@@ -43,42 +41,9 @@ MOTION_COUNTS, MOTION_ROUNDS = (0, 2), 3
 Without any it is declined, and the street's are its times."""
 
 UP_M, PITCH_DEG, FOV_DEG = 0.6, -15.0, 100.0
-SIZE = (256, 704)
 REPEATS = 7
 _FRAMES_TRIED = 16
 _ENOUGH_MS = 2000.0
-
-
-@dataclass(frozen=True)
-class Cost:
-    """A surface with a number of neighbours.
-
-    Attributes:
-        surface: Its name.
-        neighbours: How many.
-        read: Reading the frame and its neighbours from disk, and decoding.
-        plan: What is planned anew for a frame.
-        fill: Rendering from the neighbours, and merging.
-        frame: The whole call of ``RigRetarget``, all images in memory.
-        ratio: Of the whole call to that without neighbours, median over the rounds.
-        peak_mib: Growth of the process over a first call, with the neighbours' images; None where it is not told.
-        filled: Share of all pixels.
-    """
-
-    surface: str
-    neighbours: int
-    read: Quartiles
-    plan: Quartiles
-    fill: Quartiles
-    frame: Quartiles
-    ratio: float
-    peak_mib: float | None
-    filled: float
-
-    @property
-    def name(self) -> str:
-        """For tables."""
-        return row_name(self.surface, self.neighbours)
 
 
 def row_name(surface: str, neighbours: int) -> str:
@@ -88,20 +53,18 @@ def row_name(surface: str, neighbours: int) -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print the table as it stands in docs/benchmarks.md, write the JSON."""
-    parser = argparse.ArgumentParser(
-        prog="python -m arbiview_aug bench neighbours",
-        description="What other frames of the drive cost: milliseconds and MiB a frame, and the share that they fill.",
+    parser = benchmark_parser(
+        "neighbours",
+        "What other frames of the drive cost: milliseconds and MiB a frame, and the share that they fill.",
+        data="a synthetic street, driven along",
+        view_size=SIZE,
+        reduce=True,
+        repeats=REPEATS,
+        output="output/neighbours.json",
     )
-    add_data(parser, "a synthetic street, driven along")
     parser.add_argument("--counts", type=seed, nargs="+", default=list(COUNTS), metavar="N", help="(default: 0 1 2 8)")
     parser.add_argument("--step-m", type=float, default=Neighbours.step_m, metavar="M", help="(default: %(default)s)")
-    parser.add_argument("--size", type=size, default=SIZE, metavar="HxW", help="of every view (default: 256x704)")
-    parser.add_argument(
-        "--reduce", type=int, choices=REDUCES, default=2, help="decode the images at 1/N (default: %(default)s)"
-    )
     parser.add_argument("--surface", nargs="+", choices=NEEDS, default=list(NEEDS), help="(default: all)")
-    parser.add_argument("--repeats", type=count, default=REPEATS, metavar="N", help="rounds (default: %(default)s)")
-    parser.add_argument("--output", default="output/neighbours.json", metavar="FILE", help="(default: %(default)s)")
     arguments = parser.parse_args(argv)
     try:
         wanted = Neighbours(count=max(1, -(-max(arguments.counts) // 2)), step_m=arguments.step_m)
@@ -149,7 +112,7 @@ def measure(
     index, sample = _frame_with_most(data, max(counts))
     near = nearest(sample)[: max(counts)]
     target = lowered(sample["rig"], size)
-    costs: list[Cost] = []
+    costs: list[dict[str, Any]] = []
     with one_thread(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of moved cameras over a street
         for surface in surfaces:
@@ -158,18 +121,17 @@ def measure(
                 numbers = sorted({0, *(min(n, len(near)) for n in counts_of(surface, counts))})
                 rounds = min(repeats, MOTION_ROUNDS) if surface == "motion" else repeats
                 costs += _costs(data, index, surface, target, numbers, rounds)
-    return {
-        "benchmark": "neighbours",
-        "clock": "CPU time of the process, milliseconds, one thread",
-        "data": name,
-        "sources": [list(of_camera) for of_camera in sample["rig"].sizes],
-        "size": list(size),
-        "travel_m": [travel_m(sample, neighbour) for neighbour in near],
-        "rounds": repeats,
-        "machine": machine(load_before),
-        "versions": versions(),
-        "costs": [{"name": cost.name, **asdict(cost)} for cost in costs],
-    }
+    return facts(
+        "neighbours",
+        load_before,
+        clock="CPU time of the process, milliseconds, one thread",
+        data=name,
+        sources=[list(of_camera) for of_camera in sample["rig"].sizes],
+        size=list(size),
+        travel_m=[travel_m(sample, neighbour) for neighbour in near],
+        rounds=repeats,
+        costs=costs,
+    )
 
 
 def counts_of(surface: str, counts: Sequence[int]) -> Sequence[int]:
@@ -218,7 +180,7 @@ def _frame_with_most(data: Any, wanted: int) -> tuple[int, dict[str, Any]]:
 
 def _costs(
     data: Any, index: int, surface: SurfaceName, target: Rig, numbers: Sequence[int], repeats: int
-) -> list[Cost]:
+) -> list[dict[str, Any]]:
     sample = data[index]
     in_memory = [dict(neighbour) for neighbour in nearest(sample)]
     peaks, filled = {}, {}
@@ -238,14 +200,10 @@ def _costs(
     times = timed_rounds(runs, repeats, surface, enough_ms=_ENOUGH_MS)
     without = times["0 frame"]
     return [
-        Cost(
-            surface=surface,
-            neighbours=n,
-            **{part: quartiles(times[f"{n} {part}"]) for part in ("read", "plan", "fill", "frame")},
-            ratio=statistics.median(took / alone for took, alone in zip(times[f"{n} frame"], without, strict=False)),
-            peak_mib=peaks[n],
-            filled=filled[n],
-        )
+        {"name": row_name(surface, n), "surface": surface, "neighbours": n}
+        | {part: quartiles(times[f"{n} {part}"]) for part in ("read", "plan", "fill", "frame")}
+        | {"ratio": statistics.median(took / alone for took, alone in zip(times[f"{n} frame"], without, strict=False))}
+        | {"peak_mib": peaks[n], "filled": filled[n]}
         for n in numbers
     ]
 
@@ -276,7 +234,12 @@ def _frame(retarget: RigRetarget, frames: Iterator[Mapping[str, Any]]) -> Callab
 
 
 # --- the table --------------------------------------------------------------------------------------------------------
-COLUMNS = ("read ms", "plan ms", "fill ms", "frame ms", "x", "MiB", "filled")
+COLUMNS = (
+    *((f"{part} ms", f"{{{part}[0]:.1f}}") for part in ("read", "plan", "fill", "frame")),
+    ("x", "{ratio:.2f}"),
+    ("MiB", "{peak_mib:.0f}"),
+    ("filled", "{filled:.1%}"),
+)
 NOTES = (
     "CPU ms a frame on one thread. Read: the frame and its neighbours, decoded; plan: what is planned anew for every "
     "frame; fill: rendering from the neighbours; frame: the whole call, images in memory, with plan and fill; x: that "
@@ -288,11 +251,6 @@ def markdown(report: Mapping[str, Any]) -> str:
     """The table, and what is to be known about it."""
     h, w = report["size"]
     way = f"up to {max(report['travel_m'], default=0.0):.1f} m away"
-    rows = []
-    for cost in report["costs"]:
-        mib = "-" if cost["peak_mib"] is None else f"{cost['peak_mib']:.0f}"
-        ms = [f"{cost[part][0]:.1f}" for part in ("read", "plan", "fill", "frame")]
-        rows.append([cost["name"], *ms, f"{cost['ratio']:.2f}", mib, f"{cost['filled']:.1%}"])
     cameras = f"{len(report['sources'])} cameras of {report['sources'][0][1]}x{report['sources'][0][0]}"
     head = f"{report['data']}, {cameras} to views of {w}x{h}, neighbours {way}; {machine_line(report)}. {NOTES}"
-    return f"{head}\n\n{markdown_table(['', *COLUMNS], rows)}"
+    return f"{head}\n\n{study_table(report['costs'], COLUMNS)}"

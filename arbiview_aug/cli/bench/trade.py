@@ -1,45 +1,158 @@
 """``python -m arbiview_aug bench [trade]``: how much accuracy a millisecond buys, on the user's data or ours.
 
-Measures a sweep of settings (``bench.sweep``), marks the Pareto front of time and accuracy, draws one plot, and
-recommends a setting for ``--budget-ms`` or ``--min-psnr``, measured again before it is named. Decibels do not tell what
-a detector learns: static surfaces are not recommended where cameras move (``required.static_harm``).
+Sweeps quality, surface, decoded size, execution, and depth from overlap cached or not; marks the Pareto front of time
+and accuracy, draws one plot, and recommends a setting for ``--budget-ms`` or ``--min-psnr``, measured again before it
+is named. Decibels do not tell what a detector learns: static surfaces are not recommended where cameras move
+(``requirements.static_harm``).
+
+Times are CPU time of a ``RigRetarget`` call on one thread: with the plan where every frame needs its own (``objects``,
+``lidar``, ``accurate`` without a cache), without it where it is cached. Decoding is timed separately.
+
+Accuracy is the mean PSNR of the pixels that some source sees: against LiDAR points in the source cameras' colours
+(exposures made even; surfaces that may read the points get every other degree of them, the others score), or on
+synthetic streets against the true views. The colours are those of the images decoded at 1 / ``REFERENCE``, for every
+setting. The share of seen pixels, and the PSNR of whole views with the rest black, are printed beside it: a surface
+that knows what objects hide covers less, and is right to.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
+import itertools
 import os
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import torch
+from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.arguments import add_data, add_target, command_parser, count, size, writable_folder
-from arbiview_aug.cli.bench.data import REDUCES, SOURCES_OVER_VIEWS, Recorded, recorded
-from arbiview_aug.cli.bench.front import (
-    LEAST_GAIN_DB,
-    Advice,
-    Point,
-    at_least,
-    distinct_steps,
-    pareto_front,
-    within_budget,
-)
+from arbiview_aug.cli.arguments import add_target, count, writable_folder
+from arbiview_aug.cli.bench.data import REDUCES, SOURCES_OVER_VIEWS, Recorded, as_of_another_frame, recorded
 from arbiview_aug.cli.bench.plot import save_plot
-from arbiview_aug.cli.bench.sweep import REFERENCE, REPEATS, Execution, Sweep, settings
-from arbiview_aug.cli.bench.timing import Quartiles, machine, machine_line, write_json
-from arbiview_aug.environment import one_thread, versions
-from arbiview_aug.evaluate.report.tables import markdown_table
+from arbiview_aug.cli.bench.speed import remap_floor
+from arbiview_aug.cli.bench.study import (
+    LEAST_GAIN_DB,
+    SIZE,
+    Row,
+    advice,
+    benchmark_parser,
+    distinct_steps,
+    facts,
+    pareto_front,
+    study,
+    study_table,
+)
+from arbiview_aug.cli.bench.timing import Quartiles, machine_line, peak_mib, quartiles, timed_rounds, write_json
+from arbiview_aug.datasets.image_io import Reduce
+from arbiview_aug.environment import one_thread
+from arbiview_aug.evaluate.frames import ScoredFrame
+from arbiview_aug.evaluate.images import RenderedView
+from arbiview_aug.evaluate.methods import Method, Sample, views_of
 from arbiview_aug.favs.config import FavsConfig, Quality
+from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.render.requirements import HELPFUL_DATA, static_harm
 from arbiview_aug.scene.scene import SURFACES
+from arbiview_aug.scene.surface import SurfaceName
+from arbiview_aug.transforms.rig_retarget import RigRetarget
 
-SIZE = (256, 704)
+Execution = Literal["opencv", "torch", "cuda"]
+
+REPEATS = 9
+REFERENCE: Reduce = 2
+"""Decoded size whose colours score: every published figure is at half resolution."""
+_ENOUGH_MS = 1000.0  # a sweep of 63 settings takes three minutes, not twelve
+_LEARNS_ON = ("street", "objects")
+"""Surfaces that depth from overlap can correct: the others are measured, or nothing can be corrected."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A point of the sweep.
+
+    Attributes:
+        quality: As in ``RigRetarget``.
+        surface: As in ``RigRetarget``.
+        reduce: Images are decoded at 1 / this.
+        execution: ``opencv`` and ``torch`` on the CPU, ``cuda``: torch on a GPU.
+        held: Depth from overlap is cached, not computed in every frame.
+    """
+
+    quality: Quality
+    surface: SurfaceName
+    reduce: Reduce
+    execution: Execution
+    held: bool = False
+
+    @property
+    def name(self) -> str:
+        """As tables call it."""
+        held = ["depth held"] if self.held else []
+        return ", ".join([self.quality, self.surface, *held, f"1/{self.reduce}", self.execution])
+
+    def transform(self, target: Rig) -> RigRetarget:
+        """The setting as a transform; without a store of plans but for the last."""
+        return RigRetarget(
+            target,
+            quality=self.quality,
+            surface=self.surface,
+            execution="torch" if self.execution == "cuda" else self.execution,
+            refinement=RefinementCache() if self.held else None,
+            cache_bytes=0,
+            holes="black",
+        )
+
+    def method(self, target: Rig) -> Method:
+        """The setting as a row of a study of one target."""
+        retarget = self.transform(target)
+
+        def render(sample: Sample, _: Rig) -> list[RenderedView]:
+            return views_of(retarget(self.on_device(sample)))
+
+        return Method(self.name, render)
+
+    def on_device(self, sample: Sample) -> dict[str, Any]:
+        """The sample, its images on the GPU where this setting renders there."""
+        if self.execution != "cuda":
+            return dict(sample)
+        return {**sample, "images": [image.to("cuda") for image in sample["images"]]}
+
+    def call(self, target: Rig, sample: Sample) -> Callable[[], Any]:
+        """Calls of a new transform that alternate between two frames with one calibration."""
+        sample, retarget = self.on_device(sample), self.transform(target)
+        samples = itertools.cycle([sample, as_of_another_frame(sample)])
+
+        def run() -> None:
+            retarget(next(samples))
+            if self.execution == "cuda":
+                torch.cuda.synchronize()
+
+        return run
+
+
+def settings(
+    surfaces: Sequence[SurfaceName],
+    *,
+    qualities: Sequence[Quality] = get_args(Quality),
+    reduces: Sequence[Reduce] = REDUCES,
+    executions: Sequence[Execution] = ("opencv", "torch"),
+) -> list[Setting]:
+    """All combinations that differ: ``paper`` has its own surface and runs on the CPU, and depth from overlap is
+    nothing where the surface is measured or infinitely far."""
+    found = []
+    for quality, reduce, execution in itertools.product(qualities, reduces, executions):
+        if quality == "paper":
+            found += [Setting(quality, "far", reduce, execution)] if execution == "opencv" else []
+            continue
+        for surface in surfaces:
+            learns = quality == "accurate"
+            if not learns or surface in _LEARNS_ON:
+                found += [Setting(quality, surface, reduce, execution, held) for held in ((False, True)[: 1 + learns])]
+    return found
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -65,26 +178,26 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "bench trade",
+    parser = benchmark_parser(
+        "trade",
         "Speed against accuracy: every quality, surface, decoded size and execution, for one target rig.",
-        "--data FOLDER --budget-ms 20",
+        data="synthetic streets",
+        view_size=SIZE,
+        repeats=REPEATS,
+        output="output",
+        example="--data FOLDER --budget-ms 20",
     )
-    add_data(parser, "synthetic streets")
     add_target(parser)
     executions = [*get_args(Execution)] if torch.cuda.is_available() else ["opencv", "torch"]
     surfaces = [name for name in SURFACES if name != "auto"]
-    parser.add_argument("--size", type=size, default=SIZE, metavar="HxW", help="of every view (default: 256x704)")
     parser.add_argument("--frames", type=count, default=1, metavar="N", help="for accuracy (default: %(default)s)")
     parser.add_argument("--quality", nargs="+", choices=get_args(Quality), help="(default: all)")
     parser.add_argument("--surface", nargs="+", choices=surfaces, help="(default: what the samples offer)")
     parser.add_argument("--reduce", nargs="+", type=int, choices=REDUCES, help="decode at 1/N (default: 1 2 4)")
     parser.add_argument("--execution", nargs="+", choices=executions, help="(default: all that there are)")
-    parser.add_argument("--repeats", type=count, default=REPEATS, metavar="N", help="rounds (default: %(default)s)")
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument("--budget-ms", type=float, metavar="MS", help="recommend the most accurate within it")
     limit.add_argument("--min-psnr", type=float, metavar="DB", help="recommend the fastest that reaches it")
-    parser.add_argument("--output", default="output", metavar="DIR", help="(default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the JSON instead of the tables")
     parser.set_defaults(executions=executions)
     return parser
@@ -98,50 +211,68 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     qualities: Sequence[Quality] = arguments.quality or get_args(Quality)
     if "paper" in qualities:  # homographies know no lens, and all settings are of one target
         target = target.undistorted()
-    sweep = Sweep(data, target, frames=arguments.frames, repeats=arguments.repeats)
+
+    @cache
+    def frame(index: int, reduce: Reduce) -> ScoredFrame:
+        return data.frame(index, reduce, REFERENCE)
+
     wanted = settings(
-        [name for name in sweep.surfaces if not arguments.surface or name in arguments.surface],
+        [s for s in _surfaces(frame(0, REFERENCE).scored_sample) if not arguments.surface or s in arguments.surface],
         qualities=qualities,
         reduces=arguments.reduce or REDUCES,
         executions=arguments.execution or arguments.executions,
     )
-    found = sweep.measure(wanted)
-    harm = {name: static_harm(source, target, name, FavsConfig()) for name in SURFACES}
-    points = [replace(one.point, harm=harm[one.setting.surface]) for one in found]
-    by_name = {one.setting.name: one.setting for one in found}
-    advice: Advice | None = None
+    rows: list[dict[str, Any]] = []
+    for one in tqdm(wanted, desc="accuracy", unit="setting", leave=False):
+        memory = peak_mib(one.call(target, frame(0, one.reduce).scored_sample))
+        frames = [frame(index, one.reduce) for index in range(arguments.frames)]
+        (found,) = study([one.method(target)], frames, {"target": [target]}, repeats=0).values()
+        means, prefix = found["target"], "even" if data.truth is None else "true"
+        rows.append(
+            {"name": one.name, **asdict(one), "peak_mib": memory, "seen": means["seen"]}
+            | {"psnr_db": means[f"{prefix}_covered_psnr_db"], "whole_psnr_db": means[f"{prefix}_psnr_db"]}
+            | {"harm": static_harm(source, target, one.surface, FavsConfig())}
+        )
+    calls = {one.name: one.call(target, frame(0, one.reduce).scored_sample) for one in wanted}
+    h, w = target.sizes[0]
+    noise = torch.randint(0, 256, (len(target), 3, h, w), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    reads = {f"decode 1/{reduce}": data.reader(reduce) for reduce in {one.reduce for one in wanted}}
+    candidates = {"floor": remap_floor(noise, (h, w)), **reads, **calls}
+    times = timed_rounds(candidates, arguments.repeats, "times", enough_ms=_ENOUGH_MS)
+    for row in rows:
+        own, decode = times[row["name"]], quartiles(times[f"decode 1/{row['reduce']}"]).median_ms
+        row |= quartiles(own)._asdict() | {"decode_ms": decode}
+        row["floor_ratio"] = float(quartiles(own / times["floor"][: len(own)]).median_ms)
+        row["decode_ratio"] = row["median_ms"] / decode
+    by_name = {one.name: one for one in wanted}
 
-    def again(point: Point) -> Quartiles:
-        return sweep.time_again(by_name[point.name])
+    def again(row: Row) -> Quartiles:
+        one = by_name[row["name"]]
+        call = one.call(target, frame(0, one.reduce).scored_sample)
+        return quartiles(timed_rounds({one.name: call}, arguments.repeats, "again")[one.name])
 
-    if arguments.budget_ms is not None:
-        advice = within_budget(points, arguments.budget_ms, again)
-    elif arguments.min_psnr is not None:
-        advice = at_least(points, arguments.min_psnr, again)
-    front = {point.name for point in pareto_front(points)}
-    return {
-        "benchmark": "trade",
-        "clock": "CPU time of the process, milliseconds, one thread",
-        "data": data.name,
-        "target": target.name or "target",
-        "size": list(target.sizes[0]),
-        "frames": arguments.frames,
-        "against": "true views" if data.truth is not None else "LiDAR points, exposures made even",
-        "settings": [{**one.as_dict(), "front": one.setting.name in front} for one in found],
-        "steps": [point.name for point in distinct_steps(points)],
-        "advice": None if advice is None else _advice(advice, points),
-        "machine": machine(load_before),
-        "versions": versions(),
-    }
+    recommended = advice(rows, again, budget_ms=arguments.budget_ms, min_psnr_db=arguments.min_psnr)
+    front = {row["name"] for row in pareto_front(rows)}
+    return facts(
+        "trade",
+        load_before,
+        clock="CPU time of the process, milliseconds, one thread",
+        data=data.name,
+        target=target.name or "target",
+        size=list(target.sizes[0]),
+        frames=arguments.frames,
+        against="true views" if data.truth is not None else "LiDAR points, exposures made even",
+        settings=[{**row, "front": row["name"] in front} for row in rows],
+        steps=[row["name"] for row in distinct_steps(rows)],
+        advice=recommended,
+    )
 
 
-def _advice(advice: Advice, points: Sequence[Point]) -> dict[str, Any]:
-    left_out = next((point.harm for point in points if point.harm is not None), None)
-    again = None if advice.again is None else advice.again._asdict()
-    point = advice.point
-    measured = None if point is None else {"psnr_db": point.psnr_db, **point.time._asdict()}
-    words = {"setting": point and point.name, "reason": advice.reason, "left_out": left_out}
-    return {**words, "measured": measured, "again": again}
+def _surfaces(sample: Sample) -> list[SurfaceName]:
+    """Surfaces that a sample has the geometry for."""
+    needs: dict[SurfaceName, str] = {"far": "rig", "ground": "rig", "street": "rig"}
+    needs |= {"objects": "boxes_3d", "lidar": "points"}
+    return [surface for surface, key in needs.items() if key in sample]
 
 
 # --- the tables -------------------------------------------------------------------------------------------------------
@@ -169,19 +300,16 @@ def table(report: Mapping[str, Any]) -> str:
     Shown are the front, and of the rest what OpenCV makes of images decoded as the first shown on the front are.
     """
     h, w = report["size"]
-    steps, rows = report["steps"], sorted(report["settings"], key=lambda row: row["median_ms"])
+    steps, rows = report["steps"], sorted(map(dict, report["settings"]), key=lambda row: row["median_ms"])
     usual = next(row["reduce"] for row in rows if row["name"] in steps)
     shown = [r for r in rows if r["front"] or (r["reduce"] == usual and r["execution"] == "opencv")]
-    cells = []
     for row in shown:
-        mark = "step" if row["name"] in steps else "front" if row["front"] else ""
-        known = {**row, "peak_mib": math.nan if row["peak_mib"] is None else row["peak_mib"]}
-        cells.append([row["name"], mark, *(form.format(**known) for _, form in COLUMNS)])
+        row["mark"] = "step" if row["name"] in steps else "front" if row["front"] else ""
     lines = [
         f"{report['data']} to {report['target']}, views of {w}x{h}, against {report['against']}; "
         f"{machine_line(report)}. {NOTES}",
         "",
-        markdown_table(["", "", *(heading for heading, _ in COLUMNS)], cells, left=2),
+        study_table(shown, COLUMNS, ("name", "mark")),
     ]
     if len(rows) > len(shown):
         lines += ["", f"{len(rows) - len(shown)} more settings, none of them on the front, are in the JSON."]

@@ -63,7 +63,7 @@ def test_command(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert main([*arguments, "--data", str(drive), "--counts", "2"]) == 0
     report, printed = json.loads(path.read_text()), capsys.readouterr().out
     assert [cost["name"] for cost in report["costs"]] == ["street, no neighbours", "street, 2 neighbours"]
-    assert all(heading in printed for heading in COLUMNS) and f"report: {path}" in printed
+    assert all(heading in printed for heading, _ in COLUMNS) and f"report: {path}" in printed
     assert "neighbours up to 1.5 m away" in printed and report["machine"]["cpu"] and report["versions"]["torch"]
 
 

@@ -14,8 +14,7 @@ import pytest
 
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.bench.data import recorded
-from arbiview_aug.cli.bench.sweep import Setting, settings
-from arbiview_aug.cli.bench.trade import table
+from arbiview_aug.cli.bench.trade import Setting, settings, table
 from arbiview_aug.datasets.synthetic import demo_source_rig
 
 SIZE = (64, 176)

@@ -1,0 +1,229 @@
+"""The runner that the benchmarks share: methods on the same frames and targets, in turn; tables; recommendations.
+
+A row of a benchmark is one ``Method``: add it to the benchmark's list, and it is scored, timed and printed with the
+others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cli.arguments import add_data, command_parser, count, size
+from arbiview_aug.cli.bench.data import REDUCES
+from arbiview_aug.cli.bench.timing import Clock, Quartiles, machine, process_ms
+from arbiview_aug.environment import versions
+from arbiview_aug.evaluate.agreement import OverlapScore, summary, target_consistency
+from arbiview_aug.evaluate.frames import ScoredFrame, scores
+from arbiview_aug.evaluate.images import RenderedView
+from arbiview_aug.evaluate.methods import Method, Sample
+from arbiview_aug.evaluate.metrics import mean_of
+from arbiview_aug.evaluate.report.tables import markdown_table
+
+SIZE = (256, 704)
+LEAST_GAIN_DB = 0.2
+"""Smaller differences are noise: single frames of one vehicle."""
+
+Row = Mapping[str, Any]
+Columns = Sequence[tuple[str, str]]
+"""Headings, and the format of the cells below them: fields of a row."""
+
+
+def benchmark_parser(
+    name: str,
+    description: str,
+    *,
+    data: str | None = None,
+    view_size: tuple[int, int] | None = None,
+    reduce: bool = False,
+    repeats: int | None = None,
+    output: str,
+    example: str = "",
+) -> argparse.ArgumentParser:
+    """A parser with the options that benchmarks share.
+
+    Args:
+        name: The benchmark.
+        description: For ``--help``.
+        data: What is rendered without ``--data``; None for no ``--data``.
+        view_size: Default of ``--size`` (h, w); None for no such option.
+        reduce: Whether there is ``--reduce``.
+        repeats: Default of ``--repeats``; None for no such option.
+        output: Default of ``--output``.
+        example: Arguments that show it at work.
+    """
+    parser = command_parser(f"bench {name}", description, example)
+    if data is not None:
+        add_data(parser, data)
+    if view_size is not None:
+        of_views = f"of every view (default: {view_size[0]}x{view_size[1]})"
+        parser.add_argument("--size", type=size, default=view_size, metavar="HxW", help=of_views)
+    if reduce:
+        decoded = "decode the images at 1/N (default: %(default)s)"
+        parser.add_argument("--reduce", type=int, choices=REDUCES, default=2, help=decoded)
+    if repeats is not None:
+        rounds = "rounds of timing (default: %(default)s)"
+        parser.add_argument("--repeats", type=count, default=repeats, metavar="N", help=rounds)
+    kind = "FILE" if Path(output).suffix else "DIR"
+    parser.add_argument("--output", default=output, metavar=kind, help="(default: %(default)s)")
+    return parser
+
+
+def study(
+    methods: Sequence[Method],
+    frames: Sequence[ScoredFrame],
+    targets: Mapping[str, Sequence[Rig]],
+    *,
+    repeats: int = 1,
+    clock: Clock = process_ms,
+    consistency: bool = False,
+    label: str = "",
+) -> dict[str, dict[str, Any]]:
+    """Score and time methods; they take turns on each frame and target, so that other work slows all alike.
+
+    Args:
+        methods: One row each.
+        frames: Samples and their references.
+        targets: Sets of rigs to render, by name.
+        repeats: Timed calls after the first; none for methods that plan nothing.
+        clock: Runs a call and says how long it took.
+        consistency: Also compare neighbouring views (``consistency_...``).
+        label: Names the progress bar.
+
+    Returns:
+        By method: for each set of targets the mean metrics (``evaluate.frames.scores``, exposures made even), and in
+        milliseconds ``ms`` of every repeated call and ``plan_ms``, by how much the first call was longer.
+    """
+    rows: dict[str, dict[str, list[Any]]] = {m.name: {key: [] for key in (*targets, "ms", "plan_ms")} for m in methods}
+    pairs: dict[str, list[OverlapScore]] = {method.name: [] for method in methods}
+    work = list(itertools.product(((kind, rig) for kind, rigs in targets.items() for rig in rigs), frames))
+    with tqdm(total=len(work) * len(methods), desc=label, unit="row", leave=False) as progress:
+        for (kind, target), frame in work:
+            for method in methods:
+                views, metrics, times = _timed(method, frame, target, repeats if method.plans else 0, clock)
+                row = rows[method.name]
+                row[kind] += metrics
+                row["ms"] += times[1:] or times
+                row["plan_ms"].append(times[0] - times[-1])
+                if consistency:
+                    pairs[method.name] += target_consistency(target, views)
+                progress.update()
+    return {
+        name: row | {kind: mean_of(row[kind]) | summary("consistency", pairs[name]) for kind in targets}
+        for name, row in rows.items()
+    }
+
+
+def _timed(
+    method: Method, frame: ScoredFrame, target: Rig, repeats: int, clock: Clock
+) -> tuple[list[RenderedView], list[dict[str, float]], list[float]]:
+    times: list[float] = []
+
+    def render(sample: Sample, rig: Rig) -> list[RenderedView]:
+        found: list[RenderedView] = []
+        for _ in range(1 + repeats):
+            times.append(clock(lambda: found.__setitem__(slice(None), method.render(sample, rig))))
+        return found
+
+    views, metrics = scores(frame, render, target, ("even",))
+    return views, metrics, times
+
+
+def facts(benchmark: str, load_before: tuple[float, float, float], **figures: Any) -> dict[str, Any]:
+    """A report as plain data for JSON, with the machine and the versions that it was measured with."""
+    return {"benchmark": benchmark, **figures, "machine": machine(load_before), "versions": versions()}
+
+
+def study_table(rows: Sequence[Row], columns: Columns, names: Sequence[str] = ("name",)) -> str:
+    """A Markdown table of rows; a field that a row lacks is a dash.
+
+    Args:
+        rows: Fields by name.
+        columns: Headings and formats.
+        names: Fields of the first columns, which have no headings.
+    """
+    cells = [[*(str(row[name]) for name in names), *(_formatted(row, form) for _, form in columns)] for row in rows]
+    return markdown_table([*("" for _ in names), *(heading for heading, _ in columns)], cells, left=len(names))
+
+
+def _formatted(row: Row, form: str) -> str:
+    try:
+        return form.format_map(row)
+    except (KeyError, TypeError):  # not measured
+        return "-"
+
+
+# --- recommendations --------------------------------------------------------------------------------------------------
+def pareto_front(rows: Sequence[Row]) -> list[Row]:
+    """Rows that no other beats in both ``median_ms`` and ``psnr_db``, from the fastest to the most accurate."""
+    front: list[Row] = []
+    for row in sorted(rows, key=lambda row: (row["median_ms"], -row["psnr_db"])):
+        if not front or row["psnr_db"] > front[-1]["psnr_db"]:
+            front.append(row)
+    return front
+
+
+def distinct_steps(rows: Sequence[Row]) -> list[Row]:
+    """Rows of the front that differ by more than noise.
+
+    Each is better than the one before it by at least ``LEAST_GAIN_DB``, and its first quartile of time lies behind the
+    other's third. The fastest that qualifies follows; a better one at the same time replaces it.
+    """
+    steps: list[Row] = []
+    for row in pareto_front(rows):
+        if not steps:
+            steps = [row]
+        elif row["q1_ms"] <= steps[-1]["q3_ms"]:  # as fast, and better
+            if len(steps) == 1 or row["q1_ms"] > steps[-2]["q3_ms"]:
+                steps[-1] = row
+        elif row["psnr_db"] >= steps[-1]["psnr_db"] + LEAST_GAIN_DB:
+            steps.append(row)
+    return steps
+
+
+def advice(
+    rows: Sequence[Row],
+    measure_again: Callable[[Row], Quartiles],
+    *,
+    budget_ms: float | None = None,
+    min_psnr_db: float | None = None,
+) -> dict[str, Any] | None:
+    """Recommend the most accurate row within a budget, or the fastest of an accuracy; None where neither is asked for.
+
+    Rows with ``harm``, a reason against them, are never recommended. A budget must be kept when measured again, too.
+
+    Returns:
+        ``setting`` (a name, None where nothing qualifies), its ``measured`` figures and those ``again``, the
+        ``reason``, and the harm of rows that were ``left_out``.
+    """
+    if budget_ms is None and min_psnr_db is None:
+        return None
+    harmless = [row for row in rows if row["harm"] is None]
+    left_out = next((row["harm"] for row in rows if row["harm"] is not None), None)
+    front = pareto_front(harmless)
+    if budget_ms is not None:
+        candidates = [row for row in reversed(front) if row["q3_ms"] <= budget_ms]
+        reason = f"the most accurate within {budget_ms:g} ms a frame"
+    else:
+        candidates = [row for row in front if row["psnr_db"] >= min_psnr_db]  # type: ignore[operator]
+        reason = f"the fastest of at least {min_psnr_db:g} dB"
+    for row in candidates:
+        again = measure_again(row)
+        if budget_ms is None or again.median_ms <= budget_ms:
+            figures = {key: row[key] for key in ("psnr_db", *Quartiles._fields)}
+            found = {"setting": row["name"], "reason": reason, "left_out": left_out}
+            return found | {"measured": figures, "again": again._asdict()}
+    if not harmless:
+        reason = "nothing was measured that may be recommended"
+    elif budget_ms is not None:
+        reason = f"nothing keeps to {budget_ms:g} ms: the fastest takes {front[0]['median_ms']:.1f} ms"
+    else:
+        best = front[-1]
+        reason = f"nothing reaches {min_psnr_db:g} dB: the best has {best['psnr_db']:.2f} dB ({best['name']})"
+    return {"setting": None, "reason": reason, "left_out": left_out, "measured": None, "again": None}

@@ -1,0 +1,117 @@
+"""The study runner with a toy method; the Pareto front and the recommendation, on rows made by hand."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cli.bench.study import LEAST_GAIN_DB, Row, advice, distinct_steps, pareto_front, study, study_table
+from arbiview_aug.cli.bench.timing import Quartiles
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.evaluate.frames import make_frame
+from arbiview_aug.evaluate.images import RenderedView
+from arbiview_aug.evaluate.methods import Method, Sample, retargeting
+
+
+def point(name: str, ms: float, db: float, spread: float = 0.1) -> Row:
+    return {"name": name, "psnr_db": db, "harm": None} | Quartiles(ms, ms - spread, ms + spread)._asdict()
+
+
+def as_before(row: Row) -> Quartiles:
+    return Quartiles(row["median_ms"], row["q1_ms"], row["q3_ms"])
+
+
+def within(rows: list[Row], budget_ms: float, again: Callable[[Row], Quartiles] = as_before) -> dict[str, Any]:
+    return advice(rows, again, budget_ms=budget_ms)
+
+
+def at_least(rows: list[Row], db: float) -> dict[str, Any]:
+    return advice(rows, as_before, min_psnr_db=db)
+
+
+DRAFT, FAST, LIDAR = point("draft", 4, 18), point("fast", 7, 20), point("lidar", 300, 28)
+SLOWER, WORSE = point("as good, slower", 9, 20), point("as fast, worse", 7, 19)
+ALL = [LIDAR, SLOWER, WORSE, DRAFT, FAST]
+
+
+def names(rows: list[Row]) -> list[str]:
+    return [row["name"] for row in rows]
+
+
+def test_front_is_what_nothing_beats() -> None:
+    assert names(pareto_front(ALL)) == ["draft", "fast", "lidar"] == names(pareto_front(ALL[::-1]))
+    assert pareto_front([]) == [] == distinct_steps([])
+    for p in ALL:
+        beaten = any(q["median_ms"] <= p["median_ms"] and q["psnr_db"] > p["psnr_db"] for q in ALL)
+        beaten |= any(q["median_ms"] < p["median_ms"] and q["psnr_db"] >= p["psnr_db"] for q in ALL)
+        assert (p in pareto_front(ALL)) != beaten
+
+
+def test_steps_leave_out_what_measurement_cannot_tell_apart() -> None:
+    little = point("little better", 8, 20 + 0.9 * LEAST_GAIN_DB)
+    assert names(distinct_steps([*ALL, little])) == ["draft", "fast", "lidar"]
+    as_fast = point("better at the same time", 7.15, 21)
+    assert names(distinct_steps([*ALL, as_fast])) == ["draft", "better at the same time", "lidar"]
+    blurred = point("spread over draft", 5, 21, spread=2)
+    assert names(distinct_steps([DRAFT, blurred])) == ["spread over draft"]
+    steps = distinct_steps([*ALL, little, as_fast])
+    for one, two in itertools.pairwise(steps):
+        assert two["psnr_db"] >= one["psnr_db"] + LEAST_GAIN_DB and two["q1_ms"] > one["q3_ms"]
+
+
+def test_budget_is_kept_when_measured_again() -> None:
+    found = within(ALL, 20)
+    assert found["setting"] == "fast" and found["again"] == as_before(FAST)._asdict()
+    assert found["measured"] == {"psnr_db": 20} | found["again"] and found["left_out"] is None
+    # A setting that is slower the second time is passed over.
+    slow = within(ALL, 20, lambda row: Quartiles(30, 29, 31) if row is FAST else as_before(row))
+    assert slow["setting"] == "draft" and slow["again"] == as_before(DRAFT)._asdict()
+    assert within(ALL, 7.05)["setting"] == "draft", "the third quartile of fast is over the budget"
+    none = within(ALL, 3)
+    assert none["setting"] is none["again"] is None and "the fastest takes 4.0 ms" in none["reason"]
+    assert within([], 3)["setting"] is None
+    assert advice(ALL, as_before) is None, "nothing was asked"
+
+
+@pytest.mark.parametrize(("db", "expected"), [(10, DRAFT), (18, DRAFT), (19, FAST), (28, LIDAR)])
+def test_least_accuracy(db: float, expected: Row) -> None:
+    found = at_least(ALL, db)
+    assert found["setting"] == expected["name"] and found["again"] == as_before(expected)._asdict()
+    assert "the best has 28.00 dB (lidar)" in at_least(ALL, 29)["reason"]
+
+
+def test_what_harms_is_not_recommended() -> None:
+    """Whatever it measures: with a harmless one that is slower, and without any."""
+    street = {**FAST, "name": "street", "harm": "objects lean"}
+    found = within([DRAFT, street, LIDAR], 20)
+    assert found["setting"] == "draft" and found["left_out"] == "objects lean"
+    assert at_least([DRAFT, street, LIDAR], 19)["setting"] == "lidar"
+    slow = within([street, LIDAR], 20)
+    assert slow["setting"] is None and "nothing keeps to 20 ms: the fastest takes 300.0 ms" in slow["reason"]
+    assert within([street], 20)["reason"] == "nothing was measured that may be recommended"
+
+
+def test_a_row_is_one_method() -> None:
+    """A toy that paints everything grey is scored, timed and printed beside the others for one entry in the list."""
+
+    def grey(sample: Sample, target: Rig) -> list[RenderedView]:
+        return [RenderedView(np.full((*c.size, 3), 128, np.uint8), np.ones(c.size, bool)) for c in target]
+
+    drive = SyntheticDrive(demo_source_rig((32, 88)), num_frames=1, lidar=False)
+    frame = make_frame(drive[0], truth=partial(drive.render, 0), exposures=())
+    rig = frame.sample["rig"]
+    toy = Method("toy", grey)
+    found = study([retargeting("fast", "far", "far"), toy], [frame], {"same": [rig], "turned": [rig.turned(yaw_deg=5)]})
+    assert list(found) == ["far", "toy"]
+    for row in found.values():
+        assert len(row["ms"]) == len(row["plan_ms"]) == 2 and min(row["ms"]) >= 0
+    assert found["far"]["same"]["true_psnr_db"] > 40 > found["toy"]["same"]["true_psnr_db"] > 3
+    rows = [{"name": name, **row["turned"]} for name, row in found.items()]
+    printed = study_table(rows, [("seen", "{seen:.0%}"), ("dB", "{true_psnr_db:.1f}"), ("never", "{unknown:.1f}")])
+    assert printed.splitlines()[-1].startswith("| toy | 100% |") and printed.endswith("    - |")
