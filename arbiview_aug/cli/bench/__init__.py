@@ -13,8 +13,7 @@ _PROG = "python -m arbiview_aug bench"
 
 BENCHMARKS = {
     "trade": "speed against accuracy of all settings, and which to use (the default)",
-    "speed": "milliseconds against bare cv2.remap calls",
-    "device": "batches by torch, on a GPU where there is one: milliseconds, share of copy bandwidth",
+    "speed": "milliseconds against bare cv2.remap calls; --device: batches by torch against a copy",
     "ablation": "each stage and setting on and off: dB and milliseconds",
     "loader": "frames per second of a DataLoader, memory per worker",
     "neighbours": "what other frames of the drive cost, and what they fill",

@@ -11,7 +11,6 @@ largest resident set, with what it shares with the others. *CPU* is processor ti
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
 import os
 import re
@@ -29,18 +28,17 @@ from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.arguments import add_data, add_target, count, size
-from arbiview_aug.cli.bench.data import REDUCES, SOURCES_OVER_VIEWS, Recorded, recorded
-from arbiview_aug.cli.bench.timing import Quartiles, machine, machine_line, quartiles, show
+from arbiview_aug.cli.arguments import add_target, count
+from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, recorded
+from arbiview_aug.cli.bench.study import SIZE, benchmark_parser, facts, study_table
+from arbiview_aug.cli.bench.timing import Quartiles, machine_line, quartiles, show
 from arbiview_aug.datasets import RetargetedDataset, open_data
 from arbiview_aug.datasets.image_io import Reduce
-from arbiview_aug.environment import one_thread, versions
-from arbiview_aug.scene.scene import SURFACES
+from arbiview_aug.environment import one_thread
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 WORKERS = (0, 1, 2)
-SIZE = (256, 704)
 FRAMES, EPOCHS = 48, 3
 PLAIN = "read only"
 _APART_M = 1e-4
@@ -107,21 +105,19 @@ class Rate:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print the table, write the JSON."""
-    parser = argparse.ArgumentParser(
-        prog="python -m arbiview_aug bench loader",
-        description="Frames per second of a DataLoader with and without retargeting, and memory per worker.",
+    parser = benchmark_parser(
+        "loader",
+        "Frames per second of a DataLoader with and without retargeting, and memory per worker.",
+        data="synthetic streets, written as JPEGs",
+        view_size=SIZE,
+        reduce=True,
+        output="output/loader.json",
     )
-    add_data(parser, "synthetic streets, written as JPEGs")
     add_target(parser)
     parser.add_argument("--workers", type=int, nargs="+", default=list(WORKERS), metavar="N", help="(default: 0 1 2)")
-    parser.add_argument("--size", type=size, default=SIZE, metavar="HxW", help="of every view (default: 256x704)")
-    parser.add_argument(
-        "--reduce", type=int, choices=REDUCES, default=2, help="decode the images at 1/N (default: %(default)s)"
-    )
     parser.add_argument("--surface", nargs="+", choices=tuple(SURFACES), default=["auto"], help="(default: auto)")
     parser.add_argument("--frames", type=count, default=FRAMES, metavar="N", help="an epoch (default: %(default)s)")
     parser.add_argument("--epochs", type=count, default=EPOCHS, metavar="N", help="(default: %(default)s)")
-    parser.add_argument("--output", default="output/loader.json", metavar="FILE", help="(default: %(default)s)")
     arguments = parser.parse_args(argv)
     if min(arguments.workers) < 0:
         parser.error(f"argument --workers: expected whole numbers from 0, got {min(arguments.workers)}")
@@ -174,43 +170,41 @@ def measure(
         most = max(workers)
         alone, together = counted(1), counted(max(most, 1))
         rates = loader_rates(datasets, workers, epochs)
-    return {
-        "benchmark": "loader",
-        "clock": "on the wall",
-        "data": data.name,
-        "sources": [list(of_camera) for of_camera in rig.sizes],
-        "target": target.name or "target",
-        "size": list(target.sizes[0]),
-        "frames": frames,
-        "epochs": epochs,
-        "counting": {"processes": most, "against_one": together / alone},
-        "machine": machine(load_before),
-        "versions": versions(),
-        "rates": [asdict(rate) for rate in rates],
-    }
+    return facts(
+        "loader",
+        load_before,
+        clock="on the wall",
+        data=data.name,
+        sources=[list(of_camera) for of_camera in rig.sizes],
+        target=target.name or "target",
+        size=list(target.sizes[0]),
+        frames=frames,
+        epochs=epochs,
+        counting={"processes": most, "against_one": together / alone},
+        rates=[asdict(rate) for rate in rates],
+    )
+
+
+COLUMNS = (
+    ("workers", "{workers}"),
+    ("frames/s", "{frames_per_s:.1f}"),
+    ("best", "{best_per_s:.1f}"),
+    ("CPU ms", "{cpu_ms:.1f}"),
+    ("unique MiB", "{unique_mib:.0f}"),
+    ("peak MiB", "{peak_mib:.0f}"),
+)
 
 
 def table(report: Mapping[str, Any]) -> str:
-    """The report to read."""
+    """The report to read, in Markdown."""
     h, w = report["size"]
     counting = report["counting"]
-    lines = [
-        machine_line(report),
+    return (
         f"{report['data']}, {len(report['sources'])} cameras to {report['target']} at {w}x{h}, epochs of "
         f"{report['frames']} frames; {counting['processes']} processes that only count do "
-        f"{counting['against_one']:.2f} times one's work",
-        f"{'':<24}{'workers':>8}{'frames/s':>10}{'best':>8}{'CPU ms':>8}{'unique MiB':>12}{'peak MiB':>10}",
-    ]
-    for rate in report["rates"]:
-        cells = [
-            "-" if rate[key] is None else f"{rate[key]:.{digits}f}"
-            for key, digits in (("cpu_ms", 1), ("unique_mib", 0), ("peak_mib", 0))
-        ]
-        lines.append(
-            f"{rate['name']:<24}{rate['workers']:>8}{rate['frames_per_s']:>10.1f}{rate['best_per_s']:>8.1f}"
-            + "".join(f"{cell:>{width}}" for cell, width in zip(cells, (8, 12, 10), strict=True))
-        )
-    return "\n".join(lines)
+        f"{counting['against_one']:.2f} times one's work; {machine_line(report)}\n\n"
+        + study_table(report["rates"], COLUMNS)
+    )
 
 
 # --- measuring --------------------------------------------------------------------------------------------------------

@@ -21,10 +21,9 @@ is the frame with known gains for all cameras.
 
 from __future__ import annotations
 
-import argparse
 import os
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -35,11 +34,13 @@ import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.cli.arguments import add_data
-from arbiview_aug.cli.bench.timing import machine, machine_line, quartiles, show, timed_rounds
+from arbiview_aug.cli.arguments import add_data, device_named
+from arbiview_aug.cli.bench.device import YAW_DEG, device_table, measure_device
+from arbiview_aug.cli.bench.study import SIZE, benchmark_parser, facts, study_table
+from arbiview_aug.cli.bench.timing import machine_line, quartiles, show, timed_rounds
 from arbiview_aug.datasets import open_data, reduced_rig
 from arbiview_aug.datasets.registry import data_name
-from arbiview_aug.environment import one_thread, versions
+from arbiview_aug.environment import one_thread
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.generator.fillers import Holes, fill_holes
@@ -49,8 +50,6 @@ from arbiview_aug.render.plan import build_plan
 from arbiview_aug.render.tone_curve import ToneCurve
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
-YAW_DEG = 22.0
-SMALL_SIZE = (256, 704)
 REPEATS = 15
 _SMALL_ROUNDS = 3
 """Small frames take a sixth of the time and more rounds: their times are noisier."""
@@ -94,20 +93,29 @@ class _Candidate:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print the table, write the JSON."""
-    parser = argparse.ArgumentParser(
-        prog="python -m arbiview_aug bench speed",
-        description="Milliseconds on one thread, and ratios to six bare cv2.remap calls of the same output pixels.",
+    parser = benchmark_parser(
+        "speed",
+        "Milliseconds on one thread, and ratios to six bare cv2.remap calls of the same output pixels.",
+        repeats=REPEATS,
+        output="output/speed.json",
     )
     add_data(parser, "nuscenes-one below ARBIVIEW_DATA where that is, else random smooth images for nuScenes' rig")
-    parser.add_argument("--output", default="output/speed.json", metavar="FILE", help="(default: %(default)s)")
     parser.add_argument(
-        "--repeats", type=int, default=REPEATS, metavar="N", help="rounds at full size (default: %(default)s)"
+        "--device",
+        metavar="NAME",
+        help="render batches by torch on cpu, cuda, cuda:1, ...: milliseconds, and the share of copy bandwidth",
     )
     arguments = parser.parse_args(argv)
-    if arguments.repeats < 1:
-        parser.error(f"argument --repeats: expected a whole number above 0, got {arguments.repeats}")
-    report = measure(arguments.data or default_data(), arguments.repeats)
-    show(table(report), report, Path(arguments.output))
+    data = arguments.data or default_data()
+    if arguments.device is None:
+        report = measure(data, arguments.repeats)
+        text = table(report)
+    else:
+        device = device_named(arguments.device)
+        rig, images, _ = _inputs(data, None)
+        report = measure_device(rig, list(images), _name(data), device, arguments.repeats)
+        text = device_table(report)
+    show(text, report, Path(arguments.output))
     return 0
 
 
@@ -123,7 +131,7 @@ def measure(
     repeats: int = REPEATS,
     *,
     full_size: tuple[int, int] | None = None,
-    small_size: tuple[int, int] = SMALL_SIZE,
+    small_size: tuple[int, int] = SIZE,
 ) -> dict[str, Any]:
     """All measures, as plain data for JSON.
 
@@ -138,31 +146,33 @@ def measure(
     with one_thread():
         measures = _run(_full_size(rig, images), repeats, "full size")
         measures += _run(_small_size(rig, images, halves, small_size), repeats * _SMALL_ROUNDS, "small")
-    return {
-        "benchmark": "speed",
-        "floor": "six cv2.remap, linear, float32 maps, x' = 0.97 x + 0.02 y + 3, y' = 0.95 y + 0.01 x + 5",
-        "clock": "CPU time of the process, milliseconds",
-        "data": "random smooth images" if data is None else data_name(data),
-        "sources": [list(size) for size in rig.sizes],
-        "rounds": {"full size": repeats, "small": repeats * _SMALL_ROUNDS},
-        "machine": machine(load_before),
-        "versions": versions(),
-        "measures": [asdict(m) for m in measures],
-    }
+    return facts(
+        "speed",
+        load_before,
+        floor="six cv2.remap, linear, float32 maps, x' = 0.97 x + 0.02 y + 3, y' = 0.95 y + 0.01 x + 5",
+        clock="CPU time of the process, milliseconds",
+        data=_name(data),
+        sources=[list(size) for size in rig.sizes],
+        rounds={"full size": repeats, "small": repeats * _SMALL_ROUNDS},
+        measures=[asdict(m) for m in measures],
+    )
 
 
-def table(report: dict[str, Any]) -> str:
-    """The report to read."""
-    lines = [
-        machine_line(report),
-        f"{'':<44}{'median':>11}{'quartiles':>18}  ratio to",
-    ]
-    for m in report["measures"]:
-        quartiles = f"{m['q1_ms']:.2f} .. {m['q3_ms']:.2f}"
-        ratio = f"  {m['ratio']:5.2f} {m['of']}" if m["of"] else ""
-        bound = f" (at most {m['bound']:g})" if m["bound"] is not None else ""
-        lines.append(f"{m['name']:<44}{m['median_ms']:>8.2f} ms{quartiles:>18}{ratio}{bound}")
-    return "\n".join(lines)
+COLUMNS = (
+    ("ms", "{median_ms:.2f}"),
+    ("quartiles", "{q1_ms:.2f} to {q3_ms:.2f}"),
+    ("ratio", "{ratio:.2f}"),
+    ("bound", "{bound:g}"),
+)
+
+
+def table(report: Mapping[str, Any]) -> str:
+    """The report to read, in Markdown."""
+    return f"{machine_line(report)}\n\n{study_table(report['measures'], COLUMNS, ('name', 'of'))}"
+
+
+def _name(data: str | Path | None) -> str:
+    return "random smooth images" if data is None else data_name(data)
 
 
 # --- what is measured -------------------------------------------------------------------------------------------------
