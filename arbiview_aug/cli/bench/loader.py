@@ -35,6 +35,7 @@ from arbiview_aug.cli.bench.timing import Quartiles, machine_line, quartiles, sh
 from arbiview_aug.datasets import RetargetedDataset, open_data
 from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.environment import one_thread
+from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
