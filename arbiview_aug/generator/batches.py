@@ -9,18 +9,15 @@ from typing import Any
 
 import torch
 
-from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.generator.completion import complete, inpainted
 from arbiview_aug.generator.networks import GeneratorNetworks
+from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
 from arbiview_aug.sample.batching import gathered, leading_shape, rewrapped, split, stacked
 from arbiview_aug.sample.inputs import Frame, names_of_frames, read_frames
 
 SOURCES_KEY = "sources"
 """Key of a retargeted sample that holds what it was made from, a sample itself: for completion after collating."""
-
-_MAPS = ("coverage", "confidence", "source_camera", "source_frame")
-"""What a retargeted sample says of pixels that were seen."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,29 +39,29 @@ class Completion:
     seed: int = 0
 
 
-def complete_frame(part: dict[str, Any], target: Rig, frame: Frame, name: str, how: Completion) -> None:
-    """Complete one frame's views in place: ``images``, and ``generated`` (M, h, w) bool beside them.
+def complete_frame(rendered: RenderedFrame, frame: Frame, name: str, how: Completion) -> RenderedFrame:
+    """Make up the pixels of a rendered frame that no camera saw, or saw with too little confidence.
 
     Made-up pixels are not covered any more: ``coverage`` False, ``confidence`` 0, ``source_camera`` and
     ``source_frame`` -1. The gradients of the others stay.
 
     Args:
-        part: ``images`` (M, 3, h, w) or M tensors, ``coverage``, and of ``_MAPS`` what there is.
-        target: The M cameras.
-        frame: What the views were rendered from.
-        name: Of the frame, for the noise.
+        rendered: The views.
+        frame: What they were rendered from.
+        name: Name of the frame, for the noise.
         how: Settings.
     """
     # Noise by number: cameras have no names in a batch.
-    numbered = target.with_cameras([replace(camera, name=str(k)) for k, camera in enumerate(target)])
-    views, trust, least = part["images"], part.get("confidence"), how.min_confidence
+    cameras = [replace(camera, name=str(k)) for k, camera in enumerate(rendered.rig)]
+    numbered, views = rendered.rig.with_cameras(cameras), rendered.images
+    trust, least = rendered.confidence, how.min_confidence
     if how.generator is None:
-        done = inpainted(views, part["coverage"], numbered, confidence=trust, min_confidence=least)
+        done = inpainted(views, rendered.coverage, numbered, confidence=trust, min_confidence=least)
     else:
         done = complete(
             how.generator,
             views,
-            part["coverage"],
+            rendered.coverage,
             numbered,
             frame.images,
             frame.rig,
@@ -76,14 +73,12 @@ def complete_frame(part: dict[str, Any], target: Rig, frame: Frame, name: str, h
             frame=name,
         )
     holes = list(done.generated)
-    part["images"] = stacked(
-        [torch.where(hole, made, view) for hole, made, view in zip(holes, done.images, views, strict=True)]
-    )
-    part["generated"] = stacked(holes)
-    for key in _MAPS:
-        if key in part:
-            empty = -1 if key.startswith("source") else 0
-            part[key] = stacked([m.masked_fill(hole, empty) for m, hole in zip(part[key], holes, strict=True)])
+
+    def without_holes(maps: Sequence[torch.Tensor], empty: int) -> torch.Tensor | list[torch.Tensor]:
+        return stacked([m.masked_fill(hole, empty) for m, hole in zip(maps, holes, strict=True)])
+
+    images = [torch.where(hole, made, view) for hole, made, view in zip(holes, done.images, views, strict=True)]
+    return replace(rendered.with_maps(without_holes), images=images, generated=stacked(holes))
 
 
 def frame_names(
@@ -144,19 +139,19 @@ def complete_batch(
     lead = leading_shape(batch["images"])
     if len(sources) != len(views):
         raise SampleError(f"complete: expected sources of {len(views)} frames, got {len(sources)}")
-    maps = {key: split(batch[key], lead) for key in _MAPS if key in batch}
-    names, parts = frame_names(batch, sources, lead, how), []
+    maps = {key: split(batch[key], lead) for key in MAP_KEYS if key in batch}
+    filled = maps.pop("generated", None) is not None  # by ``holes`` of the transform
+    names, done = frame_names(batch, sources, lead, how), []
     for b, (view, source) in enumerate(zip(views, sources, strict=True)):
         images = list(view.images)
-        if "generated" in batch:  # ``holes`` of the transform filled them
+        if filled:
             images = [torch.where(seen, image, 0) for seen, image in zip(maps["coverage"][b], images, strict=True)]
-        part = {"images": images, **{key: of_frames[b] for key, of_frames in maps.items()}}
-        complete_frame(part, view.rig, source, names[b], how)
-        parts.append(part)
+        seen = {key: frames[b] for key, frames in maps.items()}
+        done.append(complete_frame(RenderedFrame(images, view.rig, **seen), source, names[b], how))
     out = {key: value for key, value in batch.items() if key != SOURCES_KEY}
-    for key in parts[0]:
-        out[key] = gathered([part[key] for part in parts], lead)
-    out["images"] = rewrapped(out["images"], batch["images"])
+    for key in (*maps, "generated"):
+        out[key] = gathered([getattr(frame, key) for frame in done], lead)
+    out["images"] = rewrapped(gathered([stacked(frame.images) for frame in done], lead), batch["images"])
     return out
 
 

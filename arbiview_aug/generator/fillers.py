@@ -6,6 +6,7 @@ Telea's method (2004) runs on the view reduced to ``CELLS`` cells along its shor
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import cv2
@@ -15,6 +16,8 @@ import torch
 
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.generator.inpainting import GREY, RADIUS_PX
+from arbiview_aug.render.rendered import RenderedFrame
+from arbiview_aug.sample.batching import stacked
 
 Holes = Literal["fill", "mean", "black"]
 """What pixels get that no source sees."""
@@ -29,6 +32,14 @@ to 5.5 dB, up to 1/4 -1.8 to 4.7 dB."""
 
 _LEAST_SHARE = 64
 """In 255ths: cells of which less is seen are holes; their colour would be noise."""
+
+
+def fill_frame(rendered: RenderedFrame, how: Holes) -> RenderedFrame:
+    """Fill what no source sees of a rendered frame, as ``fill_holes`` does; its images are written into."""
+    if how == "black":
+        return rendered
+    images = fill_holes(rendered.images, list(rendered.coverage), rendered.occluded, how)
+    return replace(rendered, images=images, generated=stacked([~seen for seen in rendered.coverage]))
 
 
 def fill_holes(

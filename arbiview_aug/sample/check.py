@@ -1,11 +1,12 @@
-"""sample.check."""
+"""Which further keys of a sample hold label maps, and which are stale or probably misnamed."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
+from arbiview_aug.cameras.key_names import misnamed
 from arbiview_aug.errors import SampleError
 from arbiview_aug.sample.inputs import CALIBRATION_KEYS
 
@@ -91,3 +92,27 @@ def _leaves(value: Any) -> Iterator[Any]:
             yield from _leaves(entry)
     else:
         yield value
+
+
+def warn_of_misnamed(
+    sample: Mapping[str, Any],
+    calibrated: bool,
+    static: bool,
+    named: Sequence[str],
+    warn: Callable[[str, str], None],
+) -> None:
+    """Say which keys go unread because they are probably called something else here.
+
+    Args:
+        sample: The sample dict.
+        calibrated: A rig says what its ``lens``, ``distortion`` and ``ground_z_m`` would.
+        static: Nothing in the ego frame is read or moved.
+        named: Keys that the user named: they are as they should be.
+        warn: Takes a topic and words.
+    """
+    lenses = () if calibrated else ("distortion", "lens", "ground_z_m")
+    geometry = () if static else (*EGO_KEYS, "depth_m")
+    for found, meant in misnamed(sample, ("neighbours", *lenses, *geometry)).items():
+        if found not in (*named, *PIXEL_BOUND_KEYS):  # it is said of these that they are dropped
+            words = f"the sample's {found!r} is not read; did you mean {meant!r}?"
+            warn(f"key {found}", f"{words} Rename it, in the form that RigRetarget documents, or name it in pass_keys")

@@ -8,7 +8,7 @@ that moved, is read where other frames bear it out (``merging``).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -21,10 +21,13 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.projection import ego_rays
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.errors import ArbiviewError
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.render.plan import RenderPlan, build_plan
+from arbiview_aug.render.rendered import Maps, RenderedFrame, Renderer, confidence_of
+from arbiview_aug.render.tone_curve import ToneCurve
 from arbiview_aug.render.view_plan import ViewPlan
-from arbiview_aug.sample.neighbours import Neighbour
+from arbiview_aug.sample.neighbours import Neighbour, Warn, warn_lost
 from arbiview_aug.scene.boxes import BoxSurface
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.static import Street, plane_inverse_distance
@@ -257,6 +260,69 @@ def _seen(
 
 
 # --- pixels -----------------------------------------------------------------------------------------------------------
+def fill_from_neighbours(
+    rendered: RenderedFrame,
+    fills: Fills | None,
+    images: Sequence[torch.Tensor],
+    curves: Sequence[ToneCurve] | None,
+    renderer: Renderer,
+    warn: Warn,
+) -> RenderedFrame:
+    """Fill the holes of a rendered frame with what its neighbours show.
+
+    Args:
+        rendered: The frame; its maps are written into.
+        fills: What is filled and from which neighbours; None for nothing.
+        images: The current frame's source images.
+        curves: The current frame's tone curves. A camera's exposure is that of the same camera now: fills overlap the
+            current views too little to estimate their own.
+        renderer: Renders the neighbours.
+        warn: Says which neighbours cannot be read.
+    """
+    if fills is None:
+        return rendered
+    patched = []
+    for fill in fills.fills:
+        sources = neighbour_images(fill.neighbour, images, warn)
+        if sources is not None:
+            patched.append((fill, renderer.views(fill.plan, sources, curves, images)))
+    if not patched:
+        return rendered
+    views, patches = fill_views(rendered.images, fills, patched)
+    _put(patches, rendered.coverage, lambda patch: patch.frame >= 0)
+    _put(patches, rendered.source_camera, lambda patch: patch.camera)
+    _put(patches, rendered.source_frame, lambda patch: patch.frame + 1)
+    rendered = replace(rendered, images=views)
+    if rendered.confidence is None:
+        return rendered
+    certainty = [of_view.copy() for of_view in rendered.certainty]  # the plan's own are kept
+    _put(patches, [torch.from_numpy(of_view) for of_view in certainty], lambda patch: patch.certainty)
+    rendered = replace(rendered, certainty=certainty)
+    return replace(rendered, confidence=confidence_of(rendered))
+
+
+def neighbour_images(neighbour: Neighbour, like: Sequence[torch.Tensor], warn: Warn) -> tuple[torch.Tensor, ...] | None:
+    """Read a neighbour's images; None, with a warning that names it, if they cannot be read."""
+    try:
+        return neighbour.images(like)
+    except (ArbiviewError, OSError) as error:
+        warn_lost(warn, neighbour.name, error)
+        return None
+
+
+def _put(
+    patches: Sequence[FilledPatch], maps: Maps | None, value: Callable[[FilledPatch], torch.Tensor | None]
+) -> None:
+    """Write the patches' values into maps of the views, where there are both."""
+    if maps is None:
+        return
+    for patch in patches:
+        place, values = maps[patch.target][patch.rows, patch.columns], value(patch)
+        if values is not None:
+            there = patch.frame >= 0
+            place[there.to(place.device)] = values[there].to(place.device)
+
+
 def fill_views(
     views: Sequence[torch.Tensor], fills: Fills, rendered: Sequence[tuple[Fill, Sequence[torch.Tensor]]]
 ) -> tuple[list[torch.Tensor], list[FilledPatch]]:

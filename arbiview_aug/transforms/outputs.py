@@ -1,30 +1,121 @@
-"""What a sample says of its views: their calibration, and maps (M, h, w) of how each pixel was seen."""
+"""The output sample: rendered views with their calibration, label maps rendered like them, poses and boxes moved."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 
+from arbiview_aug.cameras.key_names import hint
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError, SampleTypeError
-from arbiview_aug.favs.renderer import PaperRendering
-from arbiview_aug.render.confidence import confidence
-from arbiview_aug.render.plan import RenderPlan
-from arbiview_aug.render.torch_backend import maps_on
-from arbiview_aug.sample.batching import (
-    covered,
-    gathered,
-    is_readable,
-    lens_names,
-    stacked,
-)
-from arbiview_aug.sample.inputs import Frame
-from arbiview_aug.temporal.fill import FilledPatch
+from arbiview_aug.generator.batches import SOURCES_KEY
+from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
+from arbiview_aug.sample.batching import gathered, is_readable, lens_names, like, rewrapped, split, stacked
+from arbiview_aug.sample.check import PIXEL_BOUND_KEYS
+from arbiview_aug.sample.inputs import CALIBRATION_KEYS, Frame
 
 
+# --- one sample -------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class SampleWriter:
+    """Puts rendered frames into the form of the sample that they came from.
+
+    Attributes:
+        outputs: Further keys that are wanted.
+        generated: Whether there is ``generated``.
+        lenses: Whether there are ``lens`` and ``distortion``.
+        masks: Whether there is ``ignore``.
+        pass_keys: Keys to keep although they look bound to the source's pixels.
+        label_fill: Value of label pixels that no source sees.
+        label_frame: ``source`` or ``target``.
+        warn: Takes a topic and words.
+    """
+
+    outputs: tuple[str, ...]
+    generated: bool
+    lenses: bool
+    masks: bool
+    pass_keys: tuple[str, ...]
+    label_fill: float
+    label_frame: str
+    warn: Callable[[str, str], None]
+
+    def write(
+        self,
+        sample: Mapping[str, Any],
+        frames: Sequence[Frame],
+        lead: tuple[int, ...],
+        rendered: Sequence[RenderedFrame],
+        labels: Sequence[str],
+        target: Rig,
+        drawn: Mapping[str, float],
+    ) -> dict[str, Any]:
+        """The output sample.
+
+        Args:
+            sample: The input; it is not changed.
+            frames: Its frames.
+            lead: Its leading dimensions.
+            rendered: The rendered frames, one for each.
+            labels: Its keys that hold label maps.
+            target: The target rig in its own ego frame.
+            drawn: ``retarget_params``.
+        """
+        out = self._kept(sample, labels)
+        out["images"] = rewrapped(gathered([stacked(frame.images) for frame in rendered], lead), sample["images"])
+        device = rendered[0].images[0].device
+        parts = [calibration_entries(f.rig, device, lenses=self.lenses, masks=self.masks) for f in rendered]
+        for key in ("K", "cam2ego"):
+            out[key] = like(gathered([part[key] for part in parts], lead), sample.get(key))
+        beside = out["K"].device if isinstance(out["K"], torch.Tensor) else None
+        grounds = [part["ground_z_m"] for part in parts]
+        if lead:
+            out["ground_z_m"] = torch.tensor(grounds, dtype=torch.float64, device=beside).reshape(lead)
+        else:
+            out["ground_z_m"] = grounds[0]
+        out["coverage"] = gathered([frame.coverage for frame in rendered], lead)
+        for key in ("ignore", "distortion"):
+            if key in parts[0]:
+                out[key] = gathered([part[key] for part in parts], lead)
+        for key in (*(("generated",) if self.generated else ()), *self.outputs):
+            if key in MAP_KEYS:
+                out[key] = gathered([getattr(frame, key) for frame in rendered], lead)
+        if self.lenses:
+            out["distortion"] = out["distortion"].to(beside or "cpu")
+        if SOURCES_KEY in self.outputs:
+            out[SOURCES_KEY] = source_sample(sample["images"], frames, lead)
+        if self.lenses:
+            out["lens"] = lens_names([part["lens"] for part in parts], lead)
+        for key in labels:
+            out[key] = target_labels(key, sample[key], frames, lead, rendered, self.label_fill)
+        if drawn:
+            out["retarget_params"] = drawn
+        if self.label_frame == "target":
+            moves = [torch.from_numpy(frame.rig.ego2ego(target)) for frame in frames]
+            move_to_target(out, gathered(moves, lead), lead)
+            out["ground_z_m"] = torch.full_like(out["ground_z_m"], target.ground_z_m) if lead else target.ground_z_m
+        return out
+
+    def _kept(self, sample: Mapping[str, Any], labels: Sequence[str]) -> dict[str, Any]:
+        """The entries that go with any images, as the same objects."""
+        kept = (*labels, *self.pass_keys)
+        stale = [key for key in sample if key in PIXEL_BOUND_KEYS and key not in kept]
+        # What an earlier retargeting made up its coverage masks already.
+        dropped = [key for key in stale if key not in self.outputs and key != "generated"]
+        if dropped:
+            meant = "" if "depth_m" in sample else hint(dropped, ("depth_m",))
+            words = f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels{meant}"
+            self.warn(f"dropped {dropped}", words)
+        rendered = ("images", "K", "cam2ego")  # their places in the dict are kept
+        return {k: v for k, v in sample.items() if k in rendered or k not in (*CALIBRATION_KEYS, *stale)}
+
+
+# --- calibration ------------------------------------------------------------------------------------------------------
 def calibration_entries(rig: Rig, device: torch.device, *, lenses: bool = True, masks: bool = True) -> dict[str, Any]:
     """``K``, ``cam2ego`` and ``ground_z_m`` of a rig; ``distortion`` and ``lens``; ``ignore`` (M, h, w) on a device."""
     part: dict[str, Any] = {
@@ -53,79 +144,68 @@ def source_sample(images: Any, frames: Sequence[Frame], lead: tuple[int, ...]) -
     return {"images": images, **held, "ground_z_m": grounds.reshape(lead)}
 
 
-def seen_entries(
-    made: RenderPlan | PaperRendering,
-    images: Sequence[torch.Tensor],
-    patches: Sequence[FilledPatch],
-    seams: Sequence[torch.Tensor] | None,
-    outputs: Collection[str],
-) -> dict[str, Any]:
-    """How each pixel of one frame's rendered views was seen.
+# --- label maps -------------------------------------------------------------------------------------------------------
+def target_labels(
+    key: str,
+    value: Any,
+    frames: Sequence[Frame],
+    lead: tuple[int, ...],
+    rendered: Sequence[RenderedFrame],
+    fill: float,
+) -> Any:
+    """The label maps (..., N, H, W) of a sample in the target's views.
 
     Args:
-        made: What the views were rendered by.
-        images: The M views, filled.
-        patches: What neighbouring frames filled in.
-        seams: How blending changed each view's colours (``Stitcher.render``), for ``confidence``; None without it.
-        outputs: Which of ``source_camera`` and ``source_frame`` are wanted.
+        key: Named in error messages.
+        value: A tensor, or a list of one (..., Hi, Wi) tensor a camera.
+        frames: The frames of the sample.
+        lead: Its leading dimensions.
+        rendered: Each frame, rendered.
+        fill: Value of pixels that no source sees (False for bool maps).
 
-    Returns:
-        ``coverage``, what ``outputs`` asks for, and ``confidence`` where there are seams.
+    Raises:
+        SampleError: Maps that do not belong to the images, or a fill that their type cannot hold.
+        SampleTypeError: Maps that are no tensors.
     """
-    device = images[0].device
-    winners = _winners(made, device)
-    part: dict[str, Any] = {"coverage": covered(winners)}
-    _put(patches, part["coverage"], lambda patch: patch.frame >= 0)
-    if seams is not None and isinstance(made, RenderPlan):
-        certain = [view.certainty for view in made.targets if view.certainty is not None]
-        if patches:
-            certain = [of_view.copy() for of_view in certain]  # the plan's own are kept
-            _put(patches, [torch.from_numpy(of_view) for of_view in certain], lambda patch: patch.certainty)
-        of_views = zip(images, certain, part["coverage"], seams, strict=True)
-        part["confidence"] = stacked([confidence(*of_view) for of_view in of_views])
-    if "source_camera" in outputs:
-        part["source_camera"] = stacked([winner.clone() for winner in winners])
-        _put(patches, part["source_camera"], lambda patch: patch.camera)
-    if "source_frame" in outputs:
-        part["source_frame"] = stacked([winner.clamp(max=0) for winner in winners])
-        _put(patches, part["source_frame"], lambda patch: patch.frame + 1)
-    return part
+    maps_given = value if isinstance(value, list | tuple) else [value]
+    if not all(map(is_readable, maps_given)):
+        got = type(value).__name__
+        raise SampleTypeError(f"{key}: expected label maps as tensors, got {got}; use torch.as_tensor")
+    if isinstance(value, torch.Tensor) and value.ndim < len(lead) + 3:
+        raise SampleError(f"{key}: expected label maps of shape (..., N, H, W), got {tuple(value.shape)}")
+    try:
+        of_frames = split(value, lead)
+    except ValueError as error:
+        raise SampleError(f"{key}: {error}") from None
+    done = []
+    for frame, views, maps in zip(frames, rendered, of_frames, strict=True):
+        _check_maps(key, maps, frame)
+        assert views.labels is not None
+        plain = [label.as_subclass(torch.Tensor) for label in maps]
+        done.append(stacked(views.labels(plain, partial(_checked_fill, key, fill))))
+    return rewrapped(gathered(done, lead), value)
 
 
-def untouched_entries(coverage: torch.Tensor, outputs: Collection[str]) -> dict[str, torch.Tensor]:
-    """The same of a frame that keeps its cameras: each saw all of its own view, ``coverage`` (N, h, w)."""
-    part = {"coverage": coverage}
-    if "confidence" in outputs:
-        part["confidence"] = coverage.float()
-    frame = coverage.to(torch.int8) - 1
-    if "source_camera" in outputs:
-        numbers = torch.arange(len(coverage), dtype=torch.int8, device=coverage.device)
-        part["source_camera"] = torch.where(coverage, numbers[:, None, None], frame)
-    if "source_frame" in outputs:
-        part["source_frame"] = frame
-    return part
+def _check_maps(key: str, maps: Any, frame: Frame) -> None:
+    if len(maps) != len(frame.images):
+        raise SampleError(f"{key}: expected {len(frame.images)} label maps, one an image, got {len(maps)}")
+    for camera, label in zip(frame.rig, maps, strict=True):
+        size = tuple(label.shape[-2:])
+        if size != camera.size:
+            raise SampleError(f"{key}: camera {camera.name!r}: expected a map of (h, w) = {camera.size}, got {size}")
 
 
-def _winners(made: RenderPlan | PaperRendering, device: torch.device) -> list[torch.Tensor]:
-    """(h, w) int8 of each view, which source won; a GPU holds them with the plan."""
-    if isinstance(made, RenderPlan) and device.type != "cpu":
-        return [view.source for view in maps_on(made, device)]
-    return [torch.from_numpy(view.source_camera) for view in made.targets]
+def _checked_fill(key: str, fill: float, dtype: torch.dtype) -> float:
+    if dtype == torch.bool:
+        return False
+    if not dtype.is_floating_point:
+        limits = torch.iinfo(dtype)
+        if not limits.min <= fill <= limits.max or fill != int(fill):  # NaN fails the first
+            raise SampleError(f"{key}: label_fill: expected a value of {dtype}, got {fill!r}")
+    return fill
 
 
-def _put(
-    patches: Sequence[FilledPatch],
-    maps: torch.Tensor | list[torch.Tensor],
-    value: Callable[[FilledPatch], torch.Tensor | None],
-) -> None:
-    """Write what was filled in into maps (M, h, w) of a frame's views, where there is such a value."""
-    for patch in patches:
-        place, values = maps[patch.target][patch.rows, patch.columns], value(patch)
-        if values is not None:
-            there = patch.frame >= 0
-            place[there.to(place.device)] = values[there].to(place.device)
-
-
+# --- labels in the ego frame ------------------------------------------------------------------------------------------
 def move_to_target(out: dict[str, Any], ego2ego: torch.Tensor, lead: tuple[int, ...]) -> None:
     """Poses, points and boxes of an output sample into the target's ego frame, which differs by a translation.
 

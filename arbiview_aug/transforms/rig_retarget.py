@@ -11,38 +11,30 @@ from typing import Any, Literal, get_args
 import cv2
 import torch
 
-from arbiview_aug.cameras.framing import Fit, Framing, framing
-from arbiview_aug.cameras.key_names import hint
+from arbiview_aug.cameras.framing import Fit, framing
 from arbiview_aug.cameras.random_rig import RandomRig
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
-from arbiview_aug.favs.renderer import PaperRendering, check_pinhole
+from arbiview_aug.favs.renderer import PaperRendering, check_pinhole, render_paper
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.batches import SOURCES_KEY, complete_frame, frame_names
-from arbiview_aug.generator.fillers import Holes, fill_holes
-from arbiview_aug.image_ops import resized
+from arbiview_aug.generator.batches import complete_frame, frame_names
+from arbiview_aug.generator.fillers import Holes, fill_frame
 from arbiview_aug.render.harmonise import Harmonise, Harmoniser, PhotometricReport
-from arbiview_aug.render.labels import target_labels, warn_of_misnamed
 from arbiview_aug.render.plan import PlanCache, RenderPlan
 from arbiview_aug.render.refinement import RefinementCache
+from arbiview_aug.render.rendered import Execution, RenderedFrame, Renderer, as_rendered, resize_only
 from arbiview_aug.render.requirements import needs_geometry
-from arbiview_aug.sample.batching import barred, framed, gathered, leading_shape, lens_names, like, rewrapped, stacked
-from arbiview_aug.sample.check import PIXEL_BOUND_KEYS, check_other_keys
-from arbiview_aug.sample.inputs import CALIBRATION_KEYS, Frame, read_frames
+from arbiview_aug.sample.batching import leading_shape
+from arbiview_aug.sample.check import check_other_keys, warn_of_misnamed
+from arbiview_aug.sample.inputs import Frame, read_frames
 from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.surface import SurfaceName
-from arbiview_aug.temporal.fill import Reach
+from arbiview_aug.temporal.fill import Reach, fill_from_neighbours
 from arbiview_aug.transforms.explain import Explanation, PaperExplanation
-from arbiview_aug.transforms.outputs import (
-    calibration_entries,
-    move_to_target,
-    seen_entries,
-    source_sample,
-    untouched_entries,
-)
-from arbiview_aug.transforms.planner import Execution, FramePlanner
+from arbiview_aug.transforms.outputs import SampleWriter
+from arbiview_aug.transforms.planner import FramePlan, FramePlanner
 from arbiview_aug.transforms.settings import (
     OUTPUTS,
     RenderPath,
@@ -53,9 +45,6 @@ from arbiview_aug.transforms.settings import (
     is_number,
     one_of,
 )
-
-Made = RenderPlan | PaperRendering | list[Framing]
-"""What a frame's views are made by: a plan, the published stages; or each camera's image is only brought to size."""
 
 _MIXED_P = 0.5
 """With half of the samples untouched or more, views over a static street do not harm a detector
@@ -238,7 +227,7 @@ class RigRetarget(torch.nn.Module):
         self._warn = WarnOnce()
         # Rigs drawn for each sample never come back: only the last plan is kept.
         once = isinstance(self.target, RandomRig) and self.target.per == "sample"
-        self.stitcher = FramePlanner(
+        self.planner = FramePlanner(
             self.config,
             surface,
             Harmoniser(harmonise),
@@ -254,14 +243,23 @@ class RigRetarget(torch.nn.Module):
         base = self.target.base if isinstance(self.target, RandomRig) else self.target
         base = base if self.size is None else base.resized(self.size, fit)
         # Which keys there are depends on the settings alone.
-        self._lenses = p < 1 or any(not camera.is_rectilinear for camera in base)
-        self._masks = p < 1 or any(camera.mask is not None for camera in base)
+        self._writer = SampleWriter(
+            self.outputs,
+            generated=self.completion is not None or holes != "black",
+            lenses=p < 1 or any(not camera.is_rectilinear for camera in base),
+            masks=p < 1 or any(camera.mask is not None for camera in base),
+            pass_keys=self.pass_keys,
+            label_fill=label_fill,
+            label_frame=label_frame,
+            warn=self._warn,
+        )
+        self.renderer = Renderer(execution)
         self._limited_process: int | None = None
 
     def extra_repr(self) -> str:
         """Target and settings, for ``repr``."""
         target = self.target if isinstance(self.target, RandomRig) else (self.target.name or "unnamed rig")
-        how = self.stitcher
+        how = self.planner
         settings = (
             f"path={self.path}, holes={self.holes}, surface={how.surface}, harmonise={how.harmoniser}, "
             f"size={self.size}, fit={self.fit}, p={self.p:g}"
@@ -281,45 +279,66 @@ class RigRetarget(torch.nn.Module):
             A new dict.
         """
         self._limit_threads()
-        frames = read_frames(sample, self.source_rig)
-        lead = leading_shape(sample["images"])
+        frames, lead = read_frames(sample, self.source_rig), leading_shape(sample["images"])
+        labels = self._label_keys_of(sample, frames)
+        target, skip, drawn = self._make_params(sample, frames, params)
+        if skip and self.size is not None:
+            rendered = [resize_only(frame, self.size, self.fit, self.outputs) for frame in frames]
+        else:
+            plans = self.planner.plan(sample, frames, lead, target)
+            self.planner.judge(plans)
+            rendered = self._render(plans, frames)
+            rendered = [self._fill_from_neighbours(*of_frame) for of_frame in zip(rendered, plans, frames, strict=True)]
+            rendered = self._complete(rendered, sample, frames, lead)
+        return self._writer.write(sample, frames, lead, rendered, labels, target, drawn)
+
+    def _label_keys_of(self, sample: Mapping[str, Any], frames: Sequence[Frame]) -> list[str]:
+        """The sample's keys that hold label maps; its others are checked."""
         sizes = {tuple(image.shape[-2:]) for frame in frames for image in frame.images}
         calibrated = sample.get("rig") is not None or self.source_rig is not None
-        static = SURFACES[self.stitcher.surface].is_static and self.label_frame == "source"
+        static = SURFACES[self.planner.surface].is_static and self.label_frame == "source"
         warn_of_misnamed(sample, calibrated, static, (*self.label_keys, *self.pass_keys), self._warn)
-        labels = check_other_keys(sample, list(sizes), self.label_keys, self.pass_keys)
-        target, skip, drawn = self._draw(sample, frames, params)
-        parts, made = self._parts(sample, frames, lead, target, skip)
-        out = self._kept(sample, labels)
-        out["images"] = rewrapped(gathered([part["images"] for part in parts], lead), sample["images"])
-        for key in ("K", "cam2ego"):
-            out[key] = like(gathered([part[key] for part in parts], lead), sample.get(key))
-        beside = out["K"].device if isinstance(out["K"], torch.Tensor) else None
-        grounds = [part["ground_z_m"] for part in parts]
-        if lead:
-            out["ground_z_m"] = torch.tensor(grounds, dtype=torch.float64, device=beside).reshape(lead)
-        else:
-            out["ground_z_m"] = grounds[0]
-        for key in ("coverage", "ignore", "distortion", "generated", *self.outputs):
-            if key in parts[0]:
-                out[key] = gathered([part[key] for part in parts], lead)
-        if "distortion" in out:
-            out["distortion"] = out["distortion"].to(beside or "cpu")
-        if SOURCES_KEY in self.outputs:
-            out[SOURCES_KEY] = source_sample(sample["images"], frames, lead)
-        if "lens" in parts[0]:
-            out["lens"] = lens_names([part["lens"] for part in parts], lead)
-        for key in labels:
-            out[key] = target_labels(key, sample[key], frames, lead, made, self.label_fill, self.size)
-        if drawn:
-            out["retarget_params"] = drawn
-        if self.label_frame == "target":
-            moves = [torch.from_numpy(frame.rig.ego2ego(target)) for frame in frames]
-            move_to_target(out, gathered(moves, lead), lead)
-            out["ground_z_m"] = torch.full_like(out["ground_z_m"], target.ground_z_m) if lead else target.ground_z_m
-        return out
+        return check_other_keys(sample, list(sizes), self.label_keys, self.pass_keys)
 
-    def _draw(
+    def _render(self, plans: Sequence[FramePlan], frames: Sequence[Frame]) -> list[RenderedFrame]:
+        if isinstance(self.config, PaperConfig):
+            published = [self._published(plan, frame) for plan, frame in zip(plans, frames, strict=True)]
+            return [as_rendered(rendering, self.outputs) for rendering in published]
+        outputs = (*self.outputs, "confidence") if self._trusts else self.outputs
+        render_plans = [plan.plan for plan in plans if plan.plan is not None]
+        return self.renderer.render(render_plans, frames, [plan.curves for plan in plans], outputs)
+
+    def _published(self, plan: FramePlan, frame: Frame) -> PaperRendering:
+        """The frame rendered by the paper's stages."""
+        assert isinstance(self.config, PaperConfig)
+        rendering = render_paper(frame.rig, plan.target, frame.images, self.config, plan.detections)
+        self.planner.warn_unreachable(plan.target, rendering.coverage)
+        return rendering
+
+    def _fill_from_neighbours(self, rendered: RenderedFrame, plan: FramePlan, frame: Frame) -> RenderedFrame:
+        if plan.fills is None:
+            return rendered
+        return fill_from_neighbours(rendered, plan.fills, frame.images, plan.curves, self.renderer, self._warn)
+
+    def _complete(
+        self,
+        rendered: Sequence[RenderedFrame],
+        sample: Mapping[str, Any],
+        frames: Sequence[Frame],
+        lead: tuple[int, ...],
+    ) -> list[RenderedFrame]:
+        if self.completion is None:
+            return [self._between_bars(fill_frame(views, self.holes)) for views in rendered]
+        names, how = frame_names(sample, frames, lead, self.completion), self.completion
+        return [
+            complete_frame(self._between_bars(views), frame, name, how)
+            for views, frame, name in zip(rendered, frames, names, strict=True)
+        ]
+
+    def _between_bars(self, rendered: RenderedFrame) -> RenderedFrame:
+        return rendered.between_bars(self.size) if self.size is not None and self.fit == "pad" else rendered
+
+    def _make_params(
         self, sample: Mapping[str, Any], frames: Sequence[Frame], params: Mapping[str, float] | None
     ) -> tuple[Rig, bool, dict[str, float]]:
         """All randomness of a call: the target rig, whether to skip, and the parameters that say so."""
@@ -355,71 +374,11 @@ class RigRetarget(torch.nn.Module):
             return target if self.size is None else target.resized(self.size, self.fit)
         return target.with_cameras([c.resize(framing(c.name, c.size, self.size, "pad").scaled) for c in target])
 
-    def _kept(self, sample: Mapping[str, Any], labels: Sequence[str]) -> dict[str, Any]:
-        """The entries that go with any images, as the same objects."""
-        kept = (*labels, *self.pass_keys)
-        stale = [key for key in sample if key in PIXEL_BOUND_KEYS and key not in kept]
-        # What an earlier retargeting made up its coverage masks already.
-        dropped = [key for key in stale if key not in self.outputs and key != "generated"]
-        if dropped:
-            meant = "" if "depth_m" in sample else hint(dropped, ("depth_m",))
-            words = f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels{meant}"
-            self._warn(f"dropped {dropped}", words)
-        rendered = ("images", "K", "cam2ego")  # their places in the dict are kept
-        return {k: v for k, v in sample.items() if k in rendered or k not in (*CALIBRATION_KEYS, *stale)}
-
-    # --- images ---------------------------------------------------------------------------------------------------
-    def _parts(
-        self, sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...], target: Rig, skip: bool
-    ) -> tuple[list[dict[str, Any]], list[Made]]:
-        """Images, calibration and masks of each frame, rendered or resized; and what they were made by."""
-        if skip and self.size:
-            done = [self._resized(frame, self.size) for frame in frames]
-            return [part for part, _ in done], [framings for _, framings in done]
-        views = self.stitcher.views(sample, frames, lead, target)
-        self.stitcher.judge(views)
-        seams: list[list[torch.Tensor]] | None = [] if self._trusts else None
-        names = [] if self.completion is None else frame_names(sample, frames, lead, self.completion)
-        parts = []
-        for b, images in enumerate(self.stitcher.render(frames, views, seams)):
-            made = views[b].made
-            filled, patches = self.stitcher.filled(frames[b], views[b], images)
-            part: dict[str, Any] = {"images": stacked(filled)}
-            part |= seen_entries(made, filled, patches, None if seams is None else seams[b], self.outputs)
-            if self.completion is None and self.holes != "black":
-                occluded = [view.occluded for view in made.targets]
-                part["images"] = stacked(fill_holes(filled, part["coverage"], occluded, self.holes))
-                part["generated"] = stacked([~seen for seen in part["coverage"]])
-            shown = made.target
-            if self.size is not None and self.fit == "pad":
-                shown = made.target.resized(self.size, "pad")
-                for key, views_of in part.items():
-                    empty = -1 if key.startswith("source") else 0
-                    part[key] = torch.stack([barred(view, self.size, empty) for view in views_of])
-            part |= calibration_entries(shown, images[0].device, lenses=self._lenses, masks=self._masks)
-            if self.completion is not None:
-                complete_frame(part, shown, frames[b], names[b], self.completion)
-            parts.append(part)
-        return parts, [view.made for view in views]
-
-    def _resized(self, frame: Frame, size: tuple[int, int]) -> tuple[dict[str, Any], list[Framing]]:
-        """A frame that keeps its cameras: they saw all of it; and how each came to the size."""
-        device = frame.images[0].device
-        framings = [framing(camera.name, camera.size, size, self.fit) for camera in frame.rig]
-        rig = frame.rig.resized(size, self.fit)
-        part = calibration_entries(rig, device, lenses=self._lenses, masks=self._masks)
-        images = [framed(resized(image, f.scaled), f) for image, f in zip(frame.images, framings, strict=True)]
-        part["images"] = stacked(images)
-        seen = [framed(torch.ones(f.scaled, dtype=torch.bool, device=device), f) for f in framings]
-        part.update(untouched_entries(torch.stack(seen), self.outputs))
-        if self.completion is not None or self.holes != "black":
-            part["generated"] = torch.zeros_like(part["coverage"])
-        return part, framings
-
+    # --- plans ------------------------------------------------------------------------------------------------------
     @property
     def plans(self) -> PlanCache:
         """The plans that are held for calibrations that come back."""
-        return self.stitcher.plans
+        return self.planner.plans
 
     def plan(self, source: Rig, target: Rig, scene: Scene | None = None) -> RenderPlan:
         """The cached render plan of a pair of rigs in a scene.
@@ -427,7 +386,7 @@ class RigRetarget(torch.nn.Module):
         Raises:
             ValueError: With ``quality="paper"``.
         """
-        return self.stitcher.plan(source, target, scene)
+        return self.planner.render_plan(source, target, scene)
 
     def prepare(self, source: Rig | None = None) -> RenderPlan:
         """Build the plan for a source rig before DataLoader workers fork: they share its memory.
@@ -441,7 +400,7 @@ class RigRetarget(torch.nn.Module):
         source = source or self.source_rig
         if source is None or self._fixed_target is None:
             raise ValueError("prepare: expected a source rig and a fixed target rig")
-        surface, config, target = self.stitcher.surface, self.stitcher.config, self._fixed_target
+        surface, config, target = self.planner.surface, self.planner.config, self._fixed_target
         of_frames = SURFACES[surface].needs is not None
         if of_frames and isinstance(config, FavsConfig) and needs_geometry(source, target, surface, config):
             raise ValueError(
@@ -460,17 +419,17 @@ class RigRetarget(torch.nn.Module):
         warns of is not said again, and the draw advances the RNG.
         """
         frames, lead = read_frames(sample, self.source_rig), leading_shape(sample["images"])
-        target, _, _ = self._draw(sample, frames[:1], None)
-        view = self.stitcher.views(sample, frames, lead, target)[0]
-        if isinstance(view.made, PaperRendering):
-            return PaperExplanation(view.made)
-        gains = self.harmonisation(sample) if self.stitcher.harmoniser.is_on else None
-        return Explanation(view.made, gains, view.depth, view.motion, view.fills, view.harm)
+        target, _, _ = self._make_params(sample, frames[:1], None)
+        plan = self.planner.plan(sample, frames, lead, target)[0]
+        if plan.plan is None:
+            return PaperExplanation(self._published(plan, frames[0]))
+        gains = self.harmonisation(sample) if self.planner.harmoniser.is_on else None
+        return Explanation(plan.plan, gains, plan.depth, plan.motion, plan.fills, plan.harm)
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
         """The gains that a sample's source images would get, and why; of a batch, its first frame."""
         frame = read_frames(sample, self.source_rig)[0]
-        return self.stitcher.harmoniser.report(frame.rig, frame.images)
+        return self.planner.harmoniser.report(frame.rig, frame.images)
 
     # --- processes --------------------------------------------------------------------------------------------------
     def _limit_threads(self) -> None:

@@ -134,8 +134,8 @@ def test_occluded_pixels_are_those_that_an_image_contains(size: tuple[int, int],
 def test_what_objects_hide_is_occluded_and_what_nobody_looks_at_is_not(street: dict[str, Any]) -> None:
     for surface in ("objects", "lidar"):
         out = RigRetarget(raised(street), surface=surface)  # type: ignore[arg-type]
-        (rendered,) = out.stitcher.views(street, read_frames(street, None), (), raised(street))
-        plan = rendered.made
+        (frame_plan,) = out.planner.plan(street, read_frames(street, None), (), raised(street))
+        plan = frame_plan.plan
         assert isinstance(plan, RenderPlan)
         for view in plan.targets:
             assert view.occluded is None or not (view.occluded & view.coverage).any()

@@ -27,9 +27,10 @@ from arbiview_aug.cli.bench.study import SIZE, benchmark_parser, facts, study_ta
 from arbiview_aug.cli.bench.timing import machine_line, peak_mib, quartiles, show, timed_rounds
 from arbiview_aug.datasets import Neighbours, open_data
 from arbiview_aug.environment import one_thread
-from arbiview_aug.errors import DataError
+from arbiview_aug.errors import DataError, SampleError
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.scene.surface import SurfaceName
+from arbiview_aug.temporal.fill import fill_from_neighbours
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 COUNTS = (0, 1, 2, 8)
@@ -217,16 +218,21 @@ def _read(data: Any, index: int, number: int) -> None:
 def _plan(retarget: RigRetarget, frames: Iterator[Mapping[str, Any]], target: Rig) -> Callable[[], Any]:
     def run() -> None:
         sample = next(frames)
-        retarget.stitcher.views(sample, read_frames(sample, None), (), target)
+        retarget.planner.plan(sample, read_frames(sample, None), (), target)
 
     return run
 
 
 def _fill(retarget: RigRetarget, sample: Mapping[str, Any], target: Rig) -> Callable[[], Any]:
     frames = read_frames(sample, None)
-    (view,) = retarget.stitcher.views(sample, frames, (), target)
-    (images,) = retarget.stitcher.render(frames, [view])
-    return partial(retarget.stitcher.filled, frames[0], view, images)
+    (plan,) = retarget.planner.plan(sample, frames, (), target)
+    assert plan.plan is not None
+    (rendered,) = retarget.renderer.render([plan.plan], frames, [plan.curves])
+
+    def warn(topic: str, message: str) -> None:
+        raise SampleError(f"{topic}: {message}")
+
+    return partial(fill_from_neighbours, rendered, plan.fills, frames[0].images, plan.curves, retarget.renderer, warn)
 
 
 def _frame(retarget: RigRetarget, frames: Iterator[Mapping[str, Any]]) -> Callable[[], Any]:

@@ -98,7 +98,7 @@ def test_without_neighbours_nothing_of_fills_is_built_or_called(
     """Neither where a sample has none, nor where they are not wanted, nor where a list of them is empty."""
     target = lowered(sample["rig"], (32, 88))
     expected = RigRetarget(target, surface=surface, neighbours=None)(sample)
-    for module, names in ((planner, ("plan_fills", "fill_views")), (fill, ("build_plan", "merged"))):
+    for module, names in ((planner, ("plan_fills",)), (fill, ("fill_views", "build_plan", "merged"))):
         for name in names:
             monkeypatch.setattr(module, name, lambda *_, **__: pytest.fail("fills are made"))
     monkeypatch.setattr("arbiview_aug.sample.neighbours._neighbour", lambda *_: pytest.fail("a neighbour is looked at"))
@@ -123,7 +123,7 @@ def test_fast_costs_the_same_without_neighbours(report_bound: Callable[..., None
     retarget = RigRetarget(sample["rig"].turned(yaw_deg=22))
 
     def frame(reach: Any) -> None:
-        retarget.stitcher.reach = reach
+        retarget.planner.reach = reach
         retarget(sample)
 
     work = {"reading": partial(frame, "ground"), "not": partial(frame, None)}

@@ -1,0 +1,253 @@
+"""The views of one frame: every renderer returns a ``RenderedFrame``, every filler of holes takes and returns one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from arbiview_aug.cameras.framing import Fit, Framing, framing
+from arbiview_aug.cameras.lens import BoolArray
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.errors import SampleError
+from arbiview_aug.favs.renderer import PaperRendering, paper_labels
+from arbiview_aug.image_ops import nearest_resized, resized
+from arbiview_aug.render.atlas import Scratch
+from arbiview_aug.render.confidence import confidence
+from arbiview_aug.render.labels import render_labels
+from arbiview_aug.render.opencv_backend import render_opencv
+from arbiview_aug.render.plan import RenderPlan
+from arbiview_aug.render.tone_curve import ToneCurve
+from arbiview_aug.render.torch_backend import maps_on, render_torch
+from arbiview_aug.sample.batching import barred, covered, framed, stacked
+from arbiview_aug.sample.inputs import Frame
+
+Execution = Literal["auto", "opencv", "torch"]
+
+Maps = torch.Tensor | list[torch.Tensor]
+"""A map (h, w) of each of M views: (M, h, w) where their sizes agree, else a list."""
+
+LabelFill = Callable[[torch.dtype], float]
+"""The value of label pixels that no source sees, in maps of a type; raises SampleError where the type has no such."""
+
+LabelRenderer = Callable[[Sequence[torch.Tensor], LabelFill], list[torch.Tensor]]
+"""Renders N label maps (..., H, W) of the sources as M maps (..., h, w) of the views."""
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedFrame:
+    """The M views of one frame. All maps are its own memory; fillers write into it where they can.
+
+    Attributes:
+        images: M views (3, h, w), uint8 or float in [0, 1], black where uncovered; slices of one block where sizes
+            agree.
+        rig: Their cameras, in the source's ego frame.
+        coverage: Bool, True where some source sees the pixel.
+        source_camera: Int8 index of the winning source, -1 where uncovered; None where not asked for, as the next two.
+        source_frame: Int8, 0 for the current frame, n + 1 for number n of its neighbours, -1 where uncovered.
+        confidence: Float32 in [0, 1], 0 where uncovered.
+        generated: Bool, True where a filler made the pixel up; None before that.
+        occluded: (h, w) bool of each view, uncovered pixels that some source's image contains; None for none.
+        certainty: (h, w) uint8 of each view as in ``ViewPlan``, and ``seams`` (h, w) float32, by how much blending
+            changed it: ``confidence`` is made of both.
+        seams: See ``certainty``.
+        labels: Renders label maps; None where there are none.
+    """
+
+    images: list[torch.Tensor]
+    rig: Rig
+    coverage: Maps
+    source_camera: Maps | None = None
+    source_frame: Maps | None = None
+    confidence: Maps | None = None
+    generated: Maps | None = None
+    occluded: Sequence[BoolArray | None] = ()
+    certainty: Sequence[npt.NDArray[np.uint8]] = ()
+    seams: Sequence[torch.Tensor] = ()
+    labels: LabelRenderer | None = None
+
+    def with_maps(self, change: Callable[[Sequence[torch.Tensor], int], Maps]) -> RenderedFrame:
+        """The frame with each of its maps as ``change`` of it and of its value where no source sees."""
+        changed: dict[str, Any] = {}
+        for key in MAP_KEYS:
+            if (maps := getattr(self, key)) is not None:
+                changed[key] = change(maps, -1 if key in _SOURCES else 0)
+        return replace(self, **changed)
+
+    def between_bars(self, size: tuple[int, int]) -> RenderedFrame:
+        """The frame with every view at ``size`` (h, w), black bars above and at both sides."""
+
+        def with_bars(views: Sequence[torch.Tensor], empty: int) -> torch.Tensor:
+            return torch.stack([barred(view, size, empty) for view in views])
+
+        labels = None if self.labels is None else partial(_labels_between_bars, self.labels, size)
+        images, rig = list(with_bars(self.images, 0)), self.rig.resized(size, "pad")
+        return replace(self.with_maps(with_bars), images=images, rig=rig, labels=labels)
+
+
+MAP_KEYS = ("coverage", "source_camera", "source_frame", "confidence", "generated")
+"""Attributes of a ``RenderedFrame``, and keys of a retargeted sample, that hold maps."""
+
+_SOURCES = ("source_camera", "source_frame")
+"""Those of them that are -1, not 0, where no source sees."""
+
+
+def _labels_between_bars(
+    render: LabelRenderer, size: tuple[int, int], labels: Sequence[torch.Tensor], fill: LabelFill
+) -> list[torch.Tensor]:
+    return [barred(label, size, fill(labels[0].dtype)) for label in render(labels, fill)]
+
+
+# --- by a plan --------------------------------------------------------------------------------------------------------
+class Renderer:
+    """Executes render plans.
+
+    Args:
+        execution: ``opencv`` (CPU), ``torch`` (any device, differentiable), or ``auto``: OpenCV for CPU images that
+            need no gradient.
+    """
+
+    def __init__(self, execution: Execution = "auto") -> None:
+        self.execution = execution
+        self._scratch = Scratch()
+
+    def render(
+        self,
+        plans: Sequence[RenderPlan],
+        frames: Sequence[Frame],
+        curves: Sequence[Sequence[ToneCurve] | None],
+        outputs: Collection[str] = (),
+    ) -> list[RenderedFrame]:
+        """Render frames; those that share a plan go through torch together.
+
+        Args:
+            plans: One for each frame.
+            frames: The frames.
+            curves: For each frame a tone curve for each source, or None.
+            outputs: Which of ``source_camera``, ``source_frame`` and ``confidence`` are wanted.
+
+        Raises:
+            SampleError: OpenCV was asked for, and an image is on another device or needs gradients.
+        """
+        with_seams = "confidence" in outputs
+        done: dict[int, RenderedFrame] = {}
+        together: dict[int, list[int]] = {}
+        for b, (plan, frame) in enumerate(zip(plans, frames, strict=True)):
+            if self._uses_torch(frame.images):
+                together.setdefault(id(plan), []).append(b)
+                continue
+            seams: list[torch.Tensor] | None = [] if with_seams else None
+            views = render_opencv(plan, frame.images, self._scratch, curves[b], seams)
+            done[b] = _rendered(plan, views, seams or (), outputs)
+        for members in together.values():
+            plan = plans[members[0]]
+            batched: list[torch.Tensor] | None = [] if with_seams else None
+            sources = [torch.stack(images) for images in zip(*(frames[b].images for b in members), strict=True)]
+            blocks = render_torch(plan, sources, [curves[b] for b in members], batched)
+            for k, b in enumerate(members):
+                done[b] = _rendered(plan, [view[k] for view in blocks], [seam[k] for seam in batched or ()], outputs)
+        return [done[b] for b in range(len(frames))]
+
+    def views(
+        self,
+        plan: RenderPlan,
+        images: Sequence[torch.Tensor],
+        curves: Sequence[ToneCurve] | None,
+        like: Sequence[torch.Tensor],
+    ) -> list[torch.Tensor]:
+        """The views (3, h, w) of one frame alone, executed as the images ``like`` would be."""
+        if self._uses_torch(like):
+            return [view[0] for view in render_torch(plan, [image[None] for image in images], [curves])]
+        return render_opencv(plan, images, self._scratch, curves)
+
+    def _uses_torch(self, images: Sequence[torch.Tensor]) -> bool:
+        needed = any(image.device.type != "cpu" or image.requires_grad for image in images)
+        if self.execution == "opencv" and needed:
+            raise SampleError("execution='opencv': expected CPU images without gradients; use execution='torch'")
+        return self.execution == "torch" or (self.execution == "auto" and needed)
+
+
+def _rendered(
+    plan: RenderPlan, images: list[torch.Tensor], seams: Sequence[torch.Tensor], outputs: Collection[str]
+) -> RenderedFrame:
+    device = images[0].device
+    if device.type == "cpu":
+        winners = [torch.from_numpy(view.source_camera) for view in plan.targets]
+    else:
+        winners = [view.source for view in maps_on(plan, device)]  # the plan holds them there
+    rendered = _from_winners(images, plan.target, winners, outputs)
+    occluded = [view.occluded for view in plan.targets]
+    rendered = replace(rendered, occluded=occluded, labels=partial(_labels, partial(render_labels, plan)))
+    if "confidence" not in outputs:
+        return rendered
+    certainty = [view.certainty for view in plan.targets if view.certainty is not None]
+    rendered = replace(rendered, certainty=certainty, seams=seams)
+    return replace(rendered, confidence=confidence_of(rendered))
+
+
+def _from_winners(
+    images: list[torch.Tensor], rig: Rig, winners: Sequence[torch.Tensor], outputs: Collection[str]
+) -> RenderedFrame:
+    """Views with the maps that say which source won (h, w) int8, in memory of their own."""
+    return RenderedFrame(
+        images,
+        rig,
+        covered(winners),
+        source_camera=stacked([winner.clone() for winner in winners]) if "source_camera" in outputs else None,
+        source_frame=stacked([winner.clamp(max=0) for winner in winners]) if "source_frame" in outputs else None,
+    )
+
+
+def confidence_of(rendered: RenderedFrame) -> Maps:
+    """Compute the confidence of a frame's views from their certainty, seams and contrast."""
+    of_views = zip(rendered.images, rendered.certainty, rendered.coverage, rendered.seams, strict=True)
+    return stacked([confidence(*of_view) for of_view in of_views])
+
+
+def _labels(
+    render: Callable[[Sequence[torch.Tensor], float], list[torch.Tensor]],
+    labels: Sequence[torch.Tensor],
+    fill: LabelFill,
+) -> list[torch.Tensor]:
+    return render(labels, fill(labels[0].dtype))
+
+
+# --- by the published stages ------------------------------------------------------------------------------------------
+def as_rendered(rendering: PaperRendering, outputs: Collection[str] = ()) -> RenderedFrame:
+    """The rendering of ``quality="paper"`` as a ``RenderedFrame``; ``outputs`` as in ``Renderer.render``."""
+    winners = [torch.from_numpy(view.source_camera) for view in rendering.targets]
+    rendered = _from_winners([view.image for view in rendering.targets], rendering.target, winners, outputs)
+    occluded = [view.occluded for view in rendering.targets]
+    return replace(rendered, occluded=occluded, labels=partial(_labels, partial(paper_labels, rendering)))
+
+
+# --- resized only -----------------------------------------------------------------------------------------------------
+def resize_only(frame: Frame, size: tuple[int, int], fit: Fit, outputs: Collection[str] = ()) -> RenderedFrame:
+    """A frame that keeps its cameras, brought to ``size`` (h, w): each saw all of its own view."""
+    device = frame.images[0].device
+    framings = [framing(camera.name, camera.size, size, fit) for camera in frame.rig]
+    coverage = torch.stack([framed(torch.ones(f.scaled, dtype=torch.bool, device=device), f) for f in framings])
+    current = coverage.to(torch.int8) - 1
+    numbers = torch.arange(len(coverage), dtype=torch.int8, device=device)[:, None, None]
+    return RenderedFrame(
+        [framed(resized(image, f.scaled), f) for image, f in zip(frame.images, framings, strict=True)],
+        frame.rig.resized(size, fit),
+        coverage,
+        source_camera=torch.where(coverage, numbers, current) if "source_camera" in outputs else None,
+        source_frame=current if "source_frame" in outputs else None,
+        confidence=coverage.float() if "confidence" in outputs else None,
+        generated=torch.zeros_like(coverage),
+        labels=partial(_resized_labels, framings),
+    )
+
+
+def _resized_labels(framings: Sequence[Framing], labels: Sequence[torch.Tensor], fill: LabelFill) -> list[torch.Tensor]:
+    return [
+        framed(nearest_resized(label, f.scaled), f, fill(labels[0].dtype) if f.has_bars else 0)
+        for label, f in zip(labels, framings, strict=True)
+    ]
