@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug.atomic_io import BROKEN_ARRAY, inside
+from arbiview_aug.atomic_io import BROKEN_ARRAY, check_name, inside
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.key_names import hint, misnamed
 from arbiview_aug.cameras.lens import BoolArray
@@ -64,6 +64,20 @@ class _Frame:
         if self.folder != self.root and not os.path.isabs(name):
             name = os.path.normpath(f"{self.name}/{name}")
         return inside(self.root, name, f"{self.where}: {what}" if what else self.where)
+
+    def mask(self, name: str, what: str) -> Path:
+        """One of its masks: a frame that is opened by itself may share those of a frame beside it, as in its drive.
+
+        Raises:
+            DataError: A name or a link that leaves the folder of the data, or the frame beside it.
+        """
+        parts = os.path.normpath(name).split(os.sep, 2) if self.folder == self.root and "\0" not in name else []
+        if len(parts) == 3 and parts[0] == ".." and parts[1] != "..":
+            check_name(os.sep.join(parts[1:]), f"{self.where}: {what}")
+            beside = self.root.parent / parts[1]
+            if not beside.is_symlink() and (beside / CALIBRATION_FILE).is_file():
+                return inside(beside, parts[2], f"{self.where}: {what}")
+        return self.file(name, what)
 
 
 class FrameFolder(Recording):
@@ -306,7 +320,7 @@ def _mask_file(entry: Any, frame: _Frame) -> Path | None:
         return None
     if not isinstance(file, str) or not file:
         raise CalibrationError(f"{frame.where}: {label}: expected an image's file name, got {file!r}")
-    return frame.file(file, label)
+    return frame.mask(file, label)
 
 
 def _file_of(entry: Any, key: str) -> tuple[str, Any]:

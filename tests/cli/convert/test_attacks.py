@@ -11,6 +11,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
@@ -183,6 +185,28 @@ def test_a_frames_files_may_lie_in_other_frames(made: dict[str, Path], home: Pat
     assert FrameFolder(source)[1]["images"].shape[0] == 2
     with pytest.raises(DataError, match="expected"):
         FrameFolder(source / "0001")[0]
+
+
+def test_a_frame_alone_shares_masks_of_frames_beside_it(made: dict[str, Path], home: Path) -> None:
+    """A real drive does; anything else beside the frame is refused, and so is a link out of the other frame."""
+    source = shutil.copytree(made["frames"], home / "in" / "source")
+    size = FrameFolder(source)[1]["rig"][0].size
+    mask = cv2.imencode(".png", np.full(size, 255, np.uint8))[1].tobytes()
+    (source / "0000" / "mask.png").write_bytes(mask)
+    (source / "mask.png").write_bytes(mask)
+    (source / "other").mkdir()
+    (source / "other" / "mask.png").write_bytes(mask)
+    (source / "0000" / "link.png").symlink_to(source / "mask.png")
+    with_calibration(source, name_of("mask", "../0000/mask.png"))
+    assert FrameFolder(source / "0001")[0]["rig"][0].mask.all()
+    for name in ("../mask.png", "../other/mask.png", "../0000/link.png", "../../mask.png", "../0000/../mask.png"):
+        with_calibration(source, name_of("mask", name))
+        with pytest.raises(DataError, match=r"0001.*: expected"):
+            FrameFolder(source / "0001")[0]
+    for name in ("../a\0b/c", f"../{'x' * 300}/c", "../a\ud800b/c"):
+        with_calibration(source, name_of("mask", name))
+        with pytest.raises(DataError, match=r"0001.*: expected"):
+            FrameFolder(source / "0001")[0]
 
 
 def test_cameras_whose_names_are_no_folders(
