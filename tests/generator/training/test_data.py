@@ -36,7 +36,7 @@ def test_few_scenes_are_for_training_first(count: int, sizes: list[int]) -> None
 
 def test_unknown_data_are_refused(tmp_path: Path) -> None:
     for data in ("kitti", "frames:", "nuscenes"):
-        with pytest.raises(TrainingError, match="expected synthetic, nuscenes:ROOT or frames:DIR"):
+        with pytest.raises(TrainingError, match="expected synthetic, frames:PATH or nuscenes:PATH"):
             open_frames(data, SIZE, scenes=1)
 
 
