@@ -52,7 +52,7 @@ class Recording(Dataset[dict[str, Any]]):
         return self[self._index[token]]
 
     def files(self, index: int) -> list[Path]:
-        """All files that a sample is read from; images first, then points, or as the reader says."""
+        """All files that a sample is read from, for ``convert``: a reader that has no writer needs none."""
         raise NotImplementedError
 
 

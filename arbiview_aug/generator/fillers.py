@@ -54,7 +54,7 @@ def fill_holes(
         views: M views (3, h, w), uint8 or float in [0, 1], black where uncovered. Those on the CPU without gradients
             are written into.
         coverage: (h, w) bool of each.
-        occluded: (h, w) bool of each, which uncovered pixels some source's image contains (``TargetPlan.occluded``);
+        occluded: (h, w) bool of each, which uncovered pixels some source's image contains (``ViewPlan.occluded``);
             None for none. All others lie outside.
         how: ``fill``: occluded pixels, and those outside up to ``REACH`` from what is seen, are continued from their
             borders; farther outside they become the mean colour. ``mean``: all become the mean colour of the frame's

@@ -27,10 +27,8 @@ PIXEL_BOUND_KEYS = (
 )
 """Keys known to speak of the source's pixels: dropped, because they would be stale in the target's views."""
 
-
 EGO_KEYS = ("points", "boxes_3d", "ego2world")
 """Keys known to be in the ego frame: they pass, or move with ``label_frame="target"``."""
-
 
 _MOST_NESTED = 64  # entries of a list that are looked at: longer lists are tokens or numbers
 

@@ -1,4 +1,4 @@
-"""scene.depth_maps."""
+"""Depth maps of source images: the cameras of those from motion, and their points in the ego frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""scene.static."""
+"""Static surfaces: infinity, the ground with a round wall, and the street."""
 
 from __future__ import annotations
 

@@ -14,13 +14,11 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.favs.config import FavsConfig, PaperConfig
-from arbiview_aug.favs.renderer import check_settings
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.harmonise import Harmoniser
 from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.render.plan import PlanCache, RenderPlan, build_plan, plan_key
 from arbiview_aug.render.refinement import RefinementCache
-from arbiview_aug.render.rendered import Execution
 from arbiview_aug.render.requirements import harm_remedies, needs_geometry, static_harm
 from arbiview_aug.render.tone_curve import ToneCurve
 from arbiview_aug.sample.detections import OfCameras, detections_of_frames
@@ -100,7 +98,6 @@ class FramePlanner:
         surface: As in ``RigRetarget``.
         harmoniser: Tone curves for every frame.
         refinement: Where refinements are held, for settings with depth from overlap.
-        execution: As in ``RigRetarget``; checked only.
         cache_bytes: Memory for plans that may come back.
         reach: What neighbouring frames may fill; None leaves them out.
         mixed: Half of the samples or more stay untouched.
@@ -117,17 +114,14 @@ class FramePlanner:
         surface: SurfaceName,
         harmoniser: Harmoniser,
         refinement: RefinementCache | None,
-        execution: Execution,
         cache_bytes: int,
         reach: Reach | None,
         mixed: bool,
         strict: bool,
         warn: WarnOnce,
     ) -> None:
-        if isinstance(config, PaperConfig):
-            check_settings(surface, execution)
-            if harmoniser.is_on:
-                raise ValueError(f"harmonise: quality='paper' is as published: expected None, got {harmoniser!r}")
+        if isinstance(config, PaperConfig) and harmoniser.is_on:
+            raise ValueError(f"harmonise: quality='paper' is as published: expected None, got {harmoniser!r}")
         if refinement is not None and not (isinstance(config, FavsConfig) and config.overlap_depth):
             raise ValueError("refinement: expected quality='accurate' (or overlap_depth=True) with a RefinementCache")
         self.config, self.surface, self.harmoniser = config, surface, harmoniser
@@ -180,7 +174,7 @@ class FramePlanner:
             surface = known.best if self.surface == "auto" else self.surface
             if neighbours and self.reach is not None:
                 fills = plan_fills(plan, neighbours, known, surface, self.config, self.reach)
-            curves = self.harmoniser.curves(frame.rig, frame.images) if self.harmoniser.is_on else None
+            curves = self.harmoniser.curves(frame.rig, frame.images)
             harm = pair.harm if SURFACES[surface].is_static else None
             plans.append(FramePlan(frame.rig, pair.target, plan, {}, depth, motion, fills, curves, harm))
         return plans
@@ -194,6 +188,10 @@ class FramePlanner:
         if isinstance(self.config, PaperConfig):
             raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
         return self._plan_of_pair(self._pair(source, target), source, scene or Scene(), self.config)
+
+    def needs_geometry(self, source: Rig, target: Rig) -> bool:
+        """Whether the distance of the scene matters for any pixel of a target rig."""
+        return self._pair(source, target).needs_geometry
 
     def _pair(self, source: Rig, target: Rig) -> _RigPair:
         key = source.content_key, target.content_key

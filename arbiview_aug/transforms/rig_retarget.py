@@ -17,7 +17,7 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
-from arbiview_aug.favs.renderer import PaperRendering, check_pinhole, render_paper
+from arbiview_aug.favs.renderer import PaperRendering, check_pinhole, check_settings, render_paper
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.batches import complete_frame, frame_names
 from arbiview_aug.generator.fillers import Holes, fill_frame
@@ -25,7 +25,6 @@ from arbiview_aug.render.harmonise import Harmonise, Harmoniser, PhotometricRepo
 from arbiview_aug.render.plan import PlanCache, RenderPlan
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.render.rendered import Execution, RenderedFrame, Renderer, as_rendered, resize_only
-from arbiview_aug.render.requirements import needs_geometry
 from arbiview_aug.sample.batching import leading_shape
 from arbiview_aug.sample.check import check_other_keys, warn_of_misnamed
 from arbiview_aug.sample.inputs import Frame, read_frames
@@ -215,13 +214,14 @@ class RigRetarget(torch.nn.Module):
                 raise ValueError("outputs: quality='paper' has no 'confidence': it moves pixels by what it matches")
             if min_confidence:
                 raise ValueError("min_confidence: quality='paper' has no confidence, expected 0")
+            check_settings(surface, execution)
         elif "confidence" in outputs or min_confidence or path == "diffusion":  # the generator is told of it
             self._trusts, self.config = True, replace(self.config, certainty=True)
         self.path, self.holes, self.p, self.rng = path, holes, float(p), rng
         self.completion = completion_of(path, generator, steps, guidance, min_confidence, seed)
         self.generator = None if self.completion is None else self.completion.generator  # moves with this module
         self.size, self.fit = None if size is None else checked_size(size), fit
-        self.label_frame, self.label_fill = label_frame, label_fill
+        self.label_frame = label_frame
         self.label_keys = checked_names("label_keys", label_keys)
         self.pass_keys, self.outputs = checked_names("pass_keys", pass_keys), tuple(outputs)
         self._warn = WarnOnce()
@@ -232,7 +232,6 @@ class RigRetarget(torch.nn.Module):
             surface,
             Harmoniser(harmonise),
             refinement,
-            execution,
             cache_bytes=0 if once else cache_bytes,
             reach=neighbours,
             mixed=p <= _MIXED_P,
@@ -400,9 +399,8 @@ class RigRetarget(torch.nn.Module):
         source = source or self.source_rig
         if source is None or self._fixed_target is None:
             raise ValueError("prepare: expected a source rig and a fixed target rig")
-        surface, config, target = self.planner.surface, self.planner.config, self._fixed_target
-        of_frames = SURFACES[surface].needs is not None
-        if of_frames and isinstance(config, FavsConfig) and needs_geometry(source, target, surface, config):
+        surface = self.planner.surface
+        if SURFACES[surface].needs is not None and self.planner.needs_geometry(source, self._fixed_target):
             raise ValueError(
                 f"prepare: expected a surface whose plans come back, got {surface!r}: the boxes, points or depth of "
                 "every frame make its own"

@@ -84,29 +84,6 @@ def test_lenses_without_points(fisheye_root: Path, tmp_path: Path, capsys: pytes
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--data", "no such folder"], "data no such folder: expected a folder, found none"),
-        (["--data", "."], "expected a frame folder"),
-        (["--target", "tesla"], "expected a file or one of the shipped rigs"),
-        (["--output", "file/below"], "--output file/below: expected a folder that can be written to"),
-    ],
-)
-def test_errors_are_one_line(
-    arguments: list[str],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("file").touch()
-    assert main(["demo", *arguments]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("python -m arbiview_aug demo: ") and message in said and len(said.splitlines()) == 1
-
-
-@pytest.mark.parametrize(
     "arguments", [["--size", "704"], ["--size", "0x3"], ["--seed", "-1"], ["--frames", "0"], ["--surface", "flat"]]
 )
 def test_wrong_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -135,28 +135,6 @@ def test_figures(nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--data", "no such folder"], "data no such folder: expected a folder, found none"),
-        (["--target", "tesla"], "expected a file or one of the shipped rigs"),
-        (["--output", "file/below"], "--output file/below: expected a folder that can be written to"),
-    ],
-)
-def test_errors_are_one_line(
-    arguments: list[str],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("file").touch()
-    assert main(["evaluate", *arguments]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("python -m arbiview_aug evaluate: ") and message in said and len(said.splitlines()) == 1
-
-
-@pytest.mark.parametrize(
     "arguments",
     [
         ["--yaws", "left"],

@@ -64,6 +64,31 @@ def test_the_command_line_warns(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
         assert main(["inspect", "no such rig"]) == 2
 
 
+@pytest.mark.parametrize("command", ["demo", "evaluate"])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--data", "no such folder"], "data no such folder: expected a folder, found none"),
+        (["--data", "."], "expected a frame folder"),
+        (["--target", "tesla"], "expected a file or one of the shipped rigs"),
+        (["--output", "file/below"], "--output file/below: expected a folder that can be written to"),
+    ],
+)
+def test_errors_are_one_line(
+    command: str,
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    assert main([command, *arguments]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"python -m arbiview_aug {command}: ") and message in said and len(said.splitlines()) == 1
+
+
 def test_usage(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     printed = capsys.readouterr().out

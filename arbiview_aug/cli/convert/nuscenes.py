@@ -19,7 +19,7 @@ import numpy as np
 from arbiview_aug.atomic_io import check_name, checksum, inside, link_whole, whole_file
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.convert.manifest import Record
-from arbiview_aug.cli.convert.nuscenes_rows import NewCameras, Remaining, view_stem
+from arbiview_aug.cli.convert.nuscenes_rows import NewCameras, Remaining, kept_sensors, view_stem
 from arbiview_aug.cli.convert.settings import FOLDER, Settings
 from arbiview_aug.cli.convert.visibility import visible_shares
 from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
@@ -127,8 +127,7 @@ class NuScenes:
         own = {of: Tokens(tables, of) for _, _, of in references}
         named = {(table, key): Tokens(tables, table, key) for table, key, _ in references}
         folders = {path.parent.relative_to(self.data.root).as_posix(): "maps" for path in self._maps()}
-        cameras = {row["token"] for row in tables.rows("sensor") if row["modality"] == "camera"}
-        kept = {row["token"] for row in tables.rows("calibrated_sensor") if row["sensor_token"] not in cameras}
+        _, kept = kept_sensors(tables)
         for table in there:
             needed = _NEEDED.get(table, {})
             columns = [column for (of, _), column in named.items() if of == table]

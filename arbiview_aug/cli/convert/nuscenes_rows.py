@@ -17,6 +17,13 @@ from arbiview_aug.datasets.nuscenes.recordings import LIDAR
 from arbiview_aug.datasets.nuscenes.tables import Row, Tables, quaternion_from_rotation
 
 
+def kept_sensors(tables: Tables) -> tuple[set[str], set[str]]:
+    """Tokens of the sensors that stay, which are no cameras, and of their calibrations."""
+    sensors = {row["token"] for row in tables.rows("sensor") if row.get("modality") != "camera"}
+    calibrated = tables.rows("calibrated_sensor")
+    return sensors, {row["token"] for row in calibrated if row["sensor_token"] in sensors}
+
+
 class Remaining:
     """The source's rows without its cameras and without some samples, the chains between rows closed again.
 
@@ -42,9 +49,8 @@ class Remaining:
             for row in reversed(rows):
                 later = later if row["token"] in left_out else row["token"]
                 self._stand_in[row["token"]] = later
-        self._sensors = {row["token"] for row in tables.rows("sensor") if row.get("modality") != "camera"}
+        self._sensors, self._calibrated = kept_sensors(tables)
         calibrated = tables.rows("calibrated_sensor")
-        self._calibrated = {row["token"] for row in calibrated if row["sensor_token"] in self._sensors}
         lidar = {row["token"] for row in tables.rows("sensor") if row["channel"] == LIDAR}
         self._lidar = {row["token"] for row in calibrated if row["sensor_token"] in lidar}
         self._gone = self._annotations_left_out()

@@ -117,7 +117,7 @@ def _rigs(rigs: Sequence[Any]) -> dict[str, Any]:
         return {"rig": rigs[0]}
     for rig in rigs:
         for camera in rig:
-            if camera.lens != "pinhole" or camera.mask is not None:
+            if not camera.is_rectilinear or camera.mask is not None:
                 raise SampleError(
                     f"collate: camera {camera.name!r}: rigs that differ within a batch must be of pinhole cameras "
                     "without masks; retarget in the dataset (RetargetedDataset) instead"
