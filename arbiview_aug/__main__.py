@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from importlib import import_module, metadata
 
 from arbiview_aug.environment import warn_about_cv2_wheels
-from arbiview_aug.errors import ArbiviewError
+from arbiview_aug.errors import exit_status
 
 COMMANDS = {
     "bench": ("arbiview_aug.cli.bench", "measure speed against accuracy, on your own data too"),
@@ -21,7 +21,6 @@ COMMANDS = {
 """Module and one-line help of each command."""
 
 _RESUMABLE = ("convert", "depth", "train")
-_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 
 
 def usage() -> str:
@@ -66,15 +65,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"python -m arbiview_aug: unknown command {name!r}\n\n{usage()}", file=sys.stderr)
         return 2
     warn_about_cv2_wheels()
-    try:
-        return int(import_module(COMMANDS[name][0]).main(rest) or 0)
-    except ArbiviewError as error:
-        print(f"python -m arbiview_aug {name}: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        fix = "; run it again to go on" if name in _RESUMABLE else ""
-        print(f"python -m arbiview_aug {name}: interrupted{fix}", file=sys.stderr)
-        return _INTERRUPTED
+
+    def command() -> int | None:
+        return import_module(COMMANDS[name][0]).main(rest)
+
+    return exit_status(f"python -m arbiview_aug {name}", command, resumable=name in _RESUMABLE)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,10 @@
 
 import sys
 import warnings
+from collections.abc import Callable
+
+INTERRUPTED = 130
+"""Exit status of a process that Ctrl-C ended: 128 + SIGINT, as shells report it."""
 
 
 class ArbiviewError(Exception):
@@ -11,6 +15,35 @@ class ArbiviewError(Exception):
 def described(error: Exception) -> str:
     """An error in one line; errors of other packages with their type."""
     return str(error) if isinstance(error, ArbiviewError) else f"{type(error).__name__}: {error}"
+
+
+def exit_status(
+    program: str,
+    command: Callable[[], int | None],
+    errors: tuple[type[Exception], ...] = (ArbiviewError,),
+    *,
+    resumable: bool = False,
+) -> int:
+    """Run a command; an error or Ctrl-C becomes one line on stderr.
+
+    Args:
+        program: Comes first in that line.
+        command: Returns its exit status; None is 0.
+        errors: Exceptions that are the user's to mend.
+        resumable: Whether the same command goes on where Ctrl-C stopped it.
+
+    Returns:
+        The command's exit status, 2 after an error, 130 after Ctrl-C.
+    """
+    try:
+        return int(command() or 0)
+    except KeyboardInterrupt:
+        fix = "; run it again to go on" if resumable else ""
+        print(f"{program}: interrupted{fix}", file=sys.stderr)
+        return INTERRUPTED
+    except errors as error:
+        print(f"{program}: {error}", file=sys.stderr)
+        return 2
 
 
 class CalibrationError(ArbiviewError, ValueError):

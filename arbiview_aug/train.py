@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from arbiview_aug.cli.arguments import add_output, command_parser, count
 from arbiview_aug.datasets.registry import READERS
-from arbiview_aug.errors import ArbiviewError
+from arbiview_aug.errors import ArbiviewError, exit_status
 from arbiview_aug.generator.training.command import COMMANDS, run
 from arbiview_aug.generator.training.config import CONFIGS
 
@@ -41,12 +41,10 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run; returns the exit status: 0 done or stopped on request, 2 settings, data or disks that cannot be used."""
-    try:
-        return run(parser().parse_args(argv))
-    except (ArbiviewError, OSError) as error:
-        print(f"python -m arbiview_aug.train: {error}", file=sys.stderr)
-        return 2
+    """Run the command; returns 0 when done or stopped by a signal, 2 after an error, 130 after Ctrl-C before training."""
+    arguments = parser().parse_args(argv)
+    program = "python -m arbiview_aug.train"
+    return exit_status(program, lambda: run(arguments), (ArbiviewError, OSError), resumable=True)
 
 
 if __name__ == "__main__":

@@ -134,13 +134,25 @@ def test_an_interrupt_is_one_line_and_130(
     assert capsys.readouterr().err == f"python -m arbiview_aug {name}: interrupted{fix}\n"
 
 
-def test_a_real_interrupt(tmp_path: Path) -> None:
-    code = (
-        "import sys, threading; from arbiview_aug import __main__ as m; from arbiview_aug.cli import demo\n"
-        "demo._load = lambda _: (print('ready', flush=True), threading.Event().wait())\n"
-        "sys.exit(m.main(['demo', '--output', sys.argv[1]]))"
-    )
-    command = [sys.executable, "-c", code, str(tmp_path)]
+@pytest.mark.parametrize(
+    ("code", "expected"),
+    [
+        (
+            "from arbiview_aug import __main__ as m; from arbiview_aug.cli import demo; demo._load = wait\n"
+            "sys.exit(m.main(['demo', '--output', sys.argv[1]]))",
+            "python -m arbiview_aug demo: interrupted\n",
+        ),
+        (
+            "from arbiview_aug import train as m; from arbiview_aug.generator.training import command\n"
+            "command.open_frames = wait; sys.exit(m.main(['--output', sys.argv[1]]))",
+            "python -m arbiview_aug.train: interrupted; run it again to go on\n",
+        ),
+    ],
+    ids=["demo", "train"],
+)
+def test_a_real_interrupt(code: str, expected: str, tmp_path: Path) -> None:
+    wait = "import sys, threading; wait = lambda *_, **__: (print('ready', flush=True), threading.Event().wait())\n"
+    command = [sys.executable, "-c", wait + code, str(tmp_path)]
     # A process that pytest was started from may ignore the signal, and so would its children.
     with subprocess.Popen(
         command,
@@ -153,7 +165,7 @@ def test_a_real_interrupt(tmp_path: Path) -> None:
         assert process.stdout.readline() == "ready\n"
         os.kill(process.pid, signal.SIGINT)
         _, said = process.communicate(timeout=300)
-    assert process.returncode == 130 and said == "python -m arbiview_aug demo: interrupted\n"
+    assert process.returncode == 130 and said == expected
 
 
 def test_the_console_script() -> None:
