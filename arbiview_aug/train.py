@@ -41,7 +41,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns 0 when done or stopped by a signal, 2 after an error, 130 after Ctrl-C before training."""
+    """Run the command; returns 0 if done or stopped while training, 2 after an error, 130 after any other Ctrl-C."""
     arguments = parser().parse_args(argv)
     program = "python -m arbiview_aug.train"
     return exit_status(program, lambda: run(arguments), (ArbiviewError, OSError), resumable=True)
