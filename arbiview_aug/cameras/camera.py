@@ -214,7 +214,7 @@ class Camera:
         """The lens with this camera's coefficients."""
         return LENSES[self.lens](self.distortion)
 
-    @property
+    @cached_property
     def is_rectilinear(self) -> bool:
         """Whether the lens keeps straight lines straight: a pinhole."""
         return self.lens_model.is_rectilinear

@@ -16,7 +16,7 @@ import torch
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.evaluate.baselines import BASELINES, Renderer
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays
-from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config, paper
+from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.generator import has_shipped
 from arbiview_aug.render.harmonise import Harmonise, Harmoniser
@@ -209,7 +209,7 @@ def paper_stages() -> dict[str, PaperConfig]:
 
     Without stage 4 the fused image is the plain mean of all sources that see a pixel.
     """
-    whole = paper()
+    whole = PaperConfig()
     return {
         "paper": whole,
         "paper without stage 2, matching": replace(whole, use_feature_matching=False),

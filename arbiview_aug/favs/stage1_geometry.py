@@ -1,12 +1,20 @@
-"""FAVS Stage 1, geometric transformation: homographies from calibration alone, and their check.
+"""FAVS Stage 1: homographies from calibration alone, and their check.
+
+Equations of the paper's section "Feature-Aware Adaptive View Synthesis (FAVS) Algorithm", "Stage 1: Geometric
+Transformation Foundation":
+
+- H_geom = K2 R2 R1⁻¹ K1⁻¹: ``h_geom``.
+- H_planar = K2 (R − t nᵀ / d) K1⁻¹: ``h_planar``.
+- validity = check_homography(H_geom, corners): ``check_homography``.
+- K and R = R_z(θ) R_x(φ): ``Camera.K`` and ``Camera.looking``.
 
 Convention: H maps *source* pixels to *target* pixels, p_target ~ H p_source (the paper's H maps camera 1 to camera 2).
-The paper's R_i = ``cam2ego[:3, :3].T`` takes ego directions to camera i. Both cameras must be pinhole cameras; the
-sampling of the package goes the other way and covers every lens and surface (``arbiview_aug.render.plan``). For pinhole
-cameras on the far surface the two agree, which ``tests/favs`` pins.
+The paper's R_i is ``cam2ego[:3, :3].T``: it takes ego directions to camera i. Both cameras must be pinhole cameras.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
@@ -16,28 +24,45 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import CalibrationError
 
 MAX_AREA_RATIO = 16.0
-"""A view more than 4 times enlarged or reduced along each side carries no usable texture."""
+"""Largest change of area: beyond four times along each side there is no usable texture."""
 
 
 def h_geom(source: Camera, target: Camera) -> FloatArray:
-    """(3, 3) rotation-only homography H_geom = K2 R2 R1⁻¹ K1⁻¹ (Sec. FAVS, Stage 1): exact at infinite depth."""
-    _require_pinhole(source, target)
+    """Compute the (3, 3) rotation-only homography H_geom = K2 R2 R1⁻¹ K1⁻¹, exact at infinite depth.
+
+    Raises:
+        CalibrationError: A camera is not a pinhole camera.
+    """
+    check_pinhole((source, target))
     return target.K @ _relative_rotation(source, target) @ np.linalg.inv(source.K)
 
 
-def h_planar(source: Camera, target: Camera, normal: FloatArray, distance_m: float) -> FloatArray:
-    """(3, 3) homography of a scene plane: H_planar = K2 (R - t nᵀ / d) K1⁻¹ (Sec. FAVS, Stage 1).
+def h_geom_of_visible(sources: Sequence[Camera], target: Camera) -> dict[int, FloatArray]:
+    """Compute H_geom for the sources, by index, whose viewing cones meet the target's."""
+    homographies = {}
+    for k, source in enumerate(sources):
+        angle_rad = np.arccos(np.clip(source.cam2ego[:3, 2] @ target.cam2ego[:3, 2], -1, 1))
+        if angle_rad <= source.half_angle_rad + target.half_angle_rad:
+            homographies[k] = h_geom(source, target)
+    return homographies
 
-    R = R2 R1⁻¹ and t, the source's centre in the target's frame, take source to target: X2 = R X1 + t. The paper's
-    minus sign means the plane n·X1 = -d: ``normal`` points from the plane towards the camera, d > 0 is the distance.
+
+def h_planar(source: Camera, target: Camera, normal: FloatArray, distance_m: float) -> FloatArray:
+    """Compute the (3, 3) homography of a scene plane, H_planar = K2 (R − t nᵀ / d) K1⁻¹.
+
+    R = R2 R1⁻¹ and t, the source's centre in the target's frame, take source to target: X2 = R X1 + t. The minus sign
+    means the plane n·X1 = −d.
 
     Args:
         source: Camera 1.
         target: Camera 2.
         normal: (3,) unit normal in the source camera's frame, from the plane towards the source.
-        distance_m: Distance of the source's centre from the plane, metres, > 0.
+        distance_m: Distance d > 0 of the source's centre from the plane.
+
+    Raises:
+        CalibrationError: A camera is not a pinhole camera, or the distance is not positive.
     """
-    _require_pinhole(source, target)
+    check_pinhole((source, target))
     if not distance_m > 0:
         raise CalibrationError(f"h_planar: distance_m: expected a positive distance, got {distance_m!r}")
     t = target.cam2ego[:3, :3].T @ (source.center_m - target.center_m)
@@ -46,11 +71,11 @@ def h_planar(source: Camera, target: Camera, normal: FloatArray, distance_m: flo
 
 
 def check_homography(H: FloatArray, size: tuple[int, int], max_area_ratio: float = MAX_AREA_RATIO) -> bool:
-    """The paper's validity = check_homography(H, corners): no excessive distortion of the four image corners.
+    """Check that a homography does not distort the four image corners excessively.
 
-    True where all four corners stay in front (one sign of the third coordinate), form a convex quadrilateral of the
-    same orientation, and enclose between 1 / ``max_area_ratio`` and ``max_area_ratio`` times the image's area.
-    H and -H are the same homography, so the sign is taken from the image centre.
+    The corners must stay in front (one sign of the third coordinate), form a convex quadrilateral of the same
+    orientation, and enclose between 1 / ``max_area_ratio`` and ``max_area_ratio`` times the image's area. H and −H are
+    the same homography, so the sign is taken from the image centre.
 
     Args:
         H: (3, 3).
@@ -76,13 +101,15 @@ def check_homography(H: FloatArray, size: tuple[int, int], max_area_ratio: float
 
 
 def _relative_rotation(source: Camera, target: Camera) -> FloatArray:
-    """R2 R1⁻¹: camera 1's directions in camera 2's frame."""
+    """R2 R1⁻¹, from camera 1's frame to camera 2's."""
     return target.cam2ego[:3, :3].T @ source.cam2ego[:3, :3]
 
 
-def _require_pinhole(*cameras: Camera) -> None:
+def check_pinhole(cameras: Iterable[Camera]) -> None:
+    """Raise CalibrationError for a camera with lens distortion: homographies map straight lines to straight lines."""
     for camera in cameras:
         if not camera.is_rectilinear:
             raise CalibrationError(
-                f"camera {camera.name!r}: a homography needs a pinhole lens, got {camera.lens}; use .undistorted()"
+                f"camera {camera.name!r}: a homography (quality='paper') needs a pinhole lens, got {camera.lens}; "
+                "use .undistorted()"
             )

@@ -1,9 +1,16 @@
-"""FAVS Stage 2, feature matching: a source's warp is matched to the reference and its homography corrected.
+"""FAVS Stage 2: match each source's warp to the primary camera's and correct its homography.
 
-The reference is the primary camera's warp, so everything happens in target pixels: M takes the source's warp onto the
-reference, and H_feature = M · H_geometric. Matching needs only the region that both see: cropped overlaps.
+Equations of the paper's section "Feature-Aware Adaptive View Synthesis (FAVS) Algorithm", "Stage 2: Feature Matching
+Optimization":
 
-Convention: as in ``geometric_transformation``, H maps source pixels to target pixels. Grey images are uint8.
+- {kp, des} = SIFT(I), good_matches = {m : d1 / d2 < 0.75}: ``match_features``.
+- H_feature = RANSAC(good_matches): ``estimate_homography``.
+- |good_matches| >= min_matches, check_homography(H_feature), consistency(H_geometric, H_feature) < threshold:
+  ``accept``, ``is_valid``, ``consistency``.
+- H_base by the three cases, and α: ``h_base``, ``blend_weight``.
+
+The reference is the primary camera's warp, so both images are in target pixels: RANSAC's M takes the warp to the
+reference, and H_feature = M · H_geometric. Homographies map source pixels to target pixels. Grey images are uint8.
 """
 
 from __future__ import annotations
@@ -23,14 +30,14 @@ GreyImage = npt.NDArray[np.uint8]
 Case = Literal["feature", "blended", "geometric"]
 
 REFERENCE_WIDTH_PX = 800
-"""The target width at which ``PaperConfig`` states its lengths."""
+"""Target width at which ``PaperConfig`` states its lengths."""
 
 _NEIGHBOURS = 2  # the ratio test compares the nearest with the second-nearest
-_FLANN_LINEAR = 0  # exact, and nothing is random: 39 ms for the fullest overlap, where kd-trees take 16 and only guess
+_FLANN_LINEAR = 0  # exact; kd-trees depend on the state of OpenCV's random generator
 
 
 class Region(NamedTuple):
-    """A rectangle of corner coordinates, inclusive: pixels (x0, y0) to (x1, y1)."""
+    """Rectangle of pixels (x0, y0) to (x1, y1), both inclusive."""
 
     x0: int
     y0: int
@@ -39,14 +46,12 @@ class Region(NamedTuple):
 
     @property
     def corners(self) -> FloatArray:
-        """(4, 2) corner pixels, clockwise from the first."""
-        return np.array(
-            [(self.x0, self.y0), (self.x1, self.y0), (self.x1, self.y1), (self.x0, self.y1)], dtype=np.float64
-        )
+        """(4, 2) corner pixels, clockwise from the top left."""
+        return np.array([self[:2], (self.x1, self.y0), self[2:], (self.x0, self.y1)], dtype=np.float64)
 
 
 class Matches(NamedTuple):
-    """good_matches: (n, 2) pixels in the source's warp and in the reference, both target pixels."""
+    """good_matches: (n, 2) keypoints in the source's warp and in the reference, target pixels."""
 
     warped: FloatArray
     reference: FloatArray
@@ -57,17 +62,17 @@ NO_MATCHES = Matches(np.zeros((0, 2)), np.zeros((0, 2)))
 
 @dataclass(frozen=True)
 class FeatureReport:
-    """What stage 2 found for one source.
+    """Result of stage 2 for one source.
 
     Attributes:
-        H_base: (3, 3) the homography that goes on to stage 3.
-        case: Which of the paper's three cases gave it.
-        alpha: α, the share of H_geometric in it: 0 for ``feature``, 1 for ``geometric``.
-        good_matches: Matches that passed the ratio test.
-        inliers: Those that agree with M; 0 without one.
-        consistency_px: Corner motion between the two homographies, None without H_feature.
-        reason: Why this case, in words.
-        matches: The matches that stage 3 may cluster: the inliers of M, else all good ones.
+        H_base: (3, 3) homography for stage 3, det 1.
+        case: The case of the paper's H_base.
+        alpha: α, the share of H_geometric: 0 for ``feature``, 1 for ``geometric``.
+        good_matches: Number of matches that passed the ratio test.
+        inliers: Number of them that agree with M, 0 without one.
+        consistency_px: Largest corner motion between the two homographies; None without a valid H_feature.
+        reason: Explanation of the case.
+        matches: Matches for stage 3 to cluster: the inliers of M, else all good ones.
     """
 
     H_base: FloatArray
@@ -81,31 +86,26 @@ class FeatureReport:
 
     @property
     def quality(self) -> float:
-        """Matching quality in [0, 1]: share of inliers among the good matches, times the share of H_feature."""
+        """Matching quality in [0, 1]: the share of inliers among the good matches times the share of H_feature."""
         return (1 - self.alpha) * self.inliers / max(self.good_matches, 1)
 
 
 # --- equations --------------------------------------------------------------------------------------------------------
 def normalised(H: FloatArray) -> FloatArray:
-    """H with det H = 1. H is known up to scale and sign, and only so do sums of homographies mean anything.
+    """Scale a regular (3, 3) homography to det H = 1, which makes sums of homographies meaningful.
 
-    The real cube root keeps the determinant's sign, so that -H, whose determinant has the other sign, gives the same.
-
-    Args:
-        H: (3, 3), regular.
+    The real cube root keeps the determinant's sign, so H and −H give the same result.
     """
     return H / np.cbrt(np.linalg.det(H))
 
 
 def consistency(H_geometric: FloatArray, H_feature: FloatArray, corners: FloatArray) -> float:
-    """consistency(H_geometric, H_feature): the largest motion in pixels of a corner between the two.
-
-    Entries of H are no measure: a change of 1e-4 in one may be nothing and in another half the image.
+    """consistency(H_geometric, H_feature): the largest motion of a corner between the two, in pixels.
 
     Args:
         H_geometric: (3, 3).
         H_feature: (3, 3).
-        corners: (n, 2) *target* pixels around what the source shows: its own corners may project to infinity.
+        corners: (n, 2) *target* pixels around the source's warp; the source's own corners may project to infinity.
     """
     M = normalised(H_feature) @ np.linalg.inv(normalised(H_geometric))
     moved = np.concatenate([corners, np.ones((len(corners), 1))], 1) @ M.T
@@ -115,18 +115,18 @@ def consistency(H_geometric: FloatArray, H_feature: FloatArray, corners: FloatAr
 
 
 def blend_weight(consistency_px: float, consistent_px: float, inconsistent_px: float) -> float:
-    """α by the degree of consistency: 0 up to ``consistent_px``, 1 from ``inconsistent_px``, linear between."""
+    """α from the consistency: 0 up to ``consistent_px``, 1 from ``inconsistent_px``, linear in between."""
     return float(np.clip((consistency_px - consistent_px) / (inconsistent_px - consistent_px), 0.0, 1.0))
 
 
 def h_base(H_geometric: FloatArray, H_feature: FloatArray, alpha: float) -> FloatArray:
-    """H_base = α H_geometric + (1 - α) H_feature, both normalised; α = 0 and α = 1 are the paper's outer cases."""
+    """H_base = α H_geometric + (1 − α) H_feature, both normalised; the other two cases are α = 0 and α = 1."""
     return alpha * normalised(H_geometric) + (1 - alpha) * normalised(H_feature)
 
 
 # --- matching ---------------------------------------------------------------------------------------------------------
 def overlap_region(one: BoolArray, two: BoolArray, margin_px: int) -> Region | None:
-    """Bounding box of what both (h, w) coverages hold, grown by a margin inside the image; None without overlap."""
+    """Bounding box of the overlap of two (h, w) coverages, grown by a margin inside the image; None without overlap."""
     rows, columns = (np.flatnonzero((one & two).any(axis)) for axis in (1, 0))
     if not len(rows):
         return None
@@ -142,17 +142,16 @@ def overlap_region(one: BoolArray, two: BoolArray, margin_px: int) -> Region | N
 def match_features(
     warped: GreyImage, reference: GreyImage, usable: BoolArray, ratio: float, max_features: int
 ) -> Matches:
-    """SIFT on both images, FLANN, and Lowe's ratio test d1 / d2 < ``ratio`` (Sec. FAVS, Stage 2).
+    """Match SIFT features by FLANN and Lowe's ratio test, good_matches = {m : d1 / d2 < ratio}.
 
-    FLANN's linear index is exact; its kd-trees would depend on the state of OpenCV's random generator. SIFT repeats
-    bit for bit within ``environment.repeatable_opencv`` only.
+    SIFT repeats bit for bit within ``environment.repeatable_opencv`` only.
 
     Args:
         warped: (h, w) the source's warp.
         reference: (h, w) the reference.
-        usable: (h, w) where keypoints count: the black beyond a warp's border has corners of its own.
+        usable: (h, w) bool, False where keypoints are ignored, as at a warp's black border.
         ratio: 0.75 in the paper.
-        max_features: Strongest keypoints to keep.
+        max_features: Number of the strongest keypoints to keep.
     """
     sift = cv2.SIFT_create(nfeatures=max_features)  # type: ignore[attr-defined]
     inside = usable.astype(np.uint8) * 255
@@ -173,10 +172,9 @@ def match_features(
 
 
 def estimate_homography(matches: Matches, ransac_px: float) -> tuple[FloatArray, BoolArray] | None:
-    """RANSAC(good_matches), as MAGSAC: (3, 3) M from warp to reference and the (n,) inliers; None where there is none.
+    """RANSAC(good_matches), as MAGSAC with its fixed seed: (3, 3) M from warp to reference and the (n,) inliers.
 
-    Points on one line, or all in one place, determine no homography. MAGSAC draws from a generator of its own, which
-    starts alike in every call.
+    None for degenerate matches, such as collinear points.
     """
     if len(matches.warped) < 4:
         return None
@@ -193,12 +191,12 @@ def estimate_homography(matches: Matches, ransac_px: float) -> tuple[FloatArray,
 
 # --- the stage --------------------------------------------------------------------------------------------------------
 def is_valid(H: FloatArray, visible: Region, scale: float, max_area_ratio: float) -> bool:
-    """check_homography on the corners of what the target shows of a source: others may lie behind the target.
+    """Apply check_homography to the visible part of a source: its other corners may lie behind the target.
 
     Args:
         H: (3, 3).
-        visible: That part, in source pixels.
-        scale: Source focal length over target focal length: a target of fewer pixels is no distortion.
+        visible: Bounding box of the part that the target shows, source pixels.
+        scale: Source focal length over target focal length, so that a smaller target is no distortion.
         max_area_ratio: The bound.
     """
     shift = np.array([[1.0, 0.0, visible.x0], [0.0, 1.0, visible.y0], [0.0, 0.0, 1.0]])
@@ -215,14 +213,14 @@ def optimise_transformation(
     focal_ratio: float,
     config: PaperConfig,
 ) -> FeatureReport:
-    """Stage 2 for one source: match its warp to the reference, accept or not, and the three cases of H_base.
+    """Run stage 2 for one source: match its warp to the reference and update the base transformation.
 
     Args:
         H_geometric: (3, 3) from stage 1.
-        warped: (h, w) the source warped by it.
+        warped: (h, w) the source's warp by it.
         reference: (h, w) the primary camera's warp.
-        coverages: (h, w) where each of the two shows its source.
-        visible: What the target shows of the source, in source pixels.
+        coverages: (h, w) bool of the two warps.
+        visible: Bounding box of the part of the source that the target shows, source pixels.
         focal_ratio: Source focal length over target focal length.
         config: Settings.
     """
@@ -240,7 +238,9 @@ def optimise_transformation(
     found = match_features(warped[crop], reference[crop], usable, config.ratio, config.max_features)
     offset = np.array([region.x0, region.y0])
     matches = Matches(found.warped + offset, found.reference + offset)
-    return accept(H_geometric, matches, _bounding_box(coverages[0]), visible, focal_ratio, scale, config)
+    shown = overlap_region(coverages[0], coverages[0], 0)
+    assert shown is not None
+    return accept(H_geometric, matches, shown, visible, focal_ratio, scale, config)
 
 
 def accept(
@@ -252,13 +252,13 @@ def accept(
     scale: float,
     config: PaperConfig,
 ) -> FeatureReport:
-    """The three acceptance criteria and the three cases of H_base (Sec. FAVS, Stage 2).
+    """Apply the paper's three criteria for reliable matches and choose the case of H_base.
 
     Args:
         H_geometric: (3, 3) from stage 1.
         matches: good_matches.
         shown: Bounding box of the source's warp, target pixels.
-        visible: The same in source pixels.
+        visible: The same, source pixels.
         focal_ratio: Source focal length over target focal length.
         scale: Target width over ``REFERENCE_WIDTH_PX``.
         config: Settings.
@@ -271,32 +271,26 @@ def accept(
         return unmatched(H_geometric, f"{count} good matches determine no homography", matches)
     M, inlier = estimate
     H_feature = M @ H_geometric
-    kept = Matches(matches.warped[inlier], matches.reference[inlier])
+    agreeing = Matches(matches.warped[inlier], matches.reference[inlier])
     inliers = int(inlier.sum())
     if not is_valid(H_feature, visible, focal_ratio, config.max_area_ratio):
         reason = f"H_feature from {inliers} of {count} matches distorts the corners too much"
-        return FeatureReport(normalised(H_geometric), "geometric", 1.0, count, inliers, None, reason, kept)
-    moved_px = consistency(H_geometric, H_feature, shown.corners)
-    near, limit = config.consistent_px * scale, config.inconsistent_px * scale
-    alpha = blend_weight(moved_px, near, limit)
-    base = h_base(H_geometric, H_feature, alpha)
-    evidence = f"{inliers} of {count} matches move the corners by {moved_px:.1f} px"
+        return FeatureReport(normalised(H_geometric), "geometric", 1.0, count, inliers, None, reason, agreeing)
+    consistency_px = consistency(H_geometric, H_feature, shown.corners)
+    consistent_px, inconsistent_px = config.consistent_px * scale, config.inconsistent_px * scale
+    alpha = blend_weight(consistency_px, consistent_px, inconsistent_px)
+    evidence = f"{inliers} of {count} matches move the corners by {consistency_px:.1f} px"
     case: Case
     if alpha == 0:
-        case, reason = "feature", f"consistent: {evidence}, at most {near:.1f}"
+        case, reason = "feature", f"consistent: {evidence}, at most {consistent_px:.1f}"
     elif alpha < 1:
         case, reason = "blended", f"partially consistent: {evidence}, alpha {alpha:.2f}"
     else:
-        case, reason = "geometric", f"inconsistent: {evidence}, not below {limit:.1f}"
-    return FeatureReport(base, case, alpha, count, inliers, moved_px, reason, kept)
+        case, reason = "geometric", f"inconsistent: {evidence}, not below {inconsistent_px:.1f}"
+    base = h_base(H_geometric, H_feature, alpha)
+    return FeatureReport(base, case, alpha, count, inliers, consistency_px, reason, agreeing)
 
 
 def unmatched(H_geometric: FloatArray, reason: str, matches: Matches = NO_MATCHES) -> FeatureReport:
-    """H_geometric as it is, with the reason."""
+    """Report that H_geometric is kept, with the reason."""
     return FeatureReport(normalised(H_geometric), "geometric", 1.0, len(matches.warped), 0, None, reason, matches)
-
-
-def _bounding_box(coverage: BoolArray) -> Region:
-    box = overlap_region(coverage, coverage, 0)
-    assert box is not None  # sources without coverage are no candidates
-    return box

@@ -1,7 +1,13 @@
-"""FAVS Stage 3, object alignment: clusters of matches are objects, and their mean offset shifts the homography.
+"""FAVS Stage 3: cluster the matches into objects and shift the homography by their mean offset.
 
-DBSCAN finds the clusters in target pixels; each is an object {center, bbox, confidence, type}. ΔT minimises
-Σ w_j ‖c2_j − (H_base c1_j + ΔT)‖², which is the weighted mean of the residuals, and H_aligned = T(β ΔT) · H_base.
+Equations of the paper's section "Feature-Aware Adaptive View Synthesis (FAVS) Algorithm", "Stage 3: Object Alignment
+Fine-tuning":
+
+- clusters = DBSCAN(keypoints, ε, min_samples): ``clusters``, in target pixels.
+- object_j = {center_j, bbox_j, confidence_j, type_j}, with centroids c1_j and c2_j: ``SceneObject``, ``find_objects``.
+- w_j = confidence_j × type_weight_j × density_factor_j: ``SceneObject.weight``, ``confidence``, ``density_factor``.
+- ΔT = argmin Σ w_j ‖c2_j − (H_base c1_j + ΔT)‖²: ``mean_offset``.
+- H_aligned = T(β ΔT) · H_base: ``aligned``.
 """
 
 from __future__ import annotations
@@ -20,11 +26,11 @@ from arbiview_aug.favs.stage2_features import REFERENCE_WIDTH_PX, Matches
 
 @dataclass(frozen=True)
 class Detection:
-    """A detector's box in a source image, which gives the objects in it their type.
+    """Detector's box in a source image, from which objects take their type.
 
     Attributes:
         box: (x0, y0, x1, y1) in source pixels.
-        type: Its class; ``PaperConfig.type_weights`` says what it weighs.
+        type: Class name, weighted by ``PaperConfig.type_weights``.
     """
 
     box: tuple[float, float, float, float]
@@ -33,15 +39,15 @@ class Detection:
 
 @dataclass(frozen=True)
 class SceneObject:
-    """object_j = {center_j, bbox_j, confidence_j, type_j} (Sec. FAVS, Stage 3).
+    """object_j = {center_j, bbox_j, confidence_j, type_j}.
 
     Attributes:
-        center_source: c1: (2,) centroid in the source image.
-        center_target: c2: (2,) centroid in the reference, target pixels.
+        center_source: c1_j, (2,) centroid in source pixels.
+        center_target: c2_j, (2,) centroid in the reference, target pixels.
         bbox: (x0, y0, x1, y1) around its points in the reference.
-        confidence: In (0, 1]: how far the object moves as a whole.
+        confidence: In (0, 1], 1 where all points have the same offset.
         type: ``ground``, ``upright``, ``far``, or a detector's class.
-        density_factor: In (0, 1): how densely its points lie.
+        density_factor: In (0, 1).
         points: n_j.
     """
 
@@ -60,13 +66,13 @@ class SceneObject:
 
 @dataclass(frozen=True)
 class AlignmentReport:
-    """What stage 3 found for one source.
+    """Result of stage 3 for one source.
 
     Attributes:
         H_aligned: (3, 3) T(β ΔT) · H_base.
         shift_px: (2,) ΔT, zero where it was declined.
-        objects: The objects it was averaged over.
-        reason: In words.
+        objects: The objects found.
+        reason: Explanation of the shift.
     """
 
     H_aligned: FloatArray
@@ -77,34 +83,34 @@ class AlignmentReport:
 
 # --- equations --------------------------------------------------------------------------------------------------------
 def mean_offset(c1: FloatArray, c2: FloatArray, weights: FloatArray, H_base: FloatArray) -> FloatArray:
-    """ΔT = argmin Σ w_j ‖c2_j − (H_base c1_j + ΔT)‖² = Σ w_j (c2_j − H_base c1_j) / Σ w_j.
+    """ΔT = argmin Σ w_j ‖c2_j − (H_base c1_j + ΔT)‖², which is the weighted mean of c2_j − H_base c1_j.
 
     Args:
         c1: (m, 2) object centres in the source.
         c2: (m, 2) in the target.
         weights: (m,) >= 0, not all 0.
-        H_base: (3, 3).
+        H_base: (3, 3) source to target.
     """
     return weights @ (c2 - apply(H_base, c1)) / weights.sum()
 
 
 def aligned(H_base: FloatArray, shift_px: FloatArray, beta: float) -> FloatArray:
-    """H_aligned = T(β ΔT) · H_base: a translation in the target's pixels."""
+    """H_aligned = T(β ΔT) · H_base, a translation in target pixels."""
     T = np.eye(3)
     T[:2, 2] = beta * np.asarray(shift_px)
     return T @ H_base
 
 
 def confidence(offsets: FloatArray, spread_px: float) -> float:
-    """confidence_j = 1 / (1 + (s / spread_px)²), s the RMS distance of the (n, 2) offsets from their mean."""
+    """confidence_j = 1 / (1 + (s / spread_px)²), with s the RMS distance of the (n, 2) offsets from their mean."""
     squared = ((offsets - offsets.mean(0)) ** 2).sum(1).mean()
     return float(1 / (1 + squared / spread_px**2))
 
 
 def density_factor(points: FloatArray, radius_px: float, min_samples: int) -> float:
-    """density_factor_j = ρ / (ρ + min_samples), ρ the number of (n, 2) points in a square of side ``radius_px``.
+    """density_factor_j = ρ / (ρ + min_samples), with ρ the number of (n, 2) points per square of side ``radius_px``.
 
-    A cluster as dense as DBSCAN just accepts has 1/2. Clusters smaller than the square count as it.
+    Clusters smaller than the square count as one square.
     """
     width, height = np.maximum(np.ptp(points, axis=0), radius_px)
     density = len(points) * radius_px**2 / (width * height)
@@ -112,31 +118,31 @@ def density_factor(points: FloatArray, radius_px: float, min_samples: int) -> fl
 
 
 def apply(H: npt.NDArray[np.floating], points: FloatArray) -> FloatArray:
-    """Pixels (n, 2) through a homography."""
+    """Map (n, 2) pixels by a homography."""
     x = np.concatenate([points, np.ones((len(points), 1))], 1) @ H.T
     return x[:, :2] / x[:, 2:]
 
 
 # --- objects ----------------------------------------------------------------------------------------------------------
 def clusters(points: FloatArray, radius_px: float, min_samples: int) -> npt.NDArray[np.int64]:
-    """clusters = DBSCAN(keypoints, ε, min_samples): (n,) cluster numbers, -1 for noise."""
+    """clusters = DBSCAN(keypoints, ε, min_samples): (n,) cluster indices, -1 for noise."""
     if len(points) < min_samples:
         return np.full(len(points), -1, np.int64)
-    from sklearn.cluster import DBSCAN  # more than a second to import: only who aligns objects pays for it
+    from sklearn.cluster import DBSCAN  # imported here: takes more than a second
 
     return np.asarray(DBSCAN(eps=radius_px, min_samples=min_samples).fit_predict(points), np.int64)
 
 
 def geometric_type(bbox: tuple[float, float, float, float], target: Camera, ground_z_m: float, reach_m: float) -> str:
-    """Type of a cluster without a detector, by the road's plane.
+    """Classify a cluster by the road plane, for want of a detector.
 
-    ``ground``: even its top edge meets the road within ``reach_m``. ``far``: its bottom edge lies above the horizon.
-    ``upright``: anything between: it stands on the road and rises above it, as vehicles and pedestrians do.
+    ``far``: its bottom edge lies above the horizon. ``ground``: its top edge meets the road within ``reach_m``.
+    ``upright``: all others, such as vehicles and pedestrians.
 
     Args:
         bbox: (x0, y0, x1, y1), target pixels.
         target: The target camera.
-        ground_z_m: The road's height in its ego frame.
+        ground_z_m: Height of the road in its ego frame.
         reach_m: Distance along the ray.
     """
     x = (bbox[0] + bbox[2]) / 2
@@ -156,28 +162,28 @@ def find_objects(
     config: PaperConfig,
     detections: Sequence[Detection] = (),
 ) -> list[SceneObject]:
-    """The objects among one source's matches.
+    """Cluster one source's matches into objects.
 
     Args:
-        matches: Target pixels, the source's warped by ``H_geometric``.
-        H_geometric: (3, 3) that the source was warped by.
-        H_base: (3, 3) from stage 2: offsets are what it leaves.
+        matches: From stage 2.
+        H_geometric: (3, 3) by which the source was warped for matching.
+        H_base: (3, 3) from stage 2.
         target: The target camera.
-        ground_z_m: The road's height in its ego frame.
+        ground_z_m: Height of the road in its ego frame.
         config: Settings.
         detections: Boxes in the source image; the smallest one around an object's centre gives its type.
     """
     scale = target.width_px / REFERENCE_WIDTH_PX
     radius_px = config.cluster_radius_px * scale
-    label = clusters(matches.reference, radius_px, config.min_samples)
-    in_source = apply(np.linalg.inv(H_geometric), matches.warped) if len(label) else matches.warped
-    found = []
-    for k in range(label.max(initial=-1) + 1):
-        p1: FloatArray = in_source[label == k]
-        p2: FloatArray = matches.reference[label == k]
+    cluster = clusters(matches.reference, radius_px, config.min_samples)
+    in_source = apply(np.linalg.inv(H_geometric), matches.warped) if len(cluster) else matches.warped
+    objects = []
+    for k in range(cluster.max(initial=-1) + 1):
+        p1: FloatArray = in_source[cluster == k]
+        p2: FloatArray = matches.reference[cluster == k]
         x0, y0, x1, y1 = (float(v) for v in (*p2.min(0), *p2.max(0)))
         c1: FloatArray = p1.mean(0)
-        found.append(
+        objects.append(
             SceneObject(
                 center_source=c1,
                 center_target=p2.mean(0),
@@ -189,7 +195,7 @@ def find_objects(
                 points=len(p1),
             )
         )
-    return found
+    return objects
 
 
 def _detected_type(center: FloatArray, detections: Sequence[Detection]) -> str:
@@ -201,7 +207,7 @@ def _detected_type(center: FloatArray, detections: Sequence[Detection]) -> str:
 def align_objects(
     objects: Sequence[SceneObject], H_base: FloatArray, width_px: int, config: PaperConfig
 ) -> AlignmentReport:
-    """Stage 3 for one source: ΔT over its objects, bounded, and H_aligned.
+    """Compute ΔT over the objects, decline it if too long, and apply it to H_base.
 
     Args:
         objects: From ``find_objects``.
@@ -213,7 +219,7 @@ def align_objects(
         return declined(H_base, "no cluster of matches: nothing to align")
     weights = np.array([o.weight(config) for o in objects])
     if weights.sum() <= 0:
-        return declined(H_base, f"{len(objects)} clusters, none of a type that counts", objects)
+        return declined(H_base, f"{len(objects)} clusters, none with a positive type weight", objects)
     c1, c2 = (np.stack([getattr(o, name) for o in objects]) for name in ("center_source", "center_target"))
     shift = mean_offset(c1, c2, weights, H_base)
     length, limit = float(np.linalg.norm(shift)), config.max_shift_px * width_px / REFERENCE_WIDTH_PX
@@ -225,5 +231,5 @@ def align_objects(
 
 
 def declined(H_base: FloatArray, reason: str, objects: Sequence[SceneObject] = ()) -> AlignmentReport:
-    """H_base as it is, with the reason."""
+    """Report that H_base is kept, with the reason."""
     return AlignmentReport(H_base, np.zeros(2), tuple(objects), reason)

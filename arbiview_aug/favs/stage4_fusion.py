@@ -1,45 +1,126 @@
-"""FAVS Stage 4, adaptive fusion: w = w_distance · w_gradient · w_quality · w_primary, and the weighted average.
+"""FAVS Stage 4: warping by the final homographies, fusion weights, and the weighted average.
 
-The weights that do not depend on image content (distance, quality, primary) are part of a render plan and decide
-which source wins a pixel; the gradient weight needs the warped images.
+Equations of the paper's section "Feature-Aware Adaptive View Synthesis (FAVS) Algorithm", "Stage 4: Adaptive Fusion
+Generation":
+
+- I_warped⁽ⁱ⁾ = warp_perspective(I_source⁽ⁱ⁾, H_final⁽ⁱ⁾): ``warp_perspective``.
+- w⁽ⁱ⁾ = w_distance⁽ⁱ⁾ · w_gradient⁽ⁱ⁾ · w_quality⁽ⁱ⁾ · w_primary⁽ⁱ⁾: ``fusion_weight``, a function per factor.
+- I_target = Σ w⁽ⁱ⁾ I_warped⁽ⁱ⁾ / Σ w⁽ⁱ⁾: ``fuse``.
+
+Render plans (``arbiview_aug.render``) choose their sources by the weights that do not depend on image content:
+distance, quality and primary.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
 import numpy as np
+import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.favs.config import PaperConfig
+
+Float32Image = npt.NDArray[np.float32]
+
+_UNMASKED = 1 - 1e-6  # share of unmasked taps that counts as all: bilinear weights are sums of float32
 
 
-def distance_weight(distance_px: FloatArray, d_max_px: float, gamma: float) -> FloatArray:
-    """w_distance(x, y) = (d(x, y) / d_max)^γ: 0 at the border of what a source sees, 1 at its middle.
+class Warp(NamedTuple):
+    """A source image as the target sees it.
+
+    Attributes:
+        image: (h, w, 3) in 0..255, black outside the coverage.
+        coverage: (h, w) bool, True where the source sees the scene.
+        in_image: (h, w) bool, the coverage with the pixels that the source's mask hides.
+        uv: (h, w, 2) float32 source pixels.
+    """
+
+    image: Float32Image
+    coverage: BoolArray
+    in_image: BoolArray
+    uv: npt.NDArray[np.float32]
+
+
+# --- warping ----------------------------------------------------------------------------------------------------------
+def warp_perspective(image: Float32Image, H: FloatArray, size: tuple[int, int], mask: BoolArray | None = None) -> Warp:
+    """I_warped = warp_perspective(I_source, H), bilinear.
+
+    Unlike ``cv2.warpPerspective``, this rejects points behind the camera and never reads masked pixels or the border.
 
     Args:
-        distance_px: (...,) distance to the border, by distance transform or in closed form; negative outside.
-        d_max_px: The largest distance there is, > 0.
+        image: (H, W, 3), 0 where masked.
+        H: (3, 3) source pixels to target pixels, positive third coordinates in front.
+        size: (h, w) of the target.
+        mask: (H, W) bool, False on the own car's body.
+    """
+    uv, in_image = source_pixels(H, image.shape[:2], size)
+    coverage = in_image
+    u, v = (np.ascontiguousarray(uv[..., k]) for k in (0, 1))
+    if mask is not None and in_image.any():
+        unmasked = cv2.remap(mask.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        coverage = in_image & (unmasked >= _UNMASKED)
+    warped = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    warped[~coverage] = 0
+    return Warp(np.asarray(warped, np.float32), coverage, in_image, uv)
+
+
+def source_pixels(
+    H: FloatArray, source_size: tuple[int, ...], size: tuple[int, int]
+) -> tuple[npt.NDArray[np.float32], BoolArray]:
+    """Map each target pixel to the source by H⁻¹.
+
+    Args:
+        H: (3, 3) source pixels to target pixels, positive third coordinates in front.
+        source_size: (H, W) of the source.
+        size: (h, w) of the target.
+
+    Returns:
+        (h, w, 2) float32 source pixels; (h, w) bool, True in front of the source and between its outermost pixels.
+    """
+    back = np.linalg.inv(H)
+    x, y = np.arange(size[1], dtype=np.float64), np.arange(size[0], dtype=np.float64)[:, None]
+    u, v, third = (row[0] * x + (row[1] * y + row[2]) for row in back)
+    front = third > 1e-9 * np.abs(back[2]).max()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        uv = np.stack([u / third, v / third], -1)
+    uv = np.where(front[..., None], uv, -1.0)
+    # Rotations of whole images land a rounding error beside the outermost pixel centres.
+    nearest = np.round(uv)
+    uv = np.where(np.abs(uv - nearest) < 1e-9, nearest, uv)
+    inside = (uv >= 0) & (uv <= (source_size[1] - 1, source_size[0] - 1))
+    return np.clip(uv, -1.0, 32767.0).astype(np.float32), front & inside[..., 0] & inside[..., 1]
+
+
+# --- weights ----------------------------------------------------------------------------------------------------------
+def distance_weight(distance_px: FloatArray, d_max_px: float, gamma: float) -> FloatArray:
+    """w_distance(x, y) = (d(x, y) / d_max)^γ: 0 at the border of a source's coverage, 1 at its middle.
+
+    Args:
+        distance_px: (...,) distance to the border; negative outside.
+        d_max_px: Largest distance, > 0.
         gamma: γ >= 0.
     """
     return np.clip(distance_px / d_max_px, 0.0, 1.0) ** gamma
 
 
 def gradient_weight(gradient_magnitude: FloatArray, sigma: float) -> FloatArray:
-    """w_gradient(x, y) = 1 / (1 + |∇I(x, y)| / σ): less weight where the image has strong edges.
+    """w_gradient(x, y) = 1 / (1 + ‖∇I(x, y)‖ / σ): less weight at strong edges.
 
     Args:
-        gradient_magnitude: (...,) |∇I| in grey levels a pixel.
+        gradient_magnitude: (...,) ‖∇I‖ in grey levels per pixel.
         sigma: σ > 0 in the same unit.
     """
     return 1.0 / (1.0 + gradient_magnitude / sigma)
 
 
 def quality_weight(parallax_px: FloatArray, resolution: FloatArray) -> FloatArray:
-    """w_quality: a source's geometric quality, in (0, 1].
-
-    The paper weighs by matching quality; without matches the calibration says what to expect: the displacement that
-    an unknown depth could cause, and the resolution that the source has left.
+    """w_quality in (0, 1] from calibration alone, for render plans; ``fusion_weight`` has that of matched images.
 
     Args:
-        parallax_px: (...,) expected displacement in target pixels, >= 0.
+        parallax_px: (...,) displacement in target pixels that unknown depth may cause, >= 0.
         resolution: (...,) source pixels per target pixel along the worse axis.
     """
     return np.clip(resolution, 0.05, 1.0) / (1.0 + parallax_px)
@@ -50,15 +131,44 @@ def primary_weight(is_primary: bool, bonus: float) -> float:
     return bonus if is_primary else 1.0
 
 
+def fusion_weight(
+    image: Float32Image, coverage: BoolArray, quality: float, primary: bool, config: PaperConfig
+) -> npt.NDArray[np.float32]:
+    """w = w_distance · w_gradient · w_quality · w_primary, (h, w), 0 outside the coverage.
+
+    Args:
+        image: (h, w, 3) warped source, 0..255.
+        coverage: (h, w) bool.
+        quality: Matching quality in [0, 1]; unused for the primary camera, to which the others are matched.
+        primary: Whether the source is the primary camera.
+        config: Settings.
+    """
+    weight = coverage.astype(np.float64)
+    if config.use_distance_weight and not coverage.all():  # without a border there is no distance to it
+        distance = cv2.distanceTransform(coverage.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        weight = weight * distance_weight(distance.astype(np.float64), float(distance.max()), config.distance_gamma)
+    if config.use_gradient_weight:
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        gradient = [cv2.Sobel(grey, cv2.CV_32F, dx, dy, scale=1 / 8) for dx, dy in ((1, 0), (0, 1))]
+        weight = weight * gradient_weight(np.asarray(cv2.magnitude(*gradient), np.float64), config.gradient_sigma)
+    if config.use_quality_weight and not primary:
+        weight = weight * (config.unmatched_quality + (1 - config.unmatched_quality) * quality)
+    if config.use_primary_weight:
+        weight = weight * primary_weight(primary, config.primary_bonus)
+    # Small weights may underflow in float32, but covered pixels must stay covered.
+    return np.where(coverage, np.maximum(weight, np.finfo(np.float32).tiny), 0).astype(np.float32)
+
+
+# --- the weighted average ---------------------------------------------------------------------------------------------
 def fuse(images: FloatArray, weights: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """I_target = Σ w⁽ⁱ⁾ I⁽ⁱ⁾ / Σ w⁽ⁱ⁾, and where any weight is positive.
+    """I_target = Σ w⁽ⁱ⁾ I_warped⁽ⁱ⁾ / Σ w⁽ⁱ⁾.
 
     Args:
         images: (S, h, w, 3) warped sources.
         weights: (S, h, w) >= 0.
 
     Returns:
-        (h, w, 3) fused image, 0 where all weights are zero; (h, w) covered.
+        (h, w, 3) fused image, 0 where all weights are zero; (h, w) bool, True where any is positive.
     """
     # Divided by the largest first: the sum of subnormal weights would lose digits.
     largest = weights.max(axis=0)
@@ -67,3 +177,25 @@ def fuse(images: FloatArray, weights: FloatArray) -> tuple[FloatArray, BoolArray
     total = scaled.sum(axis=0)
     fused = (images * scaled[..., None]).sum(axis=0) / np.where(covered, total, 1.0)[..., None]
     return np.where(covered[..., None], fused, 0.0), covered
+
+
+def adaptive_fusion(
+    warps: Sequence[Warp], qualities: Sequence[float], primary: int, config: PaperConfig
+) -> tuple[Float32Image, npt.NDArray[np.int64]]:
+    """Weight and fuse the warped sources of one target view.
+
+    Args:
+        warps: S warped sources.
+        qualities: Matching quality of each in [0, 1].
+        primary: Index of the primary camera's warp.
+        config: Settings.
+
+    Returns:
+        (h, w, 3) fused image; (h, w) index of the source with the largest weight, -1 where there is none.
+    """
+    weights = [
+        fusion_weight(warp.image, warp.coverage, quality, k == primary, config)
+        for k, (warp, quality) in enumerate(zip(warps, qualities, strict=True))
+    ]
+    fused, covered = fuse(np.stack([warp.image for warp in warps]), np.stack(weights))
+    return fused.astype(np.float32), np.where(covered, np.argmax(weights, axis=0), -1)

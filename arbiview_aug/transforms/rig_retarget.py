@@ -17,7 +17,8 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
-from arbiview_aug.favs.renderer import PaperRendering, check_pinhole, check_settings, render_paper
+from arbiview_aug.favs.renderer import PaperRendering, check_settings, render_paper
+from arbiview_aug.favs.stage1_geometry import check_pinhole
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.batches import complete_frame, frame_names
 from arbiview_aug.generator.fillers import Holes, fill_frame

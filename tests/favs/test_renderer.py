@@ -10,9 +10,9 @@ import torch
 
 from arbiview_aug import CalibrationError, PaperConfig, Rig, RigRetarget, SampleError, load_rig
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.favs.renderer import PaperRendering, fusion_weight, paper_labels, primary_camera, render_paper
+from arbiview_aug.favs.renderer import PaperRendering, paper_labels, primary_camera, render_paper
 from arbiview_aug.favs.stage1_geometry import h_geom
-from arbiview_aug.favs.stage4_fusion import fuse
+from arbiview_aug.favs.stage4_fusion import fuse, fusion_weight
 from arbiview_aug.render.plan import build_plan
 from arbiview_aug.transforms.explain import PaperExplanation
 from tests import helpers
@@ -270,7 +270,7 @@ def test_messages(pair_images) -> None:
     ]:
         with pytest.raises(ValueError, match=message):
             RigRetarget(MIDDLE, quality="paper", **settings)
-    with pytest.raises(CalibrationError, match=r"'FRONT': quality='paper'.*undistorted\(\)"):
+    with pytest.raises(CalibrationError, match=r"'FRONT': a homography \(quality='paper'\).*undistorted\(\)"):
         RigRetarget("waymo", quality="paper")
     retarget = RigRetarget(MIDDLE, quality="paper")
     with pytest.raises(CalibrationError, match=r"got radtan; use .undistorted\(\)"):

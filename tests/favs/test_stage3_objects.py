@@ -146,4 +146,4 @@ def test_long_shifts_and_worthless_types_decline() -> None:
     assert report.reason == "1 objects ask for 12.7 px, more than 12.0" and np.array_equal(report.H_aligned, EYE)
     assert align_objects(found, EYE, 1600, CONFIG).shift_px.any()  # lengths scale with the target's width
     worthless = PaperConfig(type_weights=(("far", 0.0),))
-    assert align_objects(found, EYE, 800, worthless).reason == "1 clusters, none of a type that counts"
+    assert align_objects(found, EYE, 800, worthless).reason == "1 clusters, none with a positive type weight"

@@ -11,7 +11,7 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.favs.config import FavsConfig, draft
+from arbiview_aug.favs.config import FavsConfig, favs_config
 from arbiview_aug.favs.stage1_geometry import h_geom
 from arbiview_aug.render.atlas import AtlasLayout, FixedMap, Scratch
 from arbiview_aug.render.labels import render_labels
@@ -225,7 +225,7 @@ def test_seams_are_blended_and_draft_does_not() -> None:
         return float(np.abs(np.diff(row)).max())
 
     target = rig.turned(yaw_deg=22)
-    assert largest_step(build_plan(rig, target, config=draft())) >= 30
+    assert largest_step(build_plan(rig, target, config=favs_config("draft"))) >= 30
     assert largest_step(build_plan(rig, target)) <= 30
 
 
@@ -280,7 +280,7 @@ def test_only_magnified_views_are_read_by_cubics(factor: float, expected: str) -
     rig = load_rig("nuscenes").resized(0.25)
     target = zoomed(rig, factor).turned(yaw_deg=3)
     assert {view.interpolation for view in build_plan(rig, target).targets} == {expected}
-    assert {view.interpolation for view in build_plan(rig, target, config=draft()).targets} == {"nearest"}
+    assert {view.interpolation for view in build_plan(rig, target, config=favs_config("draft")).targets} == {"nearest"}
 
 
 @pytest.mark.slow

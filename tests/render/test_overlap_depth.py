@@ -14,7 +14,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.overlap import half_way_view
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
-from arbiview_aug.favs.config import accurate, favs_config
+from arbiview_aug.favs.config import favs_config
 from arbiview_aug.render.overlap_depth import LIMITS, MIN_RISE_DB, OverlapDepth, overlap_depth
 from arbiview_aug.render.plan import RenderPlan, build_plan
 from arbiview_aug.render.refinement import RefinementCache
@@ -126,7 +126,9 @@ def test_declines_what_says_nothing(name: str) -> None:
     """Bit for bit the unrefined picture, and a reason."""
     sample = {"images": USELESS[name]}
     refining = RigRetarget(TARGET, source_rig=RIG, surface="street", quality="accurate")
-    plain = RigRetarget(TARGET, source_rig=RIG, surface="street", quality=replace(accurate(), overlap_depth=False))
+    plain = RigRetarget(
+        TARGET, source_rig=RIG, surface="street", quality=replace(favs_config("accurate"), overlap_depth=False)
+    )
     assert torch.equal(refining(sample)["images"], plain(sample)["images"])
     (report,) = refining.explain(sample).depth.reports  # type: ignore[union-attr]
     assert not report.accepted and report.reason
@@ -294,5 +296,4 @@ def test_the_plan_knows_its_corrections(nearer: tuple[torch.Tensor, OverlapDepth
 
 
 def test_the_preset() -> None:
-    assert favs_config("accurate") == accurate()
-    assert accurate().overlap_depth and MIN_RISE_DB > 0
+    assert favs_config("accurate").overlap_depth and MIN_RISE_DB > 0

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.favs.config import FavsConfig, draft
+from arbiview_aug.favs.config import FavsConfig, favs_config
 from arbiview_aug.render import view_planner
 from arbiview_aug.render.plan import RenderPlan, build_plan
 from arbiview_aug.render.requirements import MOVED_M, baselines_m, covers_target_exactly, needs_geometry, static_harm
@@ -46,7 +46,9 @@ def same(one: RenderPlan, two: RenderPlan) -> bool:
     return one.layout.size == two.layout.size
 
 
-@pytest.mark.parametrize("config", [FAST, draft(), FavsConfig(distance_gamma=1.5)], ids=["fast", "draft", "gamma"])
+@pytest.mark.parametrize(
+    "config", [FAST, favs_config("draft"), FavsConfig(distance_gamma=1.5)], ids=["fast", "draft", "gamma"]
+)
 @pytest.mark.parametrize(
     "view", [lambda c: c, lambda c: zoomed(c, 1.2), lambda c: zoomed(c, 1.4).turned(yaw_deg=2, pitch_deg=1)]
 )

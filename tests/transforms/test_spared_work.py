@@ -18,7 +18,7 @@ from arbiview_aug.cameras.overlap import adjacent_pairs
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.bench.data import as_of_another_frame
 from arbiview_aug.evaluate.targets import without_masks
-from arbiview_aug.favs.config import FavsConfig, accurate
+from arbiview_aug.favs.config import FavsConfig, favs_config
 from arbiview_aug.transforms.explain import Explanation
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.helpers import street_sample
@@ -140,8 +140,8 @@ def situations(sample: Mapping[str, Any]) -> list[Situation]:
         Situation(
             "the same, accurate",
             "no overlap is matched",
-            Case(bare, cut, {"quality": replace(accurate(), interpolation="linear")}),
-            over("street", cut, bare, quality=replace(accurate(), interpolation="linear")),
+            Case(bare, cut, {"quality": replace(favs_config("accurate"), interpolation="linear")}),
+            over("street", cut, bare, quality=replace(favs_config("accurate"), interpolation="linear")),
         ),
     ]
     if "points" in sample:

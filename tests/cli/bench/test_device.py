@@ -11,7 +11,7 @@ import torch
 
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.bench.device import DTYPES, bytes_moved, device_table, measure_device
-from arbiview_aug.favs.config import draft
+from arbiview_aug.favs.config import favs_config
 from arbiview_aug.render.plan import build_plan
 from tests.helpers import street_sample
 
@@ -28,12 +28,12 @@ def test_bytes(sample: dict[str, Any]) -> None:
     rig = sample["rig"]
     images = [image[None].repeat(2, 1, 1, 1) for image in sample["images"]]
     pixels = 64 * 176
-    plan = build_plan(rig, rig, config=draft())
+    plan = build_plan(rig, rig, config=favs_config("draft"))
     assert bytes_moved(plan, images) == 6 * pixels * (2 * 3 + 2 * 4 + 2 * 3)
     floats = [image.float() for image in images]
     assert bytes_moved(plan, floats) == 6 * pixels * (2 * 12 + 8 + 2 * 12)
     one = rig.with_cameras([rig[0]])
-    assert bytes_moved(build_plan(rig, one, config=draft()), images) == pixels * (2 * 3 + 8 + 2 * 3)
+    assert bytes_moved(build_plan(rig, one, config=favs_config("draft")), images) == pixels * (2 * 3 + 8 + 2 * 3)
 
 
 @pytest.mark.parametrize("name", ["cpu", "cuda"])
