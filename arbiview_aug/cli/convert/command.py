@@ -30,7 +30,7 @@ from arbiview_aug.cli.arguments import (
 from arbiview_aug.cli.convert.job import Done, Jobs, OnError
 from arbiview_aug.cli.convert.ray_runner import ray_results
 from arbiview_aug.cli.convert.report import write_report
-from arbiview_aug.cli.convert.settings import FOLDER, Settings, check_output, check_target
+from arbiview_aug.cli.convert.settings import FOLDER, Settings, check_output
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.motion_depth import FOLDER as DEPTH_FOLDER
@@ -45,8 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Convert this shard's missing samples; the shard that completes them all finishes the output.
 
     Returns:
-        0; 1 where samples could not be read or rendered (unless they are to be skipped) or files not be written, which
-        are named.
+        0; 1 if samples could not be read or rendered (unless skipped), or files could not be written.
     """
     parser = _parser()
     arguments = parser.parse_args(argv)
@@ -56,19 +55,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"argument --motion-depth: expected it with --surface motion, got {arguments.surface}")
     settings = _settings(arguments)
     check_output(settings)
-    data = settings.open()
-    check_target(settings, data)
-    jobs, facts = _begun(settings, data, arguments)
+    jobs, facts = _begin(settings, settings.open(), arguments)
     tally = _Tally()
-    started = time.perf_counter()
-    for one in _run(jobs, arguments, tally):
-        if one.state == "stopped" or (one.state == "failed" and arguments.on_error == "fatal"):
+    started_s = time.perf_counter()
+    for done in _run(jobs, arguments, tally):
+        if done.state == "stopped" or (done.state == "failed" and arguments.on_error == "fatal"):
             break
     for line in dict.fromkeys(tally.warned):
         print(f"note: {line}", file=sys.stderr)
-    print(tally.summary(settings.output, time.perf_counter() - started))
-    for one in tally.named:
-        print(f"  {one.token}: {one.state}: {'; '.join(one.words)}", file=sys.stderr)
+    print(tally.summary(settings.output, time.perf_counter() - started_s))
+    for done in tally.unconverted:
+        print(f"  {done.token}: {done.state}: {'; '.join(done.messages)}", file=sys.stderr)
     if tally.states["stopped"] or tally.states["failed"]:
         return 1
     _finish(jobs, facts, arguments.report, arguments.num_shards)
@@ -144,15 +141,16 @@ def _parser() -> argparse.ArgumentParser:
 def _settings(arguments: argparse.Namespace) -> Settings:
     kind, root = split_kind(arguments.data)
     root = root.absolute()  # Ray's actors have a working directory of their own
-    depth, beside = arguments.motion_depth, inside(root, DEPTH_FOLDER, "depth from motion")
-    if depth is None and "motion" in SURFACES[arguments.surface].reads and beside.is_dir():
-        depth = beside
-    if depth is None and "motion" in SURFACES[arguments.surface].reads and not arguments.neighbours:
-        raise DataError(
-            f"--surface motion: expected depth from motion in {beside}, found none; make it with "
-            "python -m arbiview_aug depth --data DIR, or name its folder (--motion-depth), or find it anew from "
-            "other frames (--neighbours 2)"
-        )
+    depth = arguments.motion_depth
+    if depth is None and "motion" in SURFACES[arguments.surface].reads:
+        default = inside(root, DEPTH_FOLDER, "depth from motion")
+        depth = default if default.is_dir() else None
+        if depth is None and not arguments.neighbours:
+            raise DataError(
+                f"--surface motion: expected depth from motion in {default}, found none; make it with "
+                "python -m arbiview_aug depth --data DIR, or name its folder (--motion-depth), or estimate it from "
+                "other frames (--neighbours 2)"
+            )
     return Settings(
         root=root,
         kind=kind,
@@ -174,8 +172,8 @@ def _settings(arguments: argparse.Namespace) -> Settings:
     )
 
 
-def _begun(settings: Settings, data: Recording, arguments: argparse.Namespace) -> tuple[Jobs, Mapping[str, Any]]:
-    """The jobs of this shard, in a folder that says what it is made of; and that."""
+def _begin(settings: Settings, data: Recording, arguments: argparse.Namespace) -> tuple[Jobs, Mapping[str, Any]]:
+    """Make this shard's jobs, and write the output's facts or check them."""
     shard, shards = arguments.shard_index, arguments.num_shards
     try:
         settings.retarget()
@@ -196,17 +194,17 @@ def _begun(settings: Settings, data: Recording, arguments: argparse.Namespace) -
 def _run(jobs: Jobs, arguments: argparse.Namespace, tally: _Tally) -> Iterator[Done]:
     """Yield each sample's result, counted in ``tally``."""
 
-    def counted(one: Done) -> str:
-        tally.add(one)
+    def count_result(done: Done) -> str:
+        tally.add(done)
         return f"coverage {tally.coverage:.1%}"
 
     if arguments.runner == "ray":
-        yield from ray_results(jobs, arguments.workers, "convert", counted)
+        yield from ray_results(jobs, arguments.workers, "convert", count_result)
     elif arguments.workers > 1 and len(jobs) > 1:
-        yield from results(jobs, min(arguments.workers, len(jobs)), "convert", counted)
+        yield from results(jobs, min(arguments.workers, len(jobs)), "convert", count_result)
     else:
         with one_thread():
-            yield from results(jobs, 1, "convert", counted)
+            yield from results(jobs, 1, "convert", count_result)
 
 
 class _Tally:
@@ -215,42 +213,41 @@ class _Tally:
     def __init__(self) -> None:
         self.states: Counter[str] = Counter()
         self.seconds = np.zeros(3)
-        self.named: list[Done] = []
+        self.unconverted: list[Done] = []
         self.warned: list[str] = []
-        self._seen = 0.0
+        self._covered = 0.0
 
     @property
     def coverage(self) -> float:
         """Share of the pixels that some source saw, so far."""
-        return self._seen / max(1, self.states["made"] + self.states["kept"])
+        return self._covered / max(1, self.states["made"] + self.states["kept"])
 
-    def add(self, one: Done) -> None:
-        """One more."""
-        self.states[one.state] += 1
-        if one.state in ("made", "kept"):
-            self._seen += one.coverage
-            self.seconds += one.seconds
-            self.warned += one.words
+    def add(self, done: Done) -> None:
+        self.states[done.state] += 1
+        if done.state in ("made", "kept"):
+            self._covered += done.coverage
+            self.seconds += done.seconds
+            self.warned += done.messages
         else:
-            self.named.append(one)
+            self.unconverted.append(done)
 
     def summary(self, output: Path, wall_s: float) -> str:
-        """Counts, coverage and where the time went."""
+        """Counts, coverage and shares of the time."""
         words = {"kept": "there before", "skipped": "skipped", "failed": "failed"}
         counts = "".join(f", {self.states[state]} {word}" for state, word in words.items() if self.states[state])
-        lines = [f"{output}: {self.states['made']} samples converted{counts}; {self.coverage:.1%} of the pixels seen"]
-        made, spent_s = self.states["made"], float(self.seconds.sum())
-        if made:
-            read, retarget, write = self.seconds / spent_s
-            lines.append(
-                f"{1e3 * spent_s / made:.0f} ms a sample: read and decode {read:.0%}, retarget {retarget:.0%}, encode "
-                f"and write {write:.0%}; {made / wall_s:.2f} samples/s"
-            )
-        return "\n".join(lines)
+        made, total_s = self.states["made"], float(self.seconds.sum())
+        text = f"{output}: {made} samples converted{counts}; {self.coverage:.1%} of the pixels seen"
+        if not made:
+            return text
+        read, retarget, write = self.seconds / total_s
+        return (
+            f"{text}\n{1e3 * total_s / made:.0f} ms a sample: read and decode {read:.0%}, retarget {retarget:.0%}, "
+            f"encode and write {write:.0%}; {made / wall_s:.2f} samples/s"
+        )
 
 
 def _finish(jobs: Jobs, facts: Mapping[str, Any], report_frames: int, shards: int) -> None:
-    """Tables, provenance and report, where all samples of all shards are there."""
+    """Write tables, provenance and report once the samples of all shards are complete."""
     settings, tokens = jobs.settings, jobs.data.tokens
     converted, left_out = [], set()
     for record in jobs.manifest.records(tokens):
@@ -265,7 +262,7 @@ def _finish(jobs: Jobs, facts: Mapping[str, Any], report_frames: int, shards: in
             "machines see this folder under this path?"
         )
     if missing:
-        print(f"{missing} samples of other shards are not there yet; the last shard writes what belongs to all")
+        print(f"{missing} samples of other shards are missing so far; the last shard finishes the output")
         return
     if not converted:
         raise DataError(f"{settings.output}: expected at least one sample that can be converted, got none")

@@ -11,36 +11,25 @@ from arbiview_aug.atomic_io import inside, link_whole, write_whole
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.convert.manifest import Record
 from arbiview_aug.cli.convert.settings import FOLDER, Settings
+from arbiview_aug.cli.convert.writer import Writer
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, POINTS_FILE, SEQUENCE_FILE, FrameFolder
 from arbiview_aug.errors import DataError
 
 
-class FrameFolders:
-    """A folder for each frame of the source, by its name.
-
-    Args:
-        settings: Of the conversion.
-        data: The source.
-    """
+class FrameFolders(Writer):
+    """A folder for each frame of the source, by its name."""
 
     def __init__(self, settings: Settings, data: FrameFolder) -> None:
         self.output, self.data = settings.output, data
 
     def facts(self) -> dict[str, Any]:
-        """The source's identity, as plain data."""
         return {"kind": "frames", "root": self.data.root.resolve().name, "frames": self.data.tokens}
 
     def check(self) -> None:
-        """Refuse what would go wrong at the end.
-
-        Raises:
-            DataError: A frame's name is that of the conversion's own folder.
-        """
         if FOLDER in self.data.tokens:
             raise DataError(f"{self.data.root}: expected frames of other names than {FOLDER!r}; rename that folder")
 
     def stem(self, index: int, camera: int, name: str) -> str:
-        """The path of a view below the output, without its suffix."""
         return f"{self.data.tokens[index]}/{camera:02}"
 
     def rest(
@@ -51,18 +40,7 @@ class FrameFolders:
         rig: Rig,
         views: Sequence[Mapping[str, str]],
     ) -> tuple[dict[str, bytes], dict[str, Any]]:
-        """Link a frame's points; its calibration, which makes the folder a frame: so it is written last.
-
-        Args:
-            index: Of the frame.
-            sample: As it was read.
-            out: The same, retargeted.
-            rig: Its cameras.
-            views: Of each camera the files' names, by what follows their stem.
-
-        Returns:
-            Files, and further entries of the record.
-        """
+        """Link the points and write the calibration, last: it makes the folder a frame."""
         calibration, *_ = files = self.data.files(index)
         source = json.loads(calibration.read_text(encoding="utf-8"))
         calib = rig.to_dict()
@@ -80,15 +58,7 @@ class FrameFolders:
         return {f"{folder}/{CALIBRATION_FILE}": text}, {}
 
     def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
-        """Write what belongs to all frames: their sequence, without those that were left out.
-
-        Args:
-            records: Of the converted frames.
-            left_out: Tokens of the others.
-
-        Returns:
-            Notes for people.
-        """
+        """Write the frames' sequence, without those that were left out."""
         path = self.data.root / SEQUENCE_FILE
         if path.is_file():
             sequence = json.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""One sample: read, retargeted, written, recorded. The same function for every runner."""
+"""Conversion of one sample: read, retarget, write, record; the same for every runner."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from arbiview_aug.atomic_io import checksum, inside, write_whole
 from arbiview_aug.cli.arguments import gathered_warnings
 from arbiview_aug.cli.convert.manifest import Manifest, Record
 from arbiview_aug.cli.convert.settings import Settings
-from arbiview_aug.cli.convert.views import coded_views, rig_of
+from arbiview_aug.cli.convert.views import encode_views, rig_of
+from arbiview_aug.cli.convert.writer import Writer
 from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.motion_depth import WithMotionDepth
 from arbiview_aug.datasets.registry import find_reader
@@ -25,8 +26,8 @@ from arbiview_aug.errors import DataError, OutputError, described
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 OnError = Literal["report", "skip", "fatal"]
-"""Policy for samples that cannot be read or rendered, whatever they raise: ``report``: the others are converted,
-the output is not finished; ``skip``: it is left out, and said so; ``fatal``: all stops."""
+"""Policy for samples that cannot be read or rendered: ``report`` converts the others and leaves the output unfinished,
+``skip`` leaves the sample out and reports it, ``fatal`` stops."""
 
 State = Literal["made", "kept", "skipped", "failed", "stopped"]
 
@@ -35,48 +36,37 @@ class Done(NamedTuple):
     """Result of a sample.
 
     Attributes:
-        token: Of the sample.
-        state: ``made``; ``kept``: it was there before; ``skipped`` or ``failed``: it could not be read or rendered;
-            ``stopped``: it could not be written.
+        token: Name of the sample.
+        state: ``made``; ``kept`` from an earlier run; ``skipped`` or ``failed`` to read or render; ``stopped`` by a
+            failed write.
         coverage: Share of its pixels that some source saw.
-        seconds: Reading, retargeting, writing.
-        words: Warnings, or what failed.
+        seconds: Time to read, retarget and write.
+        messages: Warnings, or the error.
     """
 
     token: str
     state: State
     coverage: float = 0.0
     seconds: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    words: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()
 
 
-def format_of(settings: Settings, data: Recording) -> Any:
-    """The writer of the source's format.
-
-    Raises:
-        DataError: Its reader names none.
-    """
+def make_writer(settings: Settings, data: Recording) -> Writer:
+    """Make the writer of the source's format; DataError if its reader names none."""
     _, reader = find_reader(settings.root, settings.kind)
     if reader.writer is None:
         raise DataError(f"--data {settings.root}: expected a kind that can be written, got a {reader.description}")
     module, _, name = reader.writer.partition(":")
-    return getattr(import_module(module), name)(settings, data)
+    return getattr(import_module(module), name)(settings, data)  # type: ignore[no-any-return]
 
 
 class Jobs(Dataset[Done]):
-    """Samples that are converted where they are asked for.
-
-    Args:
-        settings: Of the conversion.
-        data: The source.
-        indices: The samples of this shard.
-        on_error: What becomes of samples that cannot be read or rendered.
-    """
+    """Samples of a shard, by their ``indices`` in the source, each converted on access."""
 
     def __init__(self, settings: Settings, data: Recording, indices: Sequence[int], on_error: OnError) -> None:
         self.settings, self.data, self.indices, self.on_error = settings, data, indices, on_error
         self.samples = settings.samples(data)
-        self.format, self.manifest = format_of(settings, data), Manifest(settings.output)
+        self.format, self.manifest = make_writer(settings, data), Manifest(settings.output)
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -86,7 +76,7 @@ class Jobs(Dataset[Done]):
 
     @cached_property
     def retarget(self) -> RigRetarget:
-        """The transform, one for each process: plans, and whatever it generates with, are held once."""
+        """The transform; one per process, with its plans and generator."""
         return self.settings.retarget()
 
     def __getitem__(self, number: int) -> Done:
@@ -95,40 +85,40 @@ class Jobs(Dataset[Done]):
         try:
             return self._done(token, index)
         except OutputError as error:
-            return Done(token, "stopped", words=(str(error),))
-        except Exception as error:  # one sample of thousands: whatever is wrong with it, the others go on
+            return Done(token, "stopped", messages=(str(error),))
+        except Exception as error:  # any other error concerns this sample alone
             return self._failed(token, index, described(error))
 
     def _done(self, token: str, index: int) -> Done:
-        held = self.manifest.holds(token)
-        if held is not None and self._is_current(index, held):
-            return Done(token, "kept", float(np.mean(held["coverage"])))
+        record = self.manifest.complete_record(token)
+        if record is not None and self._is_current(index, record):
+            return Done(token, "kept", float(np.mean(record["coverage"])))
         warned: list[str] = []
-        started = time.perf_counter()
+        started_s = time.perf_counter()
         with gathered_warnings(warned), repeatable_opencv():
             sample = self.samples[index]
-            read = time.perf_counter()
+            read_s = time.perf_counter()
             out = self.retarget(sample)
-            made = time.perf_counter()
-            coverage = self._written(index, sample, out)
-        seconds = read - started, made - read, time.perf_counter() - made
+            rendered_s = time.perf_counter()
+            coverage = self._write(index, sample, out)
+        seconds = read_s - started_s, rendered_s - read_s, time.perf_counter() - rendered_s
         return Done(token, "made", coverage, seconds, tuple(warned))
 
-    def _failed(self, token: str, index: int, words: str) -> Done:
+    def _failed(self, token: str, index: int, message: str) -> Done:
         if self.on_error != "skip":
-            return Done(token, "failed", words=(words,))
+            return Done(token, "failed", messages=(message,))
         try:
-            self.manifest.write({"token": token, "skipped": words}, owner=str(index))
-        except OutputError as full:
-            return Done(token, "stopped", words=(str(full),))
-        return Done(token, "skipped", words=(words,))
+            self.manifest.write({"token": token, "skipped": message}, owner=str(index))
+        except OutputError as error:
+            return Done(token, "stopped", messages=(str(error),))
+        return Done(token, "skipped", messages=(message,))
 
-    def _written(self, index: int, sample: Mapping[str, Any], out: Mapping[str, Any]) -> float:
-        """Write a sample's files, then its record; gives the share of pixels that some source saw."""
+    def _write(self, index: int, sample: Mapping[str, Any], out: Mapping[str, Any]) -> float:
+        """Write a sample's files, then its record; returns the share of pixels that some source saw."""
         output, rig = self.settings.output, rig_of(self.settings.sized_target, out)
         files: dict[str, bytes] = {}
         names: list[dict[str, str]] = []
-        for k, (camera, view) in enumerate(zip(rig, coded_views(out, self.settings.suffix), strict=True)):
+        for k, (camera, view) in enumerate(zip(rig, encode_views(out, self.settings.suffix), strict=True)):
             stem = self.format.stem(index, k, camera.name)
             names.append({suffix: stem + suffix for suffix in view})
             files |= {stem + suffix: coded for suffix, coded in view.items()}
@@ -136,19 +126,18 @@ class Jobs(Dataset[Done]):
         files |= rest
         paths = {inside(output, name, f"--output {output}"): content for name, content in files.items()}
         write_whole(paths, owner=str(index))
+        images = [view[self.settings.suffix] for view in names]
         cameras = rig.to_dict()["cameras"]
-        for camera, of_camera in zip(cameras, names, strict=True):
-            camera["file"] = of_camera[self.settings.suffix]
         coverage = [round(float(mask.float().mean()), 6) for mask in out["coverage"]]
-        read = self._read(index)
+        sources = self._source_files(index)
         record: dict[str, Any] = {
             "token": self.data.tokens[index],
             "ground_z_m": rig.ground_z_m,
-            "cameras": cameras,
+            "cameras": [{**camera, "file": image} for camera, image in zip(cameras, images, strict=True)],
             "coverage": coverage,
             "files": {name: len(content) for name, content in files.items()},
-            "sources": {_below(path, self.data.root): checksum(path) for path in read},
-            "source_bytes": _total_bytes(read),
+            "sources": {_below(path, self.data.root): checksum(path) for path in sources},
+            "source_bytes": _total_bytes(sources),
             **facts,
         }
         without = [frame["token"] for frame in sample.get("neighbours", ()) if frame.is_broken]
@@ -160,22 +149,21 @@ class Jobs(Dataset[Done]):
     def _is_current(self, index: int, record: Record) -> bool:
         """Compare a record with its source files by size and calibration, without reading images.
 
-        One that was made while a neighbour could not be read is made again: that may have been mended.
+        A sample without one of its neighbours is converted again: the neighbour may be readable by now.
         """
         try:
-            files = self._read(index)
-            read = {_below(path, self.data.root): path for path in files}
+            files = self._source_files(index)
+            sources = {_below(path, self.data.root): path for path in files}
             return (
                 not record.get("without")
-                and read.keys() == record["sources"].keys()
+                and sources.keys() == record["sources"].keys()
                 and _total_bytes(files) == record["source_bytes"]
-                and all(checksum(path) == record["sources"][n] for n, path in read.items() if path.suffix == ".json")
+                and all(checksum(path) == record["sources"][n] for n, path in sources.items() if path.suffix == ".json")
             )
-        except Exception:  # said when it is read
+        except Exception:  # reported when the sample is read
             return False
 
-    def _read(self, index: int) -> list[Path]:
-        """Source files of a sample."""
+    def _source_files(self, index: int) -> list[Path]:
         files = self.data.files(index)
         if isinstance(self.samples, WithMotionDepth):
             files.append(self.samples.depths.path(self.data.tokens[index]))

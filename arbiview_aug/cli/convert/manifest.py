@@ -1,7 +1,7 @@
-"""Record of each converted sample, written when all of its files are there.
+"""Record of each converted sample, written after all of its files.
 
-Records make a conversion resumable by any number of processes and shards: nothing is shared between samples, and each
-record says the same whoever writes it.
+Records make a conversion resumable by any number of processes and shards: samples share nothing, and a record does not
+depend on its writer.
 """
 
 from __future__ import annotations
@@ -16,26 +16,19 @@ from arbiview_aug.cli.convert.settings import FOLDER
 from arbiview_aug.errors import DataError
 
 Record = Mapping[str, Any]
-"""``token``, and of a converted sample ``cameras``, ``ground_z_m``, ``files`` (bytes by path), ``sources`` (SHA-256 by
-path) and ``source_bytes``, ``coverage``, ``without`` (neighbours that could not be read) where there are any, and what
-the format adds; of one that was left out ``skipped``, the reason."""
+"""``token``; for a converted sample ``cameras``, ``ground_z_m``, ``files`` (bytes by path), ``sources`` (SHA-256 by
+path), ``source_bytes``, ``coverage``, ``without`` (unreadable neighbours, if any) and entries of the format; or, if
+left out, ``skipped``: the reason."""
 
 
 class Manifest:
-    """The records of an output folder.
-
-    Args:
-        output: The folder.
-    """
+    """The records of an output folder."""
 
     def __init__(self, output: Path) -> None:
         self.output, self.folder = output, output / FOLDER
 
     def begin(self, facts: Mapping[str, Any]) -> None:
-        """Say what the output is made of, or check that it is made of the same.
-
-        Args:
-            facts: Plain data: versions, settings, what the source is.
+        """Write versions, settings and source of the output, or check that they are unchanged.
 
         Raises:
             DataError: The folder was begun with other facts.
@@ -44,8 +37,7 @@ class Manifest:
         if not path.is_file():
             write_whole({path: text})
             return
-        held = _read(path)
-        differ = list(_differences(held, json.loads(text)))
+        differ = list(_differences(_read(path), json.loads(text)))
         if differ:
             raise DataError(
                 f"--output {self.output}: expected what it was begun with, got {'; '.join(differ[:3])}; "
@@ -57,16 +49,16 @@ class Manifest:
         return self.folder / "samples" / f"{file_name(token)}.json"
 
     def record(self, token: str) -> Record | None:
-        """A sample's record; None where there is none."""
+        """Read a sample's record, if any."""
         path = self.path(token)
         return _read(path) if path.is_file() else None
 
     def records(self, tokens: Sequence[str]) -> Iterator[Record]:
-        """Those of samples that have one, in their order: of 40,000 they would take a gigabyte at once."""
+        """Yield the existing records in this order; 40,000 at once would take a gigabyte."""
         return filter(None, map(self.record, tokens))
 
-    def holds(self, token: str) -> Record | None:
-        """The record of a sample that is converted, with all of its files in place."""
+    def complete_record(self, token: str) -> Record | None:
+        """The record of a converted sample if all of its files are in place."""
         record = self.record(token)
         if record is None or "skipped" in record:
             return None
@@ -77,19 +69,11 @@ class Manifest:
         return record
 
     def write(self, record: Record, owner: str) -> None:
-        """Write a sample's record.
-
-        Raises:
-            OutputError: It cannot be written.
-        """
+        """Write a sample's record."""
         write_whole({self.path(record["token"]): _text(record)}, owner)
 
     def write_provenance(self, facts: Mapping[str, Any], tokens: Sequence[str]) -> None:
-        """One file that says what the output was made of: versions, settings, the source's checksums.
-
-        Raises:
-            OutputError: It cannot be written.
-        """
+        """Write versions, settings and the source's checksums to one file."""
         sources, skipped = {}, {}
         for record in self.records(tokens):
             if "skipped" in record:
@@ -110,11 +94,11 @@ def _read(path: Path) -> dict[str, Any]:
         raise DataError(f"{path}: expected what the conversion wrote, got {error}; remove this file") from None
 
 
-def _differences(held: Any, asked: Any, where: str = "") -> Iterator[str]:
+def _differences(found: Any, asked: Any, where: str = "") -> Iterator[str]:
     """Describe where two pieces of plain data differ."""
-    if isinstance(held, Mapping) and isinstance(asked, Mapping):
-        for key in dict.fromkeys([*held, *asked]):
-            yield from _differences(held.get(key), asked.get(key), f"{where}.{key}" if where else key)
-    elif held != asked:
-        long = max(len(str(held)), len(str(asked))) > 40
-        yield f"another {where}" if long else f"{where} {asked!r} instead of {held!r}"
+    if isinstance(found, Mapping) and isinstance(asked, Mapping):
+        for key in dict.fromkeys([*found, *asked]):
+            yield from _differences(found.get(key), asked.get(key), f"{where}.{key}" if where else key)
+    elif found != asked:
+        long = max(len(str(found)), len(str(asked))) > 40
+        yield f"another {where}" if long else f"{where} {asked!r} instead of {found!r}"

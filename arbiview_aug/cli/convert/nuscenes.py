@@ -1,7 +1,7 @@
 """nuScenes v1.0 out of nuScenes v1.0: new cameras at the LiDAR's times, everything else kept or linked.
 
-Keyframes are converted; what the source's cameras recorded between them is left out. A new camera recorded when the
-LiDAR did, from the LiDAR's ego pose: that is where its views are rendered, whenever the source's cameras exposed.
+Keyframes are converted; camera images between them are left out. A new camera has the LiDAR's time and ego pose: its
+views are rendered there, whenever the source's cameras exposed.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from arbiview_aug.cli.convert.manifest import Record
 from arbiview_aug.cli.convert.nuscenes_rows import NewCameras, Remaining, kept_sensors, view_stem
 from arbiview_aug.cli.convert.settings import FOLDER, Settings
 from arbiview_aug.cli.convert.visibility import visible_shares
+from arbiview_aug.cli.convert.writer import Writer
 from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
 from arbiview_aug.datasets.nuscenes.tables import (
     COUNTS,
@@ -36,7 +37,7 @@ from arbiview_aug.datasets.nuscenes.tables import (
     Tokens,
     on_circle,
 )
-from arbiview_aug.errors import DataError
+from arbiview_aug.errors import CalibrationError, DataError
 
 _TABLES = (
     *("attribute", "category", "log", "map", "visibility", "sensor", "calibrated_sensor", "ego_pose", "scene"),
@@ -61,7 +62,7 @@ _REFERENCES = (
     ("instance", "last_annotation_token", "sample_annotation"),
     *((table, key, table) for table in ("sample", "sample_annotation", "sample_data") for key in ("prev", "next")),
 )
-"""Table, column, and the table that it names rows of. Unknown is an empty token; some sources have fewer columns."""
+"""Table, column, and the table whose rows it names. An empty token means unknown; columns may be missing."""
 
 _NEEDED: Mapping[str, Mapping[str, Kind]] = {
     "sample": {"timestamp": MICROSECONDS},
@@ -78,20 +79,33 @@ _NEEDED: Mapping[str, Mapping[str, Kind]] = {
 """Columns without which rows cannot be kept."""
 
 
-class NuScenes:
+class NuScenes(Writer):
     """Tables, images and masks of the new cameras.
 
-    Args:
-        settings: Of the conversion.
-        data: The source.
+    Raises:
+        CalibrationError: The target has lenses, or a camera with the name of another sensor.
     """
 
     def __init__(self, settings: Settings, data: NuScenesDataset) -> None:
         self.output, self.data, self.suffix = settings.output, data, settings.suffix
         self.target = settings.target
+        lenses = [f"{camera.name} ({camera.lens})" for camera in self.target if not camera.is_rectilinear]
+        if lenses:
+            name = self.target.name or "the target"
+            raise CalibrationError(
+                f"rig {name!r}: expected pinhole cameras, since nuScenes tables know no lenses, got "
+                f'{", ".join(lenses)}; convert to Rig.undistorted(): python -c "from arbiview_aug import load_rig; '
+                f"load_rig('{name}').undistorted().save('pinhole.yaml')\" and --target pinhole.yaml; frame folders "
+                "carry lenses"
+            )
+        taken = sorted(set(self.target.names) & set(data.other_channels))
+        if taken:
+            raise CalibrationError(
+                f"rig {self.target.name!r}: expected cameras of other names than the sensors that are kept, got "
+                f"{', '.join(taken)}; rename them in the rig file"
+            )
 
     def facts(self) -> dict[str, Any]:
-        """The source's identity, as plain data."""
         tables = {name: checksum(self._opened().path(name)) for name in self._tables()}
         return {
             "kind": "nuscenes",
@@ -101,13 +115,11 @@ class NuScenes:
         }
 
     def check(self) -> None:
-        """Read all tables once, and look for everything that could not be written, before hours of work end with it.
+        """Read all tables once.
 
         Raises:
-            DataError: A table that is none; a row that names another one that is not there, or a file outside the root,
-                or has no column that is needed; a token that occurs twice; ``next`` or ``prev`` that lead round in a
-                circle; no samples; two samples that would write images of one name, or a camera's name makes no file's
-                name.
+            DataError: No samples; a malformed table; a dangling reference, a file outside the root or a missing column;
+                a duplicate token; a circle of ``next`` or ``prev``; image names that clash or no file can have.
         """
         if not len(self.data):
             raise DataError(f"nuScenes {self.data.root} {self.data.version}: expected samples, got none")
@@ -161,7 +173,6 @@ class NuScenes:
                 raise DataError(f"{where}: expected a file outside of {', '.join(own_folders)}, got one in {folder}")
 
     def stem(self, index: int, camera: int, name: str) -> str:
-        """The path of a view below the output, without its suffix."""
         return view_stem(self.data.files(index)[-1].name, name)
 
     def rest(
@@ -172,31 +183,15 @@ class NuScenes:
         rig: Rig,
         views: Sequence[Mapping[str, str]],
     ) -> tuple[dict[str, bytes], dict[str, Any]]:
-        """No more files; the share of each annotation's box that the new cameras show.
-
-        Args:
-            index: Of the sample.
-            sample: As it was read.
-            out: The same, retargeted.
-            rig: Its cameras.
-            views: Of each camera the files' names, by what follows their stem.
-        """
-        if "boxes_3d" not in sample:  # nothing is annotated
+        """No files, but the visible share of each annotation's box in the new cameras."""
+        if "boxes_3d" not in sample:
             return {}, {"visible": {}}
         boxes, coverage = sample["boxes_3d"].numpy(), [mask.numpy() for mask in out["coverage"]]
         shares = np.round(visible_shares(rig, coverage, boxes), 3).tolist()
         return {}, {"visible": dict(zip(sample["box_tokens"], shares, strict=True))}
 
     def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
-        """Write the tables and link the files of the sensors that stay.
-
-        Args:
-            records: Of the converted samples.
-            left_out: Tokens of the others.
-
-        Returns:
-            Notes for people.
-        """
+        """Write the tables and link the files of the remaining sensors."""
         source, there = self._opened(), self._tables()
         remaining = Remaining(source, left_out)
         cameras = NewCameras(records, self.suffix)
@@ -226,14 +221,13 @@ class NuScenes:
         notes = []
         if self._missing:
             notes.append(f"{self._missing} files that sample_data names are not in the source: were sweeps not copied?")
-        known = {*_TABLES}
-        left = sorted({path.stem for path in (self.data.root / self.data.version).glob("*.json")} - known)
-        if left:
-            notes.append(f"left out, since they may speak of the source's images: tables {', '.join(left)}")
+        unknown = sorted({path.stem for path in (self.data.root / self.data.version).glob("*.json")} - {*_TABLES})
+        if unknown:
+            notes.append(f"left out, since they may describe the source's images: tables {', '.join(unknown)}")
         return notes
 
     def _linked(self, table: str, rows: Iterable[Row]) -> Iterator[Row]:
-        """Rows, whose files are linked on the way."""
+        """Yield rows and link their files."""
         for row in rows:
             try:
                 link_whole(*self._kept(row["filename"], self._where(table, row)))
@@ -242,7 +236,7 @@ class NuScenes:
             yield row
 
     def _kept(self, name: str, where: str) -> tuple[Path, Path]:
-        """A file that is kept, in the source and in the output; links in either must not leave it."""
+        """Paths of a kept file in the source and in the output; links must not leave either."""
         return inside(self.data.root, name, where), inside(self.output, name, f"--output {self.output}: {where}")
 
     def _maps(self) -> list[Path]:
@@ -255,7 +249,7 @@ class NuScenes:
         return Tables(self.data.root, self.data.version, None)
 
     def _tables(self) -> list[str]:
-        """The tables that there are, in the order in which they are written."""
+        """Existing tables in writing order."""
         return [name for name in _TABLES if (self.data.root / self.data.version / f"{name}.json").is_file()]
 
 

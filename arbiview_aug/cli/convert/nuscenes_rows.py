@@ -1,4 +1,4 @@
-"""nuScenes rows of a converted root: what stays when samples are left out, and what the new cameras add."""
+"""nuScenes rows of a converted root: remaining rows of the source, and rows of the new cameras."""
 
 from __future__ import annotations
 
@@ -18,53 +18,50 @@ from arbiview_aug.datasets.nuscenes.tables import Row, Tables, quaternion_from_r
 
 
 def kept_sensors(tables: Tables) -> tuple[set[str], set[str]]:
-    """Tokens of the sensors that stay, which are no cameras, and of their calibrations."""
+    """Tokens of the sensors other than cameras, and of their calibrations."""
     sensors = {row["token"] for row in tables.rows("sensor") if row.get("modality") != "camera"}
     calibrated = tables.rows("calibrated_sensor")
     return sensors, {row["token"] for row in calibrated if row["sensor_token"] in sensors}
 
 
 class Remaining:
-    """The source's rows without its cameras and without some samples, the chains between rows closed again.
+    """The source's rows without its cameras and without the samples ``left_out``; chains between rows are closed again.
 
-    A LiDAR keyframe of a sample that was left out becomes a sweep of the next one of its scene.
-
-    Args:
-        tables: The source.
-        left_out: Tokens of samples.
+    A LiDAR keyframe of a sample that was left out becomes a sweep of the next sample of its scene.
     """
 
     def __init__(self, tables: Tables, left_out: set[str]) -> None:
         self.tables, self.left_out = tables, left_out
-        of_scenes: dict[str, list[Row]] = {}
-        for row in tables.rows("sample"):
-            of_scenes.setdefault(row["scene_token"], []).append(row)
-        every = [sorted(rows, key=lambda row: int(row["timestamp"])) for rows in of_scenes.values()]
-        self.drives = [[row["token"] for row in rows if row["token"] not in left_out] for rows in every]
-        """Tokens of the samples that stay, by scene, in the order of their times."""
-        self._by_scene = {scene: drive for scene, drive in zip(of_scenes, self.drives, strict=True)}
+        self._drives: dict[str, list[str]] = {}
         self._stand_in: dict[str, str] = {}
-        for rows, drive in zip(every, self.drives, strict=True):
+        rows_of_scenes: dict[str, list[Row]] = {}
+        for row in tables.rows("sample"):
+            rows_of_scenes.setdefault(row["scene_token"], []).append(row)
+        for scene, rows in rows_of_scenes.items():
+            tokens = [row["token"] for row in sorted(rows, key=lambda row: int(row["timestamp"]))]
+            drive = self._drives[scene] = [token for token in tokens if token not in left_out]
             later = drive[-1] if drive else ""
-            for row in reversed(rows):
-                later = later if row["token"] in left_out else row["token"]
-                self._stand_in[row["token"]] = later
+            for token in reversed(tokens):
+                later = later if token in left_out else token
+                self._stand_in[token] = later
         self._sensors, self._calibrated = kept_sensors(tables)
-        calibrated = tables.rows("calibrated_sensor")
         lidar = {row["token"] for row in tables.rows("sensor") if row["channel"] == LIDAR}
-        self._lidar = {row["token"] for row in calibrated if row["sensor_token"] in lidar}
-        self._gone = self._annotations_left_out()
+        self._lidar = {row["token"] for row in tables.rows("calibrated_sensor") if row["sensor_token"] in lidar}
+        self._annotations_left_out = self._find_annotations_left_out()
 
+    @property
+    def drives(self) -> list[list[str]]:
+        """Tokens of the remaining samples, by scene, in the order of their times."""
+        return [*self._drives.values()]
+
+    # --- rows of the tables after which the methods are named --------------------------------------------------------
     def sensor(self) -> Iterator[Row]:
-        """Those that are no cameras."""
         return (row for row in self.tables.rows("sensor") if row["token"] in self._sensors)
 
     def calibrated_sensor(self) -> Iterator[Row]:
-        """Those that are no cameras."""
         return (row for row in self.tables.rows("calibrated_sensor") if row["token"] in self._calibrated)
 
     def sample(self) -> Iterator[Row]:
-        """Without those that are left out."""
         place = {token: (drive, k) for drive in self.drives for k, token in enumerate(drive)}
         for row in self.tables.rows("sample"):
             if row["token"] in place:
@@ -73,42 +70,38 @@ class Remaining:
                 yield self._changed(row, around)
 
     def scene(self) -> Iterator[Row]:
-        """Those that have samples."""
         for row in self.tables.rows("scene"):
-            drive = self._by_scene.get(row["token"], [])
+            drive = self._drives.get(row["token"], [])
             if drive or not self.left_out:
                 ends = {"first_sample_token": drive[0], "last_sample_token": drive[-1]} if drive else {}
                 yield self._changed(row, {"nbr_samples": len(drive), **ends})
 
     def instance(self) -> Iterator[Row]:
-        """Those that are annotated."""
-        fewer = Counter(instance for _, _, instance in self._gone.values())
+        fewer = Counter(instance for _, _, instance in self._annotations_left_out.values())
         for row in self.tables.rows("instance"):
             first, last = (row.get(f"{end}_annotation_token", "") for end in ("first", "last"))
-            ends = {"first_annotation_token": self._beyond(first, 1), "last_annotation_token": self._beyond(last, 0)}
-            if ends["first_annotation_token"] or not first:
-                yield self._changed(
-                    row, {**ends, "nbr_annotations": (row.get("nbr_annotations") or 0) - fewer[row["token"]]}
-                )
+            remaining_first = self._remaining(first, 1)
+            if remaining_first or not first:
+                values = {
+                    "first_annotation_token": remaining_first,
+                    "last_annotation_token": self._remaining(last, 0),
+                    "nbr_annotations": (row.get("nbr_annotations") or 0) - fewer[row["token"]],
+                }
+                yield self._changed(row, values)
 
     def sample_annotation(self, visible: Mapping[str, float]) -> Iterator[Row]:
-        """Those of the samples that stay.
-
-        Args:
-            visible: Share of each annotation's box that the new cameras show.
-        """
+        """``visible``: share of each annotation's box that the new cameras show."""
         for batch in self.tables.batches("sample_annotation"):
             for row in batch:
-                if row["token"] in self._gone:
+                if row["token"] in self._annotations_left_out:
                     continue
-                ends = {"prev": self._beyond(row.get("prev", ""), 0), "next": self._beyond(row.get("next", ""), 1)}
-                row = self._changed(row, ends)
+                around = {key: self._remaining(row.get(key, ""), k) for k, key in enumerate(("prev", "next"))}
+                row = self._changed(row, around)
                 if "visibility_token" in row:
                     row = {**row, "visibility_token": level(visible[row["token"]], row["visibility_token"])}
                 yield row
 
     def sample_data(self) -> Iterator[Row]:
-        """Rows of sensors other than cameras."""
         for batch in self.tables.batches("sample_data"):
             for row in batch:
                 if row["calibrated_sensor_token"] not in self._calibrated:
@@ -120,7 +113,7 @@ class Remaining:
                     yield {**row, "sample_token": stand_in, "is_key_frame": False}
 
     def moments(self) -> tuple[dict[str, Row], set[str]]:
-        """The LiDAR's keyframe of each sample, and the tokens of all ego poses that are still used."""
+        """The LiDAR's keyframe of each sample, and the tokens of all ego poses in use."""
         keyframes, poses = {}, set()
         for row in self.sample_data():
             poses.add(row["ego_pose_token"])
@@ -129,15 +122,14 @@ class Remaining:
         return keyframes, poses
 
     def ego_pose(self, used: set[str]) -> Iterator[Row]:
-        """Those that are still used."""
         return (row for batch in self.tables.batches("ego_pose") for row in batch if row["token"] in used)
 
     def _changed(self, row: Row, values: Mapping[str, Any]) -> Row:
-        """As it was where nothing is left out; and no column that it has not."""
+        """Set existing columns of a row; rows stay as they are if nothing is left out."""
         return {**row, **{key: value for key, value in values.items() if key in row}} if self.left_out else row
 
-    def _annotations_left_out(self) -> dict[str, tuple[str, str, str]]:
-        """Each row's predecessor, successor and instance."""
+    def _find_annotations_left_out(self) -> dict[str, tuple[str, str, str]]:
+        """Predecessor, successor and instance of each annotation that is left out, by token."""
         if not self.left_out:
             return {}
         return {
@@ -147,29 +139,24 @@ class Remaining:
             if row["sample_token"] in self.left_out
         }
 
-    def _beyond(self, token: str, way: int) -> str:
-        """The first annotation of a chain that stays, from one on."""
+    def _remaining(self, token: str, direction: int) -> str:
+        """Follow a chain (0 back, 1 forward) to its first annotation that is not left out."""
         seen = set()
-        while token in self._gone:
+        while token in self._annotations_left_out:
             if token in seen:  # in an output that was begun before chains were checked
                 raise self.tables.error("sample_annotation", "chains that end", f"a circle through row {token!r}")
             seen.add(token)
-            token = self._gone[token][way]
+            token = self._annotations_left_out[token][direction]
         return token
 
 
 class NewCameras:
-    """The rows that the target's cameras add.
-
-    Args:
-        records: Of the converted samples.
-        suffix: Of their images.
-    """
+    """Rows of the target's cameras, from the records of the converted samples; ``suffix`` is that of their images."""
 
     def __init__(self, records: Iterable[Record], suffix: str) -> None:
         self.suffix = suffix
         self.visible: dict[str, float] = {}
-        """Share of each annotation's box that the cameras show."""
+        """Visible share of each annotation's box."""
         self._calibrations: dict[str, Row] = {}
         self._views: dict[str, list[tuple[str, Row]]] = {}
         for record in records:
@@ -177,21 +164,14 @@ class NewCameras:
             self._views[record["token"]] = [self._view(camera) for camera in record["cameras"]]
 
     def sensor(self) -> Iterator[Row]:
-        """One for each camera."""
         names = dict.fromkeys(name for views in self._views.values() for name, _ in views)
         return ({"token": token_of("sensor", name), "channel": name, "modality": "camera"} for name in names)
 
     def calibrated_sensor(self) -> Iterator[Row]:
-        """One for each camera and calibration: as a rule, one for each camera."""
         return iter(self._calibrations.values())
 
     def sample_data(self, drives: Sequence[Sequence[str]], keyframes: Mapping[str, Row]) -> Iterator[Row]:
-        """Rows of the new cameras, at the LiDAR's time and ego pose.
-
-        Args:
-            drives: Tokens of samples by scene, in the order of their times.
-            keyframes: The LiDAR's row of each.
-        """
+        """Rows at the time and ego pose of the LiDAR's ``keyframes``; ``drives``: samples by scene, in time."""
         for drive in drives:
             for k, sample in enumerate(drive):
                 for name, view in self._views[sample]:
@@ -208,7 +188,7 @@ class NewCameras:
                     }
 
     def _view(self, camera: Mapping[str, Any]) -> tuple[str, Row]:
-        """A camera's name, and what a row of ``sample_data`` says of it; its calibration is kept."""
+        """A camera's name and its columns of ``sample_data``; collects its calibration."""
         name, pose = camera["name"], np.array(camera["cam2ego"])
         token = token_of("calibrated_sensor", name, json.dumps([camera["K"], camera["cam2ego"]]))
         if token not in self._calibrations:
@@ -224,16 +204,11 @@ class NewCameras:
 
 
 def view_stem(lidar: str, name: str) -> str:
-    """Path of a camera's image below the root, without its suffix.
-
-    Args:
-        lidar: The name of the LiDAR's file of the same sample.
-        name: Of the camera.
-    """
+    """Path of a camera's image below the root, without suffix, after the name of the same sample's LiDAR file."""
     channel, stem = quote(name, safe="", errors="surrogatepass"), lidar.removesuffix(".bin").removesuffix(".pcd")
     return f"samples/{channel}/{stem.replace(LIDAR, channel) if LIDAR in stem else f'{stem}__{channel}'}"
 
 
 def token_of(*parts: str) -> str:
-    """A token in nuScenes' form, 32 hexadecimal digits, that depends on nothing else."""
+    """Hash texts to a token in nuScenes' form, 32 hexadecimal digits."""
     return hashlib.md5("\n".join(parts).encode(errors="surrogatepass"), usedforsecurity=False).hexdigest()

@@ -1,8 +1,7 @@
-"""The same jobs on a Ray cluster: Ray Data actors, each with one transform for all of its samples.
+"""The same jobs on a Ray cluster: Ray Data actors, each with one transform.
 
-All machines see the source and the output under the same paths. Actors keep a job's order to themselves; its bytes do
-not depend on it. Where the cluster has GPUs and a generator is asked for, actors share them, each with the generator
-once: what is generated there differs from a CPU's in its last bits.
+All machines need the source and the output under the same paths. Bytes do not depend on the order of jobs. With
+``--path diffusion``, actors share the cluster's GPUs; generated pixels differ from a CPU's in their last bits.
 """
 
 from __future__ import annotations
@@ -17,16 +16,12 @@ from arbiview_aug.environment import one_thread, optional_package
 
 
 class Actor:
-    """Holds the jobs, and with them the transform.
-
-    Args:
-        jobs: All of them; each call names one.
-    """
+    """Worker that holds all jobs and the transform; each call runs one job."""
 
     def __init__(self, jobs: Jobs) -> None:
         self.jobs = jobs
-        self._held = one_thread()
-        self._held.__enter__()
+        self._threads = one_thread()
+        self._threads.__enter__()
         if optional_package("ray", "distributed").get_gpu_ids():
             jobs.retarget.to("cuda")
 
@@ -35,13 +30,13 @@ class Actor:
 
 
 def ray_results(jobs: Jobs, workers: int, label: str, note: Callable[[Done], str]) -> Iterator[Done]:
-    """Yield each job's result, in any order.
+    """Yield each job's result, in any order, from the cluster that ``RAY_ADDRESS`` names, or from this machine.
 
     Args:
-        jobs: What is to be done.
-        workers: Actors; a running cluster is used where ``RAY_ADDRESS`` names one, else this machine.
-        label: Names the progress bar.
-        note: What it says besides.
+        jobs: Jobs to run.
+        workers: Number of actors.
+        label: Label of the progress bar.
+        note: Text of the progress bar after a result.
 
     Raises:
         ImportError: Ray is not installed; with the command that installs it.

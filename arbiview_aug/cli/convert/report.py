@@ -1,4 +1,4 @@
-"""``report.html`` of a conversion: what was written, read again and scored as ``evaluate`` scores."""
+"""``report.html`` of a conversion: the written views, scored as ``evaluate`` scores."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from arbiview_aug.evaluate.run import Evaluation, evaluate
 from arbiview_aug.scene.scene import SURFACES
 
 CONVERTED = "converted"
-"""The name of the views that were written, in tables."""
+"""Name of the written views in tables."""
 
 
 def converted(settings: Settings) -> Method:
-    """The views that a conversion wrote, as a method: of its own target; others are rendered as it rendered that."""
-    # The frame that scores holds its points back, and depth from motion is not read again.
+    """Wrap the written views as a method; for other rigs than the target it renders anew."""
+    # Scored frames hold their points back, and depth from motion is not read again.
     anew = retargeting(
         settings.quality, "auto" if SURFACES[settings.surface].needs in ("points", "motion") else settings.surface
     )
@@ -48,24 +48,14 @@ def converted(settings: Settings) -> Method:
 
 
 def write_report(settings: Settings, data: Recording, tokens: Sequence[str], count: int) -> Evaluation:
-    """Score some converted frames, spread evenly over all, and write the page.
-
-    Args:
-        settings: Of the conversion.
-        data: The source.
-        tokens: Of the samples that were converted.
-        count: How many to score.
-
-    Returns:
-        What was measured.
-    """
+    """Score ``count`` converted frames, spread evenly over ``tokens``, and write the page."""
     picked = [tokens[int(k)] for k in np.unique(np.linspace(0, len(tokens) - 1, min(count, len(tokens))).round())]
     target = settings.sized_target
     done = evaluate(_frames(data, picked), lambda _: {target.name or "target": target}, [converted(settings)])
     title = f"{data.root.resolve().name} as {target.name or 'the target'} would have seen it"
     notes = [f"{len(picked)} of {len(tokens)} frames, as they were written to {settings.output}."]
     if settings.path != "favs" or settings.holes != "black":
-        notes.append("Pixels that no camera saw are scored as they were filled; covered figures leave them out.")
+        notes.append("Pixels that no camera saw are scored as filled; covered figures leave them out.")
     if "points" in SURFACES[settings.surface].reads:
         notes.append("LiDAR points score views that were made with them: evaluate holds half of them out.")
     notes += [f"Not everything could be scored: {words}." for words in done.declined.values()]
@@ -75,6 +65,6 @@ def write_report(settings: Settings, data: Recording, tokens: Sequence[str], cou
 
 
 def _frames(data: Recording, tokens: Sequence[str]) -> Iterator[tuple[str, ScoredFrame]]:
-    """At the exposures that were recorded: the views cannot be made again at others."""
+    """Yield frames at their recorded exposures, which the views were rendered at."""
     for token in tokens:
         yield token, make_frame(data.by_token(token), exposures=("raw",))

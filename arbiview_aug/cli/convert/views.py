@@ -1,4 +1,4 @@
-"""Retargeted views as files: images, and masks as PNG beside them; and those files read again."""
+"""Retargeted views as files: images, and masks as PNG beside them."""
 
 from __future__ import annotations
 
@@ -16,18 +16,13 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.image_io import encoded, encoded_image
 
 MASKS = {"coverage": "coverage", "confidence": "confidence", "generated": "generated", "ignore": "mask"}
-"""Outputs of a retargeted sample, and what their files are called: ``<image>.<name>.png``. ``coverage``: 255 where some
-source saw the pixel; ``confidence``: 255 times it; ``generated``: 255 where it was made up; ``mask``: 255 for
-the scene, 0 for the target's own car, as in frame folders."""
+"""Outputs of a retargeted sample and the names of their files, ``<image>.<name>.png``. ``coverage``: 255 where some
+source saw the pixel; ``confidence``: scaled to 255; ``generated``: 255 for inpainted pixels; ``mask``: 255 for the
+scene, 0 for the target's own car, as in frame folders."""
 
 
-def coded_views(out: Mapping[str, Any], suffix: str) -> list[dict[str, bytes]]:
-    """The files of each view, by what follows the image's stem.
-
-    Args:
-        out: A retargeted sample with uint8 images.
-        suffix: Of the images.
-    """
+def encode_views(out: Mapping[str, Any], suffix: str) -> list[dict[str, bytes]]:
+    """Encode the files of each view, by what follows the image's stem."""
     views = []
     for k, image in enumerate(out["images"]):
         view = {suffix: encoded_image(image, suffix)}
@@ -39,24 +34,19 @@ def coded_views(out: Mapping[str, Any], suffix: str) -> list[dict[str, bytes]]:
 
 
 def rig_of(target: Rig, out: Mapping[str, Any]) -> Rig:
-    """The cameras of a retargeted sample, in its ego frame.
-
-    Args:
-        target: The rig that was asked for, at the size of the views.
-        out: The sample, which has the cameras' poses in its ego frame.
-    """
+    """Cameras of a retargeted sample, in its ego frame; ``target`` has the views' size and lenses."""
     poses, K = out["cam2ego"].numpy(), out["K"].numpy()
     cameras = [replace(camera, K=K[k], cam2ego=poses[k]) for k, camera in enumerate(target)]
     return Rig(cameras, ground_z_m=float(out["ground_z_m"]), name=target.name)
 
 
 def coverage_of(image: Path) -> BoolArray:
-    """(h, w) the coverage that lies beside a view's image."""
+    """Read the (h, w) coverage beside a view's image."""
     return np.asarray(cv2.imread(str(image.with_suffix(".coverage.png")), cv2.IMREAD_GRAYSCALE)) > 0
 
 
 def _as_bytes(key: str, values: torch.Tensor) -> Any:
-    """0 to 255; the ways that are fast: a tenth of what torch takes for a full-size mask."""
+    """Scale a mask to 0…255; ten times as fast as torch for a full-size mask."""
     if values.dtype == torch.bool:
         return (~values if key == "ignore" else values).numpy().view(np.uint8) * 255
     return cv2.convertScaleAbs(values.numpy(), alpha=255)  # rounds

@@ -421,7 +421,7 @@ def test_errors_that_nobody_expects_in_ray_actors(
     monkeypatch.setattr(ray_runner, "optional_package", lambda *_: SimpleNamespace(get_gpu_ids=list))
     row = Actor(Jobs(asked, asked.open(), range(3), "skip"))({"id": 1})
     done = pickle.loads(row["done"])
-    assert (done.token, done.state, done.words) == ("0001", "skipped", ("ZeroDivisionError: of \ud800",))
+    assert (done.token, done.state, done.messages) == ("0001", "skipped", ("ZeroDivisionError: of \ud800",))
 
 
 @pytest.mark.slow

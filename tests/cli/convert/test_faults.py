@@ -155,7 +155,7 @@ def test_shards_write_the_same_bytes(
     asked = command(f"{kind}:{sources[kind]}", tmp_path / "new")
     for shard in ("2", "0"):
         assert main([*asked, "--num-shards", "3", "--shard-index", shard]) == 0
-        assert "samples of other shards are not there yet" in capsys.readouterr().out
+        assert "samples of other shards are missing so far" in capsys.readouterr().out
     (tmp_path / "new" / "conversion" / "samples" / ".x.json.1-01234567-1-89abcdef.part").write_bytes(b"{")
     assert main([*asked, "--num-shards", "3", "--shard-index", "1"]) == 0
     assert tree(tmp_path / "new") == undisturbed[kind]

@@ -41,12 +41,12 @@ def _copied(root: Path, frame: Path) -> None:
 
 
 class Timed(Jobs):
-    """Says how many CPU seconds each sample took, in its words."""
+    """Says how many CPU seconds each sample took, in its messages."""
 
     def __getitem__(self, number: int) -> Done:
         started = time.process_time()
         done = super().__getitem__(number)
-        return done._replace(words=(str(time.process_time() - started),))
+        return done._replace(messages=(str(time.process_time() - started),))
 
 
 @pytest.mark.release
@@ -73,7 +73,7 @@ def test_two_processes_and_the_share_of_retargeting(
         seconds = [sum(one.seconds[part] for one, _ in others) for part in range(3)]
         shares.append([part / sum(seconds) for part in seconds])
         # A worker's first sample makes the plan.
-        cpu_s[processes] = float(np.median([float(one.words[0]) for one, _ in others]))
+        cpu_s[processes] = float(np.median([float(one.messages[0]) for one, _ in others]))
     speedup, possible = rates[2] / rates[1], cores[2] / cores[1]
     decode, retarget, encode = shares[0]
     print(
@@ -117,7 +117,7 @@ def test_what_calibrations_of_their_own_cost(
         _, *others = results(Timed(settings, settings.open(), range(OWN_PLANS), "report"), 1, "convert")
     assert all(one.state == "made" for one in others)
     seconds = np.median([one.seconds for one in others], axis=0)
-    cpu_ms = 1e3 * float(np.median([float(one.words[0]) for one in others]))
+    cpu_ms = 1e3 * float(np.median([float(one.messages[0]) for one in others]))
     shares = ", ".join(f"{part / seconds.sum():.0%}" for part in seconds)
     print(
         f"{surface}, {size or 'full size'}: CPU {cpu_ms:.0f} ms a sample; decode, retarget, encode and write {shares}"

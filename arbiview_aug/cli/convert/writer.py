@@ -1,0 +1,69 @@
+"""Base class of the formats that ``convert`` writes."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cli.convert.manifest import Record
+from arbiview_aug.cli.convert.settings import Settings
+
+
+class Writer(ABC):
+    """Writes a converted data set in its source's format; a row of ``READERS`` names it.
+
+    Raises:
+        ArbiviewError: The format cannot hold the target's cameras.
+    """
+
+    @abstractmethod
+    def __init__(self, settings: Settings, data: Any) -> None: ...
+
+    @abstractmethod
+    def facts(self) -> dict[str, Any]:
+        """Identity of the source, as plain data."""
+
+    @abstractmethod
+    def check(self) -> None:
+        """Look for everything that could not be written, before hours of work end with it.
+
+        Raises:
+            DataError: The source or the target has something that the format cannot hold.
+        """
+
+    @abstractmethod
+    def stem(self, index: int, camera: int, name: str) -> str:
+        """Path of a view below the output, without its suffix."""
+
+    @abstractmethod
+    def rest(
+        self,
+        index: int,
+        sample: Mapping[str, Any],
+        out: Mapping[str, Any],
+        rig: Rig,
+        views: Sequence[Mapping[str, str]],
+    ) -> tuple[dict[str, bytes], dict[str, Any]]:
+        """Files of a sample besides its views, and further entries of its record.
+
+        Args:
+            index: Number of the sample in the source.
+            sample: The sample as read.
+            out: The retargeted sample.
+            rig: Its cameras.
+            views: For each camera the names of its files, by what follows their stem.
+        """
+
+    @abstractmethod
+    def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
+        """Write what belongs to all samples.
+
+        Args:
+            records: Records of the converted samples.
+            left_out: Tokens of the others.
+
+        Returns:
+            Notes for people.
+        """
