@@ -38,7 +38,7 @@ from arbiview_aug.cameras.validation import (
 from arbiview_aug.errors import CalibrationError
 
 UNPROJECT_TOLERANCE_PX = 1e-6
-"""A ray counts as found when projecting it again lands this close to its pixel."""
+"""Largest reprojection error of a valid ray."""
 
 _ANGLES, _METRES = "finite angles in degrees", "finite (x, y, z) in metres"
 
@@ -130,19 +130,13 @@ class Camera:
         Roll turns about the optical axis: positive turns the camera clockwise as seen from behind it.
 
         Args:
-            name: The camera's name.
             azimuth_deg: 0 looks forward, 90 to the left.
             elevation_deg: 0 looks level, 90 straight up.
             roll_deg: 0 for an upright image.
             position_m: Optical centre in the ego frame.
-            width_px: Image width.
-            height_px: Image height.
             horizontal_fov_deg: Angle between the outer edges of the image, measured along the row of the principal
                 point; gives a K with square pixels and a central principal point. Either this or ``K``.
-            K: (3, 3) intrinsics.
-            lens: The lens model.
-            distortion: Its coefficients.
-            mask: The car-body mask.
+            name, width_px, height_px, K, lens, distortion, mask: As for ``Camera``.
 
         Raises:
             CalibrationError: On impossible values, or when both or none of K and horizontal_fov_deg are given.
@@ -202,7 +196,7 @@ class Camera:
 
     @cached_property
     def content_key(self) -> bytes:
-        """Digest of everything that decides where pixels fall; the name is not part of it."""
+        """Digest of size, lens, K, pose and mask; the name is not part of it."""
         digest = hashlib.sha256(repr((self.size, self.lens, self.distortion)).encode())
         digest.update(self.K.tobytes() + self.cam2ego.tobytes())
         if self.mask is not None:
@@ -216,12 +210,12 @@ class Camera:
 
     @cached_property
     def is_rectilinear(self) -> bool:
-        """Whether the lens keeps straight lines straight: a pinhole."""
+        """Whether the lens keeps straight lines straight."""
         return self.lens_model.is_rectilinear
 
     @cached_property
     def half_angle_rad(self) -> float:
-        """Angle between the optical axis and the image's farthest ray; π where the lens cannot be inverted there."""
+        """Largest angle between the optical axis and a ray of the image; π if the lens cannot be inverted there."""
         h, w = self.size
         border = np.stack(np.meshgrid(np.linspace(-0.5, w - 0.5, 9), np.linspace(-0.5, h - 0.5, 9)), -1)
         directions, valid = self.unproject_cam(border)
@@ -229,7 +223,7 @@ class Camera:
 
     @property
     def cone_rad(self) -> float:
-        """Angle off the optical axis beyond which no point falls into the image."""
+        """Largest angle off the optical axis at which a point can fall into the image."""
         return min(self.half_angle_rad, self.lens_model.fold_rad)
 
     def __eq__(self, other: object) -> bool:
@@ -258,7 +252,7 @@ class Camera:
         return self.project_cam((points - self.center_m) @ self.cam2ego[:3, :3])
 
     def project_cam(self, points_cam: FloatArray) -> Projection:
-        """Pixels of camera-frame points (..., 3); directions without a distance do as well."""
+        """Pixels of camera-frame points or directions (..., 3)."""
         x, y, z = points_cam[..., 0], points_cam[..., 1], points_cam[..., 2]
         xd, yd, valid = self.lens_model.distort(x, y, z)
         u = self.K[0, 0] * xd + self.K[0, 1] * yd + self.K[0, 2]
@@ -266,10 +260,10 @@ class Camera:
         return Projection(np.stack([u, v], -1), z, valid)
 
     def unproject(self, uv: Any) -> Rays:
-        """Unit viewing directions in the ego frame of pixels (..., 2); the ray starts at ``center_m``.
+        """Unit viewing directions in the ego frame of pixels (..., 2); rays start at ``center_m``.
 
-        Lenses are inverted by Newton's method. ``valid`` is False where no ray projects to within
-        ``UNPROJECT_TOLERANCE_PX`` of the pixel: outside the image circle, or past the lens's fold.
+        ``valid`` is False outside the image circle and past the lens's fold: no ray projects to within
+        ``UNPROJECT_TOLERANCE_PX`` of the pixel.
         """
         directions, valid = self.unproject_cam(np.asarray(uv, dtype=np.float64))
         return Rays(directions @ self.cam2ego[:3, :3].T, valid)
@@ -280,17 +274,18 @@ class Camera:
         xd = (uv[..., 0] - self.K[0, 2] - self.K[0, 1] * yd) / self.K[0, 0]
         directions = self.lens_model.undistort(xd, yd)
         if self.is_rectilinear:
-            x, y, z = np.moveaxis(directions, -1, 0)  # a reduction over so short an axis takes ten times as long
+            x, y, z = np.moveaxis(directions, -1, 0)  # ten times faster than a reduction over the short axis
             return Rays(directions, np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
         again = self.project_cam(directions)
         with np.errstate(invalid="ignore"):
-            near = np.abs(again.uv - uv).max(-1) <= UNPROJECT_TOLERANCE_PX
-        return Rays(directions, again.valid & near)
+            converged = np.abs(again.uv - uv).max(-1) <= UNPROJECT_TOLERANCE_PX
+        return Rays(directions, again.valid & converged)
 
-    def contains(self, uv: FloatArray, slack_px: float = 0.0) -> BoolArray:
-        """Whether pixels (..., 2) lie between the outermost pixel centres, where bilinear sampling reads no border."""
-        u, v = uv[..., 0] + slack_px, uv[..., 1] + slack_px
-        return (u >= 0) & (u <= self.width_px - 1 + 2 * slack_px) & (v >= 0) & (v <= self.height_px - 1 + 2 * slack_px)
+    def contains(self, uv: FloatArray, margin_px: float = 0.0) -> BoolArray:
+        """Whether pixels (..., 2) lie within the outermost pixel centres, widened by a margin."""
+        u, v = uv[..., 0] + margin_px, uv[..., 1] + margin_px
+        w, h = self.width_px - 1 + 2 * margin_px, self.height_px - 1 + 2 * margin_px
+        return (u >= 0) & (u <= w) & (v >= 0) & (v <= h)
 
     def pixel_grid(self) -> FloatArray:
         """(h, w, 2) pixel centres (x, y)."""
@@ -303,8 +298,7 @@ class Camera:
 
         Args:
             size: (h, w) in pixels.
-            fit: ``stretch``: the whole image in this shape. ``crop`` and ``pad`` keep the aspect: what covers the size
-                is cut at the top and at both sides, or what fits inside gets bars there. A mask is False on bars.
+            fit: See ``Fit``. A mask is False on bars.
 
         Raises:
             CalibrationError: An impossible size, or one that ``crop`` would have to be cut from too large an image.
@@ -324,9 +318,9 @@ class Camera:
         return replace(camera, mask=mask.astype(bool))
 
     def crop(self, top: int, left: int, size: tuple[int, int]) -> Camera:
-        """The camera of the window of ``size`` (h, w) whose first pixel is (left, top); it may exceed the image.
+        """The camera of the window of ``size`` (h, w) whose first pixel is (left, top).
 
-        Outside the image a mask is False: nothing was recorded there.
+        The window may exceed the image; a mask is False there.
         """
         h, w = checked_size(self.name, size)
         K = self.K.copy()
@@ -345,7 +339,7 @@ class Camera:
     def moved(self, ego2ego: Any) -> Camera:
         """The same camera in another ego frame: ``cam2ego`` becomes ``ego2ego @ cam2ego``."""
         move = checked_array(self.name, "ego2ego", ego2ego, (4, 4))
-        with np.errstate(over="ignore", invalid="ignore"):  # refused as a pose
+        with np.errstate(over="ignore", invalid="ignore"):  # ``Camera`` refuses such a pose
             cam2ego = move @ self.cam2ego
         return replace(self, cam2ego=cam2ego)
 

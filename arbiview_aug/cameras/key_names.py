@@ -1,4 +1,4 @@
-"""Keys that are not read because they are called something else: "did you mean …"."""
+"""Hints for misnamed keys: "did you mean …"."""
 
 from __future__ import annotations
 
@@ -30,26 +30,21 @@ USUAL_NAMES = {
     "height": ("height_px", "image_height", "h"),
     "cameras": ("cams", "sensors"),
 }
-"""What other tools and people call the keys that are read here."""
+"""Common names of the keys in other tools."""
 
 _LIKENESS = 0.88
-"""difflib's ratio of a misspelling, case apart: ``masks`` has 0.89; ``boxes_2d``, which is another thing, 0.875."""
+"""Least difflib ratio of a misspelling: ``masks`` for ``mask`` has 0.89, ``boxes_2d`` for ``boxes_3d`` 0.875."""
 
 
 def misnamed(entries: Mapping[Any, Any], read: Sequence[str]) -> dict[str, str]:
-    """Keys that nobody reads and what they are likely to be meant as: keys that are read here, and absent.
-
-    Args:
-        entries: A sample, or a part of a calibration file.
-        read: The keys that are read of it.
-    """
+    """The keys of ``entries`` that are likely meant as one of the keys that are ``read`` and absent."""
     names = tuple(read)
     found = ((key, meant_by(key, names)) for key in entries if isinstance(key, str))
     return {k: meant for k, meant in found if meant and meant not in entries and _could_be(meant, entries[k])}
 
 
 def hint(entries: Iterable[Any], wanted: Sequence[str]) -> str:
-    """For an error about keys that are missing: which ones were probably meant as these; else nothing."""
+    """Suggestions for an error about missing keys; empty where there are none."""
     names = tuple(wanted)
     found = [f"found {k!r}: did you mean {m!r}?" for k in entries if isinstance(k, str) and (m := meant_by(k, names))]
     return "".join(f"; {words}" for words in found)
@@ -57,7 +52,7 @@ def hint(entries: Iterable[Any], wanted: Sequence[str]) -> str:
 
 @lru_cache(maxsize=4096)
 def meant_by(key: str, names: tuple[str, ...]) -> str | None:
-    """The one of some names that another key is a usual name, or a misspelling, of."""
+    """The name that a key is a common alias or a misspelling of."""
     if key in names:
         return None
     usual = (name for name in names if key in USUAL_NAMES.get(name, ()))
@@ -67,7 +62,7 @@ def meant_by(key: str, names: tuple[str, ...]) -> str | None:
 
 
 def _could_be(meant: str, value: Any) -> bool:
-    """Whether a value is of the kind: people keep paths, counts and 2D boxes under such names too."""
+    """Whether a value can be the key's: paths, counts and 2D boxes have such names too."""
     if meant in ("points", "boxes_3d", "depth_m", "neighbours") and isinstance(value, str | Number | Mapping):
         return False
     if meant == "lidar" and isinstance(value, Number):

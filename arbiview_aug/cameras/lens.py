@@ -1,7 +1,7 @@
 """Lens models: one class per lens, and the table ``LENSES`` of all.
 
-A lens takes normalised image coordinates (x / z, y / z) to distorted ones, and back. A new lens is one subclass of
-``Lens`` and its entry in ``LENSES``; cameras, rig files, samples and plans ask its attributes.
+A lens maps normalised image coordinates (x / z, y / z) to distorted ones, and back. A new lens is a subclass of
+``Lens`` with an entry in ``LENSES``.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ MIN_DEPTH = 1e-6
 
 _NEWTON_STEPS = 40
 _FARTHEST = 1e12
-"""Largest distorted coordinate: the polynomial of a ray beside the camera can exceed what float32 maps hold, 1e38."""
+"""Largest distorted coordinate: polynomials at grazing angles can overflow float32 maps."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class Lens(ABC):
 
     Attributes:
         name: The name in ``Camera.lens``, rig files and samples.
-        aliases: Other names that are read.
+        aliases: Other names accepted on reading.
         coefficient_counts: Possible numbers of coefficients, ascending.
         is_rectilinear: Straight lines stay straight: two views from one centre differ by a homography.
-        sees_behind: The field of view may exceed 180 degrees, so z is no measure of depth.
+        sees_behind: The field of view may exceed 180 degrees.
         distortion: The coefficients.
     """
 
@@ -52,9 +52,9 @@ class Lens(ABC):
 
     @abstractmethod
     def distort(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Distort camera-frame directions (...,) to normalised coordinates; also return where they are valid.
+        """Distorted normalised coordinates of camera-frame directions (...,), and their validity.
 
-        Invalid ones (behind the camera, past the fold) get finite placeholders.
+        Invalid directions (behind the camera, past the fold) get finite placeholders.
         """
 
     @abstractmethod
@@ -64,7 +64,7 @@ class Lens(ABC):
     @property
     @abstractmethod
     def fold_limit(self) -> float:
-        """Limit of the radial function's rising branch, in the lens's own measure of the angle off axis."""
+        """Limit of the radial function's rising branch: an angle (fisheye) or its tangent (other lenses)."""
 
     @property
     def fold_rad(self) -> float:
@@ -88,7 +88,7 @@ class Pinhole(Lens):
 
 
 class RadTan(Lens):
-    """OpenCV's polynomial or rational model: k1 k2 p1 p2 [k3 [k4 k5 k6]]. The fold limit is a tangent."""
+    """OpenCV's polynomial or rational model: k1 k2 p1 p2 [k3 [k4 k5 k6]]."""
 
     name = "radtan"
     aliases = ("opencv_radtan",)
@@ -102,12 +102,12 @@ class RadTan(Lens):
         return np.clip(xd, -_FARTHEST, _FARTHEST), np.clip(yd, -_FARTHEST, _FARTHEST), valid
 
     def undistort(self, xd: FloatArray, yd: FloatArray) -> FloatArray:
-        """Newton's method in two unknowns, kept inside the fold; pixels leave the iteration as they converge."""
+        """Newton's method in two unknowns, inside the fold; pixels leave the iteration as they converge."""
         limit = min(self.fold_limit, 1e6)
         x_all, y_all = np.ravel(xd), np.ravel(yd)
         a_all, b_all = x_all.copy(), y_all.copy()
         open_ = np.arange(a_all.size)
-        with np.errstate(all="ignore"):  # what overflows ends as a non-finite value, mended below
+        with np.errstate(all="ignore"):  # non-finite values are replaced below
             for _ in range(_NEWTON_STEPS):
                 a, b = a_all[open_], b_all[open_]
                 shrink = np.minimum(1.0, limit / np.maximum(np.hypot(a, b), 1e-300))
@@ -168,7 +168,7 @@ class RadTan(Lens):
 
 
 class Fisheye(Lens):
-    """Kannala-Brandt with OpenCV's k1..k4. The fold limit is an angle in radians."""
+    """Kannala-Brandt with OpenCV's k1..k4."""
 
     name = "fisheye"
     aliases = ("opencv_fisheye",)
@@ -219,12 +219,12 @@ LENSES: dict[str, type[Lens]] = {lens.name: lens for lens in (Pinhole, RadTan, F
 
 
 def canonical_name(name: str) -> str:
-    """The lens's own name for one of its aliases; other names as they are."""
+    """The lens name of an alias; other names unchanged."""
     return next((lens.name for lens in LENSES.values() if name in lens.aliases), name)
 
 
 def _perspective(x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """(x / z, y / z) of directions in front of the camera, 0 elsewhere, and where that is."""
+    """(x / z, y / z) of directions and whether they are in front of the camera; 0 where they are not."""
     valid = z > MIN_DEPTH * np.sqrt(x * x + y * y + z * z)
     inverse = 1 / np.where(valid, z, 1)
     return np.where(valid, x * inverse, 0.0), np.where(valid, y * inverse, 0.0), valid
@@ -237,12 +237,8 @@ def _unit(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _smallest_positive_root(polynomial: FloatArray) -> float:
-    """Smallest positive root of a polynomial with constant term 1.
-
-    The reverse polynomial is solved: no division by a leading coefficient near zero. Roots above
-    1 / MIN_DEPTH count as none: nothing that far off axis is in front of the camera.
-    """
-    inverse = np.roots(polynomial[::-1])
+    """Smallest positive root of a polynomial with constant term 1; infinity above 1 / MIN_DEPTH."""
+    inverse = np.roots(polynomial[::-1])  # the reverse polynomial: no division by a leading coefficient near zero
     real = inverse.real[(np.abs(inverse.imag) < 1e-9 * np.abs(inverse)) & (inverse.real > 0)]
     return float(1 / real.max()) if real.max(initial=0.0) > MIN_DEPTH else math.inf
 

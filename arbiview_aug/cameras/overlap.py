@@ -1,4 +1,4 @@
-"""Overlaps of a rig's cameras: which are adjacent, and the view half-way between two, where overlaps are measured."""
+"""Adjacent cameras of a rig, and the view half-way between two of them, where overlaps are measured."""
 
 from __future__ import annotations
 
@@ -17,10 +17,7 @@ TILE_PX = 32
 
 
 def adjacent_pairs(rig: Rig) -> list[tuple[int, int]]:
-    """Pairs of cameras that are neighbours in azimuth and whose horizontal fields of view overlap.
-
-    A camera inside another's direction (a telephoto beside a wide one) has its neighbours like any other.
-    """
+    """Pairs of cameras that are neighbours in azimuth and whose horizontal fields of view overlap."""
     order = sorted(range(len(rig)), key=lambda k: (rig[k].azimuth_deg, k))
     pairs = []
     for here, there in zip(order, order[1:] + order[:1], strict=True):
@@ -33,8 +30,7 @@ def adjacent_pairs(rig: Rig) -> list[tuple[int, int]]:
 def half_way_view(a: Camera, b: Camera, size: tuple[int, int] = VIEW_SIZE) -> Camera:
     """The pinhole camera between two: mean centre, half-way rotation, the narrower camera's K scaled to ``size``.
 
-    The protocol scales K by diag(s_x, s_y, 1), without the half pixel of a resize: this is a view of its own, not a
-    resized image.
+    K is scaled by diag(s_x, s_y, 1), without the half pixel of a resize: the view is not a resized image.
     """
     between = a.cam2ego[:3, :3].T @ b.cam2ego[:3, :3]
     cam2ego = np.eye(4)
@@ -46,6 +42,6 @@ def half_way_view(a: Camera, b: Camera, size: tuple[int, int] = VIEW_SIZE) -> Ca
 
 
 def odd_tiles(size: tuple[int, int], tile_px: int = TILE_PX) -> BoolArray:
-    """(h, w) bool chessboard: True on the tiles that score, False on those that may be fitted to."""
+    """(h, w) bool chessboard: True on the tiles used for scores, False on those used for fitting."""
     row, column = np.indices(size)
     return np.asarray((column // tile_px + row // tile_px) % 2 == 1)

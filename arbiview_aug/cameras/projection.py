@@ -1,6 +1,6 @@
-"""Between target rays and source pixels: viewing rays, scene points, their pixels, borders, masks and resolution.
+"""Projection of target rays into source images, with borders, masks and resolution.
 
-Directions are held plane by plane, (3, ny, nx) in memory: three times faster.
+Directions lie plane by plane in memory, (3, ny, nx): three times faster.
 """
 
 from __future__ import annotations
@@ -30,16 +30,13 @@ def ego_rays(camera: Camera, pixels: FloatArray) -> tuple[FloatArray, BoolArray]
 def project_rays(
     source: Camera, directions: FloatArray, inverse_distance: FloatArray, offset_m: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Source pixels of scene points on target rays, homogeneously: infinity is inverse distance 0.
+    """Source pixels (..., 2) of scene points on target rays, and their validity (...,).
 
     Args:
         source: The camera that recorded the image.
         directions: (..., 3) unit rays of the target in the ego frame.
-        inverse_distance: (...,) along them, 1/m.
+        inverse_distance: (...,) along them, 1/m; 0 is infinity.
         offset_m: (3,) the target's centre minus the source's, metres.
-
-    Returns:
-        Pixels (..., 2) and validity (...,).
     """
     uv, _, valid = source.project_cam(source_points(source, directions, inverse_distance, offset_m))
     return uv, valid
@@ -48,7 +45,7 @@ def project_rays(
 def source_points(
     source: Camera, directions: FloatArray, inverse_distance: FloatArray, offset_m: FloatArray
 ) -> FloatArray:
-    """The scene points in the source's frame (..., 3), up to a positive scale; plane by plane in memory."""
+    """Scene points in the source's frame (..., 3), up to a positive scale; arguments as for ``project_rays``."""
     R = source.cam2ego[:3, :3].T
     points = R @ np.moveaxis(directions, -1, 0).reshape(3, -1)
     if np.any(offset_m):
@@ -57,27 +54,22 @@ def source_points(
 
 
 def look_apart(one: Camera, two: Camera, nearest: float) -> bool:
-    """Whether the viewing cones of two cameras, widened by the parallax of the nearest scene point, cannot meet.
+    """Whether the viewing cones of two cameras are disjoint for all scene points up to inverse distance ``nearest``.
 
-    Args:
-        one: A camera.
-        two: Another one, in the same ego frame.
-        nearest: The point's inverse distance from either of them, 1/m.
+    By the law of sines, the directions to a point at 1 / q from two centres differ by at most asin(baseline * q).
     """
-    # Law of sines: a point at 1 / q is seen from the two centres in directions that differ by at most asin(b q); by
-    # any angle where it is nearer than the baseline b.
-    nearness = float(np.linalg.norm(one.center_m - two.center_m)) * nearest
-    if nearness >= 1:
+    sine = float(np.linalg.norm(one.center_m - two.center_m)) * nearest
+    if sine >= 1:
         return False
-    apart = math.acos(float(np.clip(one.cam2ego[:3, 2] @ two.cam2ego[:3, 2], -1, 1)))
-    return apart > one.half_angle_rad + two.half_angle_rad + math.asin(nearness) + 0.01
+    angle = math.acos(float(np.clip(one.cam2ego[:3, 2] @ two.cam2ego[:3, 2], -1, 1)))
+    return angle > one.half_angle_rad + two.half_angle_rad + math.asin(sine) + 0.01
 
 
 def beyond_image(source: Camera, points: FloatArray, uv: FloatArray, valid: BoolArray) -> npt.NDArray[np.uint8]:
-    """Outcodes (...,): which of the image's borders, or the camera's plane, a scene point lies beyond; 0 is unknown.
+    """Outcodes (...,) of scene points (Cohen-Sutherland): the image borders or camera plane they lie beyond.
 
-    For pinholes they are read off homogeneous coordinates, which know their side behind the camera too (clipping as
-    in computer graphics): a cell with one bit in common holds no pixel of the image.
+    A cell whose corners share a bit holds no pixel of the image. Pinholes use homogeneous coordinates, which are valid
+    behind the camera too.
     """
     h, w = source.size
     if source.is_rectilinear:
@@ -95,36 +87,35 @@ def beyond_image(source: Camera, points: FloatArray, uv: FloatArray, valid: Bool
 
 
 def larger(vectors: FloatArray) -> FloatArray:
-    """The larger absolute component of (..., 2); a reduction over so short an axis would be ten times slower."""
+    """The larger absolute component of (..., 2); ten times faster than a reduction over the short axis."""
     return np.maximum(np.abs(vectors[..., 0]), np.abs(vectors[..., 1]))
 
 
 def clean_pixels(source: Camera, level: int) -> npt.NDArray[np.uint8]:
-    """255 (h, w) where a source that is halved ``level`` times shows the scene alone, 0 where some of its own car."""
+    """255 (h, w) where a source that is halved ``level`` times shows the scene, 0 where it shows its own car."""
     assert source.mask is not None
     clean: Any = source.mask.view(np.uint8) * np.uint8(255)
     return cv2.inRange(halved(clean, level), 255, 255) if level else clean  # type: ignore[call-overload,return-value]
 
 
 def mask_at(clean: npt.NDArray[np.uint8], at: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-    """255 where every bilinear tap with a weight at positions (h, w, 2) lies on ``clean_pixels``."""
+    """255 where all bilinear taps at positions (h, w, 2) lie on ``clean_pixels``."""
     share: Any = cv2.remap(clean, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
     return np.asarray(cv2.inRange(share, 255, 255), np.uint8)  # cv2.compare refuses a single pixel
 
 
 def edge_distance(source: Camera, uv: FloatArray) -> FloatArray:
-    """Distance (px) of source pixels (..., 2) to the border of what the source sees: the outermost centres are 0.5
-    inside it; negative outside the image."""
+    """Distance (px) of source pixels (..., 2) to the image's outer edge or mask; negative outside the image."""
     u, v = uv[..., 0], uv[..., 1]
     edge = np.minimum(np.minimum(u, source.width_px - 1 - u), np.minimum(v, source.height_px - 1 - v)) + 0.5
     if source.mask is None or source.mask.all():
         return edge
     h, w = source.size
-    whole = cv2.copyMakeBorder(source.mask.astype(np.float32), 0, -h % 8, 0, -w % 8, cv2.BORDER_REPLICATE)
-    coarse = cv2.resize(whole, (-(-w // 8), -(-h // 8)), interpolation=cv2.INTER_AREA)
+    padded = cv2.copyMakeBorder(source.mask.astype(np.float32), 0, -h % 8, 0, -w % 8, cv2.BORDER_REPLICATE)
+    coarse = cv2.resize(padded, (-(-w // 8), -(-h // 8)), interpolation=cv2.INTER_AREA)
     free = np.pad((coarse >= 1).astype(np.uint8), 1, constant_values=1)
     distance = cv2.distanceTransform(free, cv2.DIST_L2, 3)[1:-1, 1:-1]
-    distance = np.minimum(distance, 1e6) * 8  # it is the largest float where nothing is masked
+    distance = np.minimum(distance, 1e6) * 8  # OpenCV gives the largest float where nothing is masked
     index = np.clip(np.clip(uv, -8, FAR_AWAY_PX) / 8, 0, (coarse.shape[1] - 1, coarse.shape[0] - 1)).astype(np.int64)
     return np.where(edge >= 0, np.minimum(edge, distance[index[..., 1], index[..., 0]]), edge)
 
@@ -140,10 +131,8 @@ def resolution(uv: FloatArray, step: int) -> FloatArray:
 
 def _derivative(uv: FloatArray, axis: int, step: int) -> tuple[FloatArray, FloatArray]:
     """Forward differences of u and v (ny, nx) along an axis, the last one repeated."""
-    last = [slice(None), slice(None)]
-    last[axis] = slice(-1, None)
-    difference = np.diff(uv, axis=axis) / step
-    difference = np.concatenate([difference, difference[tuple(last)]], axis=axis)
+    padding = [(0, int(k == axis)) for k in range(3)]
+    difference = np.pad(np.diff(uv, axis=axis) / step, padding, mode="edge")
     return difference[..., 0], difference[..., 1]
 
 

@@ -1,4 +1,4 @@
-"""Random target rigs around a base rig: one draw a sample, or one a sequence; replayable as plain numbers."""
+"""Random target rigs around a base rig, drawn per sample or per sequence."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SCALES = ("focal_scale",)
 
 
 class RandomRig:
-    """Draws target rigs around ``base``: the whole rig turned, moved and zoomed by random amounts.
+    """Target rigs around ``base``: the whole rig turned, moved and zoomed by random amounts.
 
     Args:
         base: A rig, the name of a shipped one, or a rig file.
@@ -33,11 +33,10 @@ class RandomRig:
         forward_m: The rig moved forward.
         lateral_m: The rig moved to the left.
         focal_scale: Focal lengths scaled about the principal point.
-        per: ``sample``: a draw for each call, from torch's RNG (seeded per worker and epoch by the DataLoader).
-            ``sequence``: one draw for all samples of one ``sequence_key``, the same in every worker. It follows the
-            DataLoader's seed, so each epoch that starts its workers anew draws anew; without workers, or with
-            persistent ones, ``set_epoch`` before each epoch does it.
-        sequence_key: Which entry of a sample names its sequence.
+        per: ``sample``: one draw per call, from torch's RNG (seeded per worker and epoch by the DataLoader).
+            ``sequence``: one draw per value of ``sequence_key``, equal in all workers. It follows the DataLoader's
+            seed; call ``set_epoch`` before each epoch without workers or with persistent ones.
+        sequence_key: The sample key that names its sequence.
     """
 
     def __init__(
@@ -72,7 +71,7 @@ class RandomRig:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        if not self._epoch.is_shared():  # a copy, or from a file
+        if not self._epoch.is_shared():  # copied or unpickled
             self._epoch.share_memory_()
 
     def draw(self, rng: torch.Generator | None = None) -> dict[str, float]:
@@ -81,21 +80,20 @@ class RandomRig:
         return {name: low + (high - low) * x for (name, (low, high)), x in zip(self.ranges.items(), u, strict=True)}
 
     def set_epoch(self, epoch: int) -> None:
-        """Let ``per="sequence"`` draw anew; reaches workers that run already. See the class."""
+        """Change the draws of ``per="sequence"``, also in running workers."""
         self._epoch.fill_(epoch)
 
     def draw_for(self, sample: Mapping[str, Any], rng: torch.Generator | None = None) -> dict[str, float]:
         """Parameters for a sample, following ``per``.
 
         Raises:
-            SampleError: No sequence to draw for, or a batch of several.
+            SampleError: The sample names no sequence, or is a batch of several.
         """
         if self.per == "sample":
             return self.draw(rng)
-        # Workers of one epoch share a base seed; sequences may be split between workers.
         worker = torch.utils.data.get_worker_info()
         if worker is not None:
-            seed = worker.seed - worker.id
+            seed = worker.seed - worker.id  # the base seed that all workers of an epoch share
         else:
             seed = torch.initial_seed() if rng is None else rng.initial_seed()
         digest = hashlib.sha256(f"{seed} {int(self._epoch)} {self._sequence(sample)}".encode()).digest()
@@ -112,7 +110,7 @@ class RandomRig:
         return names.pop()
 
     def rig(self, params: Mapping[str, float]) -> Rig:
-        """The rig of drawn parameters: the same numbers give the same rig.
+        """The rig of drawn parameters.
 
         Raises:
             CalibrationError: Unknown or missing parameters.
@@ -124,12 +122,9 @@ class RandomRig:
         p = {name: float(value) for name, value in params.items()}
         rig = self.base.turned(yaw_deg=p["yaw_deg"], pitch_deg=p["pitch_deg"], roll_deg=p["roll_deg"])
         rig = rig.shifted(p["forward_m"], p["lateral_m"], p["height_m"])
-        cameras = []
-        for camera in rig:
-            K = camera.K.copy()
-            K[:2, :2] *= p["focal_scale"]
-            cameras.append(replace(camera, K=K))
-        return rig.with_cameras(cameras)
+        scale = np.ones((3, 3))
+        scale[:2, :2] = p["focal_scale"]
+        return rig.with_cameras([replace(camera, K=camera.K * scale) for camera in rig])
 
     def __repr__(self) -> str:
         moving = ", ".join(f"{n} {lo:g}..{hi:g}" for n, (lo, hi) in self.ranges.items() if hi > lo)
@@ -152,7 +147,7 @@ def _range(name: str, value: Any) -> tuple[float, float]:
 
 
 def _flat(value: Any) -> Iterator[Any]:
-    """The entries of nested lists, tensors and arrays, as a collated batch has them; of anything else itself."""
+    """The leaves of nested lists, tensors and arrays, as in a collated batch."""
     if isinstance(value, torch.Tensor | np.ndarray):
         value = value.tolist()
     if isinstance(value, list | tuple):

@@ -11,9 +11,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
@@ -39,19 +40,19 @@ class Rig:
     Args:
         cameras: One or more cameras with different names; all ``cam2ego`` are in this rig's ego frame.
         ground_z_m: Height of the road in that frame (-0.33 where the origin is a rear axle 0.33 m above it).
-        name: For people.
+        name: A label for tables and messages.
 
     Raises:
         CalibrationError: No cameras, duplicate names, or a ground height that is not finite.
     """
 
-    cameras: tuple[Camera, ...]
-    ground_z_m: float = 0.0
-    name: str = ""
+    cameras: Sequence[Camera]
+    ground_z_m: float = field(default=0.0, kw_only=True)
+    name: str = field(default="", kw_only=True)
 
-    def __init__(self, cameras: Sequence[Camera], *, ground_z_m: float = 0.0, name: str = "") -> None:
-        cameras = tuple(cameras)
-        where = f"rig {name!r}" if name else "rig"
+    def __post_init__(self) -> None:
+        cameras = tuple(self.cameras)
+        where = f"rig {self.name!r}" if self.name else "rig"
         if not cameras:
             raise CalibrationError(f"{where}: expected at least one camera, got none")
         for camera in cameras:
@@ -62,14 +63,13 @@ class Rig:
         if twice:
             raise CalibrationError(f"{where}: expected different camera names, got {', '.join(twice)} more than once")
         try:
-            ground = float(ground_z_m)
+            ground = float(self.ground_z_m)
         except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: tensors of several heights
             ground = math.nan
         if not math.isfinite(ground):
-            raise CalibrationError(f"{where}: ground_z_m: expected a finite height in metres, got {ground_z_m!r}")
+            raise CalibrationError(f"{where}: ground_z_m: expected a finite height in metres, got {self.ground_z_m!r}")
         object.__setattr__(self, "cameras", cameras)
         object.__setattr__(self, "ground_z_m", ground)
-        object.__setattr__(self, "name", name)
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -94,7 +94,7 @@ class Rig:
         return hash((self.cameras, self.ground_z_m))
 
     def __repr__(self) -> str:
-        """A table: one line a camera, as ``inspect`` prints it."""
+        """A table with one line per camera, as ``inspect`` prints it."""
         head = f"Rig {self.name or '(unnamed)'}: {len(self)} cameras, road at z = {self.ground_z_m:+.2f} m"
         width = max(len(n) for n in self.names)
         lines = [
@@ -133,11 +133,9 @@ class Rig:
 
     @cached_property
     def content_key(self) -> bytes:
-        """Digest of the calibration: equal for rigs that render the same, whatever their names."""
-        digest = hashlib.sha256(np.float64(self.ground_z_m).tobytes())
-        for camera in self.cameras:
-            digest.update(camera.content_key)
-        return digest.digest()
+        """Digest of the calibration, without names."""
+        keys = (camera.content_key for camera in self.cameras)
+        return hashlib.sha256(np.float64(self.ground_z_m).tobytes() + b"".join(keys)).digest()
 
     # --- changed copies -------------------------------------------------------------------------------------------
     def with_cameras(self, cameras: Sequence[Camera]) -> Rig:
@@ -145,21 +143,18 @@ class Rig:
         return Rig(cameras, ground_z_m=self.ground_z_m, name=self.name)
 
     def resized(self, size: tuple[int, int] | float, fit: Fit = "stretch") -> Rig:
-        """All cameras resized to (h, w), each as ``Camera.resize`` fits it; or by a scale."""
-
-        def new(c: Camera) -> tuple[int, int]:
-            if isinstance(size, tuple):
-                return size
-            return max(1, round(c.height_px * size)), max(1, round(c.width_px * size))
-
-        return self.with_cameras([c.resize(new(c), fit) for c in self.cameras])
+        """All cameras resized to (h, w), see ``Camera.resize``, or by a scale."""
+        if isinstance(size, tuple):
+            return self.with_cameras([c.resize(size, fit) for c in self])
+        sizes = [(max(1, round(h * size)), max(1, round(w * size))) for h, w in self.sizes]
+        return self.with_cameras([c.resize(to, fit) for c, to in zip(self, sizes, strict=True)])
 
     def turned(self, *, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Rig:
-        """Each camera turned about its own centre (see ``Camera.turned``)."""
+        """Each camera turned about its own centre, see ``Camera.turned``."""
         return self.with_cameras([c.turned(yaw_deg=yaw_deg, pitch_deg=pitch_deg, roll_deg=roll_deg) for c in self])
 
     def shifted(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Rig:
-        """All cameras moved along the ego's axes; the road stays."""
+        """All cameras moved along the ego axes; the road stays."""
         return self.with_cameras([c.shifted(x_m, y_m, z_m) for c in self])
 
     def undistorted(self) -> Rig:
@@ -167,7 +162,7 @@ class Rig:
         return self.with_cameras([c.undistorted() for c in self])
 
     def ego2ego(self, other: Rig) -> FloatArray:
-        """(4, 4) from this rig's ego frame to ``other``'s: both roads coincide, and so do the x and y origins."""
+        """(4, 4) from this rig's ego frame to ``other``'s; both roads and both x-y origins coincide."""
         T = np.eye(4)
         T[2, 3] = other.ground_z_m - self.ground_z_m
         return T
@@ -181,7 +176,7 @@ class Rig:
 
     # --- files ----------------------------------------------------------------------------------------------------
     def to_dict(self) -> dict[str, Any]:
-        """Plain data in the rig file's format, without masks (those are files: see ``save``)."""
+        """Plain data in the rig file's format, without masks, which ``save`` writes as files."""
         return {
             "name": self.name,
             "ground_z_m": self.ground_z_m,
@@ -204,7 +199,7 @@ class Rig:
 
         Args:
             data: The parsed file.
-            folder: Where the mask files lie.
+            folder: The folder of the mask files.
             where: Named in error messages.
 
         Raises:
@@ -226,7 +221,7 @@ class Rig:
         data = self.to_dict()
         for k, (entry, camera) in enumerate(zip(data["cameras"], self.cameras, strict=True)):
             if camera.mask is not None:
-                # Names such as /camera/front are no file names; with a space, the other cannot be a camera's own name.
+                # Names such as /camera/front are no file names; the space avoids clashes with a camera's own name.
                 name = camera.name if re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", camera.name) else f"camera {k}"
                 file = path.with_name(f"{path.stem}.{name}.mask.png")
                 cv2.imwrite(str(file), camera.mask.astype(np.uint8) * 255)
@@ -242,7 +237,7 @@ class Rig:
 
 
 def shipped_rigs() -> list[str]:
-    """Names that ``load_rig`` knows without a file."""
+    """Names of the rigs that ship with the package, for ``load_rig``."""
     folder = resources.files("arbiview_aug.cameras") / "rigs"
     return sorted(f.name.removesuffix(".yaml") for f in folder.iterdir() if f.name.endswith(".yaml"))
 
@@ -261,11 +256,7 @@ def load_rig(name_or_path: str | Path) -> Rig:
         return Rig.from_dict(yaml.safe_load(text), where=f"rig {name_or_path}")
     path = Path(name_or_path)
     where = f"rig file {path}"
-    try:
-        found = path.is_file()
-    except (OSError, ValueError):  # a name that no file can have
-        found = False
-    if not found:
+    if not os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
         raise CalibrationError(
             f"{where}: expected a file or one of the shipped rigs ({', '.join(shipped_rigs())}), found neither"
         )
@@ -310,7 +301,7 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
 
 
 def _refuse_misnamed(entries: Mapping[str, Any], key: str, label: str) -> None:
-    """Refuse numbers under another name of an absent key, which would silently be 0; words are somebody's notes."""
+    """Refuse numbers under another name of an absent key, which would silently be 0; text may be a note."""
     for found in misnamed(entries, (key,)):
         value = entries[found]
         is_zero = not any(value) if isinstance(value, list) else not value
@@ -322,19 +313,16 @@ def _refuse_misnamed(entries: Mapping[str, Any], key: str, label: str) -> None:
 
 
 def read_mask(file: Any, folder: Path | None, label: str) -> np.ndarray:
-    """(H, W) bool car-body mask from an image file: bright = scene."""
+    """Read an (H, W) bool car-body mask from an image file: bright = scene."""
     if not isinstance(file, str) or folder is None:
         raise CalibrationError(f"{label}: mask: expected a file name beside the rig file, got {file!r}")
     path = folder / file
-    try:
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
-    except (OSError, ValueError):  # a name that no file can have
-        image = None
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if os.path.isfile(path) else None
     if image is None:
         raise CalibrationError(f"{label}: mask: expected an image file {path}, found none that can be read")
     return np.asarray(image > 0)
 
 
 def content_order(cameras: Sequence[Camera]) -> list[int]:
-    """Indices of cameras in an order that depends on their calibration alone, never on their place in the list."""
+    """Indices of cameras in an order that depends on their calibration alone, not on their place in the list."""
     return sorted(range(len(cameras)), key=lambda k: (cameras[k].content_key, k))

@@ -1,6 +1,6 @@
-"""What a camera's calibration may be: each value checked, or refused with the camera's name and how to mend it.
+"""Checks of a camera's calibration.
 
-All functions take the camera's name first and raise ``CalibrationError``; what they return is read-only.
+All functions take the camera's name first, return read-only values and raise ``CalibrationError`` with the fix.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from arbiview_aug.cameras.rotations import nearest_rotation
 from arbiview_aug.errors import CalibrationError
 
 ROTATION_TOLERANCE = 1e-4
-"""Largest entry of |R Rᵀ - I| that is still a rotation: published calibrations carry 5 to 7 digits."""
+"""Largest entry of |R Rᵀ - I| accepted as a rotation: published calibrations carry 5 to 7 digits."""
 
 _MAX_COEFFICIENT = 1e6  # real lenses stay below 1e3, and near 1e300 their polynomials overflow
 
@@ -24,26 +24,24 @@ MAX_SIZE_PX = 32766
 
 
 def checked_name(name: Any) -> str:
-    """A non-empty string."""
     if not isinstance(name, str) or not name:
         raise CalibrationError(f"camera name: expected a non-empty string, got {name!r}")
     return name
 
 
 def checked_pixels(name: str, field: str, value: Any, least: int = 1) -> int:
-    """A whole number of pixels up to ``MAX_SIZE_PX``: an image's side, or a place with ``least`` below 1."""
+    """An integer number of pixels from ``least`` to ``MAX_SIZE_PX``."""
     try:
         pixels = int(value)
-        whole = pixels == value
+        valid = pixels == value and least <= pixels <= MAX_SIZE_PX
     except (TypeError, ValueError, OverflowError):
-        pixels, whole = 0, False
-    if not whole or not least <= pixels <= MAX_SIZE_PX:
+        valid = False
+    if not valid:
         raise _error(name, field, f"a whole number of pixels from {least} to {MAX_SIZE_PX}", repr(value))
     return pixels
 
 
 def checked_size(name: str, value: Any) -> tuple[int, int]:
-    """A size (h, w)."""
     try:
         h, w = value
     except (TypeError, ValueError):
@@ -52,20 +50,20 @@ def checked_size(name: str, value: Any) -> tuple[int, int]:
 
 
 def checked_numbers(name: str, field: str, values: Any, count: int, expected: str) -> tuple[float, ...]:
-    """Finite numbers; ``expected`` says in the error which."""
+    """``count`` finite numbers; ``expected`` describes them in the error."""
     try:
         numbers = tuple(float(v) for v in values)
-        good = len(numbers) == count and all(map(math.isfinite, numbers))
-        good = good and not any(isinstance(v, str | bytes) for v in values)  # float reads words too
+        valid = len(numbers) == count and all(map(math.isfinite, numbers))
+        valid = valid and not any(isinstance(v, str | bytes) for v in values)  # float() parses strings
     except (TypeError, ValueError, OverflowError):
-        good = False
-    if not good:
+        valid = False
+    if not valid:
         raise _error(name, field, expected, repr(values))
     return numbers
 
 
 def checked_array(name: str, field: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
-    """Finite float64 numbers of a shape, copied."""
+    """A finite float64 copy of the given shape."""
     try:
         if np.iscomplexobj(value):
             raise TypeError("complex numbers")
@@ -82,7 +80,7 @@ def checked_array(name: str, field: str, value: Any, shape: tuple[int, ...]) -> 
 
 
 def checked_intrinsics(name: str, value: Any) -> FloatArray:
-    """(3, 3) K with positive focal lengths, normalised and upper triangular."""
+    """(3, 3) K: upper triangular, normalised, with positive focal lengths."""
     K = checked_array(name, "K", value, (3, 3))
     if K[0, 0] <= 0 or K[1, 1] <= 0:
         raise _error(name, "K", "positive focal lengths", f"fx {K[0, 0]:g}, fy {K[1, 1]:g}")
@@ -93,27 +91,23 @@ def checked_intrinsics(name: str, value: Any) -> FloatArray:
 
 
 def checked_pose(name: str, value: Any) -> FloatArray:
-    """(4, 4) cam2ego whose rotation is within ``ROTATION_TOLERANCE`` of one, made exact."""
+    """(4, 4) cam2ego; a rotation within ``ROTATION_TOLERANCE`` is made exact."""
     cam2ego = checked_array(name, "cam2ego", value, (4, 4))
     if np.abs(cam2ego[3] - (0, 0, 0, 1)).max() > 1e-9:
         fix = "pass cam2ego.T" if np.any(cam2ego[3, :3]) and not np.any(cam2ego[:3, 3]) else ""
         raise _error(name, "cam2ego", "last row (0, 0, 0, 1)", f"{cam2ego[3].tolist()}", fix)
     R = cam2ego[:3, :3]
     largest = float(np.abs(R).max())
-    if largest > 2:  # near 1e308 the products below overflow
+    if largest > 2:  # the products below could overflow
         fix = f"the nearest rotation is {nearest_rotation(R / largest).round(9).tolist()}"
         raise _error(name, "cam2ego", "a rotation, with entries from -1 to 1", f"{R.tolist()}", fix)
     deviation = float(np.abs(R @ R.T - np.eye(3)).max())
     determinant = float(np.linalg.det(R))
     if deviation > ROTATION_TOLERANCE or determinant < 0:
-        raise _error(
-            name,
-            "cam2ego",
-            f"a rotation (|R Rᵀ - I| <= {ROTATION_TOLERANCE:g}, determinant +1)",
-            f"deviation {deviation:.3g}, determinant {determinant:.6g}",
-            f"the nearest rotation is {nearest_rotation(R).round(9).tolist()}",
-        )
-    # Residual scale and skew of published digits would bend straight lines by a fraction of a pixel.
+        expected = f"a rotation (|R Rᵀ - I| <= {ROTATION_TOLERANCE:g}, determinant +1)"
+        fix = f"the nearest rotation is {nearest_rotation(R).round(9).tolist()}"
+        raise _error(name, "cam2ego", expected, f"deviation {deviation:.3g}, determinant {determinant:.6g}", fix)
+    # Residual scale and skew of rounded digits would bend straight lines by a fraction of a pixel.
     if deviation > 1e-12:
         cam2ego = cam2ego.copy()
         cam2ego[:3, :3] = nearest_rotation(R)
@@ -122,7 +116,7 @@ def checked_pose(name: str, value: Any) -> FloatArray:
 
 
 def checked_lens(name: str, value: Any) -> LensName:
-    """The name of a lens model; aliases become the lens's own name."""
+    """The name of a lens in ``LENSES``, also for its aliases."""
     value = canonical_name(value) if isinstance(value, str) else value
     if not isinstance(value, str) or value not in LENSES:
         raise _error(name, "lens", f"one of {', '.join(LENSES)}", repr(value))
@@ -130,7 +124,7 @@ def checked_lens(name: str, value: Any) -> LensName:
 
 
 def checked_distortion(name: str, lens: str, value: Any) -> tuple[float, ...]:
-    """As many coefficients as the lens takes, at most 1e6."""
+    """As many coefficients as the lens takes, up to ``_MAX_COEFFICIENT``."""
     try:
         coefficients = tuple(float(k) + 0.0 for k in value)
     except (TypeError, ValueError, OverflowError):
@@ -147,7 +141,7 @@ def checked_distortion(name: str, lens: str, value: Any) -> tuple[float, ...]:
 
 
 def checked_mask(name: str, value: Any, size: tuple[int, int]) -> BoolArray:
-    """(h, w) bool of the image's size, copied."""
+    """A copy (h, w) bool of the image's size."""
     array = np.asarray(value)
     if array.dtype != np.bool_:
         raise _error(name, "mask", "bool, True = scene", f"dtype {array.dtype}", "pass mask > 0")

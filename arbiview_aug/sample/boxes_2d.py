@@ -1,4 +1,4 @@
-"""2D boxes of what is labelled in 3D: where they are in an image, how much is cut off, how much is hidden."""
+"""2D boxes of labelled 3D boxes, with truncation and visibility."""
 
 from __future__ import annotations
 
@@ -18,24 +18,22 @@ from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.scene.boxes import BoxSurface, checked_boxes, is_over, meets, silhouettes
 from arbiview_aug.scene.static import Far
 
-_NEAR_M = 0.1  # boxes are cut off here: what lies behind a camera has no pixels
+_NEAR_M = 0.1  # near plane
 _CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))  # [8, 3]
 _EDGES = np.array([(a, b) for a in range(8) for b in range(a) if (_CORNERS[a] != _CORNERS[b]).sum() == 1])  # [12, 2]
 _LENS_STEPS = 33
-"""Points along an edge where lenses bend it: a car 2 m away fills 90 degrees, of which a step is 3; an arc of 3 degrees
-rises 0.03 % of its radius over its chord, 0.2 px of a focal length of 600."""
+"""Points along an edge that a lens bends: steps of 3 degrees for a car 2 m away, 0.2 px at a focal length of 600 px."""
 
 
 class ImageBoxes(NamedTuple):
-    """The n boxes that reach into one camera's image.
+    """The n boxes that are visible in one camera's image.
 
     Attributes:
         rows: (n,) rows of ``boxes_3d``.
         boxes: (n, 4) float64 x0 y0 x1 y1 in pixels, cut at the outermost pixel centres: 0 to w - 1 and 0 to h - 1.
-        truncation: (n,) in [0, 1): share of the uncut rectangle that lies beyond the image, or within 0.1 m of the
-            camera's plane or behind it.
-        visibility: (n,) in [0, 1]: share of the object's pixels within the image that no nearer box hides and that the
-            camera's mask leaves; 0 where it covers no pixel's centre.
+        truncation: (n,) in [0, 1): share of the uncut rectangle outside the image or behind the near plane.
+        visibility: (n,) in [0, 1]: share of the object's pixels in the image that are neither occluded by a nearer box
+            nor masked; 0 if it covers no pixel's centre.
     """
 
     rows: npt.NDArray[np.int64]
@@ -47,14 +45,13 @@ class ImageBoxes(NamedTuple):
 def project_boxes_3d(boxes_3d: Any, cameras: Rig | Mapping[str, Any]) -> list[ImageBoxes]:
     """2D boxes of 3D boxes in each camera.
 
-    A rectangle bounds what lies within the image of a box's faces, seen through the lens where there is one: of a box
-    that reaches out of the image less than its projected corners span, cut at the border. Only boxes hide: what walls
-    and trees hide is not known.
+    A rectangle bounds the part of a box's faces within the image, seen through the lens; it is tighter than the
+    projected corners cut at the border. Only boxes occlude each other: walls and trees are unknown.
 
     Args:
         boxes_3d: (B, >= 7) centre x y z, length, width, height in metres, yaw in radians, in the cameras' ego frame.
-        cameras: A rig; or an unbatched sample, such as ``RigRetarget`` gives: pixels that its ``coverage`` or
-            ``ignore`` leave out show no object.
+        cameras: A rig, or an unbatched sample, such as ``RigRetarget`` returns, whose ``coverage`` and ``ignore`` mask
+            pixels.
 
     Returns:
         An entry for each camera.
@@ -72,21 +69,21 @@ def project_boxes_3d(boxes_3d: Any, cameras: Rig | Mapping[str, Any]) -> list[Im
 
 
 class Outline(NamedTuple):
-    """Rectangles (4,) x0 y0 x1 y1 around the image of one box: of all of it, and of what lies within the image."""
+    """Rectangles (4,) x0 y0 x1 y1 around the projection of one box: uncut, and inside the image."""
 
-    whole: FloatArray
+    uncut: FloatArray
     inside: FloatArray
 
 
 def outline(camera: Camera, box: FloatArray) -> Outline | None:
-    """Where a box (7,) is in a camera's image; None where no part of it is, or where it holds the camera."""
+    """The outline of a box (7,) in a camera's image; None if it is outside or holds the camera."""
     if is_over(box, camera.center_m) and abs(camera.center_m[2] - box[2]) <= box[5] / 2:
         return None
     c, s = np.cos(box[6]), np.sin(box[6])
     corners = (_CORNERS * box[3:6]) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + box[:3]
     x = (corners - camera.center_m) @ camera.cam2ego[:3, :3]
     one, two = x[_EDGES[:, 0]], x[_EDGES[:, 1]]
-    if not camera.lens_model.sees_behind:  # which sees what is beside it, and behind
+    if not camera.lens_model.sees_behind:
         ahead = np.maximum(one[:, 2], two[:, 2]) >= _NEAR_M
         one, two = one[ahead], two[ahead]
         one, two = _cut(one, two), _cut(two, one)
@@ -109,56 +106,44 @@ def outline(camera: Camera, box: FloatArray) -> Outline | None:
         return None
     around = [pixels[valid], within]
     if not (camera.is_rectilinear or camera.lens_model.sees_behind):
-        # Past the fold of its polynomial the box goes on as a pinhole would see it.
+        # Past the lens's fold, the box is projected as by a pinhole.
         beyond = points[~valid & (points[..., 2] > 0)] @ camera.K.T
         around.append(beyond[:, :2] / beyond[:, 2:])
-    whole = np.concatenate(around)
-    return Outline(
-        np.concatenate([whole.min(axis=0), whole.max(axis=0)]),
-        np.concatenate([within.min(axis=0), within.max(axis=0)]),
-    )
+    uncut, inside = (np.concatenate([p.min(axis=0), p.max(axis=0)]) for p in (np.concatenate(around), within))
+    return Outline(uncut, inside)
 
 
 def _clipped(one: FloatArray, two: FloatArray, limits: FloatArray) -> FloatArray:
-    """The ends (m, 2) of segments (n, 2) after they are cut off at 0 and ``limits`` (Liang and Barsky 1984)."""
+    """The ends (m, 2) of segments (n, 2) clipped to 0 and ``limits`` (Liang and Barsky 1984)."""
     step = two - one
     with np.errstate(divide="ignore", invalid="ignore"):
         low, high = -one / step, (limits - one) / step
-    still = step == 0  # along an axis: inside all the way, or nowhere
-    outside = still & ((one < 0) | (one > limits))
-    enter = np.where(still, np.where(outside, np.inf, -np.inf), np.minimum(low, high)).max(axis=1).clip(0)
-    leave = np.where(still, np.inf, np.maximum(low, high)).min(axis=1).clip(max=1)
-    some = enter <= leave
-    start, step = one[some], step[some]
-    return np.concatenate([start + share[some, None] * step for share in (enter, leave)]).clip(0, limits)
+    parallel = step == 0
+    outside = parallel & ((one < 0) | (one > limits))
+    enter = np.where(parallel, np.where(outside, np.inf, -np.inf), np.minimum(low, high)).max(axis=1).clip(0)
+    leave = np.where(parallel, np.inf, np.maximum(low, high)).min(axis=1).clip(max=1)
+    hit = enter <= leave
+    start, step = one[hit], step[hit]
+    return np.concatenate([start + share[hit, None] * step for share in (enter, leave)]).clip(0, limits)
 
 
 def _cut(one: FloatArray, two: FloatArray) -> FloatArray:
-    """The ends (n, 3) ``one`` of edges to ``two``, moved along them to the near plane where they lie behind it."""
+    """The ends (n, 3) ``one`` of edges to ``two``, clipped at the near plane."""
     behind = one[:, 2] < _NEAR_M
     share = (_NEAR_M - one[:, 2]) / np.where(behind, two[:, 2] - one[:, 2], 1.0)
     return np.where(behind[:, None], one + share[:, None] * (two - one), one)
 
 
 def _of_camera(camera: Camera, boxes: FloatArray) -> ImageBoxes:
-    index, inside, truncation = [], [], []
-    for k, box in enumerate(boxes):
-        if (seen := outline(camera, box)) is not None:
-            index.append(k)
-            inside.append(seen.inside)
-            areas = [np.prod(rectangle[2:] - rectangle[:2]) for rectangle in seen]
-            truncation.append(1 - areas[1] / areas[0])
-    found = np.array(index, np.int64)
-    return ImageBoxes(
-        rows=found,
-        boxes=np.array(inside).reshape(-1, 4),
-        truncation=np.array(truncation, np.float64),
-        visibility=_visibility(camera, boxes[found]),
-    )
+    outlines = {k: found for k, box in enumerate(boxes) if (found := outline(camera, box)) is not None}
+    rows = np.array(list(outlines), np.int64)
+    uncut, inside = np.array(list(outlines.values())).reshape(-1, 2, 4).swapaxes(0, 1)
+    uncut_px, inside_px = (np.prod(rectangles[:, 2:] - rectangles[:, :2], axis=1) for rectangles in (uncut, inside))
+    return ImageBoxes(rows, inside, 1 - inside_px / uncut_px, _visibility(camera, boxes[rows]))
 
 
 def _visibility(camera: Camera, boxes: FloatArray) -> FloatArray:
-    """(n,) the share of each box's pixels that shows it."""
+    """(n,) visible share of each box's pixels."""
     covered = np.array([len(np.unique(pixels)) for pixels in silhouettes(camera, boxes)], np.float64)
     shown = BoxSurface(Far(), boxes).drawn(camera)
     nearest = shown.face // 6

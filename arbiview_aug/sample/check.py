@@ -1,4 +1,4 @@
-"""Which further keys of a sample hold label maps, and which are stale or probably misnamed."""
+"""Checks of a sample's other keys: label maps, stale pixel data, misnamed keys."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ PIXEL_BOUND_KEYS = (
     "generated",
     "sources",
 )
-"""Keys known to speak of the source's pixels: dropped, because they would be stale in the target's views."""
+"""Keys bound to the source's pixels; they are dropped, as they would be stale in the target's views."""
 
 EGO_KEYS = ("points", "boxes_3d", "ego2world")
-"""Keys known to be in the ego frame: they pass, or move with ``label_frame="target"``."""
+"""Keys in the ego frame; they pass, or move with ``label_frame="target"``."""
 
-_MOST_NESTED = 64  # entries of a list that are looked at: longer lists are tokens or numbers
+_MAX_ENTRIES = 64  # checked per list: longer lists are tokens or numbers
 
 
 def check_other_keys(
@@ -39,16 +39,16 @@ def check_other_keys(
     label_keys: Sequence[str],
     pass_keys: Sequence[str],
 ) -> list[str]:
-    """Which keys hold label maps; refuses whatever else may speak of the source's pixels.
+    """The keys that hold label maps; refuse others that may be bound to the source's pixels.
 
     Args:
         sample: The sample dict.
         sizes: The (h, w) of its images.
         label_keys: Named by the user as label maps.
-        pass_keys: Named by the user as harmless.
+        pass_keys: Named by the user as independent of pixels.
 
     Raises:
-        SampleError: A tensor of the images' height and width, or a torchvision tv_tensor, that nobody named.
+        SampleError: A tensor of the images' height and width, or a torchvision tv_tensor, under another key.
     """
     absent = [key for key in label_keys if key not in sample]
     if absent:
@@ -63,10 +63,8 @@ def check_other_keys(
             continue
         for leaf in _leaves(value):
             if kind := _tv_tensor(leaf):
-                raise SampleError(
-                    f"{key}: a tv_tensors.{kind} speaks of the source's pixels and would be stale; "
-                    f"drop it, or name it in pass_keys=({key!r},)"
-                )
+                stale = f"{key}: a tv_tensors.{kind} is bound to the source's pixels and would be stale"
+                raise SampleError(f"{stale}; drop it, or name it in pass_keys=({key!r},)")
             shape = tuple(getattr(leaf, "shape", ()))
             if any(pair in sizes for pair in pairwise(shape)):
                 raise SampleError(
@@ -82,11 +80,8 @@ def _tv_tensor(value: Any) -> str:
 
 
 def _leaves(value: Any) -> Iterator[Any]:
-    if isinstance(value, Mapping):
-        for entry in value.values():
-            yield from _leaves(entry)
-    elif isinstance(value, list | tuple):
-        for entry in value[:_MOST_NESTED]:
+    if isinstance(value, Mapping | list | tuple):
+        for entry in value.values() if isinstance(value, Mapping) else value[:_MAX_ENTRIES]:
             yield from _leaves(entry)
     else:
         yield value
@@ -99,18 +94,18 @@ def warn_of_misnamed(
     named: Sequence[str],
     warn: Callable[[str, str], None],
 ) -> None:
-    """Say which keys go unread because they are probably called something else here.
+    """Warn of keys that are probably misnamed and would not be read.
 
     Args:
         sample: The sample dict.
-        calibrated: A rig says what its ``lens``, ``distortion`` and ``ground_z_m`` would.
-        static: Nothing in the ego frame is read or moved.
-        named: Keys that the user named: they are as they should be.
-        warn: Takes a topic and words.
+        calibrated: A rig stands for ``lens``, ``distortion`` and ``ground_z_m``.
+        static: No ego-frame key is used.
+        named: Keys that the user named on purpose.
+        warn: Called with a topic and a message.
     """
     lenses = () if calibrated else ("distortion", "lens", "ground_z_m")
     geometry = () if static else (*EGO_KEYS, "depth_m")
     for found, meant in misnamed(sample, ("neighbours", *lenses, *geometry)).items():
-        if found not in (*named, *PIXEL_BOUND_KEYS):  # it is said of these that they are dropped
-            words = f"the sample's {found!r} is not read; did you mean {meant!r}?"
-            warn(f"key {found}", f"{words} Rename it, in the form that RigRetarget documents, or name it in pass_keys")
+        if found not in (*named, *PIXEL_BOUND_KEYS):
+            message = f"the sample's {found!r} is not read; did you mean {meant!r}?"
+            warn(f"key {found}", f"{message} Rename it, as RigRetarget documents it, or name it in pass_keys")

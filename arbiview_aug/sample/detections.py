@@ -1,4 +1,4 @@
-"""What a sample knows of the objects in its images, as the boxes that give stage 3 of ``quality="paper"`` its types."""
+"""Image boxes of a sample's objects, which give stage 3 of ``quality="paper"`` its object types."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from arbiview_aug.sample.boxes_2d import outline
 from arbiview_aug.sample.inputs import Frame, numbers, read_scenes
 
 UNNAMED_TYPE = "upright"
-"""Type of labelled boxes without names: they stand on the road, which is all that stage 3 asks for."""
+"""Type of labelled boxes without names."""
 
 OfCameras = Mapping[int, Sequence[Detection]]
 """The detections of a frame, by the index of its camera."""
@@ -24,20 +24,15 @@ OfCameras = Mapping[int, Sequence[Detection]]
 def detections_of_frames(
     sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...]
 ) -> Sequence[OfCameras]:
-    """The detections of each frame: the sample's ``detections``, else its ``boxes_3d`` as its cameras see them.
+    """The detections of each frame: the sample's ``detections``, else its ``boxes_3d`` projected into its cameras.
 
-    ``detections``: for each camera ``{"boxes": (n, 4), "labels": [n names]}``, boxes x0 y0 x1 y1 in source pixels, as
-    torchvision's detectors return them, labels by name; of a batch, such a list for each frame. ``box_names``: a name
-    for each of the ``boxes_3d``; of a batch, a list for each frame. Without names they are ``upright``.
-
-    Args:
-        sample: The sample dict, its images checked.
-        frames: Its frames.
-        lead: Leading dimensions of its images.
+    ``detections``: for each camera ``{"boxes": (n, 4), "labels": [n names]}``, boxes x0 y0 x1 y1 in source pixels;
+    in a batch, such a list for each frame. ``box_names``: a name for each of the ``boxes_3d``, ``upright`` by default;
+    in a batch, a list for each frame.
 
     Raises:
         SampleError: Counts that differ from those of cameras, frames or boxes; impossible boxes.
-        SampleTypeError: Detections of another structure, labels that are no names.
+        SampleTypeError: Detections of another structure, labels that are not names.
     """
     if (given := sample.get("detections")) is not None:
         of_frames = _entries("detections", given, len(frames), "frames") if lead else [given]
@@ -70,9 +65,7 @@ def _of_cameras(given: Any, frame: Frame) -> OfCameras:
         if not np.isfinite(array).all() or (array[:, :2] > array[:, 2:]).any():
             raise SampleError(f"{where}: expected finite boxes with x0 <= x1 and y0 <= y1, got {array.tolist()}")
         kinds = _names(f"{where}['labels']", entry["labels"], len(array))
-        of_cameras[k] = [
-            Detection((x0, y0, x1, y1), kind) for (x0, y0, x1, y1), kind in zip(array.tolist(), kinds, strict=True)
-        ]
+        of_cameras[k] = [Detection(tuple(box), kind) for box, kind in zip(array.tolist(), kinds, strict=True)]
     return of_cameras
 
 
@@ -92,10 +85,6 @@ def _names(key: str, value: Any, count: int) -> list[str]:
 
 
 def _projected(camera: Camera, boxes: FloatArray, kinds: Sequence[str]) -> list[Detection]:
-    """Image boxes of (B, 7) boxes in the ego frame, cut at the image's border; those in front of others too."""
-    found = []
-    for box, kind in zip(boxes, kinds, strict=True):
-        if (seen := outline(camera, box)) is not None:
-            x0, y0, x1, y1 = seen.inside.tolist()
-            found.append(Detection((x0, y0, x1, y1), kind))
-    return found
+    """Image boxes of (B, 7) boxes in the ego frame, cut at the image's border."""
+    outlines = [(outline(camera, box), kind) for box, kind in zip(boxes, kinds, strict=True)]
+    return [Detection(tuple(seen.inside.tolist()), kind) for seen, kind in outlines if seen is not None]

@@ -1,4 +1,4 @@
-"""What the images of a sample may be, with messages that say how to mend them."""
+"""Checks of a sample's images; error messages give the fix."""
 
 from __future__ import annotations
 
@@ -15,12 +15,7 @@ _IMAGE_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)  #
 
 
 def check_container(images: Any) -> None:
-    """Refuse what is neither a tensor (..., N, 3, H, W) nor a list of tensors.
-
-    Raises:
-        SampleError: Too few dimensions.
-        SampleTypeError: Something else, with the conversion to use.
-    """
+    """Refuse images that are neither a tensor (..., N, 3, H, W) nor a list of tensors."""
     if isinstance(images, torch.Tensor):
         if images.ndim < 4:
             raise SampleError(f"images: expected shape (..., N, 3, H, W), got {tuple(images.shape)}")
@@ -33,11 +28,11 @@ def check_container(images: Any) -> None:
 
 
 def checked_images(images: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
-    """The images of one frame, N tensors (3, H, W): uint8, or float in [0, 1], all alike.
+    """The images of one frame: N tensors (3, H, W), uint8 or float in [0, 1], of one dtype and device.
 
     Raises:
-        SampleError: No image, another shape, values out of range, mixed types or devices.
-        SampleTypeError: A type, layout or device that holds no such pixels.
+        SampleError: No image, another shape, values out of range, mixed dtypes or devices.
+        SampleTypeError: Another dtype or layout, or a meta tensor.
     """
     if len(images) == 0:
         raise SampleError("images: expected at least one image, got none")
@@ -46,10 +41,14 @@ def checked_images(images: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
     if len({image.dtype for image in images}) > 1 or len({image.device for image in images}) > 1:
         raise SampleError("images: expected one dtype and device, got several; convert them alike")
     if images[0].dtype != torch.uint8:
-        # All of a frame at once: a GPU is waited for once.
+        # One transfer for all images; both extremes are NaN where an image has one.
         extremes = torch.stack([torch.stack(image.detach().aminmax()) for image in images]).tolist()
         for k, (low, high) in enumerate(extremes):
-            _check_range(k, low, high)
+            if not (low >= -1e-3 and high <= 1 + 1e-3):
+                fix = "divide by 255" if high > 1.5 and low >= 0 else "normalise after retargeting, not before"
+                if not (math.isfinite(low) and math.isfinite(high)):
+                    fix = "replace NaN and infinity first: torch.nan_to_num(images)"
+                raise SampleError(f"images[{k}]: expected floats in [0, 1], got {low:g} to {high:g}; {fix}")
     return tuple(images)
 
 
@@ -81,15 +80,5 @@ def _check_image(k: int, image: torch.Tensor) -> None:
         kind = image.layout if image.layout != torch.strided else "a meta tensor, which holds no pixels"
         raise SampleTypeError(f"images[{k}]: expected a dense tensor with pixels, got {kind}; use .to_dense()")
     if image.dtype != torch.uint8 and image.dtype not in _IMAGE_FLOATS:
-        if image.dtype.is_floating_point:
-            raise SampleTypeError(f"images[{k}]: expected uint8 or float, got {image.dtype}; convert with .float()")
-        raise SampleTypeError(f"images[{k}]: expected uint8 or float, got {image.dtype}; convert with .to(torch.uint8)")
-
-
-def _check_range(k: int, low: float, high: float) -> None:
-    """Refuse an image's least and largest value; both are NaN where it has one."""
-    if not (low >= -1e-3 and high <= 1 + 1e-3):
-        fix = "divide by 255" if high > 1.5 and low >= 0 else "normalise after retargeting, not before"
-        if not (math.isfinite(low) and math.isfinite(high)):
-            fix = "mend them first: torch.nan_to_num(images)"
-        raise SampleError(f"images[{k}]: expected floats in [0, 1], got {low:g} to {high:g}; {fix}")
+        fix = ".float()" if image.dtype.is_floating_point else ".to(torch.uint8)"
+        raise SampleTypeError(f"images[{k}]: expected uint8 or float, got {image.dtype}; convert with {fix}")

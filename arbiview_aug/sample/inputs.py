@@ -1,10 +1,9 @@
-"""The sample contract: what a sample must hold, checked once at the boundary, with messages that say how to mend it."""
+"""Checked frames and scenes of a sample dict; error messages give the fix."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.surface import Points
 
 MOTION_KEY = "motion_depth_m"
-"""Depth from motion that was found offline: (N, h, w) z-depth at the size of ``arbiview_aug.temporal.plane_sweep``."""
+"""Depth from motion computed offline: (N, h, w) z-depth at the size of ``scene.depth_maps.motion_camera``."""
 
 CALIBRATION_KEYS = (
     "images",
@@ -43,33 +42,28 @@ CALIBRATION_KEYS = (
 """Keys that describe the source's images; they are replaced by the target's or consumed."""
 
 MAX_CAMERAS = 128  # winning sources are int8
-_OFF_CENTER = 0.2  # share of the image's size by which both coordinates of a principal point never lie off its centre
+_OFF_CENTER = 0.2  # a principal point is never off centre by this share of the image's size along both axes
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The images and calibration of one checked sample.
-
-    Attributes:
-        images: N tensors (3, H, W): uint8, or float in [0, 1].
-        rig: Their cameras.
-    """
+    """One checked frame: N images (3, H, W), uint8 or float in [0, 1], and their cameras."""
 
     images: tuple[torch.Tensor, ...]
     rig: Rig
 
 
 def read_frames(sample: Any, source_rig: Rig | None) -> list[Frame]:
-    """The frames of a sample, one for each element of its leading dimensions (one if there are none).
+    """Read and check the frames of a sample, one for each element of its leading dimensions.
 
     Args:
-        sample: The sample dict; see the contract in ``RigRetarget``.
-        source_rig: The rig of every sample, where the transform was given one.
+        sample: The sample dict; see ``RigRetarget``.
+        source_rig: The rig of all samples, if the transform has one.
 
     Raises:
         SampleError: Missing calibration, mismatched counts or sizes, values out of range.
         SampleTypeError: PIL images, numpy arrays and the like, with the conversion to use.
-        CalibrationError: K, cam2ego or a lens that no real camera has.
+        CalibrationError: Impossible K, cam2ego or lens.
     """
     if not isinstance(sample, Mapping):
         raise SampleTypeError(f"sample: expected a dict, got {type(sample).__name__}")
@@ -82,24 +76,23 @@ def read_frames(sample: Any, source_rig: Rig | None) -> list[Frame]:
     if 0 in lead:
         raise SampleError(f"images: expected at least one frame, got the leading dimensions {lead}")
     try:
-        of_frames = split(images, lead)
+        frames = split(images, lead)
     except ValueError as error:
         raise SampleError(f"images: {error}") from None
-    indices = list(np.ndindex(*lead))
     return [
-        _frame(checked_images(frame), sample, source_rig, lead, index)
-        for frame, index in zip(of_frames, indices, strict=True)
+        frame_from(checked_images(frame), sample, source_rig, lead, index)
+        for frame, index in zip(frames, np.ndindex(*lead), strict=True)
     ]
 
 
 def read_scenes(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...], surface: str) -> list[Scene]:
-    """What each frame of a sample says of the geometry, in the source's ego frame.
+    """Read the scene geometry of each frame, in the source's ego frame, as far as a surface uses it.
 
     Args:
         sample: The sample dict.
         frames: Its checked frames.
         lead: Leading dimensions of its images.
-        surface: The surface asked for: what it does not use is not read.
+        surface: A name in ``SURFACES``.
 
     Raises:
         SampleError: Geometry that the surface needs is missing or impossible.
@@ -107,79 +100,54 @@ def read_scenes(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[
     row = SURFACES[surface]
     found: dict[str, list[Points]] = {}
     for name in row.reads:
-        arrays = _READERS.get(name, partial(_array_of_frames, name))(sample, frames, lead)
+        arrays = _geometry(name, sample, frames, lead)
         if arrays is not None:
             found[name] = arrays
         elif name == row.needs and name != "motion":  # neighbouring frames may still give depth from motion
-            expected, keys = _NEEDED.get(name, f"{name!r} in the sample, got none"), _SAMPLE_KEYS.get(name, (name,))
+            expected, keys = _EXPECTED.get(name, f"{name!r} in the sample, got none"), _SAMPLE_KEYS.get(name, (name,))
             raise SampleError(f"surface={surface!r}: expected {expected}{hint(sample, keys)}")
     if not found:
         return [Scene()] * len(frames)
     scenes = []
     for k in range(len(frames)):
         further: dict[str, Any] = {name: arrays[k] for name, arrays in found.items()}
-        own = {name: further.pop(name) for name in _READERS if name in further}
+        own = {name: further.pop(name) for name in _SAMPLE_KEYS if name in further}
         scenes.append(Scene(**own, further=further))
     return scenes
 
 
-def _array_of_frames(
-    key: str, sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...]
-) -> list[Points] | None:
-    """The numbers that a key of the sample holds for each frame; None without."""
-    return None if sample.get(key) is None else of_frames(key, sample[key], len(frames), lead)
+_SAMPLE_KEYS = {"boxes": ("boxes_3d",), "points": ("points", "depth_m"), "motion": (MOTION_KEY,)}
+"""Sample keys of the geometry that has a field in ``Scene``; others are read under their own name."""
 
-
-def _boxes_of_frames(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...]) -> list[Points] | None:
-    """(B, 7) boxes of each frame; None without."""
-    boxes = _array_of_frames("boxes_3d", sample, frames, lead)
-    return None if boxes is None else [checked_boxes(array) for array in boxes]
-
-
-def _motion_of_frames(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...]) -> list[Points] | None:
-    """(P, 3) points of each frame by depth from motion that was found offline; None without."""
-    maps = sample.get(MOTION_KEY)
-    return None if maps is None else _points_of_maps(MOTION_KEY, maps, frames, lead, motion_camera)
-
-
-def _points_of_frames(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...]) -> list[Points] | None:
-    """(P, 3) measured points of each frame: its ``points``, and those of its depth maps ``depth_m``; None without."""
-    points, depth_m = sample.get("points"), sample.get("depth_m")
-    if points is None and depth_m is None:
-        return None
-    parts: list[list[np.ndarray]] = [[] for _ in frames]
-    if points is not None:
-        for part, of_frame in zip(parts, of_frames("points", points, len(frames), lead), strict=True):
-            part.append(checked_points(of_frame))
-    if depth_m is not None:
-        for part, of_frame in zip(parts, _points_of_maps("depth_m", depth_m, frames, lead, lambda c: c), strict=True):
-            part.append(of_frame)
-    return [part[0] if len(part) == 1 else np.concatenate(part) for part in parts]
-
-
-_READERS: dict[str, Callable[[Mapping[str, Any], Sequence[Frame], tuple[int, ...]], list[Points] | None]] = {
-    "boxes": _boxes_of_frames,
-    "points": _points_of_frames,
-    "motion": _motion_of_frames,
-}
-"""Readers of the geometry that is more than the array of one key."""
-
-_SAMPLE_KEYS = {"boxes": ("boxes_3d",), "points": ("points", "depth_m")}
-_NEEDED = {
-    "boxes": "'boxes_3d' (B, 7) in the sample, got none; an empty (0, 7) tensor says that nothing stands there",
+_EXPECTED = {
+    "boxes": "'boxes_3d' (B, 7) in the sample, got none; pass an empty (0, 7) tensor if there are no objects",
     "points": "'points' (P, >= 3) in the ego frame, or 'depth_m' (N, H, W), z-depth of each camera in metres, in the "
     "sample, got neither",
 }
+_CHECKS: dict[str, Callable[[Points], Points]] = {"boxes_3d": checked_boxes, "points": checked_points}
 
 
-def _points_of_maps(
-    key: str,
-    depth_m: Any,
-    frames: Sequence[Frame],
-    lead: tuple[int, ...],
-    sized: Callable[[Camera], Camera],
-) -> list[Points]:
-    """(P, 3) points of each frame's depth maps, those of each camera at the size of ``sized`` of it."""
+def _geometry(
+    name: str, sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...]
+) -> list[Points] | None:
+    """The array of each frame for a name in ``SurfaceRow.reads``; None if the sample has none."""
+    parts: list[list[Points]] = []
+    for key in _SAMPLE_KEYS.get(name, (name,)):
+        value = sample.get(key)
+        if value is None:
+            continue
+        if key in ("depth_m", MOTION_KEY):
+            parts.append(_points_of_maps(key, value, frames, lead))
+            continue
+        arrays = of_frames(key, value, len(frames), lead)
+        parts.append([_CHECKS[key](array) for array in arrays] if key in _CHECKS else arrays)
+    if not parts:
+        return None
+    return [arrays[0] if len(arrays) == 1 else np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
+
+
+def _points_of_maps(key: str, depth_m: Any, frames: Sequence[Frame], lead: tuple[int, ...]) -> list[Points]:
+    """(P, 3) points of each frame's depth maps."""
     try:
         maps = split(depth_m, lead)
     except (AttributeError, TypeError, ValueError, RuntimeError) as error:
@@ -190,16 +158,14 @@ def _points_of_maps(
             of_cameras = list(numbers(key, of_cameras)) if of_cameras.ndim else ()
         if not isinstance(of_cameras, list | tuple) or len(of_cameras) != len(frame.rig):
             raise SampleError(f"{key}: expected {len(frame.rig)} maps (H, W), one for each image")
-        points = [
-            points_of_depth(sized(camera), _numbers(key, depth, ()), key)
-            for camera, depth in zip(frame.rig, of_cameras, strict=True)
-        ]
+        cameras = [motion_camera(camera) if key == MOTION_KEY else camera for camera in frame.rig]
+        points = [points_of_depth(c, numbers(key, depth), key) for c, depth in zip(cameras, of_cameras, strict=True)]
         found.append(np.concatenate(points))
     return found
 
 
 def names_of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[object]:
-    """What an entry of the sample calls each frame, hashable: a name, or in a batch a list or tensor of names."""
+    """Hashable names of each frame: from one name, or in a batch a list or tensor of names."""
     values = [value]
     if lead:
         values = list(value.reshape(count, -1)) if isinstance(value, torch.Tensor) and value.ndim else value
@@ -211,14 +177,14 @@ def names_of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> 
 
 
 def of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[Points]:
-    """Numbers of each frame: a tensor with the images' leading dimensions, or a list with an entry for each frame.
+    """The array of each frame: from a tensor with the images' leading dimensions, or a list with one per frame.
 
     Raises:
         SampleError: Another number of frames.
-        SampleTypeError: No numbers.
+        SampleTypeError: The value is not numeric.
     """
     if not lead:
-        return [_recorded(key, value)]
+        return [_array(key, value)]
     try:
         frames = value if isinstance(value, list | tuple) else split(value, lead)
     except (AttributeError, TypeError, ValueError, RuntimeError):
@@ -226,27 +192,23 @@ def of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[P
     if len(frames) != count:
         got = f"shape {tuple(value.shape)}" if hasattr(value, "shape") else type(value).__name__
         raise SampleError(f"{key}: expected a tensor {lead} + (n, ...), or a list of {count} of them, got {got}")
-    return [_recorded(key, frame) for frame in frames]
+    return [_array(key, frame) for frame in frames]
 
 
 # --- calibration ------------------------------------------------------------------------------------------------------
-def frame_from(images: tuple[torch.Tensor, ...], entry: Mapping[str, Any], source_rig: Rig | None) -> Frame:
-    """One frame of an unbatched sample, whose images are checked already.
-
-    Raises:
-        SampleError: Missing calibration, mismatched counts or sizes.
-        CalibrationError: K, cam2ego or a lens that no real camera has.
-    """
-    return _frame(images, entry, source_rig, (), ())
-
-
-def _frame(
+def frame_from(
     images: tuple[torch.Tensor, ...],
     sample: Mapping[str, Any],
     source_rig: Rig | None,
-    lead: tuple[int, ...],
-    index: tuple[int, ...],
+    lead: tuple[int, ...] = (),
+    index: tuple[int, ...] = (),
 ) -> Frame:
+    """One frame of a sample, at an ``index`` into its leading dimensions, whose images are checked already.
+
+    Raises:
+        SampleError: Missing calibration, mismatched counts or sizes.
+        CalibrationError: Impossible K, cam2ego or lens.
+    """
     rig = sample.get("rig")
     if rig is None:
         rig = source_rig if source_rig is not None else _rig_from_tensors(images, sample, index)
@@ -263,11 +225,11 @@ def _frame(
             raise SampleError(
                 f"camera {camera.name!r}: expected an image of (h, w) = {camera.size}, as calibrated, got {size}; {fix}"
             )
-    return Frame(images, _without_hidden_pixels(rig, sample, lead, index))
+    return Frame(images, _with_masks(rig, sample, lead, index))
 
 
 def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any], index: tuple[int, ...]) -> Rig:
-    """A rig from the sample's K, cam2ego and, where present, lens, distortion and ground_z_m."""
+    """The rig of the sample's K, cam2ego and, where present, lens, distortion and ground_z_m."""
     missing = [key for key in ("K", "cam2ego") if sample.get(key) is None]
     if missing:
         raise SampleError(
@@ -275,63 +237,52 @@ def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any
             f"{hint(sample, missing)}; or pass source_rig= to the transform"
         )
     K, cam2ego = (_numbers(key, sample[key], index) for key in ("K", "cam2ego"))
-    for key, array, shape in (("K", K, (3, 3)), ("cam2ego", cam2ego, (4, 4))):
-        expected = (len(images), *shape)
+    for key, array, expected in (("K", K, (len(images), 3, 3)), ("cam2ego", cam2ego, (len(images), 4, 4))):
         if array.shape != expected:
             raise SampleError(f"{key}: expected shape {expected} for {len(images)} images, got {array.shape}")
-    lenses = _lenses(sample, len(images), index)
     cameras = []
-    for k, image in enumerate(images):
+    for k, (image, (lens, distortion)) in enumerate(zip(images, _lenses(sample, len(images), index), strict=True)):
         h, w = image.shape[-2:]
         _check_principal_point(k, K[k], (h, w))
-        lens, distortion = lenses[k]
-        name = f"camera {k}"
-        cameras.append(
-            Camera(name=name, width_px=w, height_px=h, K=K[k], cam2ego=cam2ego[k], lens=lens, distortion=distortion)
-        )
-    ground_z_m = sample.get("ground_z_m", 0.0)
-    heights = numbers("ground_z_m", ground_z_m)
-    of_frame = _numbers("ground_z_m", heights, index) if heights.ndim else heights
+        calibration: dict[str, Any] = {"K": K[k], "cam2ego": cam2ego[k], "lens": lens, "distortion": distortion}
+        cameras.append(Camera(name=f"camera {k}", width_px=w, height_px=h, **calibration))
+    ground_z_m = numbers("ground_z_m", sample.get("ground_z_m", 0.0))
+    of_frame = _numbers("ground_z_m", ground_z_m, index) if ground_z_m.ndim else ground_z_m
     if of_frame.size != 1:
-        raise SampleError(f"ground_z_m: expected one height for each frame, got shape {heights.shape}")
+        raise SampleError(f"ground_z_m: expected one height for each frame, got shape {ground_z_m.shape}")
     return Rig(cameras, ground_z_m=float(of_frame.item()))
 
 
 def _check_principal_point(k: int, K: np.ndarray, size: tuple[int, int]) -> None:
-    """Refuse a K that was made for another image size; NaN is left to ``Camera``."""
+    """Refuse a K that was made for another image size; ``Camera`` refuses NaN."""
     h, w = size
     x, y = (K[0, 2] + 0.5) / w - 0.5, (K[1, 2] + 0.5) / h - 0.5  # from the image's centre, as a share of its size
-    in_turned = max(abs((K[0, 2] + 0.5) / h - 0.5), abs((K[1, 2] + 0.5) / w - 0.5))
+    off_swapped = max(abs((K[0, 2] + 0.5) / h - 0.5), abs((K[1, 2] + 0.5) / w - 0.5))
     outside = max(abs(x), abs(y)) > 0.5
     scaled = max(x, y) < -_OFF_CENTER or min(x, y) > _OFF_CENTER
-    swapped = max(abs(x), abs(y)) > 0.12 and in_turned < 0.05
+    swapped = max(abs(x), abs(y)) > 0.12 and off_swapped < 0.05
     if not (outside or scaled or swapped):
         return
     where = "inside the image" if outside else "near the middle of the image"
     fix = "height and width are swapped" if swapped else "K of another image size? Camera.resize scales K"
     raise SampleError(
         f"K[{k}]: expected a principal point {where} of (h, w) = {(h, w)}, got ({K[0, 2]:g}, {K[1, 2]:g}); "
-        f"{fix}; a camera that is really so comes as rig="
+        f"{fix}; pass rig= if the camera is really like this"
     )
 
 
 def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> list[tuple[Any, tuple[float, ...]]]:
-    """Lens and coefficients of each camera; zeros that pad them to a common number are left out."""
+    """Lens and coefficients of each camera, without the zeros that pad them to a common number."""
     names, distortion = sample.get("lens"), sample.get("distortion")
     coefficients = None if distortion is None else _numbers("distortion", distortion, index)
     if names is None:
         if coefficients is not None and coefficients.any():
-            known = ", ".join(LENSES)
-            raise SampleError(
-                f"distortion: expected 'lens' beside it, one of {known} a camera{hint(sample, ('lens',))}"
-            )
+            expected = f"'lens' beside it, one of {', '.join(LENSES)} for each camera"
+            raise SampleError(f"distortion: expected {expected}{hint(sample, ('lens',))}")
         return [("pinhole", ())] * count
     if not isinstance(names, list | tuple) or len(names) != count:
-        raise SampleError(f"lens: expected a list of {count} names, one a camera, got {names!r}")
-    lenses = [_entry(name, index) for name in names]
-    if not all(isinstance(lens, str) for lens in lenses):
-        raise SampleTypeError(f"lens: expected names, one a camera, got {lenses!r}")
-    lenses = [canonical_name(lens) for lens in lenses]
+        raise SampleError(f"lens: expected a list of {count} names, one for each camera, got {names!r}")
+    lenses = [_lens(name, index) for name in names]
     if all(lens in LENSES and LENSES[lens].coefficient_counts == (0,) for lens in lenses):
         return [(lens, ()) for lens in lenses]
     if coefficients is None or coefficients.ndim != 2 or len(coefficients) != count:
@@ -339,24 +290,26 @@ def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> li
         raise SampleError(f"distortion: expected shape ({count}, up to 8) for the lenses {lenses}, got {got}")
     result = []
     for lens, row in zip(lenses, coefficients.tolist(), strict=True):
-        needed = LENSES[lens].coefficient_counts[-1] if lens in LENSES else len(row)
-        result.append((lens, tuple(row) if any(row[needed:]) else tuple(row[:needed])))
+        count = LENSES[lens].coefficient_counts[-1] if lens in LENSES else len(row)
+        result.append((lens, tuple(row) if any(row[count:]) else tuple(row[:count])))
     return result
 
 
-def _entry(name: Any, index: tuple[int, ...]) -> Any:
-    """A camera's lens; ``default_collate`` makes a list of a batch's."""
+def _lens(name: Any, index: tuple[int, ...]) -> str:
+    """The lens of a camera in one frame: ``default_collate`` makes lists of a batch's names."""
     for i in index:
         if isinstance(name, str):
             break
         if not isinstance(name, list | tuple) or not i < len(name):
             raise SampleError(f"lens: expected a name for each frame of the batch, got {name!r}")
         name = name[i]
-    return name
+    if not isinstance(name, str):
+        raise SampleTypeError(f"lens: expected names, one for each camera, got {name!r}")
+    return canonical_name(name)
 
 
-def _without_hidden_pixels(rig: Rig, sample: Mapping[str, Any], lead: tuple[int, ...], index: tuple[int, ...]) -> Rig:
-    """The rig, masked where an earlier retargeting saw nothing (``coverage``) or the own car (``ignore``)."""
+def _with_masks(rig: Rig, sample: Mapping[str, Any], lead: tuple[int, ...], index: tuple[int, ...]) -> Rig:
+    """The rig, masked where an earlier retargeting saw nothing (``coverage``) or its own car (``ignore``)."""
     masks: list[BoolArray | None] = [camera.mask for camera in rig]
     for key in ("coverage", "ignore"):
         if sample.get(key) is None:
@@ -368,15 +321,14 @@ def _without_hidden_pixels(rig: Rig, sample: Mapping[str, Any], lead: tuple[int,
                 if tuple(pixels.shape) != camera.size or pixels.dtype != torch.bool:
                     raise ValueError(f"got {pixels.dtype} {tuple(pixels.shape)}")
                 if pixels.any():
-                    seen = ~pixels.cpu().numpy()
-                    held = masks[k]
-                    masks[k] = seen if held is None else held & seen
+                    visible, mask = ~pixels.cpu().numpy(), masks[k]
+                    masks[k] = visible if mask is None else mask & visible
         except (TypeError, ValueError, AttributeError, RuntimeError) as error:  # RuntimeError: meta, sparse
             raise SampleError(
                 f"{key}: expected a bool map of the size of each image, as an earlier retargeting gives it ({error}); "
                 "rename the key if it is something else"
             ) from None
-    if all(new is camera.mask for new, camera in zip(masks, rig, strict=True)):
+    if all(mask is camera.mask for mask, camera in zip(masks, rig, strict=True)):
         return rig
     return rig.with_cameras([replace(camera, mask=mask) for camera, mask in zip(rig, masks, strict=True)])
 
@@ -385,17 +337,13 @@ def numbers(key: str, value: Any) -> FloatArray:
     """An entry of a sample as a float64 array.
 
     Raises:
-        SampleTypeError: It holds no real numbers.
+        SampleTypeError: The value is not numeric.
     """
-    return np.asarray(_recorded(key, value), np.float64)
+    return np.asarray(_array(key, value), np.float64)
 
 
-def _recorded(key: str, value: Any) -> Points:
-    """An entry of a sample as an array: float32 as it is, the same memory, anything else as float64.
-
-    Raises:
-        SampleTypeError: It holds no real numbers.
-    """
+def _array(key: str, value: Any) -> Points:
+    """An entry of a sample as an array: float32 in the same memory, anything else as float64."""
     try:
         if isinstance(value, torch.Tensor):
             if value.layout != torch.strided or value.device.type == "meta":
@@ -414,7 +362,7 @@ def _recorded(key: str, value: Any) -> Points:
 
 
 def _numbers(key: str, value: Any, index: tuple[int, ...]) -> np.ndarray:
-    """An entry of the calibration for one frame, float64."""
+    """The calibration of one frame, float64."""
     array = numbers(key, value)
     try:
         return np.asarray(array[index])

@@ -1,7 +1,4 @@
-"""Neighbouring frames of a drive: what a sample says of them, checked; one that is no use is left out, in words.
-
-A drive is seen again and again: what no camera sees now, one often saw a metre ago. See ``arbiview_aug.temporal.fill``.
-"""
+"""Checked neighbouring frames of a drive; unusable ones are left out with a warning. See ``temporal.fill``."""
 
 from __future__ import annotations
 
@@ -21,26 +18,23 @@ from arbiview_aug.sample.inputs import Frame, frame_from, numbers, of_frames
 from arbiview_aug.scene.boxes import checked_boxes, moved_boxes
 from arbiview_aug.scene.surface import Points
 
-MAX_NEIGHBOURS = 120
-"""Numbers of frames are int8."""
+MAX_NEIGHBOURS = 120  # frame numbers are int8
 
 STILL_M, STILL_DEG = 0.1, 0.5
-"""A frame no farther away and turned no more sees what the current one sees."""
+"""A frame with less motion than this sees what the current one sees."""
 
 MAX_TRAVEL_M = 60.0
-"""Farther on, nothing of the near ground is left in view."""
+"""Largest distance to a neighbour: farther on, none of the ground nearby is in view."""
 
 MAX_SPEED_MPS = 80.0
-"""A pose that asks for more has jumped."""
-
 MAX_TILT_DEG = 6.0
-"""Between two roads that one plane should stand for: ramps have 5."""
+"""Largest angle between two roads that share one plane: ramps have 5 degrees."""
 
-_MAX_OTHER_MOUNTING = (1.5, 10.0)
-"""Metres and degrees by which a camera may stand elsewhere: what a vehicle drives and turns between two cameras."""
+_MAX_MOUNTING_M, _MAX_MOUNTING_DEG = 1.5, 10.0
+"""Largest change of a camera's pose; allows for ego motion between exposures."""
 
 Warn = Callable[[str, str], None]
-"""Of a topic and a message, once for each topic."""
+"""Warns of a topic with a message, once per topic."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,15 +42,15 @@ class Neighbour:
     """Another frame of the drive, seen from the current one.
 
     Attributes:
-        number: Its place in the sample's list.
+        number: Its index in the sample's list.
         name: Its token, else its number.
         rig: Its cameras in the current frame's ego frame, over the current frame's road.
         travel_m: Distance between the two vehicles.
-        ahead_m: How far it stood before the current one, along its heading.
-        seconds: From the current frame to it; None where either has no time.
-        boxes: (B, 7) where labelled objects were then, in the current ego frame; None where nobody said.
-        boxes_now: (B, 7) where they are in the current frame; None where nobody said.
-        given: The entry itself; its images are read when they are asked for.
+        ahead_m: Its position along the current heading.
+        seconds: Time from the current frame to it; None if either has no time.
+        boxes: (B, 7) labelled objects at its time, in the current ego frame; None if unknown.
+        boxes_now: (B, 7) labelled objects in the current frame; None if unknown.
+        given: The entry itself; its images are read lazily.
     """
 
     number: int
@@ -71,27 +65,23 @@ class Neighbour:
 
     @property
     def is_later(self) -> bool:
-        """Whether it was recorded after the current frame: without times, whether it stood before it."""
+        """Whether it was recorded after the current frame; without times, whether it is ahead."""
         return (self.seconds or self.ahead_m) > 0
 
     @property
     def labelled(self) -> FloatArray:
-        """(B, 7) the labelled objects, where they were and where they are, in the current ego frame."""
+        """(B, 7) the labelled objects of both frames, in the current ego frame."""
         return np.concatenate([np.zeros((0, 7)), *(b for b in (self.boxes, self.boxes_now) if b is not None)])
 
     @cached_property
     def moved(self) -> FloatArray | None:
-        """(B, 7) the labels of both frames that moved between them; None where either has none."""
+        """(B, 7) the labels of both frames that moved between them; None if either has none."""
         if self.boxes is None or self.boxes_now is None:
             return None
         return moved_boxes(self.boxes_now, self.boxes)
 
     def images(self, like: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        """Its images, of the type and on the device of the current ones.
-
-        Raises:
-            ArbiviewError: They are missing, broken, or do not fit its cameras.
-        """
+        """Its images, checked, with the dtype and device of the current ones."""
         found = self.given.get("images")
         if found is None:
             raise SampleError("images: expected the frame's images, got none")
@@ -108,25 +98,18 @@ class Neighbour:
 def neighbours_of_frames(
     sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...], warn: Warn
 ) -> list[list[Neighbour]]:
-    """The neighbours of each frame that can add something, the nearest first.
+    """Read the neighbours of each frame, nearest first.
 
-    ``neighbours`` is a list of mappings, each another frame of the same rig: ``images``; ``ego2ego`` (4, 4), its ego
-    frame to the current one, or ``ego2world`` beside the sample's own; its calibration as a sample has it, where it
-    differs from the current frame's; and, where there are any, ``boxes_3d`` in its own ego frame, ``time_s`` and
-    ``token``. Calibration that is K and cam2ego alone has the current frame's lenses and masks. Without boxes of its
-    own, those of the sample are moved by their velocities (columns 7 and 8, m/s in the ego frame), where both frames
-    have a time and all velocities are known. Of a batch: a list of such lists.
+    ``neighbours`` is a list of mappings, each another frame of the same rig (in a batch, a list of such lists):
+    ``images``; ``ego2ego`` (4, 4), its ego frame to the current one, or ``ego2world`` as in the sample; optionally
+    ``boxes_3d`` in its own ego frame, ``time_s``, ``token``, and its calibration where it differs. K and cam2ego alone
+    keep the current lenses and masks. Without own boxes, the sample's are moved by their velocities (columns 7 and 8,
+    m/s in the ego frame) if both frames have a time and all velocities are finite.
 
-    Frames at the very same place are left out silently; impossible ones with a warning that names them.
-
-    Args:
-        sample: The sample dict.
-        frames: Its checked frames.
-        lead: Leading dimensions of its images.
-        warn: Says what is left out and why.
+    Frames at the same place are left out silently, unusable ones with a warning.
 
     Raises:
-        SampleTypeError: ``neighbours`` is no list, or of a batch no list of lists.
+        SampleTypeError: ``neighbours`` is not a list, or in a batch not a list of lists.
         SampleError: There are too many.
     """
     value = sample.get("neighbours")
@@ -158,7 +141,7 @@ def neighbours_of_frames(
 
 
 def warn_lost(warn: Warn, name: str, error: Exception) -> None:
-    """Say that a neighbour is not used, and why."""
+    """Warn that a neighbour is not used."""
     warn(f"neighbour {name}", f"neighbour {name} is left out: {error}; the frame is rendered without it")
 
 
@@ -193,10 +176,7 @@ def _neighbour(
 
 
 def _own_rig(frame: Frame, entry: Mapping[str, Any]) -> Rig:
-    """Its cameras in its own ego frame.
-
-    Its images are not read before it is known that they are needed; the current frame's are of the same sizes.
-    """
+    """Its cameras in its own ego frame; the current images stand for its own, which are read lazily."""
     if entry.get("rig") is not None or entry.get("K") is None:
         return frame_from(frame.images, entry, frame.rig).rig
     cameras = []
@@ -209,29 +189,28 @@ def _own_rig(frame: Frame, entry: Mapping[str, Any]) -> Rig:
 
 def _ego2ego(sample: Mapping[str, Any], index: tuple[int, ...], entry: Mapping[str, Any]) -> FloatArray:
     if entry.get("ego2ego") is not None:
-        pose = numbers("ego2ego", entry["ego2ego"])
-    else:
-        missing = [where for where, of in (("it", entry), ("the sample", sample)) if of.get("ego2world") is None]
-        if missing:
-            raise SampleError(f"expected ego2ego (4, 4), or ego2world here and in the sample; {missing[-1]} has none")
-        here, there = (numbers("ego2world", of["ego2world"]) for of in (sample, entry))
-        here = here[index] if here.ndim > 2 else here
-        if here.shape != (4, 4) or there.shape != (4, 4) or not (np.isfinite(here).all() and np.isfinite(there).all()):
-            raise SampleError(f"ego2world: expected (4, 4) finite numbers, got shapes {here.shape} and {there.shape}")
-        if abs(np.linalg.det(here[:3, :3])) < 0.5:
-            raise SampleError("ego2world: expected a pose, got a matrix without a rotation")
-        if not all(np.allclose(matrix[3], (0, 0, 0, 1)) for matrix in (here, there)):
-            raise SampleError("ego2world: expected a pose, got a last row that is not 0 0 0 1")
-        pose = np.linalg.solve(here, there)
+        return _pose("ego2ego", entry["ego2ego"])
+    missing = [where for where, of in (("it", entry), ("the sample", sample)) if of.get("ego2world") is None]
+    if missing:
+        raise SampleError(f"expected ego2ego (4, 4), or ego2world here and in the sample; {missing[-1]} has none")
+    here, there = _pose("ego2world", sample["ego2world"], index), _pose("ego2world", entry["ego2world"])
+    return np.asarray(np.linalg.solve(here, there), np.float64)
+
+
+def _pose(key: str, value: Any, index: tuple[int, ...] = ()) -> FloatArray:
+    pose = numbers(key, value)
+    pose = np.asarray(pose[index]) if pose.ndim > 2 else pose
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise SampleError(f"ego2ego: expected (4, 4) finite numbers, got shape {pose.shape}")
-    if np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > 1e-3 or np.linalg.det(pose[:3, :3]) < 0:
-        raise SampleError("ego2ego: expected a rotation and a translation, got another matrix")
-    return np.asarray(pose, np.float64)
+        raise SampleError(f"{key}: expected (4, 4) finite numbers, got shape {pose.shape}")
+    R = pose[:3, :3]
+    rigid = np.abs(R @ R.T - np.eye(3)).max() <= 1e-3 and np.linalg.det(R) > 0
+    if not rigid or not np.allclose(pose[3], (0, 0, 0, 1)):
+        raise SampleError(f"{key}: expected a rotation, a translation and a last row 0 0 0 1, got {pose.tolist()}")
+    return pose
 
 
 def _seconds(sample: Mapping[str, Any], index: tuple[int, ...], entry: Mapping[str, Any]) -> float | None:
-    """From the current frame to this one; None where either has no time."""
+    """Time from the current frame to this one; None if either has no time."""
     if sample.get("time_s") is None or entry.get("time_s") is None:
         return None
     here, there = numbers("time_s", sample["time_s"]), numbers("time_s", entry["time_s"])
@@ -244,37 +223,27 @@ def _seconds(sample: Mapping[str, Any], index: tuple[int, ...], entry: Mapping[s
 def _check_motion(ego2ego: FloatArray, travel_m: float, seconds: float | None) -> None:
     """Refuse poses that no drive has."""
     if travel_m > MAX_TRAVEL_M:
-        raise SampleError(
-            f"ego2ego: expected at most {MAX_TRAVEL_M:g} m of travel, got {travel_m:.1f} m; a pose jumped?"
-        )
+        raise SampleError(f"ego2ego: expected at most {MAX_TRAVEL_M:g} m of travel, got {travel_m:.1f} m; check poses")
     tilt_deg = float(np.degrees(np.arccos(np.clip(ego2ego[2, 2], -1, 1))))
     climb_m = abs(float(ego2ego[2, 3]))
     if tilt_deg > MAX_TILT_DEG or climb_m > travel_m * np.sin(np.radians(2 * MAX_TILT_DEG)) + STILL_M:
-        raise SampleError(
-            f"ego2ego: expected one road under both, got a tilt of {tilt_deg:.1f} degrees and {climb_m:.2f} m of "
-            "climb; a pose jumped?"
-        )
+        got = f"a tilt of {tilt_deg:.1f} degrees and {climb_m:.2f} m of climb"
+        raise SampleError(f"ego2ego: expected both frames on one road plane, got {got}; check poses")
     if seconds is not None and travel_m > MAX_SPEED_MPS * abs(seconds) + STILL_M:
-        raise SampleError(
-            f"time_s: expected at most {MAX_SPEED_MPS:g} m/s, got {travel_m:.1f} m in {seconds:g} s; a pose or a clock "
-            "jumped?"
-        )
+        got = f"{travel_m:.1f} m in {seconds:g} s"
+        raise SampleError(f"time_s: expected at most {MAX_SPEED_MPS:g} m/s, got {got}; check poses and clock")
 
 
 def _check_same_vehicle(rig: Rig, own: Rig) -> None:
     for camera, other in zip(rig, own, strict=True):
         scale = float(np.abs(other.K - camera.K).max()) / camera.width_px
         if other.lens != camera.lens or scale > 0.02:
-            raise SampleError(
-                f"camera {camera.name!r}: expected the current frame's lens and K, got others; another rig?"
-            )
+            raise SampleError(f"camera {camera.name!r}: expected the current frame's lens and K, got another rig's")
         shift_m = float(np.linalg.norm(other.center_m - camera.center_m))
         turned_deg = _angle_deg(other.cam2ego[:3, :3] @ camera.cam2ego[:3, :3].T)
-        if shift_m > _MAX_OTHER_MOUNTING[0] or turned_deg > _MAX_OTHER_MOUNTING[1]:
-            raise SampleError(
-                f"camera {camera.name!r}: expected it where the current frame has it, got it {shift_m:.2f} m and "
-                f"{turned_deg:.1f} degrees away; another rig?"
-            )
+        if shift_m > _MAX_MOUNTING_M or turned_deg > _MAX_MOUNTING_DEG:
+            got = f"a pose {shift_m:.2f} m and {turned_deg:.1f} degrees away"
+            raise SampleError(f"camera {camera.name!r}: expected the current frame's mounting, got {got}; another rig?")
 
 
 def _angle_deg(R: FloatArray) -> float:
@@ -284,19 +253,18 @@ def _angle_deg(R: FloatArray) -> float:
 def _boxes(
     current: Points | None, entry: Mapping[str, Any], ego2ego: FloatArray, seconds: float | None
 ) -> tuple[FloatArray | None, FloatArray | None]:
-    """Where labelled objects are, and where they were, in the current ego frame; None where nobody said."""
+    """The labelled objects of the current frame and of the neighbour, in the current ego frame; None if unknown."""
     now = None if current is None else checked_boxes(current)
     if entry.get("boxes_3d") is not None:
-        boxes = checked_boxes(numbers("boxes_3d", entry["boxes_3d"]))
-        moved = boxes.copy()
-        moved[:, :3] = boxes[:, :3] @ ego2ego[:3, :3].T + ego2ego[:3, 3]
-        moved[:, 6] += np.arctan2(ego2ego[1, 0], ego2ego[0, 0])
-        return now, moved
+        then = checked_boxes(numbers("boxes_3d", entry["boxes_3d"])).copy()
+        then[:, :3] = then[:, :3] @ ego2ego[:3, :3].T + ego2ego[:3, 3]
+        then[:, 6] += np.arctan2(ego2ego[1, 0], ego2ego[0, 0])
+        return now, then
     if now is None or current is None or seconds is None or current.shape[-1] < 9:
         return now, None
     velocity_mps = current.reshape(-1, current.shape[-1])[:, 7:9]
-    if not np.isfinite(velocity_mps).all():  # NaN in nuScenes: one that nobody knows may have driven anywhere
+    if not np.isfinite(velocity_mps).all():  # nuScenes marks unknown velocities by NaN
         return now, None
-    moved = now.copy()
-    moved[:, :2] += velocity_mps * seconds
-    return now, moved
+    then = now.copy()
+    then[:, :2] += velocity_mps * seconds
+    return now, then

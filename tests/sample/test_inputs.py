@@ -116,9 +116,9 @@ CALIBRATION: dict[str, tuple[dict[str, Any], str]] = {
     "K of one camera": (sample(K=torch.eye(3)), r"K: expected shape \(2, 3, 3\) for 2 images, got \(3, 3\)"),
     "text": (sample(K="pinhole"), "K: expected a tensor of numbers, got str"),
     "unknown lens": (with_distortion(np.zeros((2, 4)), ["cubic"] * 2), "lens: expected one of pinhole, .* got 'cubic'"),
-    "one lens": (sample(lens=["radtan"]), r"lens: expected a list of 2 names, one a camera, got \['radtan'\]"),
+    "one lens": (sample(lens=["radtan"]), r"lens: expected a list of 2 names, one for each camera, got \['radtan'\]"),
     "a lens for all": (sample(lens="radtan"), "lens: expected a list of 2 names"),
-    "a number for a lens": (sample(lens=5), "lens: expected a list of 2 names, one a camera, got 5"),
+    "a number for a lens": (sample(lens=5), "lens: expected a list of 2 names, one for each camera, got 5"),
     "more cameras than int8 counts": (
         {"images": torch.zeros(129, 3, 1, 1), "rig": Rig([c.resize((1, 1)) for c in rig(129)])},
         "images: expected at most 128 cameras, got 129",
