@@ -75,18 +75,15 @@ class TrainingError(ArbiviewError, RuntimeError):
 
 
 class WarnOnce:
-    """Warnings issued once per topic."""
+    """Warnings issued once per topic; ``topics`` are those issued."""
 
     def __init__(self) -> None:
-        self._said: set[str] = set()
-
-    def __contains__(self, topic: str) -> bool:
-        return topic in self._said
+        self.topics: set[str] = set()
 
     def __call__(self, topic: str, message: str) -> None:
         """Warn, unless this topic was warned of before."""
-        if topic not in self._said:
-            self._said.add(topic)
+        if topic not in self.topics:
+            self.topics.add(topic)
             warnings.warn(message, stacklevel=_callers_level())
 
 

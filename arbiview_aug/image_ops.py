@@ -1,7 +1,8 @@
-"""Image resizing, and pixel coordinates in halved images."""
+"""Image resizing, pixel coordinates in halved images, and reusable buffers."""
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import cv2
@@ -35,6 +36,15 @@ def halved(image: np.ndarray, level: int, dst: np.ndarray | None = None) -> np.n
     if dst is not None and level == 0:
         dst[...] = image
     return image
+
+
+def write_halved(image: torch.Tensor, level: int, dst: np.ndarray) -> None:
+    """Write a (3, H, W) CPU image, halved ``level`` times, into ``dst`` (h, w, 3)."""
+    array = interleaved(image)
+    if array is not None:
+        halved(array, level, dst=dst)
+    else:
+        cv2.merge([halved(plane, level) for plane in image.contiguous().numpy()], dst=dst)
 
 
 def resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
@@ -78,3 +88,21 @@ def nearest_resized(label: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     y = ((torch.arange(size[0], device=label.device) + 0.5) * h / size[0]).long().clamp(max=h - 1)
     x = ((torch.arange(size[1], device=label.device) + 0.5) * w / size[1]).long().clamp(max=w - 1)
     return label[..., y[:, None], x]
+
+
+class Scratch:
+    """Image buffers reused from call to call, one set per thread: allocating them costs more than filling them."""
+
+    def __init__(self) -> None:
+        self._local = threading.local()
+
+    def get(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> np.ndarray:
+        """Return a buffer of this shape and type. Its content is arbitrary but finite: taps of weight 0 read it."""
+        buffers = self._local.__dict__
+        buffer = buffers.get(name)
+        if buffer is None or buffer.shape != shape or buffer.dtype != dtype:
+            buffers[name] = buffer = np.zeros(shape, dtype)
+        return buffer
+
+    def __reduce__(self) -> tuple[type[Scratch], tuple[()]]:
+        return Scratch, ()

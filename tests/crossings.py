@@ -17,9 +17,8 @@ from arbiview_aug import RigRetarget, load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 
 PACKAGE = str(Path(arbiview_aug.__file__).parent)
-BOUNDS = {"street, plan held": (22, 120), "LiDAR + boxes": (38, 5000), "paper": (22, 150)}
-"""Most files and crossings that a call may have: what was measured, with little room. The aims are (10, 50), (20, 500)
-and (12, 150); of them, the 150 crossings of the paper are met."""
+BOUNDS = {"street, plan held": (13, 45), "LiDAR + boxes": (35, 4500), "paper": (19, 150)}
+"""Most files and crossings that a call may have. Aims: (10, 50), (20, 500) and (12, 150)."""
 
 
 class Tracer:

@@ -165,7 +165,7 @@ class Camera:
         return replace(camera, K=intrinsics_for_fov(name, horizontal_fov_deg, *size, camera.lens_model))
 
     # --- derived ----------------------------------------------------------------------------------------------------
-    @property
+    @cached_property
     def size(self) -> tuple[int, int]:
         """(height, width) in pixels."""
         return self.height_px, self.width_px

@@ -23,7 +23,7 @@ from arbiview_aug.render.harmonise import Harmonise, Harmoniser
 from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.sample.inputs import read_frames, read_scenes
-from arbiview_aug.scene.scene import SURFACES
+from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import RenderPath
@@ -171,7 +171,7 @@ class _LastOverlaps:
     def _depth(self, sample: Sample, rig: Rig, images: list[torch.Tensor]) -> OverlapDepth | None:
         if self._surface is None:
             return None
-        (scene,) = read_scenes(sample, read_frames(sample, None), (), self._surface)
+        (scene,) = read_scenes(sample, read_frames(sample, None), (), self._surface) or [Scene()]
         row = SURFACES[scene.best if self._surface == "auto" else self._surface]
         boxes = scene.boxes if row.overlap_depth and "boxes" in row.reads else None
         return overlap_depth(rig, images, boxes)  # as ``FramePlanner`` measures it

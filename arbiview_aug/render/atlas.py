@@ -11,7 +11,6 @@ An atlas holds the source images that a plan reads, below and beside each other,
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
@@ -70,10 +69,6 @@ class FixedMap:
     def copy(self) -> FixedMap:
         """The same map in memory of its own."""
         return FixedMap(self.xy.copy(), self.frac.copy())
-
-    def rows(self, y0: int, y1: int) -> FixedMap:
-        """Rows y0 to y1, the same memory."""
-        return FixedMap(self.xy[y0:y1], self.frac[y0:y1])
 
     def rounded(self) -> FixedMap:
         """The same map at the nearest whole pixels."""
@@ -171,25 +166,3 @@ class AtlasLayout:
     def slot(self, source: int, level: int) -> Slot:
         """The place of one source at one level."""
         return next(s for s in self.slots if (s.source, s.level) == (source, level))
-
-
-# --- OpenCV -----------------------------------------------------------------------------------------------------------
-class Scratch:
-    """Buffers that are reused from frame to frame, one set a thread: fresh ones cost more than the work in them."""
-
-    def __init__(self) -> None:
-        self._local = threading.local()
-
-    def get(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> np.ndarray:
-        """A buffer of this shape and type with undefined, but finite content: bilinear taps of weight 0 read it."""
-        buffers = self._local.__dict__
-        held = buffers.get(name)
-        if held is None or held.shape != shape or held.dtype != dtype:
-            buffers[name] = held = np.zeros(shape, dtype)
-        return held
-
-    def __reduce__(self) -> tuple[type[Scratch], tuple[()]]:
-        return Scratch, ()
-
-
-# --- torch ------------------------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ from arbiview_aug.cameras.projection import edge_distance, ego_rays, project_ray
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import check_ranges
-from arbiview_aug.image_ops import halved, interleaved, level_size
+from arbiview_aug.image_ops import level_size, write_halved
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.atlas import Slot
 from arbiview_aug.render.tone_curve import KNEE, ToneCurve
@@ -228,10 +228,10 @@ def reduced(image: torch.Tensor, level: int) -> _Pixels:
     if image.device.type != "cpu" or image.dtype not in (torch.uint8, torch.float32):
         planes = torch.nn.functional.avg_pool2d(image.float(), 2**level).cpu().numpy()
         small = np.ascontiguousarray(planes.transpose(1, 2, 0))
-    elif (array := interleaved(image)) is not None:
-        small = halved(array, level)
     else:
-        small = np.stack([halved(plane, level) for plane in image.contiguous().numpy()], -1)
+        size = level_size((image.shape[1], image.shape[2]), level)
+        small = np.empty((*size, 3), np.uint8 if image.dtype == torch.uint8 else np.float32)
+        write_halved(image, level, small)
     return np.multiply(small, 1 / top, dtype=np.float32)
 
 
@@ -318,12 +318,8 @@ class Harmoniser:
         self.config = choice if isinstance(choice, HarmoniseConfig) else HarmoniseConfig()
         self.estimates = choice is True or isinstance(choice, HarmoniseConfig)
         self.gains = None if self.estimates or choice is None or choice is False else _checked_gains(choice)
+        self.is_on = self.estimates or self.gains is not None
         self._overlaps: LRUCache[bytes, Overlaps] = LRUCache(_HELD_RIGS, lambda _: 1)
-
-    @property
-    def is_on(self) -> bool:
-        """Whether anything was asked for."""
-        return self.estimates or self.gains is not None
 
     def __repr__(self) -> str:
         if self.gains is not None:

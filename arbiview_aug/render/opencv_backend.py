@@ -1,4 +1,4 @@
-"""Executing a render plan: images in, target views out; OpenCV on the CPU, or torch on any device."""
+"""Render plans executed by OpenCV, for images on the CPU."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import torch
 
-from arbiview_aug.image_ops import halved, interleaved
-from arbiview_aug.render.atlas import AtlasLayout, FixedMap, Scratch
+from arbiview_aug.image_ops import Scratch, interleaved, write_halved
+from arbiview_aug.render.atlas import AtlasLayout
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.tone_curve import STRIP_ROWS, ToneCurve
 from arbiview_aug.render.view_plan import BilinearFallback
 
-_REMAP_COLUMNS = 32000  # remap needs sizes below 32767
+_REMAP_COLUMNS = 32000  # cv2.remap needs sizes below 32767
+_FLAGS = {"nearest": cv2.INTER_NEAREST, "linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC}
 
 
 def render_opencv(
@@ -24,14 +26,14 @@ def render_opencv(
     curves: Sequence[ToneCurve] | None = None,
     seams: list[torch.Tensor] | None = None,
 ) -> list[torch.Tensor]:
-    """Target views by OpenCV, for CPU images; not differentiable.
+    """Render the target views of one frame with ``cv2.remap``; not differentiable.
 
     Args:
         plan: The plan for these images' rig.
-        images: N images (3, H, W): uint8, or float in [0, 1].
+        images: N images (3, H, W) on the CPU: uint8, or float in [0, 1].
         scratch: Buffers to reuse between calls.
-        curves: A tone curve for each image, applied to what the target reads of it.
-        seams: A list to append, for each view, (h, w) float32 to: by how much blending a second source changed the
+        curves: A tone curve for each image, applied to the pixels that are read from it.
+        seams: A list to append to, for each view, (h, w) float32: by how much blending a second source changed the
             winner's colour, mean over the channels, in the images' unit.
 
     Returns:
@@ -41,9 +43,11 @@ def render_opencv(
     scratch = scratch or Scratch()
     dtype = images[0].dtype
     work = torch.uint8 if dtype == torch.uint8 else torch.float32
-    atlas = fill_atlas(plan.layout, [image.detach().to(work) for image in images], scratch)
+    atlas = _fill_atlas(plan.layout, [image.detach().to(work) for image in images], scratch)
     views = _empty_views(plan, work)
-    for k, (target, view) in enumerate(zip(plan.targets, views, strict=True)):
+    sizes = {target.source_camera.shape for target in plan.targets}
+    buffers = {size: scratch.get(f"view {size}", (*size, 3), atlas.dtype) for size in sizes}
+    for target, view in zip(plan.targets, views, strict=True):
         h, w = target.source_camera.shape
         change = np.zeros((h, w), np.float32) if seams is not None else None
         if seams is not None:
@@ -51,49 +55,50 @@ def render_opencv(
         if not target.pairs:
             view.zero_()
             continue
-        buffer = scratch.get(f"view{h}x{w}", (h, w, 3), atlas.dtype)
+        buffer = buffers[h, w]
         for y in range(0, h, STRIP_ROWS):
-            strip = buffer[y : y + STRIP_ROWS]
-            remap(atlas, target.at.rows(y, y + STRIP_ROWS), target.interpolation, dst=strip)
+            rows = slice(y, y + STRIP_ROWS)
+            strip = buffer[rows]
+            _remap(atlas, target.at.xy[rows], target.at.frac[rows], target.interpolation, dst=strip)
             if target.edge is not None:
                 _put_edge(target.edge.rows(y, y + STRIP_ROWS, w), atlas, strip)
-            # Not in the sources: a target has no more pixels, they are in the cache, and a source need not be copied.
+            # Tone the views, not the sources: these have more pixels, and would have to be copied.
             if curves is not None:
                 for patch in target.patches[y // STRIP_ROWS]:
                     curves[patch.source].apply(strip[:, patch.x], patch.mask)
         for band in target.bands:
             bh, bw = band.weight.shape
             part = buffer[band.y : band.y + bh, band.x : band.x + bw]
-            second = remap(atlas, band.at, target.seam_interpolation)
+            second = _remap(atlas, band.at.xy, band.at.frac, target.seam_interpolation)
             if curves is not None:
                 curves[band.source].apply(second)
             if change is not None:
                 apart = np.abs(part.astype(np.float32) - second).mean(-1)
                 change[band.y : band.y + bh, band.x : band.x + bw] += apart * band.weight
             part[...] = cv2.blendLinear(part, second, 1 - band.weight, band.weight)
-        cv2.split(buffer, list(views[k].numpy()))
+        cv2.split(buffer, list(view.numpy()))
     return [view.to(dtype) for view in views]
 
 
 def _put_edge(edge: BilinearFallback, atlas: np.ndarray, strip: np.ndarray) -> None:
-    """Read what cubics must not reach bilinearly; bring float images back into their range."""
+    """Read bilinearly where cubics would reach too far, and clip what cubics overshot in float images."""
     if strip.dtype != np.uint8:
         np.clip(strip, 0, 1, out=strip)
     flat = strip.reshape(-1, 3)
     for first in range(0, len(edge.pixel), _REMAP_COLUMNS):
         some = slice(first, first + _REMAP_COLUMNS)
-        flat[edge.pixel[some]] = remap(atlas, edge.at.part(slice(None), some), "linear")[0]
+        flat[edge.pixel[some]] = _remap(atlas, edge.at.xy[:, some], edge.at.frac[:, some], "linear")[0]
 
 
 def _empty_views(plan: RenderPlan, dtype: torch.dtype) -> list[torch.Tensor]:
-    sizes = [t.source_camera.shape for t in plan.targets]
+    sizes = [target.source_camera.shape for target in plan.targets]
     if len(set(sizes)) == 1:
         return list(torch.empty((len(sizes), 3, *sizes[0]), dtype=dtype))
     return [torch.empty((3, *size), dtype=dtype) for size in sizes]
 
 
-def fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor], scratch: Scratch) -> np.ndarray:
-    """The atlas (rows, columns, 3) of (3, H, W) uint8 or float32 CPU images; channels-last stacks are not copied."""
+def _fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor], scratch: Scratch) -> np.ndarray:
+    """The atlas (rows, columns, 3) of (3, H, W) uint8 or float32 images; a channels-last block is used as it is."""
     block = _stacked_block(layout, images)
     if block is not None:
         return block
@@ -101,18 +106,12 @@ def fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor], scratch: Scr
     atlas = scratch.get("atlas", (*layout.size, 3), dtype)
     for slot in layout.slots:
         h, w = slot.size
-        place = atlas[slot.y : slot.y + h, slot.x : slot.x + w]
-        image = interleaved(images[slot.source])
-        if image is not None:
-            halved(image, slot.level, dst=place)
-        else:
-            planes = images[slot.source].contiguous().numpy()
-            cv2.merge([halved(plane, slot.level) for plane in planes], dst=place)
+        write_halved(images[slot.source], slot.level, atlas[slot.y : slot.y + h, slot.x : slot.x + w])
     return atlas
 
 
 def _stacked_block(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> np.ndarray | None:
-    """The images' own memory as the atlas, where they lie below each other already."""
+    """The images' own memory as the atlas, if they lie below each other in one channels-last block."""
     if not layout.is_stack:
         return None
     first = interleaved(images[0])
@@ -129,12 +128,13 @@ def _stacked_block(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> np.nd
     return stack.numpy()
 
 
-def remap(atlas: np.ndarray, at: FixedMap, interpolation: str, dst: np.ndarray | None = None) -> np.ndarray:
-    """Read the atlas at a map, (h, w, 3); ``OUTSIDE`` is black. Nearest sampling wants a ``rounded`` map.
-
-    Cubic sampling overshoots: float images may leave their range by a little.
-    """
-    if interpolation == "nearest":
-        return cv2.remap(atlas, at.xy, None, cv2.INTER_NEAREST, dst=dst)  # type: ignore[call-overload]
-    flag = cv2.INTER_CUBIC if interpolation == "cubic" else cv2.INTER_LINEAR
-    return cv2.remap(atlas, at.xy, at.frac, flag, dst=dst)
+def _remap(
+    atlas: np.ndarray,
+    xy: npt.NDArray[np.int16],
+    frac: npt.NDArray[np.uint16],
+    interpolation: str,
+    dst: np.ndarray | None = None,
+) -> np.ndarray:
+    """Read the atlas at a fixed-point map, (h, w, 3); ``OUTSIDE`` is black. ``nearest`` wants a ``rounded`` map."""
+    fractions = None if interpolation == "nearest" else frac
+    return cv2.remap(atlas, xy, fractions, _FLAGS[interpolation], dst=dst)  # type: ignore[call-overload,arg-type]

@@ -18,8 +18,9 @@ from typing import Any
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.image_ops import Scratch
 from arbiview_aug.lru_cache import LRUCache
-from arbiview_aug.render.atlas import AtlasLayout, Scratch
+from arbiview_aug.render.atlas import AtlasLayout
 from arbiview_aug.render.view_plan import ViewPlan
 from arbiview_aug.render.view_planner import ViewPlanner
 from arbiview_aug.scene.scene import Scene

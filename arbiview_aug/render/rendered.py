@@ -16,8 +16,7 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.renderer import PaperRendering, paper_labels
-from arbiview_aug.image_ops import nearest_resized, resized
-from arbiview_aug.render.atlas import Scratch
+from arbiview_aug.image_ops import Scratch, nearest_resized, resized
 from arbiview_aug.render.confidence import confidence
 from arbiview_aug.render.labels import render_labels
 from arbiview_aug.render.opencv_backend import render_opencv

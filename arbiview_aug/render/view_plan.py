@@ -114,7 +114,7 @@ class ViewPlan:
         """Indices of the source cameras that are read."""
         return {pair.source for pair in self.pairs} | {band.source for band in self.bands}
 
-    @property
+    @cached_property
     def seam_interpolation(self) -> str:
         """How its bands are read."""
         return "linear" if self.interpolation == "cubic" else self.interpolation

@@ -19,8 +19,8 @@ from arbiview_aug.cameras.projection import clean_pixels, edge_distance, resolut
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.favs.stage4_fusion import distance_weight, primary_weight, quality_weight
-from arbiview_aug.image_ops import level_size
-from arbiview_aug.render.atlas import AtlasLayout, FixedMap, Scratch
+from arbiview_aug.image_ops import Scratch, level_size
+from arbiview_aug.render.atlas import AtlasLayout, FixedMap
 from arbiview_aug.render.confidence import certainty
 from arbiview_aug.render.requirements import SAME_CENTER_M, covers_target_exactly
 from arbiview_aug.render.target_rays import TargetRays

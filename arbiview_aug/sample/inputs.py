@@ -86,7 +86,7 @@ def read_frames(sample: Any, source_rig: Rig | None) -> list[Frame]:
 
 
 def read_scenes(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...], surface: str) -> list[Scene]:
-    """Read the scene geometry of each frame, in the source's ego frame, as far as a surface uses it.
+    """Read the scene geometry of each frame, in the source's ego frame, as far as a surface uses it; [] without any.
 
     Args:
         sample: The sample dict.
@@ -107,7 +107,7 @@ def read_scenes(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[
             expected, keys = _EXPECTED.get(name, f"{name!r} in the sample, got none"), _SAMPLE_KEYS.get(name, (name,))
             raise SampleError(f"surface={surface!r}: expected {expected}{hint(sample, keys)}")
     if not found:
-        return [Scene()] * len(frames)
+        return []
     scenes = []
     for k in range(len(frames)):
         further: dict[str, Any] = {name: arrays[k] for name, arrays in found.items()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -42,13 +43,13 @@ class Scene:
         own = {"boxes": self.boxes, "points": self.points, "motion": self.motion}
         return own[name] if name in own else self.further.get(name)
 
-    @property
+    @cached_property
     def is_empty(self) -> bool:
         """Whether nothing is known but the road."""
         known = self.boxes is not None or self.points is not None or self.motion is not None
         return not (known or self.further or self.corrections)
 
-    @property
+    @cached_property
     def best(self) -> SurfaceName:
         """The surface made of the best geometry that there is: what ``auto`` takes."""
         if self.points is not None and len(self.points):
@@ -101,7 +102,7 @@ class SurfaceRow:
     overlap_depth: bool = False
     has_wall: bool = True
 
-    @property
+    @cached_property
     def is_static(self) -> bool:
         """Whether it knows nothing of the objects on the street."""
         return not self.reads

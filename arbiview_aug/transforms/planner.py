@@ -1,4 +1,4 @@
-"""Plans of frames: which plan renders each, from what its holes are filled, and what would harm a detector."""
+"""Plans for the frames of a sample: how each is rendered, and what fills its holes from neighbouring frames."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import torch
 
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
@@ -29,8 +28,8 @@ from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.temporal.fill import Fills, Reach, neighbour_images, plan_fills
 from arbiview_aug.temporal.motion_depth import MotionDepth, motion_depth
 
-_UNREACHABLE = 0.5  # a target camera of which less than this is covered is worth a warning
-_MAX_RIG_PAIRS = 64  # a kilobyte or two each, beside the target's cameras
+_UNREACHABLE = 0.5  # warn of target cameras of which less than this share is covered
+_MAX_RIG_PAIRS = 64  # one or two kilobytes each, beside the target's cameras
 
 
 @dataclass(frozen=True)
@@ -40,13 +39,13 @@ class FramePlan:
     Attributes:
         source: The frame's rig.
         target: The target rig in the source's ego frame.
-        plan: The render plan; None with ``quality="paper"``, for which nothing can be planned.
+        plan: The render plan; None with ``quality="paper"``, which depends on every image.
         detections: Detected objects by source camera, for ``quality="paper"``.
-        depth: Depth from overlap of each pair of neighbours, if it was asked for and matters.
+        depth: Depth from overlap, if it was asked for and matters.
         motion: Depth from motion, if it was estimated here and not offline.
-        fills: How holes are filled from neighbouring frames, if those show any of them.
+        fills: How neighbouring frames fill holes, if they show any.
         curves: A tone curve for each source, if they are harmonised.
-        harm: How a detector suffers from the surface, if that is static and cameras move.
+        harm: Why a detector suffers, if cameras move over a static surface.
     """
 
     source: Rig
@@ -61,21 +60,33 @@ class FramePlan:
 
 
 class _RigPair:
-    """What the calibrations of a source and a target rig say without any image.
+    """A source and a target rig, and what follows from their calibrations alone.
 
     Attributes:
         source: The source rig.
         target: The target rig in the source's ego frame.
         needs_geometry: Whether the distance of the scene matters for any pixel.
+        road: A scene of which the road alone is known.
     """
 
     def __init__(self, source: Rig, target: Rig, surface: SurfaceName, config: FavsConfig | PaperConfig) -> None:
-        self.source, self.target, self._config = source, target.in_frame_of(source), config
+        self.source, self.target, self.road = source, target.in_frame_of(source), Scene()
+        self._surface, self._config = surface, config
         self.needs_geometry = isinstance(config, FavsConfig) and needs_geometry(source, self.target, surface, config)
 
     @cached_property
+    def road_key(self) -> bytes:
+        """Key of the plan over the road alone."""
+        return self.plan_key(self.road)
+
+    def plan_key(self, scene: Scene) -> bytes:
+        """Key of the plan in a scene."""
+        assert isinstance(self._config, FavsConfig)
+        return plan_key(self.source, self.target, self._surface, self._config, scene)
+
+    @cached_property
     def harm(self) -> str | None:
-        """How a detector suffers if the target is rendered over a static surface."""
+        """Why a detector suffers if the target is rendered over a static surface."""
         assert isinstance(self._config, FavsConfig)
         return static_harm(self.source, self.target, "street", self._config)
 
@@ -91,18 +102,19 @@ class _RigPairs(LRUCache[tuple[bytes, bytes], _RigPair]):
 
 
 class FramePlanner:
-    """Plans frames, and holds the plans of calibrations that come back.
+    """Plans frames, and caches the plans of calibrations that come back.
 
     Args:
         config: Settings.
         surface: As in ``RigRetarget``.
-        harmoniser: Tone curves for every frame.
-        refinement: Where refinements are held, for settings with depth from overlap.
-        cache_bytes: Memory for plans that may come back.
+        harmoniser: Estimates a tone curve for each source.
+        refinement: Cache for depth from overlap, for settings that use it.
+        cache_bytes: Memory for cached plans.
         reach: What neighbouring frames may fill; None leaves them out.
-        mixed: Half of the samples or more stay untouched.
-        strict: Refuse what harms a detector instead of warning of it.
-        warn: Says what a user should know.
+        mixed: Whether at least half of the samples stay untouched.
+        strict: Raise an error instead of warning of what harms a detector.
+        unseen: A sentence on pixels that no source sees, for the warning of targets that are hardly covered.
+        warn: Issues warnings.
 
     Raises:
         ValueError: Settings that contradict each other.
@@ -118,6 +130,7 @@ class FramePlanner:
         reach: Reach | None,
         mixed: bool,
         strict: bool,
+        unseen: str,
         warn: WarnOnce,
     ) -> None:
         if isinstance(config, PaperConfig) and harmoniser.is_on:
@@ -126,9 +139,9 @@ class FramePlanner:
             raise ValueError("refinement: expected quality='accurate' (or overlap_depth=True) with a RefinementCache")
         self.config, self.surface, self.harmoniser = config, surface, harmoniser
         self.refinement, self.reach, self.warn = refinement, reach, warn
-        self.mixed, self.strict = mixed, strict
+        self.mixed, self.strict, self.unseen = mixed, strict, unseen
         self.plans = PlanCache(cache_bytes)
-        self._plan_of_frame = PlanCache(0)  # holds one
+        self._last_plan = PlanCache(0)  # holds one
         self._pairs = _RigPairs()
 
     # --- plans of frames ----------------------------------------------------------------------------------------------
@@ -138,43 +151,48 @@ class FramePlanner:
         """Plan each frame of a sample.
 
         Raises:
-            SampleError: What the settings need of the sample is missing or impossible.
+            SampleError: The sample lacks what the settings need, or it is impossible.
         """
         pairs = [self._pair(frame.rig, target) for frame in frames]
         if isinstance(self.config, PaperConfig):
-            named: Sequence[OfCameras] = [{}] * len(frames)
+            detections: Sequence[OfCameras] = [{}] * len(frames)
             if self.config.use_detections:
-                named = detections_of_frames(sample, frames, lead)
-            return [FramePlan(f.rig, p.target, detections=d) for f, p, d in zip(frames, pairs, named, strict=True)]
-        scenes = [Scene()] * len(frames)
-        given = sample.get("neighbours")  # what stands there decides what they may fill
+                detections = detections_of_frames(sample, frames, lead)
+            return [FramePlan(f.rig, p.target, detections=d) for f, p, d in zip(frames, pairs, detections, strict=True)]
+        given = sample.get("neighbours")
         fills_holes = self.reach is not None and isinstance(given, list | tuple) and len(given) > 0
-        is_needed = any(pair.needs_geometry for pair in pairs)  # otherwise it is not even read
-        if is_needed or self.surface != "auto" or fills_holes:
+        is_needed = any(pair.needs_geometry for pair in pairs)
+        scenes: Sequence[Scene] = ()
+        if is_needed or self.surface != "auto" or fills_holes:  # objects decide what neighbours may fill
             scenes = read_scenes(sample, frames, lead, self.surface)
+        scenes = scenes or [pair.road for pair in pairs]
         names = self._names(sample, len(frames), lead)
         uses_motion = "motion" in SURFACES[self.surface].reads
-        asks_motion = uses_motion and is_needed and sample.get(MOTION_KEY) is None
-        if asks_motion and given is None:
+        estimates_motion = uses_motion and is_needed and sample.get(MOTION_KEY) is None
+        if estimates_motion and given is None:
             raise SampleError(
                 f"surface='motion': expected 'neighbours' in the sample, or {MOTION_KEY!r} from the depth command, got "
                 "neither"
             )
         neighbouring: list[list[Neighbour]] = [[] for _ in frames]
-        if given is not None and (asks_motion or self.reach is not None):
+        if given is not None and (estimates_motion or self.reach is not None):
             neighbouring = neighbours_of_frames(sample, frames, lead, self.warn)
         plans = []
         for frame, pair, scene, name, neighbours in zip(frames, pairs, scenes, names, neighbouring, strict=True):
-            depth = self._depth(self.config, frame, scene, name) if pair.needs_geometry else None
-            known = scene if depth is None else replace(scene, corrections=depth.corrections)
-            motion = self._motion(frame, scene, neighbours) if asks_motion and pair.needs_geometry else None
-            if uses_motion and known.motion is None:
-                known = replace(known, motion=np.zeros((0, 3)) if motion is None else motion.points(frame.rig))
-            plan, fills = self._plan_of_pair(pair, frame.rig, known, self.config), None
-            surface = known.best if self.surface == "auto" else self.surface
+            depth = motion = fills = None
+            if pair.needs_geometry and self.config.overlap_depth:
+                depth = self._depth(frame, scene, name)
+            if pair.needs_geometry and estimates_motion:
+                motion = self._motion(frame, scene, neighbours)
+            if depth is not None:
+                scene = replace(scene, corrections=depth.corrections)
+            if uses_motion and scene.motion is None:
+                scene = replace(scene, motion=np.zeros((0, 3)) if motion is None else motion.points(frame.rig))
+            plan = self._plan_of_pair(pair, frame.rig, scene, self.config)
+            surface = scene.best if self.surface == "auto" else self.surface
             if neighbours and self.reach is not None:
-                fills = plan_fills(plan, neighbours, known, surface, self.config, self.reach)
-            curves = self.harmoniser.curves(frame.rig, frame.images)
+                fills = plan_fills(plan, neighbours, scene, surface, self.config, self.reach)
+            curves = self.harmoniser.curves(frame.rig, frame.images) if self.harmoniser.is_on else None
             harm = pair.harm if SURFACES[surface].is_static else None
             plans.append(FramePlan(frame.rig, pair.target, plan, {}, depth, motion, fills, curves, harm))
         return plans
@@ -187,7 +205,8 @@ class FramePlanner:
         """
         if isinstance(self.config, PaperConfig):
             raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
-        return self._plan_of_pair(self._pair(source, target), source, scene or Scene(), self.config)
+        pair = self._pair(source, target)
+        return self._plan_of_pair(pair, source, scene or pair.road, self.config)
 
     def needs_geometry(self, source: Rig, target: Rig) -> bool:
         """Whether the distance of the scene matters for any pixel of a target rig."""
@@ -198,22 +217,21 @@ class FramePlanner:
         return self._pairs.get(key, lambda: _RigPair(source, target, self.surface, self.config))
 
     def _plan_of_pair(self, pair: _RigPair, source: Rig, scene: Scene, config: FavsConfig) -> RenderPlan:
-        known = scene if pair.needs_geometry else Scene()
-        # A frame's geometry never comes back, unless it is a refinement that is reused: its plan must not push out
+        if scene.is_empty or not pair.needs_geometry:
+            return self.plans.get(pair.road_key, lambda: self._built(source, pair.target, pair.road, config))
+        # A frame's own geometry never comes back, unless it is a refinement that is reused: its plan must not push out
         # those that do.
-        comes_back = known.is_empty or (self.refinement is not None and known.best == "street")
-        cache = self.plans if comes_back else self._plan_of_frame
-        key = plan_key(source, pair.target, self.surface, config, known)
-        return cache.get(key, lambda: self._built(source, pair.target, config, known))
+        cache = self.plans if self.refinement is not None and scene.best == "street" else self._last_plan
+        return cache.get(pair.plan_key(scene), lambda: self._built(source, pair.target, scene, config))
 
-    def _built(self, source: Rig, target: Rig, config: FavsConfig, scene: Scene) -> RenderPlan:
+    def _built(self, source: Rig, target: Rig, scene: Scene, config: FavsConfig) -> RenderPlan:
         plan = build_plan(source, target, surface=self.surface, config=config, scene=scene)
         self.warn_unreachable(target, plan.coverage)
         return plan
 
-    # --- depth from overlap -------------------------------------------------------------------------------------------
+    # --- depth --------------------------------------------------------------------------------------------------------
     def _names(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[object]:
-        """For each frame, what the sample calls its scene, where refinements are reused by name.
+        """The name of each frame's scene, if refinements are shared by name.
 
         Raises:
             SampleError: The sample lacks the name, or has another number of them than frames.
@@ -225,50 +243,54 @@ class FramePlanner:
             raise SampleError(f"refinement: expected {key!r} in the sample, to tell which frames share a refinement")
         return names_of_frames(key, sample[key], count, lead)
 
-    def _depth(self, config: FavsConfig, frame: Frame, scene: Scene, name: object) -> OverlapDepth | None:
-        """Depth from overlap, where it is asked for and decides a pixel, and nothing was measured."""
-        surface = scene.best if self.surface == "auto" else self.surface
-        if not config.overlap_depth or not SURFACES[surface].overlap_depth:
+    def _depth(self, frame: Frame, scene: Scene, name: object) -> OverlapDepth | None:
+        """Depth from overlap; None over surfaces that it does not correct."""
+        row = SURFACES[scene.best if self.surface == "auto" else self.surface]
+        if not row.overlap_depth:
             return None
-        boxes = scene.boxes if "boxes" in SURFACES[surface].reads else None
+        boxes = scene.boxes if "boxes" in row.reads else None
         if self.refinement is None:
             return overlap_depth(frame.rig, frame.images, boxes)
         return self.refinement.get((frame.rig.content_key, name), lambda: overlap_depth(frame.rig, frame.images, boxes))
 
     def _motion(self, frame: Frame, scene: Scene, neighbours: Sequence[Neighbour]) -> MotionDepth:
-        """Depth from motion; a warning, once, where there is none."""
-        device = frame.images[0].device
+        """Depth from motion; warns once if it was declined."""
+        depth = motion_depth(
+            frame.rig,
+            frame.images,
+            neighbours,
+            scene.boxes,
+            lambda neighbour: neighbour_images(neighbour, frame.images, self.warn),
+            frame.images[0].device,
+        )
+        if not depth.density:
+            self.warn("motion", str(depth))
+        return depth
 
-        def images(neighbour: Neighbour) -> tuple[torch.Tensor, ...] | None:
-            return neighbour_images(neighbour, frame.images, self.warn)
-
-        found = motion_depth(frame.rig, frame.images, neighbours, scene.boxes, images, device)
-        if not found.density:
-            self.warn("motion", str(found))
-        return found
-
-    # --- words --------------------------------------------------------------------------------------------------------
+    # --- warnings -----------------------------------------------------------------------------------------------------
     def warn_unreachable(self, target: Rig, coverages: Sequence[BoolArray]) -> None:
-        """Warn, once, of target cameras that the sources hardly cover: of ``coverages`` (h, w) of each."""
-        if "unreachable" in self.warn:  # means over all pixels are milliseconds in every frame with a plan of its own
+        """Warn once of target cameras that the sources hardly cover, by the (h, w) coverage of each."""
+        if "unreachable" in self.warn.topics:  # the means below take milliseconds
             return
         shares = [float(coverage.mean()) for coverage in coverages]
         poor = [f"{c.name} {share:.0%}" for c, share in zip(target, shares, strict=True) if share < _UNREACHABLE]
         if poor:
             self.warn(
                 "unreachable",
-                f"the target rig {target.name!r} cannot be reached from this data: covered are "
-                f"{', '.join(poor)}; train with the coverage mask, or choose another target",
+                f"the target rig {target.name!r} cannot be reached from this data: covered are {', '.join(poor)}. "
+                f"{self.unseen} Or choose another target",
             )
 
     def judge(self, plans: Sequence[FramePlan]) -> None:
-        """Warn, once, of what ``auto`` renders over the static street to the harm of a detector.
+        """Warn once if ``auto`` falls back to the static street although cameras move, which harms a detector.
 
         Raises:
             SampleError: It does, and ``strict`` is set.
         """
+        if self.surface != "auto" or self.mixed or (not self.strict and "static" in self.warn.topics):
+            return
         for plan in plans:
-            if plan.harm is None or self.surface != "auto" or self.mixed:
+            if plan.harm is None:
                 continue
             message = f"{plan.harm}. Better: {harm_remedies(plan.source, plan.target)}; surface='street' accepts it"
             if self.strict:

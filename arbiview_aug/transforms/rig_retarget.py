@@ -1,4 +1,4 @@
-"""``RigRetarget``: samples of one vehicle in, samples as another vehicle's cameras would have seen them out."""
+"""``RigRetarget``: samples of one vehicle, as another vehicle's cameras would have seen them."""
 
 from __future__ import annotations
 
@@ -44,96 +44,90 @@ from arbiview_aug.transforms.settings import (
     completion_of,
     is_number,
     one_of,
+    unseen_note,
 )
 
 _MIXED_P = 0.5
-"""With half of the samples untouched or more, views over a static street do not harm a detector
-(``integrations/cross_rig``). Other shares have not been measured."""
+"""At most this share of retargeted samples, views over a static street do not harm a detector
+(``integrations/cross_rig``)."""
 
 
 class RigRetarget(torch.nn.Module):
-    """Re-renders a sample's cameras as a target rig's, and keeps everything that depends on them consistent.
+    """Re-render a sample's cameras as a target rig's, and keep everything that depends on them consistent.
 
-    A sample is a dict with ``images``, (..., N, 3, H, W) or a list of (..., 3, Hi, Wi), uint8 or float in [0, 1]; and
-    its calibration: ``rig`` (wins, carries lenses, masks, names and the road's height), else ``source_rig=``, else
-    ``K`` (..., N, 3, 3) and ``cam2ego`` (..., N, 4, 4), with ``lens``, ``distortion`` and ``ground_z_m`` where present.
+    A sample is a dict with ``images``, (..., N, 3, H, W) or a list of (..., 3, Hi, Wi), uint8 or float in [0, 1], and
+    its calibration: ``rig`` (wins; carries lenses, masks, names and the road's height), else ``source_rig=``, else
+    ``K`` (..., N, 3, 3) and ``cam2ego`` (..., N, 4, 4), optionally with ``lens``, ``distortion`` and ``ground_z_m``.
     ``coverage`` and ``ignore`` of an earlier retargeting mask its images.
 
-    The output holds the same keys, except ``rig``, with ``images`` (..., M, 3, h, w) of the input's dtype (a list where
-    target sizes differ), ``K`` and ``cam2ego`` of the target cameras (in the source's ego frame, both roads
-    coinciding), ``ground_z_m`` of that frame, and ``coverage`` (..., M, h, w) bool, True where some source saw the
-    pixel. ``distortion`` (..., M, 8) and ``lens`` come with targets that have lenses; ``ignore`` (..., M, h, w) bool,
-    True on the target's own car body, where its cameras have masks; ``retarget_params``, plain numbers, where anything
-    was drawn. A batch shares one draw.
+    The output has the same keys except ``rig``: ``images`` (..., M, 3, h, w) of the input's dtype (a list where target
+    sizes differ), ``K`` and ``cam2ego`` of the target cameras in the source's ego frame with both roads coinciding,
+    ``ground_z_m`` of that frame, and ``coverage`` (..., M, h, w) bool, True where some source sees the pixel. Targets
+    with lenses add ``distortion`` (..., M, 8) and ``lens``; targets with car-body masks add ``ignore`` (..., M, h, w)
+    bool, True on the own car; random settings add ``retarget_params``, plain numbers. A batch shares one draw.
 
     Label maps are rendered by the winning source's nearest label. ``points`` and ``boxes_3d`` are in the ego frame and
-    stay. Keys that are known to speak of pixels (``arbiview_aug.sample.check.PIXEL_BOUND_KEYS``) are dropped; unknown
-    ones pass as the same objects, except maps of the images' height and width, which raise unless named.
+    stay. Keys bound to the source's pixels (``arbiview_aug.sample.check.PIXEL_BOUND_KEYS``) are dropped. Unknown keys
+    pass as the same objects; maps of the images' height and width raise unless they are named.
 
     Args:
         target_rig: A ``Rig``, the name of a shipped one, a rig file, or a ``RandomRig``.
         source_rig: The rig of every sample that carries none.
-        path: ``favs``: stitching, with what no source sees as ``holes`` says. ``inpaint``: that is filled by Telea's
-            inpainting at full size. ``diffusion``: by a generator (``arbiview_aug.generator``); targets that are whole
-            never ask it.
-        holes: What pixels become that no source sees, after ``neighbours`` filled theirs. ``fill``: those that lie in
-            some source's image, where an object or the source's own car hides them, are continued from their borders,
-            and so are those outside all images up to an eighth of the view's shorter side; farther outside they become
-            the mean colour of what the frame's views show. ``mean``: all become that colour. ``black``: they stay
-            black. But for ``black``, and with the other paths, the output has ``generated`` (..., M, h, w) bool, True
-            where a pixel was made up. ``coverage`` is False there, ``confidence`` 0, ``source_camera`` -1 and labels
-            ``label_fill``; what sources see stays as it is, bit for bit. Other paths replace it: leave it at ``fill``.
-        generator: For ``diffusion``: ``Generator.from_pretrained(DIR)``; None loads the weights that ship with the
-            package, trained on synthetic streets alone. On a GPU it needs ``num_workers=0``, or
-            ``generator.complete_batch`` after collating.
-        steps: Of the generator: 1 (regression), 4, 10, 50; its own number where None.
-        guidance: Classifier-free guidance; the generator's own where None, 1 is none.
-        min_confidence: τ: pixels that are seen with less confidence are made up as well.
-        seed: Of what is made up, beside the frame (its ``token``, else its images) and the camera.
+        path: ``favs``: stitching; ``holes`` says what becomes of pixels that no source sees. ``inpaint``: Telea's
+            inpainting fills them at full size. ``diffusion``: a generator (``arbiview_aug.generator``) fills them.
+        holes: What pixels become that neither a source nor ``neighbours`` show, with ``path="favs"``. ``fill``:
+            occluded pixels, and those outside all source images by up to an eighth of the view's shorter side, are
+            continued from their borders; farther ones get the mean colour of the frame's views. ``mean``: all get that
+            colour. ``black``: they stay black. Filled pixels are True in ``generated`` (..., M, h, w) bool; their
+            ``coverage`` stays False, ``confidence`` 0, ``source_camera`` -1 and labels ``label_fill``. Covered pixels
+            are not changed.
+        generator: For ``diffusion``: ``Generator.from_pretrained(DIR)``; None loads the shipped weights, trained on
+            synthetic streets alone. A generator on a GPU needs ``num_workers=0``, or ``generator.complete_batch`` after
+            collating.
+        steps: Denoising steps: 1 (regression), 4, 10 or 50; the generator's default if None.
+        guidance: Classifier-free guidance, 1 for none; the generator's default if None.
+        min_confidence: τ: pixels seen with less confidence are filled as well.
+        seed: Seed of filled pixels, combined with the frame (its ``token``, else its images) and the camera.
         quality: ``draft``, ``fast``, ``accurate``, or a ``FavsConfig``; ``paper`` or a ``PaperConfig``: stages 1 to 4
-            as published, on the CPU, for pinhole cameras. Its objects take their types from the sample, where it has
-            ``detections`` (for each camera ``{"boxes": (n, 4), "labels": [n names]}`` in source pixels, as
-            torchvision's detectors return them) or else ``boxes_3d``, with ``box_names`` (a name each) where there are
-            any.
-        surface: ``far``, ``ground``, ``street``; ``objects``: the sample's ``boxes_3d`` stand on the street, so that
-            objects keep their height when cameras move; ``lidar``: its ``points`` (ego frame) or ``depth_m`` (..., N,
-            H, W; z-depth in metres, 0 or NaN where unknown), with ``boxes_3d`` for objects of few points; ``motion``:
-            what its ``neighbours`` show of distances (``arbiview_aug.motion``; seconds a frame), or ``motion_depth_m``
-            of the ``depth`` command, with its ``boxes_3d``; the street where that is declined, with a warning;
-            ``auto``: for each pair of cameras ``far`` where their centres coincide, else the best that the sample
-            offers: ``lidar``, else ``objects``, else ``street`` (``paper``: always ``far``). Cameras that move over
-            the street alone harm a detector: a warning says so, once, unless ``p`` mixes half untouched samples in.
-            Plans over points and boxes are made anew for every frame.
+            as published, on the CPU, for pinhole cameras. Its objects take their types from ``detections`` (for each
+            camera ``{"boxes": (n, 4), "labels": [n names]}`` in source pixels, as torchvision's detectors return them),
+            else from ``boxes_3d`` with ``box_names``.
+        surface: ``far``, ``ground``, ``street``; ``objects``: the sample's ``boxes_3d`` stand on the street; ``lidar``:
+            its ``points`` (ego frame) or ``depth_m`` (..., N, H, W; z-depth in metres, 0 or NaN where unknown), with
+            ``boxes_3d`` for objects of few points; ``motion``: depth estimated from its ``neighbours``
+            (``arbiview_aug.motion``; seconds a frame), or ``motion_depth_m`` of the ``depth`` command, with its
+            ``boxes_3d``, or the street, with a warning, if the estimate is declined. ``auto``: for each pair of
+            cameras ``far`` where their centres coincide, else the best that the sample offers: ``lidar``, else
+            ``objects``, else ``street`` (``paper``: always ``far``). Cameras that move over the street alone harm a
+            detector: a warning says so once, unless ``p`` leaves half of the samples untouched. Points and boxes need a
+            new plan for every frame.
         strict: Raise SampleError instead of that warning.
         harmonise: Bring the sources to one exposure (``arbiview_aug.render.harmonise``): True or a ``HarmoniseConfig``
-            estimates a gain for each camera in every frame; numbers are gains to use as they are. Off by default.
-            Samples that ``p`` skips keep their colours.
-        refinement: For ``quality="accurate"``, whose depth from overlap depends on the images: None computes it, and
-            plans anew, for every frame; a ``RefinementCache`` reuses both where its key says that the scene is the
-            same.
-        neighbours: What other frames of the drive may fill, where the sample has ``neighbours`` (their format:
-            ``arbiview_aug.sample.neighbours``): ``ground``, the road near the cameras that no source sees now; ``all``,
-            whatever the surface says; None does not read them. Never what the current frame sees. ``paper`` has none.
+            estimates a gain for each camera in every frame; numbers are used as gains. Off by default, and for samples
+            that ``p`` skips.
+        refinement: Cache for the depth from overlap of ``quality="accurate"``, which depends on the images. None
+            computes depth and plans for every frame; a ``RefinementCache`` reuses both where its key is the same.
+        neighbours: What other frames of the drive (the sample's ``neighbours``, see ``arbiview_aug.sample.neighbours``)
+            may fill: ``ground``, the road near the cameras; ``all``, whatever the surface says; None, nothing. Covered
+            pixels are never replaced. Not used by ``paper``.
         size: (h, w) of every output image; the target cameras are brought to it by ``fit``, and ``K`` says so.
-        fit: ``crop``: the aspect is kept, what then exceeds the size is cut at the top and at both sides. ``pad``: the
-            aspect is kept, black bars above and at both sides fill the size; there ``coverage`` is False, ``ignore``
-            True, label maps hold ``label_fill``, and nothing is filled in. ``stretch``: the aspect is not kept.
+        fit: ``crop``: keep the aspect, cut the excess at the top and both sides. ``pad``: keep the aspect, add black
+            bars at the top and both sides; there ``coverage`` is False, ``ignore`` True, labels are ``label_fill``, and
+            nothing is filled. ``stretch``: change the aspect.
         p: Probability of retargeting. A skipped sample keeps its own cameras, brought to ``size`` by ``fit``, with full
-            coverage; so ``p < 1`` needs ``size`` and equal camera counts; where these differ, mix by
-            ``arbiview_aug.MixedDataset``. The output then always has ``lens``, ``distortion`` and ``ignore``, whichever
-            rig they come from: batches collate.
-        rng: A generator for the draws instead of torch's global one; only outside DataLoader workers.
+            coverage, so ``p < 1`` needs ``size`` and equal camera counts (else see ``arbiview_aug.MixedDataset``). The
+            output then always has ``lens``, ``distortion`` and ``ignore``, so that batches collate.
+        rng: Generator of the draws instead of torch's global one; only outside DataLoader workers.
         label_frame: ``source``: output poses, points and boxes are in the source's ego frame. ``target``: they (and
             ``ego2world``) are moved into the target's, and ``ego2ego`` (..., 4, 4) is returned.
         label_keys: Keys that hold label maps (..., N, H, W) or lists of them, besides ``tv_tensors.Mask``.
-        label_fill: Value of label pixels that no source sees now (False for bool maps); images of neighbouring frames
-            and of generators bring no labels.
+        label_fill: Value of label pixels that no source sees (False for bool maps).
         pass_keys: Keys to keep although they look bound to the source's pixels.
-        outputs: Further outputs: ``source_camera`` (..., M, h, w) int8, -1 where uncovered; ``source_frame`` (..., M,
-            h, w) int8, 0 for the current frame, n + 1 for number n of the neighbours, -1 where uncovered;
-            ``confidence`` (..., M, h, w) float32 in [0, 1], exp(-e / 10) for an expected error of e grey levels of
-            255: 1 where the source is exact, 0 where uncovered (``arbiview_aug.render.confidence``; not with
-            ``paper``); ``sources``, what the frame was rendered from, as a sample, for ``Generator.complete_batch``.
+        outputs: Further outputs, maps (..., M, h, w): ``source_camera`` int8, -1 where uncovered; ``source_frame``
+            int8, 0 for the current frame, n + 1 for number n of the neighbours, -1 where uncovered; ``confidence``
+            float32 in [0, 1], exp(-e / 10) for an expected error of e grey levels of 255, 0 where uncovered
+            (``arbiview_aug.render.confidence``; not with ``paper``). ``sources``: the source images and calibration, a
+            sample for ``Generator.complete_batch``.
         execution: ``opencv`` (CPU), ``torch`` (any device, differentiable); ``auto`` takes OpenCV for CPU images that
             need no gradient.
         cache_bytes: Memory for plans; the least recently used go first.
@@ -208,7 +202,7 @@ class RigRetarget(torch.nn.Module):
             self.target = load_rig(target_rig)
         self.source_rig = source_rig if isinstance(source_rig, Rig) or source_rig is None else load_rig(source_rig)
         self.config = favs_config(quality)
-        self._trusts = False
+        self._needs_confidence = False
         if isinstance(self.config, PaperConfig):
             check_pinhole(self.target if isinstance(self.target, Rig) else self.target.base)
             if "confidence" in outputs:
@@ -216,8 +210,8 @@ class RigRetarget(torch.nn.Module):
             if min_confidence:
                 raise ValueError("min_confidence: quality='paper' has no confidence, expected 0")
             check_settings(surface, execution)
-        elif "confidence" in outputs or min_confidence or path == "diffusion":  # the generator is told of it
-            self._trusts, self.config = True, replace(self.config, certainty=True)
+        elif "confidence" in outputs or min_confidence or path == "diffusion":
+            self._needs_confidence, self.config = True, replace(self.config, certainty=True)
         self.path, self.holes, self.p, self.rng = path, holes, float(p), rng
         self.completion = completion_of(path, generator, steps, guidance, min_confidence, seed)
         self.generator = None if self.completion is None else self.completion.generator  # moves with this module
@@ -226,23 +220,24 @@ class RigRetarget(torch.nn.Module):
         self.label_keys = checked_names("label_keys", label_keys)
         self.pass_keys, self.outputs = checked_names("pass_keys", pass_keys), tuple(outputs)
         self._warn = WarnOnce()
-        # Rigs drawn for each sample never come back: only the last plan is kept.
-        once = isinstance(self.target, RandomRig) and self.target.per == "sample"
+        # Plans of rigs drawn for each sample are never reused.
+        drawn_anew = isinstance(self.target, RandomRig) and self.target.per == "sample"
         self.planner = FramePlanner(
             self.config,
             surface,
             Harmoniser(harmonise),
             refinement,
-            cache_bytes=0 if once else cache_bytes,
+            cache_bytes=0 if drawn_anew else cache_bytes,
             reach=neighbours,
             mixed=p <= _MIXED_P,
             strict=strict,
+            unseen=unseen_note(path if holes == "fill" else holes),
             warn=self._warn,
         )
         self._fixed_target = self._sized(self.target) if isinstance(self.target, Rig) else None
         base = self.target.base if isinstance(self.target, RandomRig) else self.target
         base = base if self.size is None else base.resized(self.size, fit)
-        # Which keys there are depends on the settings alone.
+        # The output's keys depend on the settings alone, so that batches collate.
         self._writer = SampleWriter(
             self.outputs,
             generated=self.completion is not None or holes != "black",
@@ -254,6 +249,8 @@ class RigRetarget(torch.nn.Module):
             warn=self._warn,
         )
         self.renderer = Renderer(execution)
+        self._reads_ego_frame = not SURFACES[surface].is_static or label_frame == "target"
+        self._checked: dict[str, type] = {}  # keys and types of the sample that was last checked for misnamed keys
         self._limited_process: int | None = None
 
     def extra_repr(self) -> str:
@@ -264,8 +261,8 @@ class RigRetarget(torch.nn.Module):
             f"path={self.path}, holes={self.holes}, surface={how.surface}, harmonise={how.harmoniser}, "
             f"size={self.size}, fit={self.fit}, p={self.p:g}"
         )
-        held = "" if how.refinement is None else f"refinement={how.refinement!r}, "
-        return f"target={target}, {settings}, {held}{self.config}"
+        refinement = "" if how.refinement is None else f"refinement={how.refinement!r}, "
+        return f"target={target}, {settings}, {refinement}{self.config}"
 
     # --- the transform --------------------------------------------------------------------------------------------
     def forward(self, sample: Mapping[str, Any], params: Mapping[str, float] | None = None) -> dict[str, Any]:
@@ -280,7 +277,7 @@ class RigRetarget(torch.nn.Module):
         """
         self._limit_threads()
         frames, lead = read_frames(sample, self.source_rig), leading_shape(sample["images"])
-        labels = self._label_keys_of(sample, frames)
+        labels = self._check_keys(sample, frames)
         target, skip, drawn = self._make_params(sample, frames, params)
         if skip and self.size is not None:
             rendered = [resize_only(frame, self.size, self.fit, self.outputs) for frame in frames]
@@ -292,24 +289,27 @@ class RigRetarget(torch.nn.Module):
             rendered = self._complete(rendered, sample, frames, lead)
         return self._writer.write(sample, frames, lead, rendered, labels, target, drawn)
 
-    def _label_keys_of(self, sample: Mapping[str, Any], frames: Sequence[Frame]) -> list[str]:
-        """The sample's keys that hold label maps; its others are checked."""
+    def _check_keys(self, sample: Mapping[str, Any], frames: Sequence[Frame]) -> list[str]:
+        """Check the sample's further keys, and return those that hold label maps."""
         sizes = {tuple(image.shape[-2:]) for frame in frames for image in frame.images}
-        calibrated = sample.get("rig") is not None or self.source_rig is not None
-        static = SURFACES[self.planner.surface].is_static and self.label_frame == "source"
-        warn_of_misnamed(sample, calibrated, static, (*self.label_keys, *self.pass_keys), self._warn)
+        types = {key: type(value) for key, value in sample.items()}
+        if types != self._checked:
+            calibrated = sample.get("rig") is not None or self.source_rig is not None
+            named = (*self.label_keys, *self.pass_keys)
+            warn_of_misnamed(sample, calibrated, not self._reads_ego_frame, named, self._warn)
+            self._checked = types
         return check_other_keys(sample, list(sizes), self.label_keys, self.pass_keys)
 
     def _render(self, plans: Sequence[FramePlan], frames: Sequence[Frame]) -> list[RenderedFrame]:
         if isinstance(self.config, PaperConfig):
-            published = [self._published(plan, frame) for plan, frame in zip(plans, frames, strict=True)]
+            published = map(self._published, plans, frames)
             return [as_rendered(rendering, self.outputs) for rendering in published]
-        outputs = (*self.outputs, "confidence") if self._trusts else self.outputs
+        outputs = (*self.outputs, "confidence") if self._needs_confidence else self.outputs
         render_plans = [plan.plan for plan in plans if plan.plan is not None]
         return self.renderer.render(render_plans, frames, [plan.curves for plan in plans], outputs)
 
     def _published(self, plan: FramePlan, frame: Frame) -> PaperRendering:
-        """The frame rendered by the paper's stages."""
+        """Render a frame by the paper's stages."""
         assert isinstance(self.config, PaperConfig)
         rendering = render_paper(frame.rig, plan.target, frame.images, self.config, plan.detections)
         self.planner.warn_unreachable(plan.target, rendering.coverage)
@@ -341,7 +341,7 @@ class RigRetarget(torch.nn.Module):
     def _make_params(
         self, sample: Mapping[str, Any], frames: Sequence[Frame], params: Mapping[str, float] | None
     ) -> tuple[Rig, bool, dict[str, float]]:
-        """All randomness of a call: the target rig, whether to skip, and the parameters that say so."""
+        """Draw the target rig and whether to skip; return both, and the parameters that replay them."""
         if self.rng is not None and torch.utils.data.get_worker_info() is not None:
             raise SampleError("rng: a generator repeats itself in every DataLoader worker; leave rng=None there")
         given = None if params is None else checked_params(params)
@@ -360,16 +360,16 @@ class RigRetarget(torch.nn.Module):
             target = self._fixed_target
             if given:
                 raise SampleError(f"params: expected none for a fixed target rig, got {', '.join(given)}")
-        counts = {len(frame.rig) for frame in frames} - {len(target)}
-        if self.p < 1 and counts:
-            raise SampleError(
-                f"p < 1: expected the target to have the source's {counts.pop()} cameras, got {len(target)}; "
-                "batches could not be collated; mix on the level of the data set (arbiview_aug.MixedDataset)"
-            )
+        for frame in frames if self.p < 1 else ():
+            if len(frame.rig) != len(target):
+                raise SampleError(
+                    f"p < 1: expected the target to have the source's {len(frame.rig)} cameras, got {len(target)}; "
+                    "batches could not be collated; mix on the level of the data set (arbiview_aug.MixedDataset)"
+                )
         return target, bool(drawn.get("skipped")), drawn
 
     def _sized(self, target: Rig) -> Rig:
-        """The cameras that are rendered: at ``size``, without its bars."""
+        """The target's cameras at ``size``, without bars."""
         if self.size is None or self.fit != "pad":
             return target if self.size is None else target.resized(self.size, self.fit)
         return target.with_cameras([c.resize(framing(c.name, c.size, self.size, "pad").scaled) for c in target])
@@ -377,7 +377,7 @@ class RigRetarget(torch.nn.Module):
     # --- plans ------------------------------------------------------------------------------------------------------
     @property
     def plans(self) -> PlanCache:
-        """The plans that are held for calibrations that come back."""
+        """The cached plans."""
         return self.planner.plans
 
     def plan(self, source: Rig, target: Rig, scene: Scene | None = None) -> RenderPlan:
@@ -395,7 +395,7 @@ class RigRetarget(torch.nn.Module):
             source: The rig of the samples; ``source_rig`` by default.
 
         Raises:
-            ValueError: No source rig, a random target, ``quality="paper"``, or a surface that is made of every frame.
+            ValueError: No source rig, a random target, ``quality="paper"``, or a surface that every frame has anew.
         """
         source = source or self.source_rig
         if source is None or self._fixed_target is None:
@@ -403,19 +403,17 @@ class RigRetarget(torch.nn.Module):
         surface = self.planner.surface
         if SURFACES[surface].needs is not None and self.planner.needs_geometry(source, self._fixed_target):
             raise ValueError(
-                f"prepare: expected a surface whose plans come back, got {surface!r}: the boxes, points or depth of "
-                "every frame make its own"
+                f"prepare: expected a surface whose plans come back, got {surface!r}: boxes, points or depth need a "
+                "new plan for every frame"
             )
         return self.plan(source, self._fixed_target)
 
-    # --- words ------------------------------------------------------------------------------------------------------
+    # --- reports ----------------------------------------------------------------------------------------------------
     def explain(self, sample: Mapping[str, Any]) -> Explanation | PaperExplanation:
         """How a sample would be rendered: sources, surfaces and why, coverage, expected parallax; print it.
 
-        With ``quality="paper"``: what each stage made of each source.
-
-        A random target is explained for one draw. As of a call, plans and refinements that it makes are held, what it
-        warns of is not said again, and the draw advances the RNG.
+        With ``quality="paper"``: what each stage made of each source. A random target is explained for one draw. Like a
+        call, it fills the caches, issues warnings once, and advances the RNG.
         """
         frames, lead = read_frames(sample, self.source_rig), leading_shape(sample["images"])
         target, _, _ = self._make_params(sample, frames[:1], None)
@@ -426,13 +424,13 @@ class RigRetarget(torch.nn.Module):
         return Explanation(plan.plan, gains, plan.depth, plan.motion, plan.fills, plan.harm)
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
-        """The gains that a sample's source images would get, and why; of a batch, its first frame."""
+        """The gains that a sample's source images would get, and why; for a batch, its first frame's."""
         frame = read_frames(sample, self.source_rig)[0]
         return self.planner.harmoniser.report(frame.rig, frame.images)
 
     # --- processes --------------------------------------------------------------------------------------------------
     def _limit_threads(self) -> None:
-        """OpenCV keeps all its threads in DataLoader workers, where they would fight for the cores."""
+        """Leave OpenCV one thread in DataLoader workers, which would fight for the cores otherwise."""
         if self._limited_process != os.getpid() and torch.utils.data.get_worker_info() is not None:
             cv2.setNumThreads(0)
             self._limited_process = os.getpid()

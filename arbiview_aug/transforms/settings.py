@@ -54,6 +54,21 @@ def completion_of(
     )
 
 
+def unseen_note(filler: str) -> str:
+    """What becomes of pixels that no source sees, by ``path`` or ``holes``, and what to do about them in training."""
+    if filler == "black":
+        return "The rest stays black: train with 'coverage' as a mask."
+    return f"The rest is {_FILLED[filler]} and marked in 'generated': leave it out of losses that compare pixels."
+
+
+_FILLED = {
+    "favs": "filled in from its surroundings",
+    "mean": "given the mean colour of the views",
+    "inpaint": "inpainted",
+    "diffusion": "made up by the generator",
+}
+
+
 def one_of(name: str, value: Any, choices: Sequence[str]) -> None:
     """Refuse, by ValueError, what is none of the choices."""
     if not isinstance(value, str) or value not in choices:

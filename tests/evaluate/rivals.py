@@ -25,7 +25,7 @@ from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.evaluate.targets import named_targets, without_masks
 from arbiview_aug.favs.stage1_geometry import h_geom
-from arbiview_aug.render.atlas import Scratch
+from arbiview_aug.image_ops import Scratch
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import RenderPlan, build_plan
 from tests.evaluate.opencv_stitching import opencv_stitching

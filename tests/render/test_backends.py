@@ -13,7 +13,8 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.favs.config import FavsConfig, favs_config
 from arbiview_aug.favs.stage1_geometry import h_geom
-from arbiview_aug.render.atlas import AtlasLayout, FixedMap, Scratch
+from arbiview_aug.image_ops import Scratch
+from arbiview_aug.render.atlas import AtlasLayout, FixedMap
 from arbiview_aug.render.labels import render_labels
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import RenderPlan, build_plan

@@ -717,6 +717,21 @@ def test_a_rig_that_sees_nothing_of_the_sources(execution: str) -> None:
     retarget({**sample, "cam2ego": sample["cam2ego"] + 0.0})  # once, whatever comes
 
 
+@pytest.mark.parametrize(
+    ("settings", "note"),
+    [
+        ({}, "filled in from its surroundings and marked in 'generated'"),
+        ({"holes": "mean"}, "given the mean colour of the views and marked"),
+        ({"holes": "black"}, "stays black: train with 'coverage' as a mask"),
+        ({"path": "inpaint"}, "inpainted and marked"),
+    ],
+)
+def test_the_warning_says_what_becomes_of_pixels_that_no_source_sees(settings: dict[str, Any], note: str) -> None:
+    source = ring().with_cameras([ring()[0]])
+    with pytest.warns(UserWarning, match=f"The rest (is )?{note}"):
+        RigRetarget(source.turned(yaw_deg=180), **settings)(sample_of(source))
+
+
 # --- executions, gradients and memory ---------------------------------------------------------------------------------
 def test_gradients_flow_to_the_images() -> None:
     source = ring()

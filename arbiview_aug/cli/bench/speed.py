@@ -44,7 +44,7 @@ from arbiview_aug.environment import one_thread
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.generator.fillers import Holes, fill_holes
-from arbiview_aug.render.atlas import Scratch
+from arbiview_aug.image_ops import Scratch
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import build_plan
 from arbiview_aug.render.tone_curve import ToneCurve
