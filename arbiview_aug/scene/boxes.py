@@ -1,9 +1,7 @@
-"""Labelled 3D boxes as solids on the street: the geometry that keeps an object's height when cameras move.
+"""Labelled 3D boxes on the street, which keep an object's height when cameras move.
 
-A static surface paints an object onto the road and the wall behind it: its base lands right, its roof stretches away.
-With boxes in the sample a ray meets the first face of a box, and the street where it passes them all. What a box hides
-from a source is not read from that source: the object's own colours would be smeared behind it. Where no other source
-sees it, it is a hole.
+A ray meets the first face of a box, or the street where it misses all boxes. Pixels that a box occludes in a source are
+not read from that source; where no other source sees them, they are holes.
 """
 
 from __future__ import annotations
@@ -32,30 +30,28 @@ from arbiview_aug.scene.surface import (
     Surface,
 )
 
-_CHUNK = 1 << 15  # points tested at once: they stay in the cache, however many there are
-_LENS_STEP_PX = 8  # cells in which rays of a lens are cast or not
+_CHUNK = 1 << 15  # points tested at once, to stay in the CPU's cache
+_LENS_STEP_PX = 8  # cells of an image with a lens; rays are cast in those near a box
 
 _UNLABELLED = 0.45
-"""Share of the street's uncertainty left by labels: poles, trees and houses have none. Fitted on synthetic streets
-(seeds 100 to 105), as is the next."""
+"""Share of the street's uncertainty due to unlabelled objects. Fitted on synthetic streets, seeds 100 to 105."""
 
 _BOX_ERROR = 0.08
-"""Mean error of a box face's inverse distance, as a share of it: objects are rounder than their boxes."""
+"""Mean relative error of a box face's inverse distance. Fitted on synthetic streets, seeds 100 to 105."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoxSurface(LayeredSurface):
     """Boxes standing on the street.
 
-    Plans are built from ``drawn`` and ``occlusion_map``; ``inverse_distance`` and ``occludes`` say the same of single
-    rays, and are their plain reference.
+    Plans use ``drawn`` and ``occlusion_map``; ``inverse_distance`` and ``occludes`` are the reference for single rays.
 
     Attributes:
-        street: What there is without them.
+        street: The surface behind the boxes.
         boxes: (B, 7) centre x, y, z, length, width, height (metres), yaw (radians), in the ego frame.
     """
 
-    smooth: ClassVar[bool] = True  # away from the boxes; near them every pixel is ``detailed``
+    smooth: ClassVar[bool] = True  # away from the boxes
     street: Surface
     boxes: FloatArray
     _shadows: dict[Camera, OcclusionMap] = field(default_factory=dict, repr=False)
@@ -89,12 +85,7 @@ class BoxSurface(LayeredSurface):
         return face // 6, before_m.reshape(-1)[face]
 
     def _enlarged(self, origin: FloatArray, pixel_rad: float) -> FloatArray:
-        """The boxes wider by half a pixel: what pixels that touch them show is mixed with their colours.
-
-        Not below, where what they stand on is seen before them: they are lifted instead. A margin in metres for loose
-        labels (3 cm) is not worth it: on synthetic streets moved sideways it took the share of marked pixels that are
-        holes from 97 to 82 %.
-        """
+        """The boxes widened by half a pixel, as border pixels mix colours, and lifted, so that the road stays free."""
         boxes = self.boxes.copy()
         more_m = pixel_rad / 2 * np.linalg.norm(boxes[:, :3] - origin, axis=-1)
         boxes[:, 2] += more_m
@@ -102,15 +93,17 @@ class BoxSurface(LayeredSurface):
         return boxes
 
     def _drawn(self, camera: Camera, boxes: FloatArray) -> Fragments:
-        """Rasterised, or for a lens by casting the rays near the boxes."""
+        """Rasterise boxes; with a lens, cast the rays near them."""
         if camera.is_rectilinear:
             return draw_boxes(camera, boxes)
         scene = BoxSurface(self.street, boxes)
         grid = Grid(camera.size, _LENS_STEP_PX)
         rays, valid = camera.unproject(grid.nodes())
         spacing = np.where(valid[:, 1:] & valid[:, :-1], np.linalg.norm(np.diff(rays, axis=1), axis=-1), 0)
-        near = valid & scene.detailed(camera.center_m, rays, 2 * float(spacing.max(initial=0.0)))
-        cells = cv2.dilate(near.astype(np.uint8), np.ones((3, 3), np.uint8))[:-1, :-1] > 0
+        near = np.zeros(valid.shape, bool)
+        for _, towards, angle in scene._outside(camera.center_m):
+            near |= rays @ towards >= np.cos(min(angle + 2 * float(spacing.max(initial=0.0)), np.pi))
+        cells = cv2.dilate((valid & near).astype(np.uint8), np.ones((3, 3), np.uint8))[:-1, :-1] > 0
         ny, nx = grid.shape
         index = np.flatnonzero(grid.cells_to_pixels(cells, (0, ny - 1, 0, nx - 1)))
         v, u = np.divmod(index, camera.width_px)
@@ -121,12 +114,12 @@ class BoxSurface(LayeredSurface):
 
     # --- rays ---------------------------------------------------------------------------------------------------------
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
-        """The first box along a ray, else the street, 1/m (...,): the street is a guess, a box is not under it."""
+        """Inverse distance to the first box along a ray, else to the street, 1/m (...,)."""
         first = self._boxes_ahead(origin, directions)[0]
         return np.where(first > 0, first, self.street.inverse_distance(origin, directions))
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
-        """Mean error (...,) in 1/m: of a box against the object in it, of the street with what has no label."""
+        """Expected error (...,) in 1/m of boxes, and of the street because of unlabelled objects."""
         on_street = inverse_distance <= self.street.inverse_distance(origin, directions)
         street = _UNLABELLED * self.street.uncertainty(origin, directions, inverse_distance)
         return np.where(on_street, street, _BOX_ERROR * inverse_distance)
@@ -134,22 +127,12 @@ class BoxSurface(LayeredSurface):
     def occludes(
         self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
     ) -> BoolArray:
-        """Whether a box stands between ``origin`` and points at these inverse distances along unit rays.
-
-        A static street is a guess, a box a label: what such a street says lies before a box lies behind it in truth.
-        """
+        """Whether a box occludes points (...,) on unit rays; points of a guessed street are always behind it."""
         first = BoxSurface(self.street, self._enlarged(origin, pixel_rad))._boxes_ahead(origin, directions)[0]
         return first > (0 if self.street.is_guess else inverse_distance * (1 + 2 * pixel_rad))
 
-    def detailed(self, origin: FloatArray, directions: FloatArray, margin_rad: float) -> BoolArray:
-        """Rays (...,) that pass a box within an angle, where nothing may be interpolated."""
-        near = np.zeros(directions.shape[:-1], bool)
-        for _, towards, angle in self._outside(origin):
-            near |= directions @ towards >= np.cos(min(angle + margin_rad, np.pi))
-        return near
-
     def _outside(self, origin: FloatArray) -> Iterator[tuple[int, FloatArray, float]]:
-        """Boxes that do not hold the origin (the vehicle with the camera does), towards which, within what angle."""
+        """Row, direction and angular radius of the boxes that do not hold the origin."""
         holding = (np.abs(_in_box_frames(self.boxes, origin)) <= self.boxes[:, 3:6] / 2).all(axis=-1)
         for row in np.flatnonzero(~holding).tolist():
             box = self.boxes[row]
@@ -159,7 +142,7 @@ class BoxSurface(LayeredSurface):
             yield row, towards / max(distance_m, 1e-9), angle
 
     def _boxes_ahead(self, origin: FloatArray, directions: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int32]]:
-        """Inverse distance (...,) to the first box face along each ray, 0 where there is none; the face's number."""
+        """Inverse distance (...,) to the first box face along each ray, 0 for none, and its number, -1 for none."""
         rays = directions.reshape(-1, 3)
         q, number = np.zeros(len(rays)), np.full(len(rays), -1, np.int32)
         for row, towards, angle in self._outside(origin):
@@ -171,14 +154,14 @@ class BoxSurface(LayeredSurface):
 
 
 def silhouettes(camera: Camera, boxes: FloatArray) -> list[npt.NDArray[np.int64]]:
-    """For each box (B, 7) the pixels whose rays meet it, into the flattened image (h, w), whatever stands before it."""
+    """For each box (B, 7) the pixels of the flattened image whose rays meet it, regardless of occlusion."""
     if camera.is_rectilinear:
         return pinhole_silhouettes(camera, boxes)
     return [BoxSurface(Far(), box[None]).drawn(camera).pixel for box in boxes]
 
 
 def meets(box: FloatArray, origin: FloatArray, directions: FloatArray) -> BoolArray:
-    """Which rays (..., 3) from a point outside a box (7,) meet it: the plain reference of ``silhouettes``."""
+    """Whether rays (..., 3) from a point outside a box (7,) meet it."""
     first, _ = _first_face(box, origin, directions.reshape(-1, 3))
     return (first > 0).reshape(directions.shape[:-1])
 
@@ -186,7 +169,7 @@ def meets(box: FloatArray, origin: FloatArray, directions: FloatArray) -> BoolAr
 def _first_face(
     box: FloatArray, origin: FloatArray, directions: FloatArray
 ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Inverse distance to where rays (n, 3) enter a box, 0 where they miss it; which side they enter (slab method)."""
+    """Inverse distances at which rays (n, 3) enter a box, 0 where they miss it, and the sides (slab method)."""
     near, far, rays = _slabs(box, origin, directions)
     axis = near.argmax(axis=-1)
     enter, leave = near.max(axis=-1), far.min(axis=-1)
@@ -202,7 +185,7 @@ def beyond(box: FloatArray, origin: FloatArray, directions: FloatArray) -> Float
 
 
 def _slabs(box: FloatArray, origin: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Distances (n, 3) at which rays (n, 3) enter and leave what lies between a box's opposite faces; its rays."""
+    """Distances (n, 3) at which rays (n, 3) enter and leave each pair of opposite faces; the rays in the box frame."""
     rays = _in_box_frame(box, directions)
     rays = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
     start, half = _in_box_frame(box, origin - box[:3]), box[3:6] / 2
@@ -211,7 +194,7 @@ def _slabs(box: FloatArray, origin: FloatArray, directions: FloatArray) -> tuple
 
 
 def points_in(boxes: FloatArray, points: Points, air_m: float = 0.0) -> list[npt.NDArray[np.int64]]:
-    """For each box (B, 7) the points (P, 3) that lie in it, or no farther than ``air_m`` beside its faces."""
+    """For each box (B, 7) the indices of the points (P, 3) in it, widened by ``air_m`` on all sides."""
     found: list[list[npt.NDArray[np.int64]]] = [[np.zeros(0, np.int64)] for _ in boxes]
     reach_m = np.hypot(boxes[:, 3], boxes[:, 4]) / 2 + 2 * air_m
     for first in range(0, len(points), _CHUNK):
@@ -225,7 +208,7 @@ def points_in(boxes: FloatArray, points: Points, air_m: float = 0.0) -> list[npt
 
 
 def is_over(box: FloatArray, point: FloatArray, air_m: float = 0.0) -> bool:
-    """Whether a point (3,) stands over, in or under the footprint of a box (7,), or within ``air_m`` beside it."""
+    """Whether a point (3,) is within the footprint of a box (7,), widened by ``air_m``."""
     return bool((np.abs(_in_box_frame(box, point - box[:3]))[:2] <= box[3:5] / 2 + air_m).all())
 
 
@@ -262,11 +245,11 @@ def checked_boxes(boxes: Any) -> FloatArray:
 
 
 STAYED_M = 0.4
-"""What a label moves by less stayed: labels of parked vehicles waver by decimetres, and so much is left out anyhow."""
+"""Largest label motion of a parked vehicle: labels jitter by decimetres."""
 
 
 def moved_boxes(one: FloatArray, two: FloatArray) -> FloatArray:
-    """The boxes (M, 7) of both frames (B, 7) that have no counterpart at the same place in the other."""
+    """The boxes (M, 7) of two frames that have no counterpart at the same place in the other."""
     if not len(one) or not len(two):
         return np.concatenate([one, two])
     apart_m = np.linalg.norm(one[:, None, :3] - two[None, :, :3], axis=-1)

@@ -1,8 +1,7 @@
-"""A surface whose distances were corrected by what two cameras saw of it.
+"""A static surface corrected by depth from overlapping cameras.
 
-A correction is a map of relative changes of inverse distance over the pixels of a view between two cameras. It belongs
-to the scene, so it holds for every ray: the point that a ray meets is projected into the views, and the change found
-there is applied along the ray.
+A correction maps the pixels of a view between two cameras to relative changes of inverse distance. The point that a ray
+meets is projected into these views, and the change found there is applied along the ray.
 """
 
 from __future__ import annotations
@@ -21,24 +20,22 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE, StaticSurface
 
 _STEPS = 2
-"""Fixed-point iterations: a corrected point lies elsewhere in the view between the cameras, and its change is read
-again. A third one moves nothing by more than 0.02 dB on two real frames."""
+"""Fixed-point iterations; a third one changes two real frames by at most 0.02 dB."""
 
-_SLACK = 8.0
-"""Maps may err by 1/8 px: distances are measured to a pixel of a view 400 px wide. Against 1/64 px on nuScenes at half
-resolution, raised: 99 % of the positions within 1/16 px, views 61 dB alike, and a third of the time."""
+_TOLERANCE_SCALE = 8.0
+"""Maps may err by 1/8 px, as distances are measured to a pixel of a view 400 px wide."""
 
 _ROW = 4096  # remap's sizes must stay below 32767
 
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """What one pair of cameras says of the distances in the view between them; read-only.
+    """The distance corrections of one pair of cameras; read-only.
 
     Attributes:
         view: The view between the two, in the ego frame.
-        change: (h, w) float32 relative change of the surface's inverse distance, > -1; 0.5: a third nearer.
-        share: (h, w) float32 in [0, 1], how far it is to be trusted: it fades to 0 towards the borders of the view.
+        change: (h, w) float32 relative change of the surface's inverse distance, > -1.
+        share: (h, w) float32 weight in [0, 1], which fades to 0 towards the borders of the view.
     """
 
     view: Camera
@@ -52,31 +49,26 @@ class Correction:
 
     @cached_property
     def planes(self) -> npt.NDArray[np.float32]:
-        """(h, w, 2) change times share, and share."""
+        """(h, w, 2): change times share, and share."""
         return np.dstack([self.change * self.share, self.share])
 
     @property
     def nbytes(self) -> int:
-        """Memory held."""
+        """Memory of the arrays."""
         return 2 * (self.change.nbytes + self.share.nbytes)
 
 
 @dataclass(frozen=True)
 class CorrectedSurface(StaticSurface):
-    """A static surface with corrections; where none reaches, it is the surface itself.
-
-    Attributes:
-        base: The surface that the corrections were found over.
-        corrections: Where several reach, their mean by share counts.
-    """
+    """A static surface ``base`` with the corrections found over it; where several apply, their weighted mean."""
 
     smooth: ClassVar[bool] = True
-    tolerance_scale: ClassVar[float] = _SLACK
+    tolerance_scale: ClassVar[float] = _TOLERANCE_SCALE
     base: StaticSurface
     corrections: tuple[Correction, ...]
 
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
-        """The base's, times one plus the change, 1/m (...,)."""
+        """Inverse distance of the base times one plus the change, 1/m (...,)."""
         base = self.base.inverse_distance(origin, directions)
         q = base
         for _ in range(_STEPS):
@@ -88,11 +80,9 @@ class CorrectedSurface(StaticSurface):
         rays, inverse = np.moveaxis(directions, -1, 0).reshape(3, -1), q.reshape(-1)
         total = np.zeros((inverse.size, 2), np.float32)
         for correction in self.corrections:
-            # Views are pinholes. Homogeneous: a point at infinity has q = 0, and most points lie outside a view, which
-            # shows without a division.
             view = correction.view
             P = view.K @ view.cam2ego[:3, :3].T
-            x, y, z = P @ rays + np.outer(P @ (origin - view.center_m), inverse)
+            x, y, z = P @ rays + np.outer(P @ (origin - view.center_m), inverse)  # homogeneous: views are pinholes
             h, w = view.size
             inside = np.flatnonzero((z > 0) & (x >= 0) & (x <= (w - 1) * z) & (y >= 0) & (y <= (h - 1) * z))
             uv = np.stack([x[inside], y[inside]], axis=-1) / z[inside, None]

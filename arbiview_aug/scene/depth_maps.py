@@ -1,4 +1,4 @@
-"""Depth maps of source images: the cameras of those from motion, and their points in the ego frame."""
+"""Ego-frame points of depth maps, and the cameras of depth maps from motion."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from arbiview_aug.errors import SampleError
 from arbiview_aug.scene.panorama import CELL_RAD
 
 MOTION_WIDTH_PX = 400
-"""Images are halved until their width is nearest to this, by ratio: 283 to 566 px, of those that are wider."""
+"""Images are halved until their width is nearest to this, by ratio."""
 
 
 def motion_camera(camera: Camera) -> Camera:
-    """A camera at the size that is worked at, odd rows and columns left out."""
+    """The camera of an image halved to ``MOTION_WIDTH_PX``, without odd rows and columns."""
     level = halvings(camera)
     if level == 0:
         return camera
@@ -25,14 +25,14 @@ def motion_camera(camera: Camera) -> Camera:
 
 
 def halvings(camera: Camera) -> int:
-    """How often a camera's images are halved."""
+    """Number of halvings of a camera's images."""
     return max(0, round(math.log2(camera.width_px / MOTION_WIDTH_PX)))
 
 
 def points_of_depth(camera: Camera, depth_m: FloatArray, key: str = "depth_m") -> FloatArray:
     """(P, 3) ego-frame points of a depth map (H, W): z along the optical axis, metres; 0, NaN and inf are unknown.
 
-    Pixels closer together than a panorama's cells are left out, and the own car by the camera's mask.
+    Pixels closer together than a panorama's cells are skipped, as are masked ones.
 
     Raises:
         SampleError: A map of another size than the camera's.

@@ -1,4 +1,4 @@
-"""What a sample says of the geometry around the vehicle, and the table ``SURFACES`` of all surfaces made of it."""
+"""The geometry of a sample, and the table ``SURFACES`` of all surfaces made of it."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from arbiview_aug.scene.point_cloud import PointCloudSurface, PointCloudWithBoxe
 from arbiview_aug.scene.static import Far, Ground, Street
 from arbiview_aug.scene.surface import Points, StaticSurface, Surface, SurfaceName
 
-_ROWS = 1 << 18  # hashed at once: bytes of ten million points would be another copy of them
+_ROWS = 1 << 18  # hashed at once, to avoid a copy of all points
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Geometry that came with a sample, in the source's ego frame; an empty one knows the road alone.
+    """The geometry of a sample, in the source's ego frame.
 
     Attributes:
         boxes: (B, 7) labelled objects: centre x, y, z, length, width, height (metres), yaw (radians).
         points: (P, 3) measured points, metres.
-        motion: (P, 3) points that motion between frames measured, metres; none where it was declined.
+        motion: (P, 3) points of depth from motion, metres.
         further: Arrays of other sample keys that a row of ``SURFACES`` reads.
-        corrections: What overlaps say of the street's distances.
+        corrections: Corrections of the street's distances by depth from overlap.
     """
 
     boxes: FloatArray | None = None
@@ -39,26 +39,25 @@ class Scene:
     _surfaces: dict[tuple[str, float], Surface] = field(default_factory=dict, init=False, repr=False)
 
     def geometry(self, name: str) -> Points | None:
-        """The array of a name in ``SurfaceRow.reads``; None where it is unknown."""
-        own = {"boxes": self.boxes, "points": self.points, "motion": self.motion}
-        return own[name] if name in own else self.further.get(name)
+        """The array of a name in ``SurfaceRow.reads``; None if there is none."""
+        return getattr(self, name) if name in ("boxes", "points", "motion") else self.further.get(name)
 
     @cached_property
     def is_empty(self) -> bool:
-        """Whether nothing is known but the road."""
-        known = self.boxes is not None or self.points is not None or self.motion is not None
-        return not (known or self.further or self.corrections)
+        """Whether there is no geometry."""
+        arrays = self.boxes, self.points, self.motion
+        return all(array is None for array in arrays) and not self.further and not self.corrections
 
     @cached_property
     def best(self) -> SurfaceName:
-        """The surface made of the best geometry that there is: what ``auto`` takes."""
+        """The surface that ``auto`` uses: made of the most accurate geometry."""
         if self.points is not None and len(self.points):
             return "lidar"
         return "street" if self.boxes is None else "objects"
 
     @property
     def key(self) -> bytes:
-        """Content hash: scenes with equal keys are the same."""
+        """Content hash."""
         digest = hashlib.sha256(repr(sorted(self.further)).encode())
         for array in (self.boxes, self.points, self.motion, *(self.further[key] for key in sorted(self.further))):
             digest.update(b"none" if array is None else repr((array.shape, array.dtype.str)).encode())
@@ -69,7 +68,7 @@ class Scene:
         return digest.digest()
 
     def surface(self, name: str, ground_z_m: float) -> Surface:
-        """A surface by name, over a road at ``ground_z_m``; kept, with what it caches of its own.
+        """A surface by name, over a road at ``ground_z_m``; cached.
 
         Raises:
             ValueError: An unknown name, or geometry that the scene lacks.
@@ -85,15 +84,14 @@ class Scene:
 
 @dataclass(frozen=True)
 class SurfaceRow:
-    """A surface that users can ask for.
+    """A row of ``SURFACES``.
 
     Attributes:
-        make: The surface of a scene, over a road at a height in metres.
-        reads: Geometry that it uses: ``boxes``, ``points``, ``motion``, or any other key of the sample. The rest is not
-            even read. A surface that reads nothing is static: its plans come back with the calibration.
-        needs: Geometry that it cannot be made without.
+        make: Makes the surface of a scene, over a road at a height in metres.
+        reads: The geometry that it uses: ``boxes``, ``points``, ``motion``, or any other key of the sample.
+        needs: The geometry that it cannot be made without.
         overlap_depth: Whether depth from overlap may correct it.
-        has_wall: Whether it ends in the far wall, whose edges a coarse grid could step over from outside.
+        has_wall: Whether it ends in the far wall, which has edges when seen from outside.
     """
 
     make: Callable[[Scene, float], Surface]
@@ -104,7 +102,7 @@ class SurfaceRow:
 
     @cached_property
     def is_static(self) -> bool:
-        """Whether it knows nothing of the objects on the street."""
+        """Whether it uses no geometry of the sample, so that its plans depend on the calibration alone."""
         return not self.reads
 
 

@@ -1,7 +1,7 @@
-"""Scene surfaces: where the ray of a target pixel meets the scene.
+"""Base classes of scene surfaces, which give the inverse distance along a unit ray in 1/m.
 
-A surface answers with the *inverse* distance along a unit ray, 1/m: infinity is 0, so the far surface, the horizon
-and rays that miss need no special cases, and a point X = o + d / q is handled as the homogeneous (o q + d, q).
+Infinity is 0, so the far surface, the horizon and rays that miss need no special cases. A point X = o + d / q is
+handled as the homogeneous (o q + d, q).
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 
 SurfaceName = Literal["auto", "far", "ground", "street", "objects", "lidar", "motion"]
-"""Surfaces a user can ask for. ``auto`` decides per pair of target and source camera (see ``plan``)."""
+"""Names in ``scene.SURFACES``. ``auto`` decides per pair of target and source camera."""
 
 Points = npt.NDArray[np.float32] | npt.NDArray[np.float64]
-"""(P, 3) points as they were recorded: millions of them are not copied. They are worked with in float64."""
+"""(P, 3) points in their recorded precision, not copied; computations use float64."""
 
 MAX_INVERSE_DISTANCE = 100.0
-"""Nothing is nearer to a camera than 1 cm: keeps points finite when a camera touches a surface."""
+"""Upper limit, 1 cm: keeps points finite when a camera touches a surface."""
 
 _TYPICAL_OBJECT_M = 20.0
 
 
 class Surface(ABC):
-    """What a ray meets, seen from any centre; hashable.
+    """A hashable scene surface, seen from any centre.
 
     Attributes:
-        smooth: Without creases: a map over it may be interpolated by what its values on a grid show.
-        tolerance_scale: Factor on the interpolation tolerance, above 1 where the surface itself is not known so well.
-        is_layered: Objects are rasterised in front of ``background``, as in ``LayeredSurface``.
-        is_dense: Evaluated at every pixel, as in ``DenseSurface``.
-        is_guess: Nothing was measured: an occluder hides what lies before it, too.
+        smooth: Without creases, so that maps may be interpolated from a coarse grid.
+        tolerance_scale: Factor on the interpolation tolerance, above 1 where the surface itself is less accurate.
+        is_layered: Objects are rasterised in front of ``background``, see ``LayeredSurface``.
+        is_dense: Evaluated at every pixel, see ``DenseSurface``.
+        is_guess: Not measured; occluders also hide its points in front of them.
     """
 
     smooth: ClassVar[bool]
@@ -46,7 +46,7 @@ class Surface(ABC):
 
     @property
     def background(self) -> Surface:
-        """The surface behind the objects; the surface itself where there are none."""
+        """The surface behind the objects; the surface itself if there are none."""
         return self
 
     @abstractmethod
@@ -62,31 +62,22 @@ class Surface(ABC):
     def occludes(
         self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
     ) -> BoolArray:
-        """Whether something stands between a source's centre and scene points.
+        """Whether something lies between a source's centre and scene points.
 
         Args:
             origin: (3,) the source's centre in the ego frame, metres.
             directions: (..., 3) unit directions towards the points, ego frame.
             inverse_distance: (...,) of the points along them, 1/m.
-            pixel_rad: Angle of one of the source's pixels.
+            pixel_rad: Angle of a source pixel.
         """
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
-        """Mean error (...,) in 1/m to expect of this surface's ``inverse_distance``.
-
-        Where a surface does not know better: 1/20, that of the nearest objects of a street.
-        """
+        """Expected error (...,) of ``inverse_distance`` in 1/m; by default that of a typical object at 20 m."""
         return np.full(inverse_distance.shape, 1 / _TYPICAL_OBJECT_M)
 
 
 class Fragments(NamedTuple):
-    """The pixels of an image that show something.
-
-    Attributes:
-        pixel: (n,) into the flattened image, ascending.
-        inverse_distance: (n,) along the pixels' rays, 1/m.
-        face: (n,) which face of which solid, a number that the surface knows.
-    """
+    """Rasterised fragments: pixels (n,) of the flattened image, ascending; inverse distances (n,), 1/m; faces (n,)."""
 
     pixel: npt.NDArray[np.int64]
     inverse_distance: FloatArray
@@ -94,13 +85,12 @@ class Fragments(NamedTuple):
 
 
 class OcclusionMap(NamedTuple):
-    """The images of solids in a source, a little enlarged: what is behind them is not read there.
+    """Occluders in a source image, slightly enlarged.
 
     Attributes:
-        beyond: (h, w) float32, 1/m: what has a smaller inverse distance is hidden; a ``StaticSurface`` background
-        always,
-            because it is a guess. 0 where there is no solid.
-        solid: (h, w) int32, which one, -1 for none.
+        beyond: (h, w) float32, 1/m: points with a smaller inverse distance are occluded, and so is a background with
+            ``is_guess``. 0 without an occluder.
+        solid: (h, w) int32 index of the occluder, -1 for none.
     """
 
     beyond: npt.NDArray[np.float32]
@@ -108,10 +98,9 @@ class OcclusionMap(NamedTuple):
 
 
 class LayeredSurface(Surface):
-    """A smooth background with solids in front of it, which can be drawn into cameras.
+    """Objects in front of a smooth background.
 
-    Pixels that show a solid are mapped one by one; the others by the background, as if there were no solids. Both are
-    hidden where the source's shadow image says so.
+    Pixels that show an object are mapped one by one, the others by the background. ``occlusion_map`` hides both.
     """
 
     is_layered: ClassVar[bool] = True
@@ -119,28 +108,23 @@ class LayeredSurface(Surface):
     @property
     @abstractmethod
     def background(self) -> Surface:
-        """What there is behind the solids."""
+        """The surface behind the objects."""
 
     @abstractmethod
     def drawn(self, camera: Camera) -> Fragments:
-        """The pixels of a camera that show solids."""
+        """Rasterise the objects into a camera."""
 
     @abstractmethod
     def occlusion_map(self, camera: Camera) -> OcclusionMap:
-        """What solids hide from a source."""
+        """The objects as occluders in a source image."""
 
     @abstractmethod
     def facing(self, origin: FloatArray, face: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int32], FloatArray]:
-        """The solids of faces (n,), and by how many metres a point lies before the faces' planes.
-
-        Args:
-            origin: (3,) the point in the ego frame.
-            face: As in ``Fragments``.
-        """
+        """The objects of faces (n,), and the signed distance of a point (3,) in front of each face's plane, metres."""
 
 
 class DenseSurface(Surface):
-    """A surface that may step anywhere: it is evaluated at every pixel, and never interpolated between coarse nodes."""
+    """A surface with discontinuities, evaluated at every pixel."""
 
     is_dense: ClassVar[bool] = True
 
@@ -150,16 +134,15 @@ class DenseSurface(Surface):
 
     @abstractmethod
     def occlusion_map(self, camera: Camera) -> OcclusionMap:
-        """What the surface hides from a source."""
+        """The surface as an occluder in a source image."""
 
 
 class StaticSurface(Surface):
-    """A surface without objects: it hides nothing from any camera; equal for the same scene."""
+    """A surface without objects, which occludes nothing."""
 
     is_guess: ClassVar[bool] = True
 
     def occludes(
         self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
     ) -> BoolArray:
-        """Nothing (...,)."""
         return np.zeros(inverse_distance.shape, bool)
