@@ -1,12 +1,12 @@
-"""``python -m arbiview_aug COMMAND``: each command is a module with ``main(argv)``, imported when it is asked for."""
+"""``python -m arbiview_aug COMMAND``: each command is a module with ``main(argv)``, imported on use."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from importlib import import_module, metadata
+from importlib import import_module
 
-from arbiview_aug.environment import warn_about_cv2_wheels
+from arbiview_aug.environment import installed_version, warn_about_cv2_wheels
 from arbiview_aug.errors import exit_status
 
 COMMANDS = {
@@ -24,26 +24,10 @@ _RESUMABLE = ("convert", "depth", "train")
 
 
 def usage() -> str:
-    """The commands, each with its one-line help."""
-    lines = [f"  {name:<9} {summary}" for name, (_, summary) in COMMANDS.items()]
-    return "\n".join(
-        [
-            "usage: python -m arbiview_aug [--version] COMMAND ...",
-            "",
-            "commands:",
-            *lines,
-            "",
-            "python -m arbiview_aug COMMAND --help explains each.",
-        ]
-    )
-
-
-def version() -> str:
-    """The installed version; a source tree that was never installed has none."""
-    try:
-        return metadata.version("arbiview_aug")
-    except metadata.PackageNotFoundError:
-        return "(not installed)"
+    """The commands with their one-line help."""
+    commands = "\n".join(f"  {name:<9} {summary}" for name, (_, summary) in COMMANDS.items())
+    head, tail = "usage: python -m arbiview_aug [--version] COMMAND ...", "python -m arbiview_aug COMMAND --help"
+    return f"{head}\n\ncommands:\n{commands}\n\n{tail} explains each."
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -55,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] == ["--version"]:
-        print(f"arbiview_aug {version()}")
+        print(f"arbiview_aug {installed_version('arbiview_aug') or '(not installed)'}")
         return 0
     if not arguments or arguments[0] in ("-h", "--help"):
         print(usage())

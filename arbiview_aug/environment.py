@@ -1,4 +1,4 @@
-"""Checks of the Python environment, and settings that make results repeatable."""
+"""Checks of installed packages, and thread settings that make results repeatable."""
 
 from __future__ import annotations
 
@@ -6,42 +6,27 @@ import platform
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from importlib import import_module, metadata
 from typing import Any
 
 import cv2
 
-CV2_WHEELS = (
-    "opencv-python",
-    "opencv-python-headless",
-    "opencv-contrib-python",
-    "opencv-contrib-python-headless",
-)
-"""Distributions that all install the package ``cv2``."""
-
-_DISTRIBUTIONS = ("arbiview_aug", "torch", "numpy", "kornia")
-
-_warned = False
+_CV2_WHEELS = ("opencv-python", "opencv-python-headless", "opencv-contrib-python", "opencv-contrib-python-headless")
 
 
-def installed_cv2_wheels() -> dict[str, str]:
-    """Versions of the installed distributions that provide ``cv2``, by name."""
-    found = {}
-    for name in CV2_WHEELS:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
+def installed_version(name: str) -> str | None:
+    """The version of a distribution; None if it is not installed."""
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
 
 
+@cache
 def warn_about_cv2_wheels() -> None:
-    """Warn once per process if two wheels provide ``cv2``: they overwrite each other's files silently."""
-    global _warned
-    if _warned:
-        return
-    _warned = True
-    found = installed_cv2_wheels()
+    """Warn once per process if several wheels provide ``cv2``."""
+    found = {name: version for name in _CV2_WHEELS if (version := installed_version(name)) is not None}
     if len(found) < 2:
         return
     versions = " and ".join(f"{name} {version}" for name, version in found.items())
@@ -54,17 +39,17 @@ def warn_about_cv2_wheels() -> None:
 
 
 def optional_package(name: str, extra: str | None = None) -> Any:
-    """Import a package of one of this package's extras, or a framework that no extra installs.
+    """Import an optional package, which an ``extra`` of this package installs if given.
 
     Raises:
-        ImportError: It is not installed; with the command that installs it.
+        ImportError: It is not installed; the message gives the command that installs it.
     """
     try:
         return import_module(name)
     except ModuleNotFoundError as error:
         top = name.split(".")[0]
         if (error.name or "").split(".")[0] != top:
-            raise  # it is there, but what it needs is not
+            raise  # one of its own dependencies is missing
         wanted = f"'arbiview_aug[{extra}]'" if extra else top
         raise ImportError(f"{top} is not installed: pip install {wanted}") from None
 
@@ -73,9 +58,8 @@ def optional_package(name: str, extra: str | None = None) -> Any:
 def repeatable_opencv() -> Iterator[None]:
     """Run OpenCV on one thread without Intel's IPP, so that the same images give the same bits.
 
-    The last bits of IPP's ``distanceTransform`` and ``magnitude`` depend on where in memory their buffers lie, and
-    SIFT's angles on those (OpenCV 5.0, IPP 2026.0). IPP can be switched off for the calling thread only, hence the one
-    thread; that number is the whole process's.
+    The last bits of IPP's ``distanceTransform`` and ``magnitude`` depend on memory alignment, and SIFT's angles on
+    those (OpenCV 5.0, IPP 2026.0). IPP can only be disabled for the calling thread. The thread count is process-wide.
     """
     ipp, threads = cv2.ipp.useIPP(), cv2.getNumThreads()
     cv2.ipp.setUseIPP(False)
@@ -106,10 +90,6 @@ def one_thread() -> Iterator[None]:
 
 def versions() -> dict[str, str]:
     """Versions that results and times depend on."""
-    found = {"python": platform.python_version(), "opencv": cv2.__version__}
-    for name in _DISTRIBUTIONS:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    names = "arbiview_aug", "torch", "numpy", "kornia"
+    packages = {name: installed_version(name) or "not installed" for name in names}
+    return {"python": platform.python_version(), "opencv": cv2.__version__, **packages}

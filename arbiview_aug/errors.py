@@ -1,4 +1,4 @@
-"""Errors that this package raises on bad input, with one base class to catch them all."""
+"""Errors that this package raises on bad input, their base class, and warnings."""
 
 import sys
 import warnings
@@ -9,11 +9,11 @@ INTERRUPTED = 130
 
 
 class ArbiviewError(Exception):
-    """Base of every error raised on purpose; the message names the camera or file, what was expected, what came."""
+    """Base of this package's errors; messages name the camera or file, the expected and the given value."""
 
 
 def described(error: Exception) -> str:
-    """An error in one line; errors of other packages with their type."""
+    """One line about an error; errors of other packages with their type."""
     return str(error) if isinstance(error, ArbiviewError) else f"{type(error).__name__}: {error}"
 
 
@@ -27,10 +27,10 @@ def exit_status(
     """Run a command; an error or Ctrl-C becomes one line on stderr.
 
     Args:
-        program: Comes first in that line.
+        program: Starts that line.
         command: Returns its exit status; None is 0.
-        errors: Exceptions that are the user's to mend.
-        resumable: Whether the same command goes on where Ctrl-C stopped it.
+        errors: Exceptions that the user can fix.
+        resumable: Whether the command continues an interrupted run.
 
     Returns:
         The command's exit status, 2 after an error, 130 after Ctrl-C.
@@ -88,11 +88,8 @@ class WarnOnce:
 
 
 def _callers_level() -> int:
-    """``stacklevel`` of the nearest line that is neither this package's nor torch's, as seen from our caller."""
-    level, frame = 1, sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _INSIDE:
+    """``stacklevel``, for our caller, of the nearest line outside this package and torch."""
+    level, frame, inside = 1, sys._getframe(1), (__name__.partition(".")[0], "torch", "torchvision")
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in inside:
         level, frame = level + 1, frame.f_back
     return level
-
-
-_INSIDE = (__name__.partition(".")[0], "torch", "torchvision")

@@ -22,7 +22,7 @@ def level_size(size: tuple[int, int], level: int) -> tuple[int, int]:
 
 
 def interleaved(image: torch.Tensor) -> np.ndarray | None:
-    """The (H, W, 3) numpy view of a (3, H, W) tensor whose memory is channels-last, else None."""
+    """The (H, W, 3) numpy view of a (3, H, W) tensor in channels-last memory, else None."""
     array = image.permute(1, 2, 0)
     return array.numpy() if array.is_contiguous() else None
 
@@ -48,10 +48,10 @@ def write_halved(image: torch.Tensor, level: int, dst: np.ndarray) -> None:
 
 
 def resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
-    """Resize a (3, H, W) image to (h, w), antialiased; a copy where the size is right already.
+    """Resize a (3, H, W) image to (h, w), antialiased; a copy if it has that size.
 
-    On the CPU by halving and then bilinearly, as target views are read: equally sharp, in a tenth of torch's time.
-    Images that need gradients or lie on other devices are resized by torch.
+    On the CPU by halving and then bilinearly, as target views are read: a tenth of torch's time. Torch resizes images
+    that need gradients or lie on other devices.
     """
     if image.device.type == "cpu" and not image.requires_grad:
         return _resized_by_opencv(image, size)

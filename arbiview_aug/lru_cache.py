@@ -12,17 +12,13 @@ V = TypeVar("V")
 
 
 class LRUCache(Generic[K, V]):
-    """Thread-safe LRU cache bounded by total value size; the last value always stays.
+    """Thread-safe LRU cache bounded by total value size, with counts of ``hits`` and ``misses``.
 
-    Threads that miss the same key at once each make the value and all get the first one: none waits.
+    The last value always stays. Threads that miss the same key at once each make the value and all get the first one.
 
     Args:
         limit: Maximum total size.
         size: Size of one value: bytes, or 1 to count values.
-
-    Attributes:
-        hits: Number of lookups that found their value.
-        misses: Number of lookups that made it.
     """
 
     def __init__(self, limit: int, size: Callable[[V], int]) -> None:
@@ -32,19 +28,19 @@ class LRUCache(Generic[K, V]):
         self._lock = threading.Lock()
 
     def get(self, key: K, make: Callable[[], V]) -> V:
-        """The value of this key, made if it is missing."""
+        """The value of a key, made if it is missing."""
         with self._lock:
             if key in self._values:
                 self.hits += 1
                 self._values.move_to_end(key)
                 return self._values[key]
             self.misses += 1
-        made = make()
+        new = make()
         with self._lock:
-            value = self._values.setdefault(key, made)
-            held = sum(map(self._size, self._values.values()))
-            while held > self.limit and len(self._values) > 1:
-                held -= self._size(self._values.popitem(last=False)[1])
+            value = self._values.setdefault(key, new)
+            total = sum(map(self._size, self._values.values()))
+            while total > self.limit and len(self._values) > 1:
+                total -= self._size(self._values.popitem(last=False)[1])
         return value
 
     @property
