@@ -61,7 +61,7 @@ class _Frames(Dataset[Done]):
         warn = WarnOnce()
         (neighbours,) = neighbours_of_frames(sample, [frame], (), warn)
         used = [neighbour.name for neighbour in neighbours]
-        held = self.depths.held(token, rig, used)
+        held = self.depths.find(token, rig, used)
         if held is not None:
             return Done(token, held.density, "", kept=True)
         boxes = None if sample.get("boxes_3d") is None else sample["boxes_3d"].numpy().astype(float)

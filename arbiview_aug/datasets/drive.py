@@ -1,4 +1,4 @@
-"""Other frames of a drive that come with a frame as its ``neighbours`` (see ``arbiview_aug.sample.neighbours``)."""
+"""Base class of readers, and the neighbours of a frame in its drive (see ``arbiview_aug.sample.neighbours``)."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ Direction = Literal["both", "past", "future"]
 
 
 class Recording(Dataset[dict[str, Any]]):
-    """Samples on disk, each with a token; the base class of the readers.
+    """Base class of the readers: samples on disk, each with a token.
 
     Attributes:
-        root: The folder.
+        root: Folder of the data.
         tokens: Unique name of each sample, in order.
         load_points: Whether to read the LiDAR's points.
     """
@@ -52,17 +52,17 @@ class Recording(Dataset[dict[str, Any]]):
         return self[self._index[token]]
 
     def files(self, index: int) -> list[Path]:
-        """All files that a sample is read from, for ``convert``: a reader that has no writer needs none."""
+        """All files that a sample is read from; only readers with a writer need it."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
 class Neighbours:
-    """Frames by distance travelled: standing still, there are none.
+    """Selection of neighbours by distance travelled; a standing vehicle has none.
 
     Attributes:
         count: Maximum number in each direction.
-        step_m: Metres of travel from one to the next; the frames are the first at or beyond them.
+        step_m: Metres of travel from one to the next; the first frame at or beyond each step is taken.
         direction: ``past`` frames, ``future`` ones, or ``both``.
 
     Raises:
@@ -86,22 +86,15 @@ class Neighbours:
         """-1 for the past, 1 for the future."""
         return {"both": (-1, 1), "past": (-1,), "future": (1,)}[self.direction]
 
-    def picked(self, travelled_m: FloatArray, index: int) -> list[int]:
-        """The neighbours of one frame of a drive, the nearest first in each direction.
-
-        Args:
-            travelled_m: (F,) distance along the drive at each of its frames, never falling.
-            index: Of the frame.
-        """
-        found = []
+    def select(self, travelled_m: FloatArray, index: int) -> list[int]:
+        """Neighbours of frame ``index`` by non-decreasing distance (F,) along a drive, nearest first per direction."""
+        found: list[int] = []
         for sign in self.signs:
             for k in range(1, self.count + 1):
-                # Poses waver by millimetres while a vehicle stands.
-                wanted = travelled_m[index] + sign * (k * self.step_m - 1e-3)
-                if sign > 0:
-                    at = int(np.searchsorted(travelled_m, wanted, side="left"))
-                else:
-                    at = int(np.searchsorted(travelled_m, wanted, side="right")) - 1
+                # 1 mm of tolerance: the poses of a standing vehicle jitter.
+                target_m = travelled_m[index] + sign * (k * self.step_m - 1e-3)
+                side: Literal["left", "right"] = "left" if sign > 0 else "right"
+                at = int(np.searchsorted(travelled_m, target_m, side)) - (sign < 0)
                 if 0 <= at < len(travelled_m) and at not in found:
                     found.append(at)
         return found
@@ -117,96 +110,80 @@ class Drive:
     """Distance travelled by a vehicle, frame by frame.
 
     Args:
-        positions_m: (F, 3) of the vehicle in the world, in the order in which the frames were recorded.
-        parts: (F,) whole numbers that never fall: frames of different ones are no neighbours.
+        positions_m: (F, 3) vehicle positions in the world, in recording order.
+        parts: (F,) non-decreasing numbers of uninterrupted parts; neighbours share their part.
     """
 
     def __init__(self, positions_m: FloatArray, parts: npt.NDArray[np.int64]) -> None:
         self._travelled_m, self._parts = travelled_m(positions_m), parts
 
     def neighbours(self, index: int, wanted: Neighbours) -> list[int]:
-        """The neighbours of one frame, by their numbers."""
+        """Indices of a frame's neighbours."""
         part = self._parts[index]
         first, end = (int(k) for k in np.searchsorted(self._parts, [part, part + 1]))
-        return [first + k for k in wanted.picked(self._travelled_m[first:end], index - first)]
+        return [first + k for k in wanted.select(self._travelled_m[first:end], index - first)]
 
 
 def travelled_m(positions_m: FloatArray) -> FloatArray:
-    """(F,) distance along positions (F, 3); jitter of a standing vehicle's poses does not count."""
-    total, found = 0.0, []
-    there: list[float] | None = None
-    for here in positions_m.tolist():
-        step_m = 0.0 if there is None else math.dist(there, here)
-        if there is None or step_m >= STILL_M:
-            there, total = here, total + step_m
-        found.append(total)
+    """(F,) distance along positions (F, 3), without the pose jitter of a standing vehicle."""
+    total_m, found = 0.0, []
+    last = None
+    for position in positions_m.tolist():
+        step_m = 0.0 if last is None else math.dist(last, position)
+        if last is None or step_m >= STILL_M:
+            last, total_m = position, total_m + step_m
+        found.append(total_m)
     return np.array(found)
 
 
 def parts_of_clock(names: Sequence[str], times_s: Mapping[str, float] | None, where: str) -> npt.NDArray[np.int64]:
-    """(F,) parts of a drive; a clock that goes back begins another one, with a warning.
-
-    Args:
-        names: Its frames, in their order.
-        times_s: Seconds by frame, or None.
-        where: Named in the warning.
-    """
+    """(F,) parts of a drive with frames ``names``; where the clock goes back, a new one begins, with a warning."""
     parts = [0] * len(names)
     for k, (one, two) in enumerate(pairwise(names), 1):
         goes_back = times_s is not None and times_s[two] <= times_s[one]
         parts[k] = parts[k - 1] + goes_back
         if goes_back:
-            warnings.warn(went_back(where, one, two), stacklevel=4)
+            warnings.warn(clock_message(where, one, two), stacklevel=4)
     return np.array(parts, np.int64)
 
 
-def went_back(where: str, one: str, two: str) -> str:
-    """Message for a clock that goes back from one frame to the next."""
-    return f"{where}: the clock goes back from frame {one!r} to {two!r}: neither is the other's neighbour"
+def clock_message(where: str, one: str, two: str) -> str:
+    """Warning for a clock that goes back from one frame to the next."""
+    return f"{where}: the clock goes back from frame {one!r} to {two!r}: they are no neighbours"
 
 
 class LazyFrame(Mapping[str, Any]):
-    """A neighbour whose images are decoded on first access.
+    """A neighbour with ``fields`` (pose, calibration, time, token), whose images ``load`` decodes on first access."""
 
-    Args:
-        known: Pose, calibration, time, token.
-        load: Decodes the images.
-    """
-
-    def __init__(self, known: Mapping[str, Any], load: Callable[[], Any]) -> None:
-        self._known, self._load = dict(known), load
+    def __init__(self, fields: Mapping[str, Any], load: Callable[[], Any]) -> None:
+        self._fields, self._load = dict(fields), load
         self.is_broken = False
         """Whether an access failed."""
 
     def __getitem__(self, key: str) -> Any:
-        if key == "images" and key not in self._known:
+        if key == "images" and key not in self._fields:
             try:
-                self._known[key] = self._load()
+                self._fields[key] = self._load()
             except (ArbiviewError, OSError):
                 self.is_broken = True
                 raise
-        return self._known[key]
+        return self._fields[key]
 
     def __iter__(self) -> Iterator[str]:
-        return iter({**self._known, "images": None})
+        return iter({**self._fields, "images": None})
 
     def __len__(self) -> int:
-        return len({**self._known, "images": None})
+        return len({**self._fields, "images": None})
 
     def __repr__(self) -> str:
         return f"LazyFrame({', '.join(self)})"
 
 
 class Unreadable(LazyFrame):
-    """A broken neighbour: every access but to its token raises the reason.
+    """A broken neighbour, which raises ``error`` on every access but to its token."""
 
-    Args:
-        known: Its token.
-        error: The reason.
-    """
-
-    def __init__(self, known: Mapping[str, Any], error: ArbiviewError) -> None:
-        super().__init__(known, self._refuse)
+    def __init__(self, fields: Mapping[str, Any], error: ArbiviewError) -> None:
+        super().__init__(fields, self._refuse)
         self._error = error
 
     def __getitem__(self, key: str) -> Any:

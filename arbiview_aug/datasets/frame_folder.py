@@ -35,13 +35,13 @@ CALIBRATION_FILE = "calib.json"
 SEQUENCE_FILE = "sequence.json"
 POINTS_FILE = "lidar.npy"
 
-# Masks a worker keeps: those of two eight-camera rigs, 2 MB each at full size.
 _CACHED_MASKS = 16
+"""Masks that a worker keeps: those of two eight-camera rigs, 2 MB each at full size."""
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """A frame's folder, in the folder of the data or that folder itself."""
+    """A frame's folder: a child of the data's root, or the root itself."""
 
     root: Path
     folder: Path
@@ -56,21 +56,13 @@ class _Frame:
         return str(self.folder / CALIBRATION_FILE)
 
     def file(self, name: str, what: str = "") -> Path:
-        """One of its files, or one of another frame of the same data.
-
-        Raises:
-            DataError: A name or a link that leaves the folder of the data.
-        """
+        """Path of a file of this or another frame; DataError for names and links that leave the root."""
         if self.folder != self.root and not os.path.isabs(name):
             name = os.path.normpath(f"{self.name}/{name}")
         return inside(self.root, name, f"{self.where}: {what}" if what else self.where)
 
     def mask(self, name: str, what: str) -> Path:
-        """One of its masks: a frame that is opened by itself may share those of a frame beside it, as in its drive.
-
-        Raises:
-            DataError: A name or a link that leaves the folder of the data, or the frame beside it.
-        """
+        """Path of a mask, as ``file``; a frame that is itself the root may share masks of a sibling frame."""
         parts = os.path.normpath(name).split(os.sep, 2) if self.folder == self.root and "\0" not in name else []
         if len(parts) == 3 and parts[0] == ".." and parts[1] != "..":
             check_name(os.sep.join(parts[1:]), f"{self.where}: {what}")
@@ -83,8 +75,8 @@ class _Frame:
 class FrameFolder(Recording):
     """A folder that is a frame (it has ``calib.json``), or a folder of such folders, in the order of their names.
 
-    ``calib.json`` holds (keys not named here are ignored, so notes and licences may stand beside; those that look like
-    another name of one that is absent are warned of, or refused where geometry would be lost)::
+    ``calib.json`` holds (other keys are ignored; those that look like a misspelt key give a warning, or an error where
+    geometry would be lost)::
 
         {
           "cameras": [                       one or more, in the order of the sample's images
@@ -111,11 +103,11 @@ class FrameFolder(Recording):
     The points are a float .npy of shape (P, >=3), x y z first, in the ego frame, metres. All files lie below ``root``,
     which may be a link: names and links that leave it are refused.
 
-    A sample is a dict: ``images`` (N, 3, h, w) uint8 RGB, or a list where sizes differ; ``rig`` (names, lenses, masks,
-    ground); ``K`` (N, 3, 3) and ``cam2ego`` (N, 4, 4) float64; ``token`` (the folder's name); and, where the frame has
-    them, ``points`` (P, >=3) float32, ``boxes_3d`` (B, >=7) float32 and ``ego2world`` (4, 4) float64; ``time_s``
-    and, if asked for, ``neighbours``, where ``sequence.json`` has the frame and both have a pose. The numbers of
-    points and boxes vary: batch with ``batch_size=None`` or a ``collate_fn`` that keeps them as lists.
+    A sample is a dict: ``images`` (N, 3, h, w) uint8 RGB, or a list if sizes differ; ``rig`` (names, lenses, masks,
+    ground); ``K`` (N, 3, 3) and ``cam2ego`` (N, 4, 4) float64; ``token`` (the folder's name); and, if the frame has
+    them, ``points`` (P, >=3) float32, ``boxes_3d`` (B, >=7) float32, ``ego2world`` (4, 4) float64 and ``time_s``.
+    ``neighbours`` are frames of ``sequence.json`` with a pose. The numbers of points and boxes vary: batch with
+    ``batch_size=None`` or a ``collate_fn`` that keeps them as lists.
 
     Args:
         root: The folder.
@@ -124,32 +116,24 @@ class FrameFolder(Recording):
         neighbours: Which other frames of the drive come with a frame; None for none.
 
     Raises:
-        TypeError: ``neighbours`` is something else.
+        TypeError: ``neighbours`` is neither ``Neighbours`` nor None.
         DataError: No frame under ``root``; on access, a file that is missing, broken or inconsistent.
         CalibrationError: On access, an impossible calibration, by camera.
     """
 
     def __init__(
-        self,
-        root: str | Path,
-        *,
-        reduce: Reduce = 1,
-        load_points: bool = True,
-        neighbours: Neighbours | None = None,
+        self, root: str | Path, *, reduce: Reduce = 1, load_points: bool = True, neighbours: Neighbours | None = None
     ) -> None:
         check_reduce(reduce)
         check_neighbours(neighbours)
-        self.root = Path(root)
-        self.reduce = reduce
-        self.load_points = load_points
+        self.root, self.reduce, self.load_points, self.neighbours = Path(root), reduce, load_points, neighbours
         self._frames = _find_frames(self.root)
         self.tokens = [frame.name for frame in self._frames]
         self._index = {token: k for k, token in enumerate(self.tokens)}
         self._last_rig: tuple[str, Rig] | None = None
         self._times_s, order = _read_sequence(self.root, self._index)
-        self.neighbours = neighbours
         self._warn = WarnOnce()
-        self._driven: list[str] = []
+        self._drive_names: list[str] = []
         self._drive = None if neighbours is None else self._find_drive(order)
 
     def files(self, index: int) -> list[Path]:
@@ -177,16 +161,16 @@ class FrameFolder(Recording):
         }
         if self.load_points and (points := _read_points(calib, frame)) is not None:
             sample["points"] = points
-        sample |= self._in_ego_frame(calib, frame)
+        sample |= self._boxes_pose_time(calib, frame)
         if self._drive is not None and self.neighbours is not None:
-            near = []
-            if frame.name in self._driven:
-                near = self._drive.neighbours(self._driven.index(frame.name), self.neighbours)
-            sample["neighbours"] = [self._neighbour(self._driven[k]) for k in near]
+            others = []
+            if frame.name in self._drive_names:
+                others = self._drive.neighbours(self._drive_names.index(frame.name), self.neighbours)
+            sample["neighbours"] = [self._neighbour(self._drive_names[k]) for k in others]
         return sample
 
-    def _in_ego_frame(self, calib: Mapping[str, Any], frame: _Frame) -> dict[str, Any]:
-        """The boxes, the pose and the time that a frame has."""
+    def _boxes_pose_time(self, calib: Mapping[str, Any], frame: _Frame) -> dict[str, Any]:
+        """A frame's boxes, pose and time, if any."""
         found: dict[str, Any] = {}
         if calib.get("boxes_3d") is not None:
             found["boxes_3d"] = _boxes(calib["boxes_3d"], frame.where)
@@ -202,7 +186,7 @@ class FrameFolder(Recording):
         return decode_images(files, names=rig.names, sizes=sizes, reduce=self.reduce)
 
     def _find_drive(self, order: Sequence[str]) -> Drive:
-        """The frames of ``sequence.json`` that have a pose; broken ones are named, and raise when they are read."""
+        """Read the poses of the frames of ``sequence.json``; broken frames give warnings."""
         positions_m = {}
         for name in order:
             frame = self._frames[self._index[name]]
@@ -212,34 +196,34 @@ class FrameFolder(Recording):
                     positions_m[name] = _pose(pose, frame.where).numpy()[:3, 3]
             except ArbiviewError as error:
                 warnings.warn(f"{error}; this frame is no neighbour", stacklevel=3)
-        self._driven = list(positions_m)
-        timed = all(name in self._times_s for name in self._driven)
-        parts = parts_of_clock(self._driven, self._times_s if timed else None, str(self.root / SEQUENCE_FILE))
+        names = self._drive_names = list(positions_m)
+        times_s = self._times_s if all(name in self._times_s for name in names) else None
+        parts = parts_of_clock(names, times_s, str(self.root / SEQUENCE_FILE))
         return Drive(np.array(list(positions_m.values())).reshape(-1, 3), parts)
 
     def _neighbour(self, name: str) -> Mapping[str, Any]:
-        """Another frame of the drive, its images still undecoded; a broken one raises on access."""
+        """Another frame of the drive; its images are decoded on access, where a broken one raises."""
         frame = self._frames[self._index[name]]
-        known: dict[str, Any] = {"token": name}
+        fields: dict[str, Any] = {"token": name}
         try:
             calib = _read_calibration(frame)
             rig = self._rig(calib, frame)
-            known |= {"rig": rig, **self._in_ego_frame(calib, frame)}
+            fields |= {"rig": rig, **self._boxes_pose_time(calib, frame)}
         except ArbiviewError as error:
-            return Unreadable(known, error)
-        return LazyFrame(known, partial(self._images, calib, frame, rig))
+            return Unreadable(fields, error)
+        return LazyFrame(fields, partial(self._images, calib, frame, rig))
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_last_rig": None}
 
     def _rig(self, calib: Mapping[str, Any], frame: _Frame) -> Rig:
-        """The frame's rig; the last one itself where the calibration is the same, as it is along most drives."""
+        """The frame's rig; the last one itself if the calibration is the same."""
         masks = [_mask_file(entry, frame) if isinstance(entry, Mapping) else None for entry in calib["cameras"]]
         bare = [_calibration_of(entry) for entry in calib["cameras"]]
         data = {"name": calib.get("name", calib.get("dataset", "")), "cameras": bare}
         data |= {key: calib[key] for key in ("ground_z_m", *misnamed(calib, ("ground_z_m",))) if key in calib}
         key = json.dumps([data, [mask and os.path.realpath(mask) for mask in masks]])
-        last = self._last_rig  # another thread may read another frame
+        last = self._last_rig  # read once, for threads
         if last is None or last[0] != key:
             rig = Rig.from_dict(data, where=frame.where)
             cameras = [_with_mask(camera, file, frame) for camera, file in zip(rig, masks, strict=True)]
@@ -262,7 +246,7 @@ def _find_frames(root: Path) -> list[_Frame]:
 
 
 def _read_sequence(root: Path, index: Mapping[str, int]) -> tuple[dict[str, float], list[str]]:
-    """Seconds by frame, and the frames in their order; nothing where there is no ``sequence.json``."""
+    """Read times (s) by frame and the frames in order; nothing without ``sequence.json``."""
     path = inside(root, SEQUENCE_FILE, str(root))
     if not path.is_file():
         return {}, []
@@ -299,7 +283,7 @@ def _read_calibration(frame: _Frame) -> dict[str, Any]:
 
 
 def _calibration_of(entry: Any) -> Any:
-    """Entries of a camera that decide the rig; timestamps and files change every frame."""
+    """Entries of a camera that decide the rig, without timestamps and files."""
     if not isinstance(entry, Mapping):
         return entry
     read = ("name", "width", "height", "K", "cam2ego", "distortion")
@@ -324,7 +308,7 @@ def _mask_file(entry: Any, frame: _Frame) -> Path | None:
 
 
 def _file_of(entry: Any, key: str) -> tuple[str, Any]:
-    """Label of a camera's file for messages, and its name."""
+    """Label for messages and name of a camera's file."""
     if not isinstance(entry, Mapping):
         return f"camera {entry!r}: {key}", None
     return f"camera {entry.get('name')!r}: {key}", entry.get(key)
@@ -376,11 +360,7 @@ def _read_points(calib: Mapping[str, Any], frame: _Frame) -> torch.Tensor | None
 
 
 def checked_points(array: Any, where: str) -> torch.Tensor:
-    """(P, >=3) float32 tensor of points.
-
-    Raises:
-        DataError: Another shape or type, or coordinates that are not finite.
-    """
+    """Check points and convert them to (P, >=3) float32; DataError for another shape or type, or NaN and infinity."""
     if not isinstance(array, np.ndarray) or array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind != "f":
         got = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
         raise DataError(f"points {where}: expected a float array of shape (P, >=3), got {got}")
@@ -394,7 +374,7 @@ def checked_points(array: Any, where: str) -> torch.Tensor:
 def _boxes(rows: Any, where: str) -> torch.Tensor:
     expected = "rows of x y z length width height yaw (at least 7 finite numbers, sizes above 0)"
     try:
-        with np.errstate(over="ignore"):  # beyond float32 is not finite either
+        with np.errstate(over="ignore"):  # infinite in float32, and refused below
             array = np.array(rows, dtype=np.float64).astype(np.float32)
     except (TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{where}: boxes_3d: expected {expected}, got {error}") from None

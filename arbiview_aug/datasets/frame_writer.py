@@ -15,11 +15,11 @@ from arbiview_aug.datasets.image_io import encoded_image
 
 
 def write_frame(folder: Path, sample: Mapping[str, Any]) -> None:
-    """Write a sample's images as JPEGs, its calibration, and its points, boxes and pose where it has them.
+    """Write a sample's images as JPEGs, its calibration, and its points, boxes and pose if it has them.
 
     Args:
-        folder: Made where it is missing.
-        sample: With ``images``, one uint8 (3, h, w) for each camera of ``rig``; the rig's masks are not written.
+        folder: The frame's folder, created if missing.
+        sample: Has ``images``, one uint8 (3, h, w) per camera of ``rig``; the rig's masks are not written.
     """
     rig: Rig = sample["rig"]
     folder.mkdir(parents=True, exist_ok=True)
@@ -27,22 +27,14 @@ def write_frame(folder: Path, sample: Mapping[str, Any]) -> None:
     for k, (entry, image) in enumerate(zip(calib["cameras"], sample["images"], strict=True)):
         entry["file"] = f"{k:02}.jpg"
         (folder / entry["file"]).write_bytes(encoded_image(image))
-    if "boxes_3d" in sample:
-        calib["boxes_3d"] = sample["boxes_3d"].tolist()
-    if "ego2world" in sample:
-        calib["ego2world"] = sample["ego2world"].tolist()
+    calib |= {key: sample[key].tolist() for key in ("boxes_3d", "ego2world") if key in sample}
     if "points" in sample:
         np.save(folder / POINTS_FILE, sample["points"].numpy())
     (folder / CALIBRATION_FILE).write_text(json.dumps(calib, indent=1))
 
 
 def write_drive(root: Path, frames: Sequence[Mapping[str, Any]]) -> None:
-    """Write the frames of one drive, in the order of their times, and ``sequence.json``.
-
-    Args:
-        root: The folder of the frames' folders.
-        frames: Samples with ``ego2world`` and ``time_s``.
-    """
+    """Write the frames of one drive (with ``ego2world`` and ``time_s``) in order of time, and ``sequence.json``."""
     entries = []
     for k, frame in enumerate(sorted(frames, key=lambda frame: float(frame["time_s"]))):
         entries.append({"name": f"{k:04}", "time_s": float(frame["time_s"])})

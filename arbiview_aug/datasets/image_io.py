@@ -1,8 +1,7 @@
-"""Decoding a frame's images: into one block, in the memory layout the renderer reads, and never half an image.
+"""Decoding of a frame's images into one block, in the renderer's memory layout, and encoding.
 
-OpenCV hides three failures, so files are looked at before and after it decodes them: a truncated JPEG becomes a
-picture with a grey rest, an image with an EXIF orientation is turned away from its calibration, and a decode into a
-given array that fails may return that array untouched.
+OpenCV hides three failures, which are checked here: it fills truncated JPEGs with grey, rotates images by their EXIF
+orientation, and may leave the output array untouched if decoding into it fails.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import DataError, SampleTypeError
 
@@ -32,9 +30,8 @@ _REDUCED_FLAGS = {
     2: cv2.IMREAD_REDUCED_COLOR_2 & ~cv2.IMREAD_COLOR,
     4: cv2.IMREAD_REDUCED_COLOR_4 & ~cv2.IMREAD_COLOR,
 }
-# OpenCV decodes to RGB itself from 4.11 on; before, the channels are swapped afterwards.
+# From OpenCV 4.11 on; for older versions channels are swapped after decoding.
 _RGB_FLAG: int | None = getattr(cv2, "IMREAD_COLOR_RGB", None)
-# Calibrations describe the stored pixels: an EXIF orientation must not turn them.
 _FLAGS = cv2.IMREAD_IGNORE_ORIENTATION | (cv2.IMREAD_COLOR if _RGB_FLAG is None else _RGB_FLAG)
 
 _PNG_START = b"\x89PNG\r\n\x1a\n"
@@ -45,7 +42,7 @@ _BARE_MARKERS = frozenset({0x01, *range(0xD0, 0xD9)})  # TEM, RST0..7, SOI: no l
 
 
 class ImageHeader(NamedTuple):
-    """Format and (h, w) of an image file, and where a JPEG's first scan begins."""
+    """Format and (h, w) of an image file, and the offset of a JPEG's first scan."""
 
     format: Literal["JPEG", "PNG"]
     size: tuple[int, int]
@@ -62,22 +59,20 @@ def decode_images(
     """Decode JPEG and PNG files as RGB.
 
     The result is a permuted view of one (N, h, w, 3) block (channels last in memory), which the CPU renderer takes
-    without a copy. EXIF orientations are ignored, grey images get three equal channels, an alpha channel is dropped.
+    without a copy. EXIF orientations are ignored, grey images get three equal channels, alpha channels are dropped.
 
-    With ``reduce`` 2 or 4 each side becomes ceil(side / reduce) and a pixel covers exactly reduce by reduce of
-    the full image's, counted from its top-left corner (``reduced_camera`` is the camera of that). JPEGs are decoded at
-    the smaller size: faster than a full decode, and less aliased than sampling the full image.
-
-    A JPEG that is whole but corrupt in its middle cannot be told from a sound one.
+    With ``reduce`` 2 or 4 each side becomes ceil(side / reduce) and a pixel covers exactly reduce by reduce pixels of
+    the full image, counted from its top-left corner (see ``reduced_camera``). JPEGs are decoded at the smaller size,
+    which is faster and less aliased than sampling the full image. A complete JPEG with corrupt data is not detected.
 
     Args:
         paths: The files.
         names: Camera names for the messages; the file's stem by default.
-        sizes: (h, w) that the calibration gives for each full image; unchecked if None.
+        sizes: Calibrated (h, w) of each full image; unchecked if None.
         reduce: 1, 2 or 4.
 
     Returns:
-        (N, 3, h, w) uint8, or a list of (3, h_i, w_i) where the sizes differ.
+        (N, 3, h, w) uint8, or a list of (3, h_i, w_i) if the sizes differ.
 
     Raises:
         DataError: A file that is missing, empty, truncated, undecodable or of another size, by camera and file.
@@ -90,14 +85,12 @@ def decode_images(
         for header, label, size in zip(headers, labels, sizes, strict=True):
             _check_size(header.size, size, label)
     shapes = [(*reduced_size(header.size, reduce), 3) for header in headers]
-    if len(set(shapes)) == 1:
-        block = np.empty((len(files), *shapes[0]), np.uint8)
-        for file, label, header, out in zip(files, labels, headers, block, strict=True):
-            _decode_into(out, file, label, header, reduce)
-        return torch.from_numpy(block).permute(0, 3, 1, 2)
-    images = [np.empty(shape, np.uint8) for shape in shapes]
+    block = np.empty((len(files), *shapes[0]), np.uint8) if len(set(shapes)) == 1 else None
+    images = [np.empty(shape, np.uint8) for shape in shapes] if block is None else [*block]
     for file, label, header, out in zip(files, labels, headers, images, strict=True):
         _decode_into(out, file, label, header, reduce)
+    if block is not None:
+        return torch.from_numpy(block).permute(0, 3, 1, 2)
     return [torch.from_numpy(image).permute(2, 0, 1) for image in images]
 
 
@@ -115,9 +108,9 @@ def reduced_size(size: tuple[int, int], reduce: int) -> tuple[int, int]:
 def reduced_camera(camera: Camera, reduce: Reduce) -> Camera:
     """The camera of an image decoded with ``reduce``.
 
-    The scale is exactly 1 / reduce about the outer top-left corner, x' = (x + 1/2) / reduce - 1/2, also where an odd
-    side is rounded up: there the last pixel reaches past the image, and the ratio of the sizes would be wrong
-    (``Camera.resize`` is for images whose outer edges coincide). A reduced pixel is scene where all of its pixels are.
+    Pixels scale by exactly 1 / reduce about the outer top-left corner, x' = (x + 1/2) / reduce - 1/2, even if an odd
+    side is rounded up and its last pixel reaches past the image (``Camera.resize`` aligns outer edges instead). A
+    reduced pixel's mask is True only if all of its pixels' are.
     """
     check_reduce(reduce)
     if reduce == 1:
@@ -125,7 +118,10 @@ def reduced_camera(camera: Camera, reduce: Reduce) -> Camera:
     scale, shift = 1 / reduce, 0.5 / reduce - 0.5
     A = np.array([[scale, 0.0, shift], [0.0, scale, shift], [0.0, 0.0, 1.0]])
     height_px, width_px = reduced_size(camera.size, reduce)
-    mask = None if camera.mask is None else _reduced_mask(camera.mask, reduce)
+    mask = camera.mask
+    if mask is not None:
+        mask = np.pad(mask, [(0, -side % reduce) for side in mask.shape], mode="edge")
+        mask = np.asarray(mask.reshape(height_px, reduce, width_px, reduce).all(axis=(1, 3)))
     return replace(camera, width_px=width_px, height_px=height_px, K=A @ camera.K, mask=mask)
 
 
@@ -135,11 +131,7 @@ def reduced_rig(rig: Rig, reduce: Reduce) -> Rig:
 
 
 def read_header(path: Path, label: str | None = None) -> ImageHeader:
-    """Format and size of a JPEG or PNG file, without decoding it.
-
-    Args:
-        path: The file.
-        label: Names camera and file in the messages.
+    """Read format and size of a JPEG or PNG file; ``label`` names camera and file in messages.
 
     Raises:
         DataError: A missing, empty or truncated file, or one of another format.
@@ -172,14 +164,12 @@ def _label(name: str, path: Path) -> str:
 
 
 def _check_size(size: tuple[int, int], calibrated: tuple[int, int], label: str) -> None:
-    if size == calibrated:
-        return
-    if size == calibrated[::-1]:
-        fix = "the calibration's width and height look swapped"
-    else:
+    if size != calibrated:
         fix = "use the calibration of these images, or resize its camera (Camera.resize) with them"
-    h, w = size
-    raise DataError(f"{label}: expected {calibrated[1]}x{calibrated[0]} (w x h) as calibrated, got {w}x{h}; {fix}")
+        if size == calibrated[::-1]:
+            fix = "the calibration's width and height look swapped"
+        h, w = size
+        raise DataError(f"{label}: expected {calibrated[1]}x{calibrated[0]} (w x h) as calibrated, got {w}x{h}; {fix}")
 
 
 def _read_png_header(start: bytes, label: str) -> ImageHeader:
@@ -195,7 +185,7 @@ def _read_jpeg_header(file: BinaryIO, label: str) -> ImageHeader:
     file.seek(2)
     while True:
         byte = file.read(1)
-        while byte == b"\xff":  # a marker may be preceded by any number of fill bytes
+        while byte == b"\xff":  # fill bytes before a marker
             byte = file.read(1)
         if not byte:
             raise _truncated("JPEG", "it ends within its header", label)
@@ -222,8 +212,8 @@ def _check_complete(file: BinaryIO, header: ImageHeader, label: str) -> None:
     file.seek(max(0, file.tell() - 16))
     if file.read().endswith(end):
         return
-    # Bytes after the end are allowed (padding, maker notes). Inside a scan 0xFF is never followed by 0xD9, but
-    # thumbnails in the header have end markers of their own: so the search begins at the scan.
+    # Bytes may follow the end (padding, maker notes). Thumbnails in a JPEG's header have end markers too: search from
+    # the scan, in which none occurs.
     file.seek(header.scan_offset)
     if end not in file.read():
         raise _truncated(header.format, "its end marker is missing", label)
@@ -234,10 +224,10 @@ def _truncated(format: str, what: str, label: str) -> DataError:
 
 
 def _decode_into(out: ByteArray, path: Path, label: str, header: ImageHeader, reduce: int) -> None:
-    """Decode into ``out`` (h, w, 3), whose shape is that of the (reduced) image."""
+    """Decode into ``out`` (h, w, 3), which has the shape of the (reduced) image."""
     if header.format == "JPEG" and _decode_jpeg_in_place(out, path, reduce):
         return
-    # PNGs have no reduced decode: cv2 resizes them to rounded-down sizes, at another scale than a JPEG's.
+    # For PNGs cv2's reduced flags round sizes down, to another scale than for JPEGs.
     own_scale = header.format == "JPEG"
     image = cv2.imread(str(path), _FLAGS | (_REDUCED_FLAGS[reduce] if own_scale else 0))
     if image is None:
@@ -254,43 +244,28 @@ def _decode_into(out: ByteArray, path: Path, label: str, header: ImageHeader, re
 
 
 def _decode_jpeg_in_place(out: ByteArray, path: Path, reduce: int) -> bool:
-    """True if it worked. A failing decode may leave ``out`` as it was and say nothing: hence the mark."""
+    """Decode into ``out``; returns False on failure, which a mark detects that was left untouched."""
     mark = np.resize(np.array([0, 255, 0, 255, 0, 255, 255], np.uint8), out[0].shape)
     out[0] = out[-1] = mark
     try:
         image = cv2.imread(str(path), out, _FLAGS | _REDUCED_FLAGS[reduce])
     except cv2.error:  # the decoded size is not the header's
         return False
-    if image is None or not np.may_share_memory(image, out):
-        return False
-    if (out[0] == mark).all() or (out[-1] == mark).all():
+    if image is None or not np.may_share_memory(image, out) or (out[0] == mark).all() or (out[-1] == mark).all():
         return False
     if _RGB_FLAG is None:
         cv2.cvtColor(out, cv2.COLOR_BGR2RGB, out)
     return True
 
 
-def _reduced_mask(mask: BoolArray, reduce: int) -> BoolArray:
-    h, w = mask.shape
-    padded = np.pad(mask, ((0, -h % reduce), (0, -w % reduce)), mode="edge")
-    return np.asarray(padded.reshape(padded.shape[0] // reduce, reduce, -1, reduce).all(axis=(1, 3)))
-
-
 JPEG_QUALITY = 96
-"""With chroma at full resolution (4:4:4). A nuScenes frame as three other rigs see it loses 0.01, 0.03 and 0.08 dB,
-scored against LiDAR points (``pytest -m slow tests/acceptance/test_converted.py``); at 95 with OpenCV's halved
-chroma 0.03, 0.07 and 0.21 dB, in files a quarter smaller."""
-
+"""Quality at 4:4:4 chroma; costs at most 0.08 dB (``tests/acceptance/test_converted.py``)."""
 
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111)
 
 
 def encoded_image(image: torch.Tensor, suffix: str = ".jpg") -> bytes:
-    """An RGB image as a file's bytes.
-
-    Args:
-        image: (3, h, w) uint8.
-        suffix: ``.jpg``, at ``JPEG_QUALITY``, or ``.png``, which loses nothing.
+    """Encode an RGB image (3, h, w) uint8 as ``.jpg``, at ``JPEG_QUALITY``, or lossless ``.png``.
 
     Raises:
         SampleTypeError: The image is of another type.
@@ -304,6 +279,6 @@ def encoded_image(image: torch.Tensor, suffix: str = ".jpg") -> bytes:
 
 
 def encoded(picture: npt.NDArray[np.uint8], suffix: str) -> bytes:
-    """A picture (h, w) or, with the channels blue, green and red, (h, w, 3) as a file's bytes."""
+    """Encode a grey picture (h, w) or a BGR one (h, w, 3)."""
     _, coded = cv2.imencode(suffix, picture, _JPEG if suffix == ".jpg" else [])
     return coded.tobytes()

@@ -20,46 +20,31 @@ from arbiview_aug.scene.depth_maps import motion_camera
 from arbiview_aug.temporal.motion_depth import BEST_TRAVEL_M, MotionDepth
 
 FOLDER = "motion_depth"
-"""Default folder name, in a data set's root."""
+"""Default name of the folder in a data set's root."""
 
 WANTED = Neighbours(count=2, step_m=BEST_TRAVEL_M / 2)
-"""The neighbours to open a data set with: at half the best travel and at all of it; what the recording comes nearer to
-is taken."""
+"""Neighbours to open a data set with: at half the best travel and at all of it."""
 
 _FORMAT = 2
 _SAME_PX, _SAME_POSE = 0.05, 1e-3
-"""Tolerances of calibrations, wide enough for images decoded at half their size."""
+"""Tolerances of equal calibrations, wide enough for images decoded at half size."""
 
 
 class DepthFolder:
-    """Files ``<token>.npz``: z-depth of each camera in float16, the calibration it belongs to, and how it was found.
-
-    Args:
-        root: The folder; made by the first ``write``.
-    """
+    """Files ``<token>.npz`` below ``root``: float16 z-depth of each camera, its calibration and its origin."""
 
     def __init__(self, root: str | Path) -> None:
         self.root = Path(root)
 
     def path(self, token: str) -> Path:
-        """Path of a frame's file; characters that file names cannot hold are escaped.
-
-        Raises:
-            DataError: It is a link that leaves the folder.
-        """
+        """Path of a frame's file, its token escaped; DataError for a link that leaves the folder."""
         return inside(self.root, f"{file_name(token)}.npz", f"depth from motion of frame {token!r}")
 
     def write(self, token: str, rig: Rig, depth: MotionDepth, neighbours: Sequence[str] = ()) -> None:
-        """Write a frame's depth atomically.
-
-        Args:
-            token: Of the frame.
-            rig: Its rig.
-            depth: What was found.
-            neighbours: Names of the frames that it was found from.
+        """Write a frame's depth atomically, with its rig and the names of the neighbours that it was estimated from.
 
         Raises:
-            OutputError: It cannot be written.
+            OutputError: The file cannot be written.
         """
         maps = {f"depth_{k:02}": one.astype(np.float16) for k, one in enumerate(depth.depth_m)}
         with whole_file(self.path(token)) as file:
@@ -73,27 +58,23 @@ class DepthFolder:
             )
 
     def read(self, token: str, rig: Rig) -> MotionDepth:
-        """A frame's depth.
-
-        Args:
-            token: Of the frame.
-            rig: Its rig, as it is used now.
+        """Read a frame's depth.
 
         Raises:
-            DataError: The file is missing, broken, or of another calibration.
+            DataError: The file is missing, broken, or of another calibration than ``rig``.
         """
         return self._read(token, rig)[0]
 
-    def held(self, token: str, rig: Rig, neighbours: Sequence[str]) -> MotionDepth | None:
-        """A frame's depth if it exists, fits, and was found from these neighbours; else None."""
+    def find(self, token: str, rig: Rig, neighbours: Sequence[str]) -> MotionDepth | None:
+        """Read a frame's depth if it exists, fits the rig, and was estimated from these neighbours."""
         try:
-            depth, found_from = self._read(token, rig)
+            depth, names = self._read(token, rig)
         except DataError:
             return None
-        return depth if found_from == list(neighbours) else None
+        return depth if names == list(neighbours) else None
 
     def _read(self, token: str, rig: Rig) -> tuple[MotionDepth, list[str]]:
-        """A frame's depth, and the names of the frames that it was found from."""
+        """Read a frame's depth and the names of its neighbours."""
         path = self.path(token)
         if not path.is_file():
             raise DataError(
@@ -102,18 +83,17 @@ class DepthFolder:
             )
         try:
             with np.load(path, allow_pickle=False) as file:
-                held: dict[str, Any] = {name: file[name] for name in file.files}
-            depth = tuple(held[f"depth_{k:02}"].astype(np.float32) for k in range(len(held["K"])))
-            found = MotionDepth(depth, str(held["words"]))
-            fits = int(held["format"]) == _FORMAT and _same(held, rig, depth)
-            found_from = held["neighbours"].tolist() if fits else []
+                arrays: dict[str, Any] = {name: file[name] for name in file.files}
+            depth = tuple(arrays[f"depth_{k:02}"].astype(np.float32) for k in range(len(arrays["K"])))
+            words, fits = str(arrays["words"]), int(arrays["format"]) == _FORMAT and _fits(arrays, rig, depth)
+            neighbours = arrays["neighbours"].tolist() if fits else []
         except (*BROKEN_ARRAY, KeyError, TypeError) as error:
             raise DataError(f"{path}: expected depth from motion, got {type(error).__name__}; delete it") from None
         if not fits:
             raise DataError(
                 f"{path}: expected depth of this calibration, got another's; delete it and run the depth command again"
             )
-        return found, found_from
+        return MotionDepth(depth, words), neighbours
 
 
 class WithMotionDepth(Dataset[dict[str, Any]]):
@@ -122,9 +102,9 @@ class WithMotionDepth(Dataset[dict[str, Any]]):
     For ``RigRetarget(surface="motion")``; samples need a ``token`` and a ``rig`` (or ``source_rig``).
 
     Args:
-        dataset: Of samples.
-        folder: Where the command wrote: ``motion_depth`` below the data set's root unless it was told otherwise.
-        source_rig: The rig of samples that carry none.
+        dataset: Map-style dataset of samples.
+        folder: Output folder of the command, by default ``motion_depth`` below the data set's root.
+        source_rig: Rig of samples without one.
 
     Raises:
         DataError: On access, a file that is missing, broken or of another calibration.
@@ -148,14 +128,14 @@ class WithMotionDepth(Dataset[dict[str, Any]]):
 
 
 def _calibration(rig: Rig) -> dict[str, Any]:
-    small = [motion_camera(camera) for camera in rig]
-    return {"K": np.stack([camera.K for camera in small]), "cam2ego": np.stack([camera.cam2ego for camera in small])}
+    cameras = [motion_camera(camera) for camera in rig]
+    return {"K": np.stack([camera.K for camera in cameras]), "cam2ego": np.stack([c.cam2ego for c in cameras])}
 
 
-def _same(held: Mapping[str, Any], rig: Rig, depth: tuple[Layer, ...]) -> bool:
-    small, now = [motion_camera(camera) for camera in rig], _calibration(rig)
+def _fits(arrays: Mapping[str, Any], rig: Rig, depth: tuple[Layer, ...]) -> bool:
+    calibration = _calibration(rig)
     return (
-        [one.shape for one in depth] == [camera.size for camera in small]
-        and np.allclose(held["K"], now["K"], rtol=0, atol=_SAME_PX)
-        and np.allclose(held["cam2ego"], now["cam2ego"], rtol=0, atol=_SAME_POSE)
+        [layer.shape for layer in depth] == [motion_camera(camera).size for camera in rig]
+        and np.allclose(arrays["K"], calibration["K"], rtol=0, atol=_SAME_PX)
+        and np.allclose(arrays["cam2ego"], calibration["cam2ego"], rtol=0, atol=_SAME_POSE)
     )

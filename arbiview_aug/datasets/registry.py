@@ -1,4 +1,4 @@
-"""Readers by kind, and the reader that fits a folder."""
+"""Table of readers, and the choice of one for a folder."""
 
 from __future__ import annotations
 
@@ -18,11 +18,10 @@ class Reader:
     """One kind of data set.
 
     Attributes:
-        description: A folder of this kind, for messages and help texts.
+        description: Such a folder, for messages and help texts.
         recognises: Whether a folder is of this kind.
-        open: The dataset of a folder, by the keywords ``version``, ``reduce`` and ``neighbours`` of ``open_data``.
-            Commands need ``len`` and ``dataset[index]``; a ``Recording`` also serves ``convert`` and ``depth``.
-        writer: Module and class, as ``module:Class``, that ``convert`` writes this kind with; None where it cannot.
+        open: Opens a folder, given the keywords ``version``, ``reduce`` and ``neighbours`` of ``open_data``.
+        writer: Subclass of ``cli.convert.writer.Writer`` as ``module:Class``; None if ``convert`` cannot write it.
     """
 
     description: str
@@ -45,11 +44,11 @@ READERS = {
         writer="arbiview_aug.cli.convert.nuscenes:NuScenes",
     ),
 }
-"""Every kind of data set, by its name in ``KIND:PATH``. A folder that could be several is the first of them."""
+"""Every kind of data set, by its name in ``KIND:PATH``; the first one that recognises a folder opens it."""
 
 
 def split_kind(data: str | Path) -> tuple[str | None, Path]:
-    """Kind and folder of ``KIND:PATH``; the kind is None where only a path is given."""
+    """Split ``KIND:PATH`` into kind and folder; the kind of a bare path is None."""
     kind, colon, folder = str(data).partition(":")
     return (kind, Path(folder)) if colon and folder and kind in READERS else (None, Path(data))
 
@@ -60,20 +59,12 @@ def data_name(data: str | Path) -> str:
 
 
 def kinds_of(root: Path) -> list[str]:
-    """All kinds of data set that a folder could be."""
+    """All kinds whose readers recognise a folder."""
     return [kind for kind, reader in READERS.items() if reader.recognises(root)]
 
 
 def find_reader(data: str | Path, kind: str | None = None) -> tuple[Path, Reader]:
-    """A data set's folder and its reader.
-
-    Args:
-        data: ``PATH`` or ``KIND:PATH``.
-        kind: A key of ``READERS``; by default that of ``KIND:PATH``, else the first one that fits.
-
-    Raises:
-        DataError: There is no such folder, or no reader fits it.
-    """
+    """Find a data set's folder and its reader; arguments and errors as for ``open_data``."""
     named, root = split_kind(data)
     kind = kind or named
     if kind is not None and kind not in READERS:
@@ -100,9 +91,9 @@ def open_data(
 
     Args:
         data: ``PATH`` or ``KIND:PATH``, such as ``nuscenes:/data/nuscenes``: a frame folder, a folder of such folders,
-            or a nuScenes root. A path alone that could be several kinds is the first of ``READERS``.
+            or a nuScenes root. A bare path is opened by the first of ``READERS`` that recognises it.
         kind: A key of ``READERS``, instead of ``KIND:``.
-        version: nuScenes' folder of tables; by default v1.0-mini or v1.0-trainval, else the first there is.
+        version: nuScenes' folder of tables; by default v1.0-mini or v1.0-trainval, else the first one.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size.
         neighbours: Which other frames of the drive come with a sample; None for none.
 

@@ -17,15 +17,14 @@ Retarget = Callable[[Any], Any]
 class RetargetedDataset(Dataset[Any]):
     """A map-style dataset whose samples pass through ``retarget``.
 
-    Errors of either pass unchanged. ``__getitems__`` (DataLoader's batched access) uses the dataset's own where it has
-    one.
+    ``__getitems__`` (DataLoader's batched access) uses the dataset's own if it has one.
 
     Args:
-        dataset: With ``__getitem__`` and ``__len__``.
-        retarget: Sample in, sample out: a ``RigRetarget``, or any composition around one.
+        dataset: Map-style dataset.
+        retarget: ``RigRetarget``, or any callable from sample to sample.
 
     Raises:
-        SampleTypeError: ``dataset`` is not map-style, or ``retarget`` cannot be called.
+        SampleTypeError: ``dataset`` is not map-style, or ``retarget`` is not callable.
     """
 
     def __init__(self, dataset: Any, retarget: Retarget) -> None:
@@ -47,23 +46,22 @@ class RetargetedDataset(Dataset[Any]):
 
 
 class MixedDataset(Dataset[Any]):
-    """The same samples untouched and retargeted, mixed by a coin for each item.
+    """Random mix of raw and retargeted versions of the same samples.
 
-    Item ``i`` is ``retargeted[i]`` with probability ``share``, else ``raw[i]``. The coin is thrown by torch's global
-    RNG whenever an item is read: each epoch and each DataLoader worker throws its own, and the same seed repeats them.
-    So samplers, subsets and the length are those of either dataset.
+    Item ``i`` is ``retargeted[i]`` with probability ``share``, else ``raw[i]``, drawn from torch's global RNG on each
+    access. Samplers, subsets and the length are those of either dataset.
 
-    Unlike ``RigRetarget(p=...)``, it lets the two have other numbers of cameras and other keys. ``default_collate``
-    cannot stack such items: use ``DataLoader(..., batch_size=None)`` for single items, or ``collate_fn=list`` for
-    batches that are lists of samples.
+    Unlike with ``RigRetarget(p=...)``, the two may differ in keys and number of cameras. ``default_collate`` cannot
+    stack such items: use ``DataLoader(..., batch_size=None)`` for single items, or ``collate_fn=list`` for batches that
+    are lists of samples.
 
-    The transform within ``retargeted`` does not know that it is mixed. ``RigRetarget(surface="street")`` tells it that
-    cameras may move over the static street.
+    The transform within ``retargeted`` does not know that it is mixed: ``RigRetarget(surface="street")`` allows cameras
+    to move over the static street.
 
     Args:
-        raw: Map-style: the untouched samples.
-        retargeted: Map-style: the same samples in the same order, for example ``RetargetedDataset(raw, retarget)`` or
-            a converted folder.
+        raw: Map-style dataset of untouched samples.
+        retargeted: The same samples in the same order, for example ``RetargetedDataset(raw, retarget)`` or a converted
+            folder.
         share: Expected share of retargeted items, from 0 to 1.
 
     Raises:
@@ -101,11 +99,11 @@ class RetargetedIterable(IterableDataset[Any]):
     ``torch.utils.data.get_worker_info`` gives every sample once per worker, with or without this wrapper.
 
     Args:
-        dataset: With ``__iter__``; started anew by every iteration.
-        retarget: Sample in, sample out: a ``RigRetarget``, or any composition around one.
+        dataset: Iterable dataset, not an iterator: each epoch iterates it anew.
+        retarget: ``RigRetarget``, or any callable from sample to sample.
 
     Raises:
-        SampleTypeError: ``dataset`` is not iterable, or ``retarget`` cannot be called.
+        SampleTypeError: ``dataset`` is not iterable, or ``retarget`` is not callable.
     """
 
     def __init__(self, dataset: Any, retarget: Retarget) -> None:

@@ -31,7 +31,7 @@ SIZE = (64, 176)
 def test_frames_are_picked_by_distance(wanted: Neighbours, expected: list[int]) -> None:
     """It stood still between 3 and 4."""
     travelled_m = np.array([0.0, 1.0, 2.5, 4.0, 4.0, 5.5, 7.0])
-    assert wanted.picked(travelled_m, 4) == expected
+    assert wanted.select(travelled_m, 4) == expected
 
 
 @pytest.mark.parametrize("bad", [{"count": 0}, {"count": 1.5}, {"step_m": 0}, {"step_m": np.nan}, {"direction": "up"}])

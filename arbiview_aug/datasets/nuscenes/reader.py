@@ -1,4 +1,4 @@
-"""nuScenes: keyframes from the v1.0 tables, read here, so that no devkit (and no second cv2 wheel) is needed."""
+"""nuScenes v1.0 keyframes, read without the devkit (which installs a second cv2 wheel)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CAMERA_RING = (
     "CAM_BACK_LEFT",
     "CAM_FRONT_LEFT",
 )
-"""The order of the cameras in a sample, clockwise from above; others follow by name."""
+"""Order of the cameras in a sample, clockwise from above; other cameras follow by name."""
 
 _POINT_FLOATS = 5  # x y z intensity ring
 
@@ -53,18 +53,17 @@ class NuScenesDataset(Recording):
     ``time_s``; with ``load_points`` the ``points`` (P, 5) float32: x y z intensity ring; with ``load_boxes`` the
     ``boxes_3d`` (B, 9) float32: centre, length, width, height in metres, yaw in radians, velocity x y in m/s over the
     ground (NaN where unknown), with ``box_names`` (categories) and ``box_tokens``. The numbers of points and boxes
-    vary: batch with ``batch_size=None`` or a ``collate_fn`` that keeps them as lists. Samples of which no annotation is
-    there at all have no boxes, with a warning.
+    vary: batch with ``batch_size=None`` or a ``collate_fn`` that keeps them as lists. If none of the samples is
+    annotated, they have no boxes, with a warning.
 
-    Cameras and LiDAR record at different times. With ``compensate_ego_motion`` a camera's pose is where the camera was
-    when it recorded, seen from the ego at the LiDAR's time: inv(ego2global at LiDAR time) @ ego2global at camera time
-    @ calibrated_sensor. Without, it is the mounting alone, which at 9 m/s is 0.4 m away from the pixels.
+    Cameras and LiDAR record at different times. With ``compensate_ego_motion`` a camera's pose is that of its exposure
+    in the ego frame at the LiDAR's time: inv(ego2global at LiDAR time) @ ego2global at camera time @ calibrated_sensor.
+    Without, it is the mounting alone, which at 9 m/s is 0.4 m away from the pixels.
 
-    With ``neighbours`` a sample also has other frames of its scene: keyframes, and sweeps, what the cameras recorded
-    between them. The first of ``channels`` decides which: its images in the order of their ``prev``, by the distance
-    that the vehicle came. A sweep has its time and ego pose, and of each other camera the image beside it, posed as
-    above; its boxes are those of the keyframes around it, moved to its time (``Annotations.at_time``). Images are
-    decoded on access.
+    With ``neighbours`` a sample also has other frames of its scene, keyframes and sweeps, by the distance that the
+    vehicle travelled between the images of the first of ``channels``. A sweep has its own time and ego pose, the image
+    of each other camera nearest in time, posed as above, and the boxes interpolated to its time. Images are decoded on
+    access.
 
     All files lie below the root, which may be a link: names and links that leave it are refused when they are read.
 
@@ -74,21 +73,20 @@ class NuScenesDataset(Recording):
     Args:
         root: The folder with ``samples`` and the folder of tables. Either this or ``nusc``.
         version: The folder of tables.
-        nusc: A devkit ``NuScenes`` object that is loaded already; its tables are used.
+        nusc: A loaded devkit ``NuScenes`` object, whose tables are used.
         split_scenes: Names or tokens of the scenes to keep; None keeps all.
-        channels: Camera channels in the order wanted; None takes all of them in the order of ``CAMERA_RING``.
+        channels: Camera channels in the order wanted; None takes all in the order of ``CAMERA_RING``.
         compensate_ego_motion: See above.
         load_points: Whether to read the LiDAR's points.
         load_boxes: Whether to read the boxes.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size; the rig follows (see ``decode_images``).
-        neighbours: Which other frames of the drive come with a sample; None for none. Opening takes half as long
-            again: the sweeps' rows are read too. Where their files are missing altogether, with a warning, only
-            keyframes are neighbours.
+        neighbours: Which other frames of the drive come with a sample; None for none. Sweeps make opening half as long
+            again. If no sweep's file exists, only keyframes are neighbours, with a warning.
 
     Raises:
-        TypeError: ``neighbours`` is something else.
-        DataError: A table that is missing or malformed, a token that leads nowhere, unknown scenes or channels; on
-            access, a file that is missing or broken.
+        TypeError: ``neighbours`` is neither ``Neighbours`` nor None.
+        DataError: A missing or malformed table, a dangling token, unknown scenes or channels; on access, a missing or
+            broken file.
     """
 
     def __init__(
@@ -109,10 +107,8 @@ class NuScenesDataset(Recording):
         check_neighbours(neighbours)
         tables = Tables(root, version, nusc)
         self.root, self.version = tables.root, tables.version
-        self.compensate_ego_motion = compensate_ego_motion
-        self.load_points = load_points
-        self.reduce = reduce
-        self.neighbours = neighbours
+        self.compensate_ego_motion, self.load_points = compensate_ego_motion, load_points
+        self.reduce, self.neighbours = reduce, neighbours
         samples = _chosen_samples(tables, split_scenes)
         self.tokens = [row["token"] for row in samples]
         self.scene_tokens: list[str] = [row["scene_token"] for row in samples]
@@ -125,15 +121,15 @@ class NuScenesDataset(Recording):
         times_s = self._recordings.time_s(self._recordings.keyframes[:, -1])
         self._annotations = read_annotations(tables, self._index, times_s, np.array(scenes)) if load_boxes else None
         if self._annotations is not None and self.tokens and not len(self._annotations.tokens):
-            self._annotations = None  # boxes of nothing would say that nothing stands or moves anywhere
+            self._annotations = None  # an empty list of boxes would mean an empty street
             warnings.warn(
                 f"nuScenes {self.root}: sample_annotation has no rows of these samples (a test split?): they come "
                 "without boxes_3d",
                 stacklevel=2,
             )
-        self._driven = np.empty(0, np.int64) if neighbours is None else self._with_files()
-        positions_m = self._recordings.ego2global(self._driven)[:, :3, 3]
-        self._drive = Drive(positions_m, self._recordings.parts[self._driven])
+        self._drive_rows = np.empty(0, np.int64) if neighbours is None else self._find_drive_rows()
+        positions_m = self._recordings.ego2global(self._drive_rows)[:, :3, 3]
+        self._drive = Drive(positions_m, self._recordings.parts[self._drive_rows])
 
     def files(self, index: int) -> list[Path]:
         """Source files of a sample: each camera's image, then the LiDAR's points."""
@@ -164,30 +160,29 @@ class NuScenesDataset(Recording):
             sample["box_names"] = [self._annotations.categories[k] for k in self._annotations.category[boxes]]
             sample["box_tokens"] = [token.decode() for token in self._annotations.tokens[boxes].tolist()]
         if self.neighbours is not None:
-            place = int(np.searchsorted(self._driven, cameras[0]))
-            near = self._drive.neighbours(place, self.neighbours)
-            sample["neighbours"] = [self._neighbour(int(self._driven[k])) for k in near]
+            frame = int(np.searchsorted(self._drive_rows, cameras[0]))
+            others = self._drive.neighbours(frame, self.neighbours)
+            sample["neighbours"] = [self._neighbour(int(self._drive_rows[k])) for k in others]
         return sample
 
     def _rig(self, cameras: IntArray, ego2global: FloatArray) -> Rig:
-        """The cameras as rows of the recordings, seen from an ego pose."""
-        recordings, global2ego, found = self._recordings, _inverse(ego2global), []
-        moved = global2ego @ recordings.ego2global(cameras)
-        for channel, row, own2ego in zip(self.channels, cameras, moved, strict=True):
+        """Rig of recorded cameras in the frame of an ego pose."""
+        recordings, rig = self._recordings, []
+        own2ego_of_cameras = _inverse(ego2global) @ recordings.ego2global(cameras)
+        for channel, row, own2ego in zip(self.channels, cameras, own2ego_of_cameras, strict=True):
             sensor = recordings.rows["sensor"][row]
             cam2ego, K = recordings.sensor2ego[sensor], recordings.K[sensor]
             if self.compensate_ego_motion:
                 cam2ego = own2ego @ cam2ego
             height_px, width_px = recordings.size(row)
             try:
-                camera = Camera(name=channel, width_px=width_px, height_px=height_px, K=K, cam2ego=cam2ego)
+                rig.append(Camera(name=channel, width_px=width_px, height_px=height_px, K=K, cam2ego=cam2ego))
             except CalibrationError as error:
                 raise CalibrationError(f"nuScenes {self.root}: image {recordings.file(row)}: {error}") from None
-            found.append(camera)
-        return reduced_rig(Rig(found, ground_z_m=0.0, name="nuscenes"), self.reduce)
+        return reduced_rig(Rig(rig, ground_z_m=0.0, name="nuscenes"), self.reduce)
 
     def _file(self, row: int) -> Path:
-        """A recording's file, which must lie below the root."""
+        """Path of a recording's file, which must lie below the root."""
         sample = self.tokens[self._recordings.rows["sample"][row]]
         where = f"nuScenes {self.root} {self.version}: table sample_data: row of sample {sample!r}: filename"
         return inside(self.root, self._recordings.file(row), where)
@@ -201,43 +196,43 @@ class NuScenesDataset(Recording):
         )
 
     # --- other frames of the drive ------------------------------------------------------------------------------------
-    def _with_files(self) -> IntArray:
-        """The first camera's recordings that can be neighbours: all, or where sweeps were not copied, keyframes."""
+    def _find_drive_rows(self) -> IntArray:
+        """Rows of the first camera that can be neighbours: all, or keyframes only if sweeps were not copied."""
         recordings = self._recordings
-        own, key = np.arange(len(recordings.tokens)), recordings.rows["key"]
-        sweeps = np.flatnonzero(~key)
-        _, of_channels = np.unique(recordings.rows["channel"][sweeps], return_index=True)
-        for row in sweeps[of_channels]:
-            folder = (self.root / recordings.file(row)).parent
-            if not os.path.isdir(folder):  # also of names that no folder can have
+        rows, is_key = np.arange(len(recordings.tokens)), recordings.rows["key"]
+        sweeps = np.flatnonzero(~is_key)
+        _, first_of_channels = np.unique(recordings.rows["channel"][sweeps], return_index=True)
+        for sweep in sweeps[first_of_channels]:
+            folder = (self.root / recordings.file(sweep)).parent
+            if not os.path.isdir(folder):  # False for impossible names too
                 warnings.warn(f"nuScenes: {folder}: found no sweeps: only keyframes are neighbours", stacklevel=3)
-                return own[key[own]]
-        return own
+                return rows[is_key[rows]]
+        return rows
 
     def _neighbour(self, row: int) -> LazyFrame:
-        """Another frame of the drive, its images still undecoded; a broken one raises on access."""
+        """Another frame of the drive; its images are decoded on access, where a broken one raises."""
         recordings, record = self._recordings, self._recordings.rows[row]
         sample, is_keyframe = int(record["sample"]), recordings.is_keyframe(row)
         moment = int(recordings.keyframes[sample, -1]) if is_keyframe else row
         ego2global, time_s = recordings.ego2global(moment), float(recordings.time_s(moment))
-        known: dict[str, Any] = {
+        fields: dict[str, Any] = {
             "token": self.tokens[sample] if is_keyframe else recordings.tokens[row].decode(),
             "time_s": time_s,
             "ego2world": torch.from_numpy(ego2global),
         }
         try:
             cameras = recordings.around(row)
-            known["rig"] = self._rig(cameras, ego2global)
+            fields["rig"] = self._rig(cameras, ego2global)
         except ArbiviewError as error:
-            return Unreadable(known, error)
+            return Unreadable(fields, error)
         if self._annotations is not None:
             global2ego = _inverse(ego2global)
             if is_keyframe:
                 boxes = self._annotations.at_sample(sample, global2ego)
             else:
                 boxes = self._annotations.at_time(int(record["scene"]), time_s, global2ego)
-            known["boxes_3d"] = torch.from_numpy(boxes)
-        return LazyFrame(known, partial(self._images, cameras))
+            fields["boxes_3d"] = torch.from_numpy(boxes)
+        return LazyFrame(fields, partial(self._images, cameras))
 
 
 def _inverse(pose: FloatArray) -> FloatArray:
@@ -277,8 +272,8 @@ def _chosen_channels(tables: Tables, channels: Sequence[str] | None) -> list[str
         chosen = list(channels)
     unknown = [channel for channel in chosen if channel not in cameras]
     if unknown or not chosen:
-        known, got = (", ".join(of) or "none" for of in (sorted(cameras), map(repr, unknown)))
-        raise DataError(f"nuScenes {tables.root}: channels: expected some of {known}, got {got}")
+        expected, got = (", ".join(names) or "none" for names in (sorted(cameras), map(repr, unknown)))
+        raise DataError(f"nuScenes {tables.root}: channels: expected some of {expected}, got {got}")
     return chosen
 
 

@@ -1,6 +1,6 @@
 """nuScenes' recordings (``sample_data`` and ``ego_pose``, millions of rows) as columns of numbers.
 
-Rows as objects would take ten times the memory, and be copied into every worker, page by page.
+Rows as Python objects would take ten times the memory, in every worker.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.datasets.drive import went_back
+from arbiview_aug.datasets.drive import clock_message
 from arbiview_aug.datasets.nuscenes.tables import (
     COUNTS,
     FILES,
@@ -31,10 +31,10 @@ from arbiview_aug.datasets.nuscenes.tables import (
 from arbiview_aug.errors import DataError
 
 LIDAR = "LIDAR_TOP"
-"""The sensor whose time and ego pose are the sample's."""
+"""Sensor whose time and ego pose are the sample's."""
 
 MAX_APART_S = 0.1
-"""A camera records every 50 to 100 ms: so the image nearest to a moment is within half of it, unless some are lost."""
+"""Maximum time to a sweep's nearest image; cameras record every 50 to 100 ms."""
 
 IntArray = npt.NDArray[np.int64]
 
@@ -60,16 +60,16 @@ class Recordings:
     """Recordings of all sensors, sorted by channel, scene and time.
 
     Attributes:
-        channels: The cameras; the first one's exposures are the frames of a drive. The LiDAR, of keyframes, is last.
+        channels: The cameras, whose first one times a drive's frames, and last the LiDAR.
         sensor2ego: (C, 4, 4) by calibrated sensor.
         K: (C, 3, 3), the identity for the LiDAR.
         rows: (R,) records of ``_ROW``.
         first: (channels * scenes + 1,) first row of each channel in each scene, and the end.
         keyframes: (S, channels) row of each sample's recording.
-        poses: (E, 7) the ego's x y z and quaternion w x y z in the world.
-        file_names: What stands before the time in a file's name and behind it; None behind a name without the time.
-        tokens: (F,) of the first channel's rows; empty without sweeps.
-        parts: (F,) number of the uninterrupted drive that a row of the first channel belongs to; empty without sweeps.
+        poses: (E, 7) ego poses: x y z and quaternion w x y z, world frame.
+        file_names: File names before and after the time; None after a name without the time.
+        tokens: (F,) tokens of the first channel's rows; empty without sweeps.
+        parts: (F,) numbers of the uninterrupted drives of these rows; empty without sweeps.
     """
 
     channels: list[str]
@@ -84,7 +84,7 @@ class Recordings:
     parts: IntArray
 
     def file(self, row: int) -> str:
-        """A recording's file, below the root."""
+        """Name of a recording's file, relative to the root."""
         head, tail = self.file_names[self.rows["file"][row]]
         return head if tail is None else f"{head}{self.rows['time_us'][row]}{tail}"
 
@@ -93,7 +93,7 @@ class Recordings:
         return int(self.rows["height"][row]), int(self.rows["width"][row])
 
     def ego2global(self, rows: Any) -> FloatArray:
-        """(..., 4, 4) where the ego was when rows (...,) were recorded."""
+        """(..., 4, 4) ego poses of rows (...,)."""
         pose = self.poses[self.rows["pose"][rows]]
         found = np.zeros((*pose.shape[:-1], 4, 4))
         found[..., :3, :3], found[..., :3, 3] = rotation_from_quaternion(pose[..., 3:]), pose[..., :3]
@@ -105,17 +105,16 @@ class Recordings:
         return np.asarray(1e-6 * self.rows["time_us"][rows])
 
     def is_keyframe(self, row: int) -> bool:
-        """True if a row of the first channel is its sample's image."""
+        """Whether a row of the first channel is its sample's image."""
         return bool(self.keyframes[self.rows["sample"][row], 0] == row)
 
     def around(self, row: int) -> IntArray:
-        """(cameras,) the rows that belong to one of the first camera's.
+        """(cameras,) rows of all cameras in the same turn as a row of the first.
 
-        Cameras expose one after the other: of each that row whose distance in time from the first camera's is nearest
-        to what it is in their keyframe.
+        Cameras expose one after the other: the delay to the first camera's exposure is nearest to that of the keyframe.
 
         Raises:
-            DataError: A camera recorded nothing then.
+            DataError: A camera has no image within ``MAX_APART_S``.
         """
         time_us, record = self.rows["time_us"], self.rows[row]
         keyframe_us = time_us[self.keyframes[record["sample"]]]
@@ -134,17 +133,12 @@ class Recordings:
 def read_recordings(
     tables: Tables, samples: Mapping[str, int], scenes: Sequence[int], channels: Sequence[str], sweeps: bool
 ) -> Recordings:
-    """The recordings of some samples and cameras.
+    """Read the recordings of the samples (number by token), which lie in ``scenes``, by the cameras ``channels``.
 
-    Args:
-        tables: The data set.
-        samples: Number of each sample's token.
-        scenes: Number of the scene of each sample.
-        channels: The cameras.
-        sweeps: Whether to read what cameras recorded between the keyframes, nine tenths of two tables.
+    ``sweeps`` also reads the images between keyframes, nine tenths of two tables.
 
     Raises:
-        DataError: Rows that are malformed or lead nowhere; a sample of which a recording is missing.
+        DataError: A malformed row, a dangling token, or a sample that lacks a recording.
     """
     wanted = [*channels, LIDAR]
     calibrated, channel_of, sensor2ego, K = _calibrations(tables, wanted)
@@ -153,7 +147,8 @@ def read_recordings(
     tokens: list[str] = []
     previous: list[str] = []
     parts = [np.empty(0, _ROW)]
-    table, unique = "sample_data", Tokens(tables, "sample_data")
+    table = "sample_data"
+    unique = Tokens(tables, table)
     for batch in tables.batches(table):
         is_key = tables.column(table, batch, "is_key_frame", FLAGS)
         kept = batch if sweeps else [*compress(batch, is_key)]
@@ -175,11 +170,9 @@ def read_recordings(
             part[key] = tables.column(table, kept, key, COUNTS, default=0)  # none for the LiDAR
         of_poses = tables.column(table, kept, "ego_pose_token", TOKENS)
         part["pose"] = [poses.setdefault(token, len(poses)) for token in of_poses]
-        of_files = []
-        for name, time_us in zip(tables.column(table, kept, "filename", FILES), times_us, strict=True):
+        for k, (name, time_us) in enumerate(zip(tables.column(table, kept, "filename", FILES), times_us, strict=True)):
             head, time, tail = name.partition(str(time_us))
-            of_files.append(files.setdefault((head, tail if time else None), len(files)))
-        part["file"] = of_files
+            part["file"][k] = files.setdefault((head, tail if time else None), len(files))
         of_tokens = unique.add(kept)
         if sweeps:
             is_first = part["channel"] == 0
@@ -192,25 +185,26 @@ def read_recordings(
     rows = rows[np.lexsort((rows["time_us"], rows["scene"], rows["channel"]))]
     keyframes = np.full((len(samples), len(wanted)), -1)
     of_keys = rows[rows["key"]]
-    times = np.zeros(keyframes.shape, np.int64)
-    np.add.at(times, (of_keys["sample"], of_keys["channel"]), 1)
-    for k, channel in np.argwhere(times > 1)[:1]:
-        one = f"one keyframe of {wanted[channel]} for sample {list(samples)[k]}"
-        raise tables.error(table, one, str(times[k, channel]), "remove the others")
+    counts = np.zeros(keyframes.shape, np.int64)
+    np.add.at(counts, (of_keys["sample"], of_keys["channel"]), 1)
+    for k, channel in np.argwhere(counts > 1)[:1]:
+        expected = f"one keyframe of {wanted[channel]} for sample {list(samples)[k]}"
+        raise tables.error(table, expected, str(counts[k, channel]), "remove the others")
     keyframes[of_keys["sample"], of_keys["channel"]] = np.flatnonzero(rows["key"])
     for k in np.flatnonzero((keyframes < 0).any(axis=1))[:1]:
         missing = ", ".join(channel for channel, row in zip(wanted, keyframes[k], strict=True) if row < 0)
         raise tables.error("sample_data", f"keyframes of {missing} for sample {list(samples)[k]}", "none")
     count = max(scenes, default=-1) + 1
-    in_order = np.arange(len(wanted) * count + 1)
     order = rows["token"][: len(tokens)]
-    tokens, previous = ([of[k] for k in order] for of in (tokens, previous))
+    tokens, previous = [tokens[k] for k in order], [previous[k] for k in order]
     return Recordings(
         channels=wanted,
         sensor2ego=sensor2ego,
         K=K,
         rows=rows,
-        first=np.searchsorted(rows["channel"].astype(np.int64) * count + rows["scene"], in_order),
+        first=np.searchsorted(
+            rows["channel"].astype(np.int64) * count + rows["scene"], np.arange(len(wanted) * count + 1)
+        ),
         keyframes=keyframes,
         poses=_ego_poses(tables, poses),
         file_names=list(files),
@@ -220,21 +214,20 @@ def read_recordings(
 
 
 def _calibrations(tables: Tables, wanted: Sequence[str]) -> tuple[dict[str, int], list[int], FloatArray, FloatArray]:
-    """Number of each calibrated sensor, -1 where it is not wanted; by number the channels, sensor2ego (C, 4, 4) and K
-    (C, 3, 3)."""
-    sensors = tables.by_token("sensor")
+    """Number of each calibrated sensor, -1 for others such as radars; channels, sensor2ego and K by number."""
     calibrated: dict[str, int] = {}
     rows: list[Row] = []
     channel_of: list[int] = []
-    every = tables.by_token("calibrated_sensor")
-    of_sensors = tables.follow("calibrated_sensor", [*every.values()], "sensor_token", "sensor", sensors)
-    for (token, row), sensor in zip(every.items(), of_sensors, strict=True):
-        channel = sensor["channel"]
-        # Radars are calibrated too: known, so that their tokens are no dangling ones, but not read.
-        calibrated[token] = len(rows) if channel in wanted else -1
-        if channel in wanted:
+    by_token = tables.by_token("calibrated_sensor")
+    sensors = tables.follow(
+        "calibrated_sensor", [*by_token.values()], "sensor_token", "sensor", tables.by_token("sensor")
+    )
+    for (token, row), sensor in zip(by_token.items(), sensors, strict=True):
+        calibrated[token] = -1
+        if sensor["channel"] in wanted:
+            calibrated[token] = len(rows)
             rows.append(row)
-            channel_of.append(wanted.index(channel))
+            channel_of.append(wanted.index(sensor["channel"]))
     sensor2ego = tables.poses("calibrated_sensor", rows)
     K = np.tile(np.eye(3), (len(rows), 1, 1))
     cameras = [k for k, channel in enumerate(channel_of) if wanted[channel] != LIDAR]
@@ -243,32 +236,31 @@ def _calibrations(tables: Tables, wanted: Sequence[str]) -> tuple[dict[str, int]
 
 
 def _ego_poses(tables: Tables, wanted: Mapping[str, int]) -> FloatArray:
-    """(E, 7) poses of tokens, by their numbers."""
+    """(E, 7) poses by number of their tokens."""
     poses = np.full((len(wanted), 7), np.nan)
-    times = np.zeros(len(wanted), np.int64)
+    counts = np.zeros(len(wanted), np.int64)
     for batch in tables.batches("ego_pose"):
         tokens = tables.column("ego_pose", batch, "token", TOKENS)
         is_wanted = [token in wanted for token in tokens]
         rows, at = [*compress(batch, is_wanted)], [wanted[token] for token in compress(tokens, is_wanted)]
-        np.add.at(times, at, 1)
+        np.add.at(counts, at, 1)
         poses[at, :3] = tables.numbers("ego_pose", rows, "translation", (3,))
         poses[at, 3:] = tables.quaternions("ego_pose", rows)
-    for k in np.flatnonzero(times != 1)[:1]:
-        one = f"the token {list(wanted)[k]!r} that a row of sample_data names"
-        raise tables.error("ego_pose", one, f"{times[k]} of them" if times[k] else "none")
+    for k in np.flatnonzero(counts != 1)[:1]:
+        expected = f"the token {list(wanted)[k]!r} that a row of sample_data names"
+        raise tables.error("ego_pose", expected, f"{counts[k]} of them" if counts[k] else "none")
     return poses
 
 
 def _parts(scene: npt.NDArray[Any], tokens: Sequence[str], previous: Sequence[str], where: str) -> IntArray:
-    """(F,) numbers of the uninterrupted drives in recordings of one camera, sorted by scene and time.
+    """(F,) numbers of the uninterrupted drives in one camera's recordings, sorted by scene and time.
 
-    A recording goes on from the one before it where its ``prev`` says so: not at a scene's border, nor where the clock
-    goes back, of which it warns.
+    A drive ends with its scene, at a missing ``prev``, and where the clock goes back (with a warning).
     """
-    place = {token: k for k, token in enumerate(tokens)}
-    before = np.array([place.get(token, -1) for token in previous], np.int64)
+    number_of = {token: k for k, token in enumerate(tokens)}
+    before = np.array([number_of.get(token, -1) for token in previous], np.int64)
     number = np.arange(len(before))
     same_scene = (before >= 0) & (scene[before] == scene)
     for k in np.flatnonzero(same_scene & (before > number)).tolist():
-        warnings.warn(went_back(where, tokens[before[k]], tokens[k]), stacklevel=4)
+        warnings.warn(clock_message(where, tokens[before[k]], tokens[k]), stacklevel=4)
     return np.cumsum(~(same_scene & (before == number - 1)))

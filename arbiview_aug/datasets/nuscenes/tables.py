@@ -1,4 +1,4 @@
-"""The nuScenes v1.0 tables, read a part at a time, and errors that say which table, token and file is at fault."""
+"""The nuScenes v1.0 tables, read in batches, and errors that name table, token and file."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from arbiview_aug.errors import DataError, SampleTypeError
 _QUATERNION_NORM_TOLERANCE = 1e-3
 
 _BATCH = 1 << 10
-"""Rows in memory at once, 1.5 MB of them: the largest tables have 2.6 million."""
+"""Rows in memory at once, 1.5 MB; the largest tables have 2.6 million."""
 
 _BLOCK, _LONGEST_ROW = 1 << 20, 1 << 16
-"""Characters read at once, and more than a row has: it is never cut where a block ends."""
+"""Characters read at once, and an upper bound on a row's, so that no block ends within a row."""
 
 _LONGEST_TOKEN = 255
-"""Characters; nuScenes' own have 32. Files and fixed-width columns are named after tokens."""
+"""Maximum characters of a token, which names files; nuScenes' own have 32."""
 
 _LARGEST_WHOLE, _LARGEST = 2**53, 1e9
-"""Times beyond the first are not exact in float64; positions (m) and pixels beyond the second are no measurements."""
+"""Bounds on whole numbers (exact in float64) and on positions (m) and pixels."""
 
 _SPACE, _DELIMITER = re.compile(r"\s*"), re.compile(r"\s*([,\]])\s*")
 
@@ -40,14 +40,9 @@ Row = Mapping[str, Any]
 
 
 class Kind(NamedTuple):
-    """The values that a column may have.
+    """Type of a column: its description for errors, after the column's name, and a check of a list of values."""
 
-    Attributes:
-        words: They in words, to follow the column's name in errors.
-        holds: Whether all of some values are such: a column is checked at once, and row by row only where it fails.
-    """
-
-    words: str
+    description: str
     holds: Callable[[list[Any]], bool]
 
 
@@ -72,7 +67,7 @@ def _are_whole(values: list[Any]) -> bool:
 
 TEXTS = Kind("as text", _are_texts)
 FILES = Kind("as text", lambda values: {*map(type, values)} <= {str})
-"""Names that no file can have are refused where the file is read or linked (``arbiview_aug.atomic_io.inside``)."""
+"""File names; ``atomic_io.inside`` refuses impossible ones on access."""
 LINKS = Kind("as a token or an empty text", _are_links)
 TOKENS = Kind(f"as a token of 1 to {_LONGEST_TOKEN} letters", lambda values: _are_links(values) and all(values))
 FLAGS = Kind("as true or false", lambda values: {*map(type, values)} <= {bool})
@@ -84,16 +79,11 @@ COUNTS = Kind(
 
 
 class Tables:
-    """The tables of one version, from its JSON files or from a devkit ``NuScenes`` object.
-
-    Args:
-        root: The folder that holds the folder of tables, or None.
-        version: The folder of tables.
-        nusc: The devkit object, or None.
+    """The tables of one version, from its JSON files below ``root`` or from a devkit ``NuScenes`` object.
 
     Raises:
         DataError: No such folder, or both or none of root and nusc.
-        SampleTypeError: ``nusc`` is something else.
+        SampleTypeError: ``nusc`` is no devkit object.
     """
 
     def __init__(self, root: str | Path | None, version: str, nusc: Any) -> None:
@@ -119,11 +109,7 @@ class Tables:
         self.root, self.version = Path(nusc.dataroot), str(getattr(nusc, "version", version))
 
     def path(self, table: str) -> Path:
-        """A table's file.
-
-        Raises:
-            DataError: It is a link that leaves the root.
-        """
+        """Path of a table's file; DataError for a link that leaves the root."""
         return inside(self.root, f"{self.version}/{table}.json", f"nuScenes {self.root}: table {table}")
 
     def rows(self, table: str) -> list[Row]:
@@ -131,10 +117,10 @@ class Tables:
         return [row for batch in self.batches(table) for row in batch]
 
     def batches(self, table: str) -> Iterator[list[Row]]:
-        """The rows of a table, some thousand at a time.
+        """Yield a table's rows in batches.
 
         Raises:
-            DataError: It is missing, or no JSON list of objects.
+            DataError: The table is missing, or no JSON list of objects.
         """
         if self.nusc is not None:
             rows = getattr(self.nusc, table, None)
@@ -154,24 +140,19 @@ class Tables:
         except DataError:
             raise
         except FileNotFoundError:
-            fix = "the version's metadata archive has it"
-            raise self.error(table, f"the file {path}", "none", fix) from None
+            raise self.error(table, f"the file {path}", "none", "the version's metadata archive has it") from None
         except _NoListError as error:
             raise self.error(table, "a list of objects", str(error)) from None
         except (OSError, ValueError, RecursionError) as error:  # no UTF-8, no JSON, or a number of 5,000 digits
-            # Without its place: it is counted from where a block begins.
+            # error.msg, since the error's position counts from the start of a block
             raise self.error(table, "JSON", getattr(error, "msg", str(error)), "unpack the archive again") from None
 
     def row(self, table: str, number: int) -> Row:
-        """One row of a table, by its place."""
+        """Row ``number`` of a table."""
         return next(islice(chain.from_iterable(self.batches(table)), number, None))
 
     def by_token(self, table: str) -> dict[str, Row]:
-        """A table's rows by their tokens.
-
-        Raises:
-            DataError: Tokens that are none, or occur twice.
-        """
+        """A table's rows by token; DataError for invalid or duplicate tokens."""
         rows = self.rows(table)
         tokens = Tokens(self, table)
         found = dict(zip(tokens.add(rows), rows, strict=True))
@@ -179,17 +160,17 @@ class Tables:
         return found
 
     def column(self, table: str, rows: Sequence[Row], key: str, kind: Kind, default: Any = None) -> list[Any]:
-        """The values of one column.
+        """Values of one column, checked at once, and row by row to name the invalid one.
 
         Args:
-            table: Its name, for errors.
-            rows: Some of its rows.
-            key: The column.
-            kind: What its values have to be.
-            default: For rows without the column, or with null in it; None where that is an error.
+            table: Name for errors.
+            rows: Rows of the table.
+            key: Name of the column.
+            kind: Type of the values.
+            default: Replaces missing values and null; with None they are errors.
 
         Raises:
-            DataError: A row whose value is another.
+            DataError: A missing or invalid value.
         """
         try:
             if default is None:
@@ -206,26 +187,23 @@ class Tables:
                 raise self.error(table, f"key {key!r}", f"a row with {', '.join(map(str, row))} (token {token})")
             value = row.get(key, default)
             if not kind.holds([default if value is None and default is not None else value]):
-                raise self.error(table, f"{key} {kind.words}", f"{_short.repr(value)} in row {token}")
-        raise AssertionError("a column holds what none of its values is")
+                raise self.error(table, f"{key} {kind.description}", f"{_short.repr(value)} in row {token}")
+        raise AssertionError("an invalid column has an invalid value")
 
-    def follow(self, table: str, rows: Sequence[Row], key: str, target: str, known: Mapping[str, Any]) -> list[Any]:
-        """The entries of ``known``, of table ``target`` by token, that a column names."""
-        tokens = self.column(table, rows, key, TOKENS)
-        found = [*map(known.get, tokens)]
+    def follow(self, table: str, rows: Sequence[Row], key: str, target: str, entries: Mapping[str, Any]) -> list[Any]:
+        """Look up a column's tokens in ``entries`` of table ``target``."""
+        found = [*map(entries.get, self.column(table, rows, key, TOKENS))]
         if None in found:
-            k = found.index(None)
-            raise self.dangling(table, rows[k], key, target)
+            raise self.dangling(table, rows[found.index(None)], key, target)
         return found
 
     def dangling(self, table: str, row: Row, key: str, target: str) -> DataError:
-        """An error to raise where a row names one of another table that is not there."""
-        token, of = _short.repr(row.get(key)), _short.repr(row.get("token"))
-        fix = f"correct its {key}, or unpack the archive again"
-        return self.error(target, f"the token {token} that row {of} of {table} names", "none", fix)
+        """Make the error for a row that names a missing row of another table."""
+        expected = f"the token {_short.repr(row.get(key))} that row {_short.repr(row.get('token'))} of {table} names"
+        return self.error(target, expected, "none", f"correct its {key}, or unpack the archive again")
 
     def numbers(self, table: str, rows: Sequence[Row], key: str, shape: tuple[int, ...]) -> FloatArray:
-        """(len(rows), *shape) finite numbers of one column."""
+        """(len(rows), *shape) float64 of one column of finite numbers."""
         if not rows:
             return np.empty((0, *shape))
         found: list[npt.NDArray[Any]] = []
@@ -264,26 +242,20 @@ class Tables:
     def error(
         self, table: str, expected: str, got: str, fix: str = "mend the table, or unpack the archive again"
     ) -> DataError:
-        """An error to raise that names data set, version and table."""
+        """Make an error that names data set, version and table."""
         return DataError(f"nuScenes {self.root} {self.version}: table {table}: expected {expected}, got {got}; {fix}")
 
     def _objects(self, table: str, batch: list[Any], first: int) -> list[Row]:
-        if not {*map(type, batch)} <= {dict}:
-            for k, row in enumerate(batch):
-                if not isinstance(row, Mapping):
-                    raise self.error(table, "a list of objects", f"an entry {type(row).__name__}, number {first + k}")
+        for k, row in enumerate(batch if {*map(type, batch)} - {dict} else ()):
+            if not isinstance(row, Mapping):
+                raise self.error(table, "a list of objects", f"an entry {type(row).__name__}, number {first + k}")
         return batch
 
 
 class Tokens:
-    """A column of tokens as 64-bit hashes: of millions, they take a twelfth of the texts' memory.
+    """A column of tokens as 64-bit hashes, in a twelfth of the texts' memory.
 
-    Different tokens have different hashes, but for one in a million tables of millions.
-
-    Args:
-        tables: The data set.
-        table: Whose.
-        key: The column.
+    Tokens of a table of millions collide with a probability of one in a million.
     """
 
     def __init__(self, tables: Tables, table: str, key: str = "token") -> None:
@@ -291,17 +263,13 @@ class Tokens:
         self._hashes = [np.empty(0, np.int64)]
 
     def add(self, rows: Sequence[Row], kind: Kind = TOKENS, default: str | None = None) -> list[str]:
-        """Some more rows, all in the end; gives their tokens, checked as ``Tables.column`` does."""
+        """Append the tokens of more rows and return them, checked as in ``Tables.column``."""
         tokens = self.tables.column(self.table, rows, self.key, kind, default)
         self._hashes.append(np.fromiter(map(hash, tokens), np.int64, len(tokens)))
         return tokens
 
     def check(self) -> None:
-        """Refuse what occurs twice.
-
-        Raises:
-            DataError: It does.
-        """
+        """Raise DataError for duplicate tokens."""
         in_order = np.sort(self._all())
         twice = in_order[1:][in_order[1:] == in_order[:-1]]
         if len(twice):
@@ -309,14 +277,10 @@ class Tokens:
             raise self.tables.error(self.table, "each token once", f"{token!r} twice", "remove one of the rows")
 
     def places_in(self, other: Tokens, or_empty: bool) -> npt.NDArray[np.int64]:
-        """(rows,) the row of another table that each token names, -1 for an empty token.
-
-        Args:
-            other: That table's tokens, each once.
-            or_empty: Whether there may be empty ones.
+        """(rows,) row of another table that each token names, -1 for an empty token, which ``or_empty`` allows.
 
         Raises:
-            DataError: One is not there.
+            DataError: A dangling token.
         """
         wanted, there = self._all(), other._all()
         if not len(there):
@@ -334,19 +298,15 @@ class Tokens:
 
 
 def on_circle(after: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Rows (c,) on circles, one for each row from which a chain does not come to an end.
-
-    Args:
-        after: (n,) the row that each one leads to, -1 for none.
-    """
-    far = np.append(after, -1)  # from -1 on to -1
-    for _ in range(len(after).bit_length()):  # 1, 2, 4, ... rows on: at last more than there are
-        far = far[far]
-    return far[:-1][far[:-1] >= 0]
+    """Find a row on a circle for each endless chain; ``after`` (n,) has the next row of each row, -1 for none."""
+    ahead = np.append(after, -1)  # -1 leads to -1
+    for _ in range(len(after).bit_length()):  # by 1, 2, 4, ... rows, until past the longest chain
+        ahead = ahead[ahead]
+    return ahead[:-1][ahead[:-1] >= 0]
 
 
 def rotation_from_quaternion(wxyz: Any) -> FloatArray:
-    """(..., 3, 3) rotations of quaternions (..., 4) in nuScenes' order w x y z; they are normalised first."""
+    """(..., 3, 3) rotations of quaternions (..., 4) w x y z, normalised first."""
     q = np.asarray(wxyz, dtype=np.float64)
     w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
     rows = (
@@ -358,10 +318,7 @@ def rotation_from_quaternion(wxyz: Any) -> FloatArray:
 
 
 def quaternion_from_rotation(R: FloatArray) -> FloatArray:
-    """(4,) quaternion w x y z of a rotation (3, 3), w not below 0.
-
-    The largest eigenvalue's eigenvector of a symmetric matrix: right for every rotation (Bar-Itzhack 2000).
-    """
+    """(4,) quaternion w x y z, w >= 0, of a rotation (3, 3), stable for every rotation (Bar-Itzhack 2000)."""
     S = np.zeros((4, 4))
     S[1:, 1:] = R + R.T - np.trace(R) * np.eye(3)
     S[0, 1:] = S[1:, 0] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
@@ -371,11 +328,11 @@ def quaternion_from_rotation(R: FloatArray) -> FloatArray:
 
 
 class _NoListError(ValueError):
-    """A file holds JSON, but no list; it says what."""
+    """JSON of another type than a list, named in the message."""
 
 
 def _entries(file: TextIO) -> Iterator[Any]:
-    """The entries of a JSON list, one by one: a table of a gigabyte is never whole in memory."""
+    """Yield the entries of a JSON list without reading a table of a gigabyte at once."""
     decode = json.JSONDecoder().raw_decode
     text, ended = file.read(_BLOCK), False
     at = _SPACE.match(text).end()  # type: ignore[union-attr]  # it matches nothing, too

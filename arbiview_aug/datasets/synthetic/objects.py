@@ -52,7 +52,7 @@ def vehicle_size(rng: np.random.Generator, cls: BoxClass) -> tuple[float, float,
     """Length, width and height in metres."""
     length, width, height = VEHICLE_SIZES[cls]
     # Height is drawn on its own: a detector must not be able to read it off the footprint.
-    return float(rng.uniform(*length)), float(rng.uniform(*width)), float(rng.uniform(*height))
+    return rng.uniform(*length), rng.uniform(*width), rng.uniform(*height)
 
 
 def add_vehicle(
@@ -73,7 +73,7 @@ def add_vehicle(
     reach = (0.68 if cls is BoxClass.TRUCK else 0.62) * x
     arch = (reach, radius, 0.0, 0.0)
     if cls is BoxClass.CAR:
-        waist = float(rng.uniform(0.52, 0.60)) * height
+        waist = rng.uniform(0.52, 0.60) * height
         place.box((-x, x), (-y, y), (0.20, waist), Material.PAINT, paint, taper=(0.10, 0.06, 0.03, 0.03), param=arch)
         rear = float(rng.choice([0.06, 0.3, 0.55])) * length / 2  # estate, hatchback, saloon
         place.box(
@@ -99,8 +99,8 @@ def add_vehicle(
             param=(0.35 if cargo else 1.0, 0, 0, 0),
         )
     elif cls is BoxClass.TRUCK:
-        cab = float(rng.uniform(1.7, 2.2))
-        top = height * float(rng.uniform(0.72, 0.9))
+        cab = rng.uniform(1.7, 2.2)
+        top = height * rng.uniform(0.72, 0.9)
         cab_color = _pick(rng, _PAINTS)
         place.box((x - cab, x), (-y + 0.05, y - 0.05), (0.45, 1.35), Material.PAINT, cab_color)
         place.box(
@@ -121,8 +121,8 @@ def add_pedestrian(
     builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float], yaw: float
 ) -> None:
     """A standing or walking person and their box."""
-    height = float(rng.uniform(1.5, 1.92))
-    length, width = float(rng.uniform(0.34, 0.52)), float(rng.uniform(0.46, 0.60))
+    height = rng.uniform(1.5, 1.92)
+    length, width = rng.uniform(0.34, 0.52), rng.uniform(0.46, 0.60)
     center = np.array([xyz[0], xyz[1], xyz[2] + height / 2])
     row = builder.add_box(center, (length, width, height), yaw, BoxClass.PEDESTRIAN)
     place = builder.place(xyz, yaw, SceneClass.PEDESTRIAN, row)
@@ -151,22 +151,22 @@ def add_tree(
     builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float], *, reach_m: float = math.inf
 ) -> None:
     """Trunk and a crown of several ellipsoids, which reaches out at most ``reach_m`` from the trunk."""
-    place = builder.place(xyz, float(rng.uniform(0, 6.28)), SceneClass.VEGETATION)
-    height, trunk = float(rng.uniform(4.5, 10)), float(rng.uniform(0.09, 0.22))
-    fork = height * float(rng.uniform(0.35, 0.5))
+    place = builder.place(xyz, rng.uniform(0, 6.28), SceneClass.VEGETATION)
+    height, trunk = rng.uniform(4.5, 10), rng.uniform(0.09, 0.22)
+    fork = height * rng.uniform(0.35, 0.5)
     bark = _pick(rng, ((0.30, 0.25, 0.20), (0.36, 0.33, 0.29)), 0.03)
     place.cylinder((0, 0, fork * 0.6), (trunk, trunk), fork * 0.6, Material.ROUGH, bark, param=(0.12, 0.12, 0, 0))
     # No lump reaches further than (0.8 + 0.58) spreads.
-    spread = min((height - fork) * float(rng.uniform(0.38, 0.55)), reach_m / 1.38)
+    spread = min((height - fork) * rng.uniform(0.38, 0.55), reach_m / 1.38)
     green = _pick(rng, ((0.22, 0.31, 0.13), (0.17, 0.26, 0.11), (0.30, 0.33, 0.14), (0.36, 0.28, 0.12)), 0.02)
     for k in range(int(rng.integers(7, 11))):
         # The golden angle spreads the lumps evenly around the trunk.
-        turn, out = 2.4 * k, spread * float(rng.uniform(0.35, 0.8)) * (k > 0)
-        radius = spread * float(rng.uniform(0.36, 0.58)) * (1.25 if k == 0 else 1.0)
-        z = fork + (height - fork) * float(rng.uniform(0.18, 0.80))
+        turn, out = 2.4 * k, spread * rng.uniform(0.35, 0.8) * (k > 0)
+        radius = spread * rng.uniform(0.36, 0.58) * (1.25 if k == 0 else 1.0)
+        z = fork + (height - fork) * rng.uniform(0.18, 0.80)
         place.ellipsoid(
             (out * np.cos(turn), out * np.sin(turn), z),
-            (radius, radius, radius * float(rng.uniform(0.65, 0.95))),
+            (radius, radius, radius * rng.uniform(0.65, 0.95)),
             Material.LEAF,
             green,
         )
@@ -176,18 +176,18 @@ def add_bush(
     builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float], *, scale: float = 1.0
 ) -> None:
     """Low ellipsoids of leaves."""
-    place = builder.place(xyz, float(rng.uniform(0, 6.28)), SceneClass.VEGETATION)
+    place = builder.place(xyz, rng.uniform(0, 6.28), SceneClass.VEGETATION)
     green = _pick(rng, ((0.20, 0.28, 0.13), (0.26, 0.30, 0.15)), 0.02)
     for _ in range(4):
         x, y = rng.normal(0, 0.4 * scale, 2)
-        r, height = scale * float(rng.uniform(0.35, 0.65)), scale * float(rng.uniform(0.35, 0.75))
+        r, height = scale * rng.uniform(0.35, 0.65), scale * rng.uniform(0.35, 0.75)
         place.ellipsoid((float(x), float(y), height * 0.6), (r, r * 0.9, height), Material.LEAF, green)
 
 
 def add_lamp_post(builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float], yaw: float) -> None:
     """A tall pole whose arm (local x) reaches over the road."""
     place = builder.place(xyz, yaw, SceneClass.POLE)
-    height, grey = float(rng.uniform(5.5, 8.5)), float(rng.uniform(0.25, 0.55))
+    height, grey = rng.uniform(5.5, 8.5), rng.uniform(0.25, 0.55)
     metal: Color = (grey, grey, grey * 1.03)
     place.cylinder((0, 0, height / 2), (0.075, 0.075), height / 2, Material.PLAIN, metal)
     place.cylinder((0, 0, 0.5), (0.12, 0.12), 0.5, Material.PLAIN, metal)
@@ -198,11 +198,11 @@ def add_lamp_post(builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[fl
 def add_sign(builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float], yaw: float) -> None:
     """A post with one or two plates that face local -x."""
     place = builder.place(xyz, yaw, SceneClass.POLE)
-    height = float(rng.uniform(2.3, 3.0))
+    height = rng.uniform(2.3, 3.0)
     place.cylinder((0, 0, height / 2), (0.035, 0.035), height / 2, Material.PLAIN, (0.52, 0.53, 0.54))
     colors: tuple[Color, ...] = ((0.78, 0.12, 0.12), (0.10, 0.25, 0.62), (0.85, 0.72, 0.10), (0.90, 0.90, 0.90))
     for k in range(int(rng.integers(1, 3))):
-        w, z = float(rng.uniform(0.25, 0.36)), height - 0.35 - 0.7 * k
+        w, z = rng.uniform(0.25, 0.36), height - 0.35 - 0.7 * k
         place.box((-0.06, -0.04), (-w, w), (z - 0.3, z + 0.3), Material.SIGN, _pick(rng, colors, 0.02))
 
 
@@ -226,9 +226,9 @@ def add_building(
     """A block with windows; detailed ones have a cornice, now and then bays or an awning over the ground floor."""
     place: Placed = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.BUILDING)
     wall = _pick(rng, _WALLS)
-    bay, storey = float(rng.uniform(2.2, 4.2)), float(rng.uniform(2.9, 3.6))
+    bay, storey = rng.uniform(2.2, 4.2), rng.uniform(2.9, 3.6)
     # bay width, storey height, share of the wall that is glass, whether the ground floor is shops
-    param = (bay, storey, float(rng.uniform(0.42, 0.72)), float(rng.random() < 0.55))
+    param = (bay, storey, rng.uniform(0.42, 0.72), float(rng.random() < 0.55))
     place.box(x, y, (base_m - 0.05, height), Material.FACADE, wall, param=param)
     if not detailed:
         return
@@ -241,13 +241,13 @@ def add_building(
     front, outward = (y[0], -1.0) if y[0] > 0 else (y[1], 1.0)
     if param[3] and rng.random() < 0.6:
         cloth = _pick(rng, _CLOTHES)
-        a = float(rng.uniform(x[0] + 0.3, (x[0] + x[1]) / 2))
-        b = min(a + float(rng.uniform(3, 7)), x[1] - 0.2)
-        ends = sorted((front, front + outward * float(rng.uniform(0.8, 1.3))))
+        a = rng.uniform(x[0] + 0.3, (x[0] + x[1]) / 2)
+        b = min(a + rng.uniform(3, 7), x[1] - 0.2)
+        ends = sorted((front, front + outward * rng.uniform(0.8, 1.3)))
         place.box((a, b), (ends[0], ends[1]), (2.75, 3.0), Material.ROUGH, cloth, param=(0.4, 0.1, 0, 0))
     if height > 9 and rng.random() < 0.4:
         for _ in range(int(rng.integers(1, 3))):
-            a = float(rng.uniform(x[0] + 0.5, max(x[0] + 0.6, x[1] - 3.5)))
+            a = rng.uniform(x[0] + 0.5, max(x[0] + 0.6, x[1] - 3.5))
             ends = sorted((front, front + outward * 0.7))
             place.box((a, min(a + 2.6, x[1])), (ends[0], ends[1]), (storey, height * 0.85), Material.FACADE, wall,
                       param=(2.6, storey, 0.7, 0.0))  # fmt: skip
@@ -257,7 +257,7 @@ def add_barrier(
     builder: SceneBuilder, rng: np.random.Generator, x: Range, y: Range, base_m: float, *, hedge: bool
 ) -> None:
     """A garden wall or a hedge between buildings."""
-    height = base_m + float(rng.uniform(0.9, 1.4 if hedge else 2.0))
+    height = base_m + rng.uniform(0.9, 1.4 if hedge else 2.0)
     if hedge:
         place = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.VEGETATION)
         place.box(x, y, (base_m - 0.05, height), Material.LEAF, _pick(rng, ((0.19, 0.27, 0.12),), 0.02))

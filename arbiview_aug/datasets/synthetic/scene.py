@@ -8,14 +8,18 @@ the road at ``ego2street``. Two kinds of primitive suffice: boxes with slanted s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+Range = tuple[float, float]
+Vector = tuple[float, float, float]
+Param = tuple[float, float, float, float]
 
 
 class SceneClass(IntEnum):
@@ -68,11 +72,11 @@ class Street:
     lanes: int
     """Lanes in each direction; traffic keeps to the right."""
     lane_width_m: float
-    half_width_m: tuple[float, float]
+    half_width_m: Range
     """Road edge to the right (y < 0) and to the left (y > 0), both positive."""
     parking: tuple[bool, bool]
-    sidewalk_m: tuple[float, float]
-    verge_m: tuple[float, float]
+    sidewalk_m: Range
+    verge_m: Range
     """Width of the grass between kerb and paving; 0 for none."""
     kerb_m: float
     crossing_x_m: float
@@ -91,10 +95,10 @@ class Street:
 class Light:
     """Sun and sky: directions in the street frame, colours in display units, 0 to 1."""
 
-    sun: tuple[float, float, float]
+    sun: Vector
     sun_strength: float
-    zenith: tuple[float, float, float]
-    horizon: tuple[float, float, float]
+    zenith: Vector
+    horizon: Vector
     clouds: float
 
 
@@ -115,7 +119,7 @@ class Scene:
         boxes: (B, 7) centre x y z, length, width, height, yaw (radians), street frame.
         box_classes: (B,) ``BoxClass``.
         velocities: (B, 2) of the boxes, m/s, street frame.
-        speed_mps: Of the vehicle, straight ahead.
+        speed_mps: Speed of the vehicle, straight ahead.
         ego2street: (4, 4) pose of the vehicle, its road plane at z = 0.
         salt: Seed of the textures.
     """
@@ -154,10 +158,10 @@ class Scene:
         return boxes
 
     def after(self, seconds: float) -> Scene:
-        """The scene so much later (or earlier): the vehicle and what has a velocity have moved, straight on."""
+        """The scene at a later (or earlier) time: the vehicle and everything with a velocity moved straight on."""
         ego2street = self.ego2street.copy()
         ego2street[:3, 3] += self.speed_mps * seconds * ego2street[:3, 0]
-        moves = np.zeros((len(self.boxes) + 1, 3))  # the last one is what belongs to no box
+        moves = np.zeros((len(self.boxes) + 1, 3))  # the last row serves primitives without a box
         moves[:-1, :2] = self.velocities * seconds
         move = moves[self.instance]
         planes, boxes = self.planes.copy(), self.boxes.copy()
@@ -173,6 +177,7 @@ class Scene:
         )
 
 
+_ZEROS = (0.0, 0.0, 0.0, 0.0)
 _SIGNS = np.array([[x, y, z] for x in (1, -1) for y in (1, -1) for z in (1, -1)], dtype=np.float64)
 
 
@@ -182,138 +187,123 @@ def yaw_matrix(yaw: float) -> FloatArray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-@dataclass
 class SceneBuilder:
-    """Collects primitives and boxes; parts may be given relative to a placed object."""
+    """Collects primitives and boxes; parts are given relative to a placed object."""
 
-    kind: list[int] = field(default_factory=list)
-    center: list[FloatArray] = field(default_factory=list)
-    rotation: list[FloatArray] = field(default_factory=list)
-    half: list[FloatArray] = field(default_factory=list)
-    planes: list[FloatArray] = field(default_factory=list)
-    corners: list[FloatArray] = field(default_factory=list)
-    material: list[int] = field(default_factory=list)
-    cls: list[int] = field(default_factory=list)
-    instance: list[int] = field(default_factory=list)
-    color: list[tuple[float, float, float]] = field(default_factory=list)
-    param: list[tuple[float, float, float, float]] = field(default_factory=list)
-    boxes: list[tuple[float, ...]] = field(default_factory=list)
-    box_classes: list[int] = field(default_factory=list)
+    def __init__(self) -> None:
+        self.primitives: list[dict[str, Any]] = []
+        self.boxes: list[tuple[float, ...]] = []
+        self.box_classes: list[int] = []
 
-    def place(self, origin: tuple[float, float, float], yaw: float, cls: SceneClass, instance: int = -1) -> Placed:
+    def place(self, origin: Vector, yaw: float, cls: SceneClass, instance: int = -1) -> Placed:
         """A frame (origin on the surface it stands on, x forward) to add parts in."""
-        return Placed(self, np.array(origin, dtype=np.float64), yaw_matrix(yaw), int(cls), instance)
+        return Placed(self, np.array(origin, dtype=np.float64), yaw_matrix(yaw), cls, instance)
 
-    def add_box(self, center: FloatArray, size: tuple[float, float, float], yaw: float, cls: BoxClass) -> int:
-        """A 3D label; returns its row."""
+    def add_box(self, center: FloatArray, size: Vector, yaw: float, cls: BoxClass) -> int:
+        """Add a 3D label; returns its row."""
         self.boxes.append((*map(float, center), *size, yaw))
-        self.box_classes.append(int(cls))
+        self.box_classes.append(cls)
         return len(self.boxes) - 1
 
-    def arrays(self) -> dict[str, npt.NDArray]:
-        """The collected lists in ``Scene``'s shapes."""
-        integer = {"kind", "material", "cls", "instance", "box_classes"}
-        out = {f.name: np.array(getattr(self, f.name)) for f in fields(self)}
-        out = {k: v.astype(np.int64 if k in integer else np.float64) for k, v in out.items()}
-        out["boxes"] = out["boxes"].reshape(-1, 7)
-        return out
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """The collected rows in ``Scene``'s shapes."""
+        columns = {name: [row[name] for row in self.primitives] for name in self.primitives[0]}
+        integer = {"kind", "material", "cls", "instance"}
+        return {
+            **{name: np.array(column, np.int64 if name in integer else np.float64) for name, column in columns.items()},
+            "boxes": np.array(self.boxes, np.float64).reshape(-1, 7),
+            "box_classes": np.array(self.box_classes, np.int64),
+        }
 
 
 @dataclass
 class Placed:
-    """Adds parts of one object in the object's own frame."""
+    """Adds parts of one object in the object's own frame; the meaning of ``param`` is the material's."""
 
     builder: SceneBuilder
     origin: FloatArray
     rotation: FloatArray
-    cls: int
+    cls: SceneClass
     instance: int
 
     def box(
         self,
-        x: tuple[float, float],
-        y: tuple[float, float],
-        z: tuple[float, float],
+        x: Range,
+        y: Range,
+        z: Range,
         material: Material,
-        color: tuple[float, float, float],
+        color: Vector,
         *,
-        taper: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
-        param: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
+        taper: Param = _ZEROS,
+        param: Param = _ZEROS,
     ) -> None:
-        """A box from its bounds; ``taper``: how far front, rear, left and right lean inward at the top, metres."""
-        lo, hi = np.array([x[0], y[0], z[0]]), np.array([x[1], y[1], z[1]])
-        half, middle = (hi - lo) / 2, (hi + lo) / 2
+        """Add a box from its bounds; ``taper``: how far front, rear, left and right lean inward at the top, metres."""
+        lo, hi = np.array([x, y, z], np.float64).T
+        half = (hi - lo) / 2
         hx, hy, hz = half
-        kf, kr, kl, kt = taper
+        front, rear, left, right = taper
         normals = np.array(
-            [[2 * hz, 0, kf], [-2 * hz, 0, kr], [0, 2 * hz, kl], [0, -2 * hz, kt], [0, 0, 1], [0, 0, -1]]
+            [[2 * hz, 0, front], [-2 * hz, 0, rear], [0, 2 * hz, left], [0, -2 * hz, right], [0, 0, 1], [0, 0, -1]]
         )
-        offsets = np.array([2 * hx - kf, 2 * hx - kr, 2 * hy - kl, 2 * hy - kt, 1, 1]) * hz
+        offsets = np.array([2 * hx - front, 2 * hx - rear, 2 * hy - left, 2 * hy - right, 1, 1]) * hz
         norm = np.linalg.norm(normals, axis=1)
-        normals, offsets = normals / norm[:, None], offsets / norm
         corners = _SIGNS * half
         top = corners[:, 2] > 0
-        corners[:, 0] -= np.where(top, np.where(corners[:, 0] > 0, kf, -kr), 0)
-        corners[:, 1] -= np.where(top, np.where(corners[:, 1] > 0, kl, -kt), 0)
-        self._add(BOX, middle, np.eye(3), half, normals, offsets, corners, material, color, param)
+        corners[:, 0] -= np.where(top, np.where(corners[:, 0] > 0, front, -rear), 0)
+        corners[:, 1] -= np.where(top, np.where(corners[:, 1] > 0, left, -right), 0)
+        planes = np.concatenate([normals, offsets[:, None]], axis=1) / norm[:, None]
+        self._add(BOX, (hi + lo) / 2, half, material, color, param, corners=corners, planes=planes)
 
-    def ellipsoid(
-        self,
-        center: tuple[float, float, float],
-        radii: tuple[float, float, float],
-        material: Material,
-        color: tuple[float, float, float],
-        *,
-        param: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
-    ) -> None:
-        """An ellipsoid along the object's axes."""
-        half = np.array(radii)
-        self._add(ELLIPSOID, np.array(center), np.eye(3), half, None, None, _SIGNS * half, material, color, param)
+    def ellipsoid(self, center: Vector, radii: Vector, material: Material, color: Vector) -> None:
+        """Add an ellipsoid along the object's axes."""
+        self._add(ELLIPSOID, np.array(center), np.array(radii), material, color)
 
     def cylinder(
         self,
-        center: tuple[float, float, float],
-        radii: tuple[float, float],
+        center: Vector,
+        radii: Range,
         half_length: float,
         material: Material,
-        color: tuple[float, float, float],
+        color: Vector,
         *,
         lateral: bool = False,
-        param: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
+        param: Param = _ZEROS,
     ) -> None:
-        """A capped elliptic cylinder, upright or (wheels) with its axis along the object's y."""
-        half = np.array([*radii, half_length])
-        axes = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]).T if lateral else np.eye(3)
-        self._add(CYLINDER, np.array(center), axes, half, None, None, _SIGNS * half, material, color, param)
+        """Add a capped elliptic cylinder, upright or (wheels) with its axis along the object's y."""
+        axes = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]) if lateral else np.eye(3)
+        self._add(CYLINDER, np.array(center), np.array([*radii, half_length]), material, color, param, axes=axes)
 
     def _add(
         self,
         kind: int,
         middle: FloatArray,
-        axes: FloatArray,
         half: FloatArray,
-        normals: FloatArray | None,
-        offsets: FloatArray | None,
-        corners: FloatArray,
         material: Material,
-        color: tuple[float, float, float],
-        param: tuple[float, float, float, float],
+        color: Vector,
+        param: Param = _ZEROS,
+        *,
+        axes: FloatArray | None = None,
+        corners: FloatArray | None = None,
+        planes: FloatArray | None = None,
     ) -> None:
-        b = self.builder
-        rotation = self.rotation @ axes
+        rotation = self.rotation @ (np.eye(3) if axes is None else axes)
         center = self.origin + self.rotation @ middle
-        planes = np.zeros((6, 4))
-        if normals is not None and offsets is not None:
-            planes[:, :3] = normals @ rotation.T
-            planes[:, 3] = offsets + planes[:, :3] @ center
-        b.kind.append(kind)
-        b.center.append(center)
-        b.rotation.append(rotation)
-        b.half.append(half)
-        b.planes.append(planes)
-        b.corners.append(center + corners @ rotation.T)
-        b.material.append(int(material))
-        b.cls.append(self.cls)
-        b.instance.append(self.instance)
-        b.color.append(color)
-        b.param.append(param)
+        world_planes = np.zeros((6, 4))
+        if planes is not None:
+            world_planes[:, :3] = planes[:, :3] @ rotation.T
+            world_planes[:, 3] = planes[:, 3] + world_planes[:, :3] @ center
+        self.builder.primitives.append(
+            {
+                "kind": kind,
+                "center": center,
+                "rotation": rotation,
+                "half": half,
+                "planes": world_planes,
+                "corners": center + (_SIGNS * half if corners is None else corners) @ rotation.T,
+                "material": material,
+                "cls": self.cls,
+                "instance": self.instance,
+                "color": color,
+                "param": param,
+            }
+        )

@@ -11,6 +11,7 @@ from arbiview_aug.datasets.synthetic.scene import (
     BoxClass,
     Light,
     Material,
+    Range,
     Scene,
     SceneBuilder,
     SceneClass,
@@ -18,9 +19,8 @@ from arbiview_aug.datasets.synthetic.scene import (
     yaw_matrix,
 )
 
-CLEAR_X_M = (-3.0, 6.5)
-CLEAR_Y_M = 2.2
-"""Nothing stands in this rectangle of the ego frame, so that no camera of any sensible rig is inside an object."""
+CLEAR_X_M, CLEAR_Y_M = (-3.0, 6.5), 2.2
+"""Rectangle of the ego frame without objects, so that no camera of any sensible rig is inside one."""
 
 END_M = 260.0
 BLOCK_DEPTH_M = 140.0
@@ -31,16 +31,18 @@ _MOVING_SHARES = (0.62, 0.18, 0.14, 0.06)
 _PARKED_SHARES = (0.76, 0.19, 0.05, 0.0)
 _SPEED_MPS = (6.0, 14.0)
 _WAITING = 0.2
-"""Share that stands still of the people and of the traffic in other directions."""
+"""Share of the people and of the traffic in other directions that stands still."""
 
 
 def make_scene(seed: int, index: int) -> Scene:
-    """The scene number ``index`` of the world ``seed``; the same arguments give the same scene on any machine."""
+    """Build scene ``index`` of the world ``seed``; the same arguments give the same scene on any machine."""
     rng = np.random.default_rng(np.random.SeedSequence([seed, index]))
     street, ego2street = _layout(rng)
     world = _World(rng, street, ego2street)
     world.add_blocks()
     world.add_buildings()
+    world.add_background()
+    world.add_street_ends()
     world.add_parked()
     parked = len(world.builder.boxes)
     world.add_moving()
@@ -65,11 +67,11 @@ def _motion(seed: np.random.SeedSequence, builder: SceneBuilder, parked: int) ->
     Traffic in the vehicle's direction keeps about its speed, so that it stays off the place before and behind it.
     """
     rng = np.random.default_rng(seed)
-    speed_mps = float(rng.uniform(*_SPEED_MPS))
+    speed_mps = rng.uniform(*_SPEED_MPS)
     velocities = np.zeros((len(builder.boxes), 2))
     for row, (box, cls) in enumerate(zip(builder.boxes, builder.box_classes, strict=True)):
         yaw, walks = box[6], cls == BoxClass.PEDESTRIAN
-        own = float(rng.uniform(0.8, 1.7)) if walks else speed_mps * float(rng.uniform(0.9, 1.1))
+        own = rng.uniform(0.8, 1.7) if walks else speed_mps * rng.uniform(0.9, 1.1)
         waits = rng.random() < _WAITING and math.cos(yaw) < 0.5
         if row >= parked and not waits:
             velocities[row] = own * math.cos(yaw), own * math.sin(yaw)
@@ -78,39 +80,36 @@ def _motion(seed: np.random.SeedSequence, builder: SceneBuilder, parked: int) ->
 
 def _layout(rng: np.random.Generator) -> tuple[Street, np.ndarray]:
     lanes = int(rng.choice([1, 1, 2]))
-    lane_width = float(rng.uniform(3.0, 3.6))
-    parking = (bool(rng.random() < 0.65), bool(rng.random() < 0.65))
-    half = tuple(lanes * lane_width + (2.3 if p else float(rng.uniform(0.3, 0.8))) for p in parking)
-    crossing = math.inf
-    if rng.random() < 0.55:
-        crossing = float(rng.uniform(17, 50) * rng.choice([1, 1, -1]))
+    lane_width = rng.uniform(3.0, 3.6)
+    parking = (rng.random() < 0.65, rng.random() < 0.65)
+    right, left = (lanes * lane_width + (2.3 if parks else rng.uniform(0.3, 0.8)) for parks in parking)
+    crossing = float(rng.uniform(17, 50) * rng.choice([1, 1, -1])) if rng.random() < 0.55 else math.inf
     street = Street(
         lanes=lanes,
         lane_width_m=lane_width,
-        half_width_m=(half[0], half[1]),
+        half_width_m=(right, left),
         parking=parking,
-        sidewalk_m=(float(rng.uniform(2.6, 5.5)), float(rng.uniform(2.6, 5.5))),
-        verge_m=tuple(float(rng.uniform(0.9, 1.5)) if rng.random() < 0.4 else 0.0 for _ in range(2)),  # type: ignore[arg-type]
-        kerb_m=float(rng.uniform(0.10, 0.14)),
+        sidewalk_m=(rng.uniform(2.6, 5.5), rng.uniform(2.6, 5.5)),
+        verge_m=tuple(rng.uniform(0.9, 1.5) if rng.random() < 0.4 else 0.0 for _ in range(2)),  # type: ignore[arg-type]
+        kerb_m=rng.uniform(0.10, 0.14),
         crossing_x_m=crossing,
-        crossing_half_m=float(rng.uniform(4, 7.5)),
-        zebra=bool(rng.random() < 0.7),
-        solid_centre=bool(rng.random() < 0.5),
-        yellow_centre=bool(rng.random() < 0.25),
-        asphalt=float(rng.uniform(0.30, 0.46)),
-        wear=float(rng.uniform(0.6, 1.4)),
+        crossing_half_m=rng.uniform(4, 7.5),
+        zebra=rng.random() < 0.7,
+        solid_centre=rng.random() < 0.5,
+        yellow_centre=rng.random() < 0.25,
+        asphalt=rng.uniform(0.30, 0.46),
+        wear=rng.uniform(0.6, 1.4),
     )
     lane = int(rng.integers(lanes))
-    y = -(lane + 0.5) * lane_width + float(rng.uniform(-0.25, 0.25))
     ego2street = np.eye(4)
-    ego2street[:3, :3] = yaw_matrix(math.radians(float(np.clip(rng.normal(0, 2), -5, 5))))
-    ego2street[1, 3] = y
+    ego2street[1, 3] = -(lane + 0.5) * lane_width + rng.uniform(-0.25, 0.25)
+    ego2street[:3, :3] = yaw_matrix(math.radians(np.clip(rng.normal(0, 2), -5, 5)))
     return street, ego2street
 
 
 def _light(rng: np.random.Generator) -> Light:
     azimuth, elevation = rng.uniform(0, 2 * math.pi), math.radians(rng.uniform(32, 65))
-    sun = (math.cos(azimuth) * math.cos(elevation), math.sin(azimuth) * math.cos(elevation), math.sin(elevation))
+    flat = math.cos(elevation)
     strength = float(rng.choice([0.0, rng.uniform(0.2, 0.5), rng.uniform(0.5, 0.9)]))
     grey = np.array([0.74, 0.77, 0.80]) + rng.normal(0, 0.02, 3)
     blue = np.array([0.30, 0.48, 0.78]) + rng.normal(0, 0.03, 3)
@@ -118,16 +117,16 @@ def _light(rng: np.random.Generator) -> Light:
     zenith = (grey * (1 - clear) + blue * clear).clip(0, 1)
     horizon = (grey * 0.35 + np.array([0.80, 0.85, 0.90]) * 0.65).clip(0, 1)
     return Light(
-        sun=sun,
+        sun=(math.cos(azimuth) * flat, math.sin(azimuth) * flat, math.sin(elevation)),
         sun_strength=strength,
         zenith=tuple(map(float, zenith)),  # type: ignore[arg-type]
         horizon=tuple(map(float, horizon)),  # type: ignore[arg-type]
-        clouds=float(rng.uniform(0.3, 1.0)),
+        clouds=rng.uniform(0.3, 1.0),
     )
 
 
 class _World:
-    """One scene while it is being filled; each method draws from the same generator in a fixed order."""
+    """A scene under construction; all methods draw from one generator, in a fixed order."""
 
     def __init__(self, rng: np.random.Generator, street: Street, ego2street: np.ndarray) -> None:
         self.rng = rng
@@ -146,25 +145,21 @@ class _World:
             for a in (-length / 2, 0, length / 2)
             for b in (-width / 2, width / 2)
         ]
-        R, origin = self.ego2street[:2, :2], self.ego2street[:2, 3]
-        ego = (np.array(ends) - origin) @ R
+        ego = (np.array(ends) - self.ego2street[:2, 3]) @ self.ego2street[:2, :2]
         lo, hi = ego.min(0), ego.max(0)
         if hi[0] > CLEAR_X_M[0] and lo[0] < CLEAR_X_M[1] and hi[1] > -CLEAR_Y_M and lo[1] < CLEAR_Y_M:
             return False
-        # Discs along the length bound the footprint closely enough for lanes side by side.
-        discs = [(x + c * a, y + s * a, width / 2) for a in np.linspace(-0.5, 0.5, 5) * max(0.0, length - width)]
+        discs = _discs(x, y, length, width, yaw)
         return all(math.hypot(x - u, y - v) > r + q + 0.12 for x, y, r in discs for u, v, q in self.taken)
 
     def add_vehicle(self, shares: tuple[float, ...], x: float, y: float, yaw: float) -> float:
-        """Adds one if there is room; returns its length either way."""
+        """Add a vehicle if there is room; returns its length either way."""
         cls = BoxClass(int(self.rng.choice(_KINDS, p=shares)))
         size = objects.vehicle_size(self.rng, cls)
         length, width, _ = size
         if self.is_clear(x, y, length, width, yaw):
             objects.add_vehicle(self.builder, self.rng, cls, size, (x, y), yaw)
-            c, s = math.cos(yaw), math.sin(yaw)
-            for a in np.linspace(-0.5, 0.5, 5) * max(0.0, length - width):
-                self.taken.append((x + c * a, y + s * a, width / 2))
+            self.taken += _discs(x, y, length, width, yaw)
         return length
 
     def at_crossing(self, x: float, margin: float) -> bool:
@@ -175,81 +170,85 @@ class _World:
         """y at a distance behind the kerb of the right (-1) or left (1) side."""
         return side * (self.street.half_width_m[side > 0] + from_kerb)
 
+    def band_y(self, side: int, start: float, end: float) -> Range:
+        """y range between two distances behind the kerb."""
+        return _span(self.side_y(side, start), self.side_y(side, end))
+
     def add_blocks(self) -> None:
         """The raised land on both sides of the road: kerb, verge, paving, yards."""
         place = self.builder.place((0, 0, 0), 0.0, SceneClass.SIDEWALK)
         for side in (-1, 1):
-            ys = sorted((self.side_y(side, 0), side * BLOCK_DEPTH_M))
+            y = _span(self.side_y(side, 0), side * BLOCK_DEPTH_M)
             for x in self.blocks:
-                place.box(x, (ys[0], ys[1]), (-0.5, self.street.kerb_m), Material.SLAB, (0.52, 0.51, 0.49))
+                place.box(x, y, (-0.5, self.street.kerb_m), Material.SLAB, (0.52, 0.51, 0.49))
 
     def add_buildings(self) -> None:
-        """Two rows of buildings on each side, and something tall where the street ends."""
+        """Two rows of buildings on each side, with walls and hedges in their gaps."""
         rng, base = self.rng, self.street.kerb_m
         for side in (-1, 1):
             walk = self.street.sidewalk_m[side > 0]
             for start, end in self.blocks:
                 x = max(start + walk, -170.0)
                 while x < min(end - walk - 7, 170.0):
-                    width = min(float(rng.uniform(8, 26)), end - walk - x)
+                    width = min(rng.uniform(8, 26), end - walk - x)
                     setback = walk + float(rng.choice([rng.uniform(0, 0.8), rng.uniform(1.5, 7)]))
                     height = float(rng.choice([rng.uniform(5, 10), rng.uniform(10, 18), rng.uniform(18, 38)]))
-                    depth = float(rng.uniform(9, 16))
+                    depth = rng.uniform(9, 16)
                     built = rng.random() < 0.88
                     if built:
-                        ys = sorted((self.side_y(side, setback), self.side_y(side, setback + depth)))
-                        objects.add_building(self.builder, rng, (x, x + width), (ys[0], ys[1]), base, height)
+                        y = self.band_y(side, setback, setback + depth)
+                        objects.add_building(self.builder, rng, (x, x + width), y, base, height)
                     if rng.random() < 0.35:
-                        ys = sorted((self.side_y(side, setback + 22), self.side_y(side, setback + 40)))
-                        tall = float(rng.uniform(25, 60))
-                        objects.add_building(self.builder, rng, (x, x + width), (ys[0], ys[1]), base, tall)
+                        y = self.band_y(side, setback + 22, setback + 40)
+                        objects.add_building(self.builder, rng, (x, x + width), y, base, rng.uniform(25, 60))
                     gap = float(rng.choice([0.05, 0.05, rng.uniform(2, 9)]))
                     if not built or (gap > 1 and rng.random() < 0.7):
-                        ys = sorted((self.side_y(side, walk + 0.3), self.side_y(side, walk + 0.8)))
-                        span = (x if not built else x + width, min(x + width + gap, end - walk))
-                        hedge = bool(rng.random() < 0.5)
+                        y = self.band_y(side, walk + 0.3, walk + 0.8)
+                        span = (x + width if built else x, min(x + width + gap, end - walk))
+                        hedge = rng.random() < 0.5
                         if span[1] > span[0] + 0.3:
-                            objects.add_barrier(self.builder, rng, span, (ys[0], ys[1]), base, hedge=hedge)
+                            objects.add_barrier(self.builder, rng, span, y, base, hedge=hedge)
                     x += width + gap
-        self._add_background()
-        for direction in (-1, 1):
-            if rng.random() < 0.7:
-                xs = sorted((direction * float(rng.uniform(185, 240)), direction * 258.0))
-                objects.add_building(self.builder, rng, (xs[0], xs[1]), (-60, 60), 0.0, float(rng.uniform(14, 45)))
 
-    def _add_background(self) -> None:
+    def add_background(self) -> None:
         """A closed row of houses or trees far behind, so that gaps do not open onto an empty plain."""
         rng, base = self.rng, self.street.kerb_m
         for side in (-1, 1):
             for start, end in self.blocks:
                 x = max(start + 3, -200.0)
                 while x < min(end - 10, 200.0):
-                    width = min(float(rng.uniform(14, 34)), end - 3 - x)
-                    near = float(rng.uniform(44, 62))
+                    width = min(rng.uniform(14, 34), end - 3 - x)
+                    distance = rng.uniform(44, 62)
                     if rng.random() < 0.7:
-                        ys = sorted((self.side_y(side, near), self.side_y(side, near + 14)))
-                        tall = float(rng.uniform(7, 24))
-                        xs = (x, x + width)
-                        objects.add_building(self.builder, rng, xs, (ys[0], ys[1]), base, tall, detailed=False)
+                        y = self.band_y(side, distance, distance + 14)
+                        height = rng.uniform(7, 24)
+                        objects.add_building(self.builder, rng, (x, x + width), y, base, height, detailed=False)
                     else:
                         for k in range(int(width / 6)):
-                            y = self.side_y(side, near - float(rng.uniform(0, 6)))
-                            objects.add_bush(self.builder, rng, (x + 6 * k, y, base), scale=float(rng.uniform(4, 8)))
+                            xyz = (x + 6 * k, self.side_y(side, distance - rng.uniform(0, 6)), base)
+                            objects.add_bush(self.builder, rng, xyz, scale=rng.uniform(4, 8))
                     x += width + 0.1
+
+    def add_street_ends(self) -> None:
+        """Something tall where the street ends."""
+        rng = self.rng
+        for direction in (-1, 1):
+            if rng.random() < 0.7:
+                x = _span(direction * rng.uniform(185, 240), direction * 258.0)
+                objects.add_building(self.builder, rng, x, (-60, 60), 0.0, rng.uniform(14, 45))
 
     def add_parked(self) -> None:
         """Rows of parked vehicles along the kerbs."""
         for side in (-1, 1):
             if not self.street.parking[side > 0]:
                 continue
-            density = float(self.rng.uniform(0.35, 0.9))
+            density = self.rng.uniform(0.35, 0.9)
             x = -_PARKED_REACH_M
             while x < _PARKED_REACH_M:
-                step = float(self.rng.uniform(0.7, 1.6))
+                step = self.rng.uniform(0.7, 1.6)
                 if self.rng.random() < density and not self.at_crossing(x, 9):
-                    yaw = (0.0 if side < 0 else math.pi) + math.radians(float(self.rng.normal(0, 1)))
-                    length = 5.0
-                    y = self.side_y(side, -1.15 + float(self.rng.normal(0, 0.06)))
+                    yaw = _heading(side) + math.radians(self.rng.normal(0, 1))
+                    y = self.side_y(side, -1.15 + self.rng.normal(0, 0.06))
                     length = self.add_vehicle(_PARKED_SHARES, x + 2.5, y, yaw)
                     x += (length + 5.0) / 2 + step
                 else:
@@ -260,15 +259,13 @@ class _World:
         street = self.street
         for side in (-1, 1):
             for lane in range(street.lanes):
-                gap = float(self.rng.uniform(8, 30))
-                x = -_MOVING_REACH_M + float(self.rng.uniform(0, 20))
+                gap = self.rng.uniform(8, 30)
+                x = -_MOVING_REACH_M + self.rng.uniform(0, 20)
                 while x < _MOVING_REACH_M:
-                    y = side * (lane + 0.5) * street.lane_width_m + float(self.rng.normal(0, 0.15))
-                    yaw = (0.0 if side < 0 else math.pi) + math.radians(float(self.rng.normal(0, 1.2)))
-                    length = 0.0
-                    if not self.at_crossing(x, 3):
-                        length = self.add_vehicle(_MOVING_SHARES, x, y, yaw)
-                    x += length + gap * float(self.rng.uniform(0.6, 1.8)) + 3
+                    y = side * (lane + 0.5) * street.lane_width_m + self.rng.normal(0, 0.15)
+                    yaw = _heading(side) + math.radians(self.rng.normal(0, 1.2))
+                    length = 0.0 if self.at_crossing(x, 3) else self.add_vehicle(_MOVING_SHARES, x, y, yaw)
+                    x += length + gap * self.rng.uniform(0.6, 1.8) + 3
 
     def add_cross_traffic(self) -> None:
         """Vehicles on the crossing street, and sometimes one in the junction."""
@@ -277,27 +274,27 @@ class _World:
             return
         for direction in (-1, 1):
             x = street.crossing_x_m + direction * street.crossing_half_m / 2
-            y = -45.0 + float(self.rng.uniform(0, 20))
+            y = -45.0 + self.rng.uniform(0, 20)
             while y < 45:
                 inside = -street.half_width_m[0] - 3 < y < street.half_width_m[1] + 3
                 if not inside or self.rng.random() < 0.3:
-                    yaw = direction * math.pi / 2 + math.radians(float(self.rng.normal(0, 2)))
+                    yaw = direction * math.pi / 2 + math.radians(self.rng.normal(0, 2))
                     self.add_vehicle(_MOVING_SHARES, x, y, yaw)
-                y += float(self.rng.uniform(8, 25))
+                y += self.rng.uniform(8, 25)
 
     def add_furniture(self) -> None:
         """Lamp posts, trees, bushes, signs and traffic lights behind the kerbs."""
         rng, base = self.rng, self.street.kerb_m
         for side in (-1, 1):
-            lamps, trees = float(rng.uniform(18, 32)), float(rng.uniform(7, 15))
+            lamps, trees = rng.uniform(18, 32), rng.uniform(7, 15)
             planted = rng.random() < 0.65
-            offset = float(rng.uniform(0, lamps))
+            offset = rng.uniform(0, lamps)
             for k in range(-5, 6):
                 x = offset + k * lamps
                 if abs(x) < 90 and not self.at_crossing(x, 1):
                     objects.add_lamp_post(self.builder, rng, (x, self.side_y(side, 0.45), base), -side * math.pi / 2)
             for k in range(-8, 9):
-                x = k * trees + float(rng.normal(0, 0.5))
+                x = k * trees + rng.normal(0, 0.5)
                 on_lamp = abs((x - offset + lamps / 2) % lamps - lamps / 2) < 1.5
                 if planted and rng.random() < 0.8 and abs(x) < 85 and not (self.at_crossing(x, 4) or on_lamp):
                     # Crowns stay off the vehicle's own place: its cameras would be inside the leaves.
@@ -305,35 +302,49 @@ class _World:
                     reach = abs(y - float(self.ego2street[1, 3])) - 2.0 if abs(x) < 10 else math.inf
                     objects.add_tree(self.builder, rng, (x, y, base), reach_m=max(reach, 0.5))
             for _ in range(int(rng.integers(2, 6))):
-                x = float(rng.uniform(-45, 60))
+                x = rng.uniform(-45, 60)
                 if not self.at_crossing(x, 1):
-                    yaw = (0.0 if side < 0 else math.pi) + float(rng.normal(0, 0.1))
+                    yaw = _heading(side) + rng.normal(0, 0.1)
                     objects.add_sign(self.builder, rng, (x, self.side_y(side, 0.3), base), yaw)
             for _ in range(int(rng.integers(0, 6))):
-                x = float(rng.uniform(-60, 70))
+                x = rng.uniform(-60, 70)
                 if not self.at_crossing(x, 3):
                     behind = self.street.sidewalk_m[side > 0] - 0.6
                     objects.add_bush(self.builder, rng, (x, self.side_y(side, behind), base))
             if not math.isinf(self.street.crossing_x_m):
                 x = self.street.crossing_x_m + side * (self.street.crossing_half_m + 0.5)
-                yaw = 0.0 if side < 0 else math.pi
-                objects.add_traffic_light(self.builder, (x, self.side_y(side, 0.5), base), yaw)
+                objects.add_traffic_light(self.builder, (x, self.side_y(side, 0.5), base), _heading(side))
 
     def add_pedestrians(self) -> None:
         """People on the sidewalks, at the zebra crossing and now and then between the lanes."""
         rng, street = self.rng, self.street
         for _ in range(int(rng.integers(6, 18))):
             side = int(rng.choice([-1, 1]))
-            x = float(rng.uniform(-35, 55))
-            y = self.side_y(side, float(rng.uniform(1.4, street.sidewalk_m[side > 0] - 0.4)))
+            x = rng.uniform(-35, 55)
+            y = self.side_y(side, rng.uniform(1.4, street.sidewalk_m[side > 0] - 0.4))
             if not self.at_crossing(x, 0.5):
-                yaw = float(rng.choice([0, math.pi])) + float(rng.normal(0, 0.2))
+                yaw = float(rng.choice([0, math.pi])) + rng.normal(0, 0.2)
                 objects.add_pedestrian(self.builder, rng, (x, y, street.kerb_m), yaw)
         if not math.isinf(street.crossing_x_m):
             for _ in range(int(rng.integers(0, 5))):
                 side = int(rng.choice([-1, 1]))
-                x = street.crossing_x_m + side * (street.crossing_half_m - 1.5) + float(rng.normal(0, 0.5))
-                y = float(rng.uniform(-street.half_width_m[0], street.half_width_m[1]))
+                x = street.crossing_x_m + side * (street.crossing_half_m - 1.5) + rng.normal(0, 0.5)
+                y = rng.uniform(-street.half_width_m[0], street.half_width_m[1])
                 if self.is_clear(x, y, 0.6, 0.6, 0.0):
                     objects.add_pedestrian(self.builder, rng, (x, y, 0.0), math.pi / 2 * float(rng.choice([-1, 1])))
                     self.taken.append((x, y, 0.35))
+
+
+def _heading(side: int) -> float:
+    """Yaw of traffic on the right (-1) or left (1) side."""
+    return 0.0 if side < 0 else math.pi
+
+
+def _span(a: float, b: float) -> Range:
+    return min(a, b), max(a, b)
+
+
+def _discs(x: float, y: float, length: float, width: float, yaw: float) -> list[tuple[float, float, float]]:
+    """x, y and radius of discs along a footprint, close enough for lanes side by side."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    return [(x + c * a, y + s * a, width / 2) for a in np.linspace(-0.5, 0.5, 5) * max(0.0, length - width)]
