@@ -1,9 +1,9 @@
-"""Depth of a frame's images from the frames before and after it: what both sides say, and nothing else.
+"""Depth of a frame's images from the frames before and after it.
 
-Each side is matched and aggregated by itself; a pixel is kept where the two come to the same distance, where that
-distance moves it by enough to be measured (not near the focus of expansion, nor far away), and where enough of its
-neighbours are kept too. What moved by itself is not at the distance that it seems to have: labelled objects are left
-out, in both frames; unlabelled ones that keep pace, or come straight ahead, cannot be told apart.
+Each neighbour is matched by a plane sweep and aggregated. A pixel is kept where both sides agree on its distance, where
+that distance moves it far enough to be measured, and where enough of its neighbours are kept too. Labelled objects are
+masked in both frames. Unlabelled traffic that keeps pace or comes straight ahead cannot be told apart from the static
+scene. ``docs/drives.md`` (Constants) says how the constants were chosen.
 """
 
 from __future__ import annotations
@@ -24,43 +24,36 @@ from arbiview_aug.render.pixel_projection import Layer
 from arbiview_aug.sample.neighbours import Neighbour
 from arbiview_aug.scene.box_raster import draw_boxes
 from arbiview_aug.scene.depth_maps import motion_camera, points_of_depth
+from arbiview_aug.temporal.change import BOX_MARGIN_M
 from arbiview_aug.temporal.plane_sweep import INVALID, SweptSurface, reduced_grey, scores_opencv, scores_torch
-from arbiview_aug.temporal.pose_check import CORRECTED_PX, MENDS, MOST_ERROR_PX, PoseSamples, pose_error
+from arbiview_aug.temporal.pose_check import CORRECTED_PX, MAX_CORRECTIONS, MAX_ERROR_PX, PoseSamples, pose_error
 from arbiview_aug.temporal.semi_global import aggregate
 
 BEST_TRAVEL_M, TRAVEL_M = 1.2, (0.4, 3.0)
-"""Between the current frame and a side's: less measures nothing, more hides too much from one of the two. The one
-nearest to the first is taken."""
+"""Best travel to a neighbour, and the range allowed: shorter baselines measure nothing, longer ones hide too much."""
 
 AGREEMENT = 0.15
-"""Share by which the two sides' inverse distances may differ. On two synthetic streets of 128x352 pixels, 0.1 keeps
-0.66 of the pixels, 0.95 of them within a tenth of the truth, 0.15 keeps 0.71 and 0.94; on three of 225x400, 0.05 kept
-0.56 and 0.965, 0.1 0.69 and 0.957, 0.15 0.73 and 0.948. What is rendered differs by 0.2 dB either way."""
+"""Largest relative difference between the two sides' inverse distances."""
 
-_AGREEMENT_PER_M = 1e-3  # and absolutely, 1/m: beyond 100 m distances do not matter
+_AGREEMENT_PER_M = 1e-3  # and the absolute one, 1/m: beyond 100 m distances do not matter
 
 FARTHEST_M = 80.0
-"""What is farther is left to the far wall of the street, 20 to 40 m away: from 0.6 m beside, the two are half a pixel
-apart in an image 400 px wide."""
+"""Largest depth kept: beyond it the static street's wall is half a pixel away at most, at 400 px and a 0.6 m offset."""
 
 LEAST_SHIFT_PX = 0.06
-"""A pixel is measured where a tenth of its inverse distance moves it by so much on all sides: what errs more, the sides
-do not agree on. On synthetic streets of 225x400 pixels, dB over the static street from 0.6 m higher and 1 m aside:
-0.5 px 2.8 and 2.7, 0.25 px 3.2 and 3.7, 0.12 px 3.4 and 4.1, 0.06 px 3.5 and 4.3; 0.03 is no better."""
+"""Least motion of a pixel on all sides when its inverse distance grows by a tenth."""
 
 _SPECKLE_PX = 100
-"""Smaller patches of one distance are errors more often than objects, at 400 px: without, 0.3 to 0.6 dB less."""
-
-_AIR_M = 0.4  # around labels, as for what neighbouring frames fill
+"""Smallest patch of one distance, in images 400 px wide."""
 
 
 @dataclass(frozen=True, eq=False)
 class MotionDepth:
-    """What motion says of the distances in one frame.
+    """Depth maps of one frame.
 
     Attributes:
-        depth_m: (h, w) float32 of each camera, z-depth at the size of ``motion_camera``; 0 where nothing is known.
-        words: How it was found, or why it was not.
+        depth_m: (h, w) float32 z-depth of each camera at the size of ``motion_camera``, 0 where unknown.
+        words: How it was found, or why it was declined.
     """
 
     depth_m: tuple[Layer, ...]
@@ -68,11 +61,15 @@ class MotionDepth:
 
     @property
     def density(self) -> float:
-        """Share of all pixels whose distance is known; 0 where it was declined."""
+        """Share of all pixels with a depth; 0 if declined."""
         return float(np.mean([np.mean(depth > 0) for depth in self.depth_m]))
 
     def points(self, rig: Rig) -> FloatArray:
-        """(P, 3) in the ego frame, metres, with the rig of the frame."""
+        """(P, 3) points in the ego frame, metres.
+
+        Args:
+            rig: The rig of the frame.
+        """
         pairs = zip(rig, self.depth_m, strict=True)
         return np.concatenate(
             [points_of_depth(motion_camera(camera), depth.astype(np.float64)) for camera, depth in pairs]
@@ -85,26 +82,25 @@ class MotionDepth:
 
 
 class _Side(NamedTuple):
-    """A neighbour, ready to be read: its cameras at the size that is worked at, and their grey images."""
+    """A neighbour with its cameras and grey images at the working size."""
 
     neighbour: Neighbour
     cameras: list[Camera]
     greys: list[Layer]
 
     def moved(self, move: FloatArray) -> _Side:
-        """With its cameras elsewhere."""
         return self._replace(cameras=[camera.moved(move) for camera in self.cameras])
 
 
-class _Found(NamedTuple):
-    """Inverse distances (h, w) of one camera, 1/m, and which of them are believed."""
+class _Estimate(NamedTuple):
+    """Inverse distances (h, w) of one camera, 1/m, and their validity."""
 
     inverse_distance: Layer
-    kept: BoolArray
+    valid: BoolArray
 
 
 Load = Callable[[Neighbour], Sequence[torch.Tensor] | None]
-"""Images of a neighbour, or None where they cannot be had: then another one is taken."""
+"""Reads the images of a neighbour; None if they cannot be read, and another one is taken."""
 
 
 def motion_depth(
@@ -115,54 +111,55 @@ def motion_depth(
     load: Load,
     device: torch.device | str = "cpu",
 ) -> MotionDepth:
-    """Depth of a frame from one neighbour before and one after it; where there is but one, from that.
+    """Estimate depth from one neighbour before the frame and one after it, or from one if there is only one.
 
-    Poses are checked on what comes out (``poses``): small errors are mended and the images matched again.
+    Poses are checked on the result (``arbiview_aug.temporal.pose_check``). Small errors are corrected and the images
+    matched again.
 
     Args:
-        rig: Of the current frame.
+        rig: Rig of the current frame.
         images: (3, H, W) of its cameras: uint8, or float in [0, 1].
         neighbours: Other frames of the drive, in the current frame's ego frame.
-        boxes: (B, 7) labelled objects of the current frame, ego frame: they are left out.
-        load: Gives a neighbour's images.
-        device: Where scores are computed.
+        boxes: (B, 7) labelled objects of the current frame, ego frame, which are left out.
+        load: Reads a neighbour's images.
+        device: Device for the matching scores.
     """
     device = torch.device(device)
-    own = [_without_objects(motion_camera(camera), boxes) for camera in rig]
+    cameras = [_without_objects(motion_camera(camera), boxes) for camera in rig]
 
-    def none(why: str) -> MotionDepth:
-        return MotionDepth(tuple(np.zeros(camera.size, np.float32) for camera in own), why)
+    def declined(reason: str) -> MotionDepth:
+        return MotionDepth(tuple(np.zeros(camera.size, np.float32) for camera in cameras), reason)
 
-    found_sides = (
-        next((s for n in of if (s := _loaded(n, load)) is not None), None) for of in _by_side(rig, neighbours)
-    )
-    sides = [side for side in found_sides if side is not None]
+    sides = []
+    for candidates in _by_side(rig, neighbours):
+        side = next((loaded for one in candidates if (loaded := _loaded(one, load)) is not None), None)
+        sides += [] if side is None else [side]
     if not sides:
         least, most = TRAVEL_M
-        return none(f"no frame {least:g} to {most:g} m before or after it can be used")
+        return declined(f"no frame {least:g} to {most:g} m before or after it can be used")
     greys = [reduced_grey(camera, image) for camera, image in zip(rig, images, strict=True)]
-    families = [SweptSurface(camera, rig.ground_z_m) for camera in own]
+    families = [SweptSurface(camera, rig.ground_z_m) for camera in cameras]
     words = f"from {' and '.join(side.neighbour.name for side in sides)}"
-    for mend in range(MENDS + 1):
-        found = [_of_camera(f, grey, k, sides, device) for k, (f, grey) in enumerate(zip(families, greys, strict=True))]
-        errors = [pose_error(_reads(families, greys, found, side)) for side in sides]
-        known = [error for error in errors if error is not None]
-        if len(known) < len(sides):
+    for correction in range(MAX_CORRECTIONS + 1):
+        estimates = [_match(f, grey, k, sides, device) for k, (f, grey) in enumerate(zip(families, greys, strict=True))]
+        errors = [pose_error(_pose_samples(families, greys, estimates, side)) for side in sides]
+        measured = [error for error in errors if error is not None]
+        if len(measured) < len(sides):
             lost = sides[errors.index(None)].neighbour.name
-            return none(f"too little of frame {lost} is alike to tell whether its pose is right")
-        worst = max(known, key=lambda error: error.error_px)
+            return declined(f"too little of frame {lost} is alike to tell whether its pose is right")
+        worst = max(measured, key=lambda error: error.error_px)
         if worst.error_px <= CORRECTED_PX:
             break
-        if mend < MENDS:
-            words += f"{'; poses mended by' if mend == 0 else ', then'} {' and '.join(map(str, known))}"
-            sides = [side.moved(error.mended) for side, error in zip(sides, known, strict=True)]
-        elif worst.error_px > MOST_ERROR_PX:
-            return none(f"the pose of frame {sides[known.index(worst)].neighbour.name} errs by {worst}")
-    return MotionDepth(tuple(_depth_m(f, one) for f, one in zip(families, found, strict=True)), words)
+        if correction < MAX_CORRECTIONS:
+            words += f"{'; poses corrected by' if correction == 0 else ', then'} {' and '.join(map(str, measured))}"
+            sides = [side.moved(error.correction) for side, error in zip(sides, measured, strict=True)]
+        elif worst.error_px > MAX_ERROR_PX:
+            return declined(f"the pose of frame {sides[measured.index(worst)].neighbour.name} errs by {worst}")
+    return MotionDepth(tuple(_depth_m(f, one) for f, one in zip(families, estimates, strict=True)), words)
 
 
 def _by_side(rig: Rig, neighbours: Sequence[Neighbour]) -> tuple[list[Neighbour], list[Neighbour]]:
-    """Those behind the vehicle and those ahead of it, the best travel first."""
+    """Split neighbours into those behind the vehicle and those ahead of it, the best travel first."""
     behind: list[Neighbour] = []
     ahead: list[Neighbour] = []
     for one in neighbours:
@@ -186,58 +183,50 @@ def _loaded(neighbour: Neighbour, load: Load) -> _Side | None:
 
 
 def _without_objects(camera: Camera, boxes: FloatArray | None) -> Camera:
-    """A camera whose mask hides labelled objects."""
-    shown = _showing(camera, boxes)
-    if not shown.any():
+    """Mask labelled objects, with a margin around them."""
+    if boxes is None or not len(boxes):
         return camera
-    return replace(camera, mask=~shown if camera.mask is None else camera.mask & ~shown)
+    grown = boxes[:, :7] + np.array([0, 0, 0, 2 * BOX_MARGIN_M, 2 * BOX_MARGIN_M, 2 * BOX_MARGIN_M, 0])
+    mask = np.ones(camera.size, bool) if camera.mask is None else camera.mask.copy()
+    mask.reshape(-1)[draw_boxes(camera, grown).pixel] = False
+    return replace(camera, mask=mask)
 
 
-def _showing(camera: Camera, boxes: FloatArray | None) -> BoolArray:
-    """(h, w) pixels that show labelled objects, with air around them."""
-    shown = np.zeros(camera.size, bool)
-    if boxes is not None and len(boxes):
-        grown = boxes[:, :7] + np.array([0, 0, 0, 2 * _AIR_M, 2 * _AIR_M, 2 * _AIR_M, 0])
-        shown.reshape(-1)[draw_boxes(camera, grown).pixel] = True
-    return shown
+def _match(family: SweptSurface, grey: Layer, k: int, sides: Sequence[_Side], device: torch.device) -> _Estimate:
+    """Estimate the distances of one camera's pixels from the scores of all sides together.
 
-
-def _of_camera(family: SweptSurface, grey: Layer, k: int, sides: Sequence[_Side], device: torch.device) -> _Found:
-    """The distances that one camera's pixels have by all sides, where these agree.
-
-    Of two sides each is asked alone. Where one of them does not see a point, what surrounds it there decides
-    (``aggregation``). A single side is asked a second time, from its own pixels.
+    Two sides must agree, each matched alone. A single side is confirmed by matching back from it.
     """
     totals, alone, seen = None, [], []
     for side in sides:
         scores = _scores(family, grey, side.cameras[k], side.greys[k], device)
         smooth = aggregate(scores)
-        alone.append(_best(family, smooth)[0])
+        alone.append(_peak(family, smooth)[0])
         totals = smooth if totals is None else totals + smooth
         seen.append(scores)
     assert totals is not None
-    q, index = _best(family, totals)
+    q, index = _peak(family, totals)
     visible = torch.stack([scores.gather(0, index[None])[0] > INVALID for scores in seen]).any(0).cpu().numpy()
     if len(sides) == 2:
-        alike = _alike(alone[0], alone[1])
+        agree = _agree(alone[0], alone[1])
     else:
-        alike = _confirmed(family, q, grey, sides[0].cameras[k], sides[0].greys[k], device)
-    kept = visible & alike & (q > 1 / FARTHEST_M)
+        agree = _confirmed(family, q, grey, sides[0].cameras[k], sides[0].greys[k], device)
+    valid = visible & agree & (q > 1 / FARTHEST_M)
     for side in sides:
-        kept &= np.hypot(*np.moveaxis(_shift(family, side.cameras[k], q), -1, 0)) >= LEAST_SHIFT_PX
-    return _Found(q, kept)
+        valid &= np.hypot(*np.moveaxis(_shift(family, side.cameras[k], q), -1, 0)) >= LEAST_SHIFT_PX
+    return _Estimate(q, valid)
 
 
 def _confirmed(
     family: SweptSurface, q: Layer, grey: Layer, camera: Camera, other: Layer, device: torch.device
 ) -> BoolArray:
-    """(h, w) whether a neighbour's own pixels, asked in turn, come to the same distances."""
+    """(h, w) whether matching back from a neighbour's pixels gives the same distances."""
     back = SweptSurface(camera, family.ground_z_m)
-    own, _ = _best(back, aggregate(_scores(back, other, family.camera, grey, device)))
+    own, _ = _peak(back, aggregate(_scores(back, other, family.camera, grey, device)))
     there: Any = cv2.remap(own, _positions(family, camera, q).astype(np.float32), None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
     offset = family.camera.center_m - camera.center_m
     away = np.linalg.norm(offset * q[..., None] + family.directions, axis=-1)
-    return _alike(there, (q / np.maximum(away, 1e-9)).astype(np.float32))
+    return _agree(there, (q / np.maximum(away, 1e-9)).astype(np.float32))
 
 
 def _scores(family: SweptSurface, grey: Layer, camera: Camera, other: Layer, device: torch.device) -> torch.Tensor:
@@ -246,24 +235,24 @@ def _scores(family: SweptSurface, grey: Layer, camera: Camera, other: Layer, dev
     return scores_torch(family, grey, camera, other, device)
 
 
-def _alike(one: Layer, two: Layer) -> BoolArray:
+def _agree(one: Layer, two: Layer) -> BoolArray:
     return np.asarray(np.abs(one - two) <= AGREEMENT * np.maximum(one, two) + _AGREEMENT_PER_M)
 
 
-def _reads(
-    families: Sequence[SweptSurface], greys: Sequence[Layer], found: Sequence[_Found], side: _Side
+def _pose_samples(
+    families: Sequence[SweptSurface], greys: Sequence[Layer], estimates: Sequence[_Estimate], side: _Side
 ) -> list[PoseSamples]:
-    """A side's images read over what was found."""
-    return [
-        PoseSamples(
-            family, camera, grey, other, *one, _positions(family, camera, one[0]), _shift(family, camera, one[0])
-        )
-        for family, camera, grey, other, one in zip(families, side.cameras, greys, side.greys, found, strict=True)
-    ]
+    samples = []
+    for family, camera, grey, other, (q, valid) in zip(
+        families, side.cameras, greys, side.greys, estimates, strict=True
+    ):
+        at, shift = _positions(family, camera, q), _shift(family, camera, q)
+        samples.append(PoseSamples(family, camera, grey, other, q, valid, at, shift))
+    return samples
 
 
 def _shift(family: SweptSurface, camera: Camera, q: Layer) -> FloatArray:
-    """(h, w, 2) by how much a side's pixels move if inverse distances grow by a tenth: along the epipolar lines."""
+    """(h, w, 2) motion of a side's pixels along the epipolar lines when inverse distances grow by a tenth."""
     return _positions(family, camera, q * np.float32(1.1)) - _positions(family, camera, q)
 
 
@@ -273,31 +262,30 @@ def _positions(family: SweptSurface, camera: Camera, inverse_distance: Layer) ->
     return np.where(valid[..., None], uv, -1e4)
 
 
-def _best(family: SweptSurface, scores: torch.Tensor) -> tuple[Layer, torch.Tensor]:
-    """The best inverse distances (h, w), between hypotheses by a parabola, and the index of the nearest one."""
+def _peak(family: SweptSurface, scores: torch.Tensor) -> tuple[Layer, torch.Tensor]:
+    """Inverse distances (h, w) of the best scores, refined by a parabola, and the index of the best hypothesis."""
     peak, index = scores.max(0)
     last = len(scores) - 1
     before, after = (scores.gather(0, (index + d).clamp(0, last)[None])[0] for d in (-1, 1))
-    bend = before - 2 * peak + after
-    inside = (index > 0) & (index < last) & (bend < -1e-6)
-    offset = torch.where(inside, 0.5 * (before - after) / torch.where(inside, bend, 1), 0).clamp(-0.5, 0.5)
+    curvature = before - 2 * peak + after
+    inside = (index > 0) & (index < last) & (curvature < -1e-6)
+    offset = torch.where(inside, 0.5 * (before - after) / torch.where(inside, curvature, 1), 0).clamp(-0.5, 0.5)
     wall = (index + offset).cpu().numpy() * family.walls[1]
     return np.asarray(family.inverse_distance(wall), np.float32), index
 
 
-def _depth_m(family: SweptSurface, found: _Found) -> Layer:
-    """z-depth (h, w) of what is kept: nothing of labelled objects, of the own car, or in small patches."""
-    camera, q = family.camera, found.inverse_distance
-    kept = found.kept if camera.mask is None else found.kept & camera.mask
-    kept = _without_speckles(q, kept)
-    ahead = family.directions @ camera.cam2ego[:3, 2]
-    return np.where(kept & (ahead > 1e-6), ahead / np.maximum(q, 1e-9), 0).astype(np.float32)
+def _depth_m(family: SweptSurface, estimate: _Estimate) -> Layer:
+    """z-depth (h, w), 0 outside the mask, where invalid, and in small patches."""
+    camera, q = family.camera, estimate.inverse_distance
+    valid = estimate.valid if camera.mask is None else estimate.valid & camera.mask
+    valid = _without_speckles(q, valid)
+    z = family.directions @ camera.cam2ego[:3, 2]
+    return np.where(valid & (z > 1e-6), z / np.maximum(q, 1e-9), 0).astype(np.float32)
 
 
-def _without_speckles(q: Layer, kept: BoolArray) -> BoolArray:
-    """What is kept (h, w), without small patches: a patch goes on where inverse distance changes by less than
-    ``AGREEMENT``."""
-    scale = 1000.0  # of the logarithm, in int16: from 1 mm to more than anything
-    levels: Any = np.where(kept, np.log(np.maximum(q, 1e-3) / 1e-3) * scale + 1, 0).astype(np.int16)
-    cv2.filterSpeckles(levels, 0, _SPECKLE_PX, AGREEMENT * scale)
-    return levels > 0
+def _without_speckles(q: Layer, valid: BoolArray) -> BoolArray:
+    """Drop small patches; within a patch, neighbouring inverse distances differ by less than ``AGREEMENT``."""
+    scale = 1000.0  # fits logarithms from 1 mm up into int16
+    log_q: Any = np.where(valid, np.log(np.maximum(q, 1e-3) / 1e-3) * scale + 1, 0).astype(np.int16)
+    cv2.filterSpeckles(log_q, 0, _SPECKLE_PX, AGREEMENT * scale)
+    return log_q > 0

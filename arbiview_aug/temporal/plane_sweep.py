@@ -1,16 +1,14 @@
-"""The sweep: a neighbouring frame read over a family of surfaces, each scored by how alike the two images then are.
+"""Plane sweep: score a neighbouring frame over a family of surfaces by how well the two images match.
 
-The surfaces are the road together with an upright wall around the camera that shrinks from infinity to ``NEAREST_M``
-(after Gallup et al., "Real-time plane-sweeping stereo with multiple sweeping directions", CVPR 2007: planes that lie as
-the scene does match where fronto-parallel ones do not). On the road all walls beyond it give the same surface: its
-pixels come out on the plane, exactly.
-
-The score is the zero-mean normalised cross-correlation of small windows: what exposure, gain and haze change in them
-cancels. ``scores_opencv`` and ``scores_torch`` are one computation on the CPU and on any device.
+Each surface is the road with an upright wall around the camera. The wall shrinks from infinity to ``NEAREST_M`` (after
+Gallup et al., "Real-time plane-sweeping stereo with multiple sweeping directions", CVPR 2007). The score is the
+zero-mean normalised cross-correlation of small windows. ``scores_opencv`` and ``scores_torch`` compute the same on the
+CPU and on any device.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -29,20 +27,16 @@ from arbiview_aug.scene.depth_maps import halvings
 from arbiview_aug.scene.static import plane_inverse_distance
 
 HYPOTHESES = 96
-"""Walls, evenly in inverse distance: half a metre of travel shifts what is beside the car by less than a pixel from one
-to the next, in images 400 px and 65 degrees wide."""
+"""Number of walls, evenly spaced in inverse distance: less than a pixel apart at half a metre of travel and 400 px."""
 
 NEAREST_M = 2.0
-"""Radius of the nearest wall: nearer to a vehicle's camera stands hardly anything, and 1.2 m of travel carries it out
-of view."""
-
+"""Radius of the nearest wall."""
 
 _RADIUS_PX = 3
-"""Windows of 7 x 7: 5 x 5 keep 10 % fewer pixels on synthetic streets, 9 x 9 widen outlines."""
+"""Windows of 7 x 7 pixels (``docs/drives.md``, Constants)."""
 
 _NOISE_LEVELS = 0.7
-"""Grey levels of contrast that count as none: what is left of a camera's noise after halving twice. 0.3 is as good on
-synthetic streets, 2 loses a tenth of the pixels."""
+"""Standard deviation of a camera's noise after halving twice, in grey levels."""
 
 INVALID = -1.0
 """Score where the neighbour does not see the point."""
@@ -50,11 +44,11 @@ INVALID = -1.0
 
 @dataclass(frozen=True, eq=False)
 class SweptSurface:
-    """The surfaces as one camera sees them.
+    """Family of surfaces around one camera.
 
     Attributes:
-        camera: At the size that is worked at.
-        ground_z_m: The road's height in the ego frame.
+        camera: The camera at the working size (``motion_camera``).
+        ground_z_m: Height of the road in the ego frame.
     """
 
     camera: Camera
@@ -62,7 +56,7 @@ class SweptSurface:
 
     @cached_property
     def directions(self) -> npt.NDArray[np.float64]:
-        """(h, w, 3) unit rays in the ego frame; the optical axis where the lens has none."""
+        """(h, w, 3) unit rays in the ego frame; the optical axis where the lens cannot be inverted."""
         rays, valid = ego_rays(self.camera, self.camera.pixel_grid())
         return np.where(valid[..., None], rays, self.camera.cam2ego[:3, 2])
 
@@ -72,8 +66,8 @@ class SweptSurface:
         return plane_inverse_distance(self.camera.center_m, self.directions, self.ground_z_m).astype(np.float32)
 
     @cached_property
-    def level(self) -> Layer:
-        """(h, w) the horizontal part of each unit ray: what turns a wall's 1/radius into inverse distance."""
+    def horizontal(self) -> Layer:
+        """(h, w) length of each unit ray's horizontal part, the factor from 1/radius to inverse distance."""
         return np.hypot(self.directions[..., 0], self.directions[..., 1]).astype(np.float32)
 
     @property
@@ -82,52 +76,60 @@ class SweptSurface:
         return np.linspace(0, 1 / NEAREST_M, HYPOTHESES, dtype=np.float32)
 
     def inverse_distance(self, wall: Any) -> Any:
-        """(h, w) along the rays, 1/m, of the road with one wall, or with a wall (h, w) for each pixel."""
-        return np.maximum(self.road, wall * self.level)
+        """(h, w) inverse distance along the rays, 1/m; ``wall`` is 1/radius, one or (h, w)."""
+        return np.maximum(self.road, wall * self.horizontal)
 
 
 def reduced_grey(camera: Camera, image: torch.Tensor) -> Layer:
-    """(h, w) grey levels of 255 of an image (3, H, W), at the size of ``motion_camera``."""
+    """Grey levels (h, w) in 0..255 of an image (3, H, W), at the size of ``motion_camera``."""
     return np.asarray(255 * cv2.cvtColor(reduced(image, halvings(camera)), cv2.COLOR_RGB2GRAY), np.float32)
 
 
 # --- on the CPU -------------------------------------------------------------------------------------------------------
 def scores_opencv(family: SweptSurface, grey: Layer, source: Camera, other: Layer) -> npt.NDArray[np.float32]:
-    """(K, h, w) in [-1, 1]: how alike two images are over each surface.
+    """Score each surface by the correlation of the two images over it.
 
     Args:
-        family: Of the camera whose pixels are asked.
+        family: Family of the reference camera.
         grey: (h, w) its image.
-        source: The neighbour's camera, in the same ego frame; what its mask hides matches nothing.
+        source: The neighbour's camera, in the same ego frame; masked pixels are invalid.
         other: (h', w') the neighbour's image.
+
+    Returns:
+        (K, h, w) in [-1, 1], or ``INVALID``.
     """
     camera = family.camera
-    rays = pixel_rays(camera)
-    length = np.sqrt(rays[0] ** 2 + rays[1] ** 2 + rays[2] ** 2)
-    slot = Slot(0, 0, 0, 0, source.size)
-    clean = _clean(source)
-    mean, spread = _moments(grey)
+    position = _position_lookup(family, source)
+    unmasked = _unmasked(source)
+    mean, variance = _moments(grey)
     scores = np.empty((HYPOTHESES, *camera.size), np.float32)
     for score, wall in zip(scores, family.walls, strict=True):
-        at, _ = project_pixels(rays, family.inverse_distance(wall) * length, camera, source, slot)
+        at = position(wall)
         read: Any = cv2.remap(other, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-        seen: Any = cv2.remap(clean, at, None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
-        other_mean, other_spread = _moments(read)
-        alike = (_box(read * grey) - mean * other_mean) / np.sqrt(spread * other_spread)
-        score[...] = np.where(seen > 0, alike, INVALID)
+        seen: Any = cv2.remap(unmasked, at, None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
+        other_mean, other_variance = _moments(read)
+        correlation = (_box(read * grey) - mean * other_mean) / np.sqrt(variance * other_variance)
+        score[...] = np.where(seen > 0, correlation, INVALID)
     return scores
 
 
-def _clean(source: Camera) -> npt.NDArray[np.uint8]:
-    """1 (h, w) where a camera shows the scene; its outermost pixels do not count, so that all taps lie inside."""
-    clean = np.ones(source.size, np.uint8) if source.mask is None else source.mask.astype(np.uint8)
-    clean[[0, -1]] = 0
-    clean[:, [0, -1]] = 0
-    return clean
+def _position_lookup(family: SweptSurface, source: Camera) -> Callable[[float], npt.NDArray[np.float32]]:
+    """Function from a wall to the source pixels (h, w, 2) of its surface's points."""
+    rays, slot = pixel_rays(family.camera), Slot(0, 0, 0, 0, source.size)
+    length = np.sqrt(rays[0] ** 2 + rays[1] ** 2 + rays[2] ** 2)
+    return lambda wall: project_pixels(rays, family.inverse_distance(wall) * length, family.camera, source, slot)[0]
+
+
+def _unmasked(source: Camera) -> npt.NDArray[np.uint8]:
+    """1 (h, w) where a camera shows the scene, 0 on its border, so that all bilinear taps lie inside."""
+    unmasked = np.ones(source.size, np.uint8) if source.mask is None else source.mask.astype(np.uint8)
+    unmasked[[0, -1]] = 0
+    unmasked[:, [0, -1]] = 0
+    return unmasked
 
 
 def _moments(image: Layer) -> tuple[Layer, Layer]:
-    """Mean and variance (h, w) of the windows, the variance with the noise's."""
+    """Mean and variance (h, w) of the windows, including the noise's variance."""
     mean = _box(image)
     return mean, np.maximum(_box(image * image) - mean * mean, 0) + np.float32(_NOISE_LEVELS**2)
 
@@ -140,57 +142,49 @@ def _box(image: Layer) -> Layer:
 # --- on any device ----------------------------------------------------------------------------------------------------
 def scores_torch(family: SweptSurface, grey: Layer, source: Camera, other: Layer, device: torch.device) -> torch.Tensor:
     """``scores_opencv`` on a device, (K, h, w)."""
-    camera = family.camera
-    place = _Positions(family, source, device)
-    here, there, clean = (torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in (grey, other, _clean(source)))
-    mean, spread = _moments_torch(here)
-    scores = torch.empty((HYPOTHESES, *camera.size), device=device)
+    position = _position_lookup_torch(family, source, device)
+    grey_there, other_there, unmasked = (
+        torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in (grey, other, _unmasked(source))
+    )
+    mean, variance = _moments_torch(grey_there)
+    scores = torch.empty((HYPOTHESES, *family.camera.size), device=device)
     size = torch.tensor(source.size[::-1], device=device)
     for score, wall in zip(scores, family.walls.tolist(), strict=True):
-        at = place(wall)
         # Coordinates are clamped: grid_sample makes NaN of huge ones.
-        grid = ((2 * at + 1) / size - 1).clamp(-1e4, 1e4)[None]
-        read = _sampled(there, grid, "bilinear", "border")
-        seen = _sampled(clean.float(), grid, "nearest", "zeros")
-        other_mean, other_spread = _moments_torch(read)
-        alike = (_box_torch(read * here) - mean * other_mean) / (spread * other_spread).sqrt()
-        score.copy_(torch.where(seen > 0, alike, INVALID))
+        grid = ((2 * position(wall) + 1) / size - 1).clamp(-1e4, 1e4)[None]
+        read = _sampled(other_there, grid, "bilinear", "border")
+        seen = _sampled(unmasked.float(), grid, "nearest", "zeros")
+        other_mean, other_variance = _moments_torch(read)
+        correlation = (_box_torch(read * grey_there) - mean * other_mean) / (variance * other_variance).sqrt()
+        score.copy_(torch.where(seen > 0, correlation, INVALID))
     return scores
 
 
-class _Positions:
-    """Source pixels (h, w, 2) of the scene points over one wall; of lenses they are found on the CPU."""
+def _position_lookup_torch(
+    family: SweptSurface, source: Camera, device: torch.device
+) -> Callable[[float], torch.Tensor]:
+    if not source.is_rectilinear:
+        on_cpu = _position_lookup(family, source)
+        return lambda wall: torch.from_numpy(on_cpu(wall)).to(device)
+    turn = source.cam2ego[:3, :3].T
+    in_source = family.directions @ turn.T, turn @ (family.camera.center_m - source.center_m), source.K
+    rays, offset, K = (torch.from_numpy(a).to(device, torch.float32) for a in in_source)
+    road, horizontal = (torch.from_numpy(a).to(device) for a in (family.road, family.horizontal))
 
-    def __init__(self, family: SweptSurface, source: Camera, device: torch.device) -> None:
-        self.family, self.source, self.device = family, source, device
-        turn = source.cam2ego[:3, :3].T
-        rays = family.directions @ turn.T
-        offset = turn @ (family.camera.center_m - source.center_m)
-        to = {"dtype": torch.float32, "device": device}
-        self.rays, self.offset, self.K = (torch.tensor(a, **to) for a in (rays, offset, source.K))  # type: ignore[arg-type]
-        self.road, self.level = (torch.from_numpy(a).to(device) for a in (family.road, family.level))
+    def positions(wall: float) -> torch.Tensor:
+        q = torch.maximum(road, wall * horizontal)
+        x, y, z = (rays + offset * q[..., None]).unbind(-1)
+        in_front = z > 1e-6
+        z = torch.where(in_front, z, 1)
+        u = (K[0, 0] * x + K[0, 1] * y) / z + K[0, 2]
+        v = K[1, 1] * y / z + K[1, 2]
+        return torch.where(in_front[..., None], torch.stack([u, v], -1), -1e4)
 
-    def __call__(self, wall: float) -> torch.Tensor:
-        if not self.source.is_rectilinear:
-            rays = pixel_rays(self.family.camera)
-            length = np.sqrt(rays[0] ** 2 + rays[1] ** 2 + rays[2] ** 2)
-            q = self.family.inverse_distance(np.float32(wall)) * length
-            at, _ = project_pixels(rays, q, self.family.camera, self.source, Slot(0, 0, 0, 0, self.source.size))
-            return torch.from_numpy(at).to(self.device)
-        q = torch.maximum(self.road, wall * self.level)
-        x, y, z = (self.rays + self.offset * q[..., None]).unbind(-1)
-        ahead = z > 1e-6
-        z = torch.where(ahead, z, 1)
-        u = (self.K[0, 0] * x + self.K[0, 1] * y) / z + self.K[0, 2]
-        v = self.K[1, 1] * y / z + self.K[1, 2]
-        return torch.where(ahead[..., None], torch.stack([u, v], -1), -1e4)
+    return positions
 
 
 def _sampled(image: torch.Tensor, grid: torch.Tensor, mode: str, padding: str) -> torch.Tensor:
-    sampled = torch.nn.functional.grid_sample(
-        image[None, None], grid, mode=mode, padding_mode=padding, align_corners=False
-    )
-    return sampled[0, 0]
+    return torch.nn.functional.grid_sample(image[None, None], grid, mode, padding, align_corners=False)[0, 0]
 
 
 def _moments_torch(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

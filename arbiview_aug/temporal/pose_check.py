@@ -1,9 +1,8 @@
-"""Whether poses are right enough for depth: what is left over once distances have explained all that they can.
+"""Estimate a neighbour's pose error from the residuals that depth cannot explain.
 
-A wrong distance moves a pixel along its epipolar line; a wrong pose moves it off the line too. So the images, read over
-the distances found, are compared where contrast runs across the lines: the photometric residual there, as a function of
-a small turn and a small sideways shift of the neighbour, is least at the pose's own error (one Gauss-Newton step for
-all cameras together).
+A wrong distance moves a pixel along its epipolar line, a wrong pose moves it off the line too. The images, aligned by
+the estimated distances, are compared where contrast runs across the lines. A Gauss-Newton step for all cameras together
+gives the turn and the sideways shift of the neighbour that minimise the photometric residual.
 """
 
 from __future__ import annotations
@@ -22,37 +21,38 @@ from arbiview_aug.render.pixel_projection import Layer
 from arbiview_aug.temporal.plane_sweep import SweptSurface
 
 CORRECTED_PX = 0.15
-"""Mean displacement, in pixels of the images that are matched, from which on a pose is mended and they are matched
-again: 0.04 degrees at 400 px. Exact poses seem to err by 0.02 to 0.1."""
+"""Mean displacement in matched images above which a pose is corrected; exact poses measure 0.02 to 0.1."""
 
-MOST_ERROR_PX = 0.4
-"""What is left after ``MENDS`` must be less, or depth is declined: a tenth of a degree."""
+MAX_ERROR_PX = 0.4
+"""Largest displacement left after the corrections, a tenth of a degree at 400 px; above it depth is declined."""
 
-MENDS = 2
-"""One step finds a third of a degree to a quarter; half a degree needs two."""
+MAX_CORRECTIONS = 2
+"""One correction reduces a third of a degree to a quarter; half a degree needs two."""
 
 _ACROSS = 0.3
-"""Contrast counts where so little of it, or less, runs along the epipolar line."""
+"""Largest share of a gradient along the epipolar line."""
 
-_CONTRAST_LEVELS = 2.0  # a pixel; fainter gradients are noise
+_CONTRAST_LEVELS = 2.0  # per pixel; fainter gradients are noise
 
-_FEW = 500  # pixels that a pose's five numbers are read off
+_MIN_PIXELS = 500  # for the five parameters
 
 _TURN_DEG, _SHIFT_M = 0.1, 0.02  # steps of the derivatives
 
+_REWEIGHTINGS = 5  # of iteratively reweighted least squares, against moving objects
+
 
 class PoseSamples(NamedTuple):
-    """A neighbour's image as one camera's pixels read it.
+    """Correspondences of one camera's pixels in a neighbour's image.
 
     Attributes:
-        family: Of the camera.
+        family: Swept surface of the camera.
         source: The neighbour's camera.
         grey: (h, w) the camera's image.
-        other: (h', w') the neighbour's.
+        other: (h', w') the neighbour's image.
         inverse_distance: (h, w) along the camera's rays, 1/m.
-        kept: (h, w) where it is believed.
-        at: (h, w, 2) where the neighbour is read.
-        shift: (h, w, 2) by how much that moves if the inverse distance grows by a tenth: along the epipolar line.
+        valid: (h, w) bool.
+        at: (h, w, 2) corresponding pixels in the neighbour.
+        shift: (h, w, 2) their motion along the epipolar line when the inverse distance grows by a tenth.
     """
 
     family: SweptSurface
@@ -60,19 +60,19 @@ class PoseSamples(NamedTuple):
     grey: Layer
     other: Layer
     inverse_distance: Layer
-    kept: BoolArray
+    valid: BoolArray
     at: FloatArray
     shift: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class PoseError:
-    """What a neighbour's pose seems to be wrong by.
+    """Error of a neighbour's pose.
 
     Attributes:
-        error_px: By how much pixels are displaced, on average.
-        turn_deg: (3,) about the current ego frame's axes: the turn that mends it.
-        shift_m: (2,) along its y and z; along the motion nothing can be told from scale.
+        error_px: Mean displacement of pixels.
+        turn_deg: (3,) correcting turn about the current ego frame's axes.
+        shift_m: (2,) correcting shift along its y and z; a shift along x cannot be told from scale.
     """
 
     error_px: float
@@ -80,59 +80,55 @@ class PoseError:
     shift_m: FloatArray
 
     @property
-    def mended(self) -> FloatArray:
-        """(4, 4) what moves the neighbour's cameras to where they seem to be, in the current ego frame."""
-        return _move(np.concatenate([self.turn_deg, self.shift_m]))
+    def correction(self) -> FloatArray:
+        """(4, 4) motion of the neighbour's cameras to their estimated poses, in the current ego frame."""
+        return _pose(np.concatenate([self.turn_deg, self.shift_m]))
 
     def __str__(self) -> str:
         degrees, metres = float(np.linalg.norm(self.turn_deg)), float(np.linalg.norm(self.shift_m))
         return f"{self.error_px:.2f} px ({degrees:.2f} degrees, {metres:.2f} m)"
 
 
-def pose_error(reads: Sequence[PoseSamples]) -> PoseError | None:
-    """The error of one neighbour's pose, from all its cameras; None where too little is alike to tell."""
-    parts = [equations for read in reads if (equations := _equations(read)) is not None]
-    if sum(len(rest) for _, rest, _ in parts) < _FEW:
+def pose_error(samples: Sequence[PoseSamples]) -> PoseError | None:
+    """Estimate the error of one neighbour's pose from all its cameras; None if too few pixels match."""
+    parts = [equations for sample in samples if (equations := _equations(sample)) is not None]
+    if sum(len(b) for _, b, _ in parts) < _MIN_PIXELS:
         return None
     A, b, J = (np.concatenate(part) for part in zip(*parts, strict=True))
     x = np.zeros(5)
-    for _ in range(_ROUNDS):
-        rest = b - A @ x
-        scale = 1.5 * np.median(np.abs(rest)) + 1e-9
-        weighted = A * (1 / (1 + (rest / scale) ** 2))[:, None]
+    for _ in range(_REWEIGHTINGS):
+        residual = b - A @ x
+        scale = 1.5 * np.median(np.abs(residual)) + 1e-9
+        weighted = A * (1 / (1 + (residual / scale) ** 2))[:, None]
         x = np.linalg.lstsq(weighted.T @ A + 1e-9 * np.eye(5), weighted.T @ b, rcond=None)[0]
     return PoseError(float(np.linalg.norm(J @ x, axis=-1).mean()), x[:3], x[3:])
 
 
-_ROUNDS = 5  # of reweighting: what moved by itself must not decide
+def _equations(sample: PoseSamples) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Linear equations A x = b, (n, 5) and (n,), and the motion J of pixels (n, 2, 5); None without usable pixels.
 
-
-def _equations(read: PoseSamples) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """(n, 5) and (n,): contrast across the epipolar line times motion off it = difference; and the motion (n, 2, 5).
-
-    The five: turns about the ego's axes in degrees, shifts along its y and z in metres. Images are compared as the
-    windows' correlation does, each to its own mean and contrast.
+    x holds turns about the ego's axes in degrees and shifts along its y and z in metres. Images are compared at their
+    local mean and contrast, as in the sweep's correlation.
     """
-    at = read.at.astype(np.float32)
-    warped: Any = cv2.remap(read.other, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-    one, two = _normalised(read.grey), _normalised(warped)
-    mean = (read.grey + warped) / 2
-    # In the neighbour's pixels the image moves as the read positions do: their Jacobian is close to the identity, a
-    # metre apart.
+    at = sample.at.astype(np.float32)
+    warped: Any = cv2.remap(sample.other, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+    one, two = _normalised(sample.grey), _normalised(warped)
+    mean = (sample.grey + warped) / 2
+    # Gradients of the warped image stand for those of the neighbour's: the warp is close to the identity.
     gx, gy = (cv2.Sobel((one + two) / 2, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1)))
-    raw = np.hypot(*(cv2.Sobel(mean, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1))))
-    length = np.maximum(np.hypot(read.shift[..., 0], read.shift[..., 1]), 1e-9)
-    ex, ey = read.shift[..., 0] / length, read.shift[..., 1] / length
-    along, steep = np.abs(gx * ex + gy * ey), np.hypot(gx, gy)
-    use = read.kept & (raw > _CONTRAST_LEVELS) & (along <= _ACROSS * steep)
+    contrast = np.hypot(*(cv2.Sobel(mean, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1))))
+    length = np.maximum(np.hypot(sample.shift[..., 0], sample.shift[..., 1]), 1e-9)
+    ex, ey = sample.shift[..., 0] / length, sample.shift[..., 1] / length
+    across = np.abs(gx * ex + gy * ey) <= _ACROSS * np.hypot(gx, gy)
+    use = sample.valid & (contrast > _CONTRAST_LEVELS) & across
     if not use.any():
         return None
-    motion = _motion(read, use)
+    motion = _motion(sample, use)
     normal = np.stack([-ey[use], ex[use]], -1)
-    off = np.einsum("nk,nkp->np", normal, motion)  # [n, 5] px off the line for each unit
-    across = gx[use] * normal[:, 0] + gy[use] * normal[:, 1]
-    # What is read with the pose as it is lies off by the pose's error: two(x) = one(x - off).
-    return across[:, None] * off, (one - two)[use], motion
+    off_line = np.einsum("nk,nkp->np", normal, motion)  # [n, 5] px per unit
+    gradient = gx[use] * normal[:, 0] + gy[use] * normal[:, 1]
+    # Pixels read by the erroneous pose are displaced by its error: two(x) = one(x - off_line).
+    return gradient[:, None] * off_line, (one - two)[use], motion
 
 
 def _normalised(image: Layer) -> Layer:
@@ -141,22 +137,22 @@ def _normalised(image: Layer) -> Layer:
     return np.asarray((image - mean) / spread)
 
 
-def _motion(read: PoseSamples, use: BoolArray) -> FloatArray:
-    """(n, 2, 5) by how much the read positions move for each unit of turn and shift of the neighbour."""
-    family, source = read.family, read.source
-    directions, q = family.directions[use], read.inverse_distance[use].astype(np.float64)
-    found = []
+def _motion(sample: PoseSamples, use: BoolArray) -> FloatArray:
+    """(n, 2, 5) motion of the corresponding pixels per unit of turn and shift of the neighbour."""
+    family, source = sample.family, sample.source
+    directions, q = family.directions[use], sample.inverse_distance[use].astype(np.float64)
+    columns = []
     for axis in range(5):
         step = _TURN_DEG if axis < 3 else _SHIFT_M
-        moved = source.moved(_move(step * np.eye(5)[axis]))
+        moved = source.moved(_pose(step * np.eye(5)[axis]))
         uv, _ = project_rays(moved, directions, q, family.camera.center_m - moved.center_m)
-        found.append((uv - read.at[use]) / step)
-    return np.stack(found, -1)
+        columns.append((uv - sample.at[use]) / step)
+    return np.stack(columns, -1)
 
 
-def _move(five: FloatArray) -> FloatArray:
+def _pose(x: FloatArray) -> FloatArray:
     """(4, 4) of turns about x, y, z in degrees and shifts along y and z in metres."""
-    move = np.eye(4)
-    move[:3, :3] = cv2.Rodrigues(np.radians(five[:3]))[0]
-    move[1:3, 3] = five[3:]
-    return move
+    pose = np.eye(4)
+    pose[:3, :3] = cv2.Rodrigues(np.radians(x[:3]))[0]
+    pose[1:3, 3] = x[3:]
+    return pose

@@ -138,13 +138,13 @@ HOLE = torch.where(FREE, 0, ROAD)
 def candidate(
     level: int,
     blur: int = 0,
-    doubt: ChangeRisk = ChangeRisk.UNLABELLED,
+    risk: ChangeRisk = ChangeRisk.UNLABELLED,
     later: bool = False,
     shows: torch.Tensor | None = None,
 ) -> Candidate:
     whole = torch.ones(H, W, dtype=torch.bool) if shows is None else shows
     image = torch.full((3, H, W), level, dtype=torch.uint8)
-    return Candidate(image, whole, *(torch.full((H, W), n, dtype=torch.uint8) for n in (blur, doubt)), later)
+    return Candidate(image, whole, *(torch.full((H, W), n, dtype=torch.uint8) for n in (blur, risk)), later)
 
 
 def test_exposure_follows_the_seam() -> None:
@@ -160,33 +160,33 @@ def test_the_sharper_of_two_that_agree_is_taken() -> None:
     assert (chosen[FREE] == 0).all()
 
 
-def passing(level: int, doubt: ChangeRisk = ChangeRisk.UNLABELLED, later: bool = False) -> Candidate:
+def passing(level: int, risk: ChangeRisk = ChangeRisk.UNLABELLED, later: bool = False) -> Candidate:
     """The road at the seam, something else farther in."""
-    one = candidate(90, doubt=doubt, later=later)
+    one = candidate(90, risk=risk, later=later)
     one.image[:, 12:] = level
     return one
 
 
 def test_two_that_contradict_each_other_leave_a_hole() -> None:
-    for doubt in ChangeRisk:
-        _, chosen = merged(HOLE, FREE, SEAM, [passing(200, doubt), candidate(90, doubt=doubt)], 2)
+    for risk in ChangeRisk:
+        _, chosen = merged(HOLE, FREE, SEAM, [passing(200, risk), candidate(90, risk=risk)], 2)
         assert (chosen[16:] == -1).all() and (chosen[8:10] == 0).all()
 
 
 def test_where_labels_vouch_the_majority_is_believed() -> None:
-    for doubt in ChangeRisk:
-        several = [passing(200, doubt), candidate(90, doubt=doubt), candidate(92, doubt=doubt)]
+    for risk in ChangeRisk:
+        several = [passing(200, risk), candidate(90, risk=risk), candidate(92, risk=risk)]
         _, chosen = merged(HOLE, FREE, SEAM, several, 2)
-        assert (chosen[16:] == (1 if doubt == ChangeRisk.NONE else -1)).all()
+        assert (chosen[16:] == (1 if risk == ChangeRisk.NONE else -1)).all()
 
 
 def test_one_alone_is_believed_unless_something_moved_beside_it() -> None:
     nothing = torch.zeros(H, W, dtype=torch.bool)
-    for doubt in ChangeRisk:
-        several = [candidate(90, doubt=doubt), candidate(90, shows=nothing), candidate(90, shows=nothing)]
+    for risk in ChangeRisk:
+        several = [candidate(90, risk=risk), candidate(90, shows=nothing), candidate(90, shows=nothing)]
         for of in (several, several[:2]):
             _, chosen = merged(HOLE, FREE, SEAM, of, 2)
-            assert (chosen[FREE] == (0 if doubt <= ChangeRisk.SHADED or len(of) == 2 else -1)).all()
+            assert (chosen[FREE] == (0 if risk <= ChangeRisk.SHADED or len(of) == 2 else -1)).all()
 
 
 def test_without_labels_two_of_one_side_are_not_enough() -> None:
@@ -208,16 +208,16 @@ def test_what_is_there_before_and_after_stood_still() -> None:
 def test_what_the_current_frame_alone_shows_goes_on_into_the_hole() -> None:
     view = HOLE.clone()
     view[:, 4:8, :16] = 200
-    for doubt in ChangeRisk:
-        several = [candidate(90, doubt=doubt), candidate(90, doubt=doubt, later=True)]
+    for risk in ChangeRisk:
+        several = [candidate(90, risk=risk), candidate(90, risk=risk, later=True)]
         _, chosen = merged(view, FREE, SEAM, several, 2)
         assert (chosen[8:12, 24:] == 0).all()
-        assert (chosen[8:, :14] == (-1 if doubt == ChangeRisk.UNLABELLED else 0)).all()
+        assert (chosen[8:, :14] == (-1 if risk == ChangeRisk.UNLABELLED else 0)).all()
 
 
 def test_an_exposure_that_is_another_object_is_not_taken_on() -> None:
     """What passes at the seam of one neighbour alone neither recolours the road nor outvotes the others."""
-    blue = candidate(90, doubt=ChangeRisk.NONE)
+    blue = candidate(90, risk=ChangeRisk.NONE)
     blue.image[:, :8] = torch.tensor([20, 40, 100], dtype=torch.uint8)[:, None, None]
     pixels, _ = merged(HOLE, FREE, SEAM, [blue], 2)
     assert (pixels[:, FREE] == 90).all()
@@ -227,7 +227,7 @@ def test_a_neighbour_without_a_seam_follows_those_that_have_one() -> None:
     """A camera twice as bright that sees the far half of the hole alone and the near one with another."""
     near, far = torch.ones(H, W, dtype=torch.bool), torch.zeros(H, W, dtype=torch.bool)
     near[18:], far[10:] = False, True
-    several = [candidate(90, doubt=ChangeRisk.NONE, shows=near), candidate(180, doubt=ChangeRisk.NONE, shows=far)]
+    several = [candidate(90, risk=ChangeRisk.NONE, shows=near), candidate(180, risk=ChangeRisk.NONE, shows=far)]
     pixels, chosen = merged(HOLE, FREE, SEAM, several, 2)
     assert (chosen[18:] == 1).all() and (pixels[:, FREE].int() - 90).abs().max() <= 1
 

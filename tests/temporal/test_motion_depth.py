@@ -79,7 +79,7 @@ def test_most_pixels_have_the_right_depth(drive: SyntheticDrive, exact: MotionDe
 @pytest.mark.slow
 def test_wrong_poses_are_mended_or_declined(drive: SyntheticDrive, sample: dict[str, Any], exact: MotionDepth) -> None:
     mended = found(turned(sample, 0.3))
-    assert "poses mended by" in mended.words
+    assert "poses corrected by" in mended.words
     density, share = right(drive, mended)
     assert density > right(drive, exact)[0] - 0.05 and share > 0.9
     lost = found(turned(sample, 4.0))

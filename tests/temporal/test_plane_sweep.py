@@ -38,7 +38,7 @@ def test_surfaces_are_the_road_and_upright_walls() -> None:
         q = family.inverse_distance(wall)
         points = origin + family.directions / np.maximum(q, 1e-9)[..., None]
         down = family.directions[..., 2] < 0
-        road = down & (-family.directions[..., 2] / 1.8 >= wall * family.level)
+        road = down & (-family.directions[..., 2] / 1.8 >= wall * family.horizontal)
         np.testing.assert_allclose(points[road][:, 2], -0.3, atol=1e-5)
         if wall:
             radius = np.hypot(*(points[~road] - origin)[:, :2].T)

@@ -98,7 +98,7 @@ def test_without_neighbours_nothing_of_fills_is_built_or_called(
     """Neither where a sample has none, nor where they are not wanted, nor where a list of them is empty."""
     target = lowered(sample["rig"], (32, 88))
     expected = RigRetarget(target, surface=surface, neighbours=None)(sample)
-    for module, names in ((planner, ("plan_fills",)), (fill, ("fill_views", "build_plan", "merged"))):
+    for module, names in ((planner, ("plan_fills",)), (fill, ("build_plan", "merged"))):
         for name in names:
             monkeypatch.setattr(module, name, lambda *_, **__: pytest.fail("fills are made"))
     monkeypatch.setattr("arbiview_aug.sample.neighbours._neighbour", lambda *_: pytest.fail("a neighbour is looked at"))
