@@ -310,12 +310,10 @@ class Camera:
                 scaled = replace(scaled, mask=np.ones(frame.scaled, bool))
             return scaled.crop(frame.top, frame.left, frame.size)
         h, w = checked_size(self.name, size)
-        A = resize_matrix(self.size, (h, w))
-        camera = replace(self, width_px=w, height_px=h, K=A @ self.K, mask=None)
-        if self.mask is None:
-            return camera
-        mask = cv2.resize(self.mask.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST_EXACT)
-        return replace(camera, mask=mask.astype(bool))
+        mask = self.mask
+        if mask is not None:
+            mask = cv2.resize(mask.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST_EXACT).astype(bool)
+        return replace(self, width_px=w, height_px=h, K=resize_matrix(self.size, (h, w)) @ self.K, mask=mask)
 
     def crop(self, top: int, left: int, size: tuple[int, int]) -> Camera:
         """The camera of the window of ``size`` (h, w) whose first pixel is (left, top).
@@ -326,15 +324,13 @@ class Camera:
         K = self.K.copy()
         top, left = (checked_pixels(self.name, f, n, -MAX_SIZE_PX) for f, n in (("top", top), ("left", left)))
         K[:2, 2] -= left, top
-        camera = replace(self, width_px=w, height_px=h, K=K, mask=None)
-        if self.mask is None:
-            return camera
-        mask = np.zeros((h, w), bool)
-        y0, y1 = max(0, top), min(self.height_px, top + h)
-        x0, x1 = max(0, left), min(self.width_px, left + w)
-        if y1 > y0 and x1 > x0:
+        mask = None
+        if self.mask is not None:
+            mask = np.zeros((h, w), bool)
+            y0, y1 = np.clip((top, top + h), 0, self.height_px)
+            x0, x1 = np.clip((left, left + w), 0, self.width_px)
             mask[y0 - top : y1 - top, x0 - left : x1 - left] = self.mask[y0:y1, x0:x1]
-        return replace(camera, mask=mask)
+        return replace(self, width_px=w, height_px=h, K=K, mask=mask)
 
     def moved(self, ego2ego: Any) -> Camera:
         """The same camera in another ego frame: ``cam2ego`` becomes ``ego2ego @ cam2ego``."""

@@ -33,9 +33,6 @@ def framing(name: str, size: tuple[int, int], to: tuple[int, int], fit: Fit) -> 
     """Frame an image of ``size`` for the size ``to``, both (h, w) in pixels.
 
     The bottom row stays and columns are centred, as BEV detectors crop their images. ``name`` is the camera's.
-
-    Raises:
-        CalibrationError: An unknown ``fit``, or shapes so different that the scaled image would be too large.
     """
     if fit not in get_args(Fit):
         raise CalibrationError(f"camera {name!r}: fit: expected one of {', '.join(get_args(Fit))}, got {fit!r}")

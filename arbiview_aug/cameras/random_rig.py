@@ -18,8 +18,6 @@ from arbiview_aug.errors import CalibrationError, SampleError
 Range = float | tuple[float, float]
 """A half-width about the neutral value (0, or 1 for scales: 0.2 means 0.8 to 1.2), or (low, high)."""
 
-_SCALES = ("focal_scale",)
-
 
 class RandomRig:
     """Target rigs around ``base``: the whole rig turned, moved and zoomed by random amounts.
@@ -96,18 +94,15 @@ class RandomRig:
             seed = worker.seed - worker.id  # the base seed that all workers of an epoch share
         else:
             seed = torch.initial_seed() if rng is None else rng.initial_seed()
-        digest = hashlib.sha256(f"{seed} {int(self._epoch)} {self._sequence(sample)}".encode()).digest()
-        return self.draw(torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1))
-
-    def _sequence(self, sample: Mapping[str, Any]) -> Any:
         key = self.sequence_key
         if key not in sample:
             keys = ", ".join(map(str, sample))
             raise SampleError(f"RandomRig(per='sequence'): expected {key!r} in the sample, got {keys}")
-        names = set(_flat(sample[key]))
+        names = set(_leaves(sample[key]))
         if len(names) != 1:
             raise SampleError(f"RandomRig(per='sequence'): {key}: expected one sequence a batch, got {len(names)}")
-        return names.pop()
+        digest = hashlib.sha256(f"{seed} {int(self._epoch)} {names.pop()}".encode()).digest()
+        return self.draw(torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1))
 
     def rig(self, params: Mapping[str, float]) -> Rig:
         """The rig of drawn parameters.
@@ -132,7 +127,8 @@ class RandomRig:
 
 
 def _range(name: str, value: Any) -> tuple[float, float]:
-    neutral = 1.0 if name in _SCALES else 0.0
+    is_scale = name == "focal_scale"
+    neutral = 1.0 if is_scale else 0.0
     try:
         if isinstance(value, tuple | list):
             low, high = (float(x) for x in value)
@@ -140,18 +136,18 @@ def _range(name: str, value: Any) -> tuple[float, float]:
             low, high = neutral - float(value), neutral + float(value)
     except (TypeError, ValueError):
         low, high = math.nan, math.nan
-    if not (math.isfinite(low) and math.isfinite(high) and low <= high) or (name in _SCALES and low <= 0):
-        positive = "positive " if name in _SCALES else ""
+    if not (math.isfinite(low) and math.isfinite(high) and low <= high) or (is_scale and low <= 0):
+        positive = "positive " if is_scale else ""
         raise CalibrationError(f"RandomRig: {name}: expected a half-width or a {positive}(low, high), got {value!r}")
     return low, high
 
 
-def _flat(value: Any) -> Iterator[Any]:
+def _leaves(value: Any) -> Iterator[Any]:
     """The leaves of nested lists, tensors and arrays, as in a collated batch."""
     if isinstance(value, torch.Tensor | np.ndarray):
         value = value.tolist()
     if isinstance(value, list | tuple):
         for entry in value:
-            yield from _flat(entry)
+            yield from _leaves(entry)
     else:
         yield value

@@ -277,25 +277,15 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
         expected = ", ".join(sorted(_CAMERA_KEYS))
         raise CalibrationError(f"{label}: expected keys {expected}, missing {', '.join(missing)}{hint(entry, missing)}")
     _refuse_misnamed(entry, "distortion", label)
+    calibration = {key: entry[key] for key in ("name", "K", "cam2ego")}
     distortion = entry.get("distortion")
-    lens: Any = "pinhole"
-    coefficients: Any = ()
     if distortion is not None:
-        if not isinstance(distortion, Mapping) or "model" not in distortion or "coeffs" not in distortion:
+        if not isinstance(distortion, Mapping) or not {"model", "coeffs"} <= distortion.keys():
             raise CalibrationError(f"{label}: distortion: expected null or {{model, coeffs}}, got {distortion!r}")
-        lens, coefficients = distortion["model"], distortion["coeffs"]
+        calibration |= {"lens": distortion["model"], "distortion": distortion["coeffs"]}
     mask = None if entry.get("mask") is None else read_mask(entry["mask"], folder, label)
     try:
-        return Camera(
-            name=entry["name"],
-            width_px=entry["width"],
-            height_px=entry["height"],
-            K=entry["K"],
-            cam2ego=entry["cam2ego"],
-            lens=lens,
-            distortion=coefficients,
-            mask=mask,
-        )
+        return Camera(width_px=entry["width"], height_px=entry["height"], mask=mask, **calibration)
     except CalibrationError as error:
         raise CalibrationError(f"{where}: {error}") from None
 

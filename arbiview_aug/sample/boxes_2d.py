@@ -60,12 +60,12 @@ def project_boxes_3d(boxes_3d: Any, cameras: Rig | Mapping[str, Any]) -> list[Im
         SampleError: Boxes of another shape, not finite or without size; a batch of samples.
     """
     boxes = checked_boxes(boxes_3d)
-    if isinstance(cameras, Rig):
-        return [_of_camera(camera, boxes) for camera in cameras]
-    frames = read_frames(cameras, None)
-    if lead := leading_shape(cameras["images"]):
-        raise SampleError(f"cameras: expected one sample, got a batch {lead}; project the boxes of each frame")
-    return [_of_camera(camera, boxes) for camera in frames[0].rig]
+    if not isinstance(cameras, Rig):
+        frames = read_frames(cameras, None)
+        if lead := leading_shape(cameras["images"]):
+            raise SampleError(f"cameras: expected one sample, got a batch {lead}; project the boxes of each frame")
+        cameras = frames[0].rig
+    return [_of_camera(camera, boxes) for camera in cameras]
 
 
 class Outline(NamedTuple):

@@ -29,10 +29,6 @@ def detections_of_frames(
     ``detections``: for each camera ``{"boxes": (n, 4), "labels": [n names]}``, boxes x0 y0 x1 y1 in source pixels;
     in a batch, such a list for each frame. ``box_names``: a name for each of the ``boxes_3d``, ``upright`` by default;
     in a batch, a list for each frame.
-
-    Raises:
-        SampleError: Counts that differ from those of cameras, frames or boxes; impossible boxes.
-        SampleTypeError: Detections of another structure, labels that are not names.
     """
     if (given := sample.get("detections")) is not None:
         of_frames = _entries("detections", given, len(frames), "frames") if lead else [given]

@@ -86,16 +86,13 @@ def read_frames(sample: Any, source_rig: Rig | None) -> list[Frame]:
 
 
 def read_scenes(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...], surface: str) -> list[Scene]:
-    """Read the scene geometry of each frame, in the source's ego frame, as far as a surface uses it; [] without any.
+    """Read the scene geometry that a surface uses for each frame, in the source's ego frame; [] without any.
 
     Args:
         sample: The sample dict.
         frames: Its checked frames.
         lead: Leading dimensions of its images.
         surface: A name in ``SURFACES``.
-
-    Raises:
-        SampleError: Geometry that the surface needs is missing or impossible.
     """
     row = SURFACES[surface]
     found: dict[str, list[Points]] = {}
@@ -177,12 +174,7 @@ def names_of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> 
 
 
 def of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[Points]:
-    """The array of each frame: from a tensor with the images' leading dimensions, or a list with one per frame.
-
-    Raises:
-        SampleError: Another number of frames.
-        SampleTypeError: The value is not numeric.
-    """
+    """The array of each frame: from a tensor with the images' leading dimensions, or a list with one per frame."""
     if not lead:
         return [_array(key, value)]
     try:
@@ -203,12 +195,7 @@ def frame_from(
     lead: tuple[int, ...] = (),
     index: tuple[int, ...] = (),
 ) -> Frame:
-    """One frame of a sample, at an ``index`` into its leading dimensions, whose images are checked already.
-
-    Raises:
-        SampleError: Missing calibration, mismatched counts or sizes.
-        CalibrationError: Impossible K, cam2ego or lens.
-    """
+    """One frame of a sample, at an ``index`` into its leading dimensions, whose images are checked already."""
     rig = sample.get("rig")
     if rig is None:
         rig = source_rig if source_rig is not None else _rig_from_tensors(images, sample, index)
@@ -236,7 +223,7 @@ def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any
             f"sample: expected calibration, 'rig' or 'K' and 'cam2ego', missing {', '.join(missing)}"
             f"{hint(sample, missing)}; or pass source_rig= to the transform"
         )
-    K, cam2ego = (_numbers(key, sample[key], index) for key in ("K", "cam2ego"))
+    K, cam2ego = (numbers(key, sample[key], index) for key in ("K", "cam2ego"))
     for key, array, expected in (("K", K, (len(images), 3, 3)), ("cam2ego", cam2ego, (len(images), 4, 4))):
         if array.shape != expected:
             raise SampleError(f"{key}: expected shape {expected} for {len(images)} images, got {array.shape}")
@@ -246,11 +233,10 @@ def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any
         _check_principal_point(k, K[k], (h, w))
         calibration: dict[str, Any] = {"K": K[k], "cam2ego": cam2ego[k], "lens": lens, "distortion": distortion}
         cameras.append(Camera(name=f"camera {k}", width_px=w, height_px=h, **calibration))
-    ground_z_m = numbers("ground_z_m", sample.get("ground_z_m", 0.0))
-    of_frame = _numbers("ground_z_m", ground_z_m, index) if ground_z_m.ndim else ground_z_m
-    if of_frame.size != 1:
+    ground_z_m = numbers("ground_z_m", sample.get("ground_z_m", 0.0), index)
+    if ground_z_m.size != 1:
         raise SampleError(f"ground_z_m: expected one height for each frame, got shape {ground_z_m.shape}")
-    return Rig(cameras, ground_z_m=float(of_frame.item()))
+    return Rig(cameras, ground_z_m=float(ground_z_m.item()))
 
 
 def _check_principal_point(k: int, K: np.ndarray, size: tuple[int, int]) -> None:
@@ -274,7 +260,7 @@ def _check_principal_point(k: int, K: np.ndarray, size: tuple[int, int]) -> None
 def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> list[tuple[Any, tuple[float, ...]]]:
     """Lens and coefficients of each camera, without the zeros that pad them to a common number."""
     names, distortion = sample.get("lens"), sample.get("distortion")
-    coefficients = None if distortion is None else _numbers("distortion", distortion, index)
+    coefficients = None if distortion is None else numbers("distortion", distortion, index)
     if names is None:
         if coefficients is not None and coefficients.any():
             expected = f"'lens' beside it, one of {', '.join(LENSES)} for each camera"
@@ -290,8 +276,8 @@ def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> li
         raise SampleError(f"distortion: expected shape ({count}, up to 8) for the lenses {lenses}, got {got}")
     result = []
     for lens, row in zip(lenses, coefficients.tolist(), strict=True):
-        count = LENSES[lens].coefficient_counts[-1] if lens in LENSES else len(row)
-        result.append((lens, tuple(row) if any(row[count:]) else tuple(row[:count])))
+        size = LENSES[lens].coefficient_counts[-1] if lens in LENSES else len(row)
+        result.append((lens, tuple(row) if any(row[size:]) else tuple(row[:size])))
     return result
 
 
@@ -333,38 +319,25 @@ def _with_masks(rig: Rig, sample: Mapping[str, Any], lead: tuple[int, ...], inde
     return rig.with_cameras([replace(camera, mask=mask) for camera, mask in zip(rig, masks, strict=True)])
 
 
-def numbers(key: str, value: Any) -> FloatArray:
-    """An entry of a sample as a float64 array.
-
-    Raises:
-        SampleTypeError: The value is not numeric.
-    """
-    return np.asarray(_array(key, value), np.float64)
+def numbers(key: str, value: Any, index: tuple[int, ...] = ()) -> FloatArray:
+    """An entry of a sample as a float64 array, at an ``index`` into its leading dimensions; scalars hold for all."""
+    array = np.asarray(_array(key, value), np.float64)
+    try:
+        return np.asarray(array[index]) if array.ndim else array
+    except IndexError:
+        raise SampleError(f"{key}: expected the images' leading dimensions, got shape {array.shape}") from None
 
 
 def _array(key: str, value: Any) -> Points:
     """An entry of a sample as an array: float32 in the same memory, anything else as float64."""
     try:
         if isinstance(value, torch.Tensor):
-            if value.layout != torch.strided or value.device.type == "meta":
-                raise TypeError(f"{value.layout} on {value.device}")
-            if value.is_complex():
-                raise TypeError("complex numbers")
             value = value.detach().cpu()
-            return (value if value.dtype == torch.float32 else value.double()).numpy()
+            value = (value if value.dtype == torch.float32 or value.is_complex() else value.double()).numpy()
         if np.iscomplexobj(value):
             raise TypeError("complex numbers")
         array = np.asarray(value)
         return array if array.dtype == np.float32 else np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # RuntimeError: quantised tensors
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # RuntimeError: quantised and meta tensors
         why = " ".join(str(error).split())[:120]
         raise SampleTypeError(f"{key}: expected a tensor of numbers, got {type(value).__name__} ({why})") from None
-
-
-def _numbers(key: str, value: Any, index: tuple[int, ...]) -> np.ndarray:
-    """The calibration of one frame, float64."""
-    array = numbers(key, value)
-    try:
-        return np.asarray(array[index])
-    except IndexError:
-        raise SampleError(f"{key}: expected the images' leading dimensions, got shape {array.shape}") from None

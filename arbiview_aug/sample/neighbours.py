@@ -107,10 +107,6 @@ def neighbours_of_frames(
     m/s in the ego frame) if both frames have a time and all velocities are finite.
 
     Frames at the same place are left out silently, unusable ones with a warning.
-
-    Raises:
-        SampleTypeError: ``neighbours`` is not a list, or in a batch not a list of lists.
-        SampleError: There are too many.
     """
     value = sample.get("neighbours")
     if value is None:
@@ -128,7 +124,8 @@ def neighbours_of_frames(
     for index, frame, now, entries in zip(np.ndindex(*lead), frames, current, lists, strict=True):
         of_frame = []
         for number, entry in enumerate(entries):
-            name = _name(entry, number)
+            token = entry.get("token") if isinstance(entry, Mapping) else None
+            name = str(number) if token is None else repr(str(token))
             try:
                 neighbour = _neighbour(sample, index, frame, now, entry, number, name)
             except (ArbiviewError, OSError) as error:
@@ -136,18 +133,13 @@ def neighbours_of_frames(
                 continue
             if neighbour is not None:
                 of_frame.append(neighbour)
-        found.append(sorted(of_frame, key=lambda one: (one.travel_m, one.number)))
+        found.append(sorted(of_frame, key=lambda neighbour: neighbour.travel_m))
     return found
 
 
 def warn_lost(warn: Warn, name: str, error: Exception) -> None:
     """Warn that a neighbour is not used."""
     warn(f"neighbour {name}", f"neighbour {name} is left out: {error}; the frame is rendered without it")
-
-
-def _name(entry: Any, number: int) -> str:
-    token = entry.get("token") if isinstance(entry, Mapping) else None
-    return str(number) if token is None else repr(str(token))
 
 
 def _neighbour(
@@ -213,8 +205,7 @@ def _seconds(sample: Mapping[str, Any], index: tuple[int, ...], entry: Mapping[s
     """Time from the current frame to this one; None if either has no time."""
     if sample.get("time_s") is None or entry.get("time_s") is None:
         return None
-    here, there = numbers("time_s", sample["time_s"]), numbers("time_s", entry["time_s"])
-    here = here[index] if here.ndim else here
+    here, there = numbers("time_s", sample["time_s"], index), numbers("time_s", entry["time_s"])
     if here.size != 1 or there.size != 1 or not np.isfinite([here.item(), there.item()]).all():
         raise SampleError("time_s: expected one finite number of seconds, here and in the sample")
     return float(there.item() - here.item())

@@ -68,11 +68,7 @@ class Scene:
         return digest.digest()
 
     def surface(self, name: str, ground_z_m: float) -> Surface:
-        """A surface by name, over a road at ``ground_z_m``; cached.
-
-        Raises:
-            ValueError: An unknown name, or geometry that the scene lacks.
-        """
+        """A surface by name, over a road at ``ground_z_m``; cached."""
         key = name, ground_z_m
         if key not in self._surfaces:
             row = SURFACES.get(name)

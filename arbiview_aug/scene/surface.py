@@ -105,11 +105,6 @@ class LayeredSurface(Surface):
 
     is_layered: ClassVar[bool] = True
 
-    @property
-    @abstractmethod
-    def background(self) -> Surface:
-        """The surface behind the objects."""
-
     @abstractmethod
     def drawn(self, camera: Camera) -> Fragments:
         """Rasterise the objects into a camera."""
