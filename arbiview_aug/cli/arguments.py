@@ -1,16 +1,17 @@
-"""Parsers, argument types and output folders that the commands share."""
+"""Parsers, argument types, output folders and progress bars that the commands share."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, get_args
 
 import torch
+from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import shipped_rigs
 from arbiview_aug.datasets.image_io import Reduce
@@ -23,11 +24,9 @@ from arbiview_aug.transforms.settings import RenderPath
 REAL_TARGET = "waymo"
 """Default target rig of real frames."""
 
-_PROGRAM = "python -m arbiview_aug"
-
 
 class _HelpFormatter(argparse.HelpFormatter):
-    """Help with each option's default at its end, unless its text gives it."""
+    """Help formatter that appends each option's default, unless the text gives it."""
 
     def _get_help_string(self, action: argparse.Action) -> str:
         text, default = action.help or "", action.default
@@ -38,14 +37,16 @@ class _HelpFormatter(argparse.HelpFormatter):
         return f"{text} (default: {words})"
 
 
-def command_parser(command: str, description: str, example: str, program: str = _PROGRAM) -> argparse.ArgumentParser:
-    """The parser of a command, without its options.
+def command_parser(
+    command: str, description: str, example: str, program: str = "python -m arbiview_aug"
+) -> argparse.ArgumentParser:
+    """Create the parser of a command, without its options.
 
     Args:
-        command: Its name, as it is typed.
+        command: Its name, as typed after ``program``.
         description: One sentence on what it does.
         example: Arguments that show it at work.
-        program: Comes before its name.
+        program: Prefix of the command.
     """
     prog = f"{program} {command}".strip()
     return argparse.ArgumentParser(
@@ -54,7 +55,7 @@ def command_parser(command: str, description: str, example: str, program: str = 
 
 
 def data(text: str) -> str:
-    """``PATH`` or ``KIND:PATH``, as ``open_data`` takes it; says on stderr which kind a path of several is taken as."""
+    """``PATH`` or ``KIND:PATH`` for ``open_data``; prints to stderr which kind an ambiguous path is taken as."""
     kind, root = split_kind(text)
     kinds = kinds_of(root) if kind is None else [kind]
     if len(kinds) > 1:
@@ -67,9 +68,9 @@ def add_data(parser: argparse.ArgumentParser, without: str | None = None, **opti
     """Add ``--data``.
 
     Args:
-        parser: To this one.
-        without: Data that is used without it, in words; None where it is required.
-        **options: Of ``add_argument``.
+        parser: The parser.
+        without: Description of the data used without it; None makes it required.
+        **options: Passed to ``add_argument``.
     """
     kinds = "; ".join(f"{kind}: {reader.description}" for kind, reader in READERS.items())
     default = "" if without is None else f" (default: {without})"
@@ -86,18 +87,28 @@ def add_target(group: argparse._ActionsContainer, *, required: bool = False) -> 
 
 def add_rendering(parser: argparse.ArgumentParser, *, several: bool = False) -> None:
     """Add ``--quality``, ``--surface`` and ``--path``; with ``several``, each takes one value or more."""
+    quality = "renderer preset; paper: the published stages, without lenses"
+    path = "what fills holes; favs: continued from their borders (docs/holes.md)"
     for name, choices, default, text in (
-        ("--quality", get_args(Quality), "fast", "renderer preset; paper: the published stages, without lenses"),
+        ("--quality", get_args(Quality), "fast", quality),
         ("--surface", tuple(SURFACES), "auto", "scene geometry; auto: the best that the data offers"),
-        (
-            "--path",
-            get_args(RenderPath),
-            "favs",
-            "what fills holes; favs: continued from their borders (docs/holes.md)",
-        ),
+        ("--path", get_args(RenderPath), "favs", path),
     ):
         options: dict[str, Any] = {"nargs": "+", "default": [default]} if several else {"default": default}
         parser.add_argument(name, choices=choices, help=text, **options)
+
+
+def add_frames(parser: argparse.ArgumentParser, default: int | None, text: str = "number of frames") -> None:
+    """Add ``--frames``, ``--seed`` and ``--size``."""
+    parser.add_argument("--frames", type=count, default=default, metavar="N", help=text)
+    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of the synthetic streets")
+    parser.add_argument(
+        "--size",
+        type=size,
+        metavar="HxW",
+        help="render at this height and width, the target cut to this aspect; synthetic sources too (default: the "
+        "rig's own; synthetic: 256x704)",
+    )
 
 
 def add_reduce(parser: argparse.ArgumentParser) -> None:
@@ -113,16 +124,16 @@ def add_output(parser: argparse.ArgumentParser, text: str = "folder to write to"
 
 
 def count(text: str) -> int:
-    """A whole number above 0."""
-    return _whole_number(text, 1, "above 0")
+    """Integer above 0."""
+    return _integer(text, 1, "above 0")
 
 
 def seed(text: str) -> int:
-    """A whole number from 0."""
-    return _whole_number(text, 0, "from 0")
+    """Integer from 0."""
+    return _integer(text, 0, "from 0")
 
 
-def _whole_number(text: str, least: int, expected: str) -> int:
+def _integer(text: str, least: int, expected: str) -> int:
     value = int(text)
     if value < least:
         raise argparse.ArgumentTypeError(f"expected a whole number {expected}, got {text!r}")
@@ -130,7 +141,7 @@ def _whole_number(text: str, least: int, expected: str) -> int:
 
 
 def device_named(name: str | None) -> torch.device:
-    """The torch device of this name; without one, a GPU if there is one.
+    """Torch device of this name; by default a GPU if there is one.
 
     Raises:
         DataError: There is no such device.
@@ -148,7 +159,7 @@ def device_named(name: str | None) -> torch.device:
 
 
 def size(text: str) -> tuple[int, int]:
-    """``256x704``: height and width."""
+    """Height and width from ``256x704``."""
     height, _, width = text.partition("x")
     if not (height.isdecimal() and width.isdecimal() and int(height) and int(width)):
         raise argparse.ArgumentTypeError(f"expected HEIGHTxWIDTH such as 256x704, got {text!r}")
@@ -156,10 +167,10 @@ def size(text: str) -> tuple[int, int]:
 
 
 def writable_folder(path: Path, asked: str) -> Path:
-    """Make a folder before any work, so that one that cannot be made costs nothing.
+    """Create a folder before any work starts.
 
     Raises:
-        DataError: It cannot be made; the message names ``asked``, the value of ``--output``.
+        DataError: It cannot be created; the message names ``asked``, the value of ``--output``.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -170,8 +181,25 @@ def writable_folder(path: Path, asked: str) -> Path:
 
 @contextmanager
 def gathered_warnings(lines: list[str]) -> Iterator[None]:
-    """Gather warnings in ``lines``, each once, so that they do not break a progress bar."""
+    """Collect warnings in ``lines``, each once, instead of printing them across a progress bar."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         yield
     lines.extend(dict.fromkeys(str(warning.message) for warning in caught))
+
+
+@contextmanager
+def named_steps(notes: list[str]) -> Iterator[Callable[[str, int], None]]:
+    """Show a progress bar and collect warnings in ``notes``.
+
+    Yields:
+        A function to call before each step, with its name and the number of steps.
+    """
+    with gathered_warnings(notes), tqdm(unit="step", leave=False) as bar:
+
+        def tick(name: str, steps: int) -> None:
+            bar.total = steps
+            bar.set_description(name)
+            bar.update()
+
+        yield tick

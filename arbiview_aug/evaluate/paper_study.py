@@ -27,7 +27,7 @@ from arbiview_aug.evaluate.methods import GENERATED, OURS, Method, baseline, has
 from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.pictures import contact_sheet, save_picture
 from arbiview_aug.evaluate.report.sheet import left_to_right
-from arbiview_aug.evaluate.report.tables import Column, cell, markdown_table
+from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import TRUCK_UP_M, VEHICLES, YAWS_DEG, named_targets, paper_target, spacing_deg
 
 REAL_FRAMES = ("nuscenes-one", "ddad-one")
@@ -149,7 +149,7 @@ def _bare(sample: Mapping[str, Any]) -> dict[str, Any]:
 
 
 # --- the tables -------------------------------------------------------------------------------------------------------
-_FOUR = (Column("PSNR", "psnr_db"), Column("SSIM", "ssim", 4), Column("MAE", "mae"), Column("RMSE", "rmse"))
+_FOUR = (("PSNR", "psnr_db", ".2f"), ("SSIM", "ssim", ".4f"), ("MAE", "mae", ".2f"), ("RMSE", "rmse", ".2f"))
 _HEADINGS = {"paper": "six", "yaw": "turned", "vehicles": "vehicles", "truck": "truck"}
 _TURNS = ", ".join(f"{yaw:g}" for yaw in YAWS_DEG)
 _GENERATOR = (
@@ -180,15 +180,15 @@ def _six(study: Study) -> str:
     """Synthetic sets have the truth to be compared with: they are here only where nothing else is."""
     sets = {name: methods for name, methods in study.means.items() if not _has_truth(methods)} or study.means
     names = [*_methods(study), *(method for method in PUBLISHED if method not in _methods(study))]
-    head = ["", *(f"{of}: {c.heading}" if c is _FOUR[0] else c.heading for of in ("published", *sets) for c in _FOUR)]
+    head = ["", *(f"{of}: {h}" if h == "PSNR" else h for of in ("published", *sets) for h, *_ in _FOUR)]
     rows = []
     for name in names:
         published = PUBLISHED.get(name)
         rows.append([name if published is None else f"{name} ({published.name})"])
-        rows[-1] += [cell({} if published is None else published._asdict(), c) for c in _FOUR]
+        rows[-1] += [cell({} if published is None else published._asdict(), f"{{{m}:{d}}}") for _, m, d in _FOUR]
         for methods in sets.values():
-            measured = methods.get(name, {}).get("paper", {})
-            rows[-1] += [cell(measured, c._replace(metric=f"raw_{c.metric}")) for c in _FOUR]
+            found = methods.get(name, {}).get("paper", {})
+            rows[-1] += [cell(found, f"{{raw_{m}:{d}}}") for _, m, d in _FOUR]
     return markdown_table(head, rows)
 
 
@@ -203,7 +203,7 @@ def _others(study: Study) -> str:
         for methods in study.means.values():
             metrics = ("true_psnr_db", "true_covered_psnr_db") if _has_truth(methods) else ("even_psnr_db",)
             of_kinds = [methods.get(name, {}).get(kind, {}) for kind in kinds]
-            rows[-1] += [" / ".join(cell(means, Column("", metric)) for metric in metrics) for means in of_kinds]
+            rows[-1] += [" / ".join(cell(means, f"{{{metric}:.2f}}") for metric in metrics) for means in of_kinds]
     return markdown_table(head, rows)
 
 
@@ -278,6 +278,6 @@ def draw_figures(sample: Mapping[str, Any], folder: Path) -> list[Path]:
                 rows.append([views[k].image for k in order])
                 titles.append(name)
                 labels.append([f"{rig.names[k]} {share * spacing[k]:+.4g} deg" for k in order])
-        picture = contact_sheet(rows, labels, titles=titles, width_px=_WIDTH_PX)
+        picture = contact_sheet(rows, labels, titles, width_px=_WIDTH_PX)
         files.append(save_picture(folder / f"figure{number}.png", picture))
     return files

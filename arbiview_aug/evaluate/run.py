@@ -1,4 +1,4 @@
-"""Methods on frames and targets: all metrics as plain data, and the views of the first frame to look at."""
+"""Evaluation of methods on frames and targets."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from arbiview_aug.evaluate.metrics import mean_of
 
 @dataclass
 class Evaluation:
-    """Everything measured.
+    """Measurements as plain data, and the views of the first frame.
 
     Attributes:
-        views: A row for each frame, target, camera and method: metrics beside those four names.
-        pairs: A row for each frame, method and pair of neighbours: ``kind`` ``overlap`` (two sources) or
+        views: One row for each frame, target, camera and method: metrics beside those four names.
+        pairs: One row for each frame, method and pair of neighbours: ``kind`` is ``overlap`` (two sources) or
             ``consistency`` (two views of ``target``).
-        pictures: Of the first frame, views by (target, method).
-        targets: Of the first frame, rigs by name.
+        pictures: Views of the first frame by (target, method).
+        targets: Rigs of the first frame by name.
         first: The first frame.
-        declined: Why a method could not render, by method.
+        declined: Reason why a method could not render, by method.
     """
 
     views: list[dict[str, Any]] = field(default_factory=list)
@@ -37,12 +37,12 @@ class Evaluation:
     declined: dict[str, str] = field(default_factory=dict)
 
     def means(self, method: str, target: str | None = None) -> dict[str, float]:
-        """Means of the per-image values over cameras and frames; over all targets by default."""
+        """Mean the per-image values over cameras and frames; over all targets by default."""
         rows = [row for row in self.views if row["method"] == method and target in (None, row["target"])]
         return mean_of([{key: value for key, value in row.items() if not isinstance(value, str)} for row in rows])
 
     def agreement(self, method: str) -> dict[str, float]:
-        """Mean and worst pair, of the sources (``overlap_...``) and of the rendered views (``consistency_...``)."""
+        """Summarize the pairs of sources (``overlap_...``) and of rendered views (``consistency_...``)."""
         row: dict[str, float] = {}
         for kind in ("overlap", "consistency"):
             found = [p for p in self.pairs if p["method"] == method and p["kind"] == kind]
@@ -56,48 +56,40 @@ def evaluate(
     targets: Callable[[Rig], Mapping[str, Rig]],
     methods: Sequence[Method],
     tick: Callable[[str, int], None] = lambda _, __: None,
+    *,
+    agreement: bool = True,
 ) -> Evaluation:
     """Run every method on every frame and target.
 
     Args:
         frames: Names and frames.
-        targets: The rigs to render, by name, for a source rig.
-        methods: What renders them.
-        tick: Told before each step what it is, and how many steps the frame has.
+        targets: Maps a source rig to the rigs to render, by name.
+        methods: The methods.
+        tick: Called before each step with its name and the frame's number of steps.
+        agreement: Whether to measure the agreement of neighbours.
     """
     done = Evaluation()
     for name, frame in frames:
         rigs = dict(targets(frame.sample["rig"]))
         if done.first is None:
             done.first, done.targets = frame, rigs
-        steps = len(methods) * (1 + len(rigs))
+        steps = len(methods) * (agreement + len(rigs))
         for method in methods:
+            row = {"frame": name, "method": method.name}
             try:
-                _one(done, name, frame, rigs, method, steps, tick)
+                if agreement:
+                    tick(f"{name}: {method.name}, overlap", steps)
+                    pairs = source_overlap(frame.sample, method)
+                    done.pairs += [{**row, "kind": "overlap", **pair._asdict()} for pair in pairs]
+                for target, rig in rigs.items():
+                    tick(f"{name}: {method.name}, {target}", steps)
+                    views, metrics = scores(frame, method.render, rig)
+                    if frame is done.first:
+                        done.pictures[target, method.name] = views
+                    row["target"] = target
+                    done.views += [{**row, "camera": c.name, **m} for c, m in zip(rig, metrics, strict=True)]
+                    pairs = target_consistency(rig, views) if agreement else []
+                    done.pairs += [{**row, "kind": "consistency", **pair._asdict()} for pair in pairs]
             except (CalibrationError, SampleError) as error:  # lenses, for a method of pinhole cameras
                 done.declined[method.name] = str(error)
     return done
-
-
-def _one(
-    done: Evaluation,
-    name: str,
-    frame: ScoredFrame,
-    rigs: Mapping[str, Rig],
-    method: Method,
-    steps: int,
-    tick: Callable[[str, int], None],
-) -> None:
-    tick(f"{name}: {method.name}, overlap", steps)
-    for pair in source_overlap(frame.sample, method):
-        done.pairs.append({"frame": name, "method": method.name, "kind": "overlap", **pair._asdict()})
-    for target, rig in rigs.items():
-        tick(f"{name}: {method.name}, {target}", steps)
-        views, rows = scores(frame, method.render, rig)
-        if frame is done.first:
-            done.pictures[target, method.name] = views
-        for camera, row in zip(rig, rows, strict=True):
-            done.views.append({"frame": name, "method": method.name, "target": target, "camera": camera.name, **row})
-        for pair in target_consistency(rig, views):
-            where = {"frame": name, "method": method.name, "kind": "consistency", "target": target}
-            done.pairs.append({**where, **pair._asdict()})

@@ -138,7 +138,7 @@ def test_an_interrupt_is_one_line_and_130(
     ("code", "expected"),
     [
         (
-            "from arbiview_aug import __main__ as m; from arbiview_aug.cli import demo; demo._load = wait\n"
+            "from arbiview_aug import __main__ as m; from arbiview_aug.cli import demo; demo.open_frames = wait\n"
             "sys.exit(m.main(['demo', '--output', sys.argv[1]]))",
             "python -m arbiview_aug demo: interrupted\n",
         ),

@@ -42,7 +42,7 @@ def done() -> Evaluation:
 @pytest.fixture(scope="module")
 def page(done: Evaluation) -> str:
     means = {name: done.means(name) for name in NAMES}
-    return html_report("A <title> & more", done, NAMES, [("Truth", means, TRUTH_COLUMNS, ("a note",))], ["5 < 6"])
+    return html_report("A <title> & more", done, NAMES, [("Truth", means, TRUTH_COLUMNS, "a note")], ["5 < 6"])
 
 
 def test_nothing_else_is_needed(page: str) -> None:

@@ -13,7 +13,6 @@ from arbiview_aug.evaluate.report.tables import (
     SEEN,
     SPARSE_COLUMNS,
     TRUTH_COLUMNS,
-    Column,
     cell,
     text_table,
 )
@@ -22,24 +21,24 @@ from tests.helpers import camera
 
 def test_cells() -> None:
     row = {"seen": 0.5, "psnr": 20.126, "ssim": 0.98765}
-    assert cell(row, SEEN) == "50.0%"
-    assert cell(row, Column("PSNR", "psnr")) == "20.13" and cell(row, Column("SSIM", "ssim", 4)) == "0.9877"
-    assert cell(row, Column("absent", "absent")) == "-", "what a row lacks is no zero"
+    assert cell(row, SEEN[1]) == "50.0%" and cell(row, "{psnr:.2f}") == "20.13" and cell(row, "{ssim:.4f}") == "0.9877"
+    assert cell(row, "{absent:.2f}") == "-", "what a row lacks is no zero"
 
 
 def test_layout() -> None:
     rows = {"a method of some length": {"seen": 1.0}, "b": {"seen": 0.25, "x": 3.0}}
-    table = text_table("Title", rows, [SEEN, Column("a wide heading", "x")], ["a note"])
-    title, head, first, second, note = table.splitlines()
-    assert title == "Title:" and note == "  a note"
-    assert len(head) == len(first) == len(second), "columns line up"
-    assert first.split()[-2:] == ["100.0%", "-"] and second.split() == ["b", "25.0%", "3.00"]
-    assert text_table("Nothing", {}, [SEEN]).count("\n") == 1
+    table = text_table("Title", rows, [SEEN, ("a wide heading", "{x:.2f}")], "a note")
+    title, _, head, rule, first, second, _, note = table.splitlines()
+    assert title == "Title:" and note == "a note"
+    assert len(head) == len(rule) == len(first) == len(second), "columns line up"
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in (first, second)]
+    assert cells == [["a method of some length", "100.0%", "-"], ["b", "25.0%", "3.00"]]
+    assert text_table("Nothing", {}, [SEEN]).count("\n") == 3
 
 
 def test_metrics_are_named_once() -> None:
     for columns in (TRUTH_COLUMNS, SPARSE_COLUMNS, OVERLAP_COLUMNS):
-        assert len({c.metric for c in columns}) == len(columns)
+        assert len({form for _, form in columns}) == len(columns)
 
 
 def test_cameras_stand_as_in_a_panorama() -> None:

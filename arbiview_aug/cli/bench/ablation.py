@@ -35,7 +35,7 @@ from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.agreement import source_overlap, summary
 from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
 from arbiview_aug.evaluate.methods import Method, paper_stages, retargeting
-from arbiview_aug.evaluate.report.tables import Column, cell, markdown_table
+from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import UP_M, paper_targets, shifted_target
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality
 from arbiview_aug.render.refinement import RefinementCache
@@ -199,9 +199,10 @@ def markdown(report: Mapping[str, Any]) -> str:
         if any(name in of["steps"] for of in sets.values())
     ]
     parts = [NOTES, markdown_table(head, rows, left=2)]
-    db = Column("", "overlap_raw_psnr_db")
     overlaps = [
-        f"{name} {' to '.join(cell(row, db) for row in of['overlap'])}" for name, of in sets.items() if of["overlap"]
+        f"{name} {' to '.join(cell(row, '{overlap_raw_psnr_db:.2f}') for row in of['overlap'])}"
+        for name, of in sets.items()
+        if of["overlap"]
     ]
     if overlaps:
         parts.append(f"Harmonising is for where neighbours overlap: as recorded, in dB, {', '.join(overlaps)}.")

@@ -19,9 +19,10 @@ from typing import Any
 import torch
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.bench.study import SIZE, facts, study_table
+from arbiview_aug.cli.bench.study import SIZE, facts
 from arbiview_aug.cli.bench.timing import clock_of, machine_line, quartiles, timed_rounds
 from arbiview_aug.environment import one_thread
+from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.image_ops import resized
 from arbiview_aug.render.plan import RenderPlan, build_plan
 from arbiview_aug.render.torch_backend import maps_on, render_torch
@@ -83,7 +84,7 @@ def device_table(report: Mapping[str, Any]) -> str:
         for row in report["rows"]
     ]
     title = f"{report['data']}, {report['cameras']} cameras turned by {YAW_DEG:g} degrees, batches of {report['batch']}"
-    return f"{title} on {report['device']}; {machine_line(report)}\n\n{study_table(rows, COLUMNS)}"
+    return f"{title} on {report['device']}; {machine_line(report)}\n\n{metric_table(rows, COLUMNS)}"
 
 
 def bytes_moved(plan: RenderPlan, images: Sequence[torch.Tensor]) -> int:

@@ -18,13 +18,14 @@ import numpy as np
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import count, device_named, writable_folder
-from arbiview_aug.cli.bench.study import benchmark_parser, facts, study, study_table
+from arbiview_aug.cli.bench.study import benchmark_parser, facts, study
 from arbiview_aug.cli.bench.timing import clock_of, machine_line, quartiles, show
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.frames import make_frame
 from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import Method, Sample, retargeting
+from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.generator import Generator
 
 SIZE = (256, 448)
@@ -159,6 +160,6 @@ def table(report: Mapping[str, Any]) -> str:
         f"with lenses {1 / FOCAL:.2g} times as wide, {share:.0%} holes; generator {report['generator']} ({size_of}) on "
         f"{report['device']}; {machine_line(report)}. {report['clock']}. {NOTES}",
         "",
-        study_table([{"name": name, **row} for name, row in rows.items()], COLUMNS),
+        metric_table([{"name": name, **row} for name, row in rows.items()], COLUMNS),
     ]
     return "\n".join(lines)

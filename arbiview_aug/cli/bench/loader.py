@@ -30,11 +30,12 @@ from tqdm import tqdm
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import add_target, count
 from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, recorded
-from arbiview_aug.cli.bench.study import SIZE, benchmark_parser, facts, study_table
+from arbiview_aug.cli.bench.study import SIZE, benchmark_parser, facts
 from arbiview_aug.cli.bench.timing import Quartiles, machine_line, quartiles, show
 from arbiview_aug.datasets import RetargetedDataset, open_data
 from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.environment import one_thread
+from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
@@ -204,7 +205,7 @@ def table(report: Mapping[str, Any]) -> str:
         f"{report['data']}, {len(report['sources'])} cameras to {report['target']} at {w}x{h}, epochs of "
         f"{report['frames']} frames; {counting['processes']} processes that only count do "
         f"{counting['against_one']:.2f} times one's work; {machine_line(report)}\n\n"
-        + study_table(report["rates"], COLUMNS)
+        + metric_table(report["rates"], COLUMNS)
     )
 
 

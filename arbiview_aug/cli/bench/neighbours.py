@@ -23,11 +23,12 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import seed
 from arbiview_aug.cli.bench.data import as_of_another_frame, recorded_drive
-from arbiview_aug.cli.bench.study import SIZE, benchmark_parser, facts, study_table
+from arbiview_aug.cli.bench.study import SIZE, benchmark_parser, facts
 from arbiview_aug.cli.bench.timing import machine_line, peak_mib, quartiles, show, timed_rounds
 from arbiview_aug.datasets import Neighbours, open_data
 from arbiview_aug.environment import one_thread
 from arbiview_aug.errors import DataError, SampleError
+from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.temporal.fill import fill_from_neighbours
@@ -259,4 +260,4 @@ def markdown(report: Mapping[str, Any]) -> str:
     way = f"up to {max(report['travel_m'], default=0.0):.1f} m away"
     cameras = f"{len(report['sources'])} cameras of {report['sources'][0][1]}x{report['sources'][0][0]}"
     head = f"{report['data']}, {cameras} to views of {w}x{h}, neighbours {way}; {machine_line(report)}. {NOTES}"
-    return f"{head}\n\n{study_table(report['costs'], COLUMNS)}"
+    return f"{head}\n\n{metric_table(report['costs'], COLUMNS)}"

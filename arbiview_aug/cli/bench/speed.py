@@ -36,12 +36,13 @@ import torch
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.arguments import add_data, device_named
 from arbiview_aug.cli.bench.device import YAW_DEG, device_table, measure_device
-from arbiview_aug.cli.bench.study import SIZE, benchmark_parser, facts, study_table
+from arbiview_aug.cli.bench.study import SIZE, benchmark_parser, facts
 from arbiview_aug.cli.bench.timing import machine_line, quartiles, show, timed_rounds
 from arbiview_aug.datasets import open_data, reduced_rig
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.environment import one_thread
 from arbiview_aug.errors import DataError
+from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.generator.fillers import Holes, fill_holes
 from arbiview_aug.image_ops import Scratch
@@ -168,7 +169,7 @@ COLUMNS = (
 
 def table(report: Mapping[str, Any]) -> str:
     """The report to read, in Markdown."""
-    return f"{machine_line(report)}\n\n{study_table(report['measures'], COLUMNS, ('name', 'of'))}"
+    return f"{machine_line(report)}\n\n{metric_table(report['measures'], COLUMNS, ('name', 'of'))}"
 
 
 def _name(data: str | Path | None) -> str:

@@ -24,15 +24,12 @@ from arbiview_aug.evaluate.frames import ScoredFrame, scores
 from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import Method, Sample
 from arbiview_aug.evaluate.metrics import mean_of
-from arbiview_aug.evaluate.report.tables import markdown_table
 
 SIZE = (256, 704)
 LEAST_GAIN_DB = 0.2
 """Smaller differences are noise: single frames of one vehicle."""
 
 Row = Mapping[str, Any]
-Columns = Sequence[tuple[str, str]]
-"""Headings, and the format of the cells below them: fields of a row."""
 
 
 def benchmark_parser(
@@ -138,25 +135,6 @@ def _timed(
 def facts(benchmark: str, load_before: tuple[float, float, float], **figures: Any) -> dict[str, Any]:
     """A report as plain data for JSON, with the machine and the versions that it was measured with."""
     return {"benchmark": benchmark, **figures, "machine": machine(load_before), "versions": versions()}
-
-
-def study_table(rows: Sequence[Row], columns: Columns, names: Sequence[str] = ("name",)) -> str:
-    """A Markdown table of rows; a field that a row lacks is a dash.
-
-    Args:
-        rows: Fields by name.
-        columns: Headings and formats.
-        names: Fields of the first columns, which have no headings.
-    """
-    cells = [[*(str(row[name]) for name in names), *(_formatted(row, form) for _, form in columns)] for row in rows]
-    return markdown_table([*("" for _ in names), *(heading for heading, _ in columns)], cells, left=len(names))
-
-
-def _formatted(row: Row, form: str) -> str:
-    try:
-        return form.format_map(row)
-    except (KeyError, TypeError):  # not measured
-        return "-"
 
 
 # --- recommendations --------------------------------------------------------------------------------------------------

@@ -45,7 +45,6 @@ from arbiview_aug.cli.bench.study import (
     facts,
     pareto_front,
     study,
-    study_table,
 )
 from arbiview_aug.cli.bench.timing import Quartiles, machine_line, peak_mib, quartiles, timed_rounds, write_json
 from arbiview_aug.datasets.image_io import Reduce
@@ -53,6 +52,7 @@ from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import Method, Sample, views_of
+from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.favs.config import FavsConfig, Quality
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.render.requirements import HELPFUL_DATA, static_harm
@@ -309,7 +309,7 @@ def table(report: Mapping[str, Any]) -> str:
         f"{report['data']} to {report['target']}, views of {w}x{h}, against {report['against']}; "
         f"{machine_line(report)}. {NOTES}",
         "",
-        study_table(shown, COLUMNS, ("name", "mark")),
+        metric_table(shown, COLUMNS, ("name", "mark")),
     ]
     if len(rows) > len(shown):
         lines += ["", f"{len(rows) - len(shown)} more settings, none of them on the front, are in the JSON."]

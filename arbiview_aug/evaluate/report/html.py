@@ -1,8 +1,4 @@
-"""``report.html``: one file without any other, to look at and to pass on.
-
-For each target rig a plan from above and one picture for each camera with a slider between two layers: the nearest
-source image, each method's view, what nobody saw, confidence, the truth. Then the tables.
-"""
+"""``report.html``: one self-contained page with sliders between views, and the tables."""
 
 from __future__ import annotations
 
@@ -18,7 +14,7 @@ from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays
 from arbiview_aug.evaluate.report.pictures import Picture, overlay_confidence
 from arbiview_aug.evaluate.report.rig_picture import draw_rigs
 from arbiview_aug.evaluate.report.sheet import hatched_view, left_to_right, shrunk
-from arbiview_aug.evaluate.report.tables import Column, Table, cell
+from arbiview_aug.evaluate.report.tables import Columns, Table, cell
 from arbiview_aug.evaluate.run import Evaluation
 
 SOURCE_LAYER = "nearest source camera"
@@ -29,19 +25,18 @@ _JPEG_QUALITY = 85
 
 
 def html_report(
-    title: str,
-    done: Evaluation,
-    methods: Sequence[str],
-    tables: Sequence[Table],
-    notes: Sequence[str] = (),
+    title: str, done: Evaluation, methods: Sequence[str], tables: Sequence[Table], notes: Sequence[str] = ()
 ) -> str:
-    """The page.
+    """Build the page.
+
+    For each target rig it shows one picture per camera, with a slider between two layers (source, methods, holes,
+    confidence, truth), and both rigs from above.
 
     Args:
         title: Heading.
-        done: What was measured; the first frame's views are shown.
+        done: The measurements; the first frame's views are shown.
         methods: Names in the order of the layers.
-        tables: Title, rows, columns and notes of each, as for ``tables.text_table``.
+        tables: Arguments of ``tables.text_table``.
         notes: Paragraphs below the heading.
     """
     parts = [f"<h1>{escape(title)}</h1>", *(f"<p>{escape(note)}</p>" for note in notes)]
@@ -54,7 +49,7 @@ def html_report(
 
 
 def layers(camera: int, rig: Rig, done: Evaluation, shown: Mapping[str, Sequence[RenderedView]]) -> dict[str, Picture]:
-    """What the slider of one target camera can show, by name."""
+    """Pictures that the slider of one target camera can show, by name."""
     assert done.first is not None
     source: Rig = done.first.sample["rig"]
     axis = rig[camera].cam2ego[:3, 2]
@@ -77,7 +72,7 @@ def _target_section(target: str, rig: Rig, done: Evaluation, shown: Mapping[str,
     assert done.first is not None
     source: Rig = done.first.sample["rig"]
     by_camera = [layers(camera, rig, done, shown) for camera in range(len(rig))]
-    # Every camera offers the same layers: where a view has no hole, the view itself is shown for its holes.
+    # Every camera offers the same layers: a view without holes stands for its own holes.
     names = list(dict.fromkeys(name for found in by_camera for name in found))
     after = next(iter(shown))
     before = TRUTH_LAYER if TRUTH_LAYER in names else SOURCE_LAYER
@@ -111,16 +106,13 @@ def _target_section(target: str, rig: Rig, done: Evaluation, shown: Mapping[str,
     )
 
 
-def _table(
-    title: str, rows: Mapping[str, Mapping[str, float]], columns: Sequence[Column], notes: Sequence[str] = ()
-) -> str:
-    head = "".join(f"<th>{escape(c.heading)}</th>" for c in columns)
+def _table(title: str, rows: Mapping[str, Mapping[str, float]], columns: Columns, notes: str) -> str:
+    head = "".join(f"<th>{escape(heading)}</th>" for heading, _ in columns)
     body = "".join(
-        f"<tr><th>{escape(name)}</th>" + "".join(f"<td>{cell(row, c)}</td>" for c in columns) + "</tr>"
+        f"<tr><th>{escape(name)}</th>" + "".join(f"<td>{cell(row, form)}</td>" for _, form in columns) + "</tr>"
         for name, row in rows.items()
     )
-    note = escape(" ".join(notes))
-    return f"<h3>{escape(title)}</h3><table><tr><th></th>{head}</tr>{body}</table><p>{note}</p>"
+    return f"<h3>{escape(title)}</h3><table><tr><th></th>{head}</tr>{body}</table><p>{escape(notes)}</p>"
 
 
 def _data_url(picture: Picture) -> str:

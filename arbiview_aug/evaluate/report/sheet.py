@@ -52,7 +52,7 @@ def frame_sheet(
     return contact_sheet(
         [[pictures[k] for k in places] for _, pictures, _, places in rows],
         [[captions[k] for k in places] for _, _, captions, places in rows],
-        titles=[title for title, *_ in rows],
+        [title for title, *_ in rows],
         width_px=width_px,
     )
 

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.bench.study import LEAST_GAIN_DB, Row, advice, distinct_steps, pareto_front, study, study_table
+from arbiview_aug.cli.bench.study import LEAST_GAIN_DB, Row, advice, distinct_steps, pareto_front, study
 from arbiview_aug.cli.bench.timing import Quartiles
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.frames import make_frame
 from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import Method, Sample, retargeting
+from arbiview_aug.evaluate.report.tables import metric_table
 
 
 def point(name: str, ms: float, db: float, spread: float = 0.1) -> Row:
@@ -113,5 +114,5 @@ def test_a_row_is_one_method() -> None:
         assert len(row["ms"]) == len(row["plan_ms"]) == 2 and min(row["ms"]) >= 0
     assert found["far"]["same"]["true_psnr_db"] > 40 > found["toy"]["same"]["true_psnr_db"] > 3
     rows = [{"name": name, **row["turned"]} for name, row in found.items()]
-    printed = study_table(rows, [("seen", "{seen:.0%}"), ("dB", "{true_psnr_db:.1f}"), ("never", "{unknown:.1f}")])
+    printed = metric_table(rows, [("seen", "{seen:.0%}"), ("dB", "{true_psnr_db:.1f}"), ("never", "{unknown:.1f}")])
     assert printed.splitlines()[-1].startswith("| toy | 100% |") and printed.endswith("    - |")
