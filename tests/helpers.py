@@ -18,7 +18,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 
 from arbiview_aug import Camera, Rig
 from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive, demo_source_rig
-from arbiview_aug.evaluate.lidar import equalised
+from arbiview_aug.evaluate.lidar import ColouredPoints, equalised, sparse_metrics
+from arbiview_aug.evaluate.metrics import mean_of
 
 
 def camera(
@@ -166,3 +167,11 @@ class ProtocolFrame:
         if not raw:
             self.images = list(equalised(self.rig, self.images, self.lidar))
             self.cameras = referee.equalised(self.cameras, self.lidar)
+
+
+def score_targets(
+    render: Callable[[Rig], Iterable[Any]], points: ColouredPoints, targets: Iterable[Rig]
+) -> dict[str, float]:
+    """Mean sparse metrics over all cameras of all target rigs, rendered to one image per camera."""
+    pairs = ((camera, image) for target in targets for camera, image in zip(target, render(target), strict=True))
+    return mean_of([score for camera, image in pairs if (score := sparse_metrics(image, camera, points)) is not None])

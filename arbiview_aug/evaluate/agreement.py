@@ -1,8 +1,8 @@
-"""Overlap metrics: two cameras' renderings of one view between them, where both see it.
+"""Overlap metrics: agreement of two cameras' renderings where both see a view.
 
-Dense, on real frames, without LiDAR: wrong geometry shows as doubled edges. Exposure differs between cameras, so beside
-the raw figure there is one after a gain and an offset per channel, fitted on the even tiles of a chessboard and scored
-on the odd ones. Methods that refine themselves on the overlap may use the even tiles only.
+They need neither LiDAR nor the truth: wrong geometry shows as doubled edges. Exposure differs between cameras, so a
+second figure follows a gain and an offset per channel, fitted on the even tiles of a chessboard and scored on the odd
+ones. Methods that learn from the overlap may use the even tiles alone.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import build_plan
 
 MIN_PIXELS = 500
-"""Pixels that both fit and test need."""
+"""Least number of pixels to fit and to test."""
 
 
 class OverlapScore(NamedTuple):
-    """Agreement of one pair of cameras: PSNR of the odd tiles, None where the overlap is too small."""
+    """Agreement of a pair of cameras: PSNR of the odd tiles, None if the overlap is too small."""
 
     first: str
     second: str
@@ -48,11 +48,11 @@ def overlap_psnr(
         one: (h, w, 3) on the scale 0-255.
         two: The other.
         both: (h, w) bool, where both sources see the view.
-        fitted: Bring ``one`` to ``two`` by a gain and an offset per channel, fitted on the even tiles.
+        fitted: Whether to map ``one`` to ``two`` first, by a gain and an offset per channel fitted on the even tiles.
         tile_px: Size of the tiles.
 
     Returns:
-        The PSNR, or None below ``MIN_PIXELS`` pixels to fit or to test.
+        The PSNR, or None with fewer than ``MIN_PIXELS`` pixels to fit or to test.
     """
     odd = odd_tiles(both.shape, tile_px)
     fit, test = both & ~odd, both & odd
@@ -76,11 +76,11 @@ def overlap_scores(
     size: tuple[int, int] = VIEW_SIZE,
     pairs: list[tuple[int, int]] | None = None,
 ) -> list[OverlapScore]:
-    """Overlap metrics of the adjacent pairs of a rig.
+    """Overlap metrics of pairs of cameras.
 
     Args:
         rig: The source rig.
-        render: Renders a view from one source alone, given the view and the source's index: image and where it sees.
+        render: Maps a view and a source's index to the view from that source alone: image and coverage.
         size: (h, w) of the views.
         pairs: Pairs of camera indices; by default ``adjacent_pairs``.
     """
@@ -97,18 +97,18 @@ def overlap_scores(
 def source_overlap(
     sample: Mapping[str, Any], method: Method, *, size: tuple[int, int] = VIEW_SIZE
 ) -> list[OverlapScore]:
-    """Overlap metrics of a method: neighbouring source cameras, each alone rendered to their half-way view.
+    """Overlap metrics of a method: adjacent source cameras, each rendered alone (``Method.alone``) to a half-way view.
 
     Args:
         sample: With ``rig`` and ``images``.
-        method: The method; what it knows of the scene from all cameras it keeps (``Method.alone``).
+        method: The method.
         size: (h, w) of the half-way views.
     """
     rig: Rig = sample["rig"]
 
     def from_one(view: Camera, k: int) -> tuple[Image, BoolArray]:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of views that one camera cannot cover: it need not
+            warnings.simplefilter("ignore")  # one camera need not cover the view
             alone = method.alone(sample, k, rig.with_cameras([view]))
         return alone.image, alone.coverage
 
@@ -118,12 +118,9 @@ def source_overlap(
 def target_consistency(
     rig: Rig, views: Sequence[RenderedView], *, size: tuple[int, int] = VIEW_SIZE
 ) -> list[OverlapScore]:
-    """Do neighbouring rendered views show the same scene? Overlap metrics of the rendered views themselves.
+    """Overlap metrics of rendered views, resampled to half-way views over the street surface.
 
-    Each view, where it shows anything, is resampled to the half-way view over the street surface. Views rendered over
-    that same surface agree even where it is wrong, and views that are right about objects disagree there: compare
-    methods of one surface. On nuScenes' frame 1 m higher, where LiDAR is 10 dB nearer to the points than the street,
-    its views score 10 dB lower here.
+    Compare methods of one surface: views rendered over the street agree even where it is wrong.
 
     Args:
         rig: The target rig, on its own road.
@@ -143,10 +140,7 @@ def target_consistency(
 
 
 def summary(prefix: str, pairs: Sequence[OverlapScore]) -> dict[str, float]:
-    """Mean over the pairs, and the worst pair's fitted figure, as ``<prefix>_...``; pairs without a score are left out.
-
-    A rig without overlaps has an empty summary.
-    """
+    """Mean and worst of the pairs with a score, as ``<prefix>_...``; empty if there are none."""
     row: dict[str, float] = {}
     for kind in ("raw", "fitted"):
         found = [value for pair in pairs if (value := getattr(pair, f"{kind}_psnr_db")) is not None]

@@ -1,7 +1,6 @@
-"""What others do instead: baselines of known origin, on the same work as our own renderers.
+"""Renderers of other projects, as simple references.
 
-All take (source rig, its images, target rig in the source's ego frame) and give the views and where they are covered.
-Images are (h, w, 3) RGB on the scale 0-255. They are written to be read, not to be fast.
+All map (source rig, its images, target rig in the source's ego frame) to views. Images are (h, w, 3) RGB, 0-255.
 """
 
 from __future__ import annotations
@@ -19,16 +18,16 @@ from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import build_plan
 
 Renderer = Callable[[Rig, Sequence[Image], Rig], list[RenderedView]]
-"""Source rig, its images, target rig: one view for each target camera."""
+"""Maps a source rig, its images and a target rig to one view per target camera."""
 
 SPLIT_DEPTH_M = 50.0
-"""Depth of everything above the horizon row in ``row_split``: UniDrive's value."""
+"""Depth above the horizon row in ``row_split``, from UniDrive."""
 
 
 def own_camera(source: Rig, images: Sequence[Image], target: Rig) -> list[RenderedView]:
-    """Each target camera sees one source camera, of its own name or else looking most nearly its way: far surface.
+    """Warp one source camera, of the same name or else the nearest direction, to each target camera.
 
-    This is "Geometric" of the paper's Table 2: projection by H = K' R' Rᵀ K⁻¹, without fusion.
+    "Geometric" of the paper's Table 2: projection by H = K' R' Rᵀ K⁻¹, without fusion.
     """
     views = []
     axes = source.cam2ego[:, :3, 2]
@@ -43,12 +42,11 @@ def own_camera(source: Rig, images: Sequence[Image], target: Rig) -> list[Render
 
 
 def crop_and_slide(source: Rig, images: Sequence[Image], target: Rig) -> list[RenderedView]:
-    """DriveSuprim's augmentation by rotation: a window slid over the side-cropped images in ring order.
+    """Slide a window over the side-cropped images in ring order, as DriveSuprim's rotation augmentation does.
 
-    Each image is cropped to the columns half-way to its neighbours' azimuths, at a constant number of pixels a degree;
-    the strips make a closed panorama, and a target camera sees the window around its azimuth, as wide as its
-    field of view. An image that does not reach half-way is stretched. Rows, pitch and position stay as they were: no
-    perspective is corrected. Everything is covered.
+    Each image is cropped (or stretched) to the columns half-way to its neighbours' azimuths, at a constant number of
+    pixels per degree. The strips form a closed panorama, from which a target camera gets the window of its azimuth and
+    field of view. Perspective, pitch and position are ignored; everything is covered.
     """
     ring = sorted(range(len(source)), key=lambda k: -source[k].azimuth_deg)  # from left to right
     azimuth = np.array([source[k].azimuth_deg for k in ring])
@@ -70,25 +68,23 @@ def crop_and_slide(source: Rig, images: Sequence[Image], target: Rig) -> list[Re
         centre_px.append(x + left * per_degree)
         x += wide
     panorama = np.concatenate(strips, axis=1)
-    views: list[RenderedView] = []
+    views = []
     for camera in target:
-        # The window's centre: the nearest strip's, moved by the turn from it.
+        # The nearest strip's centre, shifted by the turn from it.
         turn = (azimuth - camera.azimuth_deg + 180) % 360 - 180
         n = int(np.abs(turn).argmin())
         middle = centre_px[n] + turn[n] * per_degree
         half = per_degree * camera.fov_deg[0] / 2
         columns = np.arange(round(middle - half), round(middle + half)) % panorama.shape[1]
-        h, w = camera.size
-        views.append(
-            RenderedView(np.asarray(cv2.resize(panorama[:, columns], (w, h)), np.uint8), np.ones((h, w), bool))
-        )
+        view = np.asarray(cv2.resize(panorama[:, columns], camera.size[::-1]), np.uint8)
+        views.append(RenderedView(view, np.ones(camera.size, bool)))
     return views
 
 
 def row_split(source: Rig, images: Sequence[Image], target: Rig) -> list[RenderedView]:
-    """UniDrive's projection: below the camera's horizon row the road's plane, above it a plane 50 m ahead.
+    """Project the road plane below the horizon row and a plane 50 m ahead above it, as UniDrive does.
 
-    Nearest neighbour; where several sources see a pixel, the last one in the rig's order wins.
+    Nearest-neighbour sampling; the last source in the rig's order wins.
 
     Raises:
         SampleError: Lenses other than pinhole.
@@ -100,7 +96,7 @@ def row_split(source: Rig, images: Sequence[Image], target: Rig) -> list[Rendere
         points = _split_points(camera.K, camera.cam2ego, camera.size, source.ground_z_m).reshape(-1, 3)
         view, seen = np.zeros((len(points), 3), np.float32), np.zeros(len(points), bool)
         for at, image in zip(source, images, strict=True):
-            ahead = np.flatnonzero((points - at.center_m) @ at.cam2ego[:3, 2] > 0)  # half of them: the cheap test
+            ahead = np.flatnonzero((points - at.center_m) @ at.cam2ego[:3, 2] > 0)  # cheap test that halves the points
             uv, _, valid = at.project(points[ahead])
             pixel = np.floor(uv + 0.5)
             inside = valid & (pixel >= 0).all(-1) & (pixel < (at.width_px, at.height_px)).all(-1)
@@ -127,4 +123,3 @@ def _split_points(K: FloatArray, cam2ego: FloatArray, size: tuple[int, int], gro
 
 
 BASELINES: dict[str, Renderer] = {"own camera": own_camera, "crop and slide": crop_and_slide, "row split": row_split}
-"""By name."""

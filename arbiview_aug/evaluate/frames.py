@@ -1,10 +1,8 @@
-"""A frame to evaluate on: the sample that a method gets, and what its views are compared with.
+"""Frames to evaluate on: the sample that a method gets, and the references that score its views.
 
-Three references: true views of any rig (synthetic streets), LiDAR points with the colours that the source cameras saw,
-and the same with the cameras' exposures made even first, since exposure is not geometry.
-
-A method that reads the LiDAR must not be scored on the points that it read. So where a method may read them, every
-method gets the points of alternate azimuth sectors (``sparse.lidar_split``) and all are scored on the others.
+References are true views (synthetic streets), or LiDAR points in the source cameras' colours, as recorded and with even
+exposures. If a method may read points, all methods get those of alternate azimuth sectors (``lidar.lidar_split``) and
+are scored on the others.
 """
 
 from __future__ import annotations
@@ -26,19 +24,17 @@ from arbiview_aug.evaluate.lidar import ColouredPoints, coloured_points, equalis
 from arbiview_aug.evaluate.metrics import truth_metrics
 
 Render = Callable[[Mapping[str, Any], Rig], list[RenderedView]]
-"""Sample and target rig in, one view for each target camera out."""
-
+"""Renders a sample for a target rig: one view per target camera."""
 
 Exposure = Literal["raw", "even"]
 EXPOSURES: tuple[Exposure, ...] = ("raw", "even")
-"""The cameras' exposures as recorded, and made even."""
+"""Exposures as recorded, and made even."""
 
-
-_HELD_TRUTHS = 8  # one for each target would be a gigabyte of six full-size rigs
+_CACHED_TRUTHS = 8  # one for each target would take a gigabyte
 
 
 class LidarReference(NamedTuple):
-    """A sample at one exposure, and the points with its colours that score."""
+    """A sample at one exposure, and the scoring points in its colours."""
 
     sample: dict[str, Any]
     points: ColouredPoints
@@ -46,13 +42,13 @@ class LidarReference(NamedTuple):
 
 @dataclass(frozen=True)
 class ScoredFrame:
-    """What a method gets, and what scores it.
+    """A sample for methods, and its references.
 
     Attributes:
-        sample: For the methods: ``rig``, ``images`` and what else they may use.
+        sample: ``rig``, ``images`` and other keys that methods may use.
         lidar: References by exposure; empty without points.
-        held_out: Whether ``sample`` holds points, and others score.
-        truth: The true views of a rig; None where nobody knows them.
+        held_out: Whether ``sample`` has points, and others score.
+        truth: Renders the true views of a rig; None on real frames.
     """
 
     sample: dict[str, Any]
@@ -62,7 +58,7 @@ class ScoredFrame:
 
     @property
     def scored_sample(self) -> dict[str, Any]:
-        """What methods get where views are scored: with exposures made even, where points score so."""
+        """Sample that methods get for scoring, with even exposures if points score at those."""
         return self.lidar["even"].sample if "even" in self.lidar else self.sample
 
 
@@ -73,16 +69,15 @@ def make_frame(
     exposures: Sequence[Exposure] = EXPOSURES,
     hand_over_points: bool = False,
 ) -> ScoredFrame:
-    """Split a sample into what methods get and what scores them.
+    """Split a sample into the part that methods get and the references.
 
     Args:
-        sample: With ``rig`` and ``images``; ``points`` in the ego frame where there are any.
-        truth: The true views of a rig; those of the last rigs are kept.
-        exposures: To score on points at; none for not at all.
-        hand_over_points: Whether methods may use points: those of the sectors that do not score, or all where points
-            do not score. Otherwise methods get none.
+        sample: With ``rig`` and ``images``, and maybe ``points`` in the ego frame.
+        truth: Renders the true views of a rig; the last ones are cached.
+        exposures: Exposures to score points at; none if points do not score.
+        hand_over_points: Whether methods get points: those of the sectors that do not score.
     """
-    truth = None if truth is None else lru_cache(_HELD_TRUTHS)(truth)
+    truth = None if truth is None else lru_cache(_CACHED_TRUTHS)(truth)
     given = {key: value for key, value in sample.items() if key != "points"}
     if "points" not in sample:
         return ScoredFrame(given, truth=truth)
@@ -105,28 +100,35 @@ def make_frame(
 def scores(
     frame: ScoredFrame, render: Render, target: Rig, exposures: Sequence[Exposure] = EXPOSURES
 ) -> tuple[list[RenderedView], list[dict[str, float]]]:
-    """A method's views of a frame, and their metrics: one row for each target camera.
+    """Render a frame and score each view.
 
     Args:
         frame: The frame.
         render: The method.
         target: The rig to render, in its own ego frame.
-        exposures: Those of the frame's to score at.
+        exposures: Exposures to score at, of those that the frame has.
 
     Returns:
-        The views of the first exposure, and for each a row with ``seen``, the share of its pixels that some source
-        saw; where truth is known ``true_...`` (see ``truth_metrics``, with the classes ground, object and sky); where
-        there are points ``raw_...`` and ``even_...`` (see ``SparseScore.as_dict``).
+        The views at the first exposure, and one row of metrics each: ``seen``, the share of covered pixels;
+        ``true_...`` if the truth is known (``truth_metrics`` with the classes ground, object and sky); ``raw_...`` and
+        ``even_...`` if there are points (``sparse_metrics``).
     """
     mounted = target.in_frame_of(frame.sample["rig"])
     references = [(exposure, frame.lidar[exposure]) for exposure in exposures if exposure in frame.lidar]
     views = render(references[0][1].sample if references else frame.sample, target)
     rows = [{"seen": float(view.coverage.mean())} for view in views]
     if frame.truth is not None:
-        _add_truth(rows, views, frame.truth(target))
+        truth = frame.truth(target)
+        for row, view, true, tensor in zip(rows, views, as_arrays(truth.images), truth.classes, strict=True):
+            classes = tensor.numpy()
+            valid = classes != SceneClass.VOID
+            found = truth_metrics(view.image, true, coverage=view.coverage, classes=regions(classes), valid=valid)
+            row |= {f"true_{name}": value for name, value in found.items()}
     for k, (exposure, reference) in enumerate(references):
         rendered = views if k == 0 else render(reference.sample, target)
-        _add_sparse(rows, rendered, mounted, reference.points, exposure)
+        for row, camera, view in zip(rows, mounted, rendered, strict=True):
+            found = sparse_metrics(view.image, camera, reference.points, coverage=view.coverage) or {}
+            row |= {f"{exposure}_{name}": value for name, value in found.items()}
     return views, rows
 
 
@@ -134,21 +136,3 @@ def regions(classes: npt.NDArray[np.uint8]) -> dict[str, BoolArray]:
     """Ground, object and sky of a synthetic view (h, w)."""
     ground, sky = np.isin(classes, [int(c) for c in GROUND_CLASSES]), classes == SceneClass.SKY
     return {"ground": ground, "sky": sky, "object": ~ground & ~sky & (classes != SceneClass.VOID)}
-
-
-def _add_truth(rows: list[dict[str, float]], views: list[RenderedView], truth: RenderedViews) -> None:
-    images, classes = as_arrays(truth.images), [of.numpy() for of in truth.classes]
-    for row, view, true, of in zip(rows, views, images, classes, strict=True):
-        found = truth_metrics(
-            view.image, true, coverage=view.coverage, classes=regions(of), valid=of != SceneClass.VOID
-        )
-        row |= {f"true_{name}": value for name, value in found.items()}
-
-
-def _add_sparse(
-    rows: list[dict[str, float]], views: list[RenderedView], mounted: Rig, points: ColouredPoints, prefix: str
-) -> None:
-    for row, camera, view in zip(rows, mounted, views, strict=True):
-        score = sparse_metrics(view.image, camera, points, coverage=view.coverage)
-        if score is not None:
-            row |= {f"{prefix}_{name}": value for name, value in score.as_dict().items()}

@@ -1,4 +1,4 @@
-"""The one place where images change between the package's tensors and the arrays that ``evaluate`` works on."""
+"""Conversion between the package's tensors and the arrays of ``evaluate``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import torch
 
 Image = npt.NDArray[np.uint8] | npt.NDArray[np.floating[Any]]
-"""(h, w, 3) RGB on the scale 0-255: uint8, or float where a renderer kept fractions."""
+"""(h, w, 3) RGB on the scale 0-255, uint8 or float."""
 
 
 class RenderedView(NamedTuple):
@@ -24,8 +24,8 @@ class RenderedView(NamedTuple):
     Attributes:
         image: (h, w, 3), black where nothing covers it.
         coverage: (h, w) bool, where some source saw it.
-        confidence: (h, w) in [0, 1], where the renderer tells it.
-        generated: (h, w) bool, what was made up; None where nothing is.
+        confidence: (h, w) in [0, 1], if the renderer gives it.
+        generated: (h, w) bool, inpainted or generated pixels, if any.
     """
 
     image: Image
@@ -35,19 +35,12 @@ class RenderedView(NamedTuple):
 
     @property
     def shown(self) -> BoolArray:
-        """(h, w) bool, where it shows anything, seen or made up."""
+        """(h, w) bool, covered or generated pixels."""
         return self.coverage if self.generated is None else self.coverage | self.generated
 
 
 def as_arrays(images: torch.Tensor | Sequence[torch.Tensor]) -> list[Image]:
-    """A sample's images as arrays.
-
-    Args:
-        images: (N, 3, h, w) or a list of (3, h, w), RGB; uint8, or float in [0, 1].
-
-    Returns:
-        (h, w, 3) arrays on the scale 0-255; float images keep their fractions.
-    """
+    """Convert images (N, 3, h, w) or a list of (3, h, w), uint8 or float in [0, 1], to (h, w, 3) on the scale 0-255."""
     arrays: list[Image] = []
     for image in images:
         array = image.detach().cpu().numpy()
@@ -60,14 +53,14 @@ def as_arrays(images: torch.Tensor | Sequence[torch.Tensor]) -> list[Image]:
 
 
 def as_tensors(images: Sequence[Image]) -> list[torch.Tensor]:
-    """Arrays on the scale 0-255 as a sample's uint8 images (3, h, w)."""
+    """Convert arrays on the scale 0-255 to uint8 tensors (3, h, w)."""
     import torch
 
     return [torch.from_numpy(np.ascontiguousarray(to_bytes(image).transpose(2, 0, 1))) for image in images]
 
 
 def to_bytes(image: Image) -> npt.NDArray[np.uint8]:
-    """uint8, rounded; uint8 comes back as it is."""
+    """Round to uint8; uint8 is returned as it is."""
     if image.dtype == np.uint8:
         return np.asarray(image, dtype=np.uint8)
     return np.clip(np.round(image), 0, 255).astype(np.uint8)

@@ -1,18 +1,14 @@
-"""Sparse LiDAR metrics: points coloured by the source cameras are compared with a rendered target where they fall.
+"""Sparse LiDAR metrics: the paper's measure (its Table 2).
 
-This is the paper's measure (its Table 2): there is no true image of a vehicle that was not there, but a LiDAR point's
-colour is known, and so is the pixel of the target where it must appear. Two effects of the protocol:
-
-- Exposure differs between cameras and a point is coloured by one of them, so the raw figure punishes the geometrically
-  exact source. Compare methods on ``equalised`` frames (one gain per camera before colouring and rendering).
-- Pixels that nothing covers are black and count; ``covered`` tells how good the rest is, ``coverage`` how much it is.
+Points take the colours that the source cameras saw and are compared with a rendered target where they fall. Exposure
+differs between cameras, so compare methods on ``equalised`` frames. Uncovered pixels are black and count.
 
 Images are (h, w, 3) RGB on the scale 0-255, points (P, >=3) in the ego frame.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -25,11 +21,11 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.images import Image
-from arbiview_aug.evaluate.metrics import Errors, errors, flat, mean_of, ssim
+from arbiview_aug.evaluate.metrics import errors, ssim_map
 from arbiview_aug.scene.point_cloud import own_car
 
 NEAREST_M = 1.0
-"""Points closer to the camera are not used: they lie on the own car."""
+"""Closer points lie on the own car."""
 
 _OCCLUSION_FACTOR = 1.1
 _DARK, _SATURATED = 8, 235
@@ -37,7 +33,7 @@ _MIN_SHARED_POINTS = 20
 
 
 class VisiblePoints(NamedTuple):
-    """Points that a camera sees: indices (n,) into the cloud, pixels (n, 2) and depths (n,)."""
+    """Visible points of a camera: indices (n,) into the cloud, pixels (n, 2) and depths (n,)."""
 
     indices: npt.NDArray[np.intp]
     uv: FloatArray
@@ -46,7 +42,7 @@ class VisiblePoints(NamedTuple):
 
 @dataclass(frozen=True)
 class ColouredPoints:
-    """LiDAR points with the colour that a source camera saw.
+    """LiDAR points with colours of the source cameras.
 
     Attributes:
         points: (n, 3) in the ego frame.
@@ -62,55 +58,25 @@ class ColouredPoints:
         return len(self.points)
 
     def subset(self, keep: BoolArray) -> ColouredPoints:
-        """The points where ``keep`` (n,) is True."""
+        """Select the points where ``keep`` (n,) is True."""
         return ColouredPoints(self.points[keep], self.colours[keep], self.on_ground[keep])
 
 
-@dataclass(frozen=True)
-class SparseScore:
-    """How one target image agrees with the coloured points that fall into it.
-
-    Attributes:
-        all: All visible points: the paper's figure, uncovered pixels black.
-        ssim: Structural similarity of two images, black but for the points' pixels: rendered and LiDAR colours. It
-            saturates above 0.99 for everything useful.
-        coverage: Share of the points on pixels that some source covers.
-        covered: Points on covered pixels only.
-        ground: Points on the road plane.
-        other: All others.
-    """
-
-    all: Errors
-    ssim: float
-    coverage: float
-    covered: Errors | None
-    ground: Errors | None
-    other: Errors | None
-
-    def as_dict(self) -> dict[str, float]:
-        """Flat numbers: ``psnr_db, mae, rmse, ssim, coverage, covered_psnr_db, ..., ground_psnr_db, ...``."""
-        parts = {"covered": self.covered, "ground": self.ground, "other": self.other}
-        row = {**flat("", self.all), "ssim": self.ssim, "coverage": self.coverage, "points": float(self.all.n)}
-        for name, part in parts.items():
-            row.update(flat(name, part))
-        return row
-
-
 def visible_points(camera: Camera, points: FloatArray, *, cell_px: int = 8, tolerance_m: float = 0.3) -> VisiblePoints:
-    """Points that a camera sees, by a coarse z-buffer.
+    """Find the points that a camera sees, with a coarse z-buffer.
 
-    LiDAR is sparse, so that points behind a surface shine through its gaps: a point is hidden where another one in a
-    neighbourhood of 5 x 3 cells is closer by more than ``tolerance_m`` and a tenth of its depth.
+    LiDAR is sparse, so points behind a surface show through its gaps. A point is occluded if another one within 5 x 3
+    cells is closer by more than ``tolerance_m`` and a tenth of its depth.
 
     Args:
-        camera: The camera; its mask is not applied.
+        camera: The camera; its mask is ignored.
         points: (P, >=3) in the ego frame.
         cell_px: Size of the z-buffer's cells.
-        tolerance_m: Depth difference that still counts as the same surface.
+        tolerance_m: Depth difference within a surface.
     """
     h, w = camera.size
     uv, depth, valid = camera.project(points[:, :3])
-    if camera.lens_model.sees_behind:  # z is no depth for a lens that sees sideways
+    if camera.lens_model.sees_behind:  # z is not the depth of a lens that sees sideways
         depth = np.linalg.norm(points[:, :3] - camera.center_m, axis=1)
     inside = (uv >= 0).all(1) & (uv[:, 0] < w - 1) & (uv[:, 1] < h - 1)
     index = np.flatnonzero(valid & (depth > NEAREST_M) & inside)
@@ -124,10 +90,10 @@ def visible_points(camera: Camera, points: FloatArray, *, cell_px: int = 8, tole
 
 
 def colours_at(image: npt.NDArray[Any], uv: FloatArray) -> npt.NDArray[np.float32]:
-    """Bilinear samples (n, c) or (n,) of an image at pixels (n, 2)."""
+    """Sample an image bilinearly at pixels (n, 2): (n, c) or (n,)."""
     if len(uv) == 0:
         return np.zeros((0, *image.shape[2:]), np.float32)
-    # remap wants sizes below 32767: any number of points goes through rows of 16384.
+    # cv2.remap takes sizes below 32767, so the points are laid out in rows.
     rows = -(-len(uv) // 16384)
     padded = np.zeros((rows * min(len(uv), 16384), 2), np.float32)
     padded[: len(uv)] = uv
@@ -139,16 +105,15 @@ def colours_at(image: npt.NDArray[Any], uv: FloatArray) -> npt.NDArray[np.float3
 def coloured_points(
     rig: Rig, images: Sequence[Image], points: FloatArray, *, ground_band_m: float = 0.3
 ) -> ColouredPoints:
-    """LiDAR points coloured by the camera that sees each closest to its axis.
+    """Colour LiDAR points by the camera that sees each closest to its axis.
 
-    Returns of the own car (``lidar.OWN_CAR_M``) and points that no camera sees, or only on a car-body mask, are
-    dropped.
+    Drops returns of the own car and points that no camera sees outside its car-body mask.
 
     Args:
         rig: The source rig.
         images: One per camera.
         points: (P, >=3) in the ego frame.
-        ground_band_m: Distance from the road plane that still counts as ground.
+        ground_band_m: Largest distance of ground points from the road plane.
     """
     _check_images(rig, images)
     points = points[~own_car(points), :3].astype(np.float64)
@@ -166,11 +131,10 @@ def coloured_points(
 
 
 def equalising_gains(rig: Rig, images: Sequence[Image], points: FloatArray, *, prior: float = 0.1) -> FloatArray:
-    """(N,) gains that bring points seen by two cameras to one brightness.
+    """Fit (N,) gains that give points seen by two cameras one brightness.
 
-    Least squares on log-gains g: for each pair of cameras with at least 20 shared points that are neither dark nor
-    saturated, g_a - g_b = -median(log brightness_a - log brightness_b); ``prior`` pulls each towards 0, and so does
-    their sum.
+    Least squares on log-gains g: g_a - g_b = -median(log brightness_a - log brightness_b) for each pair of cameras with
+    at least 20 shared points that are neither dark nor saturated. ``prior`` weighs g = 0; so is their sum.
     """
     _check_images(rig, images)
     light: list[dict[int, float]] = []
@@ -195,13 +159,13 @@ def equalising_gains(rig: Rig, images: Sequence[Image], points: FloatArray, *, p
 
 
 def equalised(rig: Rig, images: Sequence[Image], points: FloatArray) -> list[npt.NDArray[np.uint8]]:
-    """The images with ``equalising_gains`` applied."""
+    """Apply ``equalising_gains`` to the images."""
     gains = equalising_gains(rig, images, points)
     return [np.clip(image * gain, 0, 255).astype(np.uint8) for image, gain in zip(images, gains, strict=True)]
 
 
 def lidar_split(points: FloatArray, width_deg: float = 1.0) -> tuple[BoolArray, BoolArray]:
-    """Masks (fit, test) over alternate azimuth sectors: what a LiDAR surface may use, and what scores it."""
+    """Masks (fit, test) over alternate azimuth sectors: points for a LiDAR surface, and points that score it."""
     azimuth_deg = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
     fit = np.asarray(np.floor(azimuth_deg / width_deg) % 2 == 0)
     return fit, ~fit
@@ -209,17 +173,20 @@ def lidar_split(points: FloatArray, width_deg: float = 1.0) -> tuple[BoolArray, 
 
 def sparse_metrics(
     image: Image, camera: Camera, points: ColouredPoints, *, coverage: BoolArray | None = None
-) -> SparseScore | None:
-    """Agreement of a rendered target with the coloured points it should show.
+) -> dict[str, float] | None:
+    """Compare a rendered target with the coloured points that fall into it.
 
     Args:
-        image: The target's image, black where nothing covers it (or filled, to score the filling as well).
+        image: The target's image, black (or filled) where nothing covers it.
         camera: The target camera.
         points: From ``coloured_points``.
         coverage: (h, w) bool, where some source saw the target; by default, pixels that are not black.
 
     Returns:
-        The score, or None where no point is visible.
+        ``psnr_db, mae, rmse`` over all points, the paper's figures; the same with the prefixes ``covered_``,
+        ``ground_`` and ``other_`` (off the road) where there are such points; ``ssim`` of two images that are black
+        but at the points; ``coverage``, the share of points on covered pixels; and ``points``, their number. None if
+        no point is visible.
     """
     if image.shape[:2] != camera.size:
         raise SampleError(f"camera {camera.name!r}: expected an image of {camera.size}, got {image.shape[:2]}")
@@ -233,40 +200,11 @@ def sparse_metrics(
     sparse_got[row, column], sparse_want[row, column] = got, want
     covered = np.asarray(image.any(-1) if coverage is None else coverage)[row, column]
     ground = points.on_ground[index]
-    everything = errors(got, want)
-    assert everything is not None
-    return SparseScore(
-        all=everything,
-        ssim=ssim(sparse_got, sparse_want),
-        coverage=float(covered.mean()),
-        covered=errors(got[covered], want[covered]),
-        ground=errors(got[ground], want[ground]),
-        other=errors(got[~ground], want[~ground]),
-    )
-
-
-def score_targets(
-    render: Callable[[Rig], Iterable[Image]],
-    points: ColouredPoints,
-    targets: Iterable[Rig],
-) -> dict[str, float]:
-    """Mean sparse metrics over all cameras of all target rigs.
-
-    Args:
-        render: Renders a target rig: one image per camera.
-        points: From ``coloured_points``, in the ego frame of the targets.
-        targets: See ``evaluate.targets``.
-
-    Returns:
-        Means of the per-image values (see ``SparseScore.as_dict``); empty where no point is visible.
-    """
-    rows = []
-    for target in targets:
-        for camera, image in zip(target, render(target), strict=True):
-            score = sparse_metrics(image, camera, points)
-            if score is not None:
-                rows.append(score.as_dict())
-    return mean_of(rows)
+    similarity = float(ssim_map(sparse_got, sparse_want).mean())
+    metrics = {"ssim": similarity, "coverage": float(covered.mean()), "points": float(len(index))}
+    for name, part in (("", slice(None)), ("covered_", covered), ("ground_", ground), ("other_", ~ground)):
+        metrics |= errors(got[part], want[part], name)
+    return metrics
 
 
 def _unmasked(camera: Camera, seen: VisiblePoints) -> VisiblePoints:

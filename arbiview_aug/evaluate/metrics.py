@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,29 +17,14 @@ _PEAK = 255.0
 _SMALLEST_MSE = 1e-9
 
 
-class Errors(NamedTuple):
-    """Errors over a set of pixels or points; the mean runs over them and over the three channels.
-
-    Attributes:
-        n: Number of pixels or points.
-        psnr_db: 10 log10(255² / MSE); 177.9 dB where nothing differs.
-        mae: Mean absolute error, 0-255.
-        rmse: Root of the mean squared error, 0-255.
-    """
-
-    n: int
-    psnr_db: float
-    mae: float
-    rmse: float
-
-
-def errors(got: npt.NDArray[Any], want: npt.NDArray[Any]) -> Errors | None:
-    """Errors of colours (n, 3) on the scale 0-255; None where there are none."""
+def errors(got: npt.NDArray[Any], want: npt.NDArray[Any], prefix: str = "") -> dict[str, float]:
+    """PSNR (177.9 dB for equal colours), MAE and RMSE of colours (n, 3) on the scale 0-255; empty for none."""
     if len(got) == 0:
-        return None
+        return {}
     difference = got.astype(np.float64) - want
     mse = float((difference**2).mean())
-    return Errors(len(got), psnr_db(mse), float(np.abs(difference).mean()), mse**0.5)
+    mae = float(np.abs(difference).mean())
+    return {f"{prefix}psnr_db": psnr_db(mse), f"{prefix}mae": mae, f"{prefix}rmse": mse**0.5}
 
 
 def psnr_db(mse: float) -> float:
@@ -48,9 +33,9 @@ def psnr_db(mse: float) -> float:
 
 
 def ssim_map(one: npt.NDArray[Any], two: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    """Structural similarity per pixel and channel (h, w, c) of images on the scale 0-255.
+    """Structural similarity (Wang et al. 2004) per pixel and channel (h, w, c) of images on the scale 0-255.
 
-    Wang et al. 2004: Gaussian window 11x11 with σ = 1.5, K1 = 0.01, K2 = 0.03; borders are reflected.
+    Gaussian window 11x11 with σ = 1.5, K1 = 0.01, K2 = 0.03; borders are reflected.
     """
     a, b = one.astype(np.float64), two.astype(np.float64)
     c1, c2 = (0.01 * _PEAK) ** 2, (0.03 * _PEAK) ** 2
@@ -65,13 +50,8 @@ def ssim_map(one: npt.NDArray[Any], two: npt.NDArray[Any]) -> npt.NDArray[np.flo
     return luminance * (2 * covariance + c2) / (var_a + var_b + c2)
 
 
-def ssim(one: npt.NDArray[Any], two: npt.NDArray[Any]) -> float:
-    """Mean of ``ssim_map``."""
-    return float(ssim_map(one, two).mean())
-
-
 def mean_of(rows: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    """Per key, the mean over the rows that have it: means of per-image values, as the paper's tables report."""
+    """Mean of each key over the rows that have it."""
     values: dict[str, list[float]] = {}
     for row in rows:
         for key, value in row.items():
@@ -79,30 +59,14 @@ def mean_of(rows: Iterable[Mapping[str, float]]) -> dict[str, float]:
     return {key: float(np.mean(column)) for key, column in values.items()}
 
 
-def flat(name: str, e: Errors | None) -> dict[str, float]:
-    """``{name_psnr_db: ..., name_mae: ..., name_rmse: ...}``, without the prefix for an empty name."""
-    prefix = f"{name}_" if name else ""
-    return {} if e is None else {f"{prefix}{field}": float(getattr(e, field)) for field in ("psnr_db", "mae", "rmse")}
-
-
 def gradient_energy_ratio(got: npt.NDArray[Any], want: npt.NDArray[Any], region: npt.NDArray[np.bool_]) -> float | None:
-    """Squared differences of neighbouring pixels inside a region, got over wanted: below 1 is blurred.
+    """Ratio of horizontal gradient energies of (h, w, 3) images in a region (h, w); below 1 is blurred.
 
-    Args:
-        got: (h, w, 3).
-        want: (h, w, 3) on the same scale.
-        region: (h, w) bool.
-
-    Returns:
-        None where the region has no two neighbours, or the truth no gradient.
+    None if the region has no two neighbours or ``want`` no gradient there.
     """
     pairs = region[:, 1:] & region[:, :-1]
     energy = [float((np.diff(image.astype(np.float64), axis=1)[pairs] ** 2).sum()) for image in (got, want)]
     return energy[0] / energy[1] if energy[1] > 0 else None
-
-
-CLASSES = ("ground", "object", "sky")
-"""The classes that synthetic scenes are split into."""
 
 
 def truth_metrics(
@@ -113,16 +77,16 @@ def truth_metrics(
     classes: Mapping[str, BoolArray] | None = None,
     valid: BoolArray | None = None,
 ) -> dict[str, float]:
-    """PSNR, MAE, RMSE, SSIM and sharpness against the true view: over all pixels, split by coverage and by class.
+    """Compare a view with the true one: over all pixels, split by coverage and by class.
 
-    SSIM of a region is the mean of the SSIM map over its pixels; its windows reach 5 pixels past the region's border.
+    SSIM of a region is the mean of the SSIM map over its pixels.
 
     Args:
         image: (h, w, 3) the rendered view, scale 0-255.
         truth: (h, w, 3) the true one.
         coverage: (h, w) bool, where some source saw the view: splits into ``covered`` and ``hole``.
         classes: (h, w) bool by name, for instance ``ground``, ``object``, ``sky``.
-        valid: (h, w) bool, where the truth is known and counts (the target's own car body excluded).
+        valid: (h, w) bool, where the truth is known (not on the target's own car body).
 
     Returns:
         ``psnr_db, mae, rmse, ssim, gradient_ratio, share`` over all valid pixels, and the same with the prefixes
@@ -139,33 +103,18 @@ def truth_metrics(
     everywhere = np.ones(shape, bool) if valid is None else valid
     regions = {"": everywhere}
     if coverage is not None:
-        regions |= {"covered": everywhere & coverage, "hole": everywhere & ~coverage}
-    for name, region in list(regions.items()):
-        for class_name, mask in (classes or {}).items():
-            regions["_".join(filter(None, (name, class_name)))] = region & mask
+        regions |= {"covered_": everywhere & coverage, "hole_": everywhere & ~coverage}
+    for prefix, region in list(regions.items()):
+        regions |= {f"{prefix}{name}_": region & mask for name, mask in (classes or {}).items()}
     similarity = ssim_map(image, truth).mean(-1)
     total = max(1, int(everywhere.sum()))
     row: dict[str, float] = {}
-    for name, region in regions.items():
-        row |= _region(name, region, image, truth, similarity, total)
-    return row
-
-
-def _region(
-    name: str,
-    region: BoolArray,
-    image: npt.NDArray[Any],
-    truth: npt.NDArray[Any],
-    similarity: npt.NDArray[np.float64],
-    total: int,
-) -> dict[str, float]:
-    prefix = f"{name}_" if name else ""
-    count = int(region.sum())
-    row = {f"{prefix}share": count / total}
-    if count:
-        row |= flat(name, errors(image[region], truth[region]))
-        row[f"{prefix}ssim"] = float(similarity[region].mean())
-        ratio = gradient_energy_ratio(image, truth, region)
-        if ratio is not None:
-            row[f"{prefix}gradient_ratio"] = ratio
+    for prefix, region in regions.items():
+        row[f"{prefix}share"] = int(region.sum()) / total
+        if region.any():
+            row |= errors(image[region], truth[region], prefix)
+            row[f"{prefix}ssim"] = float(similarity[region].mean())
+            ratio = gradient_energy_ratio(image, truth, region)
+            if ratio is not None:
+                row[f"{prefix}gradient_ratio"] = ratio
     return row

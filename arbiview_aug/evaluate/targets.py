@@ -1,7 +1,4 @@
-"""Target rigs to evaluate on: the paper's six configurations, yawed rigs, shifted rigs.
-
-Targets are made from the source rig, camera by camera. They carry no car-body masks: those are the source's.
-"""
+"""Target rigs to evaluate on, made from the source rig and without its car-body masks."""
 
 from __future__ import annotations
 
@@ -15,10 +12,7 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.datasets.nuscenes.reader import CAMERA_RING
 
 PAPER_SHARES = (0.2, -0.2, 0.4, -0.4, 0.5, -0.25)
-"""The paper's configurations: each camera yawed by this share of the azimuth spacing to its neighbour.
-
-With the spacing of nuScenes (55 degrees, at the back 70) these are its yaws of 11/14, 22/28, 27.5/35 and 13.75/17.5.
-"""
+"""The paper's six configurations, as shares of the azimuth spacing: yaws of 11/14, 22/28, 27.5/35 and 13.75/17.5°."""
 
 YAWS_DEG = (11.0, -11.0, 22.0, -22.0, 35.0)
 UP_M = 0.6
@@ -29,9 +23,8 @@ _SAME_DIRECTION_DEG = 5.0
 def spacing_deg(rig: Rig) -> FloatArray:
     """(N,) azimuth spacing of each camera to its neighbour.
 
-    On rigs with nuScenes' camera names the paper's own figures: 55 degrees, 70 for CAM_BACK. On others the smaller
-    one of the two gaps to the next camera on either side, where cameras within 5 degrees count as the same direction
-    (a telephoto beside a wide camera); a camera without a neighbour has its own horizontal field of view.
+    The paper's figures on rigs with nuScenes' camera names: 55 degrees, 70 for CAM_BACK. Otherwise the gap to the
+    nearest camera that is not within 5 degrees (a telephoto beside a wide camera), or the camera's own field of view.
     """
     if set(CAMERA_RING).issuperset(rig.names):
         return np.array([70.0 if name == "CAM_BACK" else 55.0 for name in rig.names])
@@ -45,7 +38,7 @@ def spacing_deg(rig: Rig) -> FloatArray:
 
 
 def paper_target(rig: Rig, share: float) -> Rig:
-    """One configuration of the paper: each camera yawed (left for a positive share) by its share of the spacing."""
+    """One configuration of the paper: each camera yawed by a share of its spacing, positive to the left."""
     cameras = [
         camera.turned(yaw_deg=share * float(spacing)) for camera, spacing in zip(rig, spacing_deg(rig), strict=True)
     ]
@@ -67,20 +60,15 @@ def shifted_target(rig: Rig, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.
     return without_masks(rig.shifted(x_m, y_m, z_m).turned(yaw_deg=yaw_deg))
 
 
-def standard_targets(rig: Rig) -> dict[str, list[Rig]]:
-    """What accuracy is reported on: ``yaw`` (±11, ±22, 35 degrees), ``up`` (0.6 m) and ``paper`` (six)."""
-    return {"yaw": yawed_targets(rig), "up": [shifted_target(rig, z_m=UP_M)], "paper": paper_targets(rig)}
-
-
 VEHICLES = ("waymo", "argoverse2", "lyft_l5", "nuplan")
-"""Shipped rigs that stand for changes of vehicle."""
+"""Shipped rigs used as other vehicles."""
 
 TRUCK_UP_M = 1.0
-"""From a sedan to a truck: the same cameras, so much higher."""
+"""Height of a truck's cameras over a sedan's."""
 
 
 def vehicle_targets(rig: Rig) -> dict[str, Rig]:
-    """``VEHICLES`` as pinhole rigs whose images are as wide as the source's, by name."""
+    """``VEHICLES`` by name, as pinhole rigs with the source's image width."""
     width = float(np.median([camera.width_px for camera in rig]))
     found = {}
     for name in VEHICLES:
@@ -91,12 +79,7 @@ def vehicle_targets(rig: Rig) -> dict[str, Rig]:
 
 
 def named_targets(kind: str, rig: Rig) -> dict[str, Rig]:
-    """A set of targets by name.
-
-    Args:
-        kind: ``paper`` (six configurations), ``yaw`` (``YAWS_DEG``), ``vehicles`` (``VEHICLES``), ``truck``.
-        rig: The source rig.
-    """
+    """Targets of a set, by name: ``paper`` (six), ``yaw`` (``YAWS_DEG``), ``vehicles`` or ``truck``."""
     if kind == "paper":
         return {f"paper {share:+g}": target for share, target in zip(PAPER_SHARES, paper_targets(rig), strict=True)}
     if kind == "yaw":

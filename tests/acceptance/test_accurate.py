@@ -104,9 +104,7 @@ def real(request: pytest.FixtureRequest, referee: ModuleType, data_root: Path) -
                     [sparse_metrics(image, camera, points) for image, camera in zip(row, rig, strict=True)]
                     for row, rig in zip(images, rigs, strict=True)
                 ]
-                found[method, name] = np.array(
-                    [[np.nan if s is None else s.all.psnr_db for s in row] for row in scores]
-                )
+                found[method, name] = np.array([[np.nan if s is None else s["psnr_db"] for s in row] for row in scores])
     depth = overlap_depth(frame.rig, as_tensors(frame.images))
     scene = Scene(corrections=depth.corrections)
     overlaps = (frame.overlap_db(Scene().surface("ground", frame.ground_z_m)),)

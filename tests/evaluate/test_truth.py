@@ -8,7 +8,7 @@ import torch
 
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.images import as_arrays, as_tensors, to_bytes
-from arbiview_aug.evaluate.metrics import errors, mean_of, psnr_db, ssim, ssim_map, truth_metrics
+from arbiview_aug.evaluate.metrics import errors, mean_of, psnr_db, ssim_map, truth_metrics
 
 
 def test_regions() -> None:
@@ -64,16 +64,17 @@ def test_messages(changes: dict, message: str) -> None:
 
 
 def test_errors_by_hand() -> None:
-    e = errors(np.array([[10, 20, 30]], np.uint8), np.array([[13, 16, 30]], np.uint8))
-    assert e == pytest.approx((1, 10 * np.log10(255**2 / (25 / 3)), 7 / 3, (25 / 3) ** 0.5))
-    assert errors(np.zeros((0, 3)), np.zeros((0, 3))) is None
+    found = errors(np.array([[10, 20, 30]], np.uint8), np.array([[13, 16, 30]], np.uint8), "a_")
+    expected = {"a_psnr_db": 10 * np.log10(255**2 / (25 / 3)), "a_mae": 7 / 3, "a_rmse": (25 / 3) ** 0.5}
+    assert found == pytest.approx(expected)
+    assert errors(np.zeros((0, 3)), np.zeros((0, 3))) == {}
     assert psnr_db(255.0**2) == 0
 
 
 def test_ssim_properties() -> None:
     image = np.random.default_rng(0).uniform(0, 255, (40, 50, 3))
-    assert ssim(image, image) == pytest.approx(1.0)
-    assert ssim(image, 255 - image) < 0
+    assert ssim_map(image, image).mean() == pytest.approx(1.0)
+    assert ssim_map(image, 255 - image).mean() < 0
     flat_one, flat_two = np.full((20, 20, 3), 100.0), np.full((20, 20, 3), 120.0)
     c1 = (0.01 * 255) ** 2
     expected = (2 * 100 * 120 + c1) / (100**2 + 120**2 + c1)  # no structure: the luminance term alone

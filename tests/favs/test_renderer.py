@@ -289,8 +289,9 @@ def test_real_frame(nuscenes_root) -> None:
     """22.5 dB is what a prototype of the published stages reached over yaws of 11 to 35 degrees (raw frames)."""
     from arbiview_aug.datasets import FrameFolder
     from arbiview_aug.evaluate.images import as_arrays, as_tensors
-    from arbiview_aug.evaluate.lidar import coloured_points, score_targets
+    from arbiview_aug.evaluate.lidar import coloured_points
     from arbiview_aug.evaluate.targets import yawed_targets
+    from tests.helpers import score_targets
 
     sample = FrameFolder(nuscenes_root)[0]
     rig = sample["rig"].resized(0.5)

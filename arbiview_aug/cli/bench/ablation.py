@@ -1,19 +1,13 @@
-"""``python -m arbiview_aug bench ablation``: what each stage and setting is worth, in dB and in milliseconds.
+"""``python -m arbiview_aug bench ablation``: gain of each stage and setting, in dB and in milliseconds.
 
-Every row is a method; all render the same targets: the paper's six configurations (each camera turned by a share of
-the spacing to its neighbour) and the rig raised by 0.6 m. On real frames they are scored by the paper's measure, LiDAR
-points with the colours that the source cameras saw, exposures made even, unseen pixels black; on the synthetic street
-against the true views, on seen pixels (``evaluate.frames``). A step is the difference of two rows.
-
-Milliseconds are CPU time of a frame on one thread, the median over the targets, without the plan that a calibration
-needs once; steps whose plan belongs to one frame pay for it. What a step adds is the median over the targets of the
-difference between its two rows: rows take turns on each target, so that what else the machine does slows all alike.
+All rows render the paper's six configurations and the rig raised by 0.6 m. A step is the difference of two rows. Its
+milliseconds are the median over the targets of their differences, CPU time without plans, unless its plan belongs to
+one frame.
 """
 
 from __future__ import annotations
 
 import statistics
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -24,13 +18,12 @@ import numpy as np
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import add_data
-from arbiview_aug.cli.bench.study import benchmark_parser, study
-from arbiview_aug.cli.bench.timing import cpu_model, quartiles, write_json
+from arbiview_aug.cli.bench.study import benchmark, benchmark_parser, study
+from arbiview_aug.cli.bench.timing import machine_line, quartiles, show
 from arbiview_aug.datasets import open_data, reduced_rig
 from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.environment import one_thread
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.agreement import source_overlap, summary
 from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
@@ -51,7 +44,7 @@ def _stages_1_and_4(*without: str) -> PaperConfig:
 
 
 class Row(NamedTuple):
-    """Settings of ``retargeting``; ``held``: with depth from overlap held; ``reduce``: targets 1 / this as large."""
+    """Settings of ``retargeting``; ``held`` caches depth from overlap, ``reduce`` shrinks the targets by a factor."""
 
     quality: Quality | FavsConfig | PaperConfig
     surface: SurfaceName = "street"
@@ -60,16 +53,13 @@ class Row(NamedTuple):
     reduce: Reduce = 1
 
     def method(self, name: str) -> Method:
-        """The row as a method that holds nothing yet."""
+        """Create the method, with empty caches."""
         refinement = RefinementCache() if self.held else None
         options: dict[str, Any] = {"harmonise": self.harmonise, "refinement": refinement, "transforms": 1}
         return retargeting(self.quality, self.surface, name, **options)
 
     def fits(self, frame: ScoredFrame) -> bool:
-        """Whether a frame can tell what the row is worth.
-
-        Boxes are needed to stand on the street. LiDAR's colours are read at points: no measure for antialiased views.
-        """
+        """Whether a frame has boxes or the truth, where the row needs them (LiDAR points cannot score antialiasing)."""
         if self.reduce > 1:
             return frame.truth is not None
         return self.surface != "objects" or "boxes_3d" in frame.sample
@@ -91,11 +81,10 @@ ROWS: dict[str, Row] = {
     "accurate": Row("accurate"),
     "accurate, held": Row("accurate", held=True),
 }
-"""Methods by name."""
 
 
 class Step(NamedTuple):
-    """Two rows that differ by one thing; ``replanned``: with it, every frame needs a plan of its own."""
+    """Two rows that differ by one setting; ``replanned``: the first needs a new plan for every frame."""
 
     row: str
     without: str
@@ -120,7 +109,6 @@ STEPS: dict[str, Step] = {
     "depth from overlap, held": Step("accurate, held", "fast"),
     "harmonising": Step("fast, harmonised", "fast"),
 }
-"""What is switched on, by name."""
 
 NOTES = (
     f"PSNR in dB on the paper's six configurations (turned) and {UP_M} m higher (raised): on real frames at LiDAR "
@@ -138,9 +126,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         "Each stage and setting on and off: accuracy, milliseconds on one thread, and what a ms buys.",
         reduce=True,
         output="output/ablation.json",
+        example="--data FOLDER",
     )
-    add_data(parser, "a synthetic street", nargs="+", default=[])  # with LiDAR, each its first frame
-    parser.add_argument("--seed", type=int, default=0, help="of the synthetic street (default: %(default)s)")
+    add_data(parser, "a synthetic street", nargs="+", default=[])
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the synthetic street")
     parser.add_argument("--only", metavar="TEXT", default="", help="steps whose names contain it")
     parser.add_argument("--json", action="store_true", help="print JSON instead of the table")
     arguments = parser.parse_args(argv)
@@ -149,15 +138,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"argument --only: expected part of one of {', '.join(STEPS)}")
     if len({*map(data_name, arguments.data)}) < len(arguments.data):
         parser.error("argument --data: expected folders of different names")
-    with one_thread(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of targets that are half outside: the paper's are
-        report = measure(arguments.data, steps, reduce=arguments.reduce, seed=arguments.seed)
-    path = Path(arguments.output)
-    text = write_json(report, path)
-    print(text if arguments.json else f"{markdown(report)}\n\n{report['cpu']}; report: {path}")
+    report = measure(arguments.data, steps, reduce=arguments.reduce, seed=arguments.seed)
+    table = f"{markdown(report)}\n\n{machine_line(report)}"
+    show(table, report, Path(arguments.output), as_json=arguments.json)
     return 0
 
 
+@benchmark
 def measure(
     data: Sequence[str],
     steps: Sequence[str],
@@ -166,15 +153,7 @@ def measure(
     seed: int = 0,
     size: tuple[int, int] = (256, 704),
 ) -> dict[str, Any]:
-    """All steps asked for and the rows that they need, as plain data for JSON.
-
-    Args:
-        data: Folders of data with LiDAR, of each the first frame; none for a synthetic street.
-        steps: Names out of ``STEPS``.
-        reduce: The images of folders are decoded at 1 / this.
-        seed: Of the street.
-        size: (h, w) of its images.
-    """
+    """Measure the named steps on the first frame of each folder with LiDAR, or on a synthetic street."""
     found = {}
     for name, frame in _frames(data, reduce, seed, size):
         fitting = {step: STEPS[step] for step in steps if ROWS[STEPS[step].row].fits(frame)}
@@ -186,11 +165,11 @@ def measure(
             "steps": {step: step_figures(which, rows, metric) for step, which in fitting.items()},
             "overlap": [_overlap(frame, harmonised) for harmonised in (False, True) if "harmonising" in fitting],
         }
-    return {"benchmark": "ablation", "cpu": cpu_model(), "data": found}
+    return {"data": found}
 
 
 def markdown(report: Mapping[str, Any]) -> str:
-    """The table of steps, data sets side by side, and what is to be known about it."""
+    """Notes and table of steps, data sets side by side."""
     sets: Mapping[str, Any] = report["data"]
     head = ["", "part of", *(h for name in sets for h in (f"{name}: turned", "raised", "ms", "mdB a ms"))]
     rows = [
@@ -209,7 +188,6 @@ def markdown(report: Mapping[str, Any]) -> str:
     return "\n\n".join(parts)
 
 
-# --- what is measured -------------------------------------------------------------------------------------------------
 def _frames(data: Sequence[str], reduce: Reduce, seed: int, size: tuple[int, int]) -> Iterator[tuple[str, ScoredFrame]]:
     for folder in data:
         sample = open_data(folder, reduce=reduce)[0]
@@ -222,7 +200,7 @@ def _frames(data: Sequence[str], reduce: Reduce, seed: int, size: tuple[int, int
 
 
 def _rows(data: str, frame: ScoredFrame, names: set[str]) -> dict[str, dict[str, Any]]:
-    """Mean metrics of each row, ``turned`` and ``raised``, and its times on each target, ``ms`` and ``plan_ms``."""
+    """Mean metrics of each row by move (``turned``, ``raised``), and its times on each target."""
     rig: Rig = frame.sample["rig"]
     targets = {"turned": paper_targets(rig), "raised": [shifted_target(rig, z_m=UP_M)]}
     found: dict[str, dict[str, Any]] = {}
@@ -234,7 +212,7 @@ def _rows(data: str, frame: ScoredFrame, names: set[str]) -> dict[str, dict[str,
 
 
 def step_figures(step: Step, rows: Mapping[str, Any], metric: str) -> dict[str, Any]:
-    """What a step reaches, what it adds, and how much of it for each ms; None where the ms are within their spread."""
+    """PSNR of a step, its gain, and its gain per ms; None where the added time is within its spread."""
     row, without = rows[step.row], rows[step.without]
     ms = np.add(row["ms"], row["plan_ms"]) if step.replanned else np.array(row["ms"])
     added = quartiles(ms - np.array(without["ms"]))
@@ -260,10 +238,10 @@ def _cells(step: Mapping[str, Any] | None) -> list[str]:
 
 
 def _signed(value: float, digits: int) -> str:
-    """With a sign, of which a rounded 0 has +."""
+    """Signed number without -0."""
     return f"{round(value, digits) + 0.0:+.{digits}f}"
 
 
 def _overlap(frame: ScoredFrame, harmonised: bool) -> dict[str, float]:
-    """Agreement of neighbours in the view between them, on the frame as recorded."""
+    """Agreement of neighbours on the frame as recorded."""
     return summary("overlap", source_overlap(frame.sample, retargeting("fast", "street", harmonise=harmonised)))

@@ -1,4 +1,4 @@
-"""Frames to measure on: a user's, read at several sizes, or synthetic streets on disk, whose true views are known."""
+"""Frames on disk to measure on: a user's, or synthetic streets with known true views."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from arbiview_aug.evaluate.targets import without_masks
 REDUCES: tuple[Reduce, ...] = get_args(Reduce)
 
 SOURCES_OVER_VIEWS = 2
-"""Synthetic images are as much larger than the views: so decoding at half size has something to save."""
+"""Size of synthetic images relative to the views, so that decoding at half size pays."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class Recorded:
     """Frames on disk.
 
     Attributes:
-        name: For tables.
+        name: Shown in tables.
         root: The folder, or ``KIND:PATH``.
-        truth: The true views of a frame for a rig; None where nobody knows them.
+        truth: Renders the true views of a frame for a rig; None on real frames.
     """
 
     name: str
@@ -44,29 +44,26 @@ class Recorded:
     truth: Callable[[int, Rig], RenderedViews] | None = None
 
     def sample(self, index: int, reduce: Reduce = 1) -> dict[str, Any]:
-        """A frame as its reader gives it."""
+        """Read a frame with images at 1 / ``reduce``."""
         data = open_data(self.root, reduce=reduce)
         return data[index]
 
     def reader(self, reduce: Reduce) -> Callable[[], Any]:
-        """Reads the first frame's images from disk, with its calibration and without its points."""
+        """Function that reads the first frame from disk, without its points."""
         data = open_data(self.root, reduce=reduce)
         data.load_points = False
         return partial(data.__getitem__, 0)
 
     def target(self, name: str | None, size: tuple[int, int]) -> Rig:
-        """The rig to render at (h, w): by its name or file, else what the commands take where none is named.
-
-        Stretched, as it was when the published figures were recorded.
-        """
+        """Rig to render, stretched to (h, w); by default the one that other commands take."""
         if name is None and self.truth is not None:
             return demo_target_rig(size)
         return without_masks(load_rig(name or REAL_TARGET)).resized(size, "stretch")
 
     def frame(self, index: int, reduce: Reduce, reference: Reduce) -> ScoredFrame:
-        """A frame to evaluate on, with images at 1 / ``reduce``, scored by the colours of images at 1 / ``reference``.
+        """Frame with images at 1 / ``reduce``, scored by the colours of images at 1 / ``reference``.
 
-        Where there is no truth, methods get the points of every other degree, and the others score.
+        On real frames methods get the points of every other degree; the others score.
 
         Raises:
             DataError: There is neither truth nor LiDAR.
@@ -85,42 +82,48 @@ class Recorded:
 
 
 @contextmanager
-def recorded(data: str | Path | None, *, frames: int = 1, size: tuple[int, int] = (512, 1408)) -> Iterator[Recorded]:
-    """A user's frames, or ``frames`` synthetic streets as JPEGs of ``size`` (h, w) in a temporary folder."""
+def recorded(
+    data: str | Path | None,
+    *,
+    frames: int = 1,
+    size: tuple[int, int] = (512, 1408),
+    neighbours: Neighbours | None = None,
+) -> Iterator[Recorded]:
+    """Open a user's frames, or write synthetic ones as JPEGs to a temporary folder.
+
+    Args:
+        data: The user's data; None for synthetic streets.
+        frames: Number of synthetic frames.
+        size: (h, w) of synthetic images.
+        neighbours: Write one synthetic frame with these neighbours instead, as a drive.
+    """
     if data is not None:
         yield Recorded(data_name(data), Path(data))
         return
-    drive = SyntheticDrive(demo_source_rig(size), num_frames=frames)
+    drive = SyntheticDrive(demo_source_rig(size), num_frames=frames, lidar=neighbours is None, neighbours=neighbours)
     with tempfile.TemporaryDirectory() as folder:
-        for k in range(frames):
-            write_frame(Path(folder) / f"{k:04}", drive[k])
-        yield Recorded("synthetic streets", Path(folder), drive.render)
-
-
-@contextmanager
-def recorded_drive(data: str | Path | None, wanted: Neighbours, *, size: tuple[int, int]) -> Iterator[tuple[str, Path]]:
-    """Name and folder of a user's drive; or of a synthetic one, a frame with the neighbours that are wanted, as JPEGs
-    of ``size`` (h, w) in a temporary folder."""
-    if data is not None:
-        yield data_name(data), Path(data)
-        return
-    sample = SyntheticDrive(demo_source_rig(size), num_frames=1, lidar=False, neighbours=wanted)[0]
-    with tempfile.TemporaryDirectory() as folder:
-        write_drive(Path(folder), [sample, *sample["neighbours"]])
-        yield "synthetic drive", Path(folder)
+        if neighbours is not None:
+            sample = drive[0]
+            write_drive(Path(folder), [sample, *sample["neighbours"]])
+        else:
+            for k in range(frames):
+                write_frame(Path(folder) / f"{k:04}", drive[k])
+        name = "synthetic streets" if neighbours is None else "synthetic drive"
+        yield Recorded(name, Path(folder), drive.render)
 
 
 def as_of_another_frame(sample: Mapping[str, Any]) -> dict[str, Any]:
-    """The same sample with its images a pixel aside and its points and boxes a millimetre: nothing that was planned or
-    estimated for the one fits the other. Memory lies as it did."""
+    """Shift images by a pixel, points and boxes by a millimetre, so that no cached plan or estimate fits.
+
+    Images keep their memory layout.
+    """
     images = sample["images"]
-    aside: Any = images.clone() if isinstance(images, torch.Tensor) else [image.clone() for image in images]
-    for to, image in zip(aside, images, strict=True):
+    shifted: Any = images.clone() if isinstance(images, torch.Tensor) else [image.clone() for image in images]
+    for to, image in zip(shifted, images, strict=True):
         to[..., 1:] = image[..., :-1]
-    moved = dict(sample) | {"images": aside}
+    found = {**sample, "images": shifted}
     for key in ("points", "boxes_3d"):
         if key in sample:
-            shift = torch.zeros(sample[key].shape[-1])
-            shift[2] = 1e-3
-            moved[key] = sample[key] + shift
-    return moved
+            found[key] = sample[key].clone()
+            found[key][:, 2] += 1e-3
+    return found

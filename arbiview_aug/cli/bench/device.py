@@ -1,27 +1,21 @@
-"""``bench speed --device``: how near the torch execution comes to moving its bytes once.
+"""``bench speed --device``: bandwidth of the torch execution, compared with a copy on the device.
 
-A batch of frames is rendered for the same cameras turned by ``YAW_DEG``, from images that lie on the device already:
-uint8, bfloat16 and float32, always with float32 grids.
-
-*Bytes* are the least that must move: each source image that is read, once; each map position, once for the whole batch;
-each view, once; all in their own types. *Share* is bytes / time, over the bandwidth of a copy within the device of as
-many bytes, measured in the same rounds (a copy moves its bytes twice: read and written). A share of 1 is the limit.
-
-Times are CUDA events', or on the CPU the process's CPU time on one thread.
+A batch of frames is rendered for the same cameras turned by ``YAW_DEG``, from images on the device. *Bytes* are the
+least that must move: each source image read once, each map position once per batch, each view once. *Share* is
+bytes / time over the bandwidth of a copy of as many bytes, measured in the same rounds.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.bench.study import SIZE, facts
+from arbiview_aug.cli.bench.study import SIZE, benchmark
 from arbiview_aug.cli.bench.timing import clock_of, machine_line, quartiles, timed_rounds
-from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.image_ops import resized
 from arbiview_aug.render.plan import RenderPlan, build_plan
@@ -32,6 +26,7 @@ DTYPES = {"uint8": torch.uint8, "bf16": torch.bfloat16, "fp32": torch.float32}
 BATCH = {"cuda": 8, "cpu": 1}
 
 
+@benchmark
 def measure_device(
     rig: Rig,
     images: Sequence[torch.Tensor],
@@ -41,30 +36,26 @@ def measure_device(
     *,
     sizes: Sequence[tuple[int, int]] | None = None,
 ) -> dict[str, Any]:
-    """Times and bandwidths of all sizes and types, as plain data for JSON.
+    """Time all sizes and types.
 
     Args:
         rig: Cameras without masks.
-        images: (3, h, w) uint8 of each.
-        data: The name of the data.
-        device: The device that renders.
+        images: One (3, h, w) uint8 per camera.
+        data: Name of the data.
+        device: Device that renders.
         repeats: Rounds.
-        sizes: (h, w) of images and views: by default those of the images, and ``SIZE``.
+        sizes: (h, w) of images and views; by default those of the images, and ``SIZE``.
     """
-    load_before, batch = os.getloadavg(), BATCH[device.type]
-    with one_thread():
-        rows = [row for to in sizes or (rig.sizes[0], SIZE) for row in _rows(rig, images, to, device, batch, repeats)]
-    return facts(
-        "speed",
-        load_before,
-        data=data,
-        cameras=len(rig),
-        batch=batch,
-        device=torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
-        clock="CUDA events" if device.type == "cuda" else "CPU time of the process",
-        rounds=repeats,
-        rows=rows,
-    )
+    batch, is_gpu = BATCH[device.type], device.type == "cuda"
+    return {
+        "data": data,
+        "cameras": len(rig),
+        "batch": batch,
+        "device": torch.cuda.get_device_name(device) if is_gpu else device.type,
+        "clock": "CUDA events" if is_gpu else "CPU time of the process",
+        "rounds": repeats,
+        "rows": [row for to in sizes or (rig.sizes[0], SIZE) for row in _rows(rig, images, to, device, batch, repeats)],
+    }
 
 
 COLUMNS = (
@@ -78,7 +69,7 @@ COLUMNS = (
 
 
 def device_table(report: Mapping[str, Any]) -> str:
-    """The report to read, in Markdown."""
+    """Title and Markdown table of a report."""
     rows = [
         row | {"name": "{1}x{0} {2}".format(*row["size"], row["dtype"]), "megabytes": row["bytes"] / 1e6}
         for row in report["rows"]
@@ -88,7 +79,7 @@ def device_table(report: Mapping[str, Any]) -> str:
 
 
 def bytes_moved(plan: RenderPlan, images: Sequence[torch.Tensor]) -> int:
-    """The least number of bytes that rendering images (B, 3, H, W) moves."""
+    """Least number of bytes that rendering images (B, 3, H, W) moves."""
     read = sum(images[k].nbytes for k in {slot.source for slot in plan.layout.slots})
     maps = maps_on(plan, images[0].device)
     grids = sum(view.grid.nbytes + (0 if view.blend is None else view.blend.grid.nbytes) for view in maps)
@@ -103,34 +94,21 @@ def _rows(
     plan = build_plan(rig, rig.turned(yaw_deg=YAW_DEG))
     small = [resized(image, to) for image in images]
     runs: dict[str, Callable[[], Any]] = {}
-    moved: dict[str, int] = {}
+    sizes: dict[str, int] = {}
     for name, dtype in DTYPES.items():
         typed = [image if dtype == torch.uint8 else (image.float() / 255).to(dtype) for image in small]
         batches = [image.to(device).repeat(batch, 1, 1, 1) for image in typed]
-        moved[name] = bytes_moved(plan, batches)
-        runs[name] = _renders(plan, batches)
-        # One copy for each number of bytes: it must not fit a cache that the frame does not fit.
-        runs[f"{name} copy"] = _copies(moved[name] // 2, device)
+        sizes[name] = bytes_moved(plan, batches)
+        runs[name] = torch.no_grad()(partial(render_torch, plan, batches))
+        # Each copy reads and writes its own buffers: smaller ones could fit a cache.
+        one, two = (torch.zeros(sizes[name] // 2, dtype=torch.uint8, device=device) for _ in range(2))
+        runs[f"{name} copy"] = partial(one.copy_, two)
     times = timed_rounds(runs, repeats, "{1}x{0}".format(*to), clock=clock_of(device))
     rows = []
     for name in DTYPES:
-        rate, copied = (moved[name] / quartiles(times[run]).median_ms / 1e6 for run in (name, f"{name} copy"))
+        rate, copied = (sizes[name] / quartiles(times[run]).median_ms / 1e6 for run in (name, f"{name} copy"))
         rows.append(
-            {"size": list(to), "dtype": name, **quartiles(times[name])._asdict(), "bytes": moved[name]}
+            {"size": list(to), "dtype": name, **quartiles(times[name])._asdict(), "bytes": sizes[name]}
             | {"gb_per_s": rate, "copy_gb_per_s": copied, "share": rate / copied}
         )
     return rows
-
-
-def _renders(plan: RenderPlan, images: list[torch.Tensor]) -> Callable[[], Any]:
-    def run() -> None:
-        with torch.no_grad():
-            render_torch(plan, images)
-
-    return run
-
-
-def _copies(half: int, device: torch.device) -> Callable[[], Any]:
-    """A copy that reads ``half`` bytes and writes as many."""
-    source, target = (torch.zeros(half, dtype=torch.uint8, device=device) for _ in range(2))
-    return lambda: target.copy_(source)

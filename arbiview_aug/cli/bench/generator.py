@@ -1,13 +1,8 @@
-"""``python -m arbiview_aug bench generator``: cost and truth of generated pixels.
-
-On synthetic streets, whose true views are known, for targets with holes: the rig turned and with wider lenses. Holes
-are left black, inpainted, or generated in 1, 4, 10 and 50 steps.
-"""
+"""``python -m arbiview_aug bench generator``: cost and accuracy of filled holes on synthetic streets."""
 
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -18,10 +13,9 @@ import numpy as np
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import count, device_named, writable_folder
-from arbiview_aug.cli.bench.study import benchmark_parser, facts, study
+from arbiview_aug.cli.bench.study import benchmark, benchmark_parser, study
 from arbiview_aug.cli.bench.timing import clock_of, machine_line, quartiles, show
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.frames import make_frame
 from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import Method, Sample, retargeting
@@ -31,11 +25,11 @@ from arbiview_aug.generator import Generator
 SIZE = (256, 448)
 STEPS = (1, 4, 10, 50)
 HELD_OUT_SEED = 77
-"""Of the streets: generators are trained on those of seed 0."""
+"""Seed of the streets; generators are trained on seed 0."""
 
 CLOCKS = {"cpu": "CPU time of the process, one thread", "cuda": "Time between two events of the GPU's empty stream"}
 YAW_DEG, FOCAL = 20.0, 0.7
-"""Of the target, against the source: a turn, and lenses that see 84° where they saw 65°; a quarter of it is holes."""
+"""Turn and relative focal length of the target: 84° instead of 65°, with a quarter of it in holes."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,20 +40,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         view_size=SIZE,
         repeats=3,
         output="output",
+        example="--steps 1 4",
     )
     parser.add_argument("--generator", metavar="DIR", help="a trained one (default: the package's own)")
     parser.add_argument("--steps", nargs="+", type=count, default=STEPS, metavar="N", help="(default: 1 4 10 50)")
-    parser.add_argument("--frames", type=count, default=2, metavar="N", help="streets (default: %(default)s)")
+    parser.add_argument("--frames", type=count, default=2, metavar="N", help="number of streets")
     arguments = parser.parse_args(argv)
     folder = writable_folder(Path(arguments.output), arguments.output)
-    with one_thread():
-        report = measure(arguments)
+    report = measure(arguments)
     show(table(report), report, folder / "generator.json")
     return 0
 
 
 def row_name(steps: int) -> str:
-    """What the row of so many steps is called."""
+    """Name of the row with this number of steps."""
     return f"{steps} step" + "s" * (steps > 1)
 
 
@@ -73,9 +67,9 @@ def wide_target(source: Rig) -> Rig:
     return source.with_cameras(cameras)
 
 
+@benchmark
 def measure(arguments: argparse.Namespace) -> dict[str, Any]:
-    """All figures, as plain data for JSON."""
-    load_before = os.getloadavg()
+    """Score and time all fillers."""
     folder = arguments.generator
     generator = Generator.shipped() if folder is None else Generator.from_pretrained(folder)
     device = device_named(None)
@@ -97,22 +91,20 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     for name, row in found.items():
         means = {key: row["wide"].get(metric) for key, metric in METRICS.items()}
         rows[name] = quartiles(np.array(row["ms"]))._asdict() | {"calls": float(np.mean(calls[name]))} | means
-    return facts(
-        "generator",
-        load_before,
-        clock=CLOCKS[device.type],
-        generator=generator.config.name,
-        generator_size=list(generator.config.image_size),
-        device=str(device),
-        cameras=len(target),
-        size=list(arguments.size),
-        frames=arguments.frames,
-        rows=rows,
-    )
+    return {
+        "clock": CLOCKS[device.type],
+        "generator": generator.config.name,
+        "generator_size": list(generator.config.image_size),
+        "device": str(device),
+        "cameras": len(target),
+        "size": list(arguments.size),
+        "frames": arguments.frames,
+        "rows": rows,
+    }
 
 
 def _counted(method: Method, generator: Generator, calls: list[int]) -> Method:
-    """The method; how often each render calls the denoiser is appended to ``calls``."""
+    """Append the number of denoiser calls of each render to ``calls``."""
 
     def render(sample: Sample, target: Rig) -> list[RenderedView]:
         before = generator.calls
@@ -150,16 +142,14 @@ NOTES = (
 
 
 def table(report: Mapping[str, Any]) -> str:
-    """The report to read, in Markdown."""
+    """Title and Markdown table of a report."""
     h, w = report["size"]
     rows = report["rows"]
     share = next(iter(rows.values()))["hole_share"]
     size_of = "x".join(map(str, reversed(report["generator_size"])))
-    lines = [
+    title = (
         f"{report['frames']} synthetic streets, {report['cameras']} views of {w}x{h}, turned by {YAW_DEG:g} degrees, "
         f"with lenses {1 / FOCAL:.2g} times as wide, {share:.0%} holes; generator {report['generator']} ({size_of}) on "
-        f"{report['device']}; {machine_line(report)}. {report['clock']}. {NOTES}",
-        "",
-        metric_table([{"name": name, **row} for name, row in rows.items()], COLUMNS),
-    ]
-    return "\n".join(lines)
+        f"{report['device']}; {machine_line(report)}. {report['clock']}. {NOTES}"
+    )
+    return f"{title}\n\n{metric_table([{'name': name, **row} for name, row in rows.items()], COLUMNS)}"

@@ -1,12 +1,7 @@
-"""``python -m arbiview_aug bench loader``: frames per second out of a ``DataLoader``, and what a worker holds.
+"""``python -m arbiview_aug bench loader``: frames per second of a ``DataLoader``, and memory per worker.
 
-Real frames: they are read and decoded from disk, repeated to an epoch, with and without retargeting, by 0, 1, 2 and
-more workers. Workers persist, so that their start is not counted, and a first epoch warms them. Rates are by the clock
-on the wall, since workers run beside each other: other work on the machine slows them. So the load stands beside them,
-and how far as many processes come that only count, against one.
-
-*Unique* is the memory that a worker has for itself (Linux: its private pages), what a further one costs; *peak* its
-largest resident set, with what it shares with the others. *CPU* is processor time a frame over all workers.
+Workers persist, and a first epoch warms them. Rates are wall-clock, so other work on the machine slows them: the load
+and the speed-up of processes that only count are reported beside them.
 """
 
 from __future__ import annotations
@@ -17,7 +12,6 @@ import re
 import subprocess
 import sys
 import time
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -30,7 +24,7 @@ from tqdm import tqdm
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import add_target, count
 from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, recorded
-from arbiview_aug.cli.bench.study import SIZE, benchmark_parser, facts
+from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
 from arbiview_aug.cli.bench.timing import Quartiles, machine_line, quartiles, show
 from arbiview_aug.datasets import RetargetedDataset, open_data
 from arbiview_aug.datasets.image_io import Reduce
@@ -56,13 +50,7 @@ print(n)
 
 
 class Repeated(Dataset[Any]):
-    """A data set over and over, to a length; points and boxes are a hair higher each time, so that nothing planned for
-    one frame serves another.
-
-    Args:
-        dataset: Of dicts, with ``__getitem__`` and ``__len__``.
-        length: How many samples.
-    """
+    """A data set repeated to a length, with points and boxes slightly higher each time, so that no plan is reused."""
 
     def __init__(self, dataset: Any, length: int) -> None:
         self.dataset, self.length = dataset, length
@@ -82,17 +70,17 @@ class Repeated(Dataset[Any]):
 
 @dataclass(frozen=True)
 class Rate:
-    """A data set through a number of workers.
+    """Rate of a data set with a number of workers.
 
     Attributes:
-        name: Of the data set.
-        workers: How many; 0 is the process itself.
-        frames_per_s: Median over the epochs, by the clock on the wall.
-        best_per_s: The fastest epoch's: other work on a machine can only slow it.
-        ms: Median and quartiles of the time a frame takes.
-        cpu_ms: Processor time a frame, over all workers; None where the system does not tell.
-        unique_mib: Memory that a worker has for itself at the end, mean over the workers; None without workers.
-        peak_mib: A worker's largest resident set, the largest of them.
+        name: The data set.
+        workers: Number of workers; 0 is the process itself.
+        frames_per_s: Wall-clock median over the epochs.
+        best_per_s: The fastest epoch's.
+        ms: Quartiles of the time per frame.
+        cpu_ms: CPU time per frame, over all workers; None except on Linux.
+        unique_mib: Mean private memory of a worker at the end; None without workers.
+        peak_mib: Largest resident set of a worker; None without workers.
     """
 
     name: str
@@ -114,12 +102,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         view_size=SIZE,
         reduce=True,
         output="output/loader.json",
+        example="--data FOLDER --workers 0 2",
     )
     add_target(parser)
-    parser.add_argument("--workers", type=int, nargs="+", default=list(WORKERS), metavar="N", help="(default: 0 1 2)")
-    parser.add_argument("--surface", nargs="+", choices=tuple(SURFACES), default=["auto"], help="(default: auto)")
-    parser.add_argument("--frames", type=count, default=FRAMES, metavar="N", help="an epoch (default: %(default)s)")
-    parser.add_argument("--epochs", type=count, default=EPOCHS, metavar="N", help="(default: %(default)s)")
+    parser.add_argument("--workers", type=int, nargs="+", default=list(WORKERS), metavar="N", help="workers")
+    parser.add_argument("--surface", nargs="+", choices=tuple(SURFACES), default=["auto"], help="scene geometry")
+    parser.add_argument("--frames", type=count, default=FRAMES, metavar="N", help="frames in an epoch")
+    parser.add_argument("--epochs", type=count, default=EPOCHS, metavar="N", help="epochs to measure")
     arguments = parser.parse_args(argv)
     if min(arguments.workers) < 0:
         parser.error(f"argument --workers: expected whole numbers from 0, got {min(arguments.workers)}")
@@ -138,6 +127,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
+@benchmark
 def measure(
     data: Recorded,
     target: Rig,
@@ -148,43 +138,28 @@ def measure(
     frames: int = FRAMES,
     epochs: int = EPOCHS,
 ) -> dict[str, Any]:
-    """All rates, as plain data for JSON.
-
-    Args:
-        data: The frames.
-        target: The rig to render.
-        workers: Numbers of workers.
-        reduce: Images are decoded at 1 / this.
-        surfaces: Retargeted over each.
-        frames: Samples in an epoch.
-        epochs: How many are measured.
-    """
-    load_before = os.getloadavg()
+    """Measure the rates of reading alone and of retargeting over each surface."""
     plain: Dataset[Any] = Repeated(open_data(data.root, reduce=reduce), frames)
     datasets: dict[str, Dataset[Any]] = {PLAIN: plain}
     rig = data.sample(0, reduce)["rig"]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of static surfaces and of what no source sees
-        for surface in surfaces:
-            retarget = RigRetarget(target, surface=surface)
-            retarget.prepare(rig)  # plans that do not depend on the frame: workers share them
-            datasets[f"retargeted, {surface}"] = RetargetedDataset(plain, retarget)
-        most = max(workers)
-        alone, together = counted(1), counted(max(most, 1))
-        rates = loader_rates(datasets, workers, epochs)
-    return facts(
-        "loader",
-        load_before,
-        clock="on the wall",
-        data=data.name,
-        sources=[list(of_camera) for of_camera in rig.sizes],
-        target=target.name or "target",
-        size=list(target.sizes[0]),
-        frames=frames,
-        epochs=epochs,
-        counting={"processes": most, "against_one": together / alone},
-        rates=[asdict(rate) for rate in rates],
-    )
+    for surface in surfaces:
+        retarget = RigRetarget(target, surface=surface)
+        retarget.prepare(rig)  # workers share static plans
+        datasets[f"retargeted, {surface}"] = RetargetedDataset(plain, retarget)
+    most = max(workers)
+    alone, together = counted(1), counted(max(most, 1))
+    rates = loader_rates(datasets, workers, epochs)
+    return {
+        "clock": "on the wall",
+        "data": data.name,
+        "sources": [list(of_camera) for of_camera in rig.sizes],
+        "target": target.name or "target",
+        "size": list(target.sizes[0]),
+        "frames": frames,
+        "epochs": epochs,
+        "counting": {"processes": most, "against_one": together / alone},
+        "rates": [asdict(rate) for rate in rates],
+    }
 
 
 COLUMNS = (
@@ -198,7 +173,7 @@ COLUMNS = (
 
 
 def table(report: Mapping[str, Any]) -> str:
-    """The report to read, in Markdown."""
+    """Title and Markdown table of a report."""
     h, w = report["size"]
     counting = report["counting"]
     return (
@@ -209,9 +184,8 @@ def table(report: Mapping[str, Any]) -> str:
     )
 
 
-# --- measuring --------------------------------------------------------------------------------------------------------
 def loader_rates(datasets: Mapping[str, Dataset[Any]], workers: Sequence[int], epochs: int) -> list[Rate]:
-    """Rates of all data sets with all numbers of workers, epoch by epoch in turn; one thread in this process."""
+    """Measure all data sets with all numbers of workers, epoch by epoch in turn; one thread in this process."""
     with one_thread():
         loaders = {
             (name, n): DataLoader(dataset, batch_size=None, num_workers=n, persistent_workers=n > 0)
@@ -221,20 +195,19 @@ def loader_rates(datasets: Mapping[str, Dataset[Any]], workers: Sequence[int], e
         pids: dict[tuple[str, int], list[int]] = {}
         for key, loader in loaders.items():
             before = _children()
-            epoch_s(loader)  # workers start, buffers are made
+            _epoch_s(loader)  # starts the workers
             pids[key] = sorted(_children() - before) or [os.getpid()]
         times: dict[tuple[str, int], list[float]] = {key: [] for key in loaders}
-        used_s = {key: 0.0 for key in loaders}
+        used_s = dict.fromkeys(loaders, 0.0)
         for _ in tqdm(range(epochs), unit="epoch", leave=False):
             for key, loader in loaders.items():
                 start_s = _cpu_s(pids[key])
-                times[key].append(epoch_s(loader))
+                times[key].append(_epoch_s(loader))
                 used_s[key] += _cpu_s(pids[key]) - start_s
         return [_rate(key, datasets[key[0]], times[key], used_s[key], pids[key]) for key in loaders]
 
 
-def epoch_s(loader: DataLoader[Any]) -> float:
-    """Seconds on the wall that an epoch takes."""
+def _epoch_s(loader: DataLoader[Any]) -> float:
     start = time.perf_counter()
     for _ in loader:
         pass
@@ -242,7 +215,7 @@ def epoch_s(loader: DataLoader[Any]) -> float:
 
 
 def counted(processes: int) -> int:
-    """How far processes that only count come together in one second: what the machine gives beside its other work."""
+    """Total count that processes reach in one second: the machine's free capacity."""
     running = [subprocess.Popen([sys.executable, "-c", _COUNTING], stdout=subprocess.PIPE) for _ in range(processes)]
     return sum(int(process.communicate()[0]) for process in running)
 
@@ -269,7 +242,7 @@ def _children() -> set[int]:
 
 
 def _cpu_s(pids: Sequence[int]) -> float:
-    """Processor time of processes so far; 0 where the system does not tell (no Linux)."""
+    """CPU time of processes so far; 0 except on Linux."""
     total = 0.0
     for pid in pids:
         try:
@@ -281,7 +254,7 @@ def _cpu_s(pids: Sequence[int]) -> float:
 
 
 def _mib(pid: int, file: str, fields: str) -> float:
-    """The sum of some of a process's memory figures; 0 where the system does not tell."""
+    """Sum of memory figures of a process; 0 except on Linux."""
     try:
         text = Path(f"/proc/{pid}/{file}").read_text()
     except OSError:

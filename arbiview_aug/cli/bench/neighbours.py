@@ -1,17 +1,13 @@
-"""``python -m arbiview_aug bench neighbours``: what other frames of the drive cost a frame, and what they fill.
+"""``python -m arbiview_aug bench neighbours``: cost of other frames of the drive, and the share that they fill.
 
-A rig that looks lower than the source's (0.6 m higher, pitched down by 15 degrees, 100 degrees wide) over each surface,
-with none, one, two and eight neighbours: those nearest along the drive. Without ``--data`` a synthetic street, driven
-along. Planned anew for every frame is what depends on it: the fills always, the views over boxes or points; a street's
-plan is held.
+The target is 0.6 m higher, pitched down by 15 degrees and 100 degrees wide. It is rendered with different numbers of
+neighbours, the nearest first. Plans that depend on the frame are built anew for every call.
 """
 
 from __future__ import annotations
 
 import itertools
-import os
 import statistics
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -22,11 +18,10 @@ import numpy as np
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import seed
-from arbiview_aug.cli.bench.data import as_of_another_frame, recorded_drive
-from arbiview_aug.cli.bench.study import SIZE, benchmark_parser, facts
+from arbiview_aug.cli.bench.data import as_of_another_frame, recorded
+from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
 from arbiview_aug.cli.bench.timing import machine_line, peak_mib, quartiles, show, timed_rounds
 from arbiview_aug.datasets import Neighbours, open_data
-from arbiview_aug.environment import one_thread
 from arbiview_aug.errors import DataError, SampleError
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.sample.inputs import read_frames
@@ -36,11 +31,10 @@ from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 COUNTS = (0, 1, 2, 8)
 NEEDS: Mapping[SurfaceName, str | None] = {"street": None, "objects": "boxes_3d", "motion": None}
-"""The surfaces, and what of a sample each cannot do without."""
+"""Surfaces, and the key of a sample that each needs."""
 
 MOTION_COUNTS, MOTION_ROUNDS = (0, 2), 3
-"""Depth from motion reads one neighbour on each side, whatever there are, and takes seconds: it is measured less often.
-Without any it is declined, and the street's are its times."""
+"""Depth from motion reads one neighbour on each side and takes seconds. Without neighbours the street is used."""
 
 UP_M, PITCH_DEG, FOV_DEG = 0.6, -15.0, 100.0
 REPEATS = 7
@@ -49,12 +43,12 @@ _ENOUGH_MS = 2000.0
 
 
 def row_name(surface: str, neighbours: int) -> str:
-    """As the table calls it."""
+    """Name of a row of the table."""
     return f"{surface}, {neighbours or 'no'} neighbour{'s' * (neighbours != 1)}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure, print the table as it stands in docs/benchmarks.md, write the JSON."""
+    """Measure, print the table, write the JSON."""
     parser = benchmark_parser(
         "neighbours",
         "What other frames of the drive cost: milliseconds and MiB a frame, and the share that they fill.",
@@ -63,20 +57,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         reduce=True,
         repeats=REPEATS,
         output="output/neighbours.json",
+        example="--data FOLDER --counts 0 2",
     )
-    parser.add_argument("--counts", type=seed, nargs="+", default=list(COUNTS), metavar="N", help="(default: 0 1 2 8)")
-    parser.add_argument("--step-m", type=float, default=Neighbours.step_m, metavar="M", help="(default: %(default)s)")
-    parser.add_argument("--surface", nargs="+", choices=NEEDS, default=list(NEEDS), help="(default: all)")
+    parser.add_argument("--counts", type=seed, nargs="+", default=list(COUNTS), metavar="N", help="of neighbours")
+    parser.add_argument("--step-m", type=float, default=Neighbours.step_m, metavar="M", help="between neighbours")
+    parser.add_argument("--surface", nargs="+", choices=NEEDS, default=list(NEEDS), help="scene geometry")
     arguments = parser.parse_args(argv)
     try:
         wanted = Neighbours(count=max(1, -(-max(arguments.counts) // 2)), step_m=arguments.step_m)
     except ValueError as error:
         parser.error(str(error))
     h, w = arguments.size
-    with recorded_drive(arguments.data, wanted, size=(2 * h, 2 * w)) as (name, root):
+    with recorded(arguments.data, size=(2 * h, 2 * w), neighbours=wanted) as data:
         report = measure(
-            partial(open_data, root, reduce=arguments.reduce, neighbours=wanted),
-            name,
+            open_data(data.root, reduce=arguments.reduce, neighbours=wanted),
+            data.name,
             counts=arguments.counts,
             surfaces=arguments.surface,
             size=arguments.size,
@@ -86,8 +81,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
+@benchmark
 def measure(
-    opened: Callable[[], Any],
+    data: Any,
     name: str,
     *,
     counts: Sequence[int] = COUNTS,
@@ -95,12 +91,12 @@ def measure(
     size: tuple[int, int] = SIZE,
     repeats: int = REPEATS,
 ) -> dict[str, Any]:
-    """All costs, as plain data for JSON.
+    """Measure the costs of a data set whose samples have neighbours.
 
     Args:
-        opened: Opens the data set, whose samples have neighbours.
-        name: Of the data.
-        counts: Numbers of neighbours; where there are fewer, all that there are.
+        data: The data set.
+        name: Its name.
+        counts: Numbers of neighbours, limited by those available.
         surfaces: Those that the sample does not offer are left out.
         size: (h, w) of every view.
         repeats: Rounds.
@@ -108,67 +104,58 @@ def measure(
     Raises:
         DataError: No frame has neighbours.
     """
-    load_before = os.getloadavg()
-    data = opened()
     data.load_points = False
     index, sample = _frame_with_most(data, max(counts))
-    near = nearest(sample)[: max(counts)]
+    neighbours = nearest(sample)[: max(counts)]
     target = lowered(sample["rig"], size)
     costs: list[dict[str, Any]] = []
-    with one_thread(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of moved cameras over a street
-        for surface in surfaces:
-            needs = NEEDS[surface]
-            if needs is None or needs in sample:
-                numbers = sorted({0, *(min(n, len(near)) for n in counts_of(surface, counts))})
-                rounds = min(repeats, MOTION_ROUNDS) if surface == "motion" else repeats
-                costs += _costs(data, index, surface, target, numbers, rounds)
-    return facts(
-        "neighbours",
-        load_before,
-        clock="CPU time of the process, milliseconds, one thread",
-        data=name,
-        sources=[list(of_camera) for of_camera in sample["rig"].sizes],
-        size=list(size),
-        travel_m=[travel_m(sample, neighbour) for neighbour in near],
-        rounds=repeats,
-        costs=costs,
-    )
+    for surface in surfaces:
+        needs = NEEDS[surface]
+        if needs is None or needs in sample:
+            numbers = sorted({0, *(min(n, len(neighbours)) for n in counts_of(surface, counts))})
+            rounds = min(repeats, MOTION_ROUNDS) if surface == "motion" else repeats
+            costs += _costs(data, index, surface, target, numbers, rounds)
+    return {
+        "clock": "CPU time of the process, milliseconds, one thread",
+        "data": name,
+        "sources": [list(of_camera) for of_camera in sample["rig"].sizes],
+        "size": list(size),
+        "travel_m": [travel_m(sample, neighbour) for neighbour in neighbours],
+        "rounds": repeats,
+        "costs": costs,
+    }
 
 
 def counts_of(surface: str, counts: Sequence[int]) -> Sequence[int]:
-    """The numbers of neighbours that a surface is measured with."""
+    """Numbers of neighbours that a surface is measured with."""
     return MOTION_COUNTS if surface == "motion" else counts
 
 
 def lowered(rig: Rig, size: tuple[int, int]) -> Rig:
-    """The rig higher, pitched down and wide, at (h, w): it looks at road that no camera of the frame sees."""
+    """Raise a rig, pitch it down and widen it, at (h, w), so that it sees road that no camera of the frame sees."""
     h, w = size
     f = w / 2 / np.tan(np.radians(FOV_DEG / 2))
     K = np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
-    cameras = []
-    for camera in rig:
-        cam2ego = camera.turned(pitch_deg=PITCH_DEG).shifted(z_m=UP_M).cam2ego
-        cameras.append(Camera(name=camera.name, width_px=w, height_px=h, K=K, cam2ego=cam2ego))
+    poses = {c.name: c.turned(pitch_deg=PITCH_DEG).shifted(z_m=UP_M).cam2ego for c in rig}
+    cameras = [Camera(name=name, width_px=w, height_px=h, K=K, cam2ego=pose) for name, pose in poses.items()]
     return Rig(cameras, ground_z_m=rig.ground_z_m, name="lowered")
 
 
 def nearest(sample: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """A sample's neighbours, from the nearest to the farthest."""
+    """Neighbours of a sample, nearest first."""
     return sorted(sample["neighbours"], key=partial(travel_m, sample))
 
 
 def travel_m(sample: Mapping[str, Any], neighbour: Mapping[str, Any]) -> float:
-    """How far away the vehicle was."""
+    """Distance between the vehicle's positions."""
     return float(np.linalg.norm(np.asarray(neighbour["ego2world"])[:3, 3] - np.asarray(sample["ego2world"])[:3, 3]))
 
 
-# --- measuring --------------------------------------------------------------------------------------------------------
 def _frame_with_most(data: Any, wanted: int) -> tuple[int, dict[str, Any]]:
-    """A frame with as many neighbours as are wanted, else with the most, near the middle of the data."""
-    around = sorted(range(len(data)), key=lambda k: abs(k - len(data) // 2))[:_FRAMES_TRIED]
+    """First frame with the wanted number of neighbours, else with the most, from the middle of the data outward."""
+    order = sorted(range(len(data)), key=lambda k: abs(k - len(data) // 2))[:_FRAMES_TRIED]
     best: tuple[int, dict[str, Any]] | None = None
-    for index in around:
+    for index in order:
         sample = data[index]
         if best is None or len(sample["neighbours"]) > len(best[1]["neighbours"]):
             best = index, sample
@@ -185,29 +172,29 @@ def _costs(
 ) -> list[dict[str, Any]]:
     sample = data[index]
     in_memory = [dict(neighbour) for neighbour in nearest(sample)]
-    peaks, filled = {}, {}
+    rows: list[dict[str, Any]] = []
     runs: dict[str, Callable[[], Any]] = {}
     for n in numbers:
         fresh = data[index]
-        first = RigRetarget(target, surface=surface, holes="black")
-        peaks[n] = peak_mib(partial(first, fresh | {"neighbours": nearest(fresh)[:n]}))
+        retarget = RigRetarget(target, surface=surface, holes="black")
+        peak = peak_mib(partial(retarget, fresh | {"neighbours": nearest(fresh)[:n]}))
         frame = sample | {"neighbours": in_memory[:n]}
         out = RigRetarget(target, surface=surface, outputs=("source_frame",), holes="black")(frame)
-        filled[n] = float((out["source_frame"] > 0).double().mean())
+        rows.append(
+            {"name": row_name(surface, n), "surface": surface, "neighbours": n, "peak_mib": peak}
+            | {"filled": float((out["source_frame"] > 0).double().mean())}
+        )
         frames = itertools.cycle([frame, as_of_another_frame(frame)])
         runs[f"{n} read"] = partial(_read, data, index, n)
-        runs[f"{n} plan"] = _plan(first, frames, target)
-        runs[f"{n} fill"] = _fill(first, frame, target)
-        runs[f"{n} frame"] = _frame(first, frames)
+        runs[f"{n} plan"] = partial(_plan, retarget, frames, target)
+        runs[f"{n} fill"] = _fill(retarget, frame, target)
+        runs[f"{n} frame"] = partial(_frame, retarget, frames)
     times = timed_rounds(runs, repeats, surface, enough_ms=_ENOUGH_MS)
-    without = times["0 frame"]
-    return [
-        {"name": row_name(surface, n), "surface": surface, "neighbours": n}
-        | {part: quartiles(times[f"{n} {part}"]) for part in ("read", "plan", "fill", "frame")}
-        | {"ratio": statistics.median(took / alone for took, alone in zip(times[f"{n} frame"], without, strict=False))}
-        | {"peak_mib": peaks[n], "filled": filled[n]}
-        for n in numbers
-    ]
+    for row in rows:
+        own = {part: times[f"{row['neighbours']} {part}"] for part in ("read", "plan", "fill", "frame")}
+        row |= {part: quartiles(taken) for part, taken in own.items()}
+        row["ratio"] = statistics.median(a / b for a, b in zip(own["frame"], times["0 frame"], strict=False))
+    return rows
 
 
 def _read(data: Any, index: int, number: int) -> None:
@@ -216,12 +203,9 @@ def _read(data: Any, index: int, number: int) -> None:
         neighbour["images"]
 
 
-def _plan(retarget: RigRetarget, frames: Iterator[Mapping[str, Any]], target: Rig) -> Callable[[], Any]:
-    def run() -> None:
-        sample = next(frames)
-        retarget.planner.plan(sample, read_frames(sample, None), (), target)
-
-    return run
+def _plan(retarget: RigRetarget, frames: Iterator[Mapping[str, Any]], target: Rig) -> None:
+    sample = next(frames)
+    retarget.planner.plan(sample, read_frames(sample, None), (), target)
 
 
 def _fill(retarget: RigRetarget, sample: Mapping[str, Any], target: Rig) -> Callable[[], Any]:
@@ -236,11 +220,10 @@ def _fill(retarget: RigRetarget, sample: Mapping[str, Any], target: Rig) -> Call
     return partial(fill_from_neighbours, rendered, plan.fills, frames[0].images, plan.curves, retarget.renderer, warn)
 
 
-def _frame(retarget: RigRetarget, frames: Iterator[Mapping[str, Any]]) -> Callable[[], Any]:
-    return lambda: retarget(next(frames))
+def _frame(retarget: RigRetarget, frames: Iterator[Mapping[str, Any]]) -> None:
+    retarget(next(frames))
 
 
-# --- the table --------------------------------------------------------------------------------------------------------
 COLUMNS = (
     *((f"{part} ms", f"{{{part}[0]:.1f}}") for part in ("read", "plan", "fill", "frame")),
     ("x", "{ratio:.2f}"),
@@ -255,7 +238,7 @@ NOTES = (
 
 
 def markdown(report: Mapping[str, Any]) -> str:
-    """The table, and what is to be known about it."""
+    """Title and Markdown table of a report."""
     h, w = report["size"]
     way = f"up to {max(report['travel_m'], default=0.0):.1f} m away"
     cameras = f"{len(report['sources'])} cameras of {report['sources'][0][1]}x{report['sources'][0][0]}"

@@ -12,15 +12,8 @@ _MARKERS = {"opencv": "o", "torch": "^", "cuda": "s"}
 
 
 def save_plot(rows: Sequence[Mapping[str, Any]], steps: Sequence[str], title: str, path: Path) -> None:
-    """Write the plot as a PNG.
-
-    Args:
-        rows: Settings with their figures, as in the report.
-        steps: Names of those on the front that are worth telling apart: they are named.
-        title: Above.
-        path: The file.
-    """
-    # Without pyplot: no global state, and no display is looked for.
+    """Write the plot as a PNG, with the names of ``steps`` beside their points."""
+    # Without pyplot: no global state and no display.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -53,7 +46,7 @@ def save_plot(rows: Sequence[Mapping[str, Any]], steps: Sequence[str], title: st
         axes.annotate(
             row["name"],
             (row["median_ms"], row["psnr_db"]),
-            # Below and above the front, a line apart: steps may lie beside each other.
+            # One line apart, below and above the front: steps may lie close together.
             xytext=(14, -14 - 12 * (left - k)) if on_left else (-14, 6 + 12 * (k - left)),
             textcoords="offset points",
             fontsize=8,
@@ -65,10 +58,8 @@ def save_plot(rows: Sequence[Mapping[str, Any]], steps: Sequence[str], title: st
     axes.set_ylabel("PSNR where some source sees, dB")
     axes.set_title(title, fontsize=10)
     axes.grid(True, which="both", alpha=0.2)
-    for label, colour in _COLOURS.items():
-        if all(row["quality"] != label for row in rows):
-            continue
-        axes.plot([], [], "o", color=colour, label=label)
+    for label in dict.fromkeys(row["quality"] for row in rows):
+        axes.plot([], [], "o", color=_COLOURS[label], label=label)
     for label in dict.fromkeys(row["execution"] for row in rows):
         axes.plot([], [], _MARKERS[label], color="black", markerfacecolor="none", label=label)
     axes.legend(fontsize=8, loc="best")

@@ -1,22 +1,16 @@
-"""``python -m arbiview_aug bench speed``: how near rendering comes to what reading the pixels alone costs.
+"""``python -m arbiview_aug bench speed``: rendering time relative to bare ``cv2.remap`` calls.
 
-The floor, fixed forever: for six cameras, six bare ``cv2.remap`` calls, linear, from interleaved uint8 RGB images into
-preallocated outputs of the target's size, with float32 maps that read a source of the output's own size at
+The floor is six linear ``cv2.remap`` calls from interleaved uint8 RGB images into preallocated outputs, with float32
+maps that read a source of the output's own size at
 
     x' = 0.97 x + 0.02 y + 3        y' = 0.95 y + 0.01 x + 5
 
-(x, y the output pixel): a mild stretch, one source each. Every figure is a ratio to the floor of the same output size,
-because milliseconds of different machines cannot be compared.
+A time is the median over the rounds; a ratio is the median of candidate / floor within a round.
 
-How times are taken stands in ``bench.timing``. A time is the median over the rounds; a ratio is the median over the
-rounds of candidate / floor within a round.
-
-``frame`` is the cached plan executed: the sample's uint8 images in, one uint8 (M, 3, h, w) tensor out. ``interleaved``
-images lie channels-last in one block, as this package's readers give them, ``planar`` ones are contiguous. ``whole
-call`` is ``RigRetarget`` with its checks and the plan's lookup, holes left black; ``filled``: with them filled, the
-default. ``holes`` is that filling alone, of so many of the pixels. ``plan`` builds the plan of a calibration that was
-not seen before; its ratio is to the frame, which it precedes where every frame has its own calibration. ``harmonised``
-is the frame with known gains for all cameras.
+``frame`` executes the cached plan; ``interleaved`` images lie channels-last in one block, as this package's readers
+give them. ``whole call`` is ``RigRetarget`` with black holes; ``filled``: with filled holes, the default; ``holes``:
+the filling alone. ``plan`` builds the plan of a new calibration; its ratio is to the frame. ``harmonised`` is the frame
+with known gains for all cameras.
 """
 
 from __future__ import annotations
@@ -24,23 +18,20 @@ from __future__ import annotations
 import os
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.arguments import add_data, device_named
 from arbiview_aug.cli.bench.device import YAW_DEG, device_table, measure_device
-from arbiview_aug.cli.bench.study import SIZE, benchmark_parser, facts
+from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
 from arbiview_aug.cli.bench.timing import machine_line, quartiles, show, timed_rounds
 from arbiview_aug.datasets import open_data, reduced_rig
 from arbiview_aug.datasets.registry import data_name
-from arbiview_aug.environment import one_thread
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.evaluate.targets import without_masks
@@ -53,39 +44,17 @@ from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 REPEATS = 15
 _SMALL_ROUNDS = 3
-"""Small frames take a sixth of the time and more rounds: their times are noisier."""
+"""Factor of rounds for small frames, whose times are noisier."""
 _NEW_CALIBRATION_M = 0.01
 _EGO_MOTION = (0.4, 0.07)
-"""Largest movement (m) and turn (deg) of a camera between its own and the LiDAR's time on nuScenes."""
+"""Largest movement (m) and turn (deg) between a camera's and the LiDAR's time on nuScenes."""
 _GAINS = (0.8, 1.1, 0.9, 1.25, 1.05, 0.95)
-"""Gains of every source, as far apart as a real frame's: none of them is free."""
+"""Gains of the sources, as far apart as on a real frame."""
 
 
-@dataclass(frozen=True)
-class Measure:
-    """One candidate, and how it compares.
+class _Candidate(NamedTuple):
+    """Function to time; ``of``: the candidate that its ratio is relative to, by default itself; ``bound``: of it."""
 
-    Attributes:
-        name: Output size and what was run.
-        of: What ``ratio`` is relative to: another measure's name, empty for a floor.
-        median_ms: Median time.
-        q1_ms: First quartile.
-        q3_ms: Third quartile.
-        ratio: Median over the rounds of this time / the other's in the same round.
-        bound: The largest ratio that is acceptable; None where the figure is for information.
-    """
-
-    name: str
-    of: str
-    median_ms: float
-    q1_ms: float
-    q3_ms: float
-    ratio: float
-    bound: float | None
-
-
-@dataclass(frozen=True)
-class _Candidate:
     name: str
     run: Callable[[], Any]
     of: str = ""
@@ -99,6 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "Milliseconds on one thread, and ratios to six bare cv2.remap calls of the same output pixels.",
         repeats=REPEATS,
         output="output/speed.json",
+        example="--device cuda",
     )
     add_data(parser, "nuscenes-one below ARBIVIEW_DATA where that is, else random smooth images for nuScenes' rig")
     parser.add_argument(
@@ -121,12 +91,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def default_data() -> Path | None:
-    """The real keyframe, where ``ARBIVIEW_DATA`` leads to it."""
+    """nuScenes keyframe below ``ARBIVIEW_DATA``, if there."""
     root = os.environ.get("ARBIVIEW_DATA")
     folder = Path(root) / "nuscenes-one" if root else None
     return folder if folder is not None and folder.is_dir() else None
 
 
+@benchmark
 def measure(
     data: str | Path | None = None,
     repeats: int = REPEATS,
@@ -134,29 +105,26 @@ def measure(
     full_size: tuple[int, int] | None = None,
     small_size: tuple[int, int] = SIZE,
 ) -> dict[str, Any]:
-    """All measures, as plain data for JSON.
+    """Time all candidates.
 
     Args:
         data: A frame folder; None for random smooth images on nuScenes' rig.
         repeats: Rounds at full size.
-        full_size: (h, w) of the random images; only to try the benchmark out.
+        full_size: (h, w) of the random images, for tests.
         small_size: (h, w) of the small output.
     """
     rig, images, halves = _inputs(data, full_size)
-    load_before = os.getloadavg()
-    with one_thread():
-        measures = _run(_full_size(rig, images), repeats, "full size")
-        measures += _run(_small_size(rig, images, halves, small_size), repeats * _SMALL_ROUNDS, "small")
-    return facts(
-        "speed",
-        load_before,
-        floor="six cv2.remap, linear, float32 maps, x' = 0.97 x + 0.02 y + 3, y' = 0.95 y + 0.01 x + 5",
-        clock="CPU time of the process, milliseconds",
-        data=_name(data),
-        sources=[list(size) for size in rig.sizes],
-        rounds={"full size": repeats, "small": repeats * _SMALL_ROUNDS},
-        measures=[asdict(m) for m in measures],
-    )
+    rounds = {"full size": repeats, "small": repeats * _SMALL_ROUNDS}
+    rows = _run(_full_size(rig, images), rounds["full size"], "full size")
+    rows += _run(_small_size(rig, images, halves, small_size), rounds["small"], "small")
+    return {
+        "floor": "six cv2.remap, linear, float32 maps, x' = 0.97 x + 0.02 y + 3, y' = 0.95 y + 0.01 x + 5",
+        "clock": "CPU time of the process, milliseconds",
+        "data": _name(data),
+        "sources": [list(size) for size in rig.sizes],
+        "rounds": rounds,
+        "measures": rows,
+    }
 
 
 COLUMNS = (
@@ -168,7 +136,7 @@ COLUMNS = (
 
 
 def table(report: Mapping[str, Any]) -> str:
-    """The report to read, in Markdown."""
+    """Machine and Markdown table of a report."""
     return f"{machine_line(report)}\n\n{metric_table(report['measures'], COLUMNS, ('name', 'of'))}"
 
 
@@ -176,7 +144,7 @@ def _name(data: str | Path | None) -> str:
     return "random smooth images" if data is None else data_name(data)
 
 
-# --- what is measured -------------------------------------------------------------------------------------------------
+# --- candidates -------------------------------------------------------------------------------------------------------
 def _full_size(rig: Rig, images: torch.Tensor) -> list[_Candidate]:
     target = rig.turned(yaw_deg=YAW_DEG)
     label = "{1}x{0}".format(*rig.sizes[0])
@@ -214,7 +182,7 @@ def _small_size(rig: Rig, images: torch.Tensor, halves: torch.Tensor, size: tupl
 
 
 def remap_floor(images: torch.Tensor, size: tuple[int, int]) -> Callable[[], None]:
-    """The floor: bare remaps of as many views of ``size`` (h, w) as there are images (N, 3, >=h, >=w) uint8."""
+    """Bare remaps to views of ``size`` (h, w), one for each of the images (N, 3, >=h, >=w) uint8."""
     h, w = size
     sources = [np.ascontiguousarray(image.permute(1, 2, 0).numpy()[:h, :w]) for image in images]
     y, x = np.indices((h, w), dtype=np.float32)
@@ -241,7 +209,7 @@ def _call(source: Rig, target: Rig, images: torch.Tensor, holes: Holes) -> Calla
 
 
 def _holes(source: Rig, target: Rig, images: torch.Tensor, label: str, floor: str) -> _Candidate:
-    """Filling the holes of one frame's views, again and again: the time does not depend on what stands in them."""
+    """Fill the holes of one frame's views; the time does not depend on their content."""
     plan = build_plan(source, target)
     views, coverage = render_opencv(plan, list(images)), [torch.from_numpy(seen) for seen in plan.coverage]
     share = 1 - statistics.mean(float(seen.float().mean()) for seen in coverage)
@@ -250,7 +218,7 @@ def _holes(source: Rig, target: Rig, images: torch.Tensor, label: str, floor: st
 
 
 def _plan(source: Rig, target: Rig) -> Callable[[], Any]:
-    """Each call with a calibration of its own: nothing that was evaluated before can serve."""
+    """Plan a new calibration in each call."""
     calls = iter(range(1, 1 << 30))
 
     def run() -> None:
@@ -261,7 +229,7 @@ def _plan(source: Rig, target: Rig) -> Callable[[], Any]:
 
 
 def _plan_with_ego_motion(source: Rig, target: Rig) -> Callable[[], Any]:
-    """Each call with every source camera moved on its own, as ego motion between the cameras' times does."""
+    """Plan in each call with every source camera moved on its own, as by ego motion between exposures."""
     rng = np.random.default_rng(0)
     move_m, turn_deg = _EGO_MOTION
 
@@ -275,22 +243,13 @@ def _plan_with_ego_motion(source: Rig, target: Rig) -> Callable[[], Any]:
     return run
 
 
-# --- measuring --------------------------------------------------------------------------------------------------------
-def _run(candidates: list[_Candidate], rounds: int, label: str) -> list[Measure]:
-    times = timed_rounds({candidate.name: candidate.run for candidate in candidates}, rounds, label)
-    return [_measure(candidate, times) for candidate in candidates]
-
-
-def _measure(candidate: _Candidate, times: dict[str, npt.NDArray[np.float64]]) -> Measure:
-    own = times[candidate.name]
-    ratio = statistics.median(own / times[candidate.of]) if candidate.of else 1.0
-    return Measure(
-        name=candidate.name,
-        of=candidate.of,
-        **quartiles(own)._asdict(),
-        ratio=float(ratio),
-        bound=candidate.bound,
-    )
+def _run(candidates: Sequence[_Candidate], rounds: int, label: str) -> list[dict[str, Any]]:
+    times = timed_rounds({name: run for name, run, *_ in candidates}, rounds, label)
+    rows = []
+    for name, _, of, bound in candidates:
+        ratio = float(statistics.median(times[name] / times[of or name]))
+        rows.append({"name": name, "of": of, **quartiles(times[name])._asdict(), "ratio": ratio, "bound": bound})
+    return rows
 
 
 def _inputs(data: str | Path | None, full_size: tuple[int, int] | None) -> tuple[Rig, torch.Tensor, torch.Tensor]:
@@ -302,8 +261,7 @@ def _inputs(data: str | Path | None, full_size: tuple[int, int] | None) -> tuple
     sample, half = open_data(data)[0], open_data(data, reduce=2)[0]
     if not isinstance(sample["images"], torch.Tensor):
         raise DataError(f"--data {data}: expected images of one size, got several")
-    rig, images, halves = without_masks(sample["rig"]), sample["images"], half["images"]
-    return rig, images, halves
+    return without_masks(sample["rig"]), sample["images"], half["images"]
 
 
 def _smooth_images(count: int, size: tuple[int, int]) -> torch.Tensor:

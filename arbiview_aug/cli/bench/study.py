@@ -1,16 +1,15 @@
-"""The runner that the benchmarks share: methods on the same frames and targets, in turn; tables; recommendations.
-
-A row of a benchmark is one ``Method``: add it to the benchmark's list, and it is scored, timed and printed with the
-others.
-"""
+"""The runner that the benchmarks share: options, scores and times of a list of ``Method``, and recommendations."""
 
 from __future__ import annotations
 
 import argparse
 import itertools
+import os
+import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec
 
 from tqdm import tqdm
 
@@ -18,7 +17,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import add_data, command_parser, count, size
 from arbiview_aug.cli.bench.data import REDUCES
 from arbiview_aug.cli.bench.timing import Clock, Quartiles, machine, process_ms
-from arbiview_aug.environment import versions
+from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.evaluate.agreement import OverlapScore, summary, target_consistency
 from arbiview_aug.evaluate.frames import ScoredFrame, scores
 from arbiview_aug.evaluate.images import RenderedView
@@ -27,9 +26,10 @@ from arbiview_aug.evaluate.metrics import mean_of
 
 SIZE = (256, 704)
 LEAST_GAIN_DB = 0.2
-"""Smaller differences are noise: single frames of one vehicle."""
+"""Smaller differences are noise on single frames."""
 
 Row = Mapping[str, Any]
+P = ParamSpec("P")
 
 
 def benchmark_parser(
@@ -43,16 +43,16 @@ def benchmark_parser(
     output: str,
     example: str = "",
 ) -> argparse.ArgumentParser:
-    """A parser with the options that benchmarks share.
+    """Create a parser with the options that benchmarks share.
 
     Args:
         name: The benchmark.
         description: For ``--help``.
-        data: What is rendered without ``--data``; None for no ``--data``.
+        data: Description of the data used without ``--data``; None for no ``--data``.
         view_size: Default of ``--size`` (h, w); None for no such option.
         reduce: Whether there is ``--reduce``.
         repeats: Default of ``--repeats``; None for no such option.
-        output: Default of ``--output``.
+        output: Default of ``--output``, a file or a folder.
         example: Arguments that show it at work.
     """
     parser = command_parser(f"bench {name}", description, example)
@@ -62,14 +62,27 @@ def benchmark_parser(
         of_views = f"of every view (default: {view_size[0]}x{view_size[1]})"
         parser.add_argument("--size", type=size, default=view_size, metavar="HxW", help=of_views)
     if reduce:
-        decoded = "decode the images at 1/N (default: %(default)s)"
-        parser.add_argument("--reduce", type=int, choices=REDUCES, default=2, help=decoded)
+        parser.add_argument("--reduce", type=int, choices=REDUCES, default=2, help="decode the images at 1/N")
     if repeats is not None:
-        rounds = "rounds of timing (default: %(default)s)"
-        parser.add_argument("--repeats", type=count, default=repeats, metavar="N", help=rounds)
-    kind = "FILE" if Path(output).suffix else "DIR"
-    parser.add_argument("--output", default=output, metavar=kind, help="(default: %(default)s)")
+        parser.add_argument("--repeats", type=count, default=repeats, metavar="N", help="rounds of timing")
+    kind = "file" if Path(output).suffix else "folder"
+    parser.add_argument("--output", default=output, metavar=kind.upper(), help=f"{kind} to write to")
     return parser
+
+
+def benchmark(measure: Callable[P, dict[str, Any]]) -> Callable[P, dict[str, Any]]:
+    """Run a benchmark on one thread, without warnings, and add the machine and the versions to its figures."""
+
+    @wraps(measure)
+    def measured(*args: P.args, **kwargs: P.kwargs) -> dict[str, Any]:
+        load_before = os.getloadavg()
+        with one_thread(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # static surfaces and unseen pixels are part of the measurement
+            figures = measure(*args, **kwargs)
+        name = measure.__module__.rpartition(".")[2]
+        return {"benchmark": name, **figures, "machine": machine(load_before), "versions": versions()}
+
+    return measured
 
 
 def study(
@@ -82,20 +95,20 @@ def study(
     consistency: bool = False,
     label: str = "",
 ) -> dict[str, dict[str, Any]]:
-    """Score and time methods; they take turns on each frame and target, so that other work slows all alike.
+    """Score and time methods, which take turns on each frame and target.
 
     Args:
         methods: One row each.
         frames: Samples and their references.
         targets: Sets of rigs to render, by name.
-        repeats: Timed calls after the first; none for methods that plan nothing.
-        clock: Runs a call and says how long it took.
-        consistency: Also compare neighbouring views (``consistency_...``).
-        label: Names the progress bar.
+        repeats: Timed calls after the first; none for methods without a plan.
+        clock: Runs a call and returns its milliseconds.
+        consistency: Whether to compare neighbouring views (``consistency_...``).
+        label: Title of the progress bar.
 
     Returns:
-        By method: for each set of targets the mean metrics (``evaluate.frames.scores``, exposures made even), and in
-        milliseconds ``ms`` of every repeated call and ``plan_ms``, by how much the first call was longer.
+        By method: mean metrics for each set of targets (``evaluate.frames.scores``, even exposures), ``ms`` of every
+        repeated call, and ``plan_ms``, the additional milliseconds of the first call.
     """
     rows: dict[str, dict[str, list[Any]]] = {m.name: {key: [] for key in (*targets, "ms", "plan_ms")} for m in methods}
     pairs: dict[str, list[OverlapScore]] = {method.name: [] for method in methods}
@@ -132,14 +145,9 @@ def _timed(
     return views, metrics, times
 
 
-def facts(benchmark: str, load_before: tuple[float, float, float], **figures: Any) -> dict[str, Any]:
-    """A report as plain data for JSON, with the machine and the versions that it was measured with."""
-    return {"benchmark": benchmark, **figures, "machine": machine(load_before), "versions": versions()}
-
-
 # --- recommendations --------------------------------------------------------------------------------------------------
 def pareto_front(rows: Sequence[Row]) -> list[Row]:
-    """Rows that no other beats in both ``median_ms`` and ``psnr_db``, from the fastest to the most accurate."""
+    """Rows that no other beats in both ``median_ms`` and ``psnr_db``, fastest first."""
     front: list[Row] = []
     for row in sorted(rows, key=lambda row: (row["median_ms"], -row["psnr_db"])):
         if not front or row["psnr_db"] > front[-1]["psnr_db"]:
@@ -150,8 +158,7 @@ def pareto_front(rows: Sequence[Row]) -> list[Row]:
 def distinct_steps(rows: Sequence[Row]) -> list[Row]:
     """Rows of the front that differ by more than noise.
 
-    Each is better than the one before it by at least ``LEAST_GAIN_DB``, and its first quartile of time lies behind the
-    other's third. The fastest that qualifies follows; a better one at the same time replaces it.
+    Each gains at least ``LEAST_GAIN_DB`` over the one before, and its first quartile of time exceeds the other's third.
     """
     steps: list[Row] = []
     for row in pareto_front(rows):
@@ -172,13 +179,13 @@ def advice(
     budget_ms: float | None = None,
     min_psnr_db: float | None = None,
 ) -> dict[str, Any] | None:
-    """Recommend the most accurate row within a budget, or the fastest of an accuracy; None where neither is asked for.
+    """Recommend the most accurate row within a budget, or the fastest of an accuracy; None if neither is given.
 
-    Rows with ``harm``, a reason against them, are never recommended. A budget must be kept when measured again, too.
+    Rows with ``harm``, a reason against them, are never recommended. A budget must hold when measured again.
 
     Returns:
-        ``setting`` (a name, None where nothing qualifies), its ``measured`` figures and those ``again``, the
-        ``reason``, and the harm of rows that were ``left_out``.
+        ``setting`` (a name, None if nothing qualifies), its ``measured`` figures and those ``again``, the ``reason``,
+        and the harm of rows that were ``left_out``.
     """
     if budget_ms is None and min_psnr_db is None:
         return None

@@ -1,8 +1,7 @@
-"""How benchmarks measure: one thread, CPU time, rounds of all candidates in turn; and on what they measured it.
+"""Timing on one thread, and the machine it was done on.
 
-The clock is the process's CPU time, over all of its threads: on an idle machine that is the time on the wall, on a
-busy one it leaves the waiting out. Each round runs every candidate in turn, each once unmeasured to warm its caches and
-then once measured, so that what else the machine does slows all alike.
+The clock is the process's CPU time over all of its threads, which leaves out waiting on a busy machine. Each round runs
+every candidate in turn, once unmeasured to warm its caches and once measured, so that other load slows all alike.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ _LEAST_ROUNDS = 3  # a median of fewer is a single time
 
 
 class Quartiles(NamedTuple):
-    """Of the times of a candidate, in milliseconds."""
+    """Median and quartiles of times, in milliseconds."""
 
     median_ms: float
     q1_ms: float
@@ -49,14 +48,16 @@ def quartiles(times_ms: npt.NDArray[np.float64]) -> Quartiles:
 
 
 def process_ms(run: Callable[[], Any]) -> float:
-    """CPU milliseconds of the process."""
+    """CPU milliseconds of the process during a call."""
     start = time.process_time()
     run()
     return 1e3 * (time.process_time() - start)
 
 
-def cuda_ms(device: torch.device) -> Clock:
-    """A clock for ``timed_rounds``: milliseconds between two events of a GPU's stream, which is empty before."""
+def clock_of(device: torch.device) -> Clock:
+    """Clock of a device: CUDA events on a GPU, else the process's CPU time."""
+    if device.type != "cuda":
+        return process_ms
 
     def clock(run: Callable[[], Any]) -> float:
         start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
@@ -71,11 +72,6 @@ def cuda_ms(device: torch.device) -> Clock:
     return clock
 
 
-def clock_of(device: torch.device) -> Clock:
-    """The one that says how long work on a device takes: its own on a GPU, else the process's CPU time."""
-    return cuda_ms(device) if device.type == "cuda" else process_ms
-
-
 def timed_rounds(
     candidates: Mapping[str, Callable[[], Any]],
     rounds: int,
@@ -84,15 +80,17 @@ def timed_rounds(
     enough_ms: float = math.inf,
     clock: Clock = process_ms,
 ) -> dict[str, npt.NDArray[np.float64]]:
-    """Milliseconds of each candidate, in every round.
+    """Time each candidate in every round.
 
     Args:
-        candidates: What to run, by name.
-        rounds: At most so many.
-        label: Names the progress bar.
-        enough_ms: A candidate that has taken as much in ``_LEAST_ROUNDS`` or more sits the others out: long times
-            vary less.
-        clock: Runs a candidate and says how long it took.
+        candidates: Functions by name.
+        rounds: Maximum number of rounds.
+        label: Title of the progress bar.
+        enough_ms: Total time after which a candidate skips further rounds, once it has run in ``_LEAST_ROUNDS``.
+        clock: Runs a candidate and returns its milliseconds.
+
+    Returns:
+        (n,) milliseconds by name.
     """
     times: dict[str, list[float]] = {name: [] for name in candidates}
     for _ in tqdm(range(rounds), desc=label, unit="round", leave=False):
@@ -105,9 +103,9 @@ def timed_rounds(
 
 
 def peak_mib(run: Callable[[], Any]) -> float | None:
-    """How much the process grows at most while ``run`` runs, in MiB; None where the system does not tell (no Linux)."""
+    """Peak growth of the process's memory during a call, in MiB; None except on Linux."""
     gc.collect()
-    with suppress(OSError, AttributeError):  # memory that the C library keeps for later would hide what is asked for
+    with suppress(OSError, AttributeError):  # memory cached by the C library would hide the growth
         ctypes.CDLL(None).malloc_trim(0)
     try:
         Path("/proc/self/clear_refs").write_text("5")  # resets the peak
@@ -120,18 +118,13 @@ def peak_mib(run: Callable[[], Any]) -> float | None:
 
 
 def machine(load_before: tuple[float, float, float]) -> dict[str, Any]:
-    """The processor, and how busy it was before and now."""
-    return {
-        "cpu": cpu_model(),
-        "cores": os.cpu_count(),
-        "threads": 1,
-        "load_before": load_before,
-        "load_after": os.getloadavg(),
-    }
+    """Processor, threads, and load before and now."""
+    facts = {"cpu": cpu_model(), "cores": os.cpu_count(), "threads": 1}
+    return facts | {"load_before": load_before, "load_after": os.getloadavg()}
 
 
 def cpu_model() -> str:
-    """As the kernel names it; platforms without /proc have at least the architecture."""
+    """Processor as the kernel names it; without /proc, at least the architecture."""
     try:
         text = Path("/proc/cpuinfo").read_text()
     except OSError:
@@ -141,15 +134,15 @@ def cpu_model() -> str:
 
 
 def machine_line(report: Mapping[str, Any]) -> str:
-    """``machine`` and ``versions`` of a report, for people."""
+    """``machine`` and ``versions`` of a report as one line of text."""
     facts = report["machine"]
     load = f"load {facts['load_before'][0]:.1f} to {facts['load_after'][0]:.1f}"
     named = ", ".join(f"{name} {version}" for name, version in report["versions"].items())
     return f"{facts['cpu']}, one thread of {facts['cores']} cores, {load}; {named}"
 
 
-def write_json(report: Mapping[str, Any], path: Path) -> str:
-    """Write a report, with its folder; gives the text.
+def show(table: str, report: Mapping[str, Any], path: Path, *, as_json: bool = False) -> None:
+    """Print a report's table, or its JSON alone, and write the JSON.
 
     Raises:
         DataError: It cannot be written.
@@ -160,18 +153,7 @@ def write_json(report: Mapping[str, Any], path: Path) -> str:
         path.write_text(text + "\n")
     except OSError as error:
         raise DataError(f"--output {path}: expected a file that can be written to, got {error.strerror}") from None
-    return text
-
-
-def show(table: str, report: Mapping[str, Any], path: Path) -> None:
-    """Print a report's table, write the report, and say where it is.
-
-    Raises:
-        DataError: It cannot be written.
-    """
-    print(table)
-    write_json(report, path)
-    print(f"report: {path}")
+    print(text if as_json else f"{table}\nreport: {path}")
 
 
 def _status_kib(field: str) -> int:

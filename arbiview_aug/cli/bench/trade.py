@@ -1,26 +1,18 @@
-"""``python -m arbiview_aug bench [trade]``: how much accuracy a millisecond buys, on the user's data or ours.
+"""``python -m arbiview_aug bench [trade]``: speed against accuracy of all settings, on the user's data or synthetic.
 
-Sweeps quality, surface, decoded size, execution, and depth from overlap cached or not; marks the Pareto front of time
-and accuracy, draws one plot, and recommends a setting for ``--budget-ms`` or ``--min-psnr``, measured again before it
-is named. Decibels do not tell what a detector learns: static surfaces are not recommended where cameras move
-(``requirements.static_harm``).
+Sweeps quality, surface, decoded size, execution and cached depth from overlap; marks the Pareto front, draws a plot,
+and recommends a setting for ``--budget-ms`` or ``--min-psnr``, measured again. Static surfaces are not recommended
+where cameras move (``requirements.static_harm``): PSNR does not show what a detector learns from them.
 
-Times are CPU time of a ``RigRetarget`` call on one thread: with the plan where every frame needs its own (``objects``,
-``lidar``, ``accurate`` without a cache), without it where it is cached. Decoding is timed separately.
-
-Accuracy is the mean PSNR of the pixels that some source sees: against LiDAR points in the source cameras' colours
-(exposures made even; surfaces that may read the points get every other degree of them, the others score), or on
-synthetic streets against the true views. The colours are those of the images decoded at 1 / ``REFERENCE``, for every
-setting. The share of seen pixels, and the PSNR of whole views with the rest black, are printed beside it: a surface
-that knows what objects hide covers less, and is right to.
+Times are CPU time of a ``RigRetarget`` call on one thread, with the plan where every frame needs its own. Accuracy is
+the mean PSNR of pixels that some source sees, against LiDAR points or the true views, in the colours of images decoded
+at 1 / ``REFERENCE``.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
-import os
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -40,17 +32,15 @@ from arbiview_aug.cli.bench.study import (
     SIZE,
     Row,
     advice,
+    benchmark,
     benchmark_parser,
     distinct_steps,
-    facts,
     pareto_front,
     study,
 )
-from arbiview_aug.cli.bench.timing import Quartiles, machine_line, peak_mib, quartiles, timed_rounds, write_json
+from arbiview_aug.cli.bench.timing import Quartiles, machine_line, peak_mib, quartiles, show, timed_rounds
 from arbiview_aug.datasets.image_io import Reduce
-from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.frames import ScoredFrame
-from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import Method, Sample, views_of
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.favs.config import FavsConfig, Quality
@@ -64,10 +54,10 @@ Execution = Literal["opencv", "torch", "cuda"]
 
 REPEATS = 9
 REFERENCE: Reduce = 2
-"""Decoded size whose colours score: every published figure is at half resolution."""
-_ENOUGH_MS = 1000.0  # a sweep of 63 settings takes three minutes, not twelve
-_LEARNS_ON = ("street", "objects")
-"""Surfaces that depth from overlap can correct: the others are measured, or nothing can be corrected."""
+"""Decoding factor of the images whose colours score."""
+_ENOUGH_MS = 1000.0  # keeps a sweep of 63 settings at three minutes
+_CORRECTED = ("street", "objects")
+"""Surfaces that depth from overlap can correct."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +68,8 @@ class Setting:
         quality: As in ``RigRetarget``.
         surface: As in ``RigRetarget``.
         reduce: Images are decoded at 1 / this.
-        execution: ``opencv`` and ``torch`` on the CPU, ``cuda``: torch on a GPU.
-        held: Depth from overlap is cached, not computed in every frame.
+        execution: ``opencv`` or ``torch`` on the CPU, or ``cuda``: torch on a GPU.
+        held: Whether depth from overlap is cached.
     """
 
     quality: Quality
@@ -90,12 +80,12 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """As tables call it."""
+        """Name in tables."""
         held = ["depth held"] if self.held else []
         return ", ".join([self.quality, self.surface, *held, f"1/{self.reduce}", self.execution])
 
     def transform(self, target: Rig) -> RigRetarget:
-        """The setting as a transform; without a store of plans but for the last."""
+        """Create the setting's transform, which caches the last plan alone."""
         return RigRetarget(
             target,
             quality=self.quality,
@@ -107,22 +97,18 @@ class Setting:
         )
 
     def method(self, target: Rig) -> Method:
-        """The setting as a row of a study of one target."""
+        """Create a row of a study of one target."""
         retarget = self.transform(target)
-
-        def render(sample: Sample, _: Rig) -> list[RenderedView]:
-            return views_of(retarget(self.on_device(sample)))
-
-        return Method(self.name, render)
+        return Method(self.name, lambda sample, _: views_of(retarget(self.on_device(sample))))
 
     def on_device(self, sample: Sample) -> dict[str, Any]:
-        """The sample, its images on the GPU where this setting renders there."""
+        """Move the images to the GPU if this setting renders there."""
         if self.execution != "cuda":
             return dict(sample)
         return {**sample, "images": [image.to("cuda") for image in sample["images"]]}
 
     def call(self, target: Rig, sample: Sample) -> Callable[[], Any]:
-        """Calls of a new transform that alternate between two frames with one calibration."""
+        """Create a transform and alternate it between two frames of one calibration."""
         sample, retarget = self.on_device(sample), self.transform(target)
         samples = itertools.cycle([sample, as_of_another_frame(sample)])
 
@@ -141,39 +127,31 @@ def settings(
     reduces: Sequence[Reduce] = REDUCES,
     executions: Sequence[Execution] = ("opencv", "torch"),
 ) -> list[Setting]:
-    """All combinations that differ: ``paper`` has its own surface and runs on the CPU, and depth from overlap is
-    nothing where the surface is measured or infinitely far."""
+    """List all combinations that differ: ``paper`` is always far and on the CPU; ``accurate`` needs overlap depth."""
     found = []
     for quality, reduce, execution in itertools.product(qualities, reduces, executions):
         if quality == "paper":
             found += [Setting(quality, "far", reduce, execution)] if execution == "opencv" else []
             continue
         for surface in surfaces:
-            learns = quality == "accurate"
-            if not learns or surface in _LEARNS_ON:
-                found += [Setting(quality, surface, reduce, execution, held) for held in ((False, True)[: 1 + learns])]
+            if quality != "accurate":
+                found.append(Setting(quality, surface, reduce, execution))
+            elif surface in _CORRECTED:
+                found += [Setting(quality, surface, reduce, execution, held) for held in (False, True)]
     return found
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure, print the tables, write the JSON and the plot; 1 where nothing harmless keeps to the stated limit."""
-    parser = _parser()
-    arguments = parser.parse_args(argv)
+    """Measure, print the tables, write the JSON and the plot; return 1 if no harmless setting keeps the limit."""
+    arguments = _parser().parse_args(argv)
     folder = writable_folder(Path(arguments.output), arguments.output)
-    sources = tuple(SOURCES_OVER_VIEWS * side for side in arguments.size)
-    with (
-        one_thread(),
-        warnings.catch_warnings(),
-        recorded(arguments.data, frames=arguments.frames, size=(sources[0], sources[1])) as data,
-    ):
-        warnings.simplefilter("ignore")  # of static surfaces and of what no source sees: it is what is measured
+    h, w = (SOURCES_OVER_VIEWS * side for side in arguments.size)
+    with recorded(arguments.data, frames=arguments.frames, size=(h, w)) as data:
         report = measure(data, arguments)
-    text = write_json(report, folder / "trade.json")
     steps = report["steps"]
     save_plot(report["settings"], steps, f"{report['data']}: {report['target']}", folder / "trade.png")
-    print(text if arguments.json else table(report))
-    if not arguments.json:
-        print(f"\nnumbers: {folder / 'trade.json'}\nplot: {folder / 'trade.png'}")
+    text = f"{table(report)}\n\nplot: {folder / 'trade.png'}"
+    show(text, report, folder / "trade.json", as_json=arguments.json)
     return 0 if report["advice"] is None or report["advice"]["setting"] else 1
 
 
@@ -190,7 +168,7 @@ def _parser() -> argparse.ArgumentParser:
     add_target(parser)
     executions = [*get_args(Execution)] if torch.cuda.is_available() else ["opencv", "torch"]
     surfaces = [name for name in SURFACES if name != "auto"]
-    parser.add_argument("--frames", type=count, default=1, metavar="N", help="for accuracy (default: %(default)s)")
+    parser.add_argument("--frames", type=count, default=1, metavar="N", help="frames for accuracy")
     parser.add_argument("--quality", nargs="+", choices=get_args(Quality), help="(default: all)")
     parser.add_argument("--surface", nargs="+", choices=surfaces, help="(default: what the samples offer)")
     parser.add_argument("--reduce", nargs="+", type=int, choices=REDUCES, help="decode at 1/N (default: 1 2 4)")
@@ -203,13 +181,13 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+@benchmark
 def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
-    """All figures, as plain data for JSON."""
-    load_before = os.getloadavg()
+    """Score and time all settings."""
     source: Rig = data.sample(0, REFERENCE)["rig"]
     target = data.target(arguments.target, arguments.size)
     qualities: Sequence[Quality] = arguments.quality or get_args(Quality)
-    if "paper" in qualities:  # homographies know no lens, and all settings are of one target
+    if "paper" in qualities:  # homographies know no lens; all settings share the target
         target = target.undistorted()
 
     @cache
@@ -253,19 +231,17 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
 
     recommended = advice(rows, again, budget_ms=arguments.budget_ms, min_psnr_db=arguments.min_psnr)
     front = {row["name"] for row in pareto_front(rows)}
-    return facts(
-        "trade",
-        load_before,
-        clock="CPU time of the process, milliseconds, one thread",
-        data=data.name,
-        target=target.name or "target",
-        size=list(target.sizes[0]),
-        frames=arguments.frames,
-        against="true views" if data.truth is not None else "LiDAR points, exposures made even",
-        settings=[{**row, "front": row["name"] in front} for row in rows],
-        steps=[row["name"] for row in distinct_steps(rows)],
-        advice=recommended,
-    )
+    return {
+        "clock": "CPU time of the process, milliseconds, one thread",
+        "data": data.name,
+        "target": target.name or "target",
+        "size": list(target.sizes[0]),
+        "frames": arguments.frames,
+        "against": "true views" if data.truth is not None else "LiDAR points, exposures made even",
+        "settings": [{**row, "front": row["name"] in front} for row in rows],
+        "steps": [row["name"] for row in distinct_steps(rows)],
+        "advice": recommended,
+    }
 
 
 def _surfaces(sample: Sample) -> list[SurfaceName]:
@@ -295,9 +271,9 @@ NOTES = (
 
 
 def table(report: Mapping[str, Any]) -> str:
-    """The report to read, in Markdown: settings from fast to slow, then others, then the recommendation.
+    """Markdown table, fastest setting first, and the recommendation.
 
-    Shown are the front, and of the rest what OpenCV makes of images decoded as the first shown on the front are.
+    Shows the front, and other OpenCV settings at the decoded size of the fastest step.
     """
     h, w = report["size"]
     steps, rows = report["steps"], sorted(map(dict, report["settings"]), key=lambda row: row["median_ms"])
@@ -319,7 +295,7 @@ def table(report: Mapping[str, Any]) -> str:
 
 
 def advice_line(advice: Mapping[str, Any]) -> str:
-    """The recommendation in a sentence; in two more, why static surfaces were left out, and the data that helps."""
+    """The recommendation, why static surfaces were left out, and the data that helps."""
     without = ""
     if advice["left_out"] is not None:
         static = ", ".join(name for name, row in SURFACES.items() if row.is_static)

@@ -42,7 +42,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_costs(drive: Path) -> None:
     report = measure(
-        lambda: FrameFolder(drive, neighbours=Neighbours(count=4)),
+        FrameFolder(drive, neighbours=Neighbours(count=4)),
         "drive",
         counts=(0, 1, 8),
         surfaces=("street",),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from arbiview_aug.cli.bench.timing import peak_mib, quartiles, timed_rounds, write_json
+from arbiview_aug.cli.bench.timing import peak_mib, quartiles, show, timed_rounds
 from arbiview_aug.errors import DataError
 
 
@@ -58,4 +58,4 @@ def test_peak_memory_is_seen_although_it_is_given_back() -> None:
 def test_report_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="expected a file that can be written to"):
-        write_json({}, tmp_path / "file" / "report.json")
+        show("", {}, tmp_path / "file" / "report.json")
