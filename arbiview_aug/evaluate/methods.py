@@ -1,7 +1,4 @@
-"""Named methods: whatever renders a sample for a target rig, so that tables can compare them.
-
-A method gets the whole sample and may use what is in it; what it must not see is left out before (``frames``).
-"""
+"""Named methods that render a sample for a target rig, as rows of tables."""
 
 from __future__ import annotations
 
@@ -31,12 +28,12 @@ from arbiview_aug.transforms.settings import RenderPath
 Sample = Mapping[str, Any]
 
 OURS: tuple[Quality, ...] = ("draft", "fast", "accurate")
-"""The presets that are not the published method."""
+"""Presets other than the published method."""
 
 INPAINTED, GENERATED = "fast, inpainted", "generator"
-"""Rows of ``fast`` with its holes filled: by Telea's inpainting, and by the weights that ship with the package."""
+"""Rows of ``fast`` with holes filled by Telea's inpainting, and by the shipped weights."""
 
-_HELD_TRANSFORMS = 8  # as many as a set of targets has; full-size plans take 50 MB each
+_CACHED_TRANSFORMS = 8  # the targets of a set; full-size plans take 50 MB each
 
 
 @dataclass(frozen=True)
@@ -45,11 +42,11 @@ class Method:
 
     Attributes:
         name: Shown in tables.
-        render: Sample with ``rig``, target rig (in its own ego frame): one view for each target camera.
-        reads_points: Whether it may use the sample's ``points``: then only a part of them can score it.
-        render_alone: Sample, index of a source camera, one-camera target rig: the view from that source alone, but
-            with what the method knows of the scene from all; None where it knows nothing but what each camera shows.
-        plans: Whether a first call takes longer than the next, because it plans.
+        render: Maps a sample with ``rig`` and a target rig (in its own ego frame) to one view per target camera.
+        reads_points: Whether it may use the sample's ``points``, so that only a part of them can score it.
+        render_alone: Maps a sample, the index of a source camera and a one-camera target rig to the view from that
+            source alone, with the scene estimated from all cameras; None if nothing is estimated from several.
+        plans: Whether the first call plans and takes longer.
     """
 
     name: str
@@ -59,7 +56,7 @@ class Method:
     plans: bool = True
 
     def alone(self, sample: Sample, camera: int, target: Rig) -> RenderedView:
-        """A one-camera target from one source camera alone."""
+        """Render a one-camera target from one source camera alone."""
         if self.render_alone is not None:
             return self.render_alone(sample, camera, target)
         (view,) = self.render(one_camera(sample, camera), target)
@@ -77,23 +74,21 @@ def retargeting(
     path: RenderPath = "favs",
     generator: Generator | None = None,
     steps: int | None = None,
-    transforms: int = _HELD_TRANSFORMS,
+    transforms: int = _CACHED_TRANSFORMS,
 ) -> Method:
-    """``RigRetarget`` as a method; a transform, with its last plan, for each of the last target rigs.
-
-    With ``path="favs"`` holes stay black: scores are of what was seen.
+    """Wrap ``RigRetarget`` as a method, with its arguments; holes stay black with ``path="favs"``.
 
     Args:
-        quality: As for ``RigRetarget``.
-        surface: As for ``RigRetarget``.
-        name: For tables; by default made of both.
-        outputs: Further outputs, ``confidence`` where there is to be one.
-        harmonise: As for ``RigRetarget``.
-        refinement: As for ``RigRetarget``.
-        path: As for ``RigRetarget``; a source camera alone is never completed.
-        generator: As for ``RigRetarget``.
-        steps: As for ``RigRetarget``.
-        transforms: Target rigs whose transforms are cached.
+        quality: Preset or configuration.
+        surface: Scene geometry.
+        name: Name in tables; by default made of quality, surface and path.
+        outputs: Further outputs, such as ``confidence``.
+        harmonise: Exposure gains.
+        refinement: Cache of depth from overlap.
+        path: Filling of holes; a source camera alone is never completed.
+        generator: The generator of ``path="diffusion"``; by default the shipped one.
+        steps: Steps of the generator.
+        transforms: Number of target rigs whose transforms are cached.
     """
     completes = path != "favs"
     if path == "diffusion" and generator is None:
@@ -119,15 +114,15 @@ def retargeting(
         return views_of(transform(target)(sample))
 
     def render_alone(sample: Sample, camera: int, target: Rig) -> RenderedView:
-        """With the depth and the gain that all cameras' overlaps gave, as if they had been found before."""
+        """Render with the depth and the gain estimated from all cameras' overlaps."""
         given, (depth, gains) = one_camera(sample, camera), overlaps.get(sample)
-        held = None
+        cache = None
         if depth is not None:
-            held, found = RefinementCache(), depth
-            held.get((given["rig"].content_key, None), lambda: found)
+            cache, found = RefinementCache(), depth
+            cache.get((given["rig"].content_key, None), lambda: found)
         gain = None if gains is None else gains[camera : camera + 1]
         retarget = RigRetarget(
-            target, quality=quality, surface=surface, harmonise=gain, refinement=held, cache_bytes=0, holes="black"
+            target, quality=quality, surface=surface, harmonise=gain, refinement=cache, cache_bytes=0, holes="black"
         )
         (view,) = views_of(retarget(given))
         return view
@@ -139,16 +134,16 @@ def retargeting(
     learns = isinstance(config, FavsConfig) and config.overlap_depth
     overlaps = _LastOverlaps(surface if learns else None, Harmoniser(harmonise))
     reads_points = "points" in SURFACES[surface].reads and not isinstance(config, PaperConfig)
-    alone = render_alone if overlaps.tell or completes else None
+    alone = render_alone if overlaps.are_used or completes else None
     return Method(label, render, reads_points, alone, plans=not isinstance(config, PaperConfig))
 
 
 class _LastOverlaps:
-    """What the overlaps of the last sample tell: a dozen views of it are rendered in a row.
+    """Depth and gains from the overlaps of the last sample, cached over its views.
 
     Args:
-        surface: The surface whose distances they correct; None where depth is not asked for.
-        harmoniser: Gives the gains.
+        surface: The surface to correct; None for no depth.
+        harmoniser: Estimates the gains.
     """
 
     def __init__(self, surface: SurfaceName | None, harmoniser: Harmoniser) -> None:
@@ -156,12 +151,11 @@ class _LastOverlaps:
         self._last: tuple[Sample, tuple[OverlapDepth | None, Sequence[float] | None]] | None = None
 
     @property
-    def tell(self) -> bool:
-        """Whether anything is asked of them."""
+    def are_used(self) -> bool:
         return self._surface is not None or self._harmoniser.is_on
 
     def get(self, sample: Sample) -> tuple[OverlapDepth | None, Sequence[float] | None]:
-        """Depth and gains, each where it is asked for."""
+        """Depth and gains of a sample, None where they are not used."""
         if self._last is None or self._last[0] is not sample:
             rig, images = sample["rig"], list(sample["images"])
             gains = self._harmoniser.report(rig, images).gains if self._harmoniser.is_on else None
@@ -178,14 +172,14 @@ class _LastOverlaps:
 
 
 def one_camera(sample: Sample, camera: int) -> dict[str, Any]:
-    """A sample as if it had one camera; what its ego frame holds stays."""
+    """Reduce a sample to one camera; geometry in the ego frame stays."""
     rig: Rig = sample["rig"]
     given = {key: value for key, value in sample.items() if key not in ("K", "cam2ego", "detections")}
     return {**given, "images": [sample["images"][camera]], "rig": rig.with_cameras([rig[camera]])}
 
 
 def views_of(out: Sample) -> list[RenderedView]:
-    """A retargeted sample's views."""
+    """Views of a retargeted sample."""
     images, coverage = as_arrays(out["images"]), [mask.cpu().numpy() for mask in out["coverage"]]
     confidence = [c.float().cpu().numpy() for c in out["confidence"]] if "confidence" in out else [None] * len(images)
     generated = [g.cpu().numpy() for g in out["generated"]] if "generated" in out else [None] * len(images)
@@ -193,7 +187,7 @@ def views_of(out: Sample) -> list[RenderedView]:
 
 
 def baseline(name: str) -> Method:
-    """One of ``baselines.BASELINES``."""
+    """Wrap one of ``baselines.BASELINES`` as a method."""
     renderer: Renderer = BASELINES[name]
 
     def render(sample: Sample, target: Rig) -> list[RenderedView]:
@@ -205,18 +199,18 @@ def baseline(name: str) -> Method:
 
 
 def paper_stages() -> dict[str, PaperConfig]:
-    """``paper`` whole, and with each stage switched off: what each is worth.
+    """``paper``, and with each stage switched off.
 
     Without stage 4 the fused image is the plain mean of all sources that see a pixel.
     """
-    whole = PaperConfig()
+    full = PaperConfig()
     return {
-        "paper": whole,
-        "paper without stage 2, matching": replace(whole, use_feature_matching=False),
-        "paper without stage 3, objects": replace(whole, use_object_alignment=False),
-        "paper without stages 2 and 3": replace(whole, use_feature_matching=False, use_object_alignment=False),
+        "paper": full,
+        "paper without stage 2, matching": replace(full, use_feature_matching=False),
+        "paper without stage 3, objects": replace(full, use_object_alignment=False),
+        "paper without stages 2 and 3": replace(full, use_feature_matching=False, use_object_alignment=False),
         "paper without stage 4, weights": replace(
-            whole,
+            full,
             use_distance_weight=False,
             use_gradient_weight=False,
             use_quality_weight=False,
@@ -226,10 +220,7 @@ def paper_stages() -> dict[str, PaperConfig]:
 
 
 def study_methods() -> list[Method]:
-    """The rows of the paper's tables and ours, from images and poses alone: no LiDAR, no boxes.
-
-    The generator's is there where diffusers is: ``fast``, its holes by the weights that ship with the package.
-    """
+    """Rows of the paper's tables and ours, from images and poses alone; the generator's only with diffusers."""
     published = [retargeting(config, "auto", name) for name, config in paper_stages().items()]
     return [
         *map(baseline, BASELINES),
@@ -241,5 +232,5 @@ def study_methods() -> list[Method]:
 
 
 def has_generator() -> bool:
-    """Whether the weights of the package are there, and the packages that they need."""
+    """Whether the shipped weights and diffusers are installed."""
     return importlib.util.find_spec("diffusers") is not None and has_shipped()

@@ -1,7 +1,7 @@
-"""The paper's Tables 1 and 2 by this package's evaluator: baselines, the published stages and ours on the same work.
+"""The paper's Tables 1 and 2 with this package's evaluator: baselines, the published stages and ours.
 
-Targets: the paper's six configurations, all cameras turned by ±11, ±22 and 35 degrees, four other vehicles, and the
-source's cameras 1 m higher (a truck). Every method gets images and poses alone.
+Targets are the paper's six configurations, all cameras turned, four other vehicles, and the cameras 1 m higher (a
+truck). Every method gets images and poses alone.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import open_data
@@ -33,10 +34,9 @@ from arbiview_aug.evaluate.targets import TRUCK_UP_M, VEHICLES, YAWS_DEG, named_
 REAL_FRAMES = ("nuscenes-one", "ddad-one")
 SYNTHETIC = "synthetic"
 SYNTHETIC_FRAMES, SYNTHETIC_SEED, SYNTHETIC_SIZE = 3, 0, (256, 704)
-"""The fixed synthetic set."""
 
 REDUCE: Reduce = 2
-"""Real images are decoded at half size, as accuracy is reported everywhere."""
+"""Decoding factor of real images."""
 
 SETS = ("paper", "yaw", "vehicles", "truck")
 
@@ -48,36 +48,28 @@ PROTOCOL = (
 )
 
 
-class Published(NamedTuple):
-    """A row of the paper: PSNR in dB, SSIM, MAE, RMSE at the LiDAR's pixels."""
-
-    name: str
-    psnr_db: float
-    ssim: float
-    mae: float
-    rmse: float
-
-
-PUBLISHED: dict[str, Published] = {
-    "crop and slide": Published("DriveSuprim, Table 1", 9.5647, 0.8542, 72.4672, 87.5129),
-    "own camera": Published("Geometric, Table 2", 9.3167, 0.8339, 74.1309, 88.7707),
-    "paper": Published("FAVS, Table 2", 11.8707, 0.8813, 42.4985, 55.1446),
-    GENERATED: Published("ArbiViewGen, Tables 1 and 2", 14.2335, 0.9691, 38.2820, 49.5294),
+PUBLISHED: dict[str, dict[str, Any]] = {
+    method: dict(zip(("name", "psnr_db", "ssim", "mae", "rmse"), row, strict=True))
+    for method, *row in (
+        ("crop and slide", "DriveSuprim, Table 1", 9.5647, 0.8542, 72.4672, 87.5129),
+        ("own camera", "Geometric, Table 2", 9.3167, 0.8339, 74.1309, 88.7707),
+        ("paper", "FAVS, Table 2", 11.8707, 0.8813, 42.4985, 55.1446),
+        (GENERATED, "ArbiViewGen, Tables 1 and 2", 14.2335, 0.9691, 38.2820, 49.5294),
+    )
 }
-"""The paper's numbers by the method of ours that they belong to."""
+"""The paper's numbers at LiDAR pixels, by our name of the method: PSNR in dB, SSIM, MAE, RMSE."""
 
 
 @dataclass
 class Study:
-    """Means by data set, method and set of targets; metrics as in ``frames.scores``."""
+    """Mean metrics (``frames.scores``) by data set, method and set of targets; reasons of methods that failed."""
 
     means: dict[str, dict[str, dict[str, dict[str, float]]]] = field(default_factory=dict)
     declined: dict[str, str] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON, with the paper's numbers."""
-        published = {method: row._asdict() for method, row in PUBLISHED.items()}
-        return {"means": self.means, "published": published, "protocol": PROTOCOL, "declined": self.declined}
+        """Plain data for JSON, with the paper's numbers."""
+        return {"means": self.means, "published": PUBLISHED, "protocol": PROTOCOL, "declined": self.declined}
 
 
 def measure_paper(
@@ -91,33 +83,29 @@ def measure_paper(
     """Measure all rows.
 
     Args:
-        data: A folder of real frames; by default ``REAL_FRAMES`` below ARBIVIEW_DATA, and the synthetic set.
-        frames: How many of each data set; by default 1 of real ones and ``SYNTHETIC_FRAMES``.
-        size: (h, w) of the synthetic images, for a quick look.
+        data: A folder of real frames; by default ``REAL_FRAMES`` below ARBIVIEW_DATA, and synthetic streets.
+        frames: Frames per data set; by default 1 of real ones and ``SYNTHETIC_FRAMES``.
+        size: (h, w) of the synthetic images.
         methods: By default ``study_methods``.
-        tick: Told before each step what it is, and how many there are so far.
+        tick: Called before each step with its name and the number of steps so far.
     """
     study, rows, steps = Study(), methods or study_methods(), 0
     for name, found in _data_sets(data, frames, size):
         collected: dict[str, dict[str, list[dict[str, float]]]] = {m.name: {kind: [] for kind in SETS} for m in rows}
         for frame in found:
-            rig: Rig = frame.sample["rig"]
             for kind in SETS:
-                # Raw exposures only where the paper has numbers; synthetic cameras have but one exposure.
+                # Raw exposures only where the paper has numbers; synthetic cameras have one exposure.
                 exposures: tuple[Exposure, ...] = ("raw", "even") if kind == "paper" else ("even",)
                 if "even" not in frame.lidar:
                     exposures = ("raw",)
-                targets = named_targets(kind, rig)
+                targets = named_targets(kind, frame.sample["rig"])
                 steps += len(targets) * len(rows)
-                for target_name, target in targets.items():
-                    for method in rows:
-                        tick(f"{name}: {target_name}, {method.name}", steps)
-                        try:
-                            found_rows = scores(frame, method.render, target, exposures)[1]
-                        except (CalibrationError, SampleError) as error:
-                            study.declined[f"{name}, {method.name}"] = str(error)
-                            continue
-                        collected[method.name][kind] += found_rows
+                for (target_name, target), method in product(targets.items(), rows):
+                    tick(f"{name}: {target_name}, {method.name}", steps)
+                    try:
+                        collected[method.name][kind] += scores(frame, method.render, target, exposures)[1]
+                    except (CalibrationError, SampleError) as error:
+                        study.declined[f"{name}, {method.name}"] = str(error)
         means = {m: {kind: mean_of(each) for kind, each in kinds.items() if each} for m, kinds in collected.items()}
         study.means[name] = {method: kinds for method, kinds in means.items() if kinds}
     return study
@@ -144,12 +132,12 @@ def _data_sets(
 
 
 def _bare(sample: Mapping[str, Any]) -> dict[str, Any]:
-    """Without labels; the points only score."""
+    """Drop labels."""
     return {key: value for key, value in sample.items() if key not in ("boxes_3d", "detections")}
 
 
-# --- the tables -------------------------------------------------------------------------------------------------------
-_FOUR = (("PSNR", "psnr_db", ".2f"), ("SSIM", "ssim", ".4f"), ("MAE", "mae", ".2f"), ("RMSE", "rmse", ".2f"))
+# --- tables -----------------------------------------------------------------------------------------------------------
+_FOUR = (("PSNR", "{psnr_db:.2f}"), ("SSIM", "{ssim:.4f}"), ("MAE", "{mae:.2f}"), ("RMSE", "{rmse:.2f}"))
 _HEADINGS = {"paper": "six", "yaw": "turned", "vehicles": "vehicles", "truck": "truck"}
 _TURNS = ", ".join(f"{yaw:g}" for yaw in YAWS_DEG)
 _GENERATOR = (
@@ -170,25 +158,25 @@ _OTHERS = (
 
 
 def paper_report(study: Study) -> str:
-    """Markdown: the paper's measure, PSNR on all targets, where ours loses, and what differs in protocol."""
+    """Markdown tables: the paper's measure, PSNR on all targets, losses, and differences in protocol."""
     parts = [] if not study.means else [_SIX, _six(study), _OTHERS, _others(study), *_losses(study)]
     caption = [_GENERATOR] if GENERATED in _methods(study) else []
     return "\n\n".join([*parts, *caption, *(f"{where}: {why}" for where, why in study.declined.items()), PROTOCOL])
 
 
 def _six(study: Study) -> str:
-    """Synthetic sets have the truth to be compared with: they are here only where nothing else is."""
+    """Table of the paper's measure, of synthetic sets only if there are no others."""
     sets = {name: methods for name, methods in study.means.items() if not _has_truth(methods)} or study.means
     names = [*_methods(study), *(method for method in PUBLISHED if method not in _methods(study))]
     head = ["", *(f"{of}: {h}" if h == "PSNR" else h for of in ("published", *sets) for h, *_ in _FOUR)]
     rows = []
     for name in names:
-        published = PUBLISHED.get(name)
-        rows.append([name if published is None else f"{name} ({published.name})"])
-        rows[-1] += [cell({} if published is None else published._asdict(), f"{{{m}:{d}}}") for _, m, d in _FOUR]
+        published = PUBLISHED.get(name, {})
+        rows.append([f"{name} ({published['name']})" if published else name, *(cell(published, f) for _, f in _FOUR)])
         for methods in sets.values():
-            found = methods.get(name, {}).get("paper", {})
-            rows[-1] += [cell(found, f"{{raw_{m}:{d}}}") for _, m, d in _FOUR]
+            means = methods.get(name, {}).get("paper", {})
+            raw = {metric.removeprefix("raw_"): value for metric, value in means.items() if metric.startswith("raw_")}
+            rows[-1] += [cell(raw, form) for _, form in _FOUR]
     return markdown_table(head, rows)
 
 
@@ -208,7 +196,7 @@ def _others(study: Study) -> str:
 
 
 def _losses(study: Study) -> list[str]:
-    """Where a baseline is above ours, unseen pixels black."""
+    """Sentence on the baselines that are above ours, with unseen pixels black."""
     found = []
     for of, methods in study.means.items():
         metric = "true_psnr_db" if _has_truth(methods) else "even_psnr_db"
@@ -232,14 +220,11 @@ def _has_truth(methods: Mapping[str, Mapping[str, Mapping[str, float]]]) -> bool
 
 
 FIGURES: dict[int, tuple[float, ...]] = {2: (0.5, -0.25), 3: (0.2,), 4: (-0.2,), 5: (0.4,), 6: (-0.4,)}
-"""The paper's figures, and the shares of the azimuth spacing by which their cameras are turned."""
-
-
-_WIDTH_PX = 1800
+"""The paper's figures, and the turns of their cameras as shares of the azimuth spacing."""
 
 
 def figure_methods() -> dict[str, Method]:
-    """The paper's rows by their caption, and ours."""
+    """The paper's rows and ours, by caption."""
     methods = {
         "DriveSuprim: crop and slide": baseline("crop and slide"),
         "geometric: own camera, no fusion": baseline("own camera"),
@@ -252,15 +237,7 @@ def figure_methods() -> dict[str, Method]:
 
 
 def draw_figures(sample: Mapping[str, Any], folder: Path) -> list[Path]:
-    """Write ``figure2.png`` to ``figure6.png``.
-
-    Args:
-        sample: With ``rig`` and ``images``.
-        folder: Where to.
-
-    Returns:
-        The files. A method that cannot take the rig's lenses has no row.
-    """
+    """Write ``figure2.png`` to ``figure6.png`` of a sample; methods that cannot take the rig's lenses have no row."""
     rig: Rig = sample["rig"]
     images: list[Image] = as_arrays(sample["images"])
     order, spacing = left_to_right(rig), spacing_deg(rig)
@@ -278,6 +255,5 @@ def draw_figures(sample: Mapping[str, Any], folder: Path) -> list[Path]:
                 rows.append([views[k].image for k in order])
                 titles.append(name)
                 labels.append([f"{rig.names[k]} {share * spacing[k]:+.4g} deg" for k in order])
-        picture = contact_sheet(rows, labels, titles, width_px=_WIDTH_PX)
-        files.append(save_picture(folder / f"figure{number}.png", picture))
+        files.append(save_picture(folder / f"figure{number}.png", contact_sheet(rows, labels, titles)))
     return files

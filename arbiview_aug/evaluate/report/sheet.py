@@ -1,4 +1,4 @@
-"""The contact sheet of a retargeted frame: source ring, target views, what nobody saw, the truth."""
+"""Contact sheet of a retargeted frame: source images, target views, holes, the truth."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.evaluate.images import Image, RenderedView, to_bytes
 from arbiview_aug.evaluate.report.pictures import Picture, contact_sheet, outline_coverage
 
-_RING_START_DEG = 200.0  # a ring is drawn from the left over the front to the right; what looks back comes last
+_RING_START_DEG = 200.0  # from the left over the front to the right; cameras that look back come last
 
 
 def frame_sheet(
@@ -23,16 +23,7 @@ def frame_sheet(
     *,
     width_px: int = 1800,
 ) -> Picture:
-    """Rows of images, each rig's cameras from left to right.
-
-    Args:
-        source: The source rig.
-        images: Its images.
-        target: The target rig.
-        views: Its rendered views.
-        truth: Its true views, where they are known.
-        width_px: Width of the sheet.
-    """
+    """Lay out source images, target views, holes and (if given) the truth, cameras from left to right."""
     ring, order = left_to_right(source), left_to_right(target)
     names, vehicle = target.names, target.name or "the target"
     unseen = [1 - float(view.coverage.mean()) for view in views]
@@ -42,7 +33,7 @@ def frame_sheet(
         (f"The same moment, retargeted to {vehicle}: {len(names)} cameras", rendered, names, order),
     ]
     if any(unseen):
-        # At about the size of the sheet: finer lines would blur into a colour.
+        # At the size of the sheet, since finer hatching would blur.
         height = round(width_px / sum(image.shape[1] / image.shape[0] for image in rendered))
         hatched = [hatched_view(view, height) for view in views]
         captions = [f"{name}: {share:.1%} unseen" for name, share in zip(names, unseen, strict=True)]
@@ -58,7 +49,7 @@ def frame_sheet(
 
 
 def hatched_view(view: RenderedView, height_px: int) -> Picture:
-    """A view, at most so high, with what nobody saw hatched."""
+    """View with hatched holes, reduced to a height."""
     small = shrunk(view.image, height_px)
     h, w = small.shape[:2]
     seen = cv2.resize(view.coverage.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST) > 0
@@ -66,12 +57,12 @@ def hatched_view(view: RenderedView, height_px: int) -> Picture:
 
 
 def shrunk(image: Image, height_px: int) -> Picture:
-    """An image, at most so high."""
+    """Image reduced to a height; smaller ones keep their size."""
     scale = min(1.0, height_px / image.shape[0])
     size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
     return np.asarray(cv2.resize(to_bytes(image), size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def left_to_right(rig: Rig) -> list[int]:
-    """Indices of the cameras as a panorama shows them."""
+    """Indices of the cameras in the order of a panorama."""
     return sorted(range(len(rig)), key=lambda k: -((rig[k].azimuth_deg + _RING_START_DEG) % 360))
