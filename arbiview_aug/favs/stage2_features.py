@@ -254,14 +254,8 @@ def accept(
 ) -> FeatureReport:
     """Apply the paper's three criteria for reliable matches and choose the case of H_base.
 
-    Args:
-        H_geometric: (3, 3) from stage 1.
-        matches: good_matches.
-        shown: Bounding box of the source's warp, target pixels.
-        visible: The same, source pixels.
-        focal_ratio: Source focal length over target focal length.
-        scale: Target width over ``REFERENCE_WIDTH_PX``.
-        config: Settings.
+    The arguments are those of ``optimise_transformation``, with the bounding box of the source's warp in target pixels
+    (``shown``) and the target's width over ``REFERENCE_WIDTH_PX`` (``scale``).
     """
     count = len(matches.warped)
     if count < config.min_matches:

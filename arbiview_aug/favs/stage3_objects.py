@@ -137,13 +137,8 @@ def geometric_type(bbox: tuple[float, float, float, float], target: Camera, grou
     """Classify a cluster by the road plane, for want of a detector.
 
     ``far``: its bottom edge lies above the horizon. ``ground``: its top edge meets the road within ``reach_m``.
-    ``upright``: all others, such as vehicles and pedestrians.
-
-    Args:
-        bbox: (x0, y0, x1, y1), target pixels.
-        target: The target camera.
-        ground_z_m: Height of the road in its ego frame.
-        reach_m: Distance along the ray.
+    ``upright``: all others, such as vehicles and pedestrians. ``bbox`` is (x0, y0, x1, y1) in target pixels; the road's
+    height is in the target's ego frame.
     """
     x = (bbox[0] + bbox[2]) / 2
     top, bottom = target.unproject(np.array([(x, bbox[1]), (x, bbox[3])])).directions[:, 2]
@@ -207,14 +202,7 @@ def _detected_type(center: FloatArray, detections: Sequence[Detection]) -> str:
 def align_objects(
     objects: Sequence[SceneObject], H_base: FloatArray, width_px: int, config: PaperConfig
 ) -> AlignmentReport:
-    """Compute ΔT over the objects, decline it if too long, and apply it to H_base.
-
-    Args:
-        objects: From ``find_objects``.
-        H_base: (3, 3) from stage 2.
-        width_px: Width of the target.
-        config: Settings.
-    """
+    """Compute ΔT, decline it if too long for the target's width, and apply it to the (3, 3) H_base of stage 2."""
     if not objects:
         return declined(H_base, "no cluster of matches: nothing to align")
     weights = np.array([o.weight(config) for o in objects])

@@ -98,21 +98,13 @@ def source_pixels(
 def distance_weight(distance_px: FloatArray, d_max_px: float, gamma: float) -> FloatArray:
     """w_distance(x, y) = (d(x, y) / d_max)^γ: 0 at the border of a source's coverage, 1 at its middle.
 
-    Args:
-        distance_px: (...,) distance to the border; negative outside.
-        d_max_px: Largest distance, > 0.
-        gamma: γ >= 0.
+    d (...,) is the distance to the border, negative outside; d_max > 0; γ >= 0.
     """
     return np.clip(distance_px / d_max_px, 0.0, 1.0) ** gamma
 
 
 def gradient_weight(gradient_magnitude: FloatArray, sigma: float) -> FloatArray:
-    """w_gradient(x, y) = 1 / (1 + ‖∇I(x, y)‖ / σ): less weight at strong edges.
-
-    Args:
-        gradient_magnitude: (...,) ‖∇I‖ in grey levels per pixel.
-        sigma: σ > 0 in the same unit.
-    """
+    """w_gradient(x, y) = 1 / (1 + ‖∇I(x, y)‖ / σ), with ‖∇I‖ (...,) and σ > 0 in grey levels per pixel."""
     return 1.0 / (1.0 + gradient_magnitude / sigma)
 
 

@@ -65,15 +65,9 @@ class MotionDepth:
         return float(np.mean([np.mean(depth > 0) for depth in self.depth_m]))
 
     def points(self, rig: Rig) -> FloatArray:
-        """(P, 3) points in the ego frame, metres.
-
-        Args:
-            rig: The rig of the frame.
-        """
-        pairs = zip(rig, self.depth_m, strict=True)
-        return np.concatenate(
-            [points_of_depth(motion_camera(camera), depth.astype(np.float64)) for camera, depth in pairs]
-        )
+        """(P, 3) points in the ego frame, metres, seen by the frame's rig."""
+        pairs = zip(map(motion_camera, rig), self.depth_m, strict=True)
+        return np.concatenate([points_of_depth(camera, depth.astype(np.float64)) for camera, depth in pairs])
 
     def __str__(self) -> str:
         if self.density == 0:
@@ -87,9 +81,6 @@ class _Side(NamedTuple):
     neighbour: Neighbour
     cameras: list[Camera]
     greys: list[Layer]
-
-    def moved(self, move: FloatArray) -> _Side:
-        return self._replace(cameras=[camera.moved(move) for camera in self.cameras])
 
 
 class _Estimate(NamedTuple):
@@ -131,7 +122,7 @@ def motion_depth(
         return MotionDepth(tuple(np.zeros(camera.size, np.float32) for camera in cameras), reason)
 
     sides = []
-    for candidates in _by_side(rig, neighbours):
+    for candidates in _by_side(neighbours):
         side = next((loaded for one in candidates if (loaded := _loaded(one, load)) is not None), None)
         sides += [] if side is None else [side]
     if not sides:
@@ -152,25 +143,20 @@ def motion_depth(
             break
         if correction < MAX_CORRECTIONS:
             words += f"{'; poses corrected by' if correction == 0 else ', then'} {' and '.join(map(str, measured))}"
-            sides = [side.moved(error.correction) for side, error in zip(sides, measured, strict=True)]
+            sides = [
+                side._replace(cameras=[camera.moved(error.correction) for camera in side.cameras])
+                for side, error in zip(sides, measured, strict=True)
+            ]
         elif worst.error_px > MAX_ERROR_PX:
             return declined(f"the pose of frame {sides[measured.index(worst)].neighbour.name} errs by {worst}")
     return MotionDepth(tuple(_depth_m(f, one) for f, one in zip(families, estimates, strict=True)), words)
 
 
-def _by_side(rig: Rig, neighbours: Sequence[Neighbour]) -> tuple[list[Neighbour], list[Neighbour]]:
+def _by_side(neighbours: Sequence[Neighbour]) -> tuple[list[Neighbour], list[Neighbour]]:
     """Split neighbours into those behind the vehicle and those ahead of it, the best travel first."""
-    behind: list[Neighbour] = []
-    ahead: list[Neighbour] = []
-    for one in neighbours:
-        if TRAVEL_M[0] <= one.travel_m <= TRAVEL_M[1]:
-            away_m = float(
-                np.mean([there.center_m[0] - here.center_m[0] for here, there in zip(rig, one.rig, strict=True)])
-            )
-            (ahead if away_m > 0 else behind).append(one)
-    for side in (behind, ahead):
-        side.sort(key=lambda one: (abs(one.travel_m - BEST_TRAVEL_M), one.number))
-    return behind, ahead
+    usable = [one for one in neighbours if TRAVEL_M[0] <= one.travel_m <= TRAVEL_M[1]]
+    usable.sort(key=lambda one: (abs(one.travel_m - BEST_TRAVEL_M), one.number))
+    return [one for one in usable if one.ahead_m <= 0], [one for one in usable if one.ahead_m > 0]
 
 
 def _loaded(neighbour: Neighbour, load: Load) -> _Side | None:

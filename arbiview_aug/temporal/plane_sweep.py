@@ -168,7 +168,7 @@ def _position_lookup_torch(
         return lambda wall: torch.from_numpy(on_cpu(wall)).to(device)
     turn = source.cam2ego[:3, :3].T
     in_source = family.directions @ turn.T, turn @ (family.camera.center_m - source.center_m), source.K
-    rays, offset, K = (torch.from_numpy(a).to(device, torch.float32) for a in in_source)
+    rays, offset, K = (torch.tensor(a, dtype=torch.float32, device=device) for a in in_source)
     road, horizontal = (torch.from_numpy(a).to(device) for a in (family.road, family.horizontal))
 
     def positions(wall: float) -> torch.Tensor:
