@@ -163,6 +163,7 @@ def _render_view(
     detections: Mapping[int, Sequence[Detection]],
 ) -> PaperView:
     size, cameras = target.size, source.cameras
+    # Stage 1.
     homographies = h_geom_of_visible(cameras, target)
     warps: dict[int, Warp] = {}
     for k in order:
@@ -172,6 +173,7 @@ def _render_view(
                 warps[k] = warp
     if not warps:
         return PaperView(torch.zeros(3, *size, dtype=dtype), np.full(size, -1, np.int8), ())
+    # Stages 2 and 3.
     primary = primary_camera(cameras, target, list(warps))
     reference = warps[primary]
     reference_grey = _grey(reference.image)
@@ -198,6 +200,7 @@ def _render_view(
         else:
             objects = declined(features.H_base, "object alignment is switched off")
         results[k] = features, objects
+    # Stage 4.
     for k, (features, objects) in results.items():
         if features.case != "geometric" or objects.shift_px.any():
             warps[k] = warp_perspective(arrays[k], objects.H_aligned, size, cameras[k].mask)

@@ -1,4 +1,4 @@
-"""``quality="paper"``: the published stages joined, alone and in ``RigRetarget``."""
+"""``quality="paper"``: the published stages together, alone and in ``RigRetarget``."""
 
 from dataclasses import fields, replace
 from functools import partial
@@ -12,7 +12,7 @@ from arbiview_aug import CalibrationError, PaperConfig, Rig, RigRetarget, Sample
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.favs.renderer import PaperRendering, paper_labels, primary_camera, render_paper
 from arbiview_aug.favs.stage1_geometry import h_geom
-from arbiview_aug.favs.stage4_fusion import fuse, fusion_weight
+from arbiview_aug.favs.stage4_fusion import fuse
 from arbiview_aug.render.plan import build_plan
 from arbiview_aug.transforms.explain import PaperExplanation
 from tests import helpers
@@ -126,22 +126,6 @@ def test_stage_switches(pair_images) -> None:
     assert report.objects.objects and report.objects.shift_px.any()
 
 
-def test_weights_by_hand() -> None:
-    image = np.zeros((5, 9, 3), np.float32)
-    image[:, 4:] = 64  # Sobel / 8: 64 · 4 / 8 = 32 grey levels a pixel on both sides of the step
-    seen = np.ones((5, 9), bool)
-    only = lambda **on: fusion_weight(image, seen, 0.5, False, replace(OFF, **on))  # noqa: E731
-    gradient = only(use_gradient_weight=True)
-    assert np.allclose(gradient[2, [0, 3, 4, 8]], [1, 1 / 3, 1 / 3, 1])  # σ = 16
-    assert np.allclose(only(use_quality_weight=True), 0.75)
-    assert np.allclose(only(use_distance_weight=True), 1)  # no border, no distance to it
-    assert np.allclose(fusion_weight(image, seen, 0.0, True, replace(OFF, use_primary_weight=True)), 4)
-    seen[:, 0] = False
-    distance = only(use_distance_weight=True)
-    assert np.allclose(distance[2], np.arange(9) / 8)
-    assert np.allclose(fusion_weight(image, seen, 1.0, False, OFF), seen)
-
-
 def test_the_primary_camera() -> None:
     rig = Rig([camera("a", 20), camera("b", -30), camera("c", 5, position_m=(1, 0, 1.5))])
     assert primary_camera(rig, camera("t", 8), [0, 1, 2]) == 0  # c looks nearer, but stands elsewhere
@@ -175,7 +159,7 @@ def test_deterministic_and_independent_of_the_source_order(pair_images) -> None:
 
 
 @pytest.mark.parametrize("kind", ["blank", "saturated", "tiles", "night"])
-def test_degenerate_images_decline_in_words(kind: str) -> None:
+def test_degenerate_images_keep_the_geometry_with_a_reason(kind: str) -> None:
     rng = np.random.default_rng(0)
     image = {
         "blank": np.zeros((3, 240, 400)),
@@ -215,7 +199,7 @@ def test_labels_follow_the_winning_homography(pair_images) -> None:
 
 
 # --- RigRetarget ------------------------------------------------------------------------------------------------------
-def test_rig_retarget_renders_by_it(pair_images) -> None:
+def test_rig_retarget_renders_the_published_stages(pair_images) -> None:
     sample = {
         "images": torch.stack(pair_images),
         "rig": PAIR,
@@ -243,7 +227,7 @@ def test_rig_retarget_renders_by_it(pair_images) -> None:
     assert torch.equal(batch["images"][1], out["images"])
 
 
-def test_explain_says_what_each_stage_did(pair_images) -> None:
+def test_explain_reports_each_stage(pair_images) -> None:
     words = RigRetarget(MIDDLE, quality=PaperConfig(min_matches=5000)).explain({"images": pair_images, "rig": PAIR})
     assert isinstance(words, PaperExplanation) and isinstance(words.rendering, PaperRendering)
     assert "stages 1 to 4 as published" in str(words) and "fewer than 5000; objects:" in str(words)

@@ -195,7 +195,7 @@ def test_a_shifted_source_is_corrected() -> None:
         assert consistency(translation(4, -3), report.H_base, np.array([[700.0, 150.0]])) < 0.3
 
 
-def test_degenerate_images_decline_in_words() -> None:
+def test_degenerate_images_decline_with_a_reason() -> None:
     blank, saturated = np.zeros(SIZE, np.uint8), np.full(SIZE, 255, np.uint8)
     tiles = np.tile(texture(3, (30, 40)), (10, 20))
     dot = blank.copy()
@@ -206,7 +206,7 @@ def test_degenerate_images_decline_in_words() -> None:
     assert run(tiles, moved(tiles, translation(11, 7))).case in ("geometric", "feature", "blended")
 
 
-def test_no_or_narrow_overlap_declines_in_words() -> None:
+def test_no_or_narrow_overlap_declines_with_a_reason() -> None:
     image = texture()
     nothing, sliver = np.zeros((2, *SIZE), bool)
     sliver[:, 795:] = True

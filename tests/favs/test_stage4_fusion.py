@@ -1,8 +1,20 @@
 """FAVS Stage 4: hand-computed weights and the weighted average."""
 
+from dataclasses import fields, replace
+
 import numpy as np
 
-from arbiview_aug.favs.stage4_fusion import distance_weight, fuse, gradient_weight, primary_weight, quality_weight
+from arbiview_aug.favs.config import PaperConfig
+from arbiview_aug.favs.stage4_fusion import (
+    distance_weight,
+    fuse,
+    fusion_weight,
+    gradient_weight,
+    primary_weight,
+    quality_weight,
+)
+
+OFF = PaperConfig(**{f.name: False for f in fields(PaperConfig) if f.name.startswith("use_")})
 
 
 def test_weights_by_hand() -> None:
@@ -11,6 +23,22 @@ def test_weights_by_hand() -> None:
     assert np.allclose(gradient_weight(np.array([0.0, 10.0, 30.0]), 10.0), [1, 0.5, 0.25])
     assert np.allclose(quality_weight(np.array([0.0, 3.0, 0.0]), np.array([2.0, 1.0, 0.5])), [1, 0.25, 0.5])
     assert primary_weight(True, 8.0) == 8.0 and primary_weight(False, 8.0) == 1.0
+
+
+def test_the_product_of_weights_by_hand() -> None:
+    image = np.zeros((5, 9, 3), np.float32)
+    image[:, 4:] = 64  # Sobel / 8: 64 · 4 / 8 = 32 grey levels a pixel on both sides of the step
+    seen = np.ones((5, 9), bool)
+    only = lambda **on: fusion_weight(image, seen, 0.5, False, replace(OFF, **on))  # noqa: E731
+    gradient = only(use_gradient_weight=True)
+    assert np.allclose(gradient[2, [0, 3, 4, 8]], [1, 1 / 3, 1 / 3, 1])  # σ = 16
+    assert np.allclose(only(use_quality_weight=True), 0.75)
+    assert np.allclose(only(use_distance_weight=True), 1)  # no border, no distance to it
+    assert np.allclose(fusion_weight(image, seen, 0.0, True, replace(OFF, use_primary_weight=True)), 4)
+    seen[:, 0] = False
+    distance = only(use_distance_weight=True)
+    assert np.allclose(distance[2], np.arange(9) / 8)
+    assert np.allclose(fusion_weight(image, seen, 1.0, False, OFF), seen)
 
 
 def test_fuse_is_the_weighted_average() -> None:

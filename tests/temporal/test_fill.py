@@ -1,4 +1,4 @@
-"""Holes filled from neighbouring frames: with real pixels, without repainting, and not where something moved."""
+"""Filling holes from neighbouring frames: with real pixels, without repainting, and not beside moved objects."""
 
 from typing import Any
 
@@ -49,7 +49,7 @@ def test_the_current_frame_is_never_repainted(filled: dict[str, Any], alone: dic
         assert same[seen].all(), key
 
 
-def test_outputs_say_where_pixels_come_from(filled: dict[str, Any], alone: dict[str, Any]) -> None:
+def test_outputs_name_the_sources_of_pixels(filled: dict[str, Any], alone: dict[str, Any]) -> None:
     gained = filled["coverage"] & ~alone["coverage"]
     assert gained.float().mean() > 0.05
     assert ((filled["source_frame"] > 0) == gained).all() and int(filled["source_frame"].max()) <= 4
@@ -94,7 +94,7 @@ def test_gradients_reach_the_current_images(sample: dict[str, Any]) -> None:
     assert images.grad is not None and images.grad.isfinite().all() and images.grad.abs().sum() > 0
 
 
-def test_explain_says_what_travel_adds(sample: dict[str, Any], alone: dict[str, Any], filled: dict[str, Any]) -> None:
+def test_explain_lists_each_neighbour(sample: dict[str, Any], alone: dict[str, Any], filled: dict[str, Any]) -> None:
     explanation = RigRetarget(low()).explain(sample)
     shares = [entry["filled"] for entry in explanation.as_dict()]
     gained = (filled["coverage"] & ~alone["coverage"]).float().mean((1, 2)).tolist()
@@ -105,7 +105,7 @@ def test_explain_says_what_travel_adds(sample: dict[str, Any], alone: dict[str, 
 
 @pytest.mark.slow
 def test_a_labelled_object_is_not_read(sample: dict[str, Any], alone: dict[str, Any]) -> None:
-    """A box over all that a neighbour sees of the road: then, nothing of it may fill anything."""
+    """Boxes over the whole road that a neighbour sees leave little to fill with."""
     wall = torch.tensor([[-8.0, 0.0, 1.0, 6.0, 40.0, 2.0, 0.0], [9.0, 0.0, 1.0, 6.0, 40.0, 2.0, 0.0]])
     everywhere = [
         n | {"boxes_3d": torch.cat([wall, wall + torch.tensor([0, 9, 0, 0, 0, 0, 1.57])])} for n in sample["neighbours"]
@@ -173,14 +173,14 @@ def test_two_that_contradict_each_other_leave_a_hole() -> None:
         assert (chosen[16:] == -1).all() and (chosen[8:10] == 0).all()
 
 
-def test_where_labels_vouch_the_majority_is_believed() -> None:
+def test_with_labels_the_majority_decides() -> None:
     for risk in ChangeRisk:
         several = [passing(200, risk), candidate(90, risk=risk), candidate(92, risk=risk)]
         _, chosen = merged(HOLE, FREE, SEAM, several, 2)
         assert (chosen[16:] == (1 if risk == ChangeRisk.NONE else -1)).all()
 
 
-def test_one_alone_is_believed_unless_something_moved_beside_it() -> None:
+def test_a_single_candidate_is_accepted_unless_something_moved_beside_it() -> None:
     nothing = torch.zeros(H, W, dtype=torch.bool)
     for risk in ChangeRisk:
         several = [candidate(90, risk=risk), candidate(90, shows=nothing), candidate(90, shows=nothing)]
@@ -196,8 +196,8 @@ def test_without_labels_two_of_one_side_are_not_enough() -> None:
         assert (chosen[16:] == (0 if several[2] is not nothing else -1)).all()
 
 
-def test_what_is_there_before_and_after_stood_still() -> None:
-    """Whatever farther frames show: a lorry may pass for as long as they last."""
+def test_agreement_before_and_after_means_static() -> None:
+    """Farther frames do not matter: a lorry may pass during all of them."""
     lorry = [passing(200), passing(200), passing(200, later=True)]
     _, chosen = merged(HOLE, FREE, SEAM, [candidate(90), candidate(90, later=True), *lorry], 2)
     assert (chosen[16:] == 0).all()
@@ -205,7 +205,7 @@ def test_what_is_there_before_and_after_stood_still() -> None:
     assert (chosen[16:] == -1).all()
 
 
-def test_what_the_current_frame_alone_shows_goes_on_into_the_hole() -> None:
+def test_an_arrived_object_continues_into_the_hole() -> None:
     view = HOLE.clone()
     view[:, 4:8, :16] = 200
     for risk in ChangeRisk:
@@ -215,16 +215,16 @@ def test_what_the_current_frame_alone_shows_goes_on_into_the_hole() -> None:
         assert (chosen[8:, :14] == (-1 if risk == ChangeRisk.UNLABELLED else 0)).all()
 
 
-def test_an_exposure_that_is_another_object_is_not_taken_on() -> None:
-    """What passes at the seam of one neighbour alone neither recolours the road nor outvotes the others."""
+def test_an_implausible_exposure_is_rejected() -> None:
+    """An object at the seam of one neighbour does not recolour the road."""
     blue = candidate(90, risk=ChangeRisk.NONE)
     blue.image[:, :8] = torch.tensor([20, 40, 100], dtype=torch.uint8)[:, None, None]
     pixels, _ = merged(HOLE, FREE, SEAM, [blue], 2)
     assert (pixels[:, FREE] == 90).all()
 
 
-def test_a_neighbour_without_a_seam_follows_those_that_have_one() -> None:
-    """A camera twice as bright that sees the far half of the hole alone and the near one with another."""
+def test_a_neighbour_without_a_seam_takes_the_exposure_of_others() -> None:
+    """A camera twice as bright sees the far half of the hole alone, and overlaps another one."""
     near, far = torch.ones(H, W, dtype=torch.bool), torch.zeros(H, W, dtype=torch.bool)
     near[18:], far[10:] = False, True
     several = [candidate(90, risk=ChangeRisk.NONE, shows=near), candidate(180, risk=ChangeRisk.NONE, shows=far)]

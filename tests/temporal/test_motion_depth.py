@@ -1,4 +1,4 @@
-"""Depth from motion on streets that stand still: how right, how dense, and when it declines."""
+"""Depth from motion on static streets: accuracy, density, and when it declines."""
 
 from typing import Any
 
@@ -43,7 +43,7 @@ def found(sample: dict[str, Any], **changes: Any) -> MotionDepth:
 
 
 def turned(sample: dict[str, Any], degrees: float) -> dict[str, Any]:
-    """With neighbours whose poses are wrong."""
+    """Turn the neighbours' poses."""
     entries = []
     for k, entry in enumerate(sample["neighbours"]):
         pose = entry["ego2world"].numpy().copy()
@@ -53,8 +53,8 @@ def turned(sample: dict[str, Any], degrees: float) -> dict[str, Any]:
 
 
 def right(drive: SyntheticDrive, depth: MotionDepth) -> tuple[float, float]:
-    """Share of the pixels nearer than 80 m, 6 degrees off the motion, that have a depth; and of those that are within a
-    tenth of the truth."""
+    """Share of pixels with a depth, among those nearer than 80 m and 6 degrees off the motion; and the share of these
+    within a tenth of the truth."""
     kept = good = pixels = 0
     for camera, one, true in zip(drive.rig, depth.depth_m, drive.render(1).depth_m, strict=True):
         rays, _ = camera.unproject(camera.pixel_grid())
@@ -77,10 +77,12 @@ def test_most_pixels_have_the_right_depth(drive: SyntheticDrive, exact: MotionDe
 
 
 @pytest.mark.slow
-def test_wrong_poses_are_mended_or_declined(drive: SyntheticDrive, sample: dict[str, Any], exact: MotionDepth) -> None:
-    mended = found(turned(sample, 0.3))
-    assert "poses corrected by" in mended.words
-    density, share = right(drive, mended)
+def test_wrong_poses_are_corrected_or_declined(
+    drive: SyntheticDrive, sample: dict[str, Any], exact: MotionDepth
+) -> None:
+    corrected = found(turned(sample, 0.3))
+    assert "poses corrected by" in corrected.words
+    density, share = right(drive, corrected)
     assert density > right(drive, exact)[0] - 0.05 and share > 0.9
     lost = found(turned(sample, 4.0))
     assert lost.density == 0 and "the static street stands" in str(lost)
@@ -88,7 +90,7 @@ def test_wrong_poses_are_mended_or_declined(drive: SyntheticDrive, sample: dict[
 
 
 @pytest.mark.slow
-def test_one_side_is_asked_twice(drive: SyntheticDrive, sample: dict[str, Any]) -> None:
+def test_one_side_is_confirmed_by_matching_back(drive: SyntheticDrive, sample: dict[str, Any]) -> None:
     density, share = right(drive, found({**sample, "neighbours": sample["neighbours"][:1]}))
     assert density > 0.4 and share > 0.85
 
@@ -132,7 +134,7 @@ def test_as_a_surface(drive: SyntheticDrive, sample: dict[str, Any], exact: Moti
     assert "over the motion surface" in str(motion.explain(sample))
 
 
-def test_where_it_is_declined_the_street_stands_with_a_warning(sample: dict[str, Any]) -> None:
+def test_the_street_replaces_declined_depth_with_a_warning(sample: dict[str, Any]) -> None:
     target = SIDE.shifted(y_m=0.5)
     motion = RigRetarget(target, surface="motion")
     with pytest.warns(UserWarning, match="depth from motion: none, no frame .* the static street stands"):
@@ -140,7 +142,7 @@ def test_where_it_is_declined_the_street_stands_with_a_warning(sample: dict[str,
     assert torch.equal(out["images"], RigRetarget(target, surface="street")(sample | {"neighbours": []})["images"])
 
 
-def test_what_it_needs_is_said(sample: dict[str, Any]) -> None:
+def test_messages(sample: dict[str, Any]) -> None:
     bare = {key: value for key, value in sample.items() if key != "neighbours"}
     motion = RigRetarget(SIDE.shifted(y_m=0.5), surface="motion")
     with pytest.raises(SampleError, match=r"surface='motion': expected 'neighbours' .* 'motion_depth_m'"):

@@ -1,4 +1,4 @@
-"""The sweep: families of surfaces, and one score on the CPU and on any device."""
+"""Plane sweep: the family of surfaces, and equal scores on the CPU and on any device."""
 
 from functools import partial
 
@@ -89,7 +89,7 @@ def test_images_are_halved_to_about_400_px() -> None:
 
 
 def test_aggregation_is_semi_global_matching_along_four_paths() -> None:
-    """Against a loop that does one pixel and one hypothesis at a time."""
+    """Against a naive loop over pixels and hypotheses."""
     rng = np.random.default_rng(0)
     scores = rng.uniform(-1, 1, (5, 4, 6)).astype(np.float32)
     K, h, w = scores.shape
