@@ -40,12 +40,8 @@ _FLUSHES = 16  # files flushed in parallel: 3 ms for 16 files of 100 kB on ext4,
 def check_name(name: Any, what: str) -> None:
     """Refuse a name, relative to a folder, that no file below it can have, without disk access.
 
-    Args:
-        name: Relative to the folder.
-        what: The origin of the name for errors: data set, table and row.
-
-    Raises:
-        DataError: Not a string, an absolute name, one with ``..``, or one that file systems cannot hold.
+    Absolute names and ``..`` are refused, as are names that file systems cannot hold. ``what`` is the origin of the
+    name for errors: data set, table and row.
     """
     try:
         coded = name.encode()
@@ -63,14 +59,9 @@ def check_name(name: Any, what: str) -> None:
 
 
 def inside(root: Path, name: Any, what: str) -> Path:
-    """The path of a file below a folder, with its links; it need not exist.
+    """The path of a file below a folder, checked by ``check_name``; it need not exist.
 
-    Args:
-        root: The folder, which may itself be a link.
-        name, what: As for ``check_name``.
-
-    Raises:
-        DataError: Another name, a link that leaves the folder, or neither a file nor a folder.
+    Links that leave the folder are refused, as are pipes, sockets and devices. The folder itself may be a link.
     """
     check_name(name, what)
     path, at, mode = root / name, str(root), stat.S_IFDIR
@@ -116,9 +107,7 @@ def file_name(token: str) -> str:
 def whole_file(path: Path, owner: str = "") -> Iterator[BinaryIO]:
     """Open a binary file that replaces ``path`` when the block ends, and is removed if the block fails.
 
-    Args:
-        path: The file; its folder is created.
-        owner: Letters or digits in the temporary file's name, for ``remove_parts``.
+    ``owner``, letters or digits, is part of the temporary file's name, for ``remove_parts``. The folder is created.
 
     Raises:
         OutputError: It cannot be written: a full disk, no permission.

@@ -80,7 +80,7 @@ class Camera:
         mask: (H, W) bool, True where the scene is seen, False on the own car's body.
 
     Raises:
-        CalibrationError: With the camera's name, what was expected, what came and how to mend it.
+        CalibrationError: An impossible value; the message names the camera and the fix.
     """
 
     name: str

@@ -28,16 +28,13 @@ def adjacent_pairs(rig: Rig) -> list[tuple[int, int]]:
 
 
 def half_way_view(a: Camera, b: Camera, size: tuple[int, int] = VIEW_SIZE) -> Camera:
-    """The pinhole camera between two: mean centre, half-way rotation, the narrower camera's K scaled to ``size``.
-
-    K is scaled by diag(s_x, s_y, 1), without the half pixel of a resize: the view is not a resized image.
-    """
+    """The pinhole camera between two: mean centre, half-way rotation, the narrower camera's K scaled to ``size``."""
     between = a.cam2ego[:3, :3].T @ b.cam2ego[:3, :3]
     cam2ego = np.eye(4)
     cam2ego[:3, :3] = a.cam2ego[:3, :3] @ cv2.Rodrigues(cv2.Rodrigues(between)[0] / 2)[0]
     cam2ego[:3, 3] = (a.center_m + b.center_m) / 2
     narrower = max((a, b), key=lambda c: c.K[0, 0] / c.width_px)
-    scale = np.diag([size[1] / narrower.width_px, size[0] / narrower.height_px, 1.0])
+    scale = np.diag([size[1] / narrower.width_px, size[0] / narrower.height_px, 1.0])  # by protocol, no half pixel
     return Camera(name=f"{a.name}+{b.name}", width_px=size[1], height_px=size[0], K=scale @ narrower.K, cam2ego=cam2ego)
 
 

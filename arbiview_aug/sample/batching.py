@@ -22,11 +22,7 @@ def leading_shape(images: Any) -> tuple[int, ...]:
 
 
 def split(value: Any, lead: tuple[int, ...]) -> list[Any]:
-    """The entries of each frame, from a (*lead, ...) tensor or a list of (*lead, ...) tensors, one per camera.
-
-    Raises:
-        ValueError: Other leading dimensions.
-    """
+    """The entries of each frame, from a (*lead, ...) tensor or a list of (*lead, ...) tensors, one per camera."""
     if not lead:
         return [value]
     if isinstance(value, list | tuple):

@@ -139,14 +139,11 @@ def _of_camera(camera: Camera, boxes: FloatArray) -> ImageBoxes:
     rows = np.array(list(outlines), np.int64)
     uncut, inside = np.array(list(outlines.values())).reshape(-1, 2, 4).swapaxes(0, 1)
     uncut_px, inside_px = (np.prod(rectangles[:, 2:] - rectangles[:, :2], axis=1) for rectangles in (uncut, inside))
-    return ImageBoxes(rows, inside, 1 - inside_px / uncut_px, _visibility(camera, boxes[rows]))
-
-
-def _visibility(camera: Camera, boxes: FloatArray) -> FloatArray:
-    """(n,) visible share of each box's pixels."""
-    covered = np.array([len(np.unique(pixels)) for pixels in silhouettes(camera, boxes)], np.float64)
-    shown = BoxSurface(Far(), boxes).drawn(camera)
-    nearest = shown.face // 6
+    boxes = boxes[rows]
+    silhouette_px = np.array([len(np.unique(pixels)) for pixels in silhouettes(camera, boxes)], np.float64)
+    fragments = BoxSurface(Far(), boxes).drawn(camera)
+    nearest = fragments.face // 6
     if camera.mask is not None:
-        nearest = nearest[camera.mask.reshape(-1)[shown.pixel]]
-    return np.bincount(nearest, minlength=len(boxes)) / np.maximum(covered, 1)
+        nearest = nearest[camera.mask.reshape(-1)[fragments.pixel]]
+    visible_px = np.bincount(nearest, minlength=len(boxes))
+    return ImageBoxes(rows, inside, 1 - inside_px / uncut_px, visible_px / np.maximum(silhouette_px, 1))

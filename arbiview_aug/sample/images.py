@@ -28,12 +28,7 @@ def check_container(images: Any) -> None:
 
 
 def checked_images(images: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
-    """The images of one frame: N tensors (3, H, W), uint8 or float in [0, 1], of one dtype and device.
-
-    Raises:
-        SampleError: No image, another shape, values out of range, mixed dtypes or devices.
-        SampleTypeError: Another dtype or layout, or a meta tensor.
-    """
+    """The images of one frame: N tensors (3, H, W), uint8 or float in [0, 1], of one dtype and device."""
     if len(images) == 0:
         raise SampleError("images: expected at least one image, got none")
     for k, image in enumerate(images):

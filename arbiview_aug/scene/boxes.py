@@ -78,7 +78,7 @@ class BoxSurface(LayeredSurface):
         return self._shadows[camera]
 
     def facing(self, origin: FloatArray, face: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int32], FloatArray]:
-        """The boxes of faces (n,), and by how many metres ``origin`` lies before the faces' planes; see ``solids``."""
+        """The boxes of faces (n,), and the distances of ``origin`` in front of the faces' planes, metres."""
         before_m = np.empty((len(self.boxes), 6))
         local, half = _in_box_frames(self.boxes, origin), self.boxes[:, 3:6] / 2
         before_m[:, 0::2], before_m[:, 1::2] = -local - half, local - half
@@ -226,20 +226,16 @@ def _in_box_frames(boxes: FloatArray, origin: FloatArray) -> FloatArray:
 
 
 def checked_boxes(boxes: Any) -> FloatArray:
-    """(B, 7) float64 boxes of a sample.
-
-    Raises:
-        SampleError: Another shape, numbers that are not finite, negative sizes.
-    """
+    """(B, 7) float64 boxes of a sample; refuse other shapes, numbers that are not finite, and sizes up to 0."""
     array = np.asarray(boxes.detach().cpu() if hasattr(boxes, "detach") else boxes, dtype=np.float64)
     if array.size == 0:
         return np.zeros((0, 7))
     if array.ndim != 2 or array.shape[1] < 7:
-        expected = "(B, >= 7): centre x y z, length, width, height, yaw"
-        raise SampleError(f"boxes_3d: expected shape {expected}, got {array.shape}")
+        raise SampleError(f"boxes_3d: expected shape (B, >= 7): x y z, length, width, height, yaw, got {array.shape}")
     array = array[:, :7]
-    if not np.isfinite(array).all() or (array[:, 3:6] <= 0).any():
-        bad = int(np.flatnonzero(~np.isfinite(array).all(1) | (array[:, 3:6] <= 0).any(1))[0])
+    valid = np.isfinite(array).all(axis=1) & (array[:, 3:6] > 0).all(axis=1)
+    if not valid.all():
+        bad = int(valid.argmin())
         raise SampleError(f"boxes_3d[{bad}]: expected finite numbers and positive sizes, got {array[bad].tolist()}")
     return array
 

@@ -33,9 +33,6 @@ def points_of_depth(camera: Camera, depth_m: FloatArray, key: str = "depth_m") -
     """(P, 3) ego-frame points of a depth map (H, W): z along the optical axis, metres; 0, NaN and inf are unknown.
 
     Pixels closer together than a panorama's cells are skipped, as are masked ones.
-
-    Raises:
-        SampleError: A map of another size than the camera's.
     """
     if depth_m.shape != camera.size:
         raise SampleError(f"{key}: camera {camera.name!r}: expected a map of {camera.size}, got {depth_m.shape}")
