@@ -1,4 +1,4 @@
-"""Cross-view attention: the gathered reference against a naive loop, the dense path against it, extremes."""
+"""Cross-view attention: against a naive loop, and extremes."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
-from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.generator.attention import HEAD_WIDTH, CrossViewAttention, PositionalEncoding, pays_dense
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.generator.attention import HEAD_WIDTH, CrossViewAttention, PositionalEncoding
 from arbiview_aug.generator.correspondence import TokenWindow, correspondences, stacked, window
 from tests.generator.small import ring, stirred
 
@@ -49,16 +49,16 @@ def test_the_encoding_is_float32_under_autocast() -> None:
     assert PositionalEncoding()(far.bfloat16()).dtype == torch.float32
 
 
-def test_turned_queries_see_the_offset() -> None:
+def test_rotated_queries_see_the_offset() -> None:
     encoding = PositionalEncoding()
     rng = torch.Generator().manual_seed(0)
     q = torch.randn(5, 3, HEAD_WIDTH, generator=rng)
     a, b = 20 * torch.rand(5, 2, generator=rng), 20 * torch.rand(5, 2, generator=rng)
     expected = (q * encoding(a - b)[:, None]).sum(-1)
-    assert torch.allclose((encoding.turned(q, b) * encoding(a)[:, None]).sum(-1), expected, atol=1e-4)
+    assert torch.allclose((encoding.rotate_queries(q, b) * encoding(a)[:, None]).sum(-1), expected, atol=1e-4)
 
 
-def test_gathered_attention_is_the_formula() -> None:
+def test_attention_is_the_formula() -> None:
     """Attention(Q_i, K_j, V_j) = Σ_l w_l Attention^(l), token by token, tap by tap."""
     rig = Rig([c.shifted(z_m=0.1 * k) for k, c in enumerate(ring(4, horizontal_fov_deg=110))])
     h, w = size = (4, 6)
@@ -66,7 +66,7 @@ def test_gathered_attention_is_the_formula() -> None:
     x = features(at, 4)
     keys, values = layer.keys_values(x)
     with torch.no_grad():
-        got, rows = layer(x, keys, values, at, dense=False, with_rows=True)
+        got, rows = layer(x, keys, values, at, with_rows=True)
         queries = layer.to_q(layer.norm(x))
         reads = correspondences(list(rig), list(rig), range(4), [size], 0.0)[0]
         w_l = torch.softmax(layer.level_logits, 0)
@@ -117,69 +117,23 @@ def test_gathered_attention_is_the_formula() -> None:
     assert torch.allclose(rows, order, atol=1e-5)
 
 
-@pytest.mark.parametrize("case", ["turned", "ring", "nuscenes", "one centre"])
-def test_dense_attention_equals_gathered_attention(case: str) -> None:
-    rigs = {
-        "turned": Rig([c.turned(yaw_deg=3 * k) for k, c in enumerate(ring(3, radius_m=0.2, horizontal_fov_deg=120))]),
-        "ring": ring(6),
-        "nuscenes": load_rig("nuscenes"),
-        "one centre": ring(5, radius_m=0.0),
-    }
-    rig = rigs[case]
-    at, layer = windows(rig, (5, 9), copies=2), block()
-    x = features(at, len(rig))
-    with torch.no_grad():
-        keys, values = layer.keys_values(x)
-        gathered = layer(x, keys, values, at, dense=False)[0]
-        dense = layer(x, keys, values, at, dense=True)[0]
-    assert at.valid.any()
-    assert (gathered - x).abs().max() > 0.1
-    assert (gathered - dense).abs().max() <= 1e-5
-
-
-def test_both_ways_have_the_same_gradients() -> None:
-    rig = ring(4, horizontal_fov_deg=110)
-    at = windows(rig, (4, 6))
-    x = features(at, 4)
-    found = []
-    for dense in (False, True):
-        layer = block()
-        y, _ = layer(x, *layer.keys_values(x), at, dense=dense)
-        y.square().mean().backward()
-        found.append([parameter.grad for parameter in layer.parameters()])
-    for one, other in zip(*found, strict=True):
-        assert torch.allclose(one, other, atol=1e-5)
-
-
-def test_which_way_pays() -> None:
-    """Views that lie almost on each other on a small grid; never a ring, never a large grid (times in the module)."""
-    together = Rig([c.turned(yaw_deg=k) for k, c in enumerate([ring(1)[0]] * 1)] + [
-        ring(1, name="d")[0].turned(yaw_deg=2), ring(1, name="e")[0].turned(yaw_deg=-2)
-    ])  # fmt: skip
-    assert pays_dense(windows(together, (7, 13)))
-    assert not pays_dense(windows(together, (28, 50)))
-    assert not pays_dense(windows(ring(6), (7, 13)))
-
-
 def test_zero_initialised_it_changes_nothing() -> None:
     torch.manual_seed(0)
     rig = ring(6)
     at, layer = windows(rig, (5, 9)), CrossViewAttention(WIDTH, 3)
     x = features(at, 6)
-    for dense in (False, True):
-        assert torch.equal(layer(x, *layer.keys_values(x), at, dense=dense)[0], x)
+    assert torch.equal(layer(x, *layer.keys_values(x), at)[0], x)
 
 
-@pytest.mark.parametrize("dense", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_what_no_view_overlaps_is_returned_bit_for_bit(dense: bool, dtype: torch.dtype) -> None:
+def test_what_no_view_overlaps_is_returned_bit_for_bit(dtype: torch.dtype) -> None:
     """With trained weights: a rig whose cameras look apart, and the tokens of a ring outside the overlap."""
     layer = block().to(dtype)
     for rig in (ring(4, horizontal_fov_deg=60), ring(6, horizontal_fov_deg=80), ring(1)):
         at = windows(rig, (4, 7))
         x = features(at, len(rig)).to(dtype)
         with torch.no_grad():
-            y = layer(x, *layer.keys_values(x), at, dense=dense)[0]
+            y = layer(x, *layer.keys_values(x), at)[0]
         assert torch.isfinite(y).all()
         assert torch.equal(y[~at.read], x[~at.read])
         if len(rig) == 6:
@@ -188,12 +142,11 @@ def test_what_no_view_overlaps_is_returned_bit_for_bit(dense: bool, dtype: torch
             assert not at.read.any()
 
 
-@pytest.mark.parametrize("dense", [False, True])
-def test_every_parameter_has_a_finite_gradient_even_where_nothing_overlaps(dense: bool) -> None:
+def test_every_parameter_has_a_finite_gradient_even_where_nothing_overlaps() -> None:
     layer = block()
     at = windows(ring(4, horizontal_fov_deg=60), (3, 5))
     x = features(at, 4).requires_grad_()
-    y, rows = layer(x, *layer.keys_values(x), at, dense=dense, with_rows=True)
+    y, rows = layer(x, *layer.keys_values(x), at, with_rows=True)
     (y.sum() + rows.sum()).backward()
     for name, parameter in layer.named_parameters():
         assert parameter.grad is not None and torch.isfinite(parameter.grad).all(), name

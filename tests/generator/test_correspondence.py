@@ -16,8 +16,8 @@ from arbiview_aug.generator.correspondence import (
     Correspondence,
     correspond,
     correspondences,
-    homography,
     plane_vectors,
+    ray_map,
     stacked,
     token_sizes,
     window,
@@ -39,6 +39,11 @@ def found(query: Camera, key: Camera, ground_z_m: float = 0.0, grid: tuple[int, 
     small = query.resize(grid)
     planes = plane_vectors(query, ground_z_m)
     return correspond(query, small.unproject_cam(small.pixel_grid()), key.resize(grid), planes)
+
+
+def homography(query: Camera, key: Camera, plane: np.ndarray) -> np.ndarray:
+    """H_ij = K_j (R + t nᵀ/d) K_i⁻¹ of two pinhole cameras."""
+    return key.K @ ray_map(query, key, plane) @ np.linalg.inv(query.K)
 
 
 def points_on_planes(query: Camera, ground_z_m: float, grid: tuple[int, int]) -> np.ndarray:
@@ -173,7 +178,7 @@ def test_the_smallest_grids(grid: tuple[int, int]) -> None:
     rig = ring(12)
     for reads in correspondences(list(rig), list(rig), range(12), token_sizes(grid, 3), 0.0):
         at = window(reads, 12)
-        assert torch.isfinite(reads.centre).all() and torch.isfinite(at.bias()).all()
+        assert torch.isfinite(reads.centre).all()
         assert ((at.tap >= 0) & (at.tap < 12 * reads.valid[0, 0, 0, 0].numel())).all()
         assert bool(at.inside[:, 4].all())  # the nearest token is always there
 

@@ -154,7 +154,7 @@ def test_any_number_of_views_on_the_smallest_grids_is_finite(
     for size in ((1, 1), (1, 2), (3, 5)):
         config = small_config(image_size=size)
         geometry = frame_geometry(list(ring(count, name="t", yaw_deg=3)), list(ring(count)), 0.0, config)
-        assert [w.size for w in geometry.target_windows()] == token_sizes(size, 2)
+        assert [w.valid.shape[-1] for w in geometry.target_windows()] == [h * w for h, w in token_sizes(size, 2)]
         with torch.no_grad():
             out = run(denoiser, geometry)
         assert out.shape == (1, count, 3, *size) and torch.isfinite(out).all()
