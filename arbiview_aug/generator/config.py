@@ -2,16 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Literal, TypeVar
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, is_dataclass
+from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
-from arbiview_aug.errors import GeneratorError
+from arbiview_aug.errors import ArbiviewError, GeneratorError
 from arbiview_aug.generator.correspondence import FACING_M
 
 Prediction = Literal["epsilon", "v_prediction"]
 
 
+# --- checks and plain data --------------------------------------------------------------------------------------------
+def check_fields(
+    config: Any,
+    expected: str,
+    valid: Callable[[Any], bool],
+    *names: str,
+    error: type[ArbiviewError] = GeneratorError,
+) -> None:
+    """Raise ``error`` for the first of these fields of a dataclass whose value is not valid."""
+    for name in names:
+        value = getattr(config, name)
+        if not valid(value):
+            raise error(f"{type(config).__name__}.{name}: expected {expected}, got {value!r}")
+
+
+_Config = TypeVar("_Config")
+
+
+def from_plain(kind: type[_Config], data: Any, where: str, error: type[ArbiviewError] = GeneratorError) -> _Config:
+    """Build a dataclass, and those nested in it, from plain data; ``where`` comes first in errors.
+
+    Raises:
+        ArbiviewError: Of type ``error``: unknown or missing keys. Impossible values raise the dataclass's own.
+    """
+    if not isinstance(data, Mapping):
+        raise error(f"{where}: expected a mapping, got {type(data).__name__}")
+    hints = get_type_hints(kind)
+    unknown = sorted(set(data) - set(hints))
+    if unknown:
+        raise error(f"{where}: expected keys among {', '.join(sorted(hints))}, got {', '.join(unknown)}")
+    values: dict[str, Any] = {}
+    for key, value in data.items():
+        nested = next((part for part in (hints[key], *get_args(hints[key])) if is_dataclass(part)), None)
+        if nested is not None and value is not None:
+            value = from_plain(nested, value, f"{where}: {key}", error)  # type: ignore[arg-type]
+        values[key] = tuple(value) if isinstance(value, list) else value
+    try:
+        return kind(**values)
+    except TypeError as missing:
+        raise error(f"{where}: {missing}") from None
+
+
+# --- the settings -----------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, kw_only=True)
 class UNetConfig:
     """The U-Net, in the terms of diffusers' ``UNet2DConditionModel``."""
@@ -23,7 +66,7 @@ class UNetConfig:
     """Whether a level has self- and cross-attention inside its blocks."""
 
     cross_view: tuple[bool, ...] = ()
-    """Whether views read each other at a level; at all levels where empty. The finest costs most."""
+    """Whether views read each other at a level; empty: at all. The finest costs most."""
 
     layers: int = 2
     """Residual layers of an encoder block; decoder blocks have one more."""
@@ -32,23 +75,18 @@ class UNetConfig:
     """Width of the cross-attention context: 768 in Stable Diffusion 1.x."""
 
     heads: tuple[int, ...] = ()
-    """Heads of the attention inside the blocks; of 32 channels each where empty."""
+    """Heads of the attention inside the blocks; empty: 32 channels each."""
 
     norm_groups: int = 32
     """Groups of the group norms."""
 
     def __post_init__(self) -> None:
-        if not self.widths or any(width % 32 or width <= 0 for width in self.widths):
-            raise GeneratorError(f"UNetConfig.widths: expected multiples of 32, got {self.widths}")
-        if len(self.transformers) != len(self.widths):
-            raise GeneratorError(
-                f"UNetConfig.transformers: expected {len(self.widths)} values, got {self.transformers}"
-            )
-        if self.cross_view and (len(self.cross_view) != len(self.widths) or not any(self.cross_view)):
-            expected = f"{len(self.widths)} values, one of them true"
-            raise GeneratorError(f"UNetConfig.cross_view: expected {expected}, got {self.cross_view}")
-        if any(width % self.norm_groups for width in self.widths):
-            raise GeneratorError(f"UNetConfig.norm_groups: expected a divisor of {self.widths}, got {self.norm_groups}")
+        widths, count = self.widths, len(self.widths)
+        check_fields(self, "multiples of 32", lambda w: w and all(n > 0 and n % 32 == 0 for n in w), "widths")
+        check_fields(self, f"{count} values", lambda t: len(t) == count, "transformers")
+        expected = f"{count} values, one of them true"
+        check_fields(self, expected, lambda c: not c or (len(c) == count and any(c)), "cross_view")
+        check_fields(self, f"a divisor of {widths}", lambda g: not any(w % g for w in widths), "norm_groups")
 
     def arguments(self, in_channels: int, out_channels: int) -> dict[str, Any]:
         """Arguments of ``UNet2DConditionModel``."""
@@ -60,43 +98,38 @@ class UNetConfig:
             "block_out_channels": self.widths,
             "layers_per_block": self.layers,
             "cross_attention_dim": self.context_width,
-            "attention_head_dim": self.heads
-            or tuple(width // 32 for width in self.widths),  # diffusers' name for heads
+            "attention_head_dim": self.heads or tuple(w // 32 for w in self.widths),  # diffusers' name for heads
             "norm_num_groups": self.norm_groups,
         }
 
 
 @dataclass(frozen=True, kw_only=True)
 class AutoencoderConfig:
-    """The autoencoder between images and latents: diffusers' ``AutoencoderKL``, or none."""
+    """The autoencoder between images and latents: diffusers' ``AutoencoderKL``, or squares of pixels without one."""
 
     widths: tuple[int, ...] = ()
-    """Channels of each level; one level less than halvings. Empty: latents are squares of pixels, nothing is lost."""
+    """Channels of each level, one level more than halvings; empty: squares of pixels, which lose nothing."""
 
     patch: int = 1
-    """Side of those squares: what a latent pixel holds without an ``AutoencoderKL``."""
+    """Side of the square of pixels in a latent pixel, without an ``AutoencoderKL``."""
 
     layers: int = 2
     """Residual layers of an encoder block."""
 
     latent_channels: int = 3
-    """Channels of a latent; of squares of pixels all their values, 3 patch²."""
+    """Channels of a latent; 3 patch² for squares of pixels."""
 
     norm_groups: int = 16
     """Groups of the group norms."""
 
     scale: float = 1.0
-    """What latents are multiplied by to have about unit variance; set from the data once it is trained."""
+    """Factor that gives latents unit variance; set from the data after training."""
 
     def __post_init__(self) -> None:
-        if self.patch < 1 or (self.widths and self.patch != 1):
-            raise GeneratorError(f"AutoencoderConfig.patch: expected 1, or more without widths, got {self.patch}")
-        pixels = 3 * self.patch**2
-        if not self.widths and self.latent_channels != pixels:
-            raise GeneratorError(f"AutoencoderConfig: pixels have {pixels} latent channels, got {self.latent_channels}")
-        if any(width % self.norm_groups for width in self.widths):
-            groups = self.norm_groups
-            raise GeneratorError(f"AutoencoderConfig.norm_groups: expected a divisor of {self.widths}, got {groups}")
+        widths, pixels = self.widths, 3 * self.patch**2
+        check_fields(self, "1, or more without widths", lambda p: p == 1 or (p > 1 and not widths), "patch")
+        check_fields(self, f"{pixels}, 3 patch²", lambda c: widths or c == pixels, "latent_channels")
+        check_fields(self, f"a divisor of {widths}", lambda g: not any(w % g for w in widths), "norm_groups")
 
     @property
     def factor(self) -> int:
@@ -130,17 +163,17 @@ class GeneratorConfig:
     autoencoder: AutoencoderConfig = field(default_factory=AutoencoderConfig)
 
     prediction: Prediction = "v_prediction"
-    """What the denoiser predicts."""
+    """Output of the denoiser."""
 
     zero_snr: bool = True
-    """Nothing of the image is left at t = 999; never with ε."""
+    """Zero terminal SNR: nothing of the image is left at t = 999; never with ε."""
 
     residual: bool = True
-    """What is diffused is what the pre-filled condition lacks of the image, see ``Denoiser``; never with ε. The first
-    of several steps is then the regression, whose result is put back into noise."""
+    """Diffuse the difference between the image and the pre-filled condition, see ``Denoiser``; never with ε. The first
+    of several steps is then the regression, whose result is noised again."""
 
     prefilled: bool = True
-    """Holes of the condition are filled by Telea's inpainting; else they are mid-grey, as Algorithm 1 has them."""
+    """Fill holes of the condition by Telea's inpainting; else they are mid-grey, as in Algorithm 1."""
 
     one_step: bool = True
     """Whether the one-step regression was trained."""
@@ -152,37 +185,32 @@ class GeneratorConfig:
     """Tokens of the empty prompt's embedding."""
 
     facing_m: float = FACING_M
-    """Distance of the plane that faces the camera, among the depth levels."""
+    """Distance of the depth level that faces the camera."""
 
     steps: int = 4
     """Denoising steps; 1 is the one-step regression."""
 
     guidance: float = 1.0
-    """Classifier-free guidance; 1 is none, and half the time."""
+    """Classifier-free guidance; 1 is none and takes half the time."""
 
     guidance_rescale: float = 0.7
-    """φ of the rescaled guidance, where there is guidance."""
+    """φ of the rescaled guidance (Lin et al. 2023)."""
 
     strength: float = 1.0
-    """Share of the diffusion that pre-filled latents are noised by: 0.6 starts at t = 599. Residual generators start
-    from 1, which scored best in PSNR and gradient energy."""
+    """Share of the diffusion by which pre-filled latents are noised: 0.6 starts at t = 599."""
 
     temperature: float = 0.5
-    """Standard deviation of the noise that a sample starts from; lower is smoother and scores higher in PSNR, since at
-    1 a perfect sampler is 3 dB below the posterior's mean."""
+    """Standard deviation of the initial noise; at 1 a perfect sampler is 3 dB below the posterior's mean."""
 
     def __post_init__(self) -> None:
-        factor = self.autoencoder.factor
-        if any(side <= 0 or side % factor for side in self.image_size):
-            raise GeneratorError(f"GeneratorConfig.image_size: expected multiples of {factor}, got {self.image_size}")
-        for name in ("zero_snr", "residual"):
-            if getattr(self, name) and self.prediction == "epsilon":
-                raise GeneratorError(f"GeneratorConfig.{name}: expected prediction 'v_prediction', got 'epsilon'")
-        if self.steps < 1 or not 0 < self.strength <= 1:
-            got = f"{self.steps} and {self.strength}"
-            raise GeneratorError(f"GeneratorConfig: expected steps >= 1 and strength in (0, 1], got {got}")
-        if not 0 <= self.temperature <= 1:
-            raise GeneratorError(f"GeneratorConfig.temperature: expected 0 to 1, got {self.temperature}")
+        factor, epsilon = self.autoencoder.factor, self.prediction == "epsilon"
+        expected = f"multiples of {factor}"
+        check_fields(self, expected, lambda size: all(n > 0 and n % factor == 0 for n in size), "image_size")
+        expected = "False with prediction 'epsilon', or prediction 'v_prediction'"
+        check_fields(self, expected, lambda used: not (used and epsilon), "zero_snr", "residual")
+        check_fields(self, "at least 1", lambda n: n >= 1, "steps")
+        check_fields(self, "a value in (0, 1]", lambda s: 0 < s <= 1, "strength")
+        check_fields(self, "a value in [0, 1]", lambda t: 0 <= t <= 1, "temperature")
 
     @property
     def latent_size(self) -> tuple[int, int]:
@@ -196,33 +224,12 @@ class GeneratorConfig:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], where: str = "generator config") -> GeneratorConfig:
-        """A config from plain data.
+        """Build a config from plain data.
 
         Raises:
             GeneratorError: Unknown or missing keys, impossible values.
         """
-        values = dict(data)
-        for key, kind in (("unet", UNetConfig), ("autoencoder", AutoencoderConfig)):
-            if key in values:
-                values[key] = _built(kind, values[key], f"{where}: {key}")
-        return _built(cls, values, where)
-
-
-_Config = TypeVar("_Config")
-
-
-def _built(kind: type[_Config], data: Any, where: str) -> _Config:
-    if not isinstance(data, Mapping):
-        raise GeneratorError(f"{where}: expected a mapping, got {type(data).__name__}")
-    known = {entry.name for entry in fields(kind)}  # type: ignore[arg-type]
-    strange = sorted(set(data) - known)
-    if strange:
-        raise GeneratorError(f"{where}: expected keys among {', '.join(sorted(known))}, got {', '.join(strange)}")
-    values = {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
-    try:
-        return kind(**values)
-    except TypeError as error:
-        raise GeneratorError(f"{where}: {error}") from None
+        return from_plain(cls, data, where)
 
 
 # --- configurations ---------------------------------------------------------------------------------------------------
@@ -253,7 +260,7 @@ def paper() -> GeneratorConfig:
 
 
 def small() -> GeneratorConfig:
-    """One GPU, minutes: a U-Net of 63 M and 10 M of cross-view attention on the latents of its own autoencoder."""
+    """Minutes on a GPU: a U-Net of 63 M and 10 M of cross-view attention on the latents of its own autoencoder."""
     return GeneratorConfig(
         name="small",
         image_size=(128, 224),
@@ -263,11 +270,7 @@ def small() -> GeneratorConfig:
 
 
 def compact() -> GeneratorConfig:
-    """At most 7 M parameters in all, 16 MB in half precision: what can ship with the package.
-
-    Squares of 4 x 4 pixels of 64 x 112 images: at 128 x 224 an hour on a CPU sees a fifth as many views, and an
-    ``AutoencoderKL`` of 1.3 M costs more than the denoiser.
-    """
+    """The shipped generator: at most 7 M parameters, 16 MB in half precision; 4 x 4 pixels of 64 x 112 images."""
     return GeneratorConfig(
         name="compact",
         image_size=(64, 112),
@@ -279,12 +282,12 @@ def compact() -> GeneratorConfig:
             context_width=64,
         ),
         autoencoder=AutoencoderConfig(patch=4, latent_channels=48),
-        steps=1,  # trained for an hour, its samples are nearer to the truth than inpainting, and speckled
+        steps=1,  # after an hour of training, samples of more steps are speckled
     )
 
 
 def tiny() -> GeneratorConfig:
-    """A CPU, minutes: squares of 2 x 2 pixels of 32 x 56 images, a quarter of the time that single pixels take."""
+    """Minutes on a CPU: 2 x 2 pixels of 32 x 56 images."""
     return GeneratorConfig(
         name="tiny",
         image_size=(32, 56),

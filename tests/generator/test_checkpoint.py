@@ -141,19 +141,19 @@ def test_configurations_survive_json(make) -> None:
 def test_impossible_configurations_are_refused() -> None:
     with pytest.raises(GeneratorError, match=r"image_size: expected multiples of 4, got \(30, 56\)"):
         small_config(image_size=(30, 56), autoencoder=compact().autoencoder)
-    with pytest.raises(GeneratorError, match="zero_snr: expected prediction 'v_prediction'"):
+    with pytest.raises(GeneratorError, match="zero_snr: expected False with prediction 'epsilon'"):
         small_config(prediction="epsilon")
-    with pytest.raises(GeneratorError, match="residual: expected prediction 'v_prediction'"):
+    with pytest.raises(GeneratorError, match="residual: expected False with prediction 'epsilon'"):
         small_config(prediction="epsilon", zero_snr=False)
-    with pytest.raises(GeneratorError, match="temperature: expected 0 to 1"):
+    with pytest.raises(GeneratorError, match=r"temperature: expected a value in \[0, 1\], got 1.5"):
         small_config(temperature=1.5)
     with pytest.raises(GeneratorError, match="patch: expected 1"):
         small_config(autoencoder=AutoencoderConfig(patch=2, widths=(32,)))
-    with pytest.raises(GeneratorError, match="12 latent channels, got 3"):
+    with pytest.raises(GeneratorError, match="latent_channels: expected 12, 3 patch², got 3"):
         AutoencoderConfig(patch=2)
     with pytest.raises(GeneratorError, match="cross_view: expected 2 values, one of them true"):
         UNetConfig(widths=(32, 32), transformers=(False, True), cross_view=(False, False))
-    with pytest.raises(GeneratorError, match="strength in"):
+    with pytest.raises(GeneratorError, match=r"strength: expected a value in \(0, 1\], got 0.0"):
         small_config(strength=0.0)
     with pytest.raises(GeneratorError, match="expected multiples of 32"):
         small_config(unet={"widths": (48,)} and type(tiny().unet)(widths=(48,), transformers=(True,)))

@@ -4,25 +4,32 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Literal, TypeVar
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from typing import Any, Literal
 
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator import config as generators
-from arbiview_aug.generator.config import AutoencoderConfig, GeneratorConfig, UNetConfig
+from arbiview_aug.generator.config import GeneratorConfig, check_fields, from_plain
 
 GeoMode = Literal["normalised", "frobenius_sum"]
+
+_check = partial(check_fields, error=TrainingError)
+
+
+def _is_share(value: float) -> bool:
+    return 0 <= value <= 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class PseudoViewConfig:
-    """Pseudo views (Algorithm 1) and what is added to them; probabilities are for each training item."""
+    """Pseudo views (Algorithm 1) and what is added to them; probabilities are per training item."""
 
     pairs: int = 1
-    """K: pairs of pseudo poses, left and right, for each draw of a real view; each is an item of its own."""
+    """K of Algorithm 1: left and right pairs of pseudo poses per draw of a real view; each is an item of its own."""
 
     yaw_deg: tuple[float, float] = (5.0, 35.0)
-    """How far a pseudo pose is turned to its side."""
+    """Range of a pseudo pose's turn to its side."""
 
     pitch_deg: float = 8.0
     lateral_m: float = 1.0
@@ -30,17 +37,17 @@ class PseudoViewConfig:
     """Half-widths of the other turns and moves."""
 
     moved: float = 0.5
-    """Probability that pseudo poses are moved at all: without, the depth levels of all pairs are one."""
+    """Probability that pseudo poses are translated; without translation infinity is the only depth level."""
 
     focal: tuple[float, float] = (0.7, 1.3)
     """Factor of the focal length."""
 
     transplanted: float = 0.8
-    """Probability of holes as targets have them; Algorithm 1 leaves next to none."""
+    """Probability of a target's coverage mask; Algorithm 1 leaves next to no holes."""
 
     hidden: float = 0.5
-    """Of those, the share whose pixels no source branch sees either: so are holes at inference. In the rest the
-    branches show them, which is what the cross-view attention learns to read from."""
+    """Share of these masks that hide the pixels from the source branches too, as at inference. In the rest the
+    branches show them, from which cross-view attention learns to read."""
 
     leave_one_out: float = 0.1
     """Probability that the real view is not among FAVS's sources."""
@@ -52,17 +59,14 @@ class PseudoViewConfig:
     """Probability that the source branches are the nearest real cameras, as at inference."""
 
     mask_bank: int = 128
-    """Coverage masks drawn from the retarget distribution at the start."""
+    """Coverage masks drawn from the retarget distribution before training."""
 
     def __post_init__(self) -> None:
-        for name in ("moved", "transplanted", "hidden", "leave_one_out", "virtual", "real_sources"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise TrainingError(f"pseudo_views.{name}: expected a probability, got {getattr(self, name)}")
-        if self.pairs < 1 or self.mask_bank < 1:
-            raise TrainingError(f"pseudo_views: expected pairs and mask_bank >= 1, got {self.pairs}, {self.mask_bank}")
-        if not (0 <= self.yaw_deg[0] <= self.yaw_deg[1] <= 90 and 0 < self.focal[0] <= self.focal[1]):
-            got = f"{self.yaw_deg} and {self.focal}"
-            raise TrainingError(f"pseudo_views: expected yaw_deg in [0, 90] and focal > 0, low before high, got {got}")
+        shares = ("moved", "transplanted", "hidden", "leave_one_out", "virtual", "real_sources")
+        _check(self, "a probability", _is_share, *shares)
+        _check(self, "at least 1", lambda n: n >= 1, "pairs", "mask_bank")
+        _check(self, "0 <= low <= high <= 90", lambda yaw: 0 <= yaw[0] <= yaw[1] <= 90, "yaw_deg")
+        _check(self, "0 < low <= high", lambda factor: 0 < factor[0] <= factor[1], "focal")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,45 +74,46 @@ class LossConfig:
     """L_total = L_main + geo · L_geo + perceptual · L_perceptual (Sec. Loss Function Design)."""
 
     geo: float = 0.1
+    """α of the paper."""
+
     geo_mode: GeoMode = "normalised"
     """``frobenius_sum``: as printed, a sum that grows with resolution; ``normalised``: mean over rows."""
 
     perceptual: float = 0.01
+    """β of the paper."""
+
     perceptual_below_t: int = 300
-    """The x0 error is 0.57 times the ε error at t = 200 and 14.6 times at t = 999: later, VGG sees noise."""
+    """Latest time with L_perceptual: the x0 error is 0.57 times the ε error at t = 200, 14.6 times at t = 999."""
 
     perceptual_every: int = 4
-    """Steps from one to the next: decoding costs more than the U-Net."""
+    """Steps between two L_perceptual: decoding costs more than the U-Net."""
 
     perceptual_crop: int = 64
-    """Side of the square of pixels that is compared."""
+    """Side in pixels of the square that is compared."""
 
     snr_limit: float = 5.0
-    """γ of Min-SNR-γ (Hang et al. 2023); 0 weighs all times alike, as printed; so does a residual generator."""
+    """γ of Min-SNR-γ (Hang et al. 2023); 0 weighs all times alike, as printed. Unused by residual generators."""
 
     snr_floor: float = 0.1
-    """Least weight: Min-SNR alone is .0047 at t = 999, which starves the times that few-step samplers live on."""
+    """Lower bound of the weight: Min-SNR alone is .0047 at t = 999, where few-step samplers start."""
 
     known: float = 0.2
-    """Weight of pixels that the condition shows, where those in its holes have 1: they are pasted back in use."""
+    """Weight of pixels that the condition shows, relative to its holes: they are pasted back at inference."""
 
     regression: float = 0.3
     """Share of the items that train the one-step regression instead of the diffusion; 0 switches it off."""
 
     def __post_init__(self) -> None:
-        if self.geo_mode not in ("normalised", "frobenius_sum"):
-            raise TrainingError(f"loss.geo_mode: expected normalised or frobenius_sum, got {self.geo_mode!r}")
-        if min(self.geo, self.perceptual, self.snr_limit, self.snr_floor) < 0 or not 0 <= self.regression < 1:
-            raise TrainingError("loss: expected weights >= 0 and regression in [0, 1)")
-        if not 0 < self.known <= 1:
-            raise TrainingError(f"loss.known: expected a weight in (0, 1], got {self.known}")
-        if self.perceptual_every < 1 or self.perceptual_crop < 1:
-            raise TrainingError("loss: expected perceptual_every and perceptual_crop >= 1")
+        _check(self, "normalised or frobenius_sum", lambda m: m in ("normalised", "frobenius_sum"), "geo_mode")
+        _check(self, "at least 0", lambda w: w >= 0, "geo", "perceptual", "snr_limit", "snr_floor")
+        _check(self, "a value in [0, 1)", lambda p: 0 <= p < 1, "regression")
+        _check(self, "a value in (0, 1]", lambda w: 0 < w <= 1, "known")
+        _check(self, "at least 1", lambda n: n >= 1, "perceptual_every", "perceptual_crop")
 
 
 @dataclass(frozen=True, kw_only=True)
 class AutoencoderTraining:
-    """The stage before, for configurations with an autoencoder of their own."""
+    """The first stage, for configurations with an autoencoder of their own."""
 
     steps: int = 3000
     batch: int = 32
@@ -117,7 +122,7 @@ class AutoencoderTraining:
     """Weight of the KL term: Stable Diffusion's (Rombach et al. 2022)."""
 
     perceptual: float = 0.1
-    """Weight of the VGG term, where there are weights."""
+    """Weight of the VGG term."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,11 +133,11 @@ class TrainConfig:
     pseudo_views: PseudoViewConfig = field(default_factory=PseudoViewConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     autoencoder: AutoencoderTraining | None = None
-    """None where latents are pixels, or the autoencoder comes with the weights."""
+    """None if latents are pixels, or the autoencoder is pretrained."""
 
     steps: int
     batch: int
-    """Items a process and step."""
+    """Items per process and step."""
 
     lr: float
     warmup: int = 100
@@ -140,26 +145,26 @@ class TrainConfig:
 
     weight_decay: float = 1e-2
     clip: float = 1.0
-    """Norm that gradients are cut to."""
+    """Largest gradient norm."""
 
     ema: float = 0.999
-    """Decay of the averaged weights; (1 + step) / (10 + step) while that is less."""
+    """Decay of the averaged weights; (1 + step) / (10 + step) while that is smaller."""
 
     drop: float = 0.1
     """Probability that condition, pose and sources are dropped together, for classifier-free guidance."""
 
     attention: bool = True
-    """Whether views read each other; off only to measure what that is worth."""
+    """Whether views read each other; off for the ablation only."""
 
     precision: Literal["no", "bf16"] = "no"
     checkpointing: bool = False
-    """Recompute blocks in the backward pass."""
+    """Gradient checkpointing: recompute blocks in the backward pass."""
 
     scenes: int = 240
-    """Synthetic streets, where the data are those."""
+    """Number of synthetic streets."""
 
     workers: int = 0
-    """Processes that make items, on the CPU; 0 makes them in this one, on the GPU where there is one."""
+    """Processes that make items, on the CPU; 0 makes them in this one, on the GPU if there is one."""
 
     seed: int = 0
     save_every: int = 500
@@ -167,13 +172,12 @@ class TrainConfig:
     validation_items: int = 8
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "scenes", "save_every", "validate_every", "validation_items"):
-            if getattr(self, name) < 1:
-                raise TrainingError(f"{name}: expected a whole number above 0, got {getattr(self, name)}")
-        if self.precision not in ("no", "bf16"):
-            raise TrainingError(f"precision: expected no or bf16 (never fp16: it overflows), got {self.precision!r}")
-        if not (self.lr > 0 and 0 <= self.ema < 1 and 0 <= self.drop < 1 and self.warmup >= 0 and self.workers >= 0):
-            raise TrainingError("expected lr > 0, ema and drop in [0, 1), warmup and workers >= 0")
+        counts = ("steps", "batch", "scenes", "save_every", "validate_every", "validation_items")
+        _check(self, "at least 1", lambda n: n >= 1, *counts)
+        _check(self, "no or bf16 (never fp16: it overflows)", lambda p: p in ("no", "bf16"), "precision")
+        _check(self, "a value above 0", lambda lr: lr > 0, "lr")
+        _check(self, "a value in [0, 1)", lambda p: 0 <= p < 1, "ema", "drop")
+        _check(self, "at least 0", lambda n: n >= 0, "warmup", "workers")
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
@@ -181,45 +185,18 @@ class TrainConfig:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> TrainConfig:
-        """A config from plain data.
+        """Build a config from plain data.
 
         Raises:
             TrainingError: Unknown or missing keys, impossible values.
+            GeneratorError: Impossible values of the generator.
         """
-        return _built(cls, data, "config")
+        return from_plain(cls, data, "config", TrainingError)
 
 
 # --- overrides --------------------------------------------------------------------------------------------------------
-_PARTS: dict[str, type] = {
-    "generator": GeneratorConfig,
-    "pseudo_views": PseudoViewConfig,
-    "loss": LossConfig,
-    "autoencoder": AutoencoderTraining,
-    "unet": UNetConfig,
-}
-_Config = TypeVar("_Config")
-
-
-def _built(kind: type[_Config], data: Mapping[str, Any], where: str) -> _Config:
-    known = {entry.name for entry in fields(kind)}  # type: ignore[arg-type]
-    strange = sorted(set(data) - known)
-    if strange:
-        raise TrainingError(f"{where}: expected keys among {', '.join(sorted(known))}, got {', '.join(strange)}")
-    values: dict[str, Any] = {}
-    for key, value in data.items():
-        if isinstance(value, Mapping):
-            of_pixels = kind is GeneratorConfig and key == "autoencoder"
-            part = AutoencoderConfig if of_pixels else _PARTS[key]
-            value = _built(part, value, f"{where}.{key}")
-        values[key] = tuple(value) if isinstance(value, list) else value
-    try:
-        return kind(**values)
-    except TypeError as error:
-        raise TrainingError(f"{where}: {error}") from None
-
-
 def overridden(config: TrainConfig, settings: Sequence[str]) -> TrainConfig:
-    """The config with settings such as ``steps=100`` or ``loss.geo=0`` put in, all at once; values as in JSON.
+    """The config with settings such as ``steps=100`` or ``loss.geo=0`` applied together; values as in JSON.
 
     Raises:
         TrainingError: An unknown key, or a value of another type.
@@ -227,37 +204,33 @@ def overridden(config: TrainConfig, settings: Sequence[str]) -> TrainConfig:
     """
     data = config.to_dict()
     for setting in settings:
-        name, given, text = setting.partition("=")
-        if not given:
+        name, equals, text = setting.partition("=")
+        if not equals:
             raise TrainingError(f"--set {setting}: expected KEY=VALUE, such as loss.geo=0")
-        _put(data, name.strip().split("."), _value(text.strip()), setting)
+        try:
+            value = json.loads(text)
+        except ValueError:
+            value = text.strip()  # a string without quotes
+        _override(data, name.strip().split("."), tuple(value) if isinstance(value, list) else value, setting)
     return TrainConfig.from_dict(data)
 
 
-def _value(text: str) -> Any:
-    try:
-        value = json.loads(text)
-    except ValueError:
-        return text  # a name
-    return tuple(value) if isinstance(value, list) else value
-
-
-def _put(data: dict[str, Any], path: Sequence[str], value: Any, setting: str) -> None:
+def _override(data: dict[str, Any], path: Sequence[str], value: Any, setting: str) -> None:
     name = path[0]
     if name not in data:
         raise TrainingError(f"--set {setting}: expected one of {', '.join(data)}, got {name!r}")
-    held = data[name]
+    default = data[name]
     if len(path) > 1:
-        if not isinstance(held, dict):
+        if not isinstance(default, dict):
             raise TrainingError(f"--set {setting}: {name} has no settings of its own")
-        _put(held, path[1:], value, setting)
+        _override(default, path[1:], value, setting)
         return
-    if isinstance(held, float) and type(value) is int:
+    if isinstance(default, float) and type(value) is int:
         value = float(value)
-    if isinstance(held, tuple) and isinstance(value, tuple) and held and isinstance(held[0], float):
+    if isinstance(default, tuple) and isinstance(value, tuple) and default and isinstance(default[0], float):
         value = tuple(map(float, value))
-    if isinstance(held, dict) or type(value) is not type(held):
-        raise TrainingError(f"--set {setting}: expected {type(held).__name__} such as {held!r}, got {value!r}")
+    if isinstance(default, dict) or type(value) is not type(default):
+        raise TrainingError(f"--set {setting}: expected {type(default).__name__} such as {default!r}, got {value!r}")
     data[name] = value
 
 
@@ -265,7 +238,7 @@ def _put(data: dict[str, Any], path: Sequence[str], value: Any, setting: str) ->
 def paper() -> TrainConfig:
     """Algorithm 1 as published, on Stable Diffusion's frozen weights (Sec. Training Parameters).
 
-    Not to the letter: L_geo is normalised, since as printed it outgrows L_main (``loss.geo_mode="frobenius_sum"``), and
+    Two deviations: L_geo is normalised, since as printed it outgrows L_main (``loss.geo_mode="frobenius_sum"``), and
     L_perceptual compares crops at early times.
     """
     return TrainConfig(
@@ -284,7 +257,7 @@ def paper() -> TrainConfig:
 
 
 def small() -> TrainConfig:
-    """One GPU, minutes."""
+    """Minutes on a GPU."""
     return TrainConfig(
         generator=generators.small(),
         autoencoder=AutoencoderTraining(),
@@ -300,7 +273,7 @@ def small() -> TrainConfig:
 
 
 def compact() -> TrainConfig:
-    """For the weights that ship: a CPU, an hour or two."""
+    """The run of the shipped weights: an hour or two on a CPU."""
     return replace(
         tiny(),
         generator=generators.compact(),
@@ -316,7 +289,7 @@ def compact() -> TrainConfig:
 
 
 def tiny() -> TrainConfig:
-    """A CPU, minutes: no VGG, which would take most of them."""
+    """Minutes on a CPU, without VGG, which would take most of them."""
     return TrainConfig(
         generator=generators.tiny(),
         loss=LossConfig(perceptual=0.0, regression=0.5),

@@ -41,11 +41,11 @@ def test_overrides() -> None:
         ("steps=true", "expected int"),
         ("loss=1", "expected dict"),
         ("lr.x=1", "no settings of its own"),
-        ("steps=0", "steps: expected a whole number above 0"),
+        ("steps=0", "TrainConfig.steps: expected at least 1, got 0"),
         ("precision=fp16", "never fp16"),
         ("loss.geo_mode=sum", "expected normalised or frobenius_sum"),
         ("pseudo_views.virtual=2", "expected a probability"),
-        ("loss.regression=1", "regression in"),
+        ("loss.regression=1", r"LossConfig.regression: expected a value in \[0, 1\), got 1"),
     ],
 )
 def test_wrong_overrides_are_refused(setting: str, message: str) -> None:
