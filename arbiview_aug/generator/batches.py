@@ -1,4 +1,4 @@
-"""The output of a transform completed: one frame of it, a batch of frames, the batches of a loader."""
+"""Completion of a transform's output: of one frame, of a batch, of the batches of a loader."""
 
 from __future__ import annotations
 
@@ -10,27 +10,19 @@ from typing import Any
 import torch
 
 from arbiview_aug.errors import SampleError
-from arbiview_aug.generator.completion import complete, inpainted
+from arbiview_aug.generator.completion import complete
 from arbiview_aug.generator.networks import GeneratorNetworks
 from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
 from arbiview_aug.sample.batching import gathered, leading_shape, rewrapped, split, stacked
 from arbiview_aug.sample.inputs import Frame, names_of_frames, read_frames
 
 SOURCES_KEY = "sources"
-"""Key of a retargeted sample that holds what it was made from, a sample itself: for completion after collating."""
+"""Key of a retargeted sample that holds its source sample, for completion after collating."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Completion:
-    """How pixels that no camera saw are made up.
-
-    Attributes:
-        generator: Asked for them; None inpaints them.
-        steps: Of the denoiser, 1 is the one-step regression; the generator's own number where None.
-        guidance: Classifier-free guidance; the generator's own where None.
-        min_confidence: τ: pixels seen with less confidence are made up as well.
-        seed: Of the noise.
-    """
+    """Settings of completion, as in ``completion.complete``; without a generator, holes are inpainted."""
 
     generator: GeneratorNetworks | None = None
     steps: int | None = None
@@ -40,51 +32,47 @@ class Completion:
 
 
 def complete_frame(rendered: RenderedFrame, frame: Frame, name: str, how: Completion) -> RenderedFrame:
-    """Make up the pixels of a rendered frame that no camera saw, or saw with too little confidence.
+    """Fill the pixels of a rendered frame that no camera saw, or saw with too little confidence.
 
-    Made-up pixels are not covered any more: ``coverage`` False, ``confidence`` 0, ``source_camera`` and
-    ``source_frame`` -1. The gradients of the others stay.
+    Filled pixels are no longer covered: ``coverage`` False, ``confidence`` 0, ``source_camera`` and ``source_frame``
+    -1. Gradients of the others stay.
 
     Args:
         rendered: The views.
-        frame: What they were rendered from.
+        frame: The frame they were rendered from.
         name: Name of the frame, for the noise.
         how: Settings.
     """
-    # Noise by number: cameras have no names in a batch.
+    # Noise by camera number: cameras have no names in a batch.
     cameras = [replace(camera, name=str(k)) for k, camera in enumerate(rendered.rig)]
-    numbered, views = rendered.rig.with_cameras(cameras), rendered.images
-    trust, least = rendered.confidence, how.min_confidence
-    if how.generator is None:
-        done = inpainted(views, rendered.coverage, numbered, confidence=trust, min_confidence=least)
-    else:
-        done = complete(
-            how.generator,
-            views,
-            rendered.coverage,
-            numbered,
-            frame.images,
-            frame.rig,
-            confidence=trust,
-            min_confidence=least,
-            steps=how.steps,
-            guidance=how.guidance,
-            seed=how.seed,
-            frame=name,
-        )
+    done = complete(
+        how.generator,
+        rendered.images,
+        rendered.coverage,
+        rendered.rig.with_cameras(cameras),
+        frame.images,
+        frame.rig,
+        confidence=rendered.confidence,
+        min_confidence=how.min_confidence,
+        steps=how.steps,
+        guidance=how.guidance,
+        seed=how.seed,
+        frame=name,
+    )
     holes = list(done.generated)
 
     def without_holes(maps: Sequence[torch.Tensor], empty: int) -> torch.Tensor | list[torch.Tensor]:
         return stacked([m.masked_fill(hole, empty) for m, hole in zip(maps, holes, strict=True)])
 
-    images = [torch.where(hole, made, view) for hole, made, view in zip(holes, done.images, views, strict=True)]
+    pixels = zip(holes, done.images, rendered.images, strict=True)
+    images = [torch.where(hole, filled, view) for hole, filled, view in pixels]
     return replace(rendered.with_maps(without_holes), images=images, generated=stacked(holes))
 
 
 def frame_names(
     sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...], how: Completion
 ) -> list[str]:
-    """What tells the noise of frames apart: their ``token``, else their images; nothing where there is no noise."""
+    """Keys of the frames' noise: their ``token``, else a digest of their images; empty without a generator."""
     if how.generator is None:  # hashing six images of 1600 x 900 takes 33 ms
         return [""] * len(frames)
     if sample.get("token") is not None:
@@ -109,17 +97,17 @@ def complete_batch(
     min_confidence: float = 0.0,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Complete samples after collating, on the generator's device: for a GPU, which DataLoader workers cannot use.
+    """Complete collated samples on the generator's device, for a GPU, which DataLoader workers cannot use.
 
-    The same pixels as ``RigRetarget(path="diffusion")`` makes, which gets the sources at first hand.
+    The pixels are those of ``RigRetarget(path="diffusion")``.
 
     Args:
         generator: The model; None inpaints.
         batch: From ``RigRetarget(..., outputs=("sources", "confidence"))``, one sample or a batch of them.
-        steps: As in ``RigRetarget``, and so are the others.
-        guidance: Likewise.
-        min_confidence: Likewise.
-        seed: Likewise.
+        steps: As in ``RigRetarget``, like all settings.
+        guidance: See ``steps``.
+        min_confidence: See ``steps``.
+        seed: See ``steps``.
 
     Returns:
         A new dict without ``sources``, with ``generated``.
@@ -156,10 +144,10 @@ def complete_batch(
 
 
 class CompletedLoader:
-    """A loader whose batches are completed in this process, on the generator's device.
+    """Loader that completes the batches of another one in this process, on the generator's device.
 
     Args:
-        loader: Of batches from ``RigRetarget(..., outputs=("sources", "confidence"))``.
+        loader: Yields batches from ``RigRetarget(..., outputs=("sources", "confidence"))``.
         generator: The model.
         settings: Of ``complete_batch``.
     """

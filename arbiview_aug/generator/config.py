@@ -82,7 +82,7 @@ class UNetConfig:
 
     def __post_init__(self) -> None:
         widths, count = self.widths, len(self.widths)
-        check_fields(self, "multiples of 32", lambda w: w and all(n > 0 and n % 32 == 0 for n in w), "widths")
+        check_fields(self, "multiples of 32", lambda w: bool(w) and all(n > 0 and n % 32 == 0 for n in w), "widths")
         check_fields(self, f"{count} values", lambda t: len(t) == count, "transformers")
         expected = f"{count} values, one of them true"
         check_fields(self, expected, lambda c: not c or (len(c) == count and any(c)), "cross_view")
@@ -128,7 +128,7 @@ class AutoencoderConfig:
     def __post_init__(self) -> None:
         widths, pixels = self.widths, 3 * self.patch**2
         check_fields(self, "1, or more without widths", lambda p: p == 1 or (p > 1 and not widths), "patch")
-        check_fields(self, f"{pixels}, 3 patch²", lambda c: widths or c == pixels, "latent_channels")
+        check_fields(self, f"{pixels}, 3 patch²", lambda c: bool(widths) or c == pixels, "latent_channels")
         check_fields(self, f"a divisor of {widths}", lambda g: not any(w % g for w in widths), "norm_groups")
 
     @property

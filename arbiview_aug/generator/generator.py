@@ -20,8 +20,8 @@ from arbiview_aug.generator.correspondence import LEVELS
 from arbiview_aug.generator.denoiser import Denoiser
 from arbiview_aug.generator.networks import GeneratorNetworks
 from arbiview_aug.generator.sampler import noise_schedule
+from arbiview_aug.generator.stable_diffusion import PLAIN_UNET, load_part
 from arbiview_aug.generator.stable_diffusion import empty_prompt as embedded_empty_prompt
-from arbiview_aug.generator.stable_diffusion import load_part
 
 _SHIPPED = Path(__file__).with_name("weights")
 
@@ -95,7 +95,7 @@ class Generator(GeneratorNetworks):
         latent = config.autoencoder.latent_channels
         if not config.autoencoder.widths:
             raise GeneratorError("from_stable_diffusion: expected a config with an autoencoder, got one on pixels")
-        unet = load_part("UNet2DConditionModel", where, "unet", config.unet.arguments(latent, latent))
+        unet = load_part("UNet2DConditionModel", where, "unet", config.unet.arguments(latent, latent) | PLAIN_UNET)
         shape = config.autoencoder.arguments()
         del shape["scaling_factor"]  # the file's counts
         vae = load_part("AutoencoderKL", where, "vae", shape)

@@ -1,8 +1,8 @@
-"""All that the denoiser is told about the cameras of a frame, as tensors: built on the CPU, batched, moved, used."""
+"""The cameras of a frame as tensors: what the denoiser needs of them for its conditions and its attention."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -21,15 +21,15 @@ from arbiview_aug.generator.correspondence import (
 
 
 class FrameGeometry(NamedTuple):
-    """The N target and S source cameras of B frames. Sources are numbered before targets where both are read.
+    """The N target and S source cameras of B frames. If both are read, sources are numbered before targets.
 
     Attributes:
         target_rays: (B, N, 6, h, w), see ``conditioning.plucker_rays``.
         target_pose: (B, N, 16), see ``conditioning.pose_vector``.
         source_rays: (B, S, 6, h, w).
         source_pose: (B, S, 16).
-        target_reads: Where the targets' tokens lie in sources and targets, one for each token grid, the finest first.
-        source_reads: Where the sources' tokens lie in the other sources.
+        target_reads: Correspondences of the targets in sources and targets, one per token grid, the finest first.
+        source_reads: Correspondences of the sources in the other sources.
     """
 
     target_rays: torch.Tensor
@@ -40,38 +40,36 @@ class FrameGeometry(NamedTuple):
     source_reads: list[Correspondence]
 
     def to(self, device: torch.device | str) -> FrameGeometry:
-        """The same on a device."""
-        return FrameGeometry(
-            self.target_rays.to(device, non_blocking=True),
-            self.target_pose.to(device, non_blocking=True),
-            self.source_rays.to(device, non_blocking=True),
-            self.source_pose.to(device, non_blocking=True),
-            [c.to(device) for c in self.target_reads],
-            [c.to(device) for c in self.source_reads],
-        )
+        """Copy to a device."""
+        tensors = (value.to(device, non_blocking=True) for value in self[:4])
+        return FrameGeometry._make([*tensors, *self[4:]]).with_reads(lambda reads: reads.to(device))
+
+    def with_reads(self, change: Callable[[Correspondence], Correspondence]) -> FrameGeometry:
+        """Replace each correspondence by ``change`` of it."""
+        return FrameGeometry._make([*self[:4], *([change(grid) for grid in reads] for reads in self[4:])])
 
     def target_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> Views:
         """The targets' conditions.
 
         Args:
             latent: (B, N, C, h, w) of FAVS at their poses, pre-filled.
-            mask: (B, N, H, W) what FAVS covers, at any resolution.
+            mask: (B, N, H, W) coverage of FAVS, at any resolution.
             confidence: (B, N, H, W) in [0, 1].
         """
         return _views(latent, mask, confidence, self.target_rays, self.target_pose)
 
     def source_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> Views:
-        """The sources' conditions; their latents are their images'."""
+        """The sources' conditions; the latents are those of their images."""
         return _views(latent, mask, confidence, self.source_rays, self.source_pose)
 
     def target_windows(self, dropped: torch.Tensor | None = None) -> list[TokenWindow]:
-        """What targets read, without sources in the frames ``dropped`` (B,) bool: for classifier-free guidance."""
+        """Windows of the targets, without sources in the frames ``dropped`` (B,) bool (classifier-free guidance)."""
         sources, targets = self.source_pose.shape[1], self.target_pose.shape[1]
         reads = self.target_reads if dropped is None else [c.without(sources, dropped) for c in self.target_reads]
         return [window(c, sources + targets) for c in reads]
 
     def source_windows(self) -> list[TokenWindow]:
-        """What sources read."""
+        """Windows of the sources."""
         return [window(c, self.source_pose.shape[1]) for c in self.source_reads]
 
 
@@ -90,28 +88,23 @@ def frame_geometry(
     grids = token_sizes(size, len(config.unet.widths))
     target_rays, target_pose = camera_conditions(targets, [reference_camera(t, sources) for t in targets], size)
     source_rays, source_pose = camera_conditions(sources, sources, size)
-    everything, count = [*sources, *targets], len(sources)
+    keys, count = [*sources, *targets], len(sources)
     settings = grids, ground_z_m, config.facing_m
     return FrameGeometry(
         target_rays[None],
         target_pose[None],
         source_rays[None],
         source_pose[None],
-        correspondences(targets, everything, range(count, len(everything)), *settings),
+        correspondences(targets, keys, range(count, len(keys)), *settings),
         correspondences(sources, sources, range(count), *settings),
     )
 
 
 def batched(frames: Sequence[FrameGeometry]) -> FrameGeometry:
-    """One geometry of frames with as many targets and sources each."""
-    return FrameGeometry(
-        torch.cat([frame.target_rays for frame in frames]),
-        torch.cat([frame.target_pose for frame in frames]),
-        torch.cat([frame.source_rays for frame in frames]),
-        torch.cat([frame.source_pose for frame in frames]),
-        [stacked(grid) for grid in zip(*(frame.target_reads for frame in frames), strict=True)],
-        [stacked(grid) for grid in zip(*(frame.source_reads for frame in frames), strict=True)],
-    )
+    """One geometry of frames with equal numbers of targets and of sources."""
+    *tensors, target_reads, source_reads = zip(*frames, strict=True)
+    reads = ([stacked(grid) for grid in zip(*grids, strict=True)] for grids in (target_reads, source_reads))
+    return FrameGeometry._make([*map(torch.cat, tensors), *reads])
 
 
 def _views(

@@ -1,7 +1,8 @@
-"""The generator's networks: what completion runs and training changes."""
+"""The generator's networks, shared by completion and training."""
 
 from __future__ import annotations
 
+import torch
 from torch import nn
 
 from arbiview_aug.generator.autoencoder import Autoencoder
@@ -18,7 +19,7 @@ class GeneratorNetworks(nn.Module):
         autoencoder: Between images and latents.
 
     Attributes:
-        calls: How often the denoiser was run for samples, steps and guidance included.
+        calls: Number of denoiser calls so far, over steps and guidance.
     """
 
     def __init__(self, config: GeneratorConfig, denoiser: Denoiser, autoencoder: Autoencoder) -> None:
@@ -30,3 +31,8 @@ class GeneratorNetworks(nn.Module):
             for parameter in denoiser.own_parameters():
                 parameter.requires_grad_(True)
         self.calls = 0
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the weights."""
+        return self.denoiser.regression.weight.device

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,17 +13,26 @@ from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError
 
 _EMPTY_PROMPT = [49406, *[49407] * 76]
-"""CLIP's tokens of "": start of text, then end of text up to the 77 that Stable Diffusion always feeds."""
+"""CLIP's tokens of "": start of text, then end of text up to Stable Diffusion's 77."""
+
+PLAIN_UNET = {
+    "mid_block_type": "UNetMidBlock2DCrossAttn",
+    "class_embed_type": None,
+    "addition_embed_type": None,
+    "encoder_hid_dim": None,
+    "time_cond_proj_dim": None,
+    "time_embedding_act_fn": None,
+    "center_input_sample": False,
+}
+"""Configuration entries of Stable Diffusion 1.5's U-Net on which ``Denoiser`` relies."""
 
 
 def load_part(kind: str, where: str | Path, subfolder: str, expected: Mapping[str, Any]) -> Any:
-    """A diffusers model, every weight from the file.
-
-    diffusers itself initialises what is missing and drops what is extra, with no more than a warning.
+    """Load a diffusers model and refuse missing or extra weights, of which diffusers itself only warns.
 
     Args:
         kind: The diffusers class.
-        where: Folder or hub id in diffusers' layout; of a hub id, safetensors are downloaded.
+        where: Folder or hub id in diffusers' layout; from a hub id, safetensors are downloaded.
         subfolder: ``unet`` or ``vae``.
         expected: Entries that its configuration must have.
 
@@ -35,8 +45,9 @@ def load_part(kind: str, where: str | Path, subfolder: str, expected: Mapping[st
         config = cls.load_config(where, subfolder=subfolder)
     except (OSError, ValueError) as error:
         raise GeneratorError(f"{label}: expected a diffusers folder or hub id with a {kind}: {error}") from None
+    defaults = inspect.signature(cls.__init__).parameters
     for name, value in expected.items():
-        got = config.get(name, _default(cls, name))
+        got = config.get(name, defaults[name].default)
         if _plain(got) != _plain(value):
             raise GeneratorError(f"{label}: expected {name} {_plain(value)}, got {_plain(got)}")
     try:
@@ -56,7 +67,7 @@ def load_part(kind: str, where: str | Path, subfolder: str, expected: Mapping[st
 
 
 def empty_prompt(where: str | Path) -> torch.Tensor:
-    """(77, width) CLIP's embedding of the empty prompt. Computed once: a generator's own folder holds it.
+    """(77, width) CLIP's embedding of the empty prompt; a generator's own folder contains it.
 
     Raises:
         GeneratorError: No text encoder in the folder.
@@ -77,15 +88,8 @@ def empty_prompt(where: str | Path) -> torch.Tensor:
         return encoder(torch.tensor([_EMPTY_PROMPT])).last_hidden_state[0]
 
 
-def _default(cls: Any, name: str) -> Any:
-    import inspect
-
-    parameter = inspect.signature(cls.__init__).parameters.get(name)
-    return None if parameter is None else parameter.default
-
-
 def _plain(value: Any) -> Any:
-    """Lists as tuples; a tuple of one repeated value as that value, since diffusers takes both."""
+    """Lists as tuples, and tuples of one repeated value as that value: diffusers takes all of them."""
     if isinstance(value, list | tuple):
         return value[0] if len(set(value)) == 1 else tuple(value)
     return value

@@ -176,7 +176,7 @@ def test_messages(generator: Generator) -> None:
         generator.complete_views([views[0], views[1][:, 1:], views[2]], coverage, TARGETS, images, SOURCES)
     with pytest.raises(SampleError, match=r"camera 't0': coverage: expected bool.*pass coverage > 0"):
         generator.complete_views(views, [c.float() for c in coverage], TARGETS, images, SOURCES)
-    with pytest.raises(GeneratorError, match="expected steps >= 1 and strength in"):
+    with pytest.raises(GeneratorError, match="steps: expected at least 1, got 0"):
         generator.complete_views(views, coverage, TARGETS, images, SOURCES, steps=0)
 
 

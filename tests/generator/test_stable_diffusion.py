@@ -146,6 +146,8 @@ def test_weights_that_do_not_fit_are_named(folder: Path) -> None:
         ("unet", "in_channels", 9, "unet: expected in_channels 4, got 9"),
         ("unet", "cross_attention_dim", 1024, "unet: expected cross_attention_dim 24, got 1024"),
         ("unet", "block_out_channels", [32, 32], r"expected block_out_channels \(32, 32, 64, 64\), got 32"),
+        ("unet", "down_block_types", ["AttnDownBlock2D"] * 4, r"expected down_block_types \(.*got AttnDownBlock2D"),
+        ("unet", "class_embed_type", "timestep", "unet: expected class_embed_type None, got timestep"),
         ("vae", "latent_channels", 16, "vae: expected latent_channels 4, got 16"),
     ],
 )

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.completion import shown_condition
+from arbiview_aug.generator.correspondence import Correspondence
 from arbiview_aug.generator.denoiser import REGRESSION, Rows
 from arbiview_aug.generator.geometry import FrameGeometry
 from arbiview_aug.generator.training.config import PseudoViewConfig, TrainConfig, overridden
@@ -45,22 +45,19 @@ SEEN_ITEMS = 32
 
 
 def wrong_rig(geometry: FrameGeometry) -> FrameGeometry:
-    """Give each frame the homographies of the next one; rays and poses stay its own."""
-    rolled = [[type(c)(*(value.roll(1, 0) for value in c)) for c in reads] for reads in geometry[4:]]
-    return FrameGeometry(*geometry[:4], *rolled)
+    """The geometry with the homographies of another frame of the batch; rays and poses stay."""
+    return geometry.with_reads(lambda reads: Correspondence(*(value.roll(1, 0) for value in reads)))
 
 
 @torch.no_grad()
 def correct_correspondences(generator: Generator, batch: Batch) -> float:
     """Share of the attention's rows whose largest weight lies on the tap nearest to H p_i."""
-    encode = generator.autoencoder.encode
-    condition = encode(shown_condition(generator.config, batch.condition, batch.known)).float()
-    sources = batch.geometry.source_views(encode(batch.sources).float(), batch.seen, batch.seen)
-    read = generator.denoiser.read_sources(sources, batch.geometry.source_windows())
+    geometry, denoiser = batch.geometry, generator.denoiser
+    views, source_views = batch.conditions.encoded(generator.config, generator.autoencoder, geometry)
+    sources = denoiser.read_sources(source_views, geometry.source_windows())
     rows: list[Rows] = []
-    t = torch.full((len(condition),), REGRESSION, device=condition.device)
-    views = batch.geometry.target_views(condition, batch.known, batch.confidence)
-    generator.denoiser(condition, t, views, batch.geometry.target_windows(), read, rows)
+    t = torch.full((len(views.latent),), REGRESSION, device=views.latent.device)
+    denoiser(views.latent, t, views, geometry.target_windows(), sources, rows)
     right = torch.cat([(row.predicted.argmax(1) == row.target.argmax(1)).float() for row in rows])
     return float(right.mean())
 

@@ -1,9 +1,10 @@
-"""L_total = L_main + α L_geo + β L_perceptual (Sec. Loss Function Design), each as this package reads it."""
+"""L_total = L_main + α L_geo + β L_perceptual (Sec. Loss Function Design), with what the paper leaves open decided."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import nn
@@ -19,12 +20,7 @@ VGG_LAYERS = (3, 8, 15, 22)
 
 
 class Diffusion:
-    """The forward process: Stable Diffusion's schedule as numbers on a device.
-
-    Args:
-        alphas_cumprod: (T,) ᾱ_t, float32.
-        prediction: What the denoiser predicts.
-    """
+    """The forward process x_t = a x0 + s ε, a = √ᾱ_t, s = √(1 − ᾱ_t), of a schedule's ᾱ (T,) float32."""
 
     def __init__(self, alphas_cumprod: torch.Tensor, prediction: Prediction) -> None:
         self.signal, self.noise = alphas_cumprod.double().sqrt().float(), (1 - alphas_cumprod.double()).sqrt().float()
@@ -44,7 +40,7 @@ class Diffusion:
         return self._at(self.signal, t) * eps - self._at(self.noise, t) * x0
 
     def x0(self, x: torch.Tensor, predicted: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
-        """Estimate x0 from the prediction at x_t; large at late t with ε."""
+        """x0 by the prediction at x_t; inaccurate at late t with ε."""
         a, s = self._at(self.signal, t), self._at(self.noise, t)
         if self.prediction == "epsilon":
             return (x - s * predicted) / a.clamp(min=1e-4)
@@ -61,27 +57,17 @@ class Diffusion:
 
 
 def masked_mse(predicted: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """(B,) weighted mean squared error of each item over its latent pixels.
-
-    Args:
-        predicted: (B, N, C, h, w).
-        target: Likewise.
-        weight: (B, N, 1, h, w) from 0.
-    """
-    each = (1, 2, 3, 4)
+    """(B,) weighted mean squared error of (B, N, C, h, w) latents; ``weight`` (B, N, 1, h, w) >= 0."""
     error = (predicted.float() - target.float()) ** 2
-    return (error * weight).sum(each) / (weight.expand_as(error).sum(each)).clamp(min=1)
+    dims = (1, 2, 3, 4)
+    return (error * weight).sum(dims) / (weight.expand_as(error).sum(dims)).clamp(min=1)
 
 
 def geometric_loss(rows: Sequence[Rows], mode: GeoMode) -> torch.Tensor:
     """L_geo over the attention maps of all blocks.
 
-    ``frobenius_sum`` is the paper's Σ_ij ‖M_pred − M_target‖_F, summed over blocks. ``normalised``: the mean over the
-    rows of ‖m_pred − m_target‖, mean over blocks: it does not grow with resolution, cameras and depth.
-
-    Args:
-        rows: From the denoiser; blocks without any row add 0.
-        mode: Which.
+    ``frobenius_sum`` is the paper's Σ_ij ‖M_pred − M_target‖_F, summed over blocks. ``normalised`` is the mean over
+    rows of ‖m_pred − m_target‖, averaged over blocks: it does not grow with resolution, cameras and depth.
     """
     losses = []
     for predicted, target, pair in rows:
@@ -134,7 +120,7 @@ def load_perceptual(weights: str | Path | None) -> Perceptual:
     """VGG16 with torchvision's ImageNet weights: from a file, else from torch hub's cache, else downloaded.
 
     Raises:
-        TrainingError: There are none; says how to get them.
+        TrainingError: Missing or wrong weights; the message says how to get them.
     """
     models = optional_package("torchvision.models", "generator")
     try:
@@ -154,9 +140,10 @@ def load_perceptual(weights: str | Path | None) -> Perceptual:
     return Perceptual(vgg.features)
 
 
-def crops(images: torch.Tensor, side: int, rng: torch.Generator) -> tuple[slice, slice]:
-    """Rows and columns of one random square, or of all where images are smaller; (..., h, w)."""
-    h, w = images.shape[-2:]
-    sides = min(side, h), min(side, w)
-    y, x = (int(torch.randint(n - s + 1, (), generator=rng)) for n, s in zip((h, w), sides, strict=True))
-    return slice(y, y + sides[0]), slice(x, x + sides[1])
+def crop(images: torch.Tensor, side: int, rng: torch.Generator) -> tuple[Any, ...]:
+    """Index of one random square of images (..., h, w), as large as they allow."""
+    spans = []
+    for n in images.shape[-2:]:
+        start = int(torch.randint(n - min(side, n) + 1, (), generator=rng))
+        spans.append(slice(start, start + side))
+    return (..., *spans)

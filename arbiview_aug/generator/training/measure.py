@@ -1,8 +1,9 @@
-"""Completion of held-out views, scored inside the holes against Telea's inpainting; and pictures of it."""
+"""Samples of training items, their PSNR inside the holes, bootstrap intervals and pictures."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,39 +12,31 @@ import numpy as np
 import torch
 
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.completion import Sampling, denoised
+from arbiview_aug.generator.completion import denoised
 from arbiview_aug.generator.training.pseudo_views import Batch
 
 
 @torch.no_grad()
 def sampled(generator: Generator, batch: Batch, *, steps: int, seed: int, pasted: bool = True) -> torch.Tensor:
-    """(B, N, 3, H, W) images in [0, 1] of a batch's targets; the same for the same seed.
+    """Sample a batch's targets: (B, N, 3, H, W) images in [0, 1].
 
     Args:
         generator: The model.
         batch: On its device.
         steps: 1 is the one-step regression.
-        seed: Of the noise.
-        pasted: Known pixels are FAVS's, as in use; else the sample's own.
+        seed: Seed of the noise.
+        pasted: Paste known pixels of FAVS, as at inference.
     """
-    config = generator.config
+    config = replace(generator.config, steps=steps, guidance=1.0)
     size = (*batch.truth.shape[:2], config.autoencoder.latent_channels, *config.latent_size)
     noise = torch.randn(size, generator=torch.Generator().manual_seed(seed)).to(batch.truth.device)
-    how = Sampling(steps, 1.0, config.strength, "dpm++")
-    shown = batch.condition, batch.known, batch.confidence, batch.sources, batch.seen
-    made = denoised(generator, batch.geometry, *shown, noise, how)
-    return torch.where(batch.known[:, :, None], batch.favs, made) if pasted else made
+    images = denoised(generator, config, batch.geometry, batch.conditions, noise)
+    return torch.where(batch.known[:, :, None], batch.favs, images) if pasted else images
 
 
-def hole_psnr(made: torch.Tensor, truth: torch.Tensor, holes: torch.Tensor) -> torch.Tensor:
-    """(B,) PSNR in dB inside the holes of each item; NaN without any.
-
-    Args:
-        made: (B, N, 3, H, W) in [0, 1].
-        truth: Likewise.
-        holes: (B, N, H, W) bool.
-    """
-    error = ((made - truth) ** 2).mean(2) * holes
+def hole_psnr(images: torch.Tensor, truth: torch.Tensor, holes: torch.Tensor) -> torch.Tensor:
+    """(B,) PSNR in dB of images (B, N, 3, H, W) in [0, 1] inside the holes (B, N, H, W); NaN without any."""
+    error = ((images - truth) ** 2).mean(2) * holes
     mse = error.sum((1, 2, 3)) / holes.sum((1, 2, 3))
     return -10 * torch.log10(mse.clamp(min=1e-10))
 
@@ -60,7 +53,7 @@ class Interval(NamedTuple):
 
 
 def bootstrap(values: Sequence[float], seed: int = 0, draws: int = 2000) -> Interval:
-    """The mean of paired differences and where it lies in 95 % of the resamplings."""
+    """Mean and 95 % percentile interval of paired differences."""
     array = np.asarray(values, np.float64)
     rng = np.random.default_rng(seed)
     means = array[rng.integers(len(array), size=(draws, len(array)))].mean(1)
@@ -70,35 +63,31 @@ def bootstrap(values: Sequence[float], seed: int = 0, draws: int = 2000) -> Inte
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
 COLUMNS = ("source", "source", "FAVS", "mask", "filled", "sample", "truth")
-_LEAST_PX = 112  # small views are enlarged, so that one sees anything
+_MIN_WIDTH_PX = 112  # smaller views are enlarged
 _GAP_PX = 2
 
 
-def picture(batch: Batch, made: torch.Tensor) -> np.ndarray:
-    """(height, width, 3) uint8: a row for each item, with the columns ``COLUMNS`` named on top.
-
-    Args:
-        batch: On any device.
-        made: (B, N, 3, H, W).
-    """
-    scale = max(1, -(-_LEAST_PX // made.shape[-1]))
-    rows = []
-    for b in range(len(made)):
-        mask = batch.known[b, :1].float()[:, None].expand(1, 3, *made.shape[-2:])
-        views = torch.cat(
-            [batch.sources[b, :2], batch.favs[b, :1], mask, batch.condition[b, :1], made[b, :1], batch.truth[b, :1]]
-        )
-        pixels = (views.cpu().clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).numpy()
-        tiles = [
-            np.pad(np.kron(p, np.ones((scale, scale, 1), np.uint8)), ((0, _GAP_PX), (0, _GAP_PX), (0, 0)))
-            for p in pixels
-        ]
-        rows.append(np.concatenate(tiles, 1))
-    width = rows[0].shape[1]
+def picture(batch: Batch, samples: torch.Tensor) -> np.ndarray:
+    """(height, width, 3) uint8: a row for each item of a batch with samples (B, N, 3, H, W), a column for each view."""
+    scale = max(1, -(-_MIN_WIDTH_PX // samples.shape[-1]))
+    mask = batch.known[:, :1, None].float().expand_as(batch.favs[:, :1])
+    columns = [
+        batch.sources[:, :2],
+        batch.favs[:, :1],
+        mask,
+        batch.condition[:, :1],
+        samples[:, :1],
+        batch.truth[:, :1],
+    ]
+    views = torch.nn.functional.pad(
+        torch.cat(columns, 1).repeat_interleave(scale, -1).repeat_interleave(scale, -2), (0, _GAP_PX, 0, _GAP_PX)
+    )  # [B, columns, 3, h, w]
+    pixels = (views.cpu().clamp(0, 1) * 255).round().byte().permute(0, 3, 1, 4, 2).flatten(2, 3).flatten(0, 1).numpy()
+    width = pixels.shape[1]
     head = np.zeros((16, width, 3), np.uint8)
     for k, name in enumerate(COLUMNS):
         cv2.putText(head, name, (k * width // len(COLUMNS) + 3, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1)
-    return np.concatenate([head, *rows])
+    return np.concatenate([head, pixels])
 
 
 def save_png(path: Path, image: np.ndarray) -> None:

@@ -1,24 +1,24 @@
-"""Training items (Algorithm 1): a real view to reconstruct, from pseudo views beside it that FAVS makes of its frame.
+"""Training items (Algorithm 1): a real view to reconstruct, and FAVS's pseudo views beside it.
 
-For a real view, pseudo poses are drawn to its left and right, FAVS renders the frame's cameras there, and the pair is
-what the model gets: its source branches, and, warped to the target pose, its condition. Never FAVS of all cameras at
-the target pose: that is the answer. Besides, each by its own probability:
+For a real view, pseudo poses are drawn to its left and right, and FAVS renders the frame's cameras there. The pair is
+the model's source branches and, warped to the target pose, its condition. FAVS of all cameras at the target pose would
+be the answer itself. Additions, each with its own probability:
 
-- *transplanted masks*: holes as targets have them, put on the real view before FAVS sees it, so that no branch shows
-  what they hide; or on the condition alone, so that the branches do;
-- *leave-one-out*: FAVS does not get the real view at all;
-- *virtual targets*: the target is the real view under a random turn and focal length, the loss on valid pixels alone;
+- *transplanted masks*: holes of real targets, imposed on the real view before FAVS, which hides them from the branches
+  too, or on the condition alone;
+- *leave-one-out*: the real view is not among FAVS's sources;
+- *virtual targets*: the target is the real view under a random turn and focal length, with the loss on valid pixels;
 - *real sources*: the branches are the nearest real cameras, as at inference.
 
-Item k is drawn from (seed, k) alone: a resumed run, or one with other workers, sees the same.
+Item k is drawn from (seed, k) alone: a resumed run, or one with other workers, sees the same items.
 """
 
 from __future__ import annotations
 
-import hashlib
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch.utils.data import Dataset
@@ -26,17 +26,16 @@ from torch.utils.data import Dataset
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.favs.config import FavsConfig
-from arbiview_aug.generator.completion import nearest_sources
+from arbiview_aug.generator.completion import Conditions, nearest_sources, seeded
 from arbiview_aug.generator.config import GeneratorConfig
 from arbiview_aug.generator.geometry import FrameGeometry, batched, frame_geometry
 from arbiview_aug.generator.inpainting import telea
 from arbiview_aug.generator.training.config import PseudoViewConfig
 from arbiview_aug.generator.training.data import Frames
 from arbiview_aug.generator.training.masks import one_of, uniform, with_focal
-from arbiview_aug.render.confidence import confidence
-from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import build_plan
-from arbiview_aug.render.torch_backend import render_torch
+from arbiview_aug.render.rendered import Renderer
+from arbiview_aug.sample.inputs import Frame
 
 _VIRTUAL_YAW_DEG, _VIRTUAL_PITCH_DEG = 20.0, 8.0
 _FAVS = FavsConfig(certainty=True)
@@ -47,15 +46,15 @@ class Batch(NamedTuple):
 
     Attributes:
         truth: (B, N, 3, H, W) the real view.
-        valid: (B, N, H, W) bool, where it is known.
-        favs: (B, N, 3, H, W) FAVS of the pair at the target pose, black where it shows nothing.
-        condition: (B, N, 3, H, W) the same, its holes inpainted.
-        known: (B, N, H, W) bool, what it shows.
+        valid: (B, N, H, W) bool, its valid pixels.
+        favs: (B, N, 3, H, W) FAVS of the pair at the target pose, black in holes.
+        condition: (B, N, 3, H, W) the same, with holes inpainted.
+        known: (B, N, H, W) bool, coverage of ``favs``.
         confidence: (B, N, H, W) in [0, 1].
         sources: (B, S, 3, H, W).
-        seen: (B, S, H, W) bool, what they show.
+        seen: (B, S, H, W) bool, valid pixels of the sources.
         geometry: Of their cameras.
-        tokens: Name the items.
+        tokens: Names of the items.
     """
 
     truth: torch.Tensor
@@ -70,35 +69,28 @@ class Batch(NamedTuple):
     tokens: tuple[str, ...]
 
     def to(self, device: torch.device | str) -> Batch:
-        """The same on a device."""
-        moved: dict[str, Any] = {
-            name: value.to(device) for name, value in self._asdict().items() if isinstance(value, torch.Tensor)
-        }
-        return self._replace(**moved, geometry=self.geometry.to(device))
+        """Copy to a device."""
+        return Batch._make([*(value.to(device) for value in self[:-1]), self.tokens])
+
+    @property
+    def conditions(self) -> Conditions:
+        """The generator's inputs."""
+        return Conditions(self.condition, self.known, self.confidence, self.sources, self.seen)
 
     @property
     def holes(self) -> torch.Tensor:
-        """(B, N, H, W) bool: known to us, not shown by FAVS."""
+        """(B, N, H, W) bool: valid pixels that FAVS does not show."""
         return self.valid & ~self.known
 
 
 def collate(items: Sequence[Batch]) -> Batch:
-    """One batch of items."""
-    named = items[0]._asdict().items()
-    tensors: dict[str, Any] = {
-        name: torch.cat([getattr(item, name) for item in items])
-        for name, value in named
-        if isinstance(value, torch.Tensor)
-    }
-    return items[0]._replace(
-        **tensors,
-        geometry=batched([item.geometry for item in items]),
-        tokens=tuple(token for item in items for token in item.tokens),
-    )
+    """Concatenate items."""
+    *tensors, geometries, tokens = zip(*items, strict=True)
+    return Batch._make([*map(torch.cat, tensors), batched(geometries), tuple(itertools.chain(*tokens))])
 
 
 class Rendered(NamedTuple):
-    """What FAVS shows of M target cameras: (M, 3, h, w) float32, (M, h, w) bool, (M, h, w) in [0, 1]."""
+    """FAVS at M target cameras: images (M, 3, h, w) in [0, 1], coverage (M, h, w) bool, confidence (M, h, w)."""
 
     images: torch.Tensor
     covered: torch.Tensor
@@ -106,10 +98,9 @@ class Rendered(NamedTuple):
 
 
 def favs(images: Sequence[torch.Tensor], rig: Rig, targets: Sequence[Camera]) -> Rendered:
-    """FAVS of some cameras at target poses of the same ego frame.
+    """Render cameras at target poses of the same ego frame by FAVS.
 
-    Far away where all centres coincide, else over the street: the paper's training gets images and poses alone. By
-    OpenCV for images on the CPU, else by torch.
+    On the surface ``far`` if all centres coincide, else on ``street``: training has images and poses alone.
 
     Args:
         images: N images (3, H, W), uint8 or in [0, 1].
@@ -117,23 +108,14 @@ def favs(images: Sequence[torch.Tensor], rig: Rig, targets: Sequence[Camera]) ->
         targets: M cameras of one size.
     """
     target = Rig([replace(c, name=str(k), mask=None) for k, c in enumerate(targets)], ground_z_m=rig.ground_z_m)
-    moved = any(abs(c.center_m - rig[k].center_m).max() > 1e-6 for c in targets for k in nearest_sources(c, rig)[:1])
-    plan = build_plan(rig, target, surface="street" if moved else "far", config=_FAVS)
-    seams: list[torch.Tensor] = []
-    if images[0].device.type == "cpu":
-        views = render_opencv(plan, images, seams=seams)
-    else:
-        changes: list[torch.Tensor] = []
-        views = [view[0] for view in render_torch(plan, [image[None] for image in images], seams=changes)]
-        seams = [change[0] for change in changes]
-    covered = [torch.from_numpy(c).to(views[0].device) for c in plan.coverage]
-    trust = []
-    for view, made, seen, seam in zip(views, plan.targets, covered, seams, strict=True):
-        trust.append(seen.float() if made.certainty is None else confidence(view, made.certainty, seen, seam))
-    unit = torch.stack(views).float()
-    if views[0].dtype == torch.uint8:
+    is_moved = any(abs(c.center_m - rig[k].center_m).max() > 1e-6 for c in targets for k in nearest_sources(c, rig)[:1])
+    plan = build_plan(rig, target, surface="street" if is_moved else "far", config=_FAVS)
+    (rendered,) = Renderer().render([plan], [Frame(tuple(images), rig)], [None], ("confidence",))
+    unit = torch.stack(rendered.images).float()
+    if rendered.images[0].dtype == torch.uint8:
         unit = unit / 255
-    return Rendered(unit.clamp(0, 1), torch.stack(covered), torch.stack(trust))
+    assert isinstance(rendered.coverage, torch.Tensor) and isinstance(rendered.confidence, torch.Tensor)  # one size
+    return Rendered(unit.clamp(0, 1), rendered.coverage, rendered.confidence)
 
 
 class PseudoViews(Dataset[Batch]):
@@ -141,12 +123,12 @@ class PseudoViews(Dataset[Batch]):
 
     Args:
         frames: The data.
-        indices: Which of the frames.
+        indices: Indices of the frames to draw from.
         config: Settings.
-        generator: Of the generator: sizes and depth levels.
+        generator: Settings of the generator: sizes and depth levels.
         masks: (n, h, w) bool to transplant.
-        seed: Of all draws.
-        device: Where FAVS renders: workers cannot use a GPU.
+        seed: Seed of all draws.
+        device: Device on which FAVS renders; the CPU in workers.
     """
 
     def __init__(
@@ -165,55 +147,50 @@ class PseudoViews(Dataset[Batch]):
 
     def __getitem__(self, k: int) -> Batch:
         config, view = self.config, k // self.config.pairs
-        rng = self._rng("view", view)
+        rng = seeded(self.seed, "view", view)
         frame = self.frames[self.indices[one_of(rng, len(self.indices))]]
         frame = frame._replace(images=[image.to(self.device) for image in frame.images])
         i = one_of(rng, len(frame.rig))
         target, truth, valid = self._target(frame.images[i], frame.rig[i], rng)
-        rng = self._rng("pair", k)
-        # --- what FAVS gets
-        transplanted = uniform(rng, 0, 1) < config.transplanted
-        hidden = uniform(rng, 0, 1) < config.hidden
+        rng = seeded(self.seed, "pair", k)
+        # --- FAVS's sources
+        is_transplanted = uniform(rng, 0, 1) < config.transplanted
+        is_hidden = uniform(rng, 0, 1) < config.hidden
         mask = self.masks[one_of(rng, len(self.masks))]
         left_out = uniform(rng, 0, 1) < config.leave_one_out and len(frame.rig) > 1
         images, cameras = list(frame.images), list(frame.rig)
         if left_out:
             del images[i], cameras[i]
-        elif transplanted and hidden:
-            cameras[i] = _masked(cameras[i], mask)
+        elif is_transplanted and is_hidden:
+            own = cameras[i].mask
+            cameras[i] = replace(cameras[i], mask=mask.numpy() if own is None else own & mask.numpy())
         rig = frame.rig.with_cameras(cameras)
-        # --- the pair, and what it shows at the target pose
+        # --- the pair, and its view at the target pose
         pair = self._pair(target, rng)
         pseudo = favs(images, rig, pair)
-        of_pair = Rig(
-            [replace(c, mask=seen.cpu().numpy()) for c, seen in zip(pair, pseudo.covered, strict=True)],
-            ground_z_m=rig.ground_z_m,
-        )
-        at_target = favs(list(pseudo.images), of_pair, [target])
-        known, trust = at_target.covered[0], at_target.confidence[0]
-        if transplanted and not hidden:
+        masked = [replace(c, mask=seen.cpu().numpy()) for c, seen in zip(pair, pseudo.covered, strict=True)]
+        at_target = favs(list(pseudo.images), Rig(masked, ground_z_m=rig.ground_z_m), [target])
+        known, confidence = at_target.covered[0], at_target.confidence[0]
+        if is_transplanted and not is_hidden:
             known = known & mask.to(known.device)
         shown = at_target.images[0] * known
-        filled = telea(shown, ~known)
         # --- the source branches
         sources, seen, branches = pseudo.images, pseudo.covered, list(pair)
-        real = uniform(rng, 0, 1) < config.real_sources
-        answer = not (left_out or (transplanted and hidden))
-        if real and len(cameras) > 2:
-            kept = [n for n in range(len(cameras)) if not (answer and n == i)]
-            near = nearest_sources(target, rig.with_cameras([cameras[n] for n in kept]))
-            used = [kept[n] for n in near]
+        if uniform(rng, 0, 1) < config.real_sources and len(cameras) > 2:
+            shows_answer = not (left_out or (is_transplanted and is_hidden))
+            others = [n for n in range(len(cameras)) if not (shows_answer and n == i)]
+            used = [others[n] for n in nearest_sources(target, rig.with_cameras([cameras[n] for n in others]))]
             branches = [cameras[n] for n in used]
-            seen = torch.stack([_seen(camera).to(known.device) for camera in branches])
+            seen = torch.stack([_valid_pixels(camera).to(known.device) for camera in branches])
             sources = torch.stack([images[n].float() / 255 for n in used])
         geometry = frame_geometry([target], branches, rig.ground_z_m, self.generator)
         return Batch(
             truth[None, None],
             valid[None, None],
             shown[None, None],
-            filled[None, None],
+            telea(shown, ~known)[None, None],
             known[None, None],
-            (trust * known)[None, None],
+            (confidence * known)[None, None],
             (sources * seen[:, None])[None],
             seen[None],
             geometry,
@@ -221,33 +198,29 @@ class PseudoViews(Dataset[Batch]):
         )
 
     # --- draws --------------------------------------------------------------------------------------------------------
-    def _rng(self, what: str, number: int) -> torch.Generator:
-        digest = hashlib.sha256(repr((self.seed, what, number)).encode()).digest()
-        return torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1)
-
     def _target(
         self, image: torch.Tensor, camera: Camera, rng: torch.Generator
     ) -> tuple[Camera, torch.Tensor, torch.Tensor]:
-        """The target camera, its true image (3, h, w) in [0, 1], and where that is known (h, w)."""
+        """Draw the target camera, with its true image (3, h, w) in [0, 1] and valid pixels (h, w)."""
         virtual = uniform(rng, 0, 1) < self.config.virtual
         yaw, pitch = (uniform(rng, -limit, limit) for limit in (_VIRTUAL_YAW_DEG, _VIRTUAL_PITCH_DEG))
         focal = uniform(rng, *self.config.focal)
         if not virtual:
-            return camera, image.float() / 255, _seen(camera).to(image.device)
+            return camera, image.float() / 255, _valid_pixels(camera).to(image.device)
         target = replace(with_focal(camera.turned(yaw_deg=yaw, pitch_deg=pitch), focal), mask=None)
-        made = favs([image], Rig([camera]), [target])
-        return target, made.images[0], made.covered[0]
+        rendered = favs([image], Rig([camera]), [target])
+        return target, rendered.images[0], rendered.covered[0]
 
     def _pair(self, target: Camera, rng: torch.Generator) -> list[Camera]:
-        """A pseudo pose to the left and one to the right of a camera."""
+        """Draw a pseudo pose to the left and one to the right of a camera."""
         config = self.config
-        moved = uniform(rng, 0, 1) < config.moved
+        is_moved = uniform(rng, 0, 1) < config.moved
         cameras = []
         for name, side in (("left", 1), ("right", -1)):
             yaw, pitch = side * uniform(rng, *config.yaw_deg), uniform(rng, -config.pitch_deg, config.pitch_deg)
             camera = with_focal(target.turned(yaw_deg=yaw, pitch_deg=pitch), uniform(rng, *config.focal))
             aside, up = (uniform(rng, -half, half) for half in (config.lateral_m, config.vertical_m))
-            if moved:
+            if is_moved:
                 right = target.cam2ego[:3, 0]
                 x_m, y_m = (-abs(aside) * side * right[:2]).tolist()  # to the pose's own side
                 camera = camera.shifted(x_m, y_m, up)
@@ -255,10 +228,5 @@ class PseudoViews(Dataset[Batch]):
         return cameras
 
 
-def _masked(camera: Camera, mask: torch.Tensor) -> Camera:
-    seen = mask.numpy()
-    return replace(camera, mask=seen if camera.mask is None else camera.mask & seen)
-
-
-def _seen(camera: Camera) -> torch.Tensor:
+def _valid_pixels(camera: Camera) -> torch.Tensor:
     return torch.ones(camera.size, dtype=torch.bool) if camera.mask is None else torch.tensor(camera.mask)

@@ -1,4 +1,4 @@
-"""One training step of CVC-SSL: a batch in, its loss terms out; one module, so that distributed training wraps it."""
+"""One training step of CVC-SSL (Algorithm 1, Sec. Loss Function Design): the loss terms of a batch."""
 
 from __future__ import annotations
 
@@ -8,21 +8,20 @@ import torch
 from torch import nn
 
 from arbiview_aug.generator.autoencoder import Autoencoder
-from arbiview_aug.generator.completion import shown_condition
 from arbiview_aug.generator.conditioning import pooled
 from arbiview_aug.generator.denoiser import REGRESSION, TIMESTEPS, Denoiser, Rows
 from arbiview_aug.generator.geometry import FrameGeometry
 from arbiview_aug.generator.sampler import noise_schedule
 from arbiview_aug.generator.training.config import TrainConfig
-from arbiview_aug.generator.training.losses import Diffusion, Perceptual, crops, geometric_loss, masked_mse
+from arbiview_aug.generator.training.losses import Diffusion, Perceptual, crop, geometric_loss, masked_mse
 from arbiview_aug.generator.training.pseudo_views import Batch
 
 
 class Draws(NamedTuple):
-    """What a step draws, on the CPU: the same on every device and in a resumed run.
+    """Random draws of a step, on the CPU: the same on every device and in a resumed run.
 
     Attributes:
-        t: (B,) int64; ``REGRESSION`` for the items that train the one-step head.
+        t: (B,) int64 times; ``REGRESSION`` for the items that train the one-step head.
         eps: (B, N, C, h, w) standard normal.
         drop: (B,) bool, items without conditions.
         rng: For the crop of the perceptual loss.
@@ -35,27 +34,26 @@ class Draws(NamedTuple):
 
 
 def without_attention(geometry: FrameGeometry) -> FrameGeometry:
-    """The geometry of frames in which no view reads another one."""
-    none = [[c._replace(valid=torch.zeros_like(c.valid)) for c in reads] for reads in geometry[4:]]
-    return FrameGeometry(*geometry[:4], *none)
+    """The geometry with all correspondences masked: no view reads another one."""
+    return geometry.with_reads(lambda reads: reads._replace(valid=torch.zeros_like(reads.valid)))
 
 
 def draw(config: TrainConfig, batch: int, views: int, rng: torch.Generator) -> Draws:
-    """Times, noise and dropped conditions of one step."""
+    """Draw times, noise and dropped conditions of one step."""
     latent = config.generator
     t = torch.randint(TIMESTEPS, (batch,), generator=rng)
-    at_once = torch.rand(batch, generator=rng) < config.loss.regression
-    drop = (torch.rand(batch, generator=rng) < config.drop) & ~at_once
+    is_regression = torch.rand(batch, generator=rng) < config.loss.regression
+    drop = (torch.rand(batch, generator=rng) < config.drop) & ~is_regression
     size = (batch, views, latent.autoencoder.latent_channels, *latent.latent_size)
-    return Draws(torch.where(at_once, REGRESSION, t), torch.randn(size, generator=rng), drop, rng)
+    return Draws(torch.where(is_regression, REGRESSION, t), torch.randn(size, generator=rng), drop, rng)
 
 
 class Step(nn.Module):
-    """The loss terms of a batch.
+    """The loss terms of a batch, as one module that distributed training can wrap.
 
     Args:
         config: Settings.
-        denoiser: What is trained.
+        denoiser: The trained network.
         autoencoder: Frozen.
         perceptual: None switches L_perceptual off.
     """
@@ -70,7 +68,7 @@ class Step(nn.Module):
         self.diffusion = Diffusion(schedule.alphas_cumprod, config.generator.prediction)
 
     def forward(self, batch: Batch, draws: Draws, perceptual: bool = False) -> dict[str, torch.Tensor]:
-        """``main``, ``regression``, ``geo`` and, where asked for, ``perceptual``: scalars without their weights.
+        """Compute ``main``, ``regression``, ``geo`` and, if asked for, ``perceptual``: scalars without their weights.
 
         Args:
             batch: On the module's device.
@@ -79,48 +77,43 @@ class Step(nn.Module):
         """
         config, loss = self.config, self.config.loss
         autoencoder, vgg = self._frozen
-        if not config.attention:
-            batch = batch._replace(geometry=without_attention(batch.geometry))
-        shown = shown_condition(config.generator, batch.condition, batch.known)
+        geometry = batch.geometry if config.attention else without_attention(batch.geometry)
         with torch.no_grad():
-            x0, condition, sources = (
-                autoencoder.encode(images).float() for images in (batch.truth, shown, batch.sources)
-            )
+            x0 = autoencoder.encode(batch.truth).float()
+            views, source_views = batch.conditions.encoded(config.generator, autoencoder, geometry)
         size = (x0.shape[-2], x0.shape[-1])
         valid = (pooled(batch.valid, size) > 0.99).float()[:, :, None]
-        counts = valid * (1 - (1 - loss.known) * pooled(batch.known, size)[:, :, None])
-        source_views = batch.geometry.source_views(sources, batch.seen, batch.seen)
-        target_views = batch.geometry.target_views(condition, batch.known, batch.confidence).dropped(draws.drop)
-        at_once = draws.t == REGRESSION
-        t = draws.t.clamp(max=TIMESTEPS - 1)
+        pixel_weight = valid * (1 - (1 - loss.known) * pooled(batch.known, size)[:, :, None])
+        is_regression = draws.t == REGRESSION
+        t, regressed = draws.t.clamp(max=TIMESTEPS - 1), is_regression.view(-1, 1, 1, 1, 1)
         noisy = self.diffusion.noisy(x0, draws.eps, t)
-        start = torch.where(at_once.view(-1, 1, 1, 1, 1), condition, noisy)
+        start = torch.where(regressed, views.latent, noisy)
+        target = torch.where(regressed, x0, self.diffusion.target(x0, draws.eps, t))
+        views, windows = views.dropped(draws.drop), geometry.target_windows(draws.drop)
         rows: list[Rows] | None = [] if loss.geo else None
-        read = self.denoiser.read_sources(source_views, batch.geometry.source_windows())
-        windows = batch.geometry.target_windows(draws.drop)
-        predicted = self.denoiser(start, draws.t, target_views, windows, read, rows).float()
-        unit = self.denoiser.unit(draws.t[:, None].expand(x0.shape[:2]), target_views)
-        wanted = torch.where(at_once.view(-1, 1, 1, 1, 1), x0, self.diffusion.target(x0, draws.eps, t))
-        error = masked_mse(predicted / unit, wanted / unit, counts)
+        sources = self.denoiser.read_sources(source_views, geometry.source_windows())
+        predicted = self.denoiser(start, draws.t, views, windows, sources, rows).float()
+        unit = self.denoiser.output_scale(draws.t[:, None].expand(x0.shape[:2]), views)
+        error = masked_mse(predicted / unit, target / unit, pixel_weight)
         weight = torch.ones_like(error)
-        if not config.generator.residual:  # else the unit has made all times alike
+        if not config.generator.residual:  # its unit makes all times alike
             weight = self.diffusion.weight(t, loss.snr_limit, loss.snr_floor)
-        terms = {"main": (error * weight)[~at_once].sum() / len(t)}
+        terms = {"main": (error * weight)[~is_regression].sum() / len(t)}
         if loss.regression:
-            terms["regression"] = error[at_once].sum() / len(t)
+            terms["regression"] = error[is_regression].sum() / len(t)
         if rows is not None:
             terms["geo"] = geometric_loss(rows, loss.geo_mode)
-        early = ~at_once & (t < loss.perceptual_below_t)
+        early = ~is_regression & (t < loss.perceptual_below_t)
         if perceptual and vgg is not None and bool(early.any()):
-            made = autoencoder.decode(self.diffusion.x0(noisy, predicted, t)[early]).float()
-            truth, seen = batch.truth[early], batch.valid[early][:, :, None]
-            rows_, columns = crops(truth, loss.perceptual_crop, draws.rng)
-            made, truth, seen = (image[..., rows_, columns].flatten(0, 1) for image in (made, truth, seen))
-            terms["perceptual"] = vgg(torch.where(seen, made, truth), truth).sum() / len(t)
+            image = autoencoder.decode(self.diffusion.x0(noisy, predicted, t)[early]).float()
+            truth, known = batch.truth[early], batch.valid[early][:, :, None]
+            square = crop(truth, loss.perceptual_crop, draws.rng)
+            image, truth, known = (value[square].flatten(0, 1) for value in (image, truth, known))
+            terms["perceptual"] = vgg(torch.where(known, image, truth), truth).sum() / len(t)
         return terms
 
     def total(self, terms: dict[str, torch.Tensor]) -> torch.Tensor:
-        """L_total: the one-step head's loss counts as L_main."""
+        """L_total = L_main + α L_geo + β L_perceptual; the one-step head's loss counts as L_main."""
         loss = self.config.loss
         weights = {"main": 1.0, "regression": 1.0, "geo": loss.geo, "perceptual": loss.perceptual}
         return torch.stack([weights[name] * term for name, term in terms.items()]).sum()

@@ -305,6 +305,6 @@ def test_an_untrained_network_errs_by_one_unit_at_all_times(tmp_path: Path) -> N
         with torch.no_grad():
             got = made.generator.denoiser(x, times, views, batch.geometry.target_windows(), read)
         wanted = truth if t == REGRESSION else made.step.diffusion.target(truth, eps, at)
-        unit = made.generator.denoiser.unit(times, views)
+        unit = made.generator.denoiser.output_scale(times, views)
         found.append(float((((got - wanted) / unit) ** 2)[batch.valid[:, :, None].expand_as(got)].mean()))
     assert 0.4 < min(found) and max(found) < 2.5, found
