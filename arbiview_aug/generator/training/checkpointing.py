@@ -1,14 +1,16 @@
-"""What a run needs to go on as if it had never stopped: weights, averaged weights, optimiser, step.
+"""State of a training run, which resumes as if it had never stopped: weights, averaged weights, optimiser, step.
 
-One safetensors file and nothing else: learning rates are functions of the step, and every draw comes from (seed, step).
-Written by the same atomic replacement as a generator's folder: a full disk or a killed process leaves the last one.
+Learning rates are functions of the step, and every draw comes from (seed, step), so nothing else is saved. Files are
+replaced atomically, as a generator's folder is: a full disk or a killed process leaves the last state.
 """
 
 from __future__ import annotations
 
 import signal
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
 import torch
@@ -20,11 +22,11 @@ from arbiview_aug.generator.training.config import TrainConfig
 
 
 class Average:
-    """Exponential moving average of a module's trained parameters, with warm-up.
+    """Exponential moving average of a module's trained parameters.
 
     Args:
-        module: Whose parameters that require gradients are averaged.
-        decay: Of the average; (1 + step) / (10 + step) while that is less.
+        module: Its parameters that require gradients are averaged.
+        decay: Of the average; (1 + step) / (10 + step) while that is smaller.
     """
 
     def __init__(self, module: nn.Module, decay: float) -> None:
@@ -33,24 +35,26 @@ class Average:
 
     @torch.no_grad()
     def update(self, module: nn.Module, step: int) -> None:
-        """After optimiser step number ``step``, from 0."""
+        """Update after optimiser step number ``step``, from 0."""
         decay = min(self.decay, (1 + step) / (10 + step))
         parameters = dict(module.named_parameters())
         for name, value in self.values.items():
             value.lerp_(parameters[name].detach().float(), 1 - decay)
 
-    @torch.no_grad()
-    def put_into(self, module: nn.Module) -> dict[str, torch.Tensor]:
-        """Replace the module's parameters; returns copies of what they were, for ``put_back``."""
+    @contextmanager
+    def applied_to(self, module: nn.Module) -> Iterator[None]:
+        """Put the averaged parameters into the module for a while."""
         parameters = dict(module.named_parameters())
-        before = {name: parameters[name].detach().clone() for name in self.values}
-        put_back(module, self.values)
-        return before
+        trained = {name: parameters[name].detach().clone() for name in self.values}
+        _copy_parameters(module, self.values)
+        try:
+            yield
+        finally:
+            _copy_parameters(module, trained)
 
 
 @torch.no_grad()
-def put_back(module: nn.Module, values: dict[str, torch.Tensor]) -> None:
-    """Copy values into the parameters of these names."""
+def _copy_parameters(module: nn.Module, values: Mapping[str, torch.Tensor]) -> None:
     parameters = dict(module.named_parameters())
     for name, value in values.items():
         parameters[name].copy_(value)
@@ -62,26 +66,27 @@ def save_state(
     """Write the state after ``step`` steps.
 
     Raises:
-        OSError: The disk is full, or the folder cannot be written; the last state is as it was.
+        OSError: The disk is full, or the folder cannot be written; the last state is unchanged.
     """
     tensors = {f"weights.{n}": p.detach() for n, p in module.named_parameters() if p.requires_grad}
     tensors |= {f"average.{name}": value for name, value in average.values.items()}
-    for k, parameter in enumerate(_trained(optimiser)):
-        for key, value in optimiser.state[parameter].items():
-            tensors[f"optimiser.{k}.{key}"] = torch.as_tensor(value)
+    for k, state in optimiser.state_dict()["state"].items():
+        tensors |= {f"optimiser.{k}.{key}": torch.as_tensor(value) for key, value in state.items()}
     write_checkpoint(folder, {"step": step, "training": config.to_dict()}, tensors)
 
 
 def saved_config(folder: Path, otherwise: TrainConfig) -> TrainConfig:
-    """The settings of the run whose state a folder holds: its scenes, sizes and split; others where it holds none.
+    """The settings of the run whose state a folder holds; ``otherwise`` without a state.
 
     Raises:
         TrainingError: The state is broken.
     """
-    if not has_state(folder):
-        return otherwise
+    return _training_config(folder, read_config(folder)[0]) if has_state(folder) else otherwise
+
+
+def _training_config(folder: Path, data: Mapping[str, Any]) -> TrainConfig:
     try:
-        return TrainConfig.from_dict(read_config(folder)[0]["training"])
+        return TrainConfig.from_dict(data["training"])
     except (GeneratorError, KeyError) as error:
         raise TrainingError(f"{folder}: expected the state of a training run: {error}") from None
 
@@ -89,58 +94,49 @@ def saved_config(folder: Path, otherwise: TrainConfig) -> TrainConfig:
 def load_state(
     folder: Path, config: TrainConfig, module: nn.Module, average: Average, optimiser: torch.optim.Optimizer
 ) -> int:
-    """Put a saved state into a run; returns the steps that were done.
+    """Load a saved state into a run; returns its number of steps.
 
     Raises:
-        TrainingError: The state is of a run with other settings, or broken.
+        TrainingError: The state belongs to a run with other settings, or is broken.
     """
     try:
         data, tensors = read_checkpoint(folder)
-        saved, step = TrainConfig.from_dict(data["training"]), int(data["step"])
+        step = int(data["step"])
     except (GeneratorError, KeyError) as error:
         raise TrainingError(f"{folder}: expected the state of a training run: {error}") from None
-    _check_same(folder, saved, config)
-    trained = [name for name, p in module.named_parameters() if p.requires_grad]
-    needed = {f"{part}.{name}" for part in ("weights", "average") for name in trained}
-    missing = sorted(needed - set(tensors))
-    if missing:
-        raise TrainingError(f"{folder}: expected {missing[0]} and others, {len(missing)} are missing")
-    put_back(module, {name: tensors[f"weights.{name}"] for name in trained})
-    for name, value in average.values.items():
-        value.copy_(tensors[f"average.{name}"])
-    for k, parameter in enumerate(_trained(optimiser)):
-        start = f"optimiser.{k}."
-        state = {name.removeprefix(start): value for name, value in tensors.items() if name.startswith(start)}
-        optimiser.state[parameter] = {
-            key: value.clone() if key == "step" else value.to(parameter.device) for key, value in state.items()
-        }
-    return step
-
-
-def has_state(folder: Path) -> bool:
-    """Whether there is a state to go on from."""
-    return (folder / CONFIG_FILE).is_file()
-
-
-def _trained(optimiser: torch.optim.Optimizer) -> list[torch.Tensor]:
-    return [parameter for group in optimiser.param_groups for parameter in group["params"]]
-
-
-_MAY_DIFFER = ("workers", "save_every", "validate_every", "validation_items")
-
-
-def _check_same(folder: Path, saved: TrainConfig, config: TrainConfig) -> None:
-    before, now = saved.to_dict(), config.to_dict()
+    before, now = _training_config(folder, data).to_dict(), config.to_dict()
     changed = [key for key in now if key not in _MAY_DIFFER and before[key] != now[key]]
     if changed:
         raise TrainingError(
             f"{folder}: a run with other settings of {', '.join(changed)}; resume with the same ones, or give another "
             "--output"
         )
+    missing = [f"{part}.{n}" for part in ("weights", "average") for n in average.values if f"{part}.{n}" not in tensors]
+    if missing:
+        raise TrainingError(f"{folder}: expected {missing[0]} and others, {len(missing)} are missing")
+    _copy_parameters(module, {name: tensors[f"weights.{name}"] for name in average.values})
+    for name, value in average.values.items():
+        value.copy_(tensors[f"average.{name}"])
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for name, value in tensors.items():
+        if name.startswith("optimiser."):
+            _, k, key = name.split(".")
+            state.setdefault(int(k), {})[key] = value
+    optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
+    return step
+
+
+_MAY_DIFFER = ("workers", "save_every", "validate_every", "validation_items")
+"""Settings that a resumed run may change."""
+
+
+def has_state(folder: Path) -> bool:
+    """Whether a folder holds a state to resume from."""
+    return (folder / CONFIG_FILE).is_file()
 
 
 class StopRequests:
-    """While entered, the two signals are noted in ``asked`` instead of ending the process; afterwards as before."""
+    """Context in which SIGTERM and SIGINT set ``asked`` instead of ending the process."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -151,9 +147,7 @@ class StopRequests:
             self._before[number] = signal.signal(number, self._ask)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
@@ -162,6 +156,6 @@ class StopRequests:
 
 
 def ignore_stop_requests() -> None:
-    """For worker processes: the main one saves first, and then ends them."""
+    """Ignore both signals in a worker: the main process saves first and then ends its workers."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,4 +1,4 @@
-"""The run: steps, averaging, logs, validation, checkpoints; one process or many, by accelerate."""
+"""The training loop: steps, averaging, logs, validation and checkpoints (Algorithm 1, Sec. Training Parameters)."""
 
 from __future__ import annotations
 
@@ -17,14 +17,7 @@ from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import shown_condition
 from arbiview_aug.generator.conditioning import pooled
-from arbiview_aug.generator.training.checkpointing import (
-    Average,
-    StopRequests,
-    has_state,
-    load_state,
-    put_back,
-    save_state,
-)
+from arbiview_aug.generator.training.checkpointing import Average, StopRequests, has_state, load_state, save_state
 from arbiview_aug.generator.training.config import TrainConfig
 from arbiview_aug.generator.training.data import Frames, item_workers
 from arbiview_aug.generator.training.losses import Perceptual
@@ -35,15 +28,15 @@ from arbiview_aug.generator.training.step import Step, draw
 
 _LOG_EVERY = 10
 _DEVIATION_ITEMS = 32
-_LEAST_DEVIATION = 0.02
-"""Lower bound, 2.5 grey levels: the error of rendering twice."""
+_MIN_DEVIATION = 0.02
+"""Lower bound of the residual's deviation, 2.5 grey levels: the error of rendering twice."""
 
 _SEEDS = {"items": 1, "validation": 2, "masks": 3, "draws": 4}
 """Offsets of the random streams: validation never sees training's draws."""
 
 
 class Trainer:
-    """Trains a generator's denoiser.
+    """Training of a generator's denoiser (Algorithm 1), on one process or many.
 
     The output folder gets ``generator/`` (averaged weights, for ``Generator.from_pretrained``), ``state/`` (to resume
     from), ``logs/`` (TensorBoard) and ``validation/`` (PNG).
@@ -51,14 +44,14 @@ class Trainer:
     Args:
         config: Settings.
         frames: The data.
-        generator: To train in place; its autoencoder is ready and stays as it is.
-        output: Folder; where it holds a state, the run goes on from there.
+        generator: Trained in place; its autoencoder is frozen.
+        output: Folder; the run resumes from a state that it holds.
         perceptual: None switches L_perceptual off.
-        show: Progress bar.
-        say: Gets messages for people.
+        show: Show a progress bar.
+        say: Called with messages.
 
     Raises:
-        TrainingError: The output holds a run with other settings, or the generator was made by others.
+        TrainingError: The output holds a run with other settings, or the generator has another configuration.
         ImportError: accelerate or tensorboard is not installed.
     """
 
@@ -81,7 +74,7 @@ class Trainer:
         self.device = self.accelerator.device
         scaled = replace(config.generator.autoencoder, scale=generator.config.autoencoder.scale)
         if generator.config != replace(config.generator, autoencoder=scaled, one_step=generator.config.one_step):
-            raise TrainingError("Trainer: expected a generator of the run's own settings, got another's")
+            raise TrainingError("Trainer: expected a generator with the run's settings, got others")
         self.generator = generator.to(self.device)
         generator.config = replace(generator.config, one_step=config.loss.regression > 0)
         generator.autoencoder.requires_grad_(False)
@@ -93,13 +86,12 @@ class Trainer:
             [p for p in step.parameters() if p.requires_grad], lr=config.lr, weight_decay=config.weight_decay
         )
         self.average = Average(generator.denoiser, config.ema)
-        self.done = 0
+        self.done, self.state_folder = 0, self.output / "state"
         if has_state(self.state_folder):
             self.done = load_state(self.state_folder, config, generator.denoiser, self.average, self.optimiser)
             self.say(f"going on after step {self.done} of {self.state_folder}")
-        # Not placed: AdamW's step counters belong on the CPU, else each is waited for.
-        placed = [True, False]
-        self.model, self._optimiser = self.accelerator.prepare(step, self.optimiser, device_placement=placed)
+        # The optimiser is not placed: AdamW's step counters on a GPU would be waited for one by one.
+        self.model, self._optimiser = self.accelerator.prepare(step, self.optimiser, device_placement=[True, False])
         self.step = step
         self._stop = StopRequests()
         masks = mask_bank(
@@ -111,11 +103,6 @@ class Trainer:
         self.validation = self._items(self.split.validation or self.split.training, masks, "validation")
         if not self.split.validation:
             self.say("too few scenes for a validation part: validating on training scenes, with other draws")
-
-    @property
-    def state_folder(self) -> Path:
-        """Where the state is."""
-        return self.output / "state"
 
     def say(self, message: str) -> None:
         """Print a message from the main process alone."""
@@ -130,26 +117,27 @@ class Trainer:
 
     @torch.no_grad()
     def _measure_deviation(self) -> None:
-        """Set the denoiser's residual deviation inside and outside holes, from the first items (reproducible)."""
+        """Measure the standard deviation of the residual inside and outside holes, on the first items."""
         encode = self.generator.autoencoder.encode
         sums = torch.zeros(2, 2, dtype=torch.float64)
         for k in range(_DEVIATION_ITEMS):
             batch = self.items[k].to(self.device)
             shown = shown_condition(self.config.generator, batch.condition, batch.known)
-            lacks = (encode(batch.truth) - encode(shown)).float().square().mean(2)
-            known, valid = (pooled(m, (lacks.shape[-2], lacks.shape[-1])) > 0.99 for m in (batch.known, batch.valid))
-            for row, where in enumerate((valid & ~known, valid & known)):
-                sums[row] += torch.stack([lacks[where].sum(), where.sum()]).cpu()
-        found = (sums[:, 0] / sums[:, 1].clamp(min=1)).sqrt().clamp(min=_LEAST_DEVIATION)
-        self.generator.denoiser.deviation.copy_(found)
+            squared = (encode(batch.truth) - encode(shown)).float().square().mean(2)
+            size = (squared.shape[-2], squared.shape[-1])
+            known, valid = (pooled(maps, size) > 0.99 for maps in (batch.known, batch.valid))
+            for row, pixels in enumerate((valid & ~known, valid & known)):
+                sums[row] += torch.stack([squared[pixels].sum(), pixels.sum()]).cpu()
+        deviation = (sums[:, 0] / sums[:, 1].clamp(min=1)).sqrt().clamp(min=_MIN_DEVIATION)
+        self.generator.denoiser.deviation.copy_(deviation)
 
     # --- the loop -----------------------------------------------------------------------------------------------------
     def train(self) -> bool:
-        """Train to the last step, or until SIGTERM or SIGINT, and save the state; returns whether it is done.
+        """Train to the last step, or until SIGTERM or SIGINT, and save; returns whether all steps are done.
 
         Raises:
-            TrainingError: A loss is not finite; the last saved state is from before.
-            OSError: The state at the end could not be saved.
+            TrainingError: A loss is not finite.
+            OSError: The last state could not be saved.
         """
         config = self.config
         writer = self._writer() if self.is_main else None
@@ -179,10 +167,10 @@ class Trainer:
         return self.done == config.steps
 
     def train_step(self, batch: Batch) -> dict[str, float]:
-        """One update; returns the loss terms.
+        """Update the weights once; returns the loss terms.
 
         Raises:
-            TrainingError: A term is not finite; names it, the step and the batch. Nothing was updated.
+            TrainingError: A term is not finite; nothing was updated.
         """
         config = self.config
         number = self.done * self.accelerator.num_processes + self.accelerator.process_index
@@ -198,7 +186,12 @@ class Trainer:
         total = self.step.total(terms)
         numbers = torch.stack([*terms.values(), total]).detach().tolist()  # one wait for a GPU
         values = dict(zip((*terms, "total"), numbers, strict=True))
-        self._check_finite(values, batch)
+        infinite = [name for name, value in values.items() if not math.isfinite(value)]
+        if infinite:
+            raise TrainingError(
+                f"step {self.done}: loss term {infinite[0]} is {values[infinite[0]]}; the batch: "
+                f"{', '.join(batch.tokens)}. The last saved state is from before; try a lower lr, or bf16 off"
+            )
         self.accelerator.backward(total)
         if config.clip:
             self.accelerator.clip_grad_norm_(self.model.parameters(), config.clip)
@@ -206,15 +199,6 @@ class Trainer:
         self._optimiser.zero_grad(set_to_none=True)
         self.average.update(self.generator.denoiser, self.done)
         return values
-
-    def _check_finite(self, values: Mapping[str, float], batch: Batch) -> None:
-        wrong = [name for name, value in values.items() if not math.isfinite(value)]
-        if wrong:
-            tokens = ", ".join(batch.tokens)
-            raise TrainingError(
-                f"step {self.done}: loss term {wrong[0]} is {values[wrong[0]]}; the batch: {tokens}. The last saved "
-                "state is from before; try a lower lr, or bf16 off"
-            )
 
     def _batches(self) -> Iterator[Batch]:
         config, world = self.config, self.accelerator.num_processes
@@ -231,8 +215,6 @@ class Trainer:
 
     # --- stopping and saving ------------------------------------------------------------------------------------------
     def _should_stop(self) -> bool:
-        if self.accelerator.num_processes == 1:
-            return self._stop.asked
         asked = torch.tensor(float(self._stop.asked), device=self.device)
         return bool(self.accelerator.reduce(asked, "sum") > 0)  # all processes stop after the same step
 
@@ -240,18 +222,15 @@ class Trainer:
         """Write the state, and the generator with averaged weights.
 
         Raises:
-            OSError: One could not be written; what was there is as it was.
+            OSError: One could not be written; the last saved one is unchanged.
         """
         try:
             if self.is_main:
                 denoiser = self.generator.denoiser
                 save_state(self.state_folder, self.config, self.done, denoiser, self.average, self.optimiser)
-                with_average = self.average.put_into(denoiser)
-                try:
+                with self.average.applied_to(denoiser):
                     self.generator.save_pretrained(self.output / "generator")
-                finally:
-                    put_back(denoiser, with_average)
-        finally:  # the others wait, whatever became of it
+        finally:  # the other processes wait in any case
             self.accelerator.wait_for_everyone()
 
     def _save_or_warn(self) -> None:
@@ -272,7 +251,7 @@ class Trainer:
         bar.set_postfix({name: f"{value:.3f}" for name, value in terms.items()})
 
     def _validate(self, writer: Any) -> None:
-        """Samples of fixed items by the averaged weights: PSNR inside the holes, and a picture."""
+        """Log samples of fixed items by the averaged weights."""
         if self.is_main:
             scores, image = self.validated()
             for name, value in scores.items():
@@ -287,20 +266,17 @@ class Trainer:
         self.accelerator.wait_for_everyone()
 
     def validated(self) -> tuple[dict[str, float], Any]:
-        """Mean PSNR inside the holes of the validation items by way of filling, and their picture (h, w, 3) uint8."""
-        config, denoiser = self.config, self.generator.denoiser
+        """Mean PSNR inside the holes of the validation items, in dB by method, and their picture (h, w, 3) uint8."""
+        config = self.config
         batch = collate([self.validation[k] for k in range(config.validation_items)]).to(self.device)
-        before = self.average.put_into(denoiser)
-        try:
-            one = sampled(self.generator, batch, steps=1, seed=0)
-            some = sampled(self.generator, batch, steps=max(2, config.generator.steps), seed=0)
-        finally:
-            put_back(denoiser, before)
-        ways = {"condition": batch.condition, "one_step": one, f"{max(2, config.generator.steps)}_steps": some}
-        if not config.loss.regression:
-            del ways["one_step"]
-        scores = {name: float(hole_psnr(image, batch.truth, batch.holes).nanmean()) for name, image in ways.items()}
-        return scores, picture(batch, some)
+        steps = max(2, config.generator.steps)
+        methods = {"condition": batch.condition}
+        with self.average.applied_to(self.generator.denoiser):
+            if config.loss.regression:
+                methods["one_step"] = sampled(self.generator, batch, steps=1, seed=0)
+            methods[f"{steps}_steps"] = samples = sampled(self.generator, batch, steps=steps, seed=0)
+        scores = {name: float(hole_psnr(image, batch.truth, batch.holes).nanmean()) for name, image in methods.items()}
+        return scores, picture(batch, samples)
 
 
 def learning_rate(config: TrainConfig, step: int) -> float:

@@ -224,7 +224,7 @@ def test_a_generator_of_other_settings_is_refused(tmp_path: Path) -> None:
     """It would say that it was trained as it was not: with inpainted conditions, say."""
     settings = config()
     other = Generator.from_config(replace(settings.generator, prefilled=False))
-    with pytest.raises(TrainingError, match="expected a generator of the run's own settings"):
+    with pytest.raises(TrainingError, match="expected a generator with the run's settings"):
         Trainer(settings, frames(), other, tmp_path, show=False)
 
 
