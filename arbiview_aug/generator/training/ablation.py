@@ -1,4 +1,4 @@
-"""Ablation study: train with one setting changed at a time and score each on held-out streets."""
+"""Ablation study: train variants of the settings and score each on held-out streets."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "without L_geo": ("loss.geo=0",),
     "without attention": ("attention=false",),
 }
-"""Settings of each variant, over the run's own."""
+"""Settings of each variant, on top of the run's own."""
 
 SEEN_ITEMS = 32
-"""Held-out real views whose condition is masked where a source branch shows the pixel: what attention can fill."""
+"""Number of held-out real views with a condition masked where a source branch shows the pixel."""
 
 
 def wrong_rig(geometry: FrameGeometry) -> FrameGeometry:
@@ -63,23 +63,21 @@ def correct_correspondences(generator: Generator, batch: Batch) -> float:
 
 
 def seen_scores(generator: Generator, batch: Batch, steps: int) -> dict[str, float]:
-    """Mean PSNR in the holes of a batch, by the homographies used; the best of one-step and sample is not picked."""
-    changes: dict[str, Callable[[FrameGeometry], FrameGeometry]] = {
-        "attention": lambda geometry: geometry,
-        "no attention": without_attention,
-        "wrong rig": wrong_rig,
+    """Mean PSNR in the holes of a batch, with the right homographies, without attention and with a wrong rig's."""
+    geometries = {
+        "attention": batch.geometry,
+        "no attention": without_attention(batch.geometry),
+        "wrong rig": wrong_rig(batch.geometry),
     }
-    scores = {"telea": float(hole_psnr(batch.condition, batch.truth, batch.holes).nanmean())}
-    for name, change in changes.items():
-        changed = batch._replace(geometry=change(batch.geometry))
+    images = {"telea": batch.condition}
+    for name, geometry in geometries.items():
         for way, count in (("one step", 1), ("sample", steps)):
-            made = sampled(generator, changed, steps=count, seed=0)
-            scores[f"{way}, {name}"] = float(hole_psnr(made, batch.truth, batch.holes).nanmean())
-    return scores
+            images[f"{way}, {name}"] = sampled(generator, batch._replace(geometry=geometry), steps=count, seed=0)
+    return {name: float(hole_psnr(image, batch.truth, batch.holes).nanmean()) for name, image in images.items()}
 
 
 def seen_batch(frames: Frames, indices: Sequence[int], config: TrainConfig, masks: torch.Tensor) -> Batch:
-    """Build the batch of ``SEEN_ITEMS`` items."""
+    """Items whose holes a source branch shows, which attention can fill."""
     settings = PseudoViewConfig(
         transplanted=1.0, hidden=0.0, leave_one_out=0.0, virtual=0.0, real_sources=0.0, moved=config.pseudo_views.moved
     )
@@ -99,20 +97,18 @@ def ablate(
     show: bool = True,
     say: Callable[[str], None] = print,
 ) -> dict[str, dict[str, Any]]:
-    """Train and score each variant; finished ones are skipped. Writes ``ablation.json``.
-
-    SIGTERM and SIGINT end it: the variant that is trained goes on from there.
+    """Train and score each variant, and write ``ablation.json``; a stopped study resumes.
 
     Args:
-        config: Of the run that the variants change.
+        config: Settings that the variants change.
         frames: Synthetic streets.
-        make: Gives a fresh generator of a variant's settings, the same each time.
-        output: A folder with one for each variant.
-        variants: Of ``VARIANTS``.
-        views: Held-out views for the scores.
+        make: Returns an untrained generator for a variant's settings, the same each time.
+        output: Folder; gets one for each variant.
+        variants: Keys of ``VARIANTS``.
+        views: Number of held-out views to score.
         perceptual: As for ``Trainer``.
-        show: Progress bars.
-        say: Gets the table.
+        show: Show progress bars.
+        say: Called with the scores.
     """
     split = frames.split(config.seed)
     indices = (split.held_out or split.validation or split.training)[:views]
@@ -122,7 +118,7 @@ def ablate(
         folder = output / variant.replace(" ", "_").replace("+", "with")
         trainer = Trainer(changed, frames, make(changed), folder, perceptual=perceptual, show=show, say=say)
         if not trainer.train():
-            return table  # stopped: a variant half trained is not scored
+            return table  # stopped by a signal
         if not trainer.is_main:
             trainer.accelerator.wait_for_everyone()
             continue

@@ -1,4 +1,4 @@
-"""First training stage: a small KL autoencoder, for configurations without pretrained weights."""
+"""First training stage: a small KL autoencoder (Rombach et al. 2022), for configurations without pretrained weights."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from arbiview_aug.generator.training.masks import one_of
 
 FOLDER, UNFINISHED = "autoencoder", "autoencoder-state"
 _SCALE_IMAGES = 64
-"""Images whose latents' standard deviation sets the scale, to within 0.1 %."""
+"""Number of images that set the latents' scale, to within 0.1 %."""
 
 _MESSAGE_EVERY = 250
 
@@ -39,22 +39,22 @@ def train_autoencoder(
     show: bool = True,
     say: Callable[[str], None] = print,
 ) -> bool:
-    """Give a generator a trained autoencoder: that of ``output``, or one that is trained and saved there.
+    """Train a generator's autoencoder in place, or load the one in ``output``.
 
-    L1 + KL, and VGG's distance where there are weights (Rombach et al. 2022, without their discriminator). Afterwards
-    latents are scaled to unit variance, as the diffusion expects. Saved and resumed as the run itself.
+    L1 + KL, and VGG's distance if there are weights (Rombach et al. 2022, without their discriminator). Afterwards
+    latents are scaled to unit variance. Saved and resumed like the main run.
 
     Args:
-        config: Settings; does nothing where latents are pixels.
+        config: Settings; does nothing without an autoencoder stage.
         frames: The data; training scenes are used.
-        generator: Whose autoencoder is trained in place.
+        generator: The model.
         output: The run's folder.
         perceptual: None leaves the term out.
-        show: Progress bar.
-        say: Gets messages for people.
+        show: Show a progress bar.
+        say: Called with messages.
 
     Returns:
-        Whether it is done; False where SIGTERM or SIGINT stopped it: its state is saved.
+        Whether it is done; False if SIGTERM or SIGINT stopped it, after saving its state.
 
     Raises:
         TrainingError: The saved one has another architecture; a loss is not finite.
@@ -72,7 +72,7 @@ def train_autoencoder(
     if perceptual is not None:
         perceptual.to(device)
     optimiser = torch.optim.AdamW(vae.parameters(), lr=stage.lr)
-    average = Average(vae, 0.0)  # of the state's format: the weights themselves
+    average = Average(vae, 0.0)  # the state's format wants one: the weights themselves
     done = load_state(unfinished, config, vae, average, optimiser) if has_state(unfinished) else 0
     vae.train()
     batches = _Batches(frames, training, stage.batch, config.seed)
@@ -87,11 +87,9 @@ def train_autoencoder(
             terms = _terms(vae, images, stage, perceptual, rng, bf16=config.precision == "bf16")
             numbers = torch.stack(list(terms.values())).detach().tolist()
             values = dict(zip(terms, numbers, strict=True))
-            wrong = [name for name, value in values.items() if not math.isfinite(value)]
-            if wrong:
-                raise TrainingError(
-                    f"autoencoder, step {step}: loss term {wrong[0]} is {values[wrong[0]]}; lower its lr"
-                )
+            for name, value in values.items():
+                if not math.isfinite(value):
+                    raise TrainingError(f"autoencoder, step {step}: loss term {name} is {value}; lower its lr")
             torch.stack(list(terms.values())).sum().backward()
             torch.nn.utils.clip_grad_norm_(vae.parameters(), 1.0)
             optimiser.step()
@@ -123,15 +121,15 @@ def _terms(
     rng: torch.Generator,
     bf16: bool,
 ) -> dict[str, torch.Tensor]:
-    """``l1``, ``kl`` and, where there are weights, ``perceptual``, weighted, of images (n, 3, H, W) in [0, 1]."""
+    """Weighted ``l1``, ``kl`` and, with VGG, ``perceptual`` of images (n, 3, H, W) in [0, 1]."""
     with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
         posterior = vae.encode(images * 2 - 1).latent_dist
         noise = torch.randn(posterior.mean.shape, generator=rng).to(images.device)
-        made = vae.decode(posterior.mean + posterior.std * noise).sample
-    made = made.float() / 2 + 0.5
-    terms = {"l1": (made - images).abs().mean(), "kl": stage.kl * posterior.kl().float().mean()}
+        decoded = vae.decode(posterior.mean + posterior.std * noise).sample
+    decoded = decoded.float() / 2 + 0.5
+    terms = {"l1": (decoded - images).abs().mean(), "kl": stage.kl * posterior.kl().float().mean()}
     if perceptual is not None:
-        terms["perceptual"] = stage.perceptual * perceptual(made, images).mean()
+        terms["perceptual"] = stage.perceptual * perceptual(decoded, images).mean()
     return terms
 
 
@@ -148,10 +146,7 @@ def _load(generator: Generator, folder: Path) -> None:
 
 
 class _Batches(Dataset[torch.Tensor]):
-    """Batch k, from (seed, k) alone: (count, 3, H, W) uint8, half of them mirrored.
-
-    All images of a frame that is drawn: its files are decoded together.
-    """
+    """Batches (count, 3, H, W) uint8, half mirrored, each drawn from (seed, step) alone."""
 
     def __init__(self, frames: Frames, indices: list[int], count: int, seed: int) -> None:
         self.frames, self.indices, self.count, self.seed = frames, indices, count, seed

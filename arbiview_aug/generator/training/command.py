@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -18,14 +19,15 @@ from arbiview_aug.generator.training.ablation import ablate
 from arbiview_aug.generator.training.autoencoder import train_autoencoder
 from arbiview_aug.generator.training.checkpointing import saved_config
 from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden
-from arbiview_aug.generator.training.data import Frames, Split, open_frames
+from arbiview_aug.generator.training.data import open_frames
 from arbiview_aug.generator.training.held_out import held_out_scores, report
 from arbiview_aug.generator.training.losses import Perceptual, load_perceptual
 from arbiview_aug.generator.training.trainer import Trainer
 
 COMMANDS = ("train", "ablate", "evaluate")
 
-_LONGEST_WAIT = timedelta(hours=3)
+_TIMEOUT = timedelta(hours=3)
+"""Of the other processes, while one trains the autoencoder or scores."""
 
 
 def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> int:
@@ -38,52 +40,51 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
     output = writable_folder(Path(arguments.output), arguments.output)
     if arguments.command == "evaluate":
         config = saved_config(output / "state", config)
-    processes = optional_package("accelerate", "generator").PartialState(
-        cpu=not torch.cuda.is_available(),
-        timeout=_LONGEST_WAIT,  # the others wait while one trains the autoencoder, or scores
-    )
-    say, show = (say if processes.is_main_process else _nothing), processes.is_main_process and not arguments.quiet
-    device = processes.device
+    accelerate = optional_package("accelerate", "generator")
+    processes = accelerate.PartialState(cpu=not torch.cuda.is_available(), timeout=_TIMEOUT)
+    show, device = processes.is_main_process and not arguments.quiet, processes.device
+    if not processes.is_main_process:
+        say = _discard
     size, seed = config.generator.image_size, config.seed
     frames = open_frames(arguments.data, size, scenes=config.scenes, seed=seed, device=device)
     split = frames.split(seed)
     if arguments.command == "evaluate":
-        return evaluate(Generator.from_pretrained(output / "generator").to(device), frames, split, arguments, say)
+        generator = Generator.from_pretrained(output / "generator").to(device)
+        indices, seeds = split.held_out[: arguments.views], range(arguments.seeds)
+        if not indices:
+            raise TrainingError("evaluate: expected held-out scenes, this data has too few")
+        scores = held_out_scores(generator, frames, indices, seeds=seeds, steps=arguments.steps, show=show)
+        report(scores, len(seeds), say)
+        return 0
     if arguments.stage == "autoencoder" and config.autoencoder is None:
         raise TrainingError(f"--stage autoencoder: --config {arguments.config} has none of its own")
     check_weights(config, arguments.weights)
     if arguments.data == "synthetic":
         used = [*split.training, *split.validation]
         if device.type != "cpu" and config.workers:
-            frames.check_fits(used)  # workers cannot render there what is not held
+            frames.check_fits(used)
         frames.prepare(used, workers=_readers(len(used)) if device.type == "cpu" else 0, show=show)
-    perceptual = _perceptual(config, arguments.vgg_weights, say)
+    options: dict[str, Any] = {
+        "perceptual": _perceptual(config, arguments.vgg_weights, say),
+        "show": show,
+        "say": say,
+    }
 
-    def made(config: TrainConfig) -> tuple[Generator, bool]:
+    def make(config: TrainConfig) -> tuple[Generator, bool]:
         generator = fresh(config, arguments.weights).to(device)
-        with processes.main_process_first():  # the others load what the first one saved
-            ready = train_autoencoder(config, frames, generator, output, perceptual=perceptual, show=show, say=say)
-        return generator, ready
+        with processes.main_process_first():  # the others load the autoencoder that it saved
+            is_ready = train_autoencoder(config, frames, generator, output, **options)
+        return generator, is_ready
 
-    generator, ready = made(config)
-    if not ready:
+    generator, is_ready = make(config)
+    if not is_ready:
         return 0
     if arguments.command == "ablate":
-        ablate(
-            config,
-            frames,
-            lambda variant: made(variant)[0],
-            output,
-            views=arguments.views,
-            perceptual=perceptual,
-            show=show,
-            say=say,
-        )
-        return 0
-    if arguments.stage == "autoencoder":
+        ablate(config, frames, lambda variant: make(variant)[0], output, views=arguments.views, **options)
+    elif arguments.stage == "autoencoder":
         say(f"the autoencoder is in {output / 'autoencoder'}")
-        return 0
-    Trainer(config, frames, generator, output, perceptual=perceptual, show=show, say=say).train()
+    else:
+        Trainer(config, frames, generator, output, **options).train()
     return 0
 
 
@@ -92,24 +93,24 @@ def _readers(count: int) -> int:
     return min(8, os.cpu_count() or 1) if count >= 16 else 0
 
 
-def _nothing(message: str) -> None:
+def _discard(message: str) -> None:
     """Discard a message: only the first process prints."""
 
 
 def check_weights(config: TrainConfig, weights: str | None) -> None:
-    """Check, before any work, that weights are given exactly where ``fresh`` needs them.
+    """Check, before any work, that weights are given exactly if ``fresh`` needs them.
 
     Raises:
-        TrainingError: A frozen U-Net without weights, or weights for a configuration that starts from nothing.
+        TrainingError: A frozen U-Net without weights, or weights for a configuration without one.
     """
     name = config.generator.name
     if config.generator.frozen_unet and weights is None:
         raise TrainingError(
-            f"--config {name}: expected --weights, a folder or hub id of Stable Diffusion 1.5 in diffusers' layout: "
-            "its U-Net stays as it is"
+            f"--config {name}: expected --weights, a folder or hub id of Stable Diffusion 1.5 in diffusers' layout, "
+            "for its frozen U-Net"
         )
     if not config.generator.frozen_unet and weights is not None:
-        raise TrainingError(f"--weights: expected none for --config {name}, which starts from nothing")
+        raise TrainingError(f"--weights: expected none for --config {name}, which is trained from scratch")
 
 
 def fresh(config: TrainConfig, weights: str | None) -> Generator:
@@ -120,21 +121,8 @@ def fresh(config: TrainConfig, weights: str | None) -> Generator:
     return Generator.from_config(config.generator)
 
 
-def evaluate(
-    generator: Generator, frames: Frames, split: Split, arguments: argparse.Namespace, say: Callable[[str], None]
-) -> int:
-    """Score a trained generator on the held-out streets of its run."""
-    indices = split.held_out[: arguments.views]
-    if not indices:
-        raise TrainingError("evaluate: expected held-out scenes, this data has too few")
-    seeds, show = range(arguments.seeds), not arguments.quiet
-    scores = held_out_scores(generator, frames, indices, seeds=seeds, steps=arguments.steps, show=show)
-    report(scores, len(seeds), say)
-    return 0
-
-
 def _perceptual(config: TrainConfig, weights: str | None, say: Callable[[str], None]) -> Perceptual | None:
-    """Load VGG16; None where the term is off, or no file was named and the download failed."""
+    """Load VGG16; None if the term is off, or the download failed without a named file."""
     if not config.loss.perceptual:
         return None
     try:

@@ -1,4 +1,4 @@
-"""Held-out streets with true pixels: completed targets against Telea's inpainting, inside the holes."""
+"""Scores on held-out streets with true pixels: filled target views against Telea's inpainting, inside the holes."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ from arbiview_aug.generator.inpainting import telea
 from arbiview_aug.generator.training.data import Frames, TrainingFrame
 from arbiview_aug.generator.training.masks import one_of, retarget
 from arbiview_aug.generator.training.measure import Interval, bootstrap, hole_psnr
-from arbiview_aug.generator.training.pseudo_views import favs
+from arbiview_aug.generator.training.pseudo_views import Rendered, favs
 
-LEAST_HOLES = 0.05
+MIN_HOLES = 0.05
+"""Smallest share of holes in a drawn target."""
+
 MEAN_OF = 8
 _TRIES = 20
 
@@ -40,22 +42,22 @@ def held_out_scores(
 ) -> dict[str, list[float]]:
     """Score each filling method by PSNR (dB) inside the holes, one value for each (seed, scene).
 
-    A target is drawn for each from the retarget distribution, with holes of at least 5 %; FAVS renders it from all
-    cameras, as at inference, and the generator completes it. A perfect sampler is 3 dB below the posterior's mean, so
-    a single sample, the mean of several and the one-step regression are scored apart.
+    Each target is drawn from the retarget distribution; FAVS renders it from all cameras and the generator completes
+    it, as at inference. A perfect sampler is 3 dB below the posterior's mean, so a single sample, the mean of several
+    and the one-step regression are scored separately.
 
     Args:
         generator: The model.
-        frames: Of synthetic streets: others have no true pixels.
-        indices: Which, held out.
-        seeds: Of targets and noise.
-        steps: Of the samples.
-        mean_of: Samples of the mean; 0 leaves it out.
-        show: Progress bar.
+        frames: Synthetic streets, whose true pixels are known.
+        indices: Indices of held-out frames.
+        seeds: Seeds of targets and noise.
+        steps: Denoising steps of the samples.
+        mean_of: Number of samples in the mean; 0 leaves it out.
+        show: Show a progress bar.
 
     Returns:
-        A value for each seed's scenes, one after the other: ``telea``, ``one_step`` where that was trained, ``sample``,
-        ``mean``; and ``sample_energy``, gradient energy against the truth.
+        Values of ``telea``, ``one_step`` (if trained), ``sample``, ``mean``; and ``sample_energy``, the gradient energy
+        relative to the truth.
 
     Raises:
         TrainingError: Frames without truth.
@@ -67,74 +69,48 @@ def held_out_scores(
     cases = [(seed, index) for seed in seeds for index in indices]
     for seed, index in tqdm(cases, desc="held out", unit="view", disable=not show):
         frame = frames[index]
-        target, shown, covered, trust = _target(frame, torch.Generator().manual_seed(100_003 * (seed + 1) + index))
+        target, view = _target(frame, torch.Generator().manual_seed(100_003 * (seed + 1) + index))
         rig = Rig([target], ground_z_m=frame.rig.ground_z_m)
         truth = drive.render(index, rig).images[0].float()[None, None] / 255
-        holes = ~covered[None, None]
-        completed = partial(_completed, generator, frame, rig, shown, covered, trust)
-        ways = {"telea": telea(shown, ~covered)[None, None]}
+        holes = ~view.covered[None]
+        inputs = view.images, view.covered, rig, frame.images, frame.rig
+        complete = partial(generator.complete_views, *inputs, confidence=view.confidence, frame=frame.token)
+        filled = {"telea": telea(view.images[0], holes[0, 0])[None]}
         if generator.config.one_step:
-            ways["one_step"] = completed(1, 0)
-        ways["sample"] = completed(steps, seed)
+            filled["one_step"] = torch.as_tensor(complete(steps=1, seed=0).images)
+        filled["sample"] = torch.as_tensor(complete(steps=steps, seed=seed).images)
         if mean_of:
-            others = [completed(steps, 1000 * (seed + 1) + k) for k in range(mean_of)]
-            ways["mean"] = torch.stack(others).mean(0)
-        for name, image in ways.items():
-            scores.setdefault(name, []).append(float(hole_psnr(image, truth, holes)))
-        made, true = (as_arrays(image[0])[0] for image in (ways["sample"], truth))
-        energy = gradient_energy_ratio(made, true, holes[0, 0].numpy())
+            samples = [complete(steps=steps, seed=1000 * (seed + 1) + k).images for k in range(mean_of)]
+            filled["mean"] = torch.stack([torch.as_tensor(images) for images in samples]).mean(0)
+        for name, images in filled.items():
+            scores.setdefault(name, []).append(float(hole_psnr(images[None], truth, holes)))
+        sample, true = (as_arrays(images)[0] for images in (filled["sample"], truth[0]))
+        energy = gradient_energy_ratio(sample, true, holes[0, 0].numpy())
         if energy is not None:
             scores.setdefault("sample_energy", []).append(energy)
     return scores
 
 
-def _completed(
-    generator: Generator,
-    frame: TrainingFrame,
-    rig: Rig,
-    shown: torch.Tensor,
-    covered: torch.Tensor,
-    trust: torch.Tensor,
-    steps: int,
-    seed: int,
-) -> torch.Tensor:
-    """(1, 1, 3, h, w) the one target view of a frame, completed as in use."""
-    done = generator.complete_views(
-        shown[None],
-        covered[None],
-        rig,
-        frame.images,
-        frame.rig,
-        confidence=trust[None],
-        steps=steps,
-        seed=seed,
-        frame=frame.token,
-    )
-    return torch.as_tensor(done.images)[None]
-
-
-def _target(frame: TrainingFrame, rng: torch.Generator) -> tuple[Camera, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """A drawn target camera, FAVS there (3, h, w) in [0, 1], its coverage and its confidence (h, w)."""
+def _target(frame: TrainingFrame, rng: torch.Generator) -> tuple[Camera, Rendered]:
+    """Draw a target camera with holes, and render it by FAVS."""
     for _ in range(_TRIES):
         camera = replace(retarget(frame.rig[one_of(rng, len(frame.rig))], rng), mask=None)
-        shown, covered, trust = (value[0] for value in favs(frame.images, frame.rig, [camera]))
-        if float((~covered).float().mean()) >= LEAST_HOLES and bool(covered.any()):
-            return camera, shown, covered, trust
-    raise TrainingError(
-        f"frame {frame.token}: expected targets with holes of {LEAST_HOLES:.0%}, none in {_TRIES} draws"
-    )
+        view = favs(frame.images, frame.rig, [camera])
+        if float((~view.covered).float().mean()) >= MIN_HOLES and bool(view.covered.any()):
+            return camera, view
+    raise TrainingError(f"frame {frame.token}: expected targets with holes of {MIN_HOLES:.0%}, none in {_TRIES} draws")
 
 
 def gains(scores: Mapping[str, Sequence[float]], seeds: int = 1) -> dict[str, Interval]:
     """Paired gain in dB of each method over Telea, with 95 % bootstrap intervals over streets.
 
     Args:
-        scores: By ``held_out_scores``.
-        seeds: How many views there are of each street: they are drawn together.
+        scores: From ``held_out_scores``.
+        seeds: Views of each street, which are resampled together.
     """
-    ways = [name for name in scores if name not in ("telea", "sample_energy")]
-    better = {name: np.subtract(scores[name], scores["telea"]).reshape(seeds, -1).mean(0) for name in ways}
-    return {name: bootstrap(of_street.tolist()) for name, of_street in better.items()}
+    methods = [name for name in scores if name not in ("telea", "sample_energy")]
+    gain = {name: np.subtract(scores[name], scores["telea"]).reshape(seeds, -1).mean(0) for name in methods}
+    return {name: bootstrap(of_street.tolist()) for name, of_street in gain.items()}
 
 
 def report(scores: Mapping[str, Sequence[float]], seeds: int = 1, say: Callable[[str], None] = print) -> None:
