@@ -1,13 +1,10 @@
-"""How far a rendered pixel can be trusted: the error to expect of it, from the geometry and from the images.
+"""Confidence of rendered pixels: their expected error, from the geometry and from the images.
 
-What can be wrong with a pixel is that something else stands along its ray than the surface says, and that its source
-has another resolution. Both are known when a plan is built (``certainty``). How wrong its colour then is depends on
-what else it could have been: on a uniform wall, nothing. The contrast of the rendered view around it says that, and
-where two sources meet their disagreement does (``confidence``).
+A pixel is wrong if the scene differs from the surface along its ray, or if its source has another resolution. Both are
+known when a plan is built (``certainty``). The error of its colour then depends on the contrast of the view around it,
+and on how much two sources disagree at a seam (``confidence``).
 
-Constants were fitted on synthetic streets (seeds 100 to 105; 0.7 m higher, 1 m sideways, 1 m forward, turned by 20°)
-and hold on others (tests/acceptance/test_confidence.py). Geometry alone does not order the errors: the most confident
-half then has 1/1.4 of the mean error over the street, 1/1.8 with boxes; with the contrast 1/2.3 and 1/2.6.
+Constants were fitted on synthetic streets and hold on others (tests/acceptance/test_confidence.py).
 """
 
 from __future__ import annotations
@@ -24,31 +21,31 @@ EXPECTED_ERROR_LEVELS = 10.0
 """Confidence is exp(-e / this) for an expected error of e grey levels of 255: 0.5 means 7 levels, 0.9 means 1."""
 
 _DECORRELATION_RAD = 0.01
-"""Displacement over which a view's details become unrelated: 0.3 to 2 times it order the errors as well."""
+"""Displacement over which a view's details become unrelated; insensitive from 0.3 to 2 times."""
 
 _RESOLUTION_POWER = 0.5
-"""A source with half or twice the target's resolution keeps 70 % of the detail: 0.25 to 1 do as well."""
+"""A source with half or twice the target's resolution keeps 70 % of the detail; insensitive from 0.25 to 1."""
 
 _ERROR_PER_CONTRAST = 0.55
-"""Mean absolute error of unrelated detail, as a share of the standard deviation around it: measured 0.54 and 0.53."""
+"""Mean absolute error of unrelated detail, as a share of the standard deviation around it."""
 
 _LEAST_CONTRAST = 6.0
-"""Grey levels added to the contrast: what is displaced into a uniform area is not seen there. 4 to 12 do as well."""
+"""Grey levels added to the contrast, for objects displaced into uniform areas; insensitive from 4 to 12."""
 
 _CELL = 0.005  # contrast is gathered in cells of this share of the width
-_WINDOWS = (5, 11)  # cells a side: 3 and 6 % of the width; one of the two alone orders the errors less well
+_WINDOWS = (5, 11)  # cells a side: 3 and 6 % of the width
 
 
 def certainty(parallax_rad: FloatArray, pixels_per_pixel: FloatArray) -> FloatArray:
-    """Share (...,) in [0, 1] of a source's detail that is right: 1 at the target's own centre and resolution.
+    """Share (...,) in [0, 1] of a source's detail that is correct: 1 at the target's own centre and resolution.
 
     Args:
         parallax_rad: (...,) displacement that unknown depth is expected to cause.
-        pixels_per_pixel: (...,) source pixels per target pixel along the worse axis. Fewer than 1 blur, more alias.
+        pixels_per_pixel: (...,) source pixels per target pixel along the worse axis; fewer blur, more alias.
     """
     ratio = np.clip(pixels_per_pixel, 1e-3, 1e3)
-    kept = np.minimum(ratio, 1 / ratio) ** _RESOLUTION_POWER
-    return np.asarray(np.exp(-parallax_rad / _DECORRELATION_RAD) * kept)
+    detail = np.minimum(ratio, 1 / ratio) ** _RESOLUTION_POWER
+    return np.asarray(np.exp(-parallax_rad / _DECORRELATION_RAD) * detail)
 
 
 def confidence(
@@ -64,7 +61,7 @@ def confidence(
     """
     levels = 1.0 if view.dtype == torch.uint8 else 255.0
     with torch.no_grad():
-        # In place: fresh memory for each term takes three times as long.
+        # In place: three times as fast.
         doubt = torch.from_numpy(certain).to(view.device).float().div_(-255).add_(1)
         error = _contrast(view.detach(), levels, covered).add_(_LEAST_CONTRAST).mul_(doubt).add_(seam, alpha=levels)
         return error.mul_(-_ERROR_PER_CONTRAST / EXPECTED_ERROR_LEVELS).exp_().mul_(covered)
@@ -74,7 +71,7 @@ def _contrast(view: torch.Tensor, levels: float, covered: torch.Tensor) -> torch
     """Standard deviation (..., h, w) of covered grey levels around each pixel: the mean of two window sizes."""
     h, w = covered.shape
     cell = max(1, 2 * round(_CELL * w / 2))
-    step = max(1, cell // 2)  # four pixels of each cell tell enough
+    step = max(1, cell // 2)  # four pixels of each cell suffice
     seen = covered[::step, ::step].float()
     grey = view[..., ::step, ::step].float().mean(-3) * levels
     # Around mid-grey: float32 would lose the variance of bright areas.
@@ -95,7 +92,7 @@ def _contrast(view: torch.Tensor, levels: float, covered: torch.Tensor) -> torch
 
 
 def _around(cells: torch.Tensor, window: int) -> torch.Tensor:
-    """Sums (..., h, w) over windows of ``window`` cells a side, none beyond the border: a fifth of a pooling's time."""
+    """Sums (..., h, w) over windows of ``window`` cells a side; five times as fast as pooling."""
     h, w = cells.shape[-2:]
     padded = torch.nn.functional.pad(cells, [window // 2] * 4)
     across = functools.reduce(torch.add, (padded[..., k : k + w] for k in range(window)))

@@ -1,4 +1,4 @@
-"""Dense optical flow between two images of one view: how far to trust it, and when not to ask for it."""
+"""Dense optical flow between two images of one view, with its reliability."""
 
 from __future__ import annotations
 
@@ -11,17 +11,16 @@ import numpy.typing as npt
 from arbiview_aug.cameras.lens import BoolArray
 
 ROUND_TRIP_PX = 0.75
-"""Flow there and back that misses by this much counts half: it has been to something else."""
+"""Forward-backward error at which flow has a weight of one half."""
 
-_BLANK_GREY = 2.0  # spread of grey levels below which an image is blank, or black night
+_BLANK_GREY = 2.0  # standard deviation below which an image is blank, in grey levels
 
 _REPEATS = 0.7
-"""Correlation of an overlap with itself, shifted sideways, from which on its texture repeats: gratings have 0.9 and
-more, the overlaps of three real frames 0.35 at most."""
+"""Autocorrelation along rows above which texture repeats: gratings have 0.9, real overlaps at most 0.35."""
 
 
 def why_ambiguous(one: npt.NDArray[np.float32], two: npt.NDArray[np.float32], both: BoolArray) -> str:
-    """Why matches between two views (h, w, 3) in [0, 255] would say nothing where both see (h, w); "" where they do."""
+    """Why views (h, w, 3) in [0, 255] cannot be matched where both see (h, w); "" if they can."""
     if min(float(view[both].std()) for view in (one, two)) < _BLANK_GREY:
         return "one of the images shows nothing"
     if max(_repetition(view, both) for view in (one, two)) > _REPEATS:
@@ -32,10 +31,10 @@ def why_ambiguous(one: npt.NDArray[np.float32], two: npt.NDArray[np.float32], bo
 def dense_flow(
     one: npt.NDArray[np.float32], two: npt.NDArray[np.float32], both: BoolArray
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Optical flow (h, w, 2) from one view to the other, and how far to trust it, (h, w) in [0, 1].
+    """Optical flow (h, w, 2) from one view to the other, and its weight (h, w) in [0, 1].
 
-    The views are brought to one brightness. What only one of them shows is filled by the mean of both, blurred, so that
-    nothing moves there.
+    The views are brought to one brightness. Pixels that only one of them sees get the blurred mean of both, without any
+    motion.
     """
     grey = [cv2.cvtColor(view, cv2.COLOR_RGB2GRAY) for view in (one, two)]
     log = [np.log(np.maximum(view[both], 4)) for view in grey]
@@ -48,7 +47,7 @@ def dense_flow(
     first, second = (np.clip(np.where(both, view, around), 0, 255).astype(np.uint8) for view in grey)
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     dis.setFinestScale(0)
-    dis.setVariationalRefinementIterations(0)  # half the time, and depth is smoothed anyway
+    dis.setVariationalRefinementIterations(0)  # depth is smoothed later
     there: Any = dis.calc(first, second, None)  # type: ignore[call-overload]
     back: Any = dis.calc(second, first, None)  # type: ignore[call-overload]
     h, w = both.shape
@@ -61,7 +60,7 @@ def dense_flow(
 
 
 def _repetition(image: npt.NDArray[np.float32], inside: BoolArray) -> float:
-    """Highest correlation of a view (h, w, 3) with itself, shifted along its rows beyond where it first fell to 0.3."""
+    """Highest autocorrelation along the rows of a view (h, w, 3), beyond the shift where it first falls to 0.3."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     window = inside.astype(np.float32)
     size = cv2.getOptimalDFTSize(2 * inside.shape[1])
@@ -73,6 +72,6 @@ def _repetition(image: npt.NDArray[np.float32], inside: BoolArray) -> float:
         np.fft.irfft((spectra[a] * spectra[b].conj()).sum(axis=0), size)[: inside.shape[1] // 2] for a, b in products
     )
     correlation = shifted / np.sqrt(np.maximum(here, 1e-6) * np.maximum(there, 1e-6))
-    correlation = correlation[pixels > pixels[0] / 4]  # fewer say nothing
+    correlation = correlation[pixels > pixels[0] / 4]
     fallen = np.flatnonzero(correlation < 0.3)
     return float(correlation[fallen[0] :].max()) if len(fallen) else 0.0

@@ -1,12 +1,9 @@
 """Photometric harmonisation: one gain per source camera, so that neighbours agree where they overlap.
 
-Cameras of one vehicle expose on their own; a seam between them shows as a step. The log-ratios of adjacent cameras at
-their half-way views, over the street surface, give one log-gain per camera, jointly: weighted least squares with a
-prior towards no change. More freedom was measured and rejected: gain and offset jointly shrink contrast, gains per
-channel add nothing.
-
-The overlap's *even* chessboard tiles alone are read, since evaluation scores on the odd ones; half of each (a finer
-chessboard) is fitted to, the other half decides whether the gains are accepted.
+The log-ratios of adjacent cameras in their half-way views, over the street surface, give one log-gain per camera:
+joint weighted least squares with a prior towards no change. Only the overlap's *even* chessboard tiles are read, since
+evaluation scores the odd ones. Half of each tile (a finer chessboard) is fitted; the other half decides whether the
+gains are accepted.
 """
 
 from __future__ import annotations
@@ -21,7 +18,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from arbiview_aug.cameras.lens import BoolArray
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.overlap import adjacent_pairs, half_way_view, odd_tiles
 from arbiview_aug.cameras.projection import edge_distance, ego_rays, project_rays
 from arbiview_aug.cameras.rig import Rig, content_order
@@ -43,36 +41,31 @@ class HarmoniseConfig:
     """How gains are estimated, bounded and accepted."""
 
     max_gain: float = 2.5
-    """Clamp, from 1 / max_gain to max_gain: 1.94 is the largest of a real frame (nuScenes' cameras differ that much);
-    beyond, matching is at fault or the picture is beyond rescue."""
+    """Gains are clipped to [1 / max_gain, max_gain]; 1.94 is the largest of a real nuScenes frame."""
 
     prior_log_gain: float = 0.5
-    """Expected size of a camera's log-gain: the prior is weak, it matters where overlaps are tiny or disagree."""
+    """Standard deviation of the prior on log-gains: weak, for overlaps that are tiny or disagree."""
 
     pair_log_error: float = 0.03
-    """Error that a pair's median keeps however many pixels it has: lens shading, parallax. It bounds the weight of
-    one large overlap against the others."""
+    """Error floor of a pair's log-ratio (lens shading, parallax); bounds the weight of a large overlap."""
 
     knee: float = KNEE
-    """Where a gain begins to fade towards saturation, as a share of the scale: a saturated sky has lost its
-    brightness, and a darker one beside a bright road would be wrong. Overlaps of nuScenes and DDAD frames are within
-    0.15 dB from 0.75 to 0.99; against synthetic truth higher is better, by 0.5 dB at most; but a gain of 0.5 with a
-    knee of 0.95 stretches the greys above it tenfold, which shows in clouds."""
+    """Share of the scale from which a gain fades towards saturation; see ``ToneCurve``."""
 
     dark: float = 0.03
-    """Pixels below this share of the scale say nothing of exposure: noise and black level."""
+    """Pixels below this share of the scale are ignored: noise and black level."""
 
     bright: float = 0.92
-    """Nor do those with a channel above this: they may be saturated."""
+    """Pixels with a channel above this share of the scale are ignored: they may be saturated."""
 
     min_pixels: int = 200
-    """Pixels that both the fit and the gate need in a pair, of a half-way view of 225 x 400."""
+    """Pixels that both the fit and the gate need in a pair, in a half-way view of 225 x 400."""
 
     min_rise_db: float = 0.1
-    """Least rise of the held-out raw overlap PSNR, mean over pairs; below it the images stay as they are."""
+    """Least rise of the held-out raw overlap PSNR, mean over pairs, for gains to be accepted."""
 
     min_log_gain: float = 0.005
-    """If no gain changes more than this the cameras agree: half a grey level at mid-grey is not worth a copy."""
+    """If no log-gain exceeds this, the images stay as they are: half a grey level at mid-grey."""
 
     def __post_init__(self) -> None:
         check_ranges(self, _RANGES)
@@ -93,13 +86,13 @@ _RANGES: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class PhotometricReport:
-    """What harmonisation does to a frame, and why; ``str`` says it in words.
+    """The gains of a frame, and why; ``str`` prints them.
 
     Attributes:
-        gains: One for each source camera, median 1 before the clamp; all 1 where they were declined.
+        gains: One for each source camera, median 1 before clipping; all 1 if they were declined.
         accepted: Whether the images are changed.
         reason: Why, or why not.
-        raw_db_before: PSNR between neighbours on held-out tiles, mean over pairs; None where nothing was measured.
+        raw_db_before: PSNR between neighbours on held-out tiles, mean over pairs; None without a fit.
         raw_db_after: The same with the estimated gains, accepted or not.
     """
 
@@ -116,41 +109,28 @@ class PhotometricReport:
 
 
 class SharedPixels(NamedTuple):
-    """Where two neighbours see the same pixels of their half-way view.
+    """Pixels of their half-way view that two neighbours share."""
 
-    Attributes:
-        a: Index of one camera in content order.
-        b: Index of the other.
-        at: Where each of the two halved sources is read, (2, n, 2) float32, fitted pixels first.
-        fitted: How many pixels are fitted to; the others are held out.
-    """
-
-    a: int
-    b: int
-    at: _Pixels
-    fitted: int
+    a: int  # index of one camera in content order
+    b: int  # and of the other
+    at: _Pixels  # (2, n, 2) positions in each of the two halved images, fitted pixels first
+    fitted: int  # number of pixels to fit; the others are held out
 
 
 class Overlaps(NamedTuple):
-    """All overlaps of a rig: what does not depend on images.
+    """All overlaps of a rig."""
 
-    Attributes:
-        order: Indices of the rig's cameras in content order: the result must not depend on the list's.
-        levels: How many times each camera's image is halved before it is read, in content order.
-        pairs: The adjacent pairs that see enough in common.
-    """
-
-    order: tuple[int, ...]
-    levels: tuple[int, ...]
-    pairs: tuple[SharedPixels, ...]
+    order: tuple[int, ...]  # camera indices in content order: results must not depend on the list's
+    levels: tuple[int, ...]  # halvings of each camera's image, in content order
+    pairs: tuple[SharedPixels, ...]  # adjacent pairs that share enough pixels
 
 
 def find_overlaps(rig: Rig, config: HarmoniseConfig | None = None) -> Overlaps:
-    """Where adjacent cameras see the same, over the street surface; own-car masks left out."""
+    """Find the pixels that adjacent cameras share over the street surface, without own-car masks."""
     config = config or HarmoniseConfig()
     order = tuple(content_order(rig.cameras))
     rig = rig.with_cameras([rig[k] for k in order])
-    levels = tuple(max(0, math.floor(math.log2(w / _SOURCE_WIDTH_PX))) for _, w in rig.sizes)
+    levels = tuple(source_level(camera, _SOURCE_WIDTH_PX) for camera in rig)
     slots = [Slot(k, level, 0, 0, level_size(rig[k].size, level)) for k, level in enumerate(levels)]
     even = ~odd_tiles(_VIEW_SIZE, _TILE_PX)
     held_out = odd_tiles(_VIEW_SIZE, _TILE_PX // 2)[even]
@@ -163,9 +143,7 @@ def find_overlaps(rig: Rig, config: HarmoniseConfig | None = None) -> Overlaps:
         both = np.flatnonzero(valid)
         reads: list[npt.NDArray[np.floating]] = []
         for k in (a, b):
-            uv, valid = project_rays(rig[k], rays[both], q[both], view.center_m - rig[k].center_m)
-            # Halved pixels mix what lies beside them: keep away from border and own car.
-            seen = valid & (edge_distance(rig[k], uv) > 1.5 * 2 ** levels[k])
+            uv, seen = project_halved(rig[k], levels[k], view.center_m, rays[both], q[both])
             both = both[seen]
             reads = [read[seen] for read in reads] + [slots[k].from_source(uv[seen])]
         fitted = np.concatenate([np.flatnonzero(~held_out[both]), np.flatnonzero(held_out[both])])
@@ -175,6 +153,30 @@ def find_overlaps(rig: Rig, config: HarmoniseConfig | None = None) -> Overlaps:
     return Overlaps(order, levels, tuple(pairs))
 
 
+def source_level(camera: Camera, width_px: int) -> int:
+    """How many times an image can be halved down to no less than ``width_px`` columns."""
+    return max(0, math.floor(math.log2(camera.width_px / width_px)))
+
+
+def project_halved(
+    camera: Camera, level: int, center_m: FloatArray, rays: FloatArray, q: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Project surface points into a camera.
+
+    Args:
+        camera: The camera.
+        level: How many times its image is halved before it is read.
+        center_m: (3,) origin of the rays in the ego frame.
+        rays: (..., 3) directions.
+        q: (...,) inverse distances along them, 1/m.
+
+    Returns:
+        (..., 2) pixels, and (...,) whether they are visible and clear of border and mask: halved pixels mix neighbours.
+    """
+    uv, valid = project_rays(camera, rays, q, center_m - camera.center_m)
+    return uv, valid & (edge_distance(camera, uv) > 1.5 * 2**level)
+
+
 def estimate_gains(
     rig: Rig,
     images: Sequence[torch.Tensor],
@@ -182,13 +184,13 @@ def estimate_gains(
     *,
     overlaps: Overlaps | None = None,
 ) -> PhotometricReport:
-    """One gain per camera from one frame.
+    """Estimate one gain per camera from one frame.
 
     Args:
         rig: The source rig.
         images: N images (3, H, W): uint8, or float in [0, 1]; any device. They are not changed.
         config: Settings.
-        overlaps: ``find_overlaps(rig, config)``, where it is at hand: it costs more than the rest.
+        overlaps: ``find_overlaps(rig, config)``, if it is known: it takes longer than the rest.
 
     Returns:
         The gains, or gains of 1 and the reason.
@@ -199,26 +201,25 @@ def estimate_gains(
     if not overlaps.pairs:
         return PhotometricReport(none, False, "no two cameras overlap enough")
     small = [reduced(images[k], level) for k, level in zip(overlaps.order, overlaps.levels, strict=True)]
-    seen = [(pair, _read(small[pair.a], pair.at[0]), _read(small[pair.b], pair.at[1])) for pair in overlaps.pairs]
-    measured = [_log_ratio(one[: pair.fitted], two[: pair.fitted], config) for pair, one, two in seen]
-    if all(ratio is None for ratio in measured):
+    read = [(pair, _read(small[pair.a], pair.at[0]), _read(small[pair.b], pair.at[1])) for pair in overlaps.pairs]
+    ratios = [_log_ratio(one[: pair.fitted], two[: pair.fitted], config) for pair, one, two in read]
+    if all(ratio is None for ratio in ratios):
         return PhotometricReport(none, False, "too few pixels in the overlaps are neither dark nor saturated")
     log_gains = np.zeros(len(rig))
-    solved = _solve(len(rig), overlaps.pairs, measured, config)
+    solved = _solve(len(rig), overlaps.pairs, ratios, config)
     log_gains[list(overlaps.order)] = np.clip(solved, -np.log(config.max_gain), np.log(config.max_gain))
     if np.abs(log_gains).max() < config.min_log_gain:
         return PhotometricReport(none, False, "the cameras agree already")
     gains = tuple(float(gain) for gain in np.exp(log_gains))
     curves = [ToneCurve(gains[k], config.knee) for k in overlaps.order]
-    before = _raw_db([(one[pair.fitted :], two[pair.fitted :]) for pair, one, two in seen])
+    before = _raw_db([(one[pair.fitted :], two[pair.fitted :]) for pair, one, two in read])
     after = _raw_db(
-        [(curves[p.a].of_array(one[p.fitted :]), curves[p.b].of_array(two[p.fitted :])) for p, one, two in seen]
+        [(curves[p.a].of_array(one[p.fitted :]), curves[p.b].of_array(two[p.fitted :])) for p, one, two in read]
     )
-    rise = after - before
-    words = f"overlap {before:.1f} to {after:.1f} dB on held-out tiles"
-    if rise < config.min_rise_db:
-        return PhotometricReport(none, False, f"gains would not help, {words}", before, after)
-    return PhotometricReport(gains, True, words, before, after)
+    reason = f"overlap {before:.1f} to {after:.1f} dB on held-out tiles"
+    if after - before < config.min_rise_db:
+        return PhotometricReport(none, False, f"gains would not help, {reason}", before, after)
+    return PhotometricReport(gains, True, reason, before, after)
 
 
 def reduced(image: torch.Tensor, level: int) -> _Pixels:
@@ -236,7 +237,7 @@ def reduced(image: torch.Tensor, level: int) -> _Pixels:
 
 
 def _read(image: _Pixels, at: _Pixels) -> _Pixels:
-    """The image at positions (n, 2): (n, 3)."""
+    """Sample the image at positions (n, 2): (n, 3)."""
     columns = 1024  # remap's sizes must stay below 32767
     padded = np.pad(at, ((0, -len(at) % columns), (0, 0))).reshape(-1, columns, 2)
     values = cv2.remap(image, padded, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
@@ -244,11 +245,11 @@ def _read(image: _Pixels, at: _Pixels) -> _Pixels:
 
 
 def _log_ratio(one: _Pixels, two: _Pixels, config: HarmoniseConfig) -> tuple[float, float] | None:
-    """Median log-ratio of brightness, one over two, and its variance; None where too few pixels can say."""
+    """Median log-ratio of brightness, one over two, and its variance; None from too few pixels."""
     use: BoolArray = np.ones(len(one), bool)
     light = []
     for pixels in (one, two):
-        # Channel by channel: a reduction over so short an axis would be ten times slower.
+        # By channel: reducing over so short an axis is ten times slower.
         r, g, b = pixels.T
         light.append((r + g + b).astype(np.float64))
         use &= (light[-1] > 3 * config.dark) & (np.maximum(np.maximum(r, g), b) < config.bright)
@@ -265,19 +266,17 @@ def _log_ratio(one: _Pixels, two: _Pixels, config: HarmoniseConfig) -> tuple[flo
 def _solve(
     count: int,
     pairs: Sequence[SharedPixels],
-    measured: Sequence[tuple[float, float] | None],
+    ratios: Sequence[tuple[float, float] | None],
     config: HarmoniseConfig,
 ) -> npt.NDArray[np.float64]:
-    """Log-gains that bring every pair together, weighted, with the prior; their median is 0 in every connected group.
+    """Least-squares log-gains with the prior; their median is 0 in every connected group of cameras.
 
-    Pairs know nothing of the common level. Around the median one odd camera gives way and the others keep their
-    exposure; around the mean all would move (against the truth of synthetic streets with one camera exposed by 0.7 or
-    1.3: 51 to 84 % of the lost PSNR back, 68 to 100 % with the median).
+    Ratios leave the common level open. With the median, one odd camera gives way and the others keep their exposure.
     """
     normal = np.eye(count) / config.prior_log_gain**2
     right = np.zeros(count)
     group = np.arange(count)
-    for pair, ratio in zip(pairs, measured, strict=True):
+    for pair, ratio in zip(pairs, ratios, strict=True):
         if ratio is None:
             continue
         row = np.zeros(count)
@@ -298,17 +297,14 @@ def _raw_db(pairs: Sequence[tuple[npt.NDArray[np.floating], npt.NDArray[np.float
 
 
 Harmonise = bool | HarmoniseConfig | Sequence[float] | None
-"""What a user can ask for: no harmonisation, gains estimated for every frame, or gains of their own."""
+"""A user's choice: None or False for none, True or a config to estimate gains for every frame, or given gains."""
 
 
 class Harmoniser:
-    """A user's choice of harmonisation, as tone curves for a frame.
-
-    Holds the overlaps of the last few calibrations, nothing of any image. Pickles without them.
+    """Tone curves for the sources of a frame. Caches the overlaps of the last few calibrations; pickles without them.
 
     Args:
-        choice: None and False: no harmonisation; True or a ``HarmoniseConfig``: gains estimated for every frame;
-            numbers: gains, one for each source camera, used as they are.
+        choice: As in ``Harmonise``; given gains are one for each source camera.
 
     Raises:
         ValueError: Anything else, or gains that are no positive numbers up to a thousand.
@@ -319,7 +315,7 @@ class Harmoniser:
         self.estimates = choice is True or isinstance(choice, HarmoniseConfig)
         self.gains = None if self.estimates or choice is None or choice is False else _checked_gains(choice)
         self.is_on = self.estimates or self.gains is not None
-        self._overlaps: LRUCache[bytes, Overlaps] = LRUCache(_HELD_RIGS, lambda _: 1)
+        self._overlaps: LRUCache[bytes, Overlaps] = LRUCache(_CACHED_RIGS, lambda _: 1)
 
     def __repr__(self) -> str:
         if self.gains is not None:
@@ -330,11 +326,7 @@ class Harmoniser:
         return Harmoniser, (self.config if self.estimates else self.gains,)
 
     def report(self, rig: Rig, images: Sequence[torch.Tensor]) -> PhotometricReport:
-        """The gains of a frame, and why.
-
-        Raises:
-            SampleError: A number of gains that is not the frame's number of cameras.
-        """
+        """The gains of a frame, and why; SampleError if the number of given gains is not that of cameras."""
         if self.gains is not None:
             if len(self.gains) != len(rig):
                 raise SampleError(f"harmonise: expected a gain for each of {len(rig)} cameras, got {len(self.gains)}")
@@ -345,15 +337,15 @@ class Harmoniser:
         return estimate_gains(rig, images, self.config, overlaps=overlaps)
 
     def curves(self, rig: Rig, images: Sequence[torch.Tensor]) -> tuple[ToneCurve, ...] | None:
-        """A tone curve for each camera, or None where the images stay as they are."""
+        """A tone curve for each camera; None if the images stay as they are."""
         if not self.is_on:
             return None
         gains = self.report(rig, images).gains
         return None if all(g == 1 for g in gains) else tuple(ToneCurve(g, self.config.knee) for g in gains)
 
 
-_MAX_GIVEN_GAIN = 1e3  # ten stops: two cameras never differ more, and near 1e38 pixels of 0 would become NaN
-_HELD_RIGS = 8  # about 0.2 MB each; every frame of a drive may have a calibration of its own
+_MAX_GIVEN_GAIN = 1e3  # ten stops
+_CACHED_RIGS = 8  # about 0.2 MB each; every frame of a drive may have its own calibration
 
 
 def _checked_gains(choice: object) -> tuple[float, ...]:

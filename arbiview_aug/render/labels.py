@@ -1,4 +1,4 @@
-"""Label maps of the target views, read where the images are read."""
+"""Label maps of the target views, read at the images' positions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from arbiview_aug.render.plan import RenderPlan
 
 
 def render_labels(plan: RenderPlan, labels: Sequence[torch.Tensor], fill: float) -> list[torch.Tensor]:
-    """Label maps of the target views: the winning source's nearest label, ``fill`` where none sees.
+    """Render label maps by the winning source's nearest label; ``fill`` where uncovered.
 
     Args:
         plan: The plan for these labels' rig.

@@ -1,19 +1,16 @@
-"""Depth from overlap: where two cameras see the same, they say how far it is.
+"""Depth from overlap: stereo between neighbouring cameras of one frame corrects the street surface.
 
-Two neighbours' images, read over the street surface into the view half-way between them, agree where the surface is
-right. Where it is not, the two show the same thing side by side, shifted along the epipolar direction. Dense optical
-flow between them, only its component along that direction, becomes a relative change of inverse distance. Flow across
-it (calibration, rolling shutter, plain errors) would improve seams and was measured to harm everything else.
+Two neighbours' images, read over the street into their half-way view, agree where the surface is right. Elsewhere they
+are shifted along the epipolar direction. The component of dense optical flow along that direction becomes a relative
+change of inverse distance; flow across it (calibration, rolling shutter) is ignored.
 
-A pair is refined only if that makes its two views more alike where nothing was fitted: the fit behind the decision
-reads other tiles than the decision does. All of it, and the depth that is finally used, takes its measurements from the
-*even* tiles of the chessboard whose odd tiles evaluation scores; optical flow itself sees the whole images, since at an
-even tile's border it looks into its neighbours. Wherever a pair declines, the surface is untouched, bit for bit.
+A pair is corrected only if that makes its views more alike on tiles that the fit did not read. Fit and decision use the
+*even* tiles of the chessboard whose odd tiles evaluation scores; optical flow sees the whole images. The surface of a
+declined pair stays the same, bit for bit.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -26,10 +23,11 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.overlap import adjacent_pairs, half_way_view, odd_tiles
-from arbiview_aug.cameras.projection import edge_distance, ego_rays, project_rays
+from arbiview_aug.cameras.projection import ego_rays, project_rays
 from arbiview_aug.cameras.rig import Rig, content_order
+from arbiview_aug.image_ops import at_level
 from arbiview_aug.render.dense_flow import dense_flow, why_ambiguous
-from arbiview_aug.render.harmonise import reduced
+from arbiview_aug.render.harmonise import project_halved, reduced, source_level
 from arbiview_aug.scene.box_raster import draw_boxes
 from arbiview_aug.scene.corrected import Correction
 from arbiview_aug.scene.static import Street
@@ -42,31 +40,28 @@ MIN_PIXELS = 200
 """Pixels that the fit and the decision need in a pair, as for harmonisation."""
 
 MIN_RISE_DB = 0.2
-"""Least rise of the fitted overlap PSNR on held-out tiles: differences below are noise on real frames."""
-
-SMOOTHING_PX = 5.0
-"""σ of the normalised smoothing of depth, at a view 400 px wide."""
-
-LEAST_PARALLAX_PX = 1.5
-"""Where the views shift by less than this when the distance halves, flow's own error would become depth: changes are
-shrunk towards none (ridge)."""
+"""Least rise of the fitted overlap PSNR on held-out tiles: less is noise on real frames."""
 
 LIMITS = (-0.6, 1.5)
-"""Bounds of the relative change: from 2.5 times as far to 2.5 times nearer. Poles and trees reach the upper one on
-real frames, open fields the lower."""
+"""Bounds of the relative change of inverse distance: 2.5 times farther to 2.5 times nearer."""
 
-FADE_PX = 40.0
-"""Beyond what was measured, the nearest change fades to the background's over this many pixels of a view 400 px wide:
-objects end, houses and woods behind them go on."""
-
-BACKGROUND_FADE_PX = 75.0
-"""And the background's fades to none over this many. Wider fades are better still on nuScenes (up 0.6 m: +0.5 dB at
-125), and worse on DDAD (yaw: -0.2), whose road has a wood on one side and open fields on the other."""
+# In pixels of a view 400 px wide, chosen on real and synthetic frames:
+_SMOOTHING_PX = 5.0  # σ of the normalised smoothing of depth
+_RIDGE_PX = 1.5  # views that shift by less when the distance halves have their changes shrunk: flow has errors
+_FADE_PX = 40.0  # beyond measured pixels the nearest change fades to the background's over this distance
+_BACKGROUND_FADE_PX = 75.0  # and the background's to none over this one
+_BORDER_PX = 16.0  # changes fade to none towards the view's border
+_MARGIN_PX = 16  # around an overlap: the reach of optical flow's patches
+_ROWS_PX = 15.0  # σ of the smoothing of the background's change over rows
+_FEW_PIXELS = 3.0  # a row's background fades if fewer pixels were measured
+_LEAST_SUPPORT = 0.02  # measured share of the smoothing window; at most a quarter is possible
+_BACKGROUND_QUANTILE = 0.3  # of a row's changes
+_NEAREST_BACKGROUND = 0.5  # larger changes belong to objects, not to the background
 
 
 @dataclass(frozen=True)
 class OverlapReport:
-    """What refinement made of one pair of neighbours; ``str`` says it in words.
+    """The result for one pair of neighbours; ``str`` prints it.
 
     Attributes:
         first: Name of one camera.
@@ -74,8 +69,8 @@ class OverlapReport:
         accepted: Whether the surface changes.
         reason: Why, or why not.
         db_before: PSNR between the two in their half-way view on held-out tiles, after a gain and an offset per
-            channel fitted on others; None where nothing was measured.
-        db_after: The same with the distances found, accepted or not.
+            channel fitted on others; None without a fit.
+        db_after: The same with the estimated distances, accepted or not.
     """
 
     first: str
@@ -91,12 +86,12 @@ class OverlapReport:
 
 @dataclass(frozen=True, eq=False)
 class OverlapDepth:
-    """What the overlaps of one frame say of distances.
+    """Depth from the overlaps of one frame.
 
     Attributes:
-        corrections: Of the accepted pairs.
+        corrections: One for each accepted pair.
         reports: One for each pair of neighbours, in the order of their names.
-        matched: How many pairs were matched: none without overlap.
+        matched: Number of pairs that were matched.
     """
 
     corrections: tuple[Correction, ...]
@@ -115,46 +110,34 @@ class OverlapDepth:
 
 
 class _Strip(NamedTuple):
-    """The overlap of a pair in its half-way view, cut out with a margin."""
+    """The overlap of a pair, cut out of its half-way view."""
 
     view: Camera
     rows: slice
     columns: slice
     rays: FloatArray  # (h, w, 3)
     q: FloatArray  # (h, w) of the street
-    fit: BoolArray  # (h, w) seen by both cameras, without labelled objects, to measure on
-    test: BoolArray  # (h, w) the same, to decide on
+    fit: BoolArray  # (h, w) to fit on: seen by both cameras, without labelled objects
+    test: BoolArray  # (h, w) to decide on, likewise
     both: BoolArray  # (h, w) seen by both cameras
 
 
-class _Views(NamedTuple):
-    """What all half-way views have in common."""
-
-    fit: BoolArray  # (h, w) even tiles, halved by a finer chessboard: to measure on
-    test: BoolArray  # (h, w) and to decide on
-    inside: FloatArray  # (h, w) in [0, 1], fading to none at the border: nothing may jump there
-
-
 def overlap_depth(rig: Rig, images: Sequence[torch.Tensor], boxes: FloatArray | None = None) -> OverlapDepth:
-    """Distances from the overlaps of one frame, over the street surface.
+    """Estimate distances from the overlaps of one frame, over the street surface.
 
     Args:
         rig: The source rig.
         images: N images (3, H, W): uint8, or float in [0, 1]; any device. They are not changed.
-        boxes: (B, 7) labelled objects, as in ``Scene``: what shows them is not measured, because their distance is
-            known and is not that of what stands around them. On 20 synthetic streets, 0.6 m higher, with boxes: +0.04
-            dB overall, +0.2 to +0.3 on the road around vehicles; at most 0.02 less for other moves.
+        boxes: (B, 7) labelled objects, as in ``Scene``; pixels that show them are left out: their distance is known.
 
     Returns:
-        Corrections, and why each pair was refined or not. The same for any order of the cameras.
+        Corrections, and why each pair was accepted or not. They do not depend on the order of the cameras.
     """
     order = content_order(rig.cameras)
     rig = rig.with_cameras([rig[k] for k in order])
     images = [images[k] for k in order]
     surface = Street(ground_z_m=rig.ground_z_m)
-    pairs = adjacent_pairs(rig)
-    views = _views()
-    strips = [(a, b, _strip(rig, a, b, surface, views, boxes)) for a, b in pairs]
+    strips = [(a, b, _strip(rig, a, b, surface, boxes)) for a, b in adjacent_pairs(rig)]
     used = {k for a, b, strip in strips if strip is not None for k in (a, b)}
     small = {k: _small(rig[k], images[k]) for k in used}
     corrections, reports, matched = [], [], 0
@@ -164,7 +147,7 @@ def overlap_depth(rig: Rig, images: Sequence[torch.Tensor], boxes: FloatArray | 
             reports.append(OverlapReport(*names, False, "they share too little"))
             continue
         matched += 1
-        correction, report = _refine(strip, views, (rig[a], rig[b]), (small[a], small[b]), surface)
+        correction, report = _refine(strip, (rig[a], rig[b]), (small[a], small[b]), surface)
         reports.append(report)
         if correction is not None:
             corrections.append(correction)
@@ -178,72 +161,48 @@ class _Small(NamedTuple):
     level: int
 
 
-def _level(camera: Camera) -> int:
-    return max(0, math.floor(math.log2(camera.width_px / _SOURCE_WIDTH_PX)))
-
-
 def _small(camera: Camera, image: torch.Tensor) -> _Small:
-    level = _level(camera)
+    level = source_level(camera, _SOURCE_WIDTH_PX)
     return _Small(reduced(image, level) * np.float32(255), level)
 
 
-def _views() -> _Views:
-    h, w = _VIEW_SIZE
-    even, finer = ~odd_tiles(_VIEW_SIZE, _TILE_PX), odd_tiles(_VIEW_SIZE, _TILE_PX // 2)
-    x, y = np.arange(w), np.arange(h)[:, None]
-    border_px = np.minimum(np.minimum(x, w - 1 - x), np.minimum(y, h - 1 - y))
-    return _Views(even & ~finer, even & finer, _fade(1 - border_px / _BORDER_PX))
-
-
-_BORDER_PX = 16.0
-
-
-def _strip(rig: Rig, a: int, b: int, surface: StaticSurface, views: _Views, boxes: FloatArray | None) -> _Strip | None:
-    """The overlap of two cameras, or None where they share too little."""
+def _strip(rig: Rig, a: int, b: int, surface: StaticSurface, boxes: FloatArray | None) -> _Strip | None:
+    """The overlap of two cameras; None if they share too little."""
     view = half_way_view(rig[a], rig[b], _VIEW_SIZE)
     pixels = view.pixel_grid()
-    # A first glance on every eighth pixel finds the columns.
-    seen = _seen_by_both(rig, a, b, view, pixels[::8, ::8], surface)
-    if not seen[2].any():
+    coarse = _seen_by_both(rig, a, b, view, pixels[::8, ::8], surface)[2]
+    if not coarse.any():
         return None
-    margin = 16  # flow's patches look so far beyond; and the glance steps over 8
-    (y0, y1), (x0, x1) = (
-        (max(int(at[0]) * 8 - margin, 0), min(int(at[-1]) * 8 + margin + 1, size))
-        for at, size in zip((np.flatnonzero(seen[2].any(k)) for k in (1, 0)), _VIEW_SIZE, strict=True)
+    rows, columns = (
+        slice(max(int(at[0]) * 8 - _MARGIN_PX, 0), min(int(at[-1]) * 8 + _MARGIN_PX + 1, size))
+        for at, size in zip((np.flatnonzero(coarse.any(k)) for k in (1, 0)), _VIEW_SIZE, strict=True)
     )
-    rows, columns = slice(y0, y1), slice(x0, x1)
     rays, q, both = _seen_by_both(rig, a, b, view, pixels[rows, columns], surface)
-    measured = both & ~_showing(view, boxes)[rows, columns]
-    fit, test = (tiles[rows, columns] & measured for tiles in (views.fit, views.test))
+    usable = ~odd_tiles(_VIEW_SIZE, _TILE_PX)
+    if boxes is not None:
+        usable.reshape(-1)[draw_boxes(view, boxes).pixel] = False
+    usable, held_out = usable[rows, columns] & both, odd_tiles(_VIEW_SIZE, _TILE_PX // 2)[rows, columns]
+    fit, test = usable & ~held_out, usable & held_out
     few = min(np.count_nonzero(fit), np.count_nonzero(test)) < MIN_PIXELS
     return None if few else _Strip(view, rows, columns, rays, q, fit, test, both)
-
-
-def _showing(view: Camera, boxes: FloatArray | None) -> BoolArray:
-    """Pixels (h, w) of a view that show boxes."""
-    shown = np.zeros(view.size, bool)
-    if boxes is not None:
-        shown.reshape(-1)[draw_boxes(view, boxes).pixel] = True
-    return shown
 
 
 def _seen_by_both(
     rig: Rig, a: int, b: int, view: Camera, pixels: FloatArray, surface: StaticSurface
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Rays (..., 3), inverse distances (...,) and where both cameras see the surface."""
+    """Rays (..., 3), inverse distances (...,) and whether both cameras see the surface (...,)."""
     rays, seen = ego_rays(view, pixels)
     q = surface.inverse_distance(view.center_m, rays)
     for camera in (rig[a], rig[b]):
-        uv, valid = project_rays(camera, rays, q, view.center_m - camera.center_m)
-        # Halved pixels mix what lies beside them: keep away from border and own car.
-        seen = seen & valid & (edge_distance(camera, uv) > 1.5 * 2 ** _level(camera))
+        level = source_level(camera, _SOURCE_WIDTH_PX)
+        seen = seen & project_halved(camera, level, view.center_m, rays, q)[1]
     return rays, q, seen
 
 
 def _refine(
-    strip: _Strip, views: _Views, cameras: tuple[Camera, Camera], images: tuple[_Small, _Small], surface: StaticSurface
+    strip: _Strip, cameras: tuple[Camera, Camera], images: tuple[_Small, _Small], surface: StaticSurface
 ) -> tuple[Correction | None, OverlapReport]:
-    """The pair's correction where it passes the gate, and why."""
+    """The pair's correction if it passes the gate, and why."""
     names = cameras[0].name, cameras[1].name
     one, two = (_read_over(strip.q, strip, c, image) for c, image in zip(cameras, images, strict=True))
     fit, test = strip.fit, strip.test
@@ -259,20 +218,19 @@ def _refine(
     before = _fitted_db(one, two, fit, test)
     one, two = (_read_over(changed, strip, c, image) for c, image in zip(cameras, images, strict=True))
     after = _fitted_db(one, two, fit, test)
-    words = f"{before:.1f} to {after:.1f} dB on held-out tiles"
+    reason = f"{before:.1f} to {after:.1f} dB on held-out tiles"
     if after - before < MIN_RISE_DB:
-        return None, OverlapReport(*names, False, f"refining would not help, {words}", before, after)
+        return None, OverlapReport(*names, False, f"refining would not help, {reason}", before, after)
     final = _smoothed(along, epipolar, trust * (fit | test))
     if not final.measured.any():
         return None, OverlapReport(*names, False, "too little is found in both images", before, after)
-    return _extended(strip, final, views), OverlapReport(*names, True, words, before, after)
+    return _extended(strip, final), OverlapReport(*names, True, reason, before, after)
 
 
 def _read_over(q: FloatArray, strip: _Strip, camera: Camera, small: _Small) -> npt.NDArray[np.float32]:
-    """A camera's image (h, w, 3) in the half-way view, over a surface."""
+    """Warp a camera's image into the half-way view (h, w, 3), over inverse distances (h, w)."""
     uv, _ = project_rays(camera, strip.rays, q, strip.view.center_m - camera.center_m)
-    scale = 2.0**small.level
-    at = np.clip((uv + 0.5) / scale - 0.5, -1e4, 1e4).astype(np.float32)
+    at = np.clip(at_level(uv, small.level), -1e4, 1e4).astype(np.float32)
     return np.asarray(
         cv2.remap(small.image, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),  # type: ignore[call-overload]
         np.float32,
@@ -284,14 +242,13 @@ def _epipolar(
 ) -> tuple[FloatArray, FloatArray]:
     """Flow along the epipolar direction times its length, and the length squared: (h, w), px² per unit of change.
 
-    The epipolar vector is how far a point's two images part, in the half-way view, when its inverse distance changes,
-    to first order, along with how the surface bends the two readings.
+    The epipolar vector is the derivative of the shift between the two warped images by the relative change.
     """
     step = 0.05
     y, x = np.mgrid[strip.rows, strip.columns].astype(np.float64)
     ends = []
     for camera in cameras:
-        # The point, moved towards the view; where the camera's ray to it meets the surface; seen from the view.
+        # The camera's ray to the displaced point meets the surface elsewhere: there the warped image shows the point.
         towards = strip.rays + (strip.q * (1 + step))[..., None] * (strip.view.center_m - camera.center_m)
         towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
         q = surface.inverse_distance(camera.center_m, towards)
@@ -302,7 +259,7 @@ def _epipolar(
 
 
 class _Depth(NamedTuple):
-    """Relative changes (h, w) over a strip, and where they were measured."""
+    """Relative changes (h, w) of inverse distance over a strip, and the pixels with measurements."""
 
     change: npt.NDArray[np.float32]
     measured: BoolArray
@@ -311,18 +268,15 @@ class _Depth(NamedTuple):
 def _smoothed(along: FloatArray, squared: FloatArray, weight: npt.NDArray[np.floating]) -> _Depth:
     """Weighted least squares in a Gaussian window: change = Σ w f·e / (Σ w e·e + λ² Σ w)."""
     top, bottom, total = (
-        cv2.GaussianBlur(values.astype(np.float32), (0, 0), SMOOTHING_PX)
+        cv2.GaussianBlur(values.astype(np.float32), (0, 0), _SMOOTHING_PX)
         for values in (weight * along, weight * squared, weight)
     )
-    change = top / np.maximum(bottom + LEAST_PARALLAX_PX**2 * total, 1e-6)
+    change = top / np.maximum(bottom + _RIDGE_PX**2 * total, 1e-6)
     return _Depth(np.clip(change, *LIMITS).astype(np.float32), total > _LEAST_SUPPORT)
 
 
-_LEAST_SUPPORT = 0.02  # share of the window that was measured; a quarter of it may be at best
-
-
-def _extended(strip: _Strip, depth: _Depth, views: _Views) -> Correction:
-    """The strip's depth over the whole view: beside it the nearest measured change, then its background's, fading."""
+def _extended(strip: _Strip, depth: _Depth) -> Correction:
+    """Extend a strip's depth over the whole view: the nearest change fades to the background's, then to none."""
     change = np.zeros(_VIEW_SIZE, np.float32)
     change[strip.rows, strip.columns] = depth.change
     missing = np.ones(_VIEW_SIZE, np.uint8)
@@ -330,15 +284,17 @@ def _extended(strip: _Strip, depth: _Depth, views: _Views) -> Correction:
     distance, nearest = cv2.distanceTransformWithLabels(missing, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     by_label = np.zeros(int(nearest.max()) + 1, np.float32)
     by_label[nearest[missing == 0]] = change[missing == 0]
-    beside = np.where(missing == 0, change, cv2.GaussianBlur(by_label[nearest], (0, 0), SMOOTHING_PX))
-    near = _fade(distance / FADE_PX)
+    beside = np.where(missing == 0, change, cv2.GaussianBlur(by_label[nearest], (0, 0), _SMOOTHING_PX))
+    near = _fade(distance / _FADE_PX)
     change = beside * near + _background(change, missing == 0)[:, None] * (1 - near)
-    share = _fade(distance / BACKGROUND_FADE_PX) * views.inside
+    (h, w), x, y = _VIEW_SIZE, np.arange(_VIEW_SIZE[1]), np.arange(_VIEW_SIZE[0])[:, None]
+    border_px = np.minimum(np.minimum(x, w - 1 - x), np.minimum(y, h - 1 - y))
+    share = _fade(distance / _BACKGROUND_FADE_PX) * _fade(1 - border_px / _BORDER_PX)
     return Correction(strip.view, change.astype(np.float32), share.astype(np.float32))
 
 
 def _background(change: npt.NDArray[np.float32], measured: BoolArray) -> FloatArray:
-    """(h,) the change of what stands behind, row by row: a low quantile, smoothed over rows."""
+    """(h,) change of the background in each row: a low quantile, smoothed over rows."""
     count = measured.sum(axis=1)
     ordered = np.sort(np.where(measured, change, np.inf), axis=1)
     rank = np.minimum((count * _BACKGROUND_QUANTILE).astype(np.int64), np.maximum(count - 1, 0))
@@ -348,14 +304,6 @@ def _background(change: npt.NDArray[np.float32], measured: BoolArray) -> FloatAr
         for values in (np.minimum(low, _NEAREST_BACKGROUND) * count, count)
     )
     return np.asarray(weighted / np.maximum(total, 1.0) * np.clip(total / _FEW_PIXELS, 0, 1))
-
-
-_BACKGROUND_QUANTILE = 0.3
-"""0.15 to 0.5 are within 0.1 dB of each other, except that 0.5 follows near trees on DDAD (-0.1 dB)."""
-
-_NEAREST_BACKGROUND = 0.5  # what is nearer than by this change is an object, not the background
-_ROWS_PX = 15.0
-_FEW_PIXELS = 3.0  # a row's background fades where it was measured on fewer pixels
 
 
 def _fade(t: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -1,4 +1,4 @@
-"""Refinements to reuse between frames: depth from overlap, held by calibration and by what a sample calls its scene."""
+"""A cache of depth from overlap, by calibration and by the name of the scene."""
 
 from __future__ import annotations
 
@@ -7,15 +7,14 @@ from arbiview_aug.render.overlap_depth import OverlapDepth
 
 
 class RefinementCache(LRUCache[tuple[bytes, object], OverlapDepth]):
-    """Refinements to reuse: within a scene that stands still, or when the same samples come again in the next epoch.
+    """LRU cache of depth from overlap, for scenes that stand still or samples that come again in the next epoch.
 
-    Frames with the same calibration and the same ``sample[key]`` share the refinement of the first of them. The least
-    recently used are dropped once ``max_bytes`` are held. Pickles, and copies, as empty: each DataLoader worker fills
-    its own.
+    Frames with the same calibration and the same ``sample[key]`` share the refinement of the first of them. Pickles and
+    copies are empty: each DataLoader worker fills its own.
 
     Args:
-        key: Entry of the samples that names what may share, a scene's or a sample's token; None: all frames of one
-            calibration share, which is right for a vehicle at rest only.
+        key: Key of the sample's scene or sample token. None shares one refinement among all frames of a calibration,
+            which is only right for a vehicle at rest.
         max_bytes: Memory for refinements, about 4 MB each for six cameras.
     """
 

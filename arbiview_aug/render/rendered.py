@@ -40,22 +40,21 @@ LabelRenderer = Callable[[Sequence[torch.Tensor], LabelFill], list[torch.Tensor]
 
 @dataclass(frozen=True, eq=False)
 class RenderedFrame:
-    """The M views of one frame. All maps are its own memory; fillers write into it where they can.
+    """The M views of one frame. It owns the memory of its maps; fillers may write into them.
 
     Attributes:
         images: M views (3, h, w), uint8 or float in [0, 1], black where uncovered; slices of one block where sizes
             agree.
         rig: Their cameras, in the source's ego frame.
         coverage: Bool, True where some source sees the pixel.
-        source_camera: Int8 index of the winning source, -1 where uncovered; None where not asked for, as the next two.
+        source_camera: Int8 index of the winning source, -1 where uncovered; None unless requested, like the next two.
         source_frame: Int8, 0 for the current frame, n + 1 for number n of its neighbours, -1 where uncovered.
         confidence: Float32 in [0, 1], 0 where uncovered.
-        generated: Bool, True where a filler made the pixel up; None before that.
-        occluded: (h, w) bool of each view, uncovered pixels that some source's image contains; None for none.
-        certainty: (h, w) uint8 of each view as in ``ViewPlan``, and ``seams`` (h, w) float32, by how much blending
-            changed it: ``confidence`` is made of both.
-        seams: See ``certainty``.
-        labels: Renders label maps; None where there are none.
+        generated: Bool, True where a filler made up the pixel; None before filling.
+        occluded: (h, w) bool of each view, uncovered pixels inside some source's image; None for none.
+        certainty: (h, w) uint8 of each view as in ``ViewPlan``, for ``confidence_of``.
+        seams: (h, w) float32 of each view, by how much blending changed it, for ``confidence_of``.
+        labels: Renders label maps; None if there are none.
     """
 
     images: list[torch.Tensor]
@@ -71,11 +70,11 @@ class RenderedFrame:
     labels: LabelRenderer | None = None
 
     def with_maps(self, change: Callable[[Sequence[torch.Tensor], int], Maps]) -> RenderedFrame:
-        """The frame with each of its maps as ``change`` of it and of its value where no source sees."""
+        """The frame with ``change(map, value where uncovered)`` for each of its maps."""
         changed: dict[str, Any] = {}
         for key in MAP_KEYS:
             if (maps := getattr(self, key)) is not None:
-                changed[key] = change(maps, -1 if key in _SOURCES else 0)
+                changed[key] = change(maps, -1 if key in ("source_camera", "source_frame") else 0)
         return replace(self, **changed)
 
     def between_bars(self, size: tuple[int, int]) -> RenderedFrame:
@@ -91,9 +90,6 @@ class RenderedFrame:
 
 MAP_KEYS = ("coverage", "source_camera", "source_frame", "confidence", "generated")
 """Attributes of a ``RenderedFrame``, and keys of a retargeted sample, that hold maps."""
-
-_SOURCES = ("source_camera", "source_frame")
-"""Those of them that are -1, not 0, where no source sees."""
 
 
 def _labels_between_bars(
@@ -122,35 +118,35 @@ class Renderer:
         curves: Sequence[Sequence[ToneCurve] | None],
         outputs: Collection[str] = (),
     ) -> list[RenderedFrame]:
-        """Render frames; those that share a plan go through torch together.
+        """Render frames; torch renders those that share a plan in one batch.
 
         Args:
             plans: One for each frame.
             frames: The frames.
             curves: For each frame a tone curve for each source, or None.
-            outputs: Which of ``source_camera``, ``source_frame`` and ``confidence`` are wanted.
+            outputs: The requested of ``source_camera``, ``source_frame`` and ``confidence``.
 
         Raises:
-            SampleError: OpenCV was asked for, and an image is on another device or needs gradients.
+            SampleError: ``execution="opencv"``, and an image is on another device or needs gradients.
         """
         with_seams = "confidence" in outputs
-        done: dict[int, RenderedFrame] = {}
-        together: dict[int, list[int]] = {}
+        rendered: dict[int, RenderedFrame] = {}
+        batches: dict[int, list[int]] = {}
         for b, (plan, frame) in enumerate(zip(plans, frames, strict=True)):
             if self._uses_torch(frame.images):
-                together.setdefault(id(plan), []).append(b)
+                batches.setdefault(id(plan), []).append(b)
                 continue
             seams: list[torch.Tensor] | None = [] if with_seams else None
             views = render_opencv(plan, frame.images, self._scratch, curves[b], seams)
-            done[b] = _rendered(plan, views, seams or (), outputs)
-        for members in together.values():
+            rendered[b] = _rendered(plan, views, seams or (), outputs)
+        for members in batches.values():
             plan = plans[members[0]]
-            batched: list[torch.Tensor] | None = [] if with_seams else None
+            seams = [] if with_seams else None
             sources = [torch.stack(images) for images in zip(*(frames[b].images for b in members), strict=True)]
-            blocks = render_torch(plan, sources, [curves[b] for b in members], batched)
+            views = render_torch(plan, sources, [curves[b] for b in members], seams)
             for k, b in enumerate(members):
-                done[b] = _rendered(plan, [view[k] for view in blocks], [seam[k] for seam in batched or ()], outputs)
-        return [done[b] for b in range(len(frames))]
+                rendered[b] = _rendered(plan, [view[k] for view in views], [seam[k] for seam in seams or ()], outputs)
+        return [rendered[b] for b in range(len(frames))]
 
     def views(
         self,
@@ -178,10 +174,9 @@ def _rendered(
     if device.type == "cpu":
         winners = [torch.from_numpy(view.source_camera) for view in plan.targets]
     else:
-        winners = [view.source for view in maps_on(plan, device)]  # the plan holds them there
-    rendered = _from_winners(images, plan.target, winners, outputs)
+        winners = [view.source for view in maps_on(plan, device)]
     occluded = [view.occluded for view in plan.targets]
-    rendered = replace(rendered, occluded=occluded, labels=partial(_labels, partial(render_labels, plan)))
+    rendered = _from_winners(images, plan.target, winners, occluded, partial(render_labels, plan), outputs)
     if "confidence" not in outputs:
         return rendered
     certainty = [view.certainty for view in plan.targets if view.certainty is not None]
@@ -190,15 +185,22 @@ def _rendered(
 
 
 def _from_winners(
-    images: list[torch.Tensor], rig: Rig, winners: Sequence[torch.Tensor], outputs: Collection[str]
+    images: list[torch.Tensor],
+    rig: Rig,
+    winners: Sequence[torch.Tensor],
+    occluded: Sequence[BoolArray | None],
+    labels: Callable[[Sequence[torch.Tensor], float], list[torch.Tensor]],
+    outputs: Collection[str],
 ) -> RenderedFrame:
-    """Views with the maps that say which source won (h, w) int8, in memory of their own."""
+    """A frame with the maps that follow from the (h, w) int8 winning sources, copied."""
     return RenderedFrame(
         images,
         rig,
         covered(winners),
         source_camera=stacked([winner.clone() for winner in winners]) if "source_camera" in outputs else None,
         source_frame=stacked([winner.clamp(max=0) for winner in winners]) if "source_frame" in outputs else None,
+        occluded=occluded,
+        labels=partial(_filled_labels, labels),
     )
 
 
@@ -208,7 +210,7 @@ def confidence_of(rendered: RenderedFrame) -> Maps:
     return stacked([confidence(*of_view) for of_view in of_views])
 
 
-def _labels(
+def _filled_labels(
     render: Callable[[Sequence[torch.Tensor], float], list[torch.Tensor]],
     labels: Sequence[torch.Tensor],
     fill: LabelFill,
@@ -218,16 +220,16 @@ def _labels(
 
 # --- by the published stages ------------------------------------------------------------------------------------------
 def as_rendered(rendering: PaperRendering, outputs: Collection[str] = ()) -> RenderedFrame:
-    """The rendering of ``quality="paper"`` as a ``RenderedFrame``; ``outputs`` as in ``Renderer.render``."""
-    winners = [torch.from_numpy(view.source_camera) for view in rendering.targets]
-    rendered = _from_winners([view.image for view in rendering.targets], rendering.target, winners, outputs)
-    occluded = [view.occluded for view in rendering.targets]
-    return replace(rendered, occluded=occluded, labels=partial(_labels, partial(paper_labels, rendering)))
+    """Convert the rendering of ``quality="paper"``; ``outputs`` as in ``Renderer.render``."""
+    views = rendering.targets
+    winners, occluded = [torch.from_numpy(view.source_camera) for view in views], [view.occluded for view in views]
+    labels = partial(paper_labels, rendering)
+    return _from_winners([view.image for view in views], rendering.target, winners, occluded, labels, outputs)
 
 
 # --- resized only -----------------------------------------------------------------------------------------------------
 def resize_only(frame: Frame, size: tuple[int, int], fit: Fit, outputs: Collection[str] = ()) -> RenderedFrame:
-    """A frame that keeps its cameras, brought to ``size`` (h, w): each saw all of its own view."""
+    """Resize a frame to ``size`` (h, w) without retargeting it; its views are fully covered."""
     device = frame.images[0].device
     framings = [framing(camera.name, camera.size, size, fit) for camera in frame.rig]
     coverage = torch.stack([framed(torch.ones(f.scaled, dtype=torch.bool, device=device), f) for f in framings])

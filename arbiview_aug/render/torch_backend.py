@@ -1,8 +1,8 @@
-"""A render plan's maps as tensors on a device: made once for each, so that a frame moves images alone.
+"""Render plans executed by torch: batches, any device, differentiable in the images.
 
-Convention: grids are ``grid_sample``'s (align_corners=True) of the very positions that OpenCV reads, float32 whatever
-the images are: half precision would move them by visible amounts. All bands of a view are one list of pixels, since no
-pixel has more than one second source.
+Convention: grids are ``grid_sample``'s (align_corners=True) of the same positions that OpenCV reads, float32 for images
+of any type: half precision would move them visibly. All bands of a view are one list of pixels, since no pixel has more
+than one second source. A plan's grids are computed once for each device.
 """
 
 from __future__ import annotations
@@ -25,41 +25,26 @@ from arbiview_aug.render.view_plan import ViewPlan
 
 @dataclass(frozen=True)
 class Blend:
-    """The pixels of a view into which a second source is blended.
+    """The pixels of a view into which a second source is blended."""
 
-    Attributes:
-        pixel: (n,) int64 into the flattened view.
-        grid: (1, n, 2) float32, where the second source is read.
-        weight: (n,) float32, its share.
-        source: (n,) int64, which one.
-    """
-
-    pixel: torch.Tensor
-    grid: torch.Tensor
-    weight: torch.Tensor
-    source: torch.Tensor
+    pixel: torch.Tensor  # (n,) int64 into the flattened view
+    grid: torch.Tensor  # (1, n, 2) float32 positions in the second source
+    weight: torch.Tensor  # (n,) float32 share of the second source
+    source: torch.Tensor  # (n,) int64 index of the second source
 
 
 @dataclass(frozen=True)
 class ViewMaps:
-    """A target view's maps.
+    """A target view's maps."""
 
-    Attributes:
-        grid: (h, w, 2) float32, where the winning source is read; outside the atlas where none sees.
-        source: (h, w) int8, which one; -1 where none sees.
-        blend: Its bands; None without any.
-        edge: Of a view that is read by cubics the pixels (n,) int64, into the flattened view, that are not, and their
-            grid (1, n, 2); None without any.
-    """
-
-    grid: torch.Tensor
-    source: torch.Tensor
+    grid: torch.Tensor  # (h, w, 2) float32 positions in the winning source; outside the atlas where none sees
+    source: torch.Tensor  # (h, w) int8 index of the winning source, -1 where none sees
     blend: Blend | None
-    edge: tuple[torch.Tensor, torch.Tensor] | None
+    edge: tuple[torch.Tensor, torch.Tensor] | None  # the view's ``BilinearFallback``: (n,) int64 and (1, n, 2) float32
 
     @property
     def nbytes(self) -> int:
-        """Memory held."""
+        """Memory in bytes."""
         tensors = [self.grid, self.source, *(self.edge or ())]
         if self.blend is not None:
             tensors += [self.blend.pixel, self.blend.grid, self.blend.weight, self.blend.source]
@@ -67,22 +52,20 @@ class ViewMaps:
 
 
 def maps_on(plan: RenderPlan, device: torch.device) -> Sequence[ViewMaps]:
-    """The maps of each of the plan's views on a device; held by the plan."""
-    held = plan.on_devices.get(device)
-    if held is None:
-        # Made in inference mode, they could never be a part of a backward pass.
+    """The maps of each of the plan's views on a device; cached in the plan."""
+    if device not in plan.on_devices:
+        # Inference tensors could not take part in a later backward pass.
         with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
-            held = tuple(_view_maps(target, plan.layout.size, device) for target in plan.targets)
-        plan.on_devices[device] = held
-    return held
+            plan.on_devices[device] = tuple(_view_maps(target, plan.layout.size, device) for target in plan.targets)
+    return plan.on_devices[device]
 
 
 def _view_maps(target: ViewPlan, atlas_size: tuple[int, int], device: torch.device) -> ViewMaps:
-    grid = torch_grid(target.at.to_float(), atlas_size, device)
+    grid = _grid(target.at.to_float(), atlas_size, device)
     source, blend = torch.from_numpy(target.source_camera).to(device), _blend(target, atlas_size, device)
     if target.edge is None:
         return ViewMaps(grid, source, blend, None)
-    at_edge = torch_grid(target.edge.at.to_float(), atlas_size, device)
+    at_edge = _grid(target.edge.at.to_float(), atlas_size, device)
     return ViewMaps(grid, source, blend, (torch.from_numpy(target.edge.pixel).to(device), at_edge))
 
 
@@ -97,16 +80,15 @@ def _blend(target: ViewPlan, atlas_size: tuple[int, int], device: torch.device) 
         positions.append(band.at.to_float()[y, x])
         weights.append(band.weight[y, x])
         sources.append(np.full(len(y), band.source))
-    grid = torch_grid(np.concatenate(positions)[None], atlas_size, device)
+    grid = _grid(np.concatenate(positions)[None], atlas_size, device)
     pixel, weight, source = (torch.from_numpy(np.concatenate(parts)).to(device) for parts in (pixels, weights, sources))
     return Blend(pixel, grid, weight, source)
 
 
-def torch_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Tensor:
+def _fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Tensor:
     """The atlas (B, 3, rows, columns) float32 of (B, 3, H, W) images in 0..255 or [0, 1]; differentiable."""
-    whole = images[0].dtype == torch.uint8
     batch, device = images[0].shape[0], images[0].device
-    # What no slot fills must be finite: bilinear taps of weight 0 read it.
+    # Gaps between slots must be finite: bilinear taps of weight 0 read them.
     is_full = sum(math.prod(slot.size) for slot in layout.slots) == math.prod(layout.size)
     atlas = (torch.empty if is_full else torch.zeros)((batch, 3, *layout.size), dtype=torch.float32, device=device)
     for slot in layout.slots:
@@ -116,21 +98,21 @@ def torch_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Te
             image = image.float()
         for _ in range(slot.level):
             image = torch.nn.functional.avg_pool2d(image, 2)
-            if whole:
-                image = torch.floor(image + 0.5)  # as OpenCV rounds its halved uint8 images
-        atlas[:, :, slot.y : slot.y + h, slot.x : slot.x + w] = image  # converts as it copies
+            if images[0].dtype == torch.uint8:
+                image = torch.floor(image + 0.5)  # as OpenCV rounds halved uint8 images
+        atlas[:, :, slot.y : slot.y + h, slot.x : slot.x + w] = image
     return atlas
 
 
-def torch_grid(uv: npt.NDArray[np.floating], atlas_size: tuple[int, int], device: torch.device) -> torch.Tensor:
+def _grid(uv: npt.NDArray[np.floating], atlas_size: tuple[int, int], device: torch.device) -> torch.Tensor:
     """``grid_sample``'s (h, w, 2) float32 grid (align_corners=True) of atlas positions (h, w, 2)."""
     h, w = atlas_size
     scale = np.array([max(w - 1, 1), max(h - 1, 1)])
-    # In float64 up to the last step: half precision or early rounding moves positions by visible amounts.
+    # float64 up to the last step: early rounding would move positions visibly.
     return torch.from_numpy((uv.astype(np.float64) / scale * 2 - 1).astype(np.float32)).to(device)
 
 
-def grid_sample(atlas: torch.Tensor, grid: torch.Tensor, interpolation: str) -> torch.Tensor:
+def _sample(atlas: torch.Tensor, grid: torch.Tensor, interpolation: str) -> torch.Tensor:
     """Read a (B, 3, H, W) atlas at an (h, w, 2) grid: (B, 3, h, w); outside is black."""
     mode = {"nearest": "nearest", "linear": "bilinear", "cubic": "bicubic"}[interpolation]  # both cubics have a = -0.75
     batched = grid.expand(atlas.shape[0], *grid.shape)
@@ -143,38 +125,36 @@ def render_torch(
     curves: Sequence[Sequence[ToneCurve] | None] | None = None,
     seams: list[torch.Tensor] | None = None,
 ) -> list[torch.Tensor]:
-    """Target views by ``grid_sample``: batches, any device, differentiable in the images.
+    """Render the target views of a batch with ``grid_sample``.
 
     Args:
         plan: The plan for these images' rig, shared by the batch.
         images: N images (B, 3, H, W): uint8, or float in [0, 1]; sampled in float32.
-        curves: For each frame of the batch nothing, or a tone curve for each image.
-        seams: A list to append, for each view, (B, h, w) float32 to: see ``render_opencv``.
+        curves: For each frame of the batch None, or a tone curve for each image.
+        seams: A list to append (B, h, w) float32 to for each view: see ``render_opencv``.
 
     Returns:
         M views (B, 3, h, w) of the images' type.
     """
     dtype, device = images[0].dtype, images[0].device
-    whole = dtype == torch.uint8
-    atlas = torch_atlas(plan.layout, images)
-    tones = (
-        None if curves is None or not any(curves) else _Tones.of(curves, len(images), device, 255.0 if whole else 1.0)
-    )
+    top = 255 if dtype == torch.uint8 else 1
+    atlas = _fill_atlas(plan.layout, images)
+    tones = _Tones.of(curves, len(images), device, top) if curves is not None and any(curves) else None
     views = []
     for target, maps in zip(plan.targets, maps_on(plan, device), strict=True):
-        view = grid_sample(atlas, maps.grid, target.interpolation)
+        view = _sample(atlas, maps.grid, target.interpolation)
         if maps.edge is not None:
             pixel, grid = maps.edge
-            at_edge = grid_sample(atlas, grid, "linear")[:, :, 0]
-            view = view.clamp(0, 255 if whole else 1).flatten(2).index_copy(2, pixel, at_edge).view_as(view)
+            at_edge = _sample(atlas, grid, "linear")[:, :, 0]
+            view = view.clamp(0, top).flatten(2).index_copy(2, pixel, at_edge).view_as(view)
         if tones is not None:
-            view = tones.applied(view, maps.source.long(), whole)
-        change = None if seams is None else view.new_zeros(view.shape[0], *view.shape[2:])
+            view = tones.applied(view, maps.source.long())
+        change = view.new_zeros(view.shape[0], *view.shape[2:])
         if maps.blend is not None:
-            view = _blended(view, atlas, maps.blend, target.seam_interpolation, tones, whole, change)
-        if seams is not None and change is not None:
+            view = _blended(view, atlas, maps.blend, target.seam_interpolation, tones, change)
+        if seams is not None:
             seams.append(change)
-        views.append(_rounded(view, dtype))
+        views.append(view.round().clamp(0, 255).to(dtype) if dtype == torch.uint8 else view.to(dtype))
     return views
 
 
@@ -184,51 +164,40 @@ def _blended(
     blend: Blend,
     interpolation: str,
     tones: _Tones | None,
-    whole: bool,
-    change: torch.Tensor | None,
+    change: torch.Tensor,
 ) -> torch.Tensor:
-    """A view (B, 3, h, w) with its second sources; into ``change`` (B, h, w) goes what they changed."""
-    second = grid_sample(atlas, blend.grid, interpolation)[:, :, 0]  # [B, 3, n]
+    """Blend the second sources into a view (B, 3, h, w), and write by how much they changed it to (B, h, w)."""
+    second = _sample(atlas, blend.grid, interpolation)[:, :, 0]  # [B, 3, n]
     if tones is not None:
-        second = tones.applied(second, blend.source, whole)
+        second = tones.applied(second, blend.source)
     first = view.flatten(2)[:, :, blend.pixel]
-    if change is not None:
-        change.flatten(1)[:, blend.pixel] = (first - second).detach().abs().mean(1) * blend.weight
+    change.flatten(1)[:, blend.pixel] = (first - second).detach().abs().mean(1) * blend.weight
     mixed = torch.lerp(first, second, blend.weight.expand_as(second))
     return view.flatten(2).index_copy(2, blend.pixel, mixed).view_as(view)
 
 
 class _Tones(NamedTuple):
-    """The curves of all frames and sources as tensors: two straight lines each (see ``ToneCurve``).
+    """The tone curves of all frames and sources, two straight lines each (see ``ToneCurve``)."""
 
-    Attributes:
-        gain: (B, N) slope of the lower line; 1 where nothing changes.
-        slope: (B, N) of the upper line.
-        offset: (B, N) its value at 0.
-    """
-
-    gain: torch.Tensor
-    slope: torch.Tensor
-    offset: torch.Tensor
+    gain: torch.Tensor  # (B, N) slope of the lower line, 1 for none
+    slope: torch.Tensor  # (B, N) slope of the upper line
+    offset: torch.Tensor  # (B, N) its value at 0
+    top: int  # 255 for uint8 images, else 1
 
     @classmethod
-    def of(cls, curves: Sequence[Sequence[ToneCurve] | None], sources: int, device: torch.device, top: float) -> _Tones:
-        none = [ToneCurve(1.0)] * sources
-        frames = [none if of_frame is None else of_frame for of_frame in curves]
+    def of(cls, curves: Sequence[Sequence[ToneCurve] | None], sources: int, device: torch.device, top: int) -> _Tones:
+        frames = [[ToneCurve(1.0)] * sources if of_frame is None else of_frame for of_frame in curves]
         lines = [[(c.gain, c.upper_slope, top * (1 - c.upper_slope)) for c in of_frame] for of_frame in frames]
-        return cls(*torch.tensor(lines, dtype=torch.float32).to(device).unbind(-1))
+        gain, slope, offset = torch.tensor(lines, dtype=torch.float32).to(device).unbind(-1)
+        return cls(gain, slope, offset, top)
 
-    def applied(self, view: torch.Tensor, source: torch.Tensor, whole: bool) -> torch.Tensor:
+    def applied(self, view: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
         """Views (B, 3, ...) read from sources (...,), -1 for none, after their curves."""
-        gain, slope, offset = (lines[:, source][:, None] for lines in self)  # [B, 1, ...]
-        # Whole numbers as the OpenCV execution has them, which looks them up in a table.
-        read = torch.floor(view + 0.5) if whole else view
+        gain, slope, offset = (lines[:, source][:, None] for lines in self[:3])  # [B, 1, ...]
+        # Rounded before and after, like the OpenCV execution, which looks uint8 values up in a table.
+        read = torch.floor(view + 0.5) if self.top == 255 else view
         lower, upper = read * gain, read * slope + offset
         toned = torch.where(gain > 1, torch.minimum(lower, upper), torch.maximum(lower, upper))
-        if whole:
+        if self.top == 255:
             toned = torch.floor(toned + 0.5).clamp(0, 255)
         return torch.where((gain != 1) & (source >= 0), toned, view)
-
-
-def _rounded(view: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
-    return torch.round(view).clamp(0, 255).to(dtype) if dtype == torch.uint8 else view.to(dtype)

@@ -1,4 +1,4 @@
-"""How one target view is rendered, as plain data: maps, winners, blended bands, and why it is so."""
+"""How one target view is rendered, as plain data: maps, winning sources and blended bands."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from arbiview_aug.render.tone_curve import TonePatch, patches
 
 @dataclass(frozen=True)
 class SourceUse:
-    """Why and how one source serves one target; ``explain`` prints it.
+    """How one target uses one source; ``explain`` prints it.
 
     Attributes:
         source: Index of the source camera in the source rig.
@@ -24,7 +24,7 @@ class SourceUse:
         baseline_m: Distance between the two optical centres.
         parallax_px: Expected displacement from unknown depth: the median over the pixels that the source wins.
         share: Share of the target's pixels that it wins.
-        level: How many times its image is halved before it is read.
+        level: Halvings of its image before it is read.
     """
 
     source: int
@@ -38,43 +38,30 @@ class SourceUse:
 
 @dataclass(frozen=True)
 class BlendRegion:
-    """A rectangle in which a second source is blended into the winning one.
+    """A rectangle in which a second source is blended into the winning one."""
 
-    Attributes:
-        y: First row in the target.
-        x: First column.
-        source: Index of the second source.
-        at: Where it is read.
-        weight: (h, w) float32 share of the second source, at most 0.5; 0 where it adds nothing.
-    """
-
-    y: int
-    x: int
-    source: int
-    at: FixedMap
-    weight: npt.NDArray[np.float32]
+    y: int  # first row in the target
+    x: int  # first column
+    source: int  # index of the second source
+    at: FixedMap  # its positions in the atlas
+    weight: npt.NDArray[np.float32]  # (h, w) its share, at most 0.5
 
 
 @dataclass(frozen=True)
 class BilinearFallback:
-    """Pixels of a view that is read by cubics, around which these would reach beyond what the source shows.
+    """Pixels of a cubic view that are read bilinearly, because cubics would reach outside the source or its mask."""
 
-    Attributes:
-        pixel: (n,) into the flattened view, ascending.
-        at: (1, n) where they are read, bilinearly.
-    """
-
-    pixel: npt.NDArray[np.int64]
-    at: FixedMap
+    pixel: npt.NDArray[np.int64]  # (n,) into the flattened view, ascending
+    at: FixedMap  # (1, n) positions in the atlas
 
     def rows(self, y0: int, y1: int, width: int) -> BilinearFallback:
-        """Those of rows y0 to y1, numbered from there."""
+        """The pixels of rows y0 to y1, numbered from y0."""
         a, b = np.searchsorted(self.pixel, (y0 * width, y1 * width))
         return BilinearFallback(self.pixel[a:b] - y0 * width, self.at.part(slice(None), slice(a, b)))
 
     @property
     def nbytes(self) -> int:
-        """Memory held."""
+        """Memory in bytes."""
         return self.pixel.nbytes + self.at.nbytes
 
 
@@ -83,16 +70,15 @@ class ViewPlan:
     """How one target view is rendered.
 
     Attributes:
-        at: Where each pixel reads its winning source in the atlas.
+        at: Position of each pixel in the atlas, in its winning source.
         source_camera: (h, w) int8 index of the winning source, -1 where no source sees the pixel.
         bands: Blended rectangles along the seams.
-        pairs: One report for each source that wins any pixel.
-        interpolation: How it is read: ``nearest``, ``linear`` or ``cubic``. Bands are never read by cubics: a mean of
-            two sources is no sharper for it.
-        certainty: (h, w) ``confidence.certainty`` of the winning source in 255ths, 0 where uncovered; if asked for.
-        edge: Where cubics must not be used.
-        occluded: (h, w) bool, pixels that no source sees although some source's image contains them: something hides
-            them there, an object or the source's own car. None where there are none: what is uncovered lies outside.
+        pairs: One for each source that wins any pixel.
+        interpolation: ``nearest``, ``linear`` or ``cubic``.
+        certainty: (h, w) ``confidence.certainty`` of the winning source in 255ths, 0 where uncovered; on request.
+        edge: Pixels that must not be read by cubics.
+        occluded: (h, w) bool, uncovered pixels that lie in some source's image, behind an object or the source's own
+            car; None if there are none.
     """
 
     at: FixedMap
@@ -116,17 +102,17 @@ class ViewPlan:
 
     @cached_property
     def seam_interpolation(self) -> str:
-        """How its bands are read."""
+        """Interpolation of its bands; never cubic: a mean of two sources is no sharper for it."""
         return "linear" if self.interpolation == "cubic" else self.interpolation
 
     @cached_property
     def patches(self) -> list[list[TonePatch]]:
-        """For each strip of rows, which source wins where, for tone curves; found when first asked for."""
+        """The tone patches of each strip of rows."""
         return patches(self.source_camera, [pair.source for pair in self.pairs])
 
     @property
     def nbytes(self) -> int:
-        """Memory held."""
+        """Memory in bytes."""
         bands = sum(b.at.nbytes + b.weight.nbytes for b in self.bands)
         further = sum(part.nbytes for part in (self.certainty, self.edge, self.occluded) if part is not None)
         return self.at.nbytes + self.source_camera.nbytes + bands + further

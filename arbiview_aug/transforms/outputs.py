@@ -1,4 +1,4 @@
-"""The output sample: rendered views with their calibration, label maps rendered like them, poses and boxes moved."""
+"""The output sample: rendered views with their calibration, label maps, and labels in the ego frame."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from arbiview_aug.sample.inputs import CALIBRATION_KEYS, Frame
 # --- one sample -------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class SampleWriter:
-    """Puts rendered frames into the form of the sample that they came from.
+    """Writes rendered frames as a sample of the form that they were read from.
 
     Attributes:
-        outputs: Further keys that are wanted.
-        generated: Whether there is ``generated``.
-        lenses: Whether there are ``lens`` and ``distortion``.
-        masks: Whether there is ``ignore``.
+        outputs: Further keys that are requested.
+        generated: Whether to write ``generated``.
+        lenses: Whether to write ``lens`` and ``distortion``.
+        masks: Whether to write ``ignore``.
         pass_keys: Keys to keep although they look bound to the source's pixels.
         label_fill: Value of label pixels that no source sees.
         label_frame: ``source`` or ``target``.
-        warn: Takes a topic and words.
+        warn: Issues a warning about a topic.
     """
 
     outputs: tuple[str, ...]
@@ -53,31 +53,29 @@ class SampleWriter:
         rendered: Sequence[RenderedFrame],
         labels: Sequence[str],
         target: Rig,
-        drawn: Mapping[str, float],
+        params: Mapping[str, float],
     ) -> dict[str, Any]:
-        """The output sample.
+        """Write the output sample.
 
         Args:
             sample: The input; it is not changed.
             frames: Its frames.
             lead: Its leading dimensions.
-            rendered: The rendered frames, one for each.
-            labels: Its keys that hold label maps.
+            rendered: The rendered frames.
+            labels: The sample's keys that hold label maps.
             target: The target rig in its own ego frame.
-            drawn: ``retarget_params``.
+            params: ``retarget_params``.
         """
-        out = self._kept(sample, labels)
+        out = self._passed_on(sample, labels)
         out["images"] = rewrapped(gathered([stacked(frame.images) for frame in rendered], lead), sample["images"])
         device = rendered[0].images[0].device
         parts = [calibration_entries(f.rig, device, lenses=self.lenses, masks=self.masks) for f in rendered]
         for key in ("K", "cam2ego"):
             out[key] = like(gathered([part[key] for part in parts], lead), sample.get(key))
-        beside = out["K"].device if isinstance(out["K"], torch.Tensor) else None
+        device = out["K"].device
         grounds = [part["ground_z_m"] for part in parts]
-        if lead:
-            out["ground_z_m"] = torch.tensor(grounds, dtype=torch.float64, device=beside).reshape(lead)
-        else:
-            out["ground_z_m"] = grounds[0]
+        ground_z_m = torch.tensor(grounds, dtype=torch.float64, device=device).reshape(lead) if lead else grounds[0]
+        out["ground_z_m"] = ground_z_m
         out["coverage"] = gathered([frame.coverage for frame in rendered], lead)
         for key in ("ignore", "distortion"):
             if key in parts[0]:
@@ -86,38 +84,37 @@ class SampleWriter:
             if key in MAP_KEYS:
                 out[key] = gathered([getattr(frame, key) for frame in rendered], lead)
         if self.lenses:
-            out["distortion"] = out["distortion"].to(beside or "cpu")
+            out["distortion"] = out["distortion"].to(device)
+            out["lens"] = lens_names([part["lens"] for part in parts], lead)
         if SOURCES_KEY in self.outputs:
             out[SOURCES_KEY] = source_sample(sample["images"], frames, lead)
-        if self.lenses:
-            out["lens"] = lens_names([part["lens"] for part in parts], lead)
         for key in labels:
             out[key] = target_labels(key, sample[key], frames, lead, rendered, self.label_fill)
-        if drawn:
-            out["retarget_params"] = drawn
+        if params:
+            out["retarget_params"] = params
         if self.label_frame == "target":
             moves = [torch.from_numpy(frame.rig.ego2ego(target)) for frame in frames]
             move_to_target(out, gathered(moves, lead), lead)
             out["ground_z_m"] = torch.full_like(out["ground_z_m"], target.ground_z_m) if lead else target.ground_z_m
         return out
 
-    def _kept(self, sample: Mapping[str, Any], labels: Sequence[str]) -> dict[str, Any]:
-        """The entries that go with any images, as the same objects."""
-        kept = (*labels, *self.pass_keys)
-        stale = [key for key in sample if key in PIXEL_BOUND_KEYS and key not in kept]
-        # What an earlier retargeting made up its coverage masks already.
+    def _passed_on(self, sample: Mapping[str, Any], labels: Sequence[str]) -> dict[str, Any]:
+        """The entries that do not depend on the images, as the same objects."""
+        named = (*labels, *self.pass_keys)
+        stale = [key for key in sample if key in PIXEL_BOUND_KEYS and key not in named]
+        # The coverage of an earlier retargeting already masks what it generated.
         dropped = [key for key in stale if key not in self.outputs and key != "generated"]
         if dropped:
             meant = "" if "depth_m" in sample else hint(dropped, ("depth_m",))
-            words = f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels{meant}"
-            self.warn(f"dropped {dropped}", words)
-        rendered = ("images", "K", "cam2ego")  # their places in the dict are kept
-        return {k: v for k, v in sample.items() if k in rendered or k not in (*CALIBRATION_KEYS, *stale)}
+            message = f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels{meant}"
+            self.warn(f"dropped {dropped}", message)
+        replaced = ("images", "K", "cam2ego")  # these keep their places in the dict
+        return {k: v for k, v in sample.items() if k in replaced or k not in (*CALIBRATION_KEYS, *stale)}
 
 
 # --- calibration ------------------------------------------------------------------------------------------------------
 def calibration_entries(rig: Rig, device: torch.device, *, lenses: bool = True, masks: bool = True) -> dict[str, Any]:
-    """``K``, ``cam2ego`` and ``ground_z_m`` of a rig; ``distortion`` and ``lens``; ``ignore`` (M, h, w) on a device."""
+    """``K``, ``cam2ego`` and ``ground_z_m`` of a rig, its ``distortion`` and ``lens``, and ``ignore`` on a device."""
     part: dict[str, Any] = {
         "K": torch.from_numpy(rig.K),
         "cam2ego": torch.from_numpy(rig.cam2ego),
@@ -128,20 +125,19 @@ def calibration_entries(rig: Rig, device: torch.device, *, lenses: bool = True, 
         part["distortion"] = torch.tensor(padded, dtype=torch.float64)
         part["lens"] = [c.lens for c in rig]
     if masks:
-        seen = [np.ones(c.size, bool) if c.mask is None else c.mask for c in rig]
-        part["ignore"] = stacked([torch.from_numpy(~m).to(device) for m in seen])
+        ignored = [np.zeros(c.size, bool) if c.mask is None else ~c.mask for c in rig]
+        part["ignore"] = stacked([torch.from_numpy(mask).to(device) for mask in ignored])
     return part
 
 
 def source_sample(images: Any, frames: Sequence[Frame], lead: tuple[int, ...]) -> dict[str, Any]:
-    """The sample that frames came from: its images, their calibration and masks."""
+    """A sample of the source images, their calibration and masks."""
     parts = [calibration_entries(frame.rig, frame.images[0].device) for frame in frames]
-    held: dict[str, Any] = {
-        key: gathered([part[key] for part in parts], lead) for key in ("K", "cam2ego", "distortion", "ignore")
-    }
-    held["lens"] = lens_names([part["lens"] for part in parts], lead)
+    keys = ("K", "cam2ego", "distortion", "ignore")
+    entries: dict[str, Any] = {key: gathered([part[key] for part in parts], lead) for key in keys}
+    entries["lens"] = lens_names([part["lens"] for part in parts], lead)
     grounds = torch.tensor([part["ground_z_m"] for part in parts], dtype=torch.float64)
-    return {"images": images, **held, "ground_z_m": grounds.reshape(lead)}
+    return {"images": images, **entries, "ground_z_m": grounds.reshape(lead)}
 
 
 # --- label maps -------------------------------------------------------------------------------------------------------
@@ -153,22 +149,13 @@ def target_labels(
     rendered: Sequence[RenderedFrame],
     fill: float,
 ) -> Any:
-    """The label maps (..., N, H, W) of a sample in the target's views.
-
-    Args:
-        key: Named in error messages.
-        value: A tensor, or a list of one (..., Hi, Wi) tensor a camera.
-        frames: The frames of the sample.
-        lead: Its leading dimensions.
-        rendered: Each frame, rendered.
-        fill: Value of pixels that no source sees (False for bool maps).
+    """Render label maps, (..., N, H, W) or a list of (..., Hi, Wi), in the target's views.
 
     Raises:
-        SampleError: Maps that do not belong to the images, or a fill that their type cannot hold.
-        SampleTypeError: Maps that are no tensors.
+        SampleError: Maps that do not fit the images, or a fill value that their type cannot hold.
+        SampleTypeError: Maps that are not tensors.
     """
-    maps_given = value if isinstance(value, list | tuple) else [value]
-    if not all(map(is_readable, maps_given)):
+    if not all(map(is_readable, value if isinstance(value, list | tuple) else [value])):
         got = type(value).__name__
         raise SampleTypeError(f"{key}: expected label maps as tensors, got {got}; use torch.as_tensor")
     if isinstance(value, torch.Tensor) and value.ndim < len(lead) + 3:
@@ -177,13 +164,13 @@ def target_labels(
         of_frames = split(value, lead)
     except ValueError as error:
         raise SampleError(f"{key}: {error}") from None
-    done = []
-    for frame, views, maps in zip(frames, rendered, of_frames, strict=True):
+    views = []
+    for frame, of_frame, maps in zip(frames, rendered, of_frames, strict=True):
         _check_maps(key, maps, frame)
-        assert views.labels is not None
+        assert of_frame.labels is not None
         plain = [label.as_subclass(torch.Tensor) for label in maps]
-        done.append(stacked(views.labels(plain, partial(_checked_fill, key, fill))))
-    return rewrapped(gathered(done, lead), value)
+        views.append(stacked(of_frame.labels(plain, partial(_checked_fill, key, fill))))
+    return rewrapped(gathered(views, lead), value)
 
 
 def _check_maps(key: str, maps: Any, frame: Frame) -> None:
@@ -207,14 +194,14 @@ def _checked_fill(key: str, fill: float, dtype: torch.dtype) -> float:
 
 # --- labels in the ego frame ------------------------------------------------------------------------------------------
 def move_to_target(out: dict[str, Any], ego2ego: torch.Tensor, lead: tuple[int, ...]) -> None:
-    """Poses, points and boxes of an output sample into the target's ego frame, which differs by a translation.
+    """Move an output sample's poses, points and boxes into the target's ego frame, by the translation of ``ego2ego``.
 
     Args:
         out: The output; its entries are replaced, never written to.
         ego2ego: (*lead, 4, 4) source's ego frame to target's.
         lead: Leading dimensions.
     """
-    # Sums, no products of matrices: those autocast, or TF32, would round to bfloat16's metres in a thousand.
+    # Sums instead of matrix products, which autocast and TF32 would round.
     out["ego2ego"], offset_m = ego2ego.to(out["cam2ego"].device), ego2ego[..., :3, 3]
     out["cam2ego"] = out["cam2ego"].clone()
     out["cam2ego"][..., :3, 3] += offset_m[..., None, :].to(out["cam2ego"])
@@ -235,7 +222,7 @@ def move_to_target(out: dict[str, Any], ego2ego: torch.Tensor, lead: tuple[int, 
 
 
 def _before_move(pose: torch.Tensor, offset_m: torch.Tensor) -> torch.Tensor:
-    """Poses (*lead, 4, 4) of an ego frame as those of one that lies (*lead, 3) behind it."""
+    """Poses (*lead, 4, 4) of an ego frame whose coordinates are larger by (*lead, 3)."""
     try:
         lead = torch.broadcast_shapes(pose.shape[:-2], offset_m.shape[:-1])
     except RuntimeError:
@@ -247,7 +234,7 @@ def _before_move(pose: torch.Tensor, offset_m: torch.Tensor) -> torch.Tensor:
 
 
 def _translated(key: str, value: Any, offset_m: torch.Tensor, lead: tuple[int, ...]) -> Any:
-    """Points or boxes (*lead, P, C) moved by (*lead, 3); lists have an entry for each frame."""
+    """Points or boxes (*lead, P, C), or a list of them for each frame, moved by (*lead, 3)."""
     if isinstance(value, list | tuple):
         offsets = offset_m.reshape(-1, 3).expand(len(value) if not lead else -1, 3)
         if len(offsets) != len(value):
@@ -258,7 +245,7 @@ def _translated(key: str, value: Any, offset_m: torch.Tensor, lead: tuple[int, .
     if not is_readable(value) or not value.is_floating_point():
         kind = value.dtype if isinstance(value, torch.Tensor) else type(value).__name__
         raise SampleTypeError(f"{key}: label_frame='target': expected a float tensor, got {kind}")
-    if not value.numel():  # in any shape nothing stands there
+    if not value.numel():  # empty, in any shape
         return value.clone()
     if value.ndim < len(lead) + 1 or value.shape[-1] < 3 or tuple(value.shape[: len(lead)]) != lead:
         expected = ", ".join((*map(str, lead), "count", ">=3"))

@@ -1,9 +1,8 @@
-"""``ResizeRig`` and ``CropRig``: samples in other sizes, with the calibration that then belongs to them.
+"""``ResizeRig`` and ``CropRig``: samples in other sizes, with the calibration that belongs to them.
 
-A resize or crop that does not know of cameras (torchvision's, kornia's) leaves ``K`` as it was: every projection is
-wrong from then on, and nothing fails. These move pixels, ``K``, masks and label maps together, under the one pixel
-convention of ``Camera.resize`` and ``Camera.crop``: outer edges stay on outer edges. Lenses are described in normalised
-coordinates and stay as they are.
+A resize or crop that does not know of cameras (torchvision's, kornia's) leaves ``K`` wrong without any error. These
+change pixels, ``K``, masks and label maps together, by the pixel convention of ``Camera.resize`` and ``Camera.crop``.
+Lenses use normalised coordinates and stay as they are.
 """
 
 from __future__ import annotations
@@ -24,21 +23,12 @@ from arbiview_aug.sample.batching import is_readable, like, rewrapped
 from arbiview_aug.sample.check import PIXEL_BOUND_KEYS, check_other_keys
 from arbiview_aug.sample.inputs import MOTION_KEY, numbers, read_frames
 
-_MAPS = (
-    "coverage",
-    "ignore",
-    "source_camera",
-    "source_frame",
-    "confidence",
-    "generated",
-    "depth",
-    "depth_m",
-)
-"""Keys known to hold maps (..., N, H, W) over the images' pixels: read at the nearest pixel."""
+_MAPS = ("coverage", "ignore", "source_camera", "source_frame", "confidence", "generated", "depth", "depth_m")
+"""Keys of maps (..., N, H, W) over the images' pixels, which are resized by the nearest pixel."""
 
 
 class _PixelTransform(torch.nn.Module, ABC):
-    """What resizing and cropping share: which entries of a sample follow the pixels, and which cannot."""
+    """Applies one change of pixels to the images of a sample and to everything that follows them."""
 
     def __init__(self, label_keys: Sequence[str], pass_keys: Sequence[str]) -> None:
         super().__init__()
@@ -52,8 +42,8 @@ class _PixelTransform(torch.nn.Module, ABC):
             sample: As ``RigRetarget`` takes or gives it, batched or not; it is not changed.
 
         Returns:
-            A new dict. 2D boxes and the like (``project_boxes_3d`` makes them anew), and other frames of the drive, are
-            dropped with a warning.
+            A new dict. 2D boxes and the like (recompute them by ``project_boxes_3d``), and other frames of the drive,
+            are dropped with a warning.
 
         Raises:
             SampleError: As ``RigRetarget`` raises; ``CropRig``: a window that leaves an image.
@@ -78,11 +68,11 @@ class _PixelTransform(torch.nn.Module, ABC):
 
     @abstractmethod
     def _image(self, image: torch.Tensor) -> torch.Tensor:
-        """A (3, H, W) image."""
+        """Change a (3, H, W) image."""
 
     @abstractmethod
-    def _map(self, label: torch.Tensor) -> torch.Tensor:
-        """A (H, W) map."""
+    def _map(self, image: torch.Tensor) -> torch.Tensor:
+        """Change a (H, W) map."""
 
     @abstractmethod
     def _camera(self, camera: Camera) -> Camera:
@@ -94,7 +84,7 @@ class _PixelTransform(torch.nn.Module, ABC):
 
 
 class ResizeRig(_PixelTransform):
-    """Resizes all images of a sample, antialiased, and K, rig, masks and label maps with them.
+    """Resize all images of a sample, antialiased, and K, rig, masks and label maps with them.
 
     Args:
         size: (h, w) of every output image.
@@ -113,8 +103,8 @@ class ResizeRig(_PixelTransform):
     def _image(self, image: torch.Tensor) -> torch.Tensor:
         return resized(image, self.size)
 
-    def _map(self, label: torch.Tensor) -> torch.Tensor:
-        return nearest_resized(label, self.size)
+    def _map(self, image: torch.Tensor) -> torch.Tensor:
+        return nearest_resized(image, self.size)
 
     def _camera(self, camera: Camera) -> Camera:
         return camera.resize(self.size)
@@ -124,7 +114,7 @@ class ResizeRig(_PixelTransform):
 
 
 class CropRig(_PixelTransform):
-    """Cuts one window out of all images of a sample, and out of K, rig, masks and label maps with them.
+    """Cut one window out of all images of a sample, and out of K, rig, masks and label maps with them.
 
     Args:
         top: First row.
@@ -151,7 +141,7 @@ class CropRig(_PixelTransform):
         """Settings, for ``repr``."""
         return f"top={self.top}, left={self.left}, size={self.size}"
 
-    def _window(self, image: torch.Tensor) -> torch.Tensor:
+    def _image(self, image: torch.Tensor) -> torch.Tensor:
         (h, w), (to_h, to_w) = image.shape[-2:], self.size
         if self.top + to_h > h or self.left + to_w > w:
             raise SampleError(
@@ -160,11 +150,7 @@ class CropRig(_PixelTransform):
             )
         return image[..., self.top : self.top + to_h, self.left : self.left + to_w]
 
-    def _image(self, image: torch.Tensor) -> torch.Tensor:
-        return self._window(image)
-
-    def _map(self, label: torch.Tensor) -> torch.Tensor:
-        return self._window(label)
+    _map = _image
 
     def _camera(self, camera: Camera) -> Camera:
         return camera.crop(self.top, self.left, self.size)

@@ -267,13 +267,12 @@ def test_curves_stay_in_range_and_rise(gain: float, knee: float, worst: Worst) -
     x = np.linspace(0, 1, 4097)
     with no_numpy_warnings():
         exact, single = curve.of_array(x), curve.of_array(x.astype(np.float32))
-        torched = curve.of_tensor(torch.from_numpy(x.astype(np.float32))).numpy()
         levels = np.arange(256, dtype=np.uint8).reshape(1, 256, 1).repeat(3, 2)
         curve.apply(levels)
-    for y in (exact, single, torched):
+    for y in (exact, single):
         assert y[0] == 0 and y[-1] == pytest.approx(1, abs=1e-6) and (np.diff(y) >= -1e-6).all()
     assert (np.diff(levels[0, :, 0].astype(int)) >= 0).all() and levels[0, 255, 0] == 255
-    error = 255 * max(np.abs(single - exact).max(), np.abs(torched - exact).max())
+    error = 255 * np.abs(single - exact).max()
     worst("grey levels, tone curves in float32", error)
     assert error <= 1e-3
 
