@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
@@ -15,15 +15,16 @@ class LRUCache(Generic[K, V]):
     """Thread-safe LRU cache bounded by total value size, with counts of ``hits`` and ``misses``.
 
     The last value always stays. Threads that miss the same key at once each make the value and all get the first one.
+    Pickles as empty.
 
     Args:
         limit: Maximum total size.
-        size: Size of one value: bytes, or 1 to count values.
+        size: Size of one value, picklable; None counts values.
     """
 
-    def __init__(self, limit: int, size: Callable[[V], int]) -> None:
+    def __init__(self, limit: int, size: Callable[[V], int] | None = None) -> None:
         self.limit, self.hits, self.misses = limit, 0, 0
-        self._size = size
+        self._size = size or _one
         self._values: OrderedDict[K, V] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -51,3 +52,10 @@ class LRUCache(Generic[K, V]):
 
     def __len__(self) -> int:
         return len(self._values)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.limit, self._size)
+
+
+def _one(_: object) -> int:
+    return 1

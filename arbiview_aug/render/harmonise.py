@@ -315,7 +315,7 @@ class Harmoniser:
         self.estimates = choice is True or isinstance(choice, HarmoniseConfig)
         self.gains = None if self.estimates or choice is None or choice is False else _checked_gains(choice)
         self.is_on = self.estimates or self.gains is not None
-        self._overlaps: LRUCache[bytes, Overlaps] = LRUCache(_CACHED_RIGS, lambda _: 1)
+        self._overlaps: LRUCache[bytes, Overlaps] = LRUCache(_CACHED_RIGS)
 
     def __repr__(self) -> str:
         if self.gains is not None:

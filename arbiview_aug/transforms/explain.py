@@ -1,4 +1,4 @@
-"""A render plan, or a rendering by ``quality="paper"``, in words."""
+"""Explanations of a render plan, or of a rendering by ``quality="paper"``."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.favs.renderer import PaperRendering, SourceReport
 from arbiview_aug.render.harmonise import PhotometricReport
 from arbiview_aug.render.overlap_depth import OverlapDepth
@@ -22,15 +23,15 @@ from arbiview_aug.temporal.motion_depth import MotionDepth
 
 @dataclass(frozen=True)
 class Explanation:
-    """Why a plan is what it is; ``str`` prints it, ``as_dict`` gives plain data.
+    """Why a frame is rendered as it is; ``str`` prints it, ``as_dict`` gives plain data.
 
     Attributes:
-        plan: The plan.
-        harmonisation: The sources' gains and why, where harmonisation was asked for.
-        depth: What became of each pair of neighbours, where depth from overlap was asked for and matters.
-        motion: What motion said of the distances, where it was asked.
-        fills: What other frames of the drive show of the holes, where the sample has any.
-        harm: How a detector suffers from the surface, where that is static and cameras move.
+        plan: The render plan.
+        harmonisation: The sources' gains and why, if they are harmonised.
+        depth: Depth from overlap, if it was asked for and matters.
+        motion: Depth from motion, if it was estimated.
+        fills: How other frames of the drive fill holes, if there are any.
+        harm: Why a detector suffers, if cameras move over a static surface.
     """
 
     plan: RenderPlan
@@ -43,13 +44,15 @@ class Explanation:
     def as_dict(self) -> list[dict[str, Any]]:
         """One entry for each target camera: coverage, share to invent, and its sources with surface and reason.
 
-        With other frames of the drive also ``filled``: the share that they show besides, no more than which is filled.
+        With other frames of the drive also ``filled``: at most this share is filled from them.
         """
-        shares = [0.0] * len(self.plan.targets) if self.fills is None else self.fills.shares(self.plan)
-        entries = []
-        for camera, target, share in zip(self.plan.target, self.plan.targets, shares, strict=True):
-            entry = _entry(camera, target.coverage, [self._source(pair) for pair in target.pairs])
-            entries.append(entry if self.fills is None else entry | {"filled": share})
+        entries = [
+            _entry(camera, target.coverage, [self._source(pair) for pair in target.pairs])
+            for camera, target in zip(self.plan.target, self.plan.targets, strict=True)
+        ]
+        if self.fills is not None:
+            for entry, share in zip(entries, self.fills.shares(self.plan), strict=True):
+                entry["filled"] = share
         return entries
 
     def _source(self, pair: SourceUse) -> dict[str, Any]:
@@ -64,32 +67,26 @@ class Explanation:
         }
 
     def __str__(self) -> str:
-        lines = [
-            f"{self.plan.source.name or 'source'} -> {self.plan.target.name or 'target'}: "
-            f"{len(self.plan.source)} cameras to {len(self.plan.target)}"
-        ]
+        lines = []
         if self.harmonisation is not None:
-            lines.append(f"  {self.harmonisation}")
+            lines.append(str(self.harmonisation))
         if self.harm is not None:
-            lines += [f"  {self.harm}", f"  better: {harm_remedies(self.plan.source, self.plan.target)}"]
+            lines += [self.harm, f"better: {harm_remedies(self.plan.source, self.plan.target)}"]
         if self.depth is not None:
-            lines.extend(f"  {line}" for line in str(self.depth).splitlines())
+            lines += str(self.depth).splitlines()
         if self.motion is not None:
-            lines.append(f"  {self.motion}")
+            lines.append(str(self.motion))
         if self.fills is not None:
-            lines.extend(f"  {line}" for line in self.fills.lines(self.plan))
-        return "\n".join([*lines, *_lines(self.as_dict(), _source_line)])
+            lines += self.fills.lines(self.plan)
+        head = [_head(self.plan.source, self.plan.target), *(f"  {line}" for line in lines)]
+        return "\n".join([*head, *_lines(self.as_dict(), _source_line)])
 
     __repr__ = __str__
 
 
 @dataclass(frozen=True)
 class PaperExplanation:
-    """What the published stages did to a frame; ``str`` prints it, ``as_dict`` gives plain data.
-
-    Attributes:
-        rendering: The frame.
-    """
+    """What the published stages did to a frame; ``str`` prints it, ``as_dict`` gives plain data."""
 
     rendering: PaperRendering
 
@@ -118,14 +115,14 @@ class PaperExplanation:
         }
 
     def __str__(self) -> str:
-        rendering = self.rendering
-        lines = [
-            f"{rendering.source.name or 'source'} -> {rendering.target.name or 'target'}: {len(rendering.source)} "
-            f"cameras to {len(rendering.target)}, stages 1 to 4 as published, far surface"
-        ]
-        return "\n".join([*lines, *_lines(self.as_dict(), _stages)])
+        head = f"{_head(self.rendering.source, self.rendering.target)}, stages 1 to 4 as published, far surface"
+        return "\n".join([head, *_lines(self.as_dict(), _stages)])
 
     __repr__ = __str__
+
+
+def _head(source: Rig, target: Rig) -> str:
+    return f"{source.name or 'source'} -> {target.name or 'target'}: {len(source)} cameras to {len(target)}"
 
 
 def _entry(camera: Camera, coverage: BoolArray, sources: list[dict[str, Any]]) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from arbiview_aug.favs.config import FavsConfig, PaperConfig
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.harmonise import Harmoniser
 from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
-from arbiview_aug.render.plan import PlanCache, RenderPlan, build_plan, plan_key
+from arbiview_aug.render.plan import RenderPlan, build_plan, plan_key
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.render.requirements import harm_remedies, needs_geometry, static_harm
 from arbiview_aug.render.tone_curve import ToneCurve
@@ -91,16 +92,6 @@ class _RigPair:
         return static_harm(self.source, self.target, "street", self._config)
 
 
-class _RigPairs(LRUCache[tuple[bytes, bytes], _RigPair]):
-    """Pairs of rigs by content. Pickles as empty."""
-
-    def __init__(self) -> None:
-        super().__init__(_MAX_RIG_PAIRS, lambda _: 1)
-
-    def __reduce__(self) -> tuple[type[_RigPairs], tuple[()]]:
-        return _RigPairs, ()
-
-
 class FramePlanner:
     """Plans frames, and caches the plans of calibrations that come back.
 
@@ -140,9 +131,9 @@ class FramePlanner:
         self.config, self.surface, self.harmoniser = config, surface, harmoniser
         self.refinement, self.reach, self.warn = refinement, reach, warn
         self.mixed, self.strict, self.unseen = mixed, strict, unseen
-        self.plans = PlanCache(cache_bytes)
-        self._last_plan = PlanCache(0)  # holds one
-        self._pairs = _RigPairs()
+        self.plans: LRUCache[bytes, RenderPlan] = LRUCache(cache_bytes, attrgetter("nbytes"))
+        self._last_plan: LRUCache[bytes, RenderPlan] = LRUCache(1)
+        self._pairs: LRUCache[tuple[bytes, bytes], _RigPair] = LRUCache(_MAX_RIG_PAIRS)
 
     # --- plans of frames ----------------------------------------------------------------------------------------------
     def plan(

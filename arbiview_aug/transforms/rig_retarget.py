@@ -22,8 +22,9 @@ from arbiview_aug.favs.stage1_geometry import check_pinhole
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.batches import complete_frame, frame_names
 from arbiview_aug.generator.fillers import Holes, fill_frame
+from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.harmonise import Harmonise, Harmoniser, PhotometricReport
-from arbiview_aug.render.plan import PlanCache, RenderPlan
+from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.render.rendered import Execution, RenderedFrame, Renderer, as_rendered, resize_only
 from arbiview_aug.sample.batching import leading_shape
@@ -376,7 +377,7 @@ class RigRetarget(torch.nn.Module):
 
     # --- plans ------------------------------------------------------------------------------------------------------
     @property
-    def plans(self) -> PlanCache:
+    def plans(self) -> LRUCache[bytes, RenderPlan]:
         """The cached plans."""
         return self.planner.plans
 

@@ -1,4 +1,4 @@
-"""Settings of a transform, checked: what is impossible is refused when it is made, in words."""
+"""Checks of a transform's settings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from arbiview_aug.generator.batches import SOURCES_KEY, Completion
 RenderPath = Literal["favs", "inpaint", "diffusion"]
 
 OUTPUTS = ("source_camera", "source_frame", "confidence", SOURCES_KEY)
-"""What a sample can hold besides, on request."""
+"""Further keys of the output, on request."""
 
 
 def completion_of(
@@ -26,10 +26,10 @@ def completion_of(
     min_confidence: float,
     seed: int,
 ) -> Completion | None:
-    """Checked settings of what is made up; None where nothing is.
+    """Checked settings of inpainting or a generator; None for ``path="favs"``.
 
     Raises:
-        ValueError: Impossible ones, or some for another path.
+        ValueError: Impossible settings, or settings of another path.
     """
     if path != "diffusion" and any(value is not None for value in (generator, steps, guidance)):
         raise ValueError(f"generator, steps, guidance: they are for path='diffusion', got path={path!r}")
@@ -70,34 +70,34 @@ _FILLED = {
 
 
 def one_of(name: str, value: Any, choices: Sequence[str]) -> None:
-    """Refuse, by ValueError, what is none of the choices."""
+    """Raise ValueError unless ``value`` is one of the choices."""
     if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
 
 
 def checked_names(name: str, value: Any) -> tuple[str, ...]:
-    """Names in a tuple; ValueError for anything else, a single string too."""
+    """Names as a tuple; ValueError for anything else, a single string too."""
     if not isinstance(value, list | tuple) or not all(isinstance(entry, str) for entry in value):
         raise ValueError(f"{name}: expected names in a list or tuple, got {value!r}")
     return tuple(value)
 
 
 def is_number(value: Any) -> bool:
-    """Whether it is a real number; True and False are none."""
+    """Whether it is a real number, and not a bool."""
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def checked_params(params: Any) -> dict[str, float]:
-    """``retarget_params`` as plain numbers; SampleError where they are none."""
+    """``retarget_params`` as plain numbers; SampleError for anything else."""
     try:
-        return {name: float(value) for name, value in params.items()}  # of a collated batch: tensors
+        return {name: float(value) for name, value in params.items()}  # tensors in a collated batch
     except (AttributeError, TypeError, ValueError, RuntimeError):
-        got = repr(params)
-    raise SampleError(f"params: expected the 'retarget_params' of an output, names and numbers, got {got}")
+        pass
+    raise SampleError(f"params: expected the 'retarget_params' of an output, names and numbers, got {params!r}")
 
 
 def checked_size(size: Any) -> tuple[int, int]:
-    """(h, w) in pixels; ValueError for what no image has."""
+    """(h, w) in pixels; ValueError for impossible sizes."""
     try:
         h, w = (operator.index(side) for side in size)  # 10.5 is refused, not cut
     except (TypeError, ValueError):

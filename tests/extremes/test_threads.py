@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from operator import attrgetter
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 import torch
 
 from arbiview_aug import RigRetarget
-from arbiview_aug.render.plan import PlanCache
+from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.refinement import RefinementCache
 from tests.extremes import misuse
 
@@ -49,14 +50,14 @@ def test_threads_do_not_disturb_each_other(settings: dict[str, Any]) -> None:
     for k, images in enumerate(rendered):
         assert torch.equal(images, fresh(sample(k % 35))["images"])
     assert retarget.plans.hits + retarget.plans.misses == count
-    assert retarget.plans.nbytes <= settings.get("cache_bytes", 2**30) or len(retarget.plans) == 1
+    assert retarget.plans.size <= settings.get("cache_bytes", 2**30) or len(retarget.plans) == 1
 
 
-@pytest.mark.parametrize("cache", [PlanCache(20), RefinementCache(max_bytes=20)])
+@pytest.mark.parametrize("cache", [LRUCache(20, attrgetter("nbytes")), RefinementCache(max_bytes=20)])
 def test_caches_keep_count(cache: Any) -> None:
     def get(k: int) -> int:
         key = bytes([k * k % 7])
-        name = key if isinstance(cache, PlanCache) else (key, None)
+        name = (key, None) if isinstance(cache, RefinementCache) else key
         return int(cache.get(name, lambda: SimpleNamespace(nbytes=5, key=key)).key == key)
 
     with ThreadPoolExecutor(4) as threads:

@@ -1,6 +1,7 @@
 """The render plan against a slow float64 reference: maps, coverage, winners, and what it says of itself."""
 
 import pickle
+from operator import attrgetter
 
 import cv2
 import numpy as np
@@ -10,7 +11,8 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.projection import ego_rays, project_rays
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.favs.config import FavsConfig
-from arbiview_aug.render.plan import PlanCache, RenderPlan, build_plan, plan_key
+from arbiview_aug.lru_cache import LRUCache
+from arbiview_aug.render.plan import RenderPlan, build_plan, plan_key
 from arbiview_aug.scene.scene import Scene
 from tests.helpers import sampled
 
@@ -197,13 +199,13 @@ def test_plans_pickle_and_the_cache_is_bounded() -> None:
     plan = build_plan(source, source.turned(yaw_deg=3))
     again = pickle.loads(pickle.dumps(plan))
     assert np.array_equal(again.targets[0].at.xy, plan.targets[0].at.xy)
-    cache = PlanCache(max_bytes=int(plan.nbytes * 2.5))
+    cache: LRUCache[bytes, RenderPlan] = LRUCache(int(plan.nbytes * 2.5), attrgetter("nbytes"))
     keys = []
     for yaw in (1, 2, 3, 1):
         target = source.turned(yaw_deg=yaw)
         keys.append(plan_key(source, target, "auto", FavsConfig()))
         cache.get(keys[-1], lambda target=target: build_plan(source, target))
-    assert keys[0] == keys[3] and len(cache) == 2 and cache.nbytes <= cache.max_bytes and cache.misses == 4
+    assert keys[0] == keys[3] and len(cache) == 2 and cache.size <= cache.limit and cache.misses == 4
     assert len(pickle.loads(pickle.dumps(cache))) == 0
 
 
