@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from arbiview_aug.cameras.framing import Fit, Framing, framing
+from arbiview_aug.cameras.framing import Fit, framing
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
@@ -29,10 +29,10 @@ from arbiview_aug.sample.inputs import Frame
 Execution = Literal["auto", "opencv", "torch"]
 
 Maps = torch.Tensor | list[torch.Tensor]
-"""A map (h, w) of each of M views: (M, h, w) where their sizes agree, else a list."""
+"""Maps of M views: (M, h, w) where their sizes agree, else a list of (h, w)."""
 
 LabelFill = Callable[[torch.dtype], float]
-"""The value of label pixels that no source sees, in maps of a type; raises SampleError where the type has no such."""
+"""Gives the value of uncovered label pixels; raises SampleError if a type cannot hold it."""
 
 LabelRenderer = Callable[[Sequence[torch.Tensor], LabelFill], list[torch.Tensor]]
 """Renders N label maps (..., H, W) of the sources as M maps (..., h, w) of the views."""
@@ -80,22 +80,19 @@ class RenderedFrame:
     def between_bars(self, size: tuple[int, int]) -> RenderedFrame:
         """The frame with every view at ``size`` (h, w), black bars above and at both sides."""
 
-        def with_bars(views: Sequence[torch.Tensor], empty: int) -> torch.Tensor:
+        def with_bars(views: Sequence[torch.Tensor], empty: float) -> torch.Tensor:
             return torch.stack([barred(view, size, empty) for view in views])
 
-        labels = None if self.labels is None else partial(_labels_between_bars, self.labels, size)
+        def labels(maps: Sequence[torch.Tensor], fill: LabelFill) -> list[torch.Tensor]:
+            assert self.labels is not None
+            return list(with_bars(self.labels(maps, fill), fill(maps[0].dtype)))
+
         images, rig = list(with_bars(self.images, 0)), self.rig.resized(size, "pad")
         return replace(self.with_maps(with_bars), images=images, rig=rig, labels=labels)
 
 
 MAP_KEYS = ("coverage", "source_camera", "source_frame", "confidence", "generated")
 """Attributes of a ``RenderedFrame``, and keys of a retargeted sample, that hold maps."""
-
-
-def _labels_between_bars(
-    render: LabelRenderer, size: tuple[int, int], labels: Sequence[torch.Tensor], fill: LabelFill
-) -> list[torch.Tensor]:
-    return [barred(label, size, fill(labels[0].dtype)) for label in render(labels, fill)]
 
 
 # --- by a plan --------------------------------------------------------------------------------------------------------
@@ -200,7 +197,7 @@ def _from_winners(
         source_camera=stacked([winner.clone() for winner in winners]) if "source_camera" in outputs else None,
         source_frame=stacked([winner.clamp(max=0) for winner in winners]) if "source_frame" in outputs else None,
         occluded=occluded,
-        labels=partial(_filled_labels, labels),
+        labels=lambda maps, fill: labels(maps, fill(maps[0].dtype)),
     )
 
 
@@ -208,14 +205,6 @@ def confidence_of(rendered: RenderedFrame) -> Maps:
     """Compute the confidence of a frame's views from their certainty, seams and contrast."""
     of_views = zip(rendered.images, rendered.certainty, rendered.coverage, rendered.seams, strict=True)
     return stacked([confidence(*of_view) for of_view in of_views])
-
-
-def _filled_labels(
-    render: Callable[[Sequence[torch.Tensor], float], list[torch.Tensor]],
-    labels: Sequence[torch.Tensor],
-    fill: LabelFill,
-) -> list[torch.Tensor]:
-    return render(labels, fill(labels[0].dtype))
 
 
 # --- by the published stages ------------------------------------------------------------------------------------------
@@ -243,12 +232,8 @@ def resize_only(frame: Frame, size: tuple[int, int], fit: Fit, outputs: Collecti
         source_frame=current if "source_frame" in outputs else None,
         confidence=coverage.float() if "confidence" in outputs else None,
         generated=torch.zeros_like(coverage),
-        labels=partial(_resized_labels, framings),
+        labels=lambda maps, fill: [
+            framed(nearest_resized(label, f.scaled), f, fill(label.dtype) if f.has_bars else 0)
+            for label, f in zip(maps, framings, strict=True)
+        ],
     )
-
-
-def _resized_labels(framings: Sequence[Framing], labels: Sequence[torch.Tensor], fill: LabelFill) -> list[torch.Tensor]:
-    return [
-        framed(nearest_resized(label, f.scaled), f, fill(labels[0].dtype) if f.has_bars else 0)
-        for label, f in zip(labels, framings, strict=True)
-    ]

@@ -77,15 +77,14 @@ class SampleWriter:
         ground_z_m = torch.tensor(grounds, dtype=torch.float64, device=device).reshape(lead) if lead else grounds[0]
         out["ground_z_m"] = ground_z_m
         out["coverage"] = gathered([frame.coverage for frame in rendered], lead)
-        for key in ("ignore", "distortion"):
-            if key in parts[0]:
-                out[key] = gathered([part[key] for part in parts], lead)
-        for key in (*(("generated",) if self.generated else ()), *self.outputs):
+        if self.masks:
+            out["ignore"] = gathered([part["ignore"] for part in parts], lead)
+        if self.lenses:
+            out["distortion"] = gathered([part["distortion"] for part in parts], lead).to(device)
+            out["lens"] = lens_names([part["lens"] for part in parts], lead)
+        for key in ("generated", *self.outputs) if self.generated else self.outputs:
             if key in MAP_KEYS:
                 out[key] = gathered([getattr(frame, key) for frame in rendered], lead)
-        if self.lenses:
-            out["distortion"] = out["distortion"].to(device)
-            out["lens"] = lens_names([part["lens"] for part in parts], lead)
         if SOURCES_KEY in self.outputs:
             out[SOURCES_KEY] = source_sample(sample["images"], frames, lead)
         for key in labels:

@@ -35,44 +35,27 @@ _MAX_RIG_PAIRS = 64  # one or two kilobytes each, beside the target's cameras
 
 @dataclass(frozen=True)
 class FramePlan:
-    """How one frame is rendered.
-
-    Attributes:
-        source: The frame's rig.
-        target: The target rig in the source's ego frame.
-        plan: The render plan; None with ``quality="paper"``, which depends on every image.
-        detections: Detected objects by source camera, for ``quality="paper"``.
-        depth: Depth from overlap, if it was asked for and matters.
-        motion: Depth from motion, if it was estimated here and not offline.
-        fills: How neighbouring frames fill holes, if they show any.
-        curves: A tone curve for each source, if they are harmonised.
-        harm: Why a detector suffers, if cameras move over a static surface.
-    """
+    """How one frame is rendered."""
 
     source: Rig
-    target: Rig
-    plan: RenderPlan | None = None
-    detections: OfCameras = field(default_factory=dict)
-    depth: OverlapDepth | None = None
-    motion: MotionDepth | None = None
-    fills: Fills | None = None
-    curves: tuple[ToneCurve, ...] | None = None
-    harm: str | None = None
+    target: Rig  # in the source's ego frame
+    plan: RenderPlan | None = None  # none with ``quality="paper"``, which depends on every image
+    detections: OfCameras = field(default_factory=dict)  # by source camera, for ``quality="paper"``
+    depth: OverlapDepth | None = None  # if it was asked for and matters
+    motion: MotionDepth | None = None  # if it was estimated here and not offline
+    fills: Fills | None = None  # holes that neighbouring frames fill
+    curves: tuple[ToneCurve, ...] | None = None  # one for each source, if they are harmonised
+    harm: str | None = None  # why a detector suffers, if cameras move over a static surface
 
 
 class _RigPair:
-    """A source and a target rig, and what follows from their calibrations alone.
-
-    Attributes:
-        source: The source rig.
-        target: The target rig in the source's ego frame.
-        needs_geometry: Whether the distance of the scene matters for any pixel.
-        road: A scene of which the road alone is known.
-    """
+    """A source and a target rig, and what follows from their calibrations alone."""
 
     def __init__(self, source: Rig, target: Rig, surface: SurfaceName, config: FavsConfig | PaperConfig) -> None:
-        self.source, self.target, self.road = source, target.in_frame_of(source), Scene()
+        self.source, self.target = source, target.in_frame_of(source)
+        self.road = Scene()  # nothing else is known
         self._surface, self._config = surface, config
+        # Whether the distance of the scene matters for any pixel.
         self.needs_geometry = isinstance(config, FavsConfig) and needs_geometry(source, self.target, surface, config)
 
     @cached_property

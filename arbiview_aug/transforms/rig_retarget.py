@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import repeat
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -196,16 +197,13 @@ class RigRetarget(torch.nn.Module):
             raise ValueError(f"rng: expected a torch.Generator or None, got {type(rng).__name__}")
         if refinement is not None and not isinstance(refinement, RefinementCache):
             raise ValueError(f"refinement: expected a RefinementCache or None, got {type(refinement).__name__}")
-        self.target: Rig | RandomRig
-        if isinstance(target_rig, Rig | RandomRig):
-            self.target = target_rig
-        else:
-            self.target = load_rig(target_rig)
+        self.target = target_rig if isinstance(target_rig, Rig | RandomRig) else load_rig(target_rig)
         self.source_rig = source_rig if isinstance(source_rig, Rig) or source_rig is None else load_rig(source_rig)
+        base = self.target.base if isinstance(self.target, RandomRig) else self.target
         self.config = favs_config(quality)
         self._needs_confidence = False
         if isinstance(self.config, PaperConfig):
-            check_pinhole(self.target if isinstance(self.target, Rig) else self.target.base)
+            check_pinhole(base)
             if "confidence" in outputs:
                 raise ValueError("outputs: quality='paper' has no 'confidence': it moves pixels by what it matches")
             if min_confidence:
@@ -236,7 +234,6 @@ class RigRetarget(torch.nn.Module):
             warn=self._warn,
         )
         self._fixed_target = self._sized(self.target) if isinstance(self.target, Rig) else None
-        base = self.target.base if isinstance(self.target, RandomRig) else self.target
         base = base if self.size is None else base.resized(self.size, fit)
         # The output's keys depend on the settings alone, so that batches collate.
         self._writer = SampleWriter(
@@ -286,7 +283,11 @@ class RigRetarget(torch.nn.Module):
             plans = self.planner.plan(sample, frames, lead, target)
             self.planner.judge(plans)
             rendered = self._render(plans, frames)
-            rendered = [self._fill_from_neighbours(*of_frame) for of_frame in zip(rendered, plans, frames, strict=True)]
+            for k, (plan, frame) in enumerate(zip(plans, frames, strict=True)):
+                if plan.fills is not None:
+                    rendered[k] = fill_from_neighbours(
+                        rendered[k], plan.fills, frame.images, plan.curves, self.renderer, self._warn
+                    )
             rendered = self._complete(rendered, sample, frames, lead)
         return self._writer.write(sample, frames, lead, rendered, labels, target, drawn)
 
@@ -316,11 +317,6 @@ class RigRetarget(torch.nn.Module):
         self.planner.warn_unreachable(plan.target, rendering.coverage)
         return rendering
 
-    def _fill_from_neighbours(self, rendered: RenderedFrame, plan: FramePlan, frame: Frame) -> RenderedFrame:
-        if plan.fills is None:
-            return rendered
-        return fill_from_neighbours(rendered, plan.fills, frame.images, plan.curves, self.renderer, self._warn)
-
     def _complete(
         self,
         rendered: Sequence[RenderedFrame],
@@ -329,15 +325,13 @@ class RigRetarget(torch.nn.Module):
         lead: tuple[int, ...],
     ) -> list[RenderedFrame]:
         if self.completion is None:
-            return [self._between_bars(fill_frame(views, self.holes)) for views in rendered]
-        names, how = frame_names(sample, frames, lead, self.completion), self.completion
-        return [
-            complete_frame(self._between_bars(views), frame, name, how)
-            for views, frame, name in zip(rendered, frames, names, strict=True)
-        ]
-
-    def _between_bars(self, rendered: RenderedFrame) -> RenderedFrame:
-        return rendered.between_bars(self.size) if self.size is not None and self.fit == "pad" else rendered
+            rendered = [fill_frame(of_frame, self.holes) for of_frame in rendered]
+        if self.size is not None and self.fit == "pad":
+            rendered = [of_frame.between_bars(self.size) for of_frame in rendered]
+        if self.completion is None:
+            return list(rendered)
+        names = frame_names(sample, frames, lead, self.completion)
+        return list(map(complete_frame, rendered, frames, names, repeat(self.completion)))
 
     def _make_params(
         self, sample: Mapping[str, Any], frames: Sequence[Frame], params: Mapping[str, float] | None
@@ -347,11 +341,10 @@ class RigRetarget(torch.nn.Module):
             raise SampleError("rng: a generator repeats itself in every DataLoader worker; leave rng=None there")
         given = None if params is None else checked_params(params)
         drawn: dict[str, float] = {}
-        if self.p < 1:
-            if given is None:
-                drawn["skipped"] = float(torch.rand((), generator=self.rng).item() >= self.p)
-            else:
-                drawn["skipped"] = given.pop("skipped", 0.0)
+        if self.p < 1 and given is None:
+            drawn["skipped"] = float(torch.rand((), generator=self.rng).item() >= self.p)
+        elif self.p < 1 and given is not None:
+            drawn["skipped"] = given.pop("skipped", 0.0)
         if isinstance(self.target, RandomRig):
             rig_params = self.target.draw_for(sample, self.rng) if given is None else given
             target = self._sized(self.target.rig(rig_params))
