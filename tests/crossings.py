@@ -48,7 +48,7 @@ class Tracer:
 
 
 def traced_calls() -> dict[str, Tracer]:
-    """A tracer for each kind of call, warmed up: what is held is held."""
+    """A tracer for each kind of call, with warm caches."""
     sample = SyntheticDrive(load_rig("nuscenes").undistorted().resized((90, 160)), num_frames=1)[0]
     bare = {key: value for key, value in sample.items() if key not in ("points", "boxes_3d")}
     target = load_rig("argoverse2").undistorted().resized((64, 96))
@@ -62,7 +62,7 @@ def traced_calls() -> dict[str, Tracer]:
         warnings.simplefilter("ignore")
         for name, (retarget, given) in calls.items():
             retarget(given)
-            again = given | {"points": given["points"] + 0.01} if "points" in given else given  # its plan is made anew
+            again = given | {"points": given["points"] + 0.01} if "points" in given else given  # needs a new plan
             with Tracer() as found[name]:
                 retarget(again)
     return found

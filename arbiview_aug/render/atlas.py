@@ -1,4 +1,4 @@
-"""Reading images at maps: the atlas of source images, fixed-point maps, and their OpenCV and torch executions.
+"""The atlas of source images, and fixed-point maps into it.
 
 Convention: a map holds, for every target pixel, the (x, y) of the atlas pixel to read; pixel centres are integers.
 Maps are OpenCV's fixed-point pairs: ``xy`` (h, w, 2) int16 whole pixels and ``frac`` (h, w) uint16 with 32nds of a

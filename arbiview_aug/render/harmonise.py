@@ -25,9 +25,8 @@ from arbiview_aug.cameras.projection import edge_distance, ego_rays, project_ray
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import check_ranges
-from arbiview_aug.image_ops import level_size, write_halved
+from arbiview_aug.image_ops import at_level, level_size, write_halved
 from arbiview_aug.lru_cache import LRUCache
-from arbiview_aug.render.atlas import Slot
 from arbiview_aug.render.tone_curve import KNEE, ToneCurve
 from arbiview_aug.scene.static import Street
 
@@ -114,7 +113,7 @@ class SharedPixels(NamedTuple):
     a: int  # index of one camera in content order
     b: int  # and of the other
     at: _Pixels  # (2, n, 2) positions in each of the two halved images, fitted pixels first
-    fitted: int  # number of pixels to fit; the others are held out
+    fitted: int  # number of pixels to fit; the rest are held out
 
 
 class Overlaps(NamedTuple):
@@ -131,7 +130,6 @@ def find_overlaps(rig: Rig, config: HarmoniseConfig | None = None) -> Overlaps:
     order = tuple(content_order(rig.cameras))
     rig = rig.with_cameras([rig[k] for k in order])
     levels = tuple(source_level(camera, _SOURCE_WIDTH_PX) for camera in rig)
-    slots = [Slot(k, level, 0, 0, level_size(rig[k].size, level)) for k, level in enumerate(levels)]
     even = ~odd_tiles(_VIEW_SIZE, _TILE_PX)
     held_out = odd_tiles(_VIEW_SIZE, _TILE_PX // 2)[even]
     surface = Street(ground_z_m=rig.ground_z_m)
@@ -145,11 +143,11 @@ def find_overlaps(rig: Rig, config: HarmoniseConfig | None = None) -> Overlaps:
         for k in (a, b):
             uv, seen = project_halved(rig[k], levels[k], view.center_m, rays[both], q[both])
             both = both[seen]
-            reads = [read[seen] for read in reads] + [slots[k].from_source(uv[seen])]
-        fitted = np.concatenate([np.flatnonzero(~held_out[both]), np.flatnonzero(held_out[both])])
+            reads = [read[seen] for read in reads] + [at_level(uv[seen], levels[k])]
+        fitted_first = np.argsort(held_out[both], kind="stable")
         count = int((~held_out[both]).sum())
         if min(count, len(both) - count) >= config.min_pixels:
-            pairs.append(SharedPixels(a, b, np.stack(reads)[:, fitted].astype(np.float32), count))
+            pairs.append(SharedPixels(a, b, np.stack(reads)[:, fitted_first].astype(np.float32), count))
     return Overlaps(order, levels, tuple(pairs))
 
 
@@ -223,7 +221,7 @@ def estimate_gains(
 
 
 def reduced(image: torch.Tensor, level: int) -> _Pixels:
-    """The image (h, w, 3) float32 in [0, 1], halved ``level`` times."""
+    """Convert an image (3, H, W) to (h, w, 3) float32 in [0, 1], halved ``level`` times."""
     image = image.detach()
     top = np.float32(255 if image.dtype == torch.uint8 else 1)
     if image.device.type != "cpu" or image.dtype not in (torch.uint8, torch.float32):
@@ -321,9 +319,6 @@ class Harmoniser:
         if self.gains is not None:
             return f"({', '.join(f'{gain:g}' for gain in self.gains)})"
         return repr(self.config) if self.estimates else "off"
-
-    def __reduce__(self) -> tuple[type[Harmoniser], tuple[Harmonise]]:
-        return Harmoniser, (self.config if self.estimates else self.gains,)
 
     def report(self, rig: Rig, images: Sequence[torch.Tensor]) -> PhotometricReport:
         """The gains of a frame, and why; SampleError if the number of given gains is not that of cameras."""

@@ -100,7 +100,7 @@ class OverlapDepth:
 
     @property
     def nbytes(self) -> int:
-        """Memory held."""
+        """Memory in bytes."""
         return sum(correction.nbytes for correction in self.corrections)
 
     def __str__(self) -> str:
@@ -222,7 +222,7 @@ def _refine(
     if after - before < MIN_RISE_DB:
         return None, OverlapReport(*names, False, f"refining would not help, {reason}", before, after)
     final = _smoothed(along, epipolar, trust * (fit | test))
-    if not final.measured.any():
+    if not final.valid.any():
         return None, OverlapReport(*names, False, "too little is found in both images", before, after)
     return _extended(strip, final), OverlapReport(*names, True, reason, before, after)
 
@@ -262,7 +262,7 @@ class _Depth(NamedTuple):
     """Relative changes (h, w) of inverse distance over a strip, and the pixels with measurements."""
 
     change: npt.NDArray[np.float32]
-    measured: BoolArray
+    valid: BoolArray
 
 
 def _smoothed(along: FloatArray, squared: FloatArray, weight: npt.NDArray[np.floating]) -> _Depth:
@@ -280,23 +280,23 @@ def _extended(strip: _Strip, depth: _Depth) -> Correction:
     change = np.zeros(_VIEW_SIZE, np.float32)
     change[strip.rows, strip.columns] = depth.change
     missing = np.ones(_VIEW_SIZE, np.uint8)
-    missing[strip.rows, strip.columns] = ~(depth.measured & strip.both)
+    missing[strip.rows, strip.columns] = ~(depth.valid & strip.both)
     distance, nearest = cv2.distanceTransformWithLabels(missing, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     by_label = np.zeros(int(nearest.max()) + 1, np.float32)
     by_label[nearest[missing == 0]] = change[missing == 0]
     beside = np.where(missing == 0, change, cv2.GaussianBlur(by_label[nearest], (0, 0), _SMOOTHING_PX))
-    near = _fade(distance / _FADE_PX)
-    change = beside * near + _background(change, missing == 0)[:, None] * (1 - near)
+    weight = _fade(distance / _FADE_PX)
+    change = beside * weight + _background(change, missing == 0)[:, None] * (1 - weight)
     (h, w), x, y = _VIEW_SIZE, np.arange(_VIEW_SIZE[1]), np.arange(_VIEW_SIZE[0])[:, None]
     border_px = np.minimum(np.minimum(x, w - 1 - x), np.minimum(y, h - 1 - y))
     share = _fade(distance / _BACKGROUND_FADE_PX) * _fade(1 - border_px / _BORDER_PX)
     return Correction(strip.view, change.astype(np.float32), share.astype(np.float32))
 
 
-def _background(change: npt.NDArray[np.float32], measured: BoolArray) -> FloatArray:
+def _background(change: npt.NDArray[np.float32], valid: BoolArray) -> FloatArray:
     """(h,) change of the background in each row: a low quantile, smoothed over rows."""
-    count = measured.sum(axis=1)
-    ordered = np.sort(np.where(measured, change, np.inf), axis=1)
+    count = valid.sum(axis=1)
+    ordered = np.sort(np.where(valid, change, np.inf), axis=1)
     rank = np.minimum((count * _BACKGROUND_QUANTILE).astype(np.int64), np.maximum(count - 1, 0))
     low = np.where(count > 0, ordered[np.arange(len(ordered)), rank], 0.0)
     weighted, total = (

@@ -276,7 +276,7 @@ class RigRetarget(torch.nn.Module):
         self._limit_threads()
         frames, lead = read_frames(sample, self.source_rig), leading_shape(sample["images"])
         labels = self._check_keys(sample, frames)
-        target, skip, drawn = self._make_params(sample, frames, params)
+        target, skip, draws = self._make_params(sample, frames, params)
         if skip and self.size is not None:
             rendered = [resize_only(frame, self.size, self.fit, self.outputs) for frame in frames]
         else:
@@ -289,7 +289,7 @@ class RigRetarget(torch.nn.Module):
                         rendered[k], plan.fills, frame.images, plan.curves, self.renderer, self._warn
                     )
             rendered = self._complete(rendered, sample, frames, lead)
-        return self._writer.write(sample, frames, lead, rendered, labels, target, drawn)
+        return self._writer.write(sample, frames, lead, rendered, labels, target, draws)
 
     def _check_keys(self, sample: Mapping[str, Any], frames: Sequence[Frame]) -> list[str]:
         """Check the sample's further keys, and return those that hold label maps."""
@@ -340,15 +340,15 @@ class RigRetarget(torch.nn.Module):
         if self.rng is not None and torch.utils.data.get_worker_info() is not None:
             raise SampleError("rng: a generator repeats itself in every DataLoader worker; leave rng=None there")
         given = None if params is None else checked_params(params)
-        drawn: dict[str, float] = {}
+        draws: dict[str, float] = {}
         if self.p < 1 and given is None:
-            drawn["skipped"] = float(torch.rand((), generator=self.rng).item() >= self.p)
+            draws["skipped"] = float(torch.rand((), generator=self.rng).item() >= self.p)
         elif self.p < 1 and given is not None:
-            drawn["skipped"] = given.pop("skipped", 0.0)
+            draws["skipped"] = given.pop("skipped", 0.0)
         if isinstance(self.target, RandomRig):
             rig_params = self.target.draw_for(sample, self.rng) if given is None else given
             target = self._sized(self.target.rig(rig_params))
-            drawn.update(rig_params)
+            draws.update(rig_params)
         else:
             assert self._fixed_target is not None
             target = self._fixed_target
@@ -360,7 +360,7 @@ class RigRetarget(torch.nn.Module):
                     f"p < 1: expected the target to have the source's {len(frame.rig)} cameras, got {len(target)}; "
                     "batches could not be collated; mix on the level of the data set (arbiview_aug.MixedDataset)"
                 )
-        return target, bool(drawn.get("skipped")), drawn
+        return target, bool(draws.get("skipped")), draws
 
     def _sized(self, target: Rig) -> Rig:
         """The target's cameras at ``size``, without bars."""

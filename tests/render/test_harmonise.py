@@ -1,4 +1,4 @@
-"""One gain per camera from the overlaps: recovery, refusal in words, and the way into both executions."""
+"""One gain per camera from the overlaps: recovery, refusal, and rendering by both backends."""
 
 from __future__ import annotations
 

@@ -163,7 +163,7 @@ def vars_of(camera: Camera) -> dict:
     return {f: getattr(camera, f) for f in fields}
 
 
-def test_a_target_that_nobody_sees_has_no_coverage() -> None:
+def test_a_target_that_no_source_sees_has_no_coverage() -> None:
     source = half_size("nuscenes").with_cameras([half_size("nuscenes")[0]])
     plan = build_plan(source, source.turned(yaw_deg=180))
     assert not plan.targets[0].coverage.any() and plan.targets[0].pairs == ()

@@ -1,4 +1,4 @@
-"""What a target requires: a source that serves it alone changes no pixel, and where no depth decides none is asked."""
+"""Requirements of a target: skipping other sources changes no pixel, and depth is computed only if it matters."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def batches(dataset: Any, workers: int, start: str | None = None, **settings: An
 
 
 def same(one: Any, two: Any) -> bool:
-    """Equal in every bit, through dicts and lists; velocities that nobody knows are NaN."""
+    """Bitwise equality of nested dicts and lists; unknown velocities are NaN."""
     if isinstance(one, torch.Tensor):
         alike = one.shape == two.shape and bool(((one == two) | (one.isnan() & two.isnan())).all())
         return one.dtype == two.dtype and alike

@@ -1,4 +1,4 @@
-"""What a plan says of itself."""
+"""Explanations of render plans."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_entries_are_plain_data_and_add_up() -> None:
         assert all(other["baseline_m"] > 0.3 and other["parallax_px"] > 0 for other in others)
 
 
-def test_in_words() -> None:
+def test_text() -> None:
     ahead = nuscenes().shifted(x_m=0.6)
     text = str(explained(ahead))
     assert text.splitlines()[0].endswith("6 cameras to 6")
@@ -49,7 +49,7 @@ def test_in_words() -> None:
 
 
 @pytest.mark.parametrize("surface", ["auto", "street", "far"])
-def test_what_a_static_street_does_to_a_detector_is_said_with_what_helps(surface: SurfaceName) -> None:
+def test_harm_of_a_static_street_is_explained_with_remedies(surface: SurfaceName) -> None:
     source = nuscenes()
     sample = {"images": [torch.zeros((3, *size), dtype=torch.uint8) for size in source.sizes], "rig": source}
 

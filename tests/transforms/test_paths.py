@@ -1,4 +1,4 @@
-"""What fills the holes of retargeted views: nothing, inpainting, a generator; in the transform and after collating."""
+"""Fillers of holes: none, inpainting, a generator; in the transform and after collating."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.generator.small import ring, small_config, stirred
 
 @pytest.fixture(autouse=True)
 def no_warnings() -> Iterator[None]:
-    """Of targets that nobody covers: they are wanted here."""
+    """Ignore warnings of targets that are not covered."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -51,7 +51,7 @@ def on(mask: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
 
 
 # --- in the transform -------------------------------------------------------------------------------------------------
-def test_inpainting_fills_what_nobody_sees_and_nothing_else() -> None:
+def test_inpainting_fills_uncovered_pixels_only() -> None:
     seen = RigRetarget(TARGET, holes="black")(a_sample())
     filled = RigRetarget(TARGET, path="inpaint")(a_sample())
     holes = ~seen["coverage"]
@@ -63,7 +63,7 @@ def test_inpainting_fills_what_nobody_sees_and_nothing_else() -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
-def test_a_generator_fills_what_nobody_sees_and_nothing_else(generator: Generator, dtype: torch.dtype) -> None:
+def test_a_generator_fills_uncovered_pixels_only(generator: Generator, dtype: torch.dtype) -> None:
     sample = a_sample()
     if dtype == torch.float32:
         sample["images"] = sample["images"].float() / 255
@@ -80,7 +80,7 @@ def test_a_generator_fills_what_nobody_sees_and_nothing_else(generator: Generato
     assert not torch.equal(retarget({**sample, "token": "two"})["images"], made["images"])
 
 
-def test_whole_targets_never_ask_the_generator(generator: Generator) -> None:
+def test_covered_targets_never_call_the_generator(generator: Generator) -> None:
     before = generator.calls
     out = RigRetarget(SOURCE, path="diffusion", generator=generator)(a_sample())
     assert generator.calls == before and not out["generated"].any() and out["coverage"].all()
@@ -99,7 +99,7 @@ def test_the_own_car_stays_and_is_not_generated(generator: Generator) -> None:
         assert out["generated"].any() and not (out["generated"] & out["ignore"]).any()
 
 
-def test_doubtful_pixels_are_made_up_as_well(generator: Generator) -> None:
+def test_pixels_of_low_confidence_are_filled_too(generator: Generator) -> None:
     plain = RigRetarget(TARGET, outputs=("confidence",))(a_sample())
     least = float(plain["confidence"][plain["coverage"]].median())
     outputs = ("confidence", "source_camera", "source_frame")
@@ -131,7 +131,7 @@ def test_skipped_samples_collate_with_completed_ones(generator: Generator) -> No
     assert not batch["generated"][0].any() and batch["generated"][2].any()
 
 
-def test_what_was_made_up_is_masked_when_retargeted_again() -> None:
+def test_generated_pixels_are_masked_when_retargeted_again() -> None:
     once = RigRetarget(TARGET, path="inpaint", outputs=("sources", "confidence"))(a_sample())
     again = RigRetarget(TARGET.undistorted(), holes="black")(once)
     assert torch.equal(again["coverage"], once["coverage"])

@@ -37,7 +37,7 @@ def sample_of(rig: Rig = RIG, **entries: object) -> dict:
 
 
 def _points(rig: Rig) -> list[np.ndarray]:
-    """Of each camera a point 10 m away, near the middle of its image."""
+    """For each camera, a point 10 m away near the middle of its image."""
     return [camera.center_m + 10 * camera.unproject([52.0, 33.0]).directions for camera in rig]
 
 

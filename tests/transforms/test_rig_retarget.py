@@ -310,7 +310,7 @@ def test_label_maps_are_the_winning_sources(dtype: torch.dtype) -> None:
     assert torch.equal(out["classes"], expected)
 
 
-def test_bool_labels_are_false_where_nobody_sees() -> None:
+def test_bool_labels_are_false_where_uncovered() -> None:
     source = ring().with_cameras([ring()[0]])
     sample = sample_of(source, moving=torch.ones((1, *SIZE), dtype=torch.bool))
     out = RigRetarget(source.turned(yaw_deg=30), label_keys=["moving"])(sample)
