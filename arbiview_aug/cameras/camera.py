@@ -128,6 +128,7 @@ class Camera:
         (right, down, forward) on the ego axes (-y, -z, +x). R_z(azimuth) turns about the ego's z axis (up):
         positive looks to the left. R_x(elevation) turns about the camera's own x axis (right): positive looks up.
         Roll turns about the optical axis: positive turns the camera clockwise as seen from behind it.
+        Further arguments are those of ``Camera``.
 
         Args:
             azimuth_deg: 0 looks forward, 90 to the left.
@@ -136,7 +137,6 @@ class Camera:
             position_m: Optical centre in the ego frame.
             horizontal_fov_deg: Angle between the outer edges of the image, measured along the row of the principal
                 point; gives a K with square pixels and a central principal point. Either this or ``K``.
-            name, width_px, height_px, K, lens, distortion, mask: As for ``Camera``.
 
         Raises:
             CalibrationError: On impossible values, or when both or none of K and horizontal_fov_deg are given.
@@ -161,8 +161,7 @@ class Camera:
         )
         if horizontal_fov_deg is None:
             return camera
-        size = camera.width_px, camera.height_px
-        return replace(camera, K=intrinsics_for_fov(name, horizontal_fov_deg, *size, camera.lens_model))
+        return replace(camera, K=intrinsics_for_fov(name, horizontal_fov_deg, camera.size, camera.lens_model))
 
     # --- derived ----------------------------------------------------------------------------------------------------
     @cached_property
@@ -298,7 +297,8 @@ class Camera:
 
         Args:
             size: (h, w) in pixels.
-            fit: See ``Fit``. A mask is False on bars.
+            fit: ``stretch`` scales each side by itself, ``crop`` covers the size and cuts at the top and both sides,
+                ``pad`` fits inside and adds bars there, where a mask is False.
 
         Raises:
             CalibrationError: An impossible size, or one that ``crop`` would have to be cut from too large an image.

@@ -243,19 +243,17 @@ def _smallest_positive_root(polynomial: FloatArray) -> float:
     return float(1 / real.max()) if real.max(initial=0.0) > MIN_DEPTH else math.inf
 
 
-def intrinsics_for_fov(name: str, fov_deg: float, width_px: int, height_px: int, lens: Lens) -> FloatArray:
+def intrinsics_for_fov(name: str, fov_deg: float, size: tuple[int, int], lens: Lens) -> FloatArray:
     """Square-pixel K with a central principal point whose outer image edges span ``fov_deg``."""
     largest = 360.0 if lens.sees_behind else 180.0
     if not isinstance(fov_deg, Real) or not 0 < fov_deg < largest:
-        raise CalibrationError(
-            f"camera {name!r}: horizontal_fov_deg: expected between 0 and {largest:g} for a {lens.name} lens, "
-            f"got {fov_deg!r}"
-        )
+        expected = f"expected between 0 and {largest:g} for a {lens.name} lens"
+        raise CalibrationError(f"camera {name!r}: horizontal_fov_deg: {expected}, got {fov_deg!r}")
     half = np.array(math.radians(fov_deg) / 2)
     x, _, valid = lens.distort(np.sin(half), np.array(0.0), np.cos(half))
     if not valid or x <= 0:
-        raise CalibrationError(
-            f"camera {name!r}: horizontal_fov_deg: expected an angle inside the lens's unfolded branch, got {fov_deg:g}"
-        )
-    focal = width_px / 2 / float(x)
-    return np.array([[focal, 0, (width_px - 1) / 2], [0, focal, (height_px - 1) / 2], [0, 0, 1.0]])
+        expected = "expected an angle inside the lens's unfolded branch"
+        raise CalibrationError(f"camera {name!r}: horizontal_fov_deg: {expected}, got {fov_deg:g}")
+    h, w = size
+    focal = w / 2 / float(x)
+    return np.array([[focal, 0, (w - 1) / 2], [0, focal, (h - 1) / 2], [0, 0, 1.0]])

@@ -82,7 +82,11 @@ class RandomRig:
         self._epoch.fill_(epoch)
 
     def draw_for(self, sample: Mapping[str, Any], rng: torch.Generator | None = None) -> dict[str, float]:
-        """Parameters for a sample, following ``per``; refuse batches of several sequences."""
+        """Parameters for a sample, following ``per``.
+
+        Raises:
+            SampleError: The sample names no sequence, or is a batch of several.
+        """
         if self.per == "sample":
             return self.draw(rng)
         worker = torch.utils.data.get_worker_info()
@@ -101,7 +105,11 @@ class RandomRig:
         return self.draw(torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1))
 
     def rig(self, params: Mapping[str, float]) -> Rig:
-        """The rig of drawn parameters."""
+        """The rig of drawn parameters.
+
+        Raises:
+            CalibrationError: Unknown or missing parameters.
+        """
         if set(params) != set(self.ranges):
             raise CalibrationError(
                 f"RandomRig: expected the parameters {', '.join(self.ranges)}, got {', '.join(map(str, params))}"

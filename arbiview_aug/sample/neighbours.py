@@ -82,11 +82,8 @@ class Neighbour:
 
     def images(self, like: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
         """Its images, checked, with the dtype and device of the current ones."""
-        found = self.given.get("images")
-        if found is None:
-            raise SampleError("images: expected the frame's images, got none")
-        check_container(found)
-        images = checked_images(list(found))
+        check_container(self.given.get("images"))
+        images = checked_images(list(self.given["images"]))
         sizes, expected = [tuple(image.shape[1:]) for image in images], self.rig.sizes
         if sizes != expected:
             raise SampleError(f"images: expected the sizes {expected}, got {sizes}")
