@@ -155,8 +155,8 @@ def match_features(
     """
     sift = cv2.SIFT_create(nfeatures=max_features)  # type: ignore[attr-defined]
     inside = usable.astype(np.uint8) * 255
-    found = [sift.detectAndCompute(image, inside) for image in (warped, reference)]
-    (points_1, descriptors_1), (points_2, descriptors_2) = found
+    points_1, descriptors_1 = sift.detectAndCompute(warped, inside)
+    points_2, descriptors_2 = sift.detectAndCompute(reference, inside)
     # Blank images have no descriptors, and a search for two neighbours needs two.
     if descriptors_1 is None or descriptors_2 is None or len(descriptors_2) < _NEIGHBOURS:
         return NO_MATCHES
@@ -235,9 +235,9 @@ def optimise_transformation(
         return unmatched(H_geometric, f"the overlap with the primary camera is narrower than {least:.0f} px")
     crop = slice(region.y0, region.y1 + 1), slice(region.x0, region.x1 + 1)
     usable = (coverages[0] & coverages[1])[crop]
-    found = match_features(warped[crop], reference[crop], usable, config.ratio, config.max_features)
+    cropped = match_features(warped[crop], reference[crop], usable, config.ratio, config.max_features)
     offset = np.array([region.x0, region.y0])
-    matches = Matches(found.warped + offset, found.reference + offset)
+    matches = Matches(cropped.warped + offset, cropped.reference + offset)
     shown = overlap_region(coverages[0], coverages[0], 0)
     assert shown is not None
     return accept(H_geometric, matches, shown, visible, focal_ratio, scale, config)

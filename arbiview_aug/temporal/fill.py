@@ -36,7 +36,7 @@ from arbiview_aug.temporal.change import BOX_MARGIN_M, ChangeRisk, change_risks
 from arbiview_aug.temporal.merge import Candidate, merged
 
 Reach = Literal["ground", "all"]
-"""What neighbours may fill: the near road, or everything that the surface covers."""
+"""Area that neighbours may fill: the near road, or everything that the surface covers."""
 
 NEAR_M = 15.0
 """Radius of the near road around a target camera, measured along the road."""
@@ -71,7 +71,7 @@ class Hole(NamedTuple):
 
 
 class Fill(NamedTuple):
-    """What one neighbour shows of the holes.
+    """One neighbour's views of the holes.
 
     Attributes:
         neighbour: The frame.
@@ -130,7 +130,7 @@ def plan_fills(
         scene: Geometry of the current frame, in its ego frame.
         surface: Name of the surface that the current frame is rendered over.
         config: Its settings.
-        reach: What may be filled.
+        reach: Area that may be filled.
     """
     if not neighbours or all(target.coverage.all() for target in plan.targets):
         return None
@@ -234,7 +234,7 @@ def fill_from_neighbours(
     renderer: Renderer,
     warn: Warn,
 ) -> RenderedFrame:
-    """Fill the holes of a rendered frame by what its neighbours show.
+    """Fill the holes of a rendered frame from its neighbours.
 
     Args:
         rendered: The frame; its maps, and its images where possible, are written into.

@@ -1,9 +1,9 @@
-"""Merge what several frames show of one hole: at the view's exposure, the sharpest that shows a static scene.
+"""Merge several frames' views of one hole: take the sharpest static one at each pixel, at the view's exposure.
 
 A candidate is accepted by the votes of the others, as far as the labels require (``ChangeRisk``). ``NONE``: half of the
 others agree. ``SHADED``: all others agree. ``BESIDE``: the same, and one confirms it. ``UNLABELLED``: the nearest
 frames before and after the current one agree with it; where all frames lie on one side, at least three agree, or none
-of at most two contradicts; and what the current frame shows beside the hole is not an object that has arrived since.
+of at most two contradicts; and the current frame shows no newly arrived object beside the hole.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _MEAN_WEIGHT = 0.02
 
 
 class Candidate(NamedTuple):
-    """What a neighbour shows of a hole; ``blur`` and ``risk`` as in ``arbiview_aug.temporal.fill.Fill``.
+    """One neighbour's view of a hole; ``blur`` and ``risk`` as in ``arbiview_aug.temporal.fill.Fill``.
 
     Attributes:
         image: (3, h, w) of the view's type.
@@ -203,20 +203,20 @@ def _toned(
     reference, known = current, seam
     unmatched = []
     for k, one in enumerate(candidates):
-        found = _exposure(current, toned[k], seam & one.shows, _SEAM_INLIERS)
-        if found is None:
+        exposure = _exposure(current, toned[k], seam & one.shows, _SEAM_INLIERS)
+        if exposure is None:
             unmatched.append(k)
             continue
-        gain, inliers = found
+        gain, inliers = exposure
         toned[k] = gain * (toned[k] + _DARK_LEVELS) - _DARK_LEVELS
         toned[k] = toned[k] + _offset(current - toned[k], inliers, margin_px)
         new = free & one.shows & ~known
         reference, known = torch.where(new, toned[k], reference), known | new
     for k in unmatched:
         shows = free & candidates[k].shows
-        found = _exposure(reference, toned[k], shows & known, _OVERLAP_INLIERS)
-        if found is not None:
-            toned[k] = found[0] * (toned[k] + _DARK_LEVELS) - _DARK_LEVELS
+        exposure = _exposure(reference, toned[k], shows & known, _OVERLAP_INLIERS)
+        if exposure is not None:
+            toned[k] = exposure[0] * (toned[k] + _DARK_LEVELS) - _DARK_LEVELS
             reference, known = torch.where(shows & ~known, toned[k], reference), known | shows
     return toned
 
