@@ -12,8 +12,19 @@ from torch.utils.data import DataLoader
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig, demo_target_rig, make_scene
+from arbiview_aug.datasets.synthetic import (
+    SceneClass,
+    SyntheticDrive,
+    demo_source_rig,
+    demo_target_rig,
+    ground,
+    make_scene,
+    raycast,
+)
+from arbiview_aug.datasets.synthetic.materials import MATERIALS, Surface
 from arbiview_aug.datasets.synthetic.raycast import cast
+from arbiview_aug.datasets.synthetic.render import Renderer, camera_rays
+from arbiview_aug.datasets.synthetic.shading import Hits, SceneTables, sky_color
 from arbiview_aug.datasets.synthetic.texture import band, noise, pulses
 
 SIZE = (64, 176)
@@ -339,3 +350,18 @@ def test_scene_is_plain_data():
     for name in ("center", "planes", "color", "boxes"):
         np.testing.assert_array_equal(getattr(scene, name), getattr(again, name))
     assert scene.street == again.street and scene.light == again.light
+
+
+def test_tensors_are_made_on_the_device():
+    """On the device "meta", which refuses operations with tensors of another one."""
+    scene, camera, n = make_scene(0, 0), demo_source_rig(SIZE)[0], 7
+    with Renderer(device="meta").run():
+        rays, local = camera_rays(camera), raycast.scene_from(scene, np.array([1.0, 0.0, 1.5]))
+        tables, number, vector, row = SceneTables.build(scene), torch.zeros(n), torch.zeros(n, 3), torch.arange(n)
+        made = [*rays, *local[:-1], *tables[1:], raycast.pyramids(rays.directions)]
+        made += [ground.road_color(scene.street, 1, *[number] * 4), *ground.sample_light(tables.light, number, number)]
+        made += [ground.slab_color(scene.street, 1, vector, number > 0, number, number, vector)]
+        made += [sky_color(scene, Hits(vector, vector, number, number, row))]
+        surface = [scene, vector, vector, vector, row, vector, vector, number, number, vector, torch.zeros(n, 4), row]
+        made += [material(Surface(*surface)) for material in MATERIALS.values()]
+    assert all(tensor.device.type == "meta" for tensor in made)

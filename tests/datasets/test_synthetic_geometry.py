@@ -62,7 +62,7 @@ def test_vectorised_cast_equals_a_naive_loop():
         az = azimuth + rng.uniform(-0.05, 0.05, (8, 12))
         el = rng.uniform(-0.15, 0.12, (8, 1)) + rng.uniform(-0.05, 0.05, (8, 12))
         rays = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], 1)
-        local = scene_from(scene, origin, torch.device("cpu"))
+        local = scene_from(scene, origin)
         tensor = torch.from_numpy(rays.astype(np.float32))
         t, hit = cast(local, tensor, find_candidates(local, tensor))
         differing = 0

@@ -1,4 +1,4 @@
-"""SyntheticDrive: a map-style dataset of street scenes seen by any rig, and the truth behind them."""
+"""SyntheticDrive: a map-style dataset of street scenes seen by any rig, with ground truth."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, cast, find_candid
 from arbiview_aug.datasets.synthetic.render import Renderer, stack_or_list
 from arbiview_aug.datasets.synthetic.scene import Material, Scene, SceneClass
 from arbiview_aug.datasets.synthetic.street import make_scene
-from arbiview_aug.datasets.synthetic.threads import one_torch_thread
 
 LIDAR_POSITION_M = (0.9, 0.0, 1.9)
 """Ego x, y and height over the road: a roof-mounted sensor, as on nuScenes' vehicles."""
@@ -32,10 +31,10 @@ _BEAMS = 32
 
 
 class RenderedViews(NamedTuple):
-    """The truth for one rig: tensors (N, ...) where all cameras have one size, else lists of N.
+    """Ground truth for one rig: tensors (N, ...) if all cameras have one size, else lists of N.
 
     Attributes:
-        images: (3, h, w) uint8 RGB a camera; black where the lens sees nothing.
+        images: (3, h, w) uint8 RGB per camera; black where the lens sees nothing.
         depth_m: (h, w) float32 z in the camera frame along the ray through each pixel's centre; infinite for the sky
             and where the lens sees nothing; negative past 90 degrees off a fisheye's axis.
         classes: (h, w) uint8 ``SceneClass`` of that ray.
@@ -48,17 +47,16 @@ class RenderedViews(NamedTuple):
     instances: Tensor | list[Tensor]
 
     def visible_pixels(self, num_boxes: int) -> Tensor:
-        """(N, num_boxes) int64: how many pixels of each camera show each box's object."""
-        return torch.stack(
-            [torch.bincount(v.flatten().long() + 1, minlength=num_boxes + 1)[1:] for v in self.instances]
-        )
+        """(N, num_boxes) int64 number of pixels of each camera that show each box's object."""
+        counts = [torch.bincount(view.flatten().long() + 1, minlength=num_boxes + 1) for view in self.instances]
+        return torch.stack(counts)[:, 1:]
 
 
 class SyntheticDrive(Dataset[dict[str, Any]]):
     """Procedural streets as camera samples with LiDAR-like points and 3D boxes, in the rig's ego frame.
 
-    Scene ``index`` depends on (seed, index) alone, never on the rig: different rigs see the same street, from the
-    same place, standing on its road. Datasets with different seeds share no street.
+    Scene ``index`` depends on (seed, index) alone: different rigs see the same street from the same place, standing on
+    its road. Datasets with different seeds share no street.
 
     ``drive[i]`` is a dict: ``images`` (N, 3, h, w) uint8 (a list where sizes differ), ``rig``, ``K`` (N, 3, 3) and
     ``cam2ego`` (N, 4, 4) float64, ``points`` (P, 4) float32 x y z intensity (0 to 255), ``boxes_3d`` (B, 7) float32
@@ -67,16 +65,16 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
     and the traffic were elsewhere (``Scene.after``).
 
     Args:
-        rig: The cameras; their masks do not matter here (what a mask hides is rendered all the same).
+        rig: The cameras; masked pixels are rendered too.
         num_frames: Length of the dataset.
-        seed: Of the world, not negative.
-        supersampling: Rays across a pixel at outlines; 1 switches antialiasing of outlines off.
+        seed: Seed of the world, not negative.
+        supersampling: Rays across a pixel at outlines; 1 for no antialiasing.
         lidar: Whether samples carry ``points``.
         neighbours: Which other frames of the drive come with a sample; None for none.
-        device: Where to render; what is returned lies on the CPU. Two kinds of device agree to rounding, not in bits.
+        device: Device to render on; samples lie on the CPU. Different kinds of device agree up to rounding.
 
     Raises:
-        TypeError: ``rig`` is not a ``Rig``, or ``neighbours`` something else.
+        TypeError: ``rig`` is no ``Rig``, or ``neighbours`` neither ``Neighbours`` nor None.
         ValueError: A count or seed out of range.
     """
 
@@ -111,11 +109,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         return f"SyntheticDrive({len(self)} frames, seed {self.seed}, {rig})"
 
     def scene(self, index: int) -> Scene:
-        """The street as plain data.
-
-        Raises:
-            IndexError: Past the end.
-        """
+        """The street as plain data; IndexError past the end."""
         index = self._checked_index(index)
         if self._scene is None or self._scene[0] != index:
             self._scene = (index, make_scene(self.seed, index))
@@ -123,13 +117,12 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         scene = self.scene(index)
-        views = self._renderer.render(scene, self.rig.cameras, self.rig.ground_z_m)
         sample: dict[str, Any] = {
-            "images": stack_or_list([v.image for v in views]),
+            "images": self._images(scene),
             "rig": self.rig,
             "K": torch.from_numpy(self.rig.K),
             "cam2ego": torch.from_numpy(self.rig.cam2ego),
-            "boxes_3d": torch.from_numpy(scene.boxes_ego(self.rig.ground_z_m).astype(np.float32)),
+            "boxes_3d": self._boxes(scene),
             "box_classes": torch.from_numpy(scene.box_classes.copy()),
             "token": f"synthetic-{self.seed}-{self._checked_index(index)}",
         }
@@ -146,42 +139,40 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         return sample
 
     def _neighbour(self, scene: Scene, seconds: float, token: str) -> LazyFrame:
-        known = {
+        fields = {
             "rig": self.rig,
             "ego2world": torch.from_numpy(scene.ego2street),
             "time_s": seconds,
-            "boxes_3d": torch.from_numpy(scene.boxes_ego(self.rig.ground_z_m).astype(np.float32)),
+            "boxes_3d": self._boxes(scene),
             "token": f"{token}{seconds:+.3f}s",
         }
-        return LazyFrame(known, partial(self._images, scene))
+        return LazyFrame(fields, partial(self._images, scene))
 
     def _images(self, scene: Scene) -> Tensor | list[Tensor]:
         views = self._renderer.render(scene, self.rig.cameras, self.rig.ground_z_m)
-        return stack_or_list([v.image for v in views])
+        return stack_or_list([view.image for view in views])
+
+    def _boxes(self, scene: Scene) -> Tensor:
+        return torch.from_numpy(scene.boxes_ego(self.rig.ground_z_m).astype(np.float32))
 
     def render(self, index: int, rig: Rig | None = None) -> RenderedViews:
-        """The true views of scene ``index`` for any rig; the dataset's own by default.
-
-        ``rig``'s road is put on the scene's road, so it needs no conversion between ego frames.
+        """Render the true views of scene ``index`` for any rig, put on the scene's road; by default the dataset's own.
 
         Raises:
             IndexError: Past the end.
             TypeError: ``rig`` is not a ``Rig``.
         """
         rig = self.rig if rig is None else _checked_rig(rig)
-        scene = self.scene(index)
-        views = self._renderer.render(scene, rig.cameras, rig.ground_z_m)
+        views = self._renderer.render(self.scene(index), rig.cameras, rig.ground_z_m)
         return RenderedViews(*(stack_or_list([v[k] for v in views]) for k in range(4)))
 
-    @torch.no_grad()
-    @one_torch_thread()
     def points(self, index: int) -> Tensor:
         """(P, 4) float32 LiDAR-like points x y z intensity (0 to 255) of scene ``index``, in the rig's ego frame.
 
         32 beams from 1.9 m over the road, first returns within 90 m, with Gaussian range noise of 2 cm (one sigma).
         """
         index = self._checked_index(index)
-        scene, device = self.scene(index), self._renderer.device
+        scene = self.scene(index)
         elevation = np.radians(np.linspace(*LIDAR_BEAMS_DEG, _BEAMS))
         azimuth = np.linspace(0, 2 * math.pi, LIDAR_COLUMNS, endpoint=False)
         el, az = (a.ravel() for a in np.meshgrid(elevation, azimuth, indexing="xy"))  # columns are neighbours
@@ -189,9 +180,10 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         R, position = scene.ego2street[:3, :3], np.array(LIDAR_POSITION_M)
         origin = R @ position + scene.ego2street[:3, 3]
         street = (ego @ R.T).astype(np.float32).reshape(LIDAR_COLUMNS // 8, 8 * _BEAMS, 3)
-        rays = torch.from_numpy(street).to(device).transpose(1, 2).contiguous()
-        local = scene_from(scene, origin, device)
-        distance, hit = cast(local, rays, find_candidates(local, rays))
+        with self._renderer.run():
+            rays = torch.as_tensor(street).transpose(1, 2).contiguous()
+            local = scene_from(scene, origin)
+            distance, hit = cast(local, rays, find_candidates(local, rays))
         t, row = distance.cpu().numpy().ravel().astype(np.float64), hit.cpu().numpy().ravel()
         rng = np.random.default_rng(np.random.SeedSequence([self.seed, index, 1]))
         noise, gain = rng.normal(0, LIDAR_NOISE_M, len(t)), rng.uniform(0.8, 1.2, len(t))
@@ -200,7 +192,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         points[:, 2] += self.rig.ground_z_m
         albedo = scene.color.mean(1)[row.clip(0)]
         albedo = np.where(row == GROUND_ID, 0.5 * scene.street.asphalt, albedo)[keep]
-        # Glass sends little back, retro-reflective plates much.
+        # Glass returns little light, retro-reflective plates much.
         material = np.where(row[keep] >= 0, scene.material[row[keep].clip(0)], -1)
         albedo = albedo * np.select([material == Material.GLASSHOUSE, material == Material.SIGN], [0.3, 3.0], 1.0)
         intensity = (albedo * gain[keep] * 90).clip(0, 255)
@@ -270,4 +262,4 @@ def _ring(
 
 
 GROUND_CLASSES = (SceneClass.GROUND, SceneClass.SIDEWALK)
-"""Surfaces that a vehicle or a person stands on."""
+"""Classes that vehicles and people stand on."""

@@ -26,7 +26,7 @@ def road_color(street: Street, salt: int, x: Tensor, y: Tensor, fx: Tensor, fy: 
     f = torch.maximum(fx, fy)
     wear = street.wear
     tone = street.asphalt * (1 + 0.10 * octave(x, y, 7.0, f, salt) + 0.09 * octave(x, y, 1.7, f, salt + 1))
-    # Traffic stretches everything along the road: streaks, polished wheel tracks, a darker oil strip between them.
+    # Streaks along the road, polished wheel tracks, a darker oil strip between them.
     streak = noise(x * (1 / 9.0), y * (1 / 0.45), salt + 2) * fade(torch.maximum(fx * 0.05, fy), 0.45)
     streak = streak + 0.7 * noise(x * (1 / 4.0), y * (1 / 0.15), salt + 3) * fade(torch.maximum(fx * 0.04, fy), 0.15)
     lane = y * (1 / street.lane_width_m)
@@ -44,14 +44,13 @@ def road_color(street: Street, salt: int, x: Tensor, y: Tensor, fx: Tensor, fy: 
     outside = _beyond_crossing(street, x, 0.0)
     dirt = step(0.55 - edge, 0.0, 0.5) * (0.6 + 0.4 * octave(x, y, 0.5, f, salt + 9)) * outside
     tone = tone * (1 - 0.28 * dirt)
-    tint = torch.tensor([1.0, 1.0, 1.015], device=x.device)
+    tint = torch.tensor([1.0, 1.0, 1.015])
     color = tone[:, None] * tint
-    worn = 0.80 - 0.30 * street.wear * step(
-        octave(x, y, 0.35, f, salt + 10) + 0.5 * octave(x, y, 0.08, f, salt + 11), 0.1, 0.9
-    )
+    flaking = octave(x, y, 0.35, f, salt + 10) + 0.5 * octave(x, y, 0.08, f, salt + 11)
+    worn = 0.80 - 0.30 * street.wear * step(flaking, 0.1, 0.9)
     paint, centre = _markings(street, x, y, fx, fy)
-    white = torch.tensor([0.80, 0.80, 0.78], device=x.device)
-    yellow = torch.tensor([0.80, 0.62, 0.16], device=x.device) if street.yellow_centre else white
+    white = torch.tensor([0.80, 0.80, 0.78])
+    yellow = torch.tensor([0.80, 0.62, 0.16]) if street.yellow_centre else white
     color = mix(color, white, paint * worn)
     return mix(color, yellow, centre * worn)
 
@@ -88,14 +87,8 @@ def _cracks(street: Street, salt: int, tone: Tensor, x: Tensor, y: Tensor, f: Te
         distance = n.abs() * (0.45 * across)  # the noise falls by about 2 over its wavelength
         line = ((width + f / 2 - distance) / f.clamp_min(width)).clamp(0, 1) * fade(f, across * 0.5)
         where = step(noise(x * 0.11, y * 0.16, salt + 55 + k), -0.2 + 0.5 * k, 0.5 + 0.4 * k)
-        tone = tone * (
-            1
-            - depth
-            * min(1.0, street.wear)
-            * line
-            * where
-            * (width / torch.maximum(f, _scalar(width, f))).clamp(0.25, 1)
-        )
+        thinned = (width / f.clamp_min(width)).clamp(0.25, 1)
+        tone = tone * (1 - depth * min(1.0, street.wear) * line * where * thinned)
     return tone
 
 
@@ -154,54 +147,38 @@ def slab_color(street: Street, salt: int, p: Tensor, top: Tensor, fx: Tensor, fy
     x, y = p[:, 0], p[:, 1]
     f = torch.maximum(fx, fy)
     left = y > 0
-    half = [
-        torch.where(left, _scalar(v[1], y), _scalar(v[0], y))
-        for v in (street.half_width_m, street.sidewalk_m, street.verge_m)
-    ]
-    behind = y.abs() - half[0]
-    corner = (x - street.crossing_x_m).abs() - street.crossing_half_m  # infinite without a crossing
-    corner = corner.clamp(max=1e4)
+    widths = torch.tensor([street.half_width_m, street.sidewalk_m, street.verge_m])
+    half_width, sidewalk, verge_width = torch.where(left, widths[:, 1:], widths[:, :1])
+    behind = y.abs() - half_width
+    corner = ((x - street.crossing_x_m).abs() - street.crossing_half_m).clamp(max=1e4)  # infinite without a crossing
     kerb = torch.maximum(band(behind, -1.0, 0.16, fy), band(corner, -1.0, 0.16, fx))
     kerb = torch.where(top, kerb, torch.ones_like(kerb))
-    dark = (
-        1
-        + 0.10 * octave(x, y, 1.3, f, salt + 70)
-        + 0.10 * octave(x, y, 0.2, f, salt + 71)
-        + 0.10 * octave(x, y, 0.06, f, salt + 74)
-    )
+    dark = 1 + 0.10 * octave(x, y, 1.3, f, salt + 70)
+    dark = dark + 0.10 * octave(x, y, 0.2, f, salt + 71) + 0.10 * octave(x, y, 0.06, f, salt + 74)
     # paving: 0.6 m slabs of slightly different tone with joints
     i, j = (x * (1 / 0.6)).floor().to(torch.int32), (y * (1 / 0.6)).floor().to(torch.int32)
     tone = 1 + 0.14 * (cell_hash(i, j, salt + 72) - 0.5) * fade(f, 0.6)
     joints = torch.maximum(pulses(x, 0.6, 0.02, fx), pulses(y, 0.6, 0.02, fy))
     color = base * (dark * tone * (1 - 0.4 * joints))[:, None]
-    green = torch.tensor([0.25, 0.29, 0.15], device=x.device)
-    blades = (
-        1
-        + 0.20 * octave(x, y, 0.9, f, salt + 73)
-        + 0.28 * octave(x, y, 0.16, f, salt + 75)
-        + 0.3 * octave(x, y, 0.05, f, salt + 76)
-    )
+    green = torch.tensor([0.25, 0.29, 0.15])
+    blades = 1 + 0.20 * octave(x, y, 0.9, f, salt + 73)
+    blades = blades + 0.28 * octave(x, y, 0.16, f, salt + 75) + 0.3 * octave(x, y, 0.05, f, salt + 76)
     grass = green * blades[:, None]
     away = (corner > 2.6).float()
     # Yards: some plots are paved, some are lawns.
     plot = cell_hash((x * (1 / 19.0)).floor().to(torch.int32), left.to(torch.int32), salt + 77) < 0.6
-    lawn = band(behind, half[1], 1e4, fy) * away * plot
-    verge = band(behind, _scalar(0.16, y), 0.16 + half[2], fy) * away
+    lawn = band(behind, sidewalk, 1e4, fy) * away * plot
+    verge = band(behind, 0.16, 0.16 + verge_width, fy) * away
     color = mix(color, grass, torch.maximum(lawn, verge))
     stones = torch.maximum(pulses(x, 1.0, 0.015, fx), pulses(y, 1.0, 0.015, fy))
-    stone = torch.tensor([0.60, 0.595, 0.58], device=x.device) * (dark * (1 - 0.35 * stones))[:, None]
+    stone = torch.tensor([0.60, 0.595, 0.58]) * (dark * (1 - 0.35 * stones))[:, None]
     return mix(color, stone, kerb)
-
-
-def _scalar(value: float, like: Tensor) -> Tensor:
-    return torch.tensor(value, dtype=like.dtype, device=like.device)
 
 
 def light_map(scene: Scene) -> FloatGrid:
     """(2, rows along y, columns along x) float32: share of the sky's and of the sun's light that reaches the ground."""
-    xs = np.arange(SHADOW_X_M[0], SHADOW_X_M[1], SHADOW_CELL_M, dtype=np.float32) + SHADOW_CELL_M / 2
-    ys = np.arange(SHADOW_Y_M[0], SHADOW_Y_M[1], SHADOW_CELL_M, dtype=np.float32) + SHADOW_CELL_M / 2
-    sky, sun = np.ones((len(ys), len(xs)), np.float32), np.ones((len(ys), len(xs)), np.float32)
+    xs, ys = (np.arange(a, b, SHADOW_CELL_M, dtype=np.float32) + SHADOW_CELL_M / 2 for a, b in (SHADOW_X_M, SHADOW_Y_M))
+    sky, sun = np.ones((2, len(ys), len(xs)), np.float32)
 
     def window(lo: np.ndarray, hi: np.ndarray) -> tuple[slice, slice]:
         a = np.searchsorted(xs, [lo[0], hi[0]]), np.searchsorted(ys, [lo[1], hi[1]])
@@ -216,11 +193,11 @@ def light_map(scene: Scene) -> FloatGrid:
         u, v = np.abs(c * dx + s * dy) - box[3] / 2, np.abs(c * dy - s * dx) - box[4] / 2
         outside = np.sqrt(np.maximum(u, 0) ** 2 + np.maximum(v, 0) ** 2)
         depth = np.minimum(np.maximum(u, v), 0)
-        # Half the sky is hidden right at the sill; deep underneath nearly all of it is.
-        near = np.clip(1 - outside / spread, 0, 1) ** 3 * 0.5
-        under = np.clip(-depth / 0.45, 0, 1) * 0.36
-        shade = (near + under if label != 4 else near).astype(np.float32)
-        sky[rows, cols] *= 1 - shade
+        # Half the sky is occluded at the sill, nearly all of it deep underneath.
+        shade = np.clip(1 - outside / spread, 0, 1) ** 3 * 0.5
+        if label != 4:
+            shade = shade + np.clip(-depth / 0.45, 0, 1) * 0.36
+        sky[rows, cols] *= 1 - shade.astype(np.float32)
     if scene.light.sun_strength > 0:
         _cast_shadows(scene, xs, ys, sun, window)
     both = F.avg_pool2d(F.pad(torch.from_numpy(np.stack([sky, sun]))[None], (1, 1, 1, 1), mode="replicate"), 3, 1)
@@ -228,7 +205,7 @@ def light_map(scene: Scene) -> FloatGrid:
 
 
 def _cast_shadows(scene: Scene, xs: FloatGrid, ys: FloatGrid, sun: FloatGrid, window: _Window) -> None:
-    """Sets ``sun`` to 0 where a ray to the sun meets a primitive."""
+    """Darken ``sun`` where a ray to the sun hits a primitive."""
     d = np.array(scene.light.sun)
     shift = d[:2] / d[2]
     for k in np.flatnonzero(scene.cls != SceneClass.SIDEWALK):
@@ -237,8 +214,7 @@ def _cast_shadows(scene: Scene, xs: FloatGrid, ys: FloatGrid, sun: FloatGrid, wi
         if rows.start == rows.stop or cols.start == cols.stop:
             continue
         shaded = _shaded_by_box if scene.kind[k] == BOX else _shaded_by_quadric
-        # Leaves let some light through.
-        dim = 0.75 if scene.cls[k] == SceneClass.VEGETATION else 1.0
+        dim = 0.75 if scene.cls[k] == SceneClass.VEGETATION else 1.0  # light passes through leaves
         sun[rows, cols] *= 1 - np.float32(dim) * shaded(scene, int(k), xs[None, cols], ys[rows, None], d)
 
 
@@ -273,7 +249,7 @@ def _shaded_by_quadric(scene: Scene, k: int, x: FloatGrid, y: FloatGrid, d: np.n
 
 
 def sample_light(table: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Sky and sun shares (n,) at ground points (n,) from a light map on the device; the border value outside."""
+    """Sky and sun shares (n,) at ground points (n,) from a light map; the border value outside."""
     u = (x - SHADOW_X_M[0]) * (2 / (SHADOW_X_M[1] - SHADOW_X_M[0])) - 1
     v = (y - SHADOW_Y_M[0]) * (2 / (SHADOW_Y_M[1] - SHADOW_Y_M[0])) - 1
     grid = torch.stack([u.clamp(-1, 1), v.clamp(-1, 1)], -1)[None, None]

@@ -1,7 +1,6 @@
-"""Things on the street, built from primitives: vehicles, pedestrians, trees, lamp posts, signs, buildings.
+"""Objects built from primitives: vehicles, pedestrians, trees, lamp posts, signs, buildings.
 
-Every labelled object touches all six sides of its 3D box: the wheels carry its width and its lowest point, the roof
-its height, the body its length.
+Every labelled object touches all six sides of its 3D box.
 """
 
 from __future__ import annotations
@@ -10,10 +9,9 @@ import math
 
 import numpy as np
 
-from arbiview_aug.datasets.synthetic.scene import BoxClass, Material, Placed, SceneBuilder, SceneClass
+from arbiview_aug.datasets.synthetic.scene import BoxClass, Material, Range, SceneBuilder, SceneClass, Vector
 
-Color = tuple[float, float, float]
-Range = tuple[float, float]
+Color = Vector
 
 # Length, width and height in metres: published sizes of production vehicles, from small cars to city buses.
 VEHICLE_SIZES: dict[BoxClass, tuple[Range, Range, Range]] = {
@@ -48,20 +46,15 @@ def _pick(rng: np.random.Generator, colors: tuple[Color, ...], spread: float = 0
     return tuple(float(c) for c in base.clip(0.05, 0.92))  # type: ignore[return-value]
 
 
-def vehicle_size(rng: np.random.Generator, cls: BoxClass) -> tuple[float, float, float]:
+def vehicle_size(rng: np.random.Generator, cls: BoxClass) -> Vector:
     """Length, width and height in metres."""
     length, width, height = VEHICLE_SIZES[cls]
-    # Height is drawn on its own: a detector must not be able to read it off the footprint.
+    # The height is independent, so that a detector cannot infer it from the footprint.
     return rng.uniform(*length), rng.uniform(*width), rng.uniform(*height)
 
 
 def add_vehicle(
-    builder: SceneBuilder,
-    rng: np.random.Generator,
-    cls: BoxClass,
-    size: tuple[float, float, float],
-    xy: tuple[float, float],
-    yaw: float,
+    builder: SceneBuilder, rng: np.random.Generator, cls: BoxClass, size: Vector, xy: Range, yaw: float
 ) -> None:
     """A vehicle on the road plane and its box."""
     length, width, height = size
@@ -76,37 +69,21 @@ def add_vehicle(
         waist = rng.uniform(0.52, 0.60) * height
         place.box((-x, x), (-y, y), (0.20, waist), Material.PAINT, paint, taper=(0.10, 0.06, 0.03, 0.03), param=arch)
         rear = float(rng.choice([0.06, 0.3, 0.55])) * length / 2  # estate, hatchback, saloon
-        place.box(
-            (-x + 0.08 + rear * 0.55, 0.22 * length),
-            (-y + 0.03, y - 0.03),  # flush with the body's leaning flanks
-            (waist, height),
-            Material.GLASSHOUSE,
-            paint,
-            taper=(0.16 * length, 0.08 + rear * 0.45, 0.16, 0.16),
-            param=(1.0, 0, 0, 0),
-        )
+        cabin = (-x + 0.08 + rear * 0.55, 0.22 * length), (-y + 0.03, y - 0.03), (waist, height)
+        taper = (0.16 * length, 0.08 + rear * 0.45, 0.16, 0.16)
+        place.box(*cabin, Material.GLASSHOUSE, paint, taper=taper, param=(1.0, 0, 0, 0))
     elif cls is BoxClass.VAN:
         waist = 0.48 * height
         place.box((-x, x), (-y, y), (0.24, waist), Material.PAINT, paint, taper=(0.08, 0, 0, 0), param=arch)
-        cargo = float(rng.random() < 0.5)
-        place.box(
-            (-x, x - 0.75),
-            (-y, y),
-            (waist, height),
-            Material.GLASSHOUSE,
-            paint,
-            taper=(0.40, 0.03, 0.10, 0.10),
-            param=(0.35 if cargo else 1.0, 0, 0, 0),
-        )
+        cabin, glazed = ((-x, x - 0.75), (-y, y), (waist, height)), 0.35 if rng.random() < 0.5 else 1.0
+        place.box(*cabin, Material.GLASSHOUSE, paint, taper=(0.40, 0.03, 0.10, 0.10), param=(glazed, 0, 0, 0))
     elif cls is BoxClass.TRUCK:
         cab = rng.uniform(1.7, 2.2)
         top = height * rng.uniform(0.72, 0.9)
         cab_color = _pick(rng, _PAINTS)
         place.box((x - cab, x), (-y + 0.05, y - 0.05), (0.45, 1.35), Material.PAINT, cab_color)
-        place.box(
-            (x - cab, x), (-y + 0.05, y - 0.05), (1.35, top), Material.GLASSHOUSE, cab_color,
-            taper=(0.22, 0, 0.04, 0.04), param=(1.0, 0, 0, 0),
-        )  # fmt: skip
+        cabin = (x - cab, x), (-y + 0.05, y - 0.05), (1.35, top)
+        place.box(*cabin, Material.GLASSHOUSE, cab_color, taper=(0.22, 0, 0.04, 0.04), param=(1.0, 0, 0, 0))
         place.box((-x, x - cab - 0.15), (-y, y), (0.95, height), Material.ROUGH, paint, param=(0.5, 0.05, 0, 0))
         place.box((-x + 0.1, x - cab), (-0.45, 0.45), (0.5, 0.95), Material.PLAIN, DARK)
     else:
@@ -117,9 +94,7 @@ def add_vehicle(
             place.cylinder(center, (radius, radius), 0.11, Material.WHEEL, TIRE, lateral=True)
 
 
-def add_pedestrian(
-    builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float], yaw: float
-) -> None:
+def add_pedestrian(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, yaw: float) -> None:
     """A standing or walking person and their box."""
     height = rng.uniform(1.5, 1.92)
     length, width = rng.uniform(0.34, 0.52), rng.uniform(0.46, 0.60)
@@ -147,9 +122,7 @@ def add_pedestrian(
     place.ellipsoid((0, 0, height - head), (0.10, 0.085, head), Material.PLAIN, skin)
 
 
-def add_tree(
-    builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float], *, reach_m: float = math.inf
-) -> None:
+def add_tree(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, reach_m: float = math.inf) -> None:
     """Trunk and a crown of several ellipsoids, which reaches out at most ``reach_m`` from the trunk."""
     place = builder.place(xyz, rng.uniform(0, 6.28), SceneClass.VEGETATION)
     height, trunk = rng.uniform(4.5, 10), rng.uniform(0.09, 0.22)
@@ -164,17 +137,11 @@ def add_tree(
         turn, out = 2.4 * k, spread * rng.uniform(0.35, 0.8) * (k > 0)
         radius = spread * rng.uniform(0.36, 0.58) * (1.25 if k == 0 else 1.0)
         z = fork + (height - fork) * rng.uniform(0.18, 0.80)
-        place.ellipsoid(
-            (out * np.cos(turn), out * np.sin(turn), z),
-            (radius, radius, radius * rng.uniform(0.65, 0.95)),
-            Material.LEAF,
-            green,
-        )
+        radii = (radius, radius, radius * rng.uniform(0.65, 0.95))
+        place.ellipsoid((out * np.cos(turn), out * np.sin(turn), z), radii, Material.LEAF, green)
 
 
-def add_bush(
-    builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float], *, scale: float = 1.0
-) -> None:
+def add_bush(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, scale: float = 1.0) -> None:
     """Low ellipsoids of leaves."""
     place = builder.place(xyz, rng.uniform(0, 6.28), SceneClass.VEGETATION)
     green = _pick(rng, ((0.20, 0.28, 0.13), (0.26, 0.30, 0.15)), 0.02)
@@ -184,7 +151,7 @@ def add_bush(
         place.ellipsoid((float(x), float(y), height * 0.6), (r, r * 0.9, height), Material.LEAF, green)
 
 
-def add_lamp_post(builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float], yaw: float) -> None:
+def add_lamp_post(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, yaw: float) -> None:
     """A tall pole whose arm (local x) reaches over the road."""
     place = builder.place(xyz, yaw, SceneClass.POLE)
     height, grey = rng.uniform(5.5, 8.5), rng.uniform(0.25, 0.55)
@@ -195,7 +162,7 @@ def add_lamp_post(builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[fl
     place.box((1.2, 1.9), (-0.12, 0.12), (height - 0.16, height - 0.02), Material.PLAIN, (0.75, 0.74, 0.68))
 
 
-def add_sign(builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, float, float], yaw: float) -> None:
+def add_sign(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, yaw: float) -> None:
     """A post with one or two plates that face local -x."""
     place = builder.place(xyz, yaw, SceneClass.POLE)
     height = rng.uniform(2.3, 3.0)
@@ -206,7 +173,7 @@ def add_sign(builder: SceneBuilder, rng: np.random.Generator, xyz: tuple[float, 
         place.box((-0.06, -0.04), (-w, w), (z - 0.3, z + 0.3), Material.SIGN, _pick(rng, colors, 0.02))
 
 
-def add_traffic_light(builder: SceneBuilder, xyz: tuple[float, float, float], yaw: float) -> None:
+def add_traffic_light(builder: SceneBuilder, xyz: Vector, yaw: float) -> None:
     """A signal head on a post, facing local -x."""
     place = builder.place(xyz, yaw, SceneClass.POLE)
     place.cylinder((0, 0, 1.7), (0.06, 0.06), 1.7, Material.PLAIN, (0.25, 0.26, 0.26))
@@ -224,7 +191,7 @@ def add_building(
     detailed: bool = True,
 ) -> None:
     """A block with windows; detailed ones have a cornice, now and then bays or an awning over the ground floor."""
-    place: Placed = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.BUILDING)
+    place = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.BUILDING)
     wall = _pick(rng, _WALLS)
     bay, storey = rng.uniform(2.2, 4.2), rng.uniform(2.9, 3.6)
     # bay width, storey height, share of the wall that is glass, whether the ground floor is shops
@@ -233,11 +200,8 @@ def add_building(
     if not detailed:
         return
     trim: Color = (wall[0] * 0.8, wall[1] * 0.8, wall[2] * 0.8)
-    edge = 0.25
-    place.box(
-        (x[0] - edge, x[1] + edge), (y[0] - edge, y[1] + edge), (height, height + 0.4), Material.ROUGH, trim,
-        param=(0.8, 0.08, 0, 0),
-    )  # fmt: skip
+    cornice = (x[0] - 0.25, x[1] + 0.25), (y[0] - 0.25, y[1] + 0.25), (height, height + 0.4)
+    place.box(*cornice, Material.ROUGH, trim, param=(0.8, 0.08, 0, 0))
     front, outward = (y[0], -1.0) if y[0] > 0 else (y[1], 1.0)
     if param[3] and rng.random() < 0.6:
         cloth = _pick(rng, _CLOTHES)
@@ -249,8 +213,8 @@ def add_building(
         for _ in range(int(rng.integers(1, 3))):
             a = rng.uniform(x[0] + 0.5, max(x[0] + 0.6, x[1] - 3.5))
             ends = sorted((front, front + outward * 0.7))
-            place.box((a, min(a + 2.6, x[1])), (ends[0], ends[1]), (storey, height * 0.85), Material.FACADE, wall,
-                      param=(2.6, storey, 0.7, 0.0))  # fmt: skip
+            bounds = (a, min(a + 2.6, x[1])), (ends[0], ends[1]), (storey, height * 0.85)
+            place.box(*bounds, Material.FACADE, wall, param=(2.6, storey, 0.7, 0.0))
 
 
 def add_barrier(

@@ -1,9 +1,9 @@
 """Ray casting from one point: culling by packet, then closed-form intersections.
 
-Rays come in packets of directions that point roughly the same way (a tile of pixels, some LiDAR columns). Each packet
-is bounded by a pyramid, primitives are tested against the pyramids, and each packet meets its own candidates from near
-to far. Distances are along unit directions. Primitives are moved to the ray origin in float64 before anything is
-rounded to float32. Only elementwise arithmetic is used, so results do not depend on the number of threads.
+Rays come in packets of similar directions (a tile of pixels, some LiDAR columns). Each packet is bounded by a pyramid
+that selects its candidate primitives, which are intersected from near to far. Distances are along unit directions.
+Primitives are moved to the ray origin in float64, then rounded to float32. Only elementwise arithmetic is used, so
+results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -17,44 +17,32 @@ from torch import Tensor
 from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, Scene
 
 SKY_ID, GROUND_ID = -1, -2
-"""Ids of what is no primitive."""
+"""Ids of hits on no primitive."""
 
-_NARROWEST_COS = 0.2
-"""A packet with a ray further than 78 degrees off its axis has no pyramid around it: it meets everything."""
+_MIN_COS = 0.2
+"""Packets with a ray further than 78 degrees off their axis have no pyramid: every primitive is a candidate."""
 
 _PAIRS_PER_STEP = 96
-"""Packets handled at a time: the temporaries of 96 x 6 x 256 floats stay in the cache of one core."""
+"""Packets handled at a time: temporaries of 96 x 6 x 256 floats fit in a core's cache."""
 
 
 class LocalScene(NamedTuple):
-    """The primitives seen from one point, nearest first; float32 tensors on the device.
+    """The primitives relative to a ray origin, nearest first; float32."""
 
-    Attributes:
-        order: (P,) row of each in the scene.
-        distance: (P,) lower bound on the distance to its surface.
-        thickness: (P,) its second-smallest extent, metres: how thin it can look.
-        corners: (P, 8, 3) its hull, relative to the origin.
-        is_box: (P,) bool.
-        normals: (P, 6, 3) and offsets: (P, 6) of the half-spaces n·p <= b.
-        to_unit: (P, 3, 3) to the unit sphere or cylinder; origin: (P, 3) the ray origin there.
-        round_z: (P,) 1 for ellipsoids, 0 for cylinders.
-        height_m: The origin's height over the road plane.
-    """
-
-    order: Tensor
-    distance: Tensor
-    thickness: Tensor
-    corners: Tensor
-    is_box: Tensor
-    normals: Tensor
-    offsets: Tensor
-    to_unit: Tensor
-    origin: Tensor
-    round_z: Tensor
-    height_m: float
+    order: Tensor  # [P] row of each in the scene
+    distance: Tensor  # [P] lower bound on the distance to its surface
+    thickness: Tensor  # [P] its second-smallest extent, metres: how thin it can look
+    corners: Tensor  # [P, 8, 3] its hull, relative to the origin
+    is_box: Tensor  # [P] bool
+    normals: Tensor  # [P, 6, 3] half-spaces n·p <= b
+    offsets: Tensor  # [P, 6]
+    to_unit: Tensor  # [P, 3, 3] to the unit sphere or cylinder
+    origin: Tensor  # [P, 3] the ray origin there
+    round_z: Tensor  # [P] 1 for ellipsoids, 0 for cylinders
+    height_m: float  # the origin's height over the road plane
 
 
-def scene_from(scene: Scene, origin: np.ndarray, device: torch.device) -> LocalScene:
+def scene_from(scene: Scene, origin: np.ndarray) -> LocalScene:
     """The scene relative to ``origin`` (3,), street frame."""
     rotated = np.einsum("pji,pj->pi", scene.rotation, origin - scene.center)  # [P, 3] origin in local axes
     distance = np.linalg.norm(np.maximum(np.abs(rotated) - scene.half, 0), axis=1)
@@ -63,14 +51,14 @@ def scene_from(scene: Scene, origin: np.ndarray, device: torch.device) -> LocalS
     planes = scene.planes[order]
 
     def put(array: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(device)
+        return torch.as_tensor(np.ascontiguousarray(array, dtype=np.float32))
 
     return LocalScene(
-        order=torch.from_numpy(order).to(device),
+        order=torch.as_tensor(order),
         distance=put(distance[order] - 1e-3),
         thickness=put(2 * np.sort(scene.half[order], axis=1)[:, 1]),
         corners=put(scene.corners[order] - origin),
-        is_box=torch.from_numpy(scene.kind[order] == BOX).to(device),
+        is_box=torch.as_tensor(scene.kind[order] == BOX),
         normals=put(planes[:, :, :3]),
         offsets=put(planes[:, :, 3] - planes[:, :, :3] @ origin),
         to_unit=put(to_unit[order]),
@@ -81,34 +69,24 @@ def scene_from(scene: Scene, origin: np.ndarray, device: torch.device) -> LocalS
 
 
 class Candidates(NamedTuple):
-    """Which primitives a packet may meet, as pairs sorted by packet, then by distance.
+    """Primitives that packets may hit, as pairs sorted by packet, then by distance."""
 
-    Attributes:
-        packet, primitive: (C,) row of the packet, row of the local scene.
-        rank: (C,) 0 for a packet's nearest candidate, 1 for the next.
-    """
-
-    packet: Tensor
-    primitive: Tensor
-    rank: Tensor
+    packet: Tensor  # [C] row of the packet
+    primitive: Tensor  # [C] row of the local scene
+    rank: Tensor  # [C] 0 for a packet's nearest candidate, 1 for the next
 
 
 def pyramids(rays: Tensor) -> Tensor:
     """Inward side normals (n, 4, 3) of a pyramid around each packet of unit rays (n, 3, R); zeros where too wide."""
-    # Sums over rays would depend on their order of summation; any inner ray serves as the axis.
     axis = rays[:, :, rays.shape[2] // 2] + rays[:, :, 0] + rays[:, :, -1]
     axis = axis / axis.norm(dim=1, keepdim=True).clamp_min(1e-6)
-    up = torch.where(
-        axis[:, 2:].abs() < 0.9,
-        torch.tensor([0.0, 0.0, 1.0], device=rays.device),
-        torch.tensor([1.0, 0.0, 0.0], device=rays.device),
-    )
+    up = torch.where(axis[:, 2:].abs() < 0.9, torch.tensor([0.0, 0.0, 1.0]), torch.tensor([1.0, 0.0, 0.0]))
     u = torch.linalg.cross(up, axis)
     u = u / u.norm(dim=1, keepdim=True)
     v = torch.linalg.cross(axis, u)
     along = _dot(axis, rays)  # [n, R]
-    narrow = along.amin(1) > _NARROWEST_COS
-    along = along.clamp_min(_NARROWEST_COS)
+    narrow = along.amin(1) > _MIN_COS
+    along = along.clamp_min(_MIN_COS)
     sides = []
     for side in (u, v):
         tangent = _dot(side, rays) / along
@@ -122,11 +100,11 @@ def _dot(a: Tensor, rays: Tensor) -> Tensor:
 
 
 def find_candidates(local: LocalScene, rays: Tensor) -> Candidates:
-    """Primitives whose hull reaches into a packet's pyramid; conservative."""
+    """Find the primitives whose hull may reach into a packet's pyramid."""
     sides = pyramids(rays)
-    # First against the sixteenths of all packets together, then one by one: most primitives fall at the first test.
-    groups = torch.arange(len(sides), device=sides.device) * 16 // max(1, len(sides))
-    seen = torch.zeros(len(sides), len(local.order), dtype=torch.bool, device=sides.device)
+    # Cull first by sixteenths of all packets together, then by packet.
+    groups = torch.arange(len(sides)) * 16 // max(1, len(sides))
+    seen = torch.zeros(len(sides), len(local.order), dtype=torch.bool)
     for group in range(16):
         rows = (groups == group).nonzero()[:, 0]
         if not len(rows):
@@ -138,7 +116,7 @@ def find_candidates(local: LocalScene, rays: Tensor) -> Candidates:
     packet, primitive = seen.nonzero(as_tuple=True)
     counts = seen.sum(1)
     first = counts.cumsum(0) - counts
-    rank = torch.arange(len(packet), device=packet.device) - first[packet]
+    rank = torch.arange(len(packet)) - first[packet]
     return Candidates(packet, primitive, rank)
 
 
@@ -150,7 +128,7 @@ def _inside(sides: Tensor, corners: Tensor) -> Tensor:
 
 
 def cast(local: LocalScene, rays: Tensor, candidates: Candidates) -> tuple[Tensor, Tensor]:
-    """First hits of packets of unit rays (n, 3, R).
+    """Find the first hits of packets of unit rays (n, 3, R).
 
     Returns:
         (n, R) distance, infinite for the sky; (n, R) int64 row in the scene, ``GROUND_ID`` or ``SKY_ID``.
@@ -163,16 +141,15 @@ def cast(local: LocalScene, rays: Tensor, candidates: Candidates) -> tuple[Tenso
     for count in rounds:
         packet, primitive = packets[start : start + count], primitives[start : start + count]
         start += count
-        # What lies behind everything the packet has met so far needs no test.
-        open_ = local.distance[primitive] < t.amax(1)[packet]
+        in_front = local.distance[primitive] < t.amax(1)[packet]
         for boxes, meet in ((True, _meet_box), (False, _meet_quadric)):
-            chosen = (open_ & (local.is_box[primitive] == boxes)).nonzero()[:, 0]
+            chosen = (in_front & (local.is_box[primitive] == boxes)).nonzero()[:, 0]
             for part in chosen.split(_PAIRS_PER_STEP):
                 n, p = packet[part], primitive[part]
-                near = t.index_select(0, n)
+                before = t.index_select(0, n)
                 found = meet(local, p, rays.index_select(0, n))
-                nearer = found < near
-                t[n] = torch.where(nearer, found, near)
+                nearer = found < before
+                t[n] = torch.where(nearer, found, before)
                 hit[n] = torch.where(nearer, local.order[p][:, None], hit.index_select(0, n))
     return t, hit
 
@@ -188,12 +165,9 @@ def _ground(local: LocalScene, rays: Tensor) -> tuple[Tensor, Tensor]:
 def _meet_box(local: LocalScene, p: Tensor, rays: Tensor) -> Tensor:
     """Distance (n, R) at which rays (n, 3, R) enter box p (n,); infinite where they miss or start inside."""
     normal = local.normals.index_select(0, p)
-    speed = (
-        normal[:, :, 0:1] * rays[:, None, 0]
-        + normal[:, :, 1:2] * rays[:, None, 1]
-        + normal[:, :, 2:3] * rays[:, None, 2]
-    )  # [n, 6, R]
-    # A parallel ray outside a half-space must miss: as "entering" it at a huge distance it does.
+    x, y, z = (normal[:, :, k : k + 1] * rays[:, None, k] for k in range(3))
+    speed = x + y + z  # [n, 6, R]
+    # A ray parallel to a half-space enters it at a huge distance: from outside it misses.
     speed = torch.where(speed.abs() < 1e-9, -1e-9, speed)
     t = local.offsets[p][:, :, None] / speed
     entering = speed < 0
@@ -210,7 +184,7 @@ def _meet_quadric(local: LocalScene, p: Tensor, rays: Tensor) -> Tensor:
     rz, qz = dz * w, oz * w
     a = (dx * dx + dy * dy + rz * rz).clamp_min(1e-12)
     b = dx * ox + dy * oy + rz * qz
-    # |d|^2 - |o x d|^2 instead of b^2 - a c: the latter cancels for what is far and thin.
+    # |d|^2 - |o x d|^2 instead of b^2 - a c, which cancels for distant, thin primitives.
     cx, cy, cz = oy * rz - qz * dy, qz * dx - ox * rz, ox * dy - oy * dx
     root = a - (cx * cx + cy * cy + cz * cz)
     half = root.clamp_min(0).sqrt()

@@ -1,15 +1,15 @@
 """Images, depth, classes and instances of a scene for any camera.
 
-Two passes. The first casts one ray through every pixel's centre: it gives depth, class, instance and the colour of
-pixels inside one surface, whose texture is filtered analytically. The second casts ``supersampling``² rays through
-pixels at outlines, and through tiles with something thinner than a pixel and a half.
+The first pass casts one ray through every pixel's centre, for depth, class, instance and analytically filtered colour.
+The second casts ``supersampling``² rays through pixels at outlines and in tiles with thin primitives.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -27,26 +27,21 @@ from arbiview_aug.datasets.synthetic.raycast import (
 )
 from arbiview_aug.datasets.synthetic.scene import Scene, SceneClass
 from arbiview_aug.datasets.synthetic.shading import Hits, SceneTables, faces, shade
-from arbiview_aug.datasets.synthetic.threads import one_torch_thread
+from arbiview_aug.environment import one_thread
+from arbiview_aug.lru_cache import LRUCache
 
 TILE_PX = 16
 _PACKET_PX = 16
 """Outline pixels that share a packet in the second pass."""
 _THIN_PX = 1.5
+"""Primitives thinner than this are supersampled."""
 _BATCH_PX = 1_500_000
-"""Pixels shaded together at most: about 150 MB of intermediate results."""
+"""Maximum number of pixels shaded together, with 150 MB of intermediate results."""
+_CACHED_CAMERAS = 24
 
 
 class CameraView(NamedTuple):
-    """Rendered view of one camera; the last three are of the ray through each pixel's centre.
-
-    Attributes:
-        image: (3, h, w) uint8 RGB; black where the lens sees nothing.
-        depth_m: (h, w) float32 z in the camera frame; infinite for the sky and where the lens sees
-            nothing; negative past 90 degrees off a fisheye's axis.
-        classes: (h, w) uint8 ``SceneClass``.
-        instances: (h, w) int16 row of the 3D boxes, -1 for none.
-    """
+    """One camera's part of ``RenderedViews``."""
 
     image: Tensor
     depth_m: Tensor
@@ -55,29 +50,20 @@ class CameraView(NamedTuple):
 
 
 class CameraRays(NamedTuple):
-    """A camera's rays by tile, in the ego frame: they depend on the camera alone.
+    """A camera's rays by tile, in the ego frame."""
 
-    Attributes:
-        directions: (n, 3, 256) unit rays of the pixel centres, tiles in rows.
-        right, down: (n, 3, 256) change of direction by one pixel.
-        pitch: (n, 256) angle between neighbouring pixels, radians.
-        valid: (n, 256) bool, whether the lens sees anything there.
-        axis: (3,) the optical axis, float32.
-    """
-
-    directions: Tensor
-    right: Tensor
-    down: Tensor
-    pitch: Tensor
-    valid: Tensor
-    axis: Tensor
+    directions: Tensor  # [n, 3, 256] unit rays of the pixel centres, tiles in rows
+    right: Tensor  # [n, 3, 256] change of direction by one pixel
+    down: Tensor  # [n, 3, 256]
+    pitch: Tensor  # [n, 256] angle between neighbouring pixels, radians
+    valid: Tensor  # [n, 256] whether the lens sees anything there
+    axis: Tensor  # [3] optical axis
 
 
-def camera_rays(camera: Camera, device: torch.device) -> CameraRays:
-    """The rays of ``camera``; float64 geometry, rounded at the end."""
+def camera_rays(camera: Camera) -> CameraRays:
+    """Rays of a camera; float64 geometry, rounded at the end."""
     rays, valid = camera.unproject(camera.pixel_grid())
     valid = valid & np.isfinite(rays).all(-1)
-    # Where the lens sees nothing any direction will do, as long as it does not widen the tile.
     rays = np.where(valid[..., None], rays, camera.cam2ego[:3, 2])
     right, down = _differences(rays, valid, 1), _differences(rays, valid, 0)
     pitch = np.sqrt(np.linalg.norm(right, axis=-1) * np.linalg.norm(down, axis=-1)).clip(1e-6, 0.3)
@@ -86,9 +72,9 @@ def camera_rays(camera: Camera, device: torch.device) -> CameraRays:
 
     def put(array: np.ndarray) -> Tensor:
         dtype = bool if array.dtype == bool else np.float32
-        return _to_tiles(torch.from_numpy(np.ascontiguousarray(array, dtype=dtype)).to(device))
+        return _to_tiles(torch.as_tensor(np.ascontiguousarray(array, dtype=dtype)))
 
-    axis = torch.from_numpy(camera.cam2ego[:3, 2].astype(np.float32)).to(device)
+    axis = torch.as_tensor(camera.cam2ego[:3, 2].astype(np.float32))
     return CameraRays(put(rays), put(right), put(down), put(pitch)[:, 0], put(valid)[:, 0], axis)
 
 
@@ -110,7 +96,7 @@ def _differences(rays: np.ndarray, valid: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _fill_by_tile(rays: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Gives invalid pixels a valid ray of their own tile, so that they do not widen its pyramid."""
+    """Give invalid pixels a valid ray of their own tile, so that they do not widen its pyramid."""
     rays = rays.copy()
     for top in range(0, rays.shape[0], TILE_PX):
         for left in range(0, rays.shape[1], TILE_PX):
@@ -124,8 +110,8 @@ def _to_tiles(a: Tensor) -> Tensor:
     """(h, w[, c]) to (tiles, c, 256); the last rows and columns are repeated to fill tiles."""
     h, w = a.shape[:2]
     a = a.reshape(h, w, -1)
-    rows = torch.arange(-(-h // TILE_PX) * TILE_PX, device=a.device).clamp(max=h - 1)
-    cols = torch.arange(-(-w // TILE_PX) * TILE_PX, device=a.device).clamp(max=w - 1)
+    rows = torch.arange(-(-h // TILE_PX) * TILE_PX).clamp(max=h - 1)
+    cols = torch.arange(-(-w // TILE_PX) * TILE_PX).clamp(max=w - 1)
     a = a[rows][:, cols]
     a = a.view(len(rows) // TILE_PX, TILE_PX, len(cols) // TILE_PX, TILE_PX, -1)
     return a.permute(0, 2, 4, 1, 3).reshape(-1, a.shape[-1], TILE_PX * TILE_PX).contiguous()
@@ -140,51 +126,36 @@ def _from_tiles(a: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 class Renderer:
-    """Renders scenes on one device; keeps the rays of the last cameras and the tables of the last scene."""
+    """Renders scenes; keeps the rays of the last cameras and the tables of the last scene."""
 
-    def __init__(self, *, supersampling: int = 2, device: torch.device | str = "cpu", cached_cameras: int = 24) -> None:
-        self.supersampling = supersampling
-        self.device = torch.device(device)
-        self._cached_cameras = cached_cameras
-        self._rays: OrderedDict[bytes, CameraRays] = OrderedDict()
+    def __init__(self, *, supersampling: int = 2, device: torch.device | str = "cpu") -> None:
+        self.supersampling, self.device = supersampling, torch.device(device)
+        self._rays: LRUCache[bytes, CameraRays] = LRUCache(_CACHED_CAMERAS, lambda _: 1)
         self._tables: SceneTables | None = None
 
-    def __getstate__(self) -> dict[str, object]:
-        # The caches are large and cheap to make again: they do not travel to workers.
-        return {**self.__dict__, "_rays": OrderedDict(), "_tables": None}
+    def __reduce__(self) -> tuple[Any, tuple[()]]:
+        return partial(Renderer, supersampling=self.supersampling, device=self.device), ()  # without the caches
 
-    def rays(self, camera: Camera) -> CameraRays:
-        """The camera's rays, from the cache where it has them."""
-        key = camera.content_key
-        if key not in self._rays:
-            self._rays[key] = camera_rays(camera, self.device)
-            while len(self._rays) > self._cached_cameras:
-                self._rays.popitem(last=False)
-        self._rays.move_to_end(key)
-        return self._rays[key]
+    @contextmanager
+    def run(self) -> Iterator[None]:
+        """Make new tensors on the device, without gradients, on one thread: most steps are too small for more."""
+        with torch.no_grad(), one_thread(), nullcontext() if self.device.type == "cpu" else self.device:
+            yield
 
-    def tables(self, scene: Scene) -> SceneTables:
-        """The scene's tables on the device."""
-        if self._tables is None or self._tables.scene is not scene:
-            self._tables = SceneTables.build(scene, self.device)
-        return self._tables
-
-    @torch.no_grad()
-    @one_torch_thread()
     def render(self, scene: Scene, cameras: Sequence[Camera], ground_z_m: float) -> list[CameraView]:
-        """Views of ``scene`` whose road lies at ``ground_z_m`` in the cameras' ego frame."""
-        views: list[CameraView] = []
-        batch: list[Camera] = []
-        for camera in cameras:
-            # Small cameras are shaded together: fewer, longer tensor operations.
-            if batch and sum(c.width_px * c.height_px for c in (*batch, camera)) > _BATCH_PX:
-                views += self._render_batch(scene, batch, ground_z_m)
-                batch = []
-            batch.append(camera)
-        return views + self._render_batch(scene, batch, ground_z_m)
+        """Render ``scene``, whose road lies at ``ground_z_m`` in the cameras' ego frame."""
+        batches: list[list[Camera]] = [[]]
+        for camera in cameras:  # small cameras are shaded together, in longer tensor operations
+            if batches[-1] and sum(c.width_px * c.height_px for c in (*batches[-1], camera)) > _BATCH_PX:
+                batches.append([])
+            batches[-1].append(camera)
+        with self.run():
+            return [view for batch in batches for view in self._render_batch(scene, batch, ground_z_m)]
 
     def _render_batch(self, scene: Scene, cameras: list[Camera], ground_z_m: float) -> list[CameraView]:
-        tables = self.tables(scene)
+        if self._tables is None or self._tables.scene is not scene:
+            self._tables = SceneTables.build(scene)
+        tables = self._tables
         casts = [self._cast(scene, camera, ground_z_m) for camera in cameras]
         hits = _joined([c.hits for c in casts])
         face = faces(tables, hits.point, hits.primitive)
@@ -200,7 +171,7 @@ class Renderer:
         return [self._view(scene, c, color) for c, color in zip(casts, colors, strict=True)]
 
     def _means(self, color: Tensor) -> Tensor:
-        """(m, 3) means of (m * s * s, 3) colours; a fixed order of summation."""
+        """(m, 3) means of (m * s * s, 3) colours, in a fixed order of summation."""
         samples = color.view(-1, self.supersampling**2, 3)
         total = samples[:, 0].clone()
         for k in range(1, samples.shape[1]):
@@ -209,12 +180,12 @@ class Renderer:
 
     def _cast(self, scene: Scene, camera: Camera, ground_z_m: float) -> _Cast:
         """First pass: one ray through every pixel's centre."""
-        rays = self.rays(camera)
+        rays = self._rays.get(camera.content_key, partial(camera_rays, camera))
         pose = scene.ego2street
         origin = pose[:3, :3] @ (camera.center_m - (0, 0, ground_z_m)) + pose[:3, 3]
-        start = torch.from_numpy(origin.astype(np.float32)).to(self.device)
-        directions = _turned(rays.directions, scene)
-        local = scene_from(scene, origin, self.device)
+        start = torch.as_tensor(origin.astype(np.float32))
+        directions = _to_street(rays.directions, scene)
+        local = scene_from(scene, origin)
         candidates = find_candidates(local, directions)
         t, hit = cast(local, directions, candidates)
         t = torch.where(rays.valid, t, torch.inf)
@@ -224,12 +195,12 @@ class Renderer:
         return _Cast(camera, rays, start, local, candidates, t, hit, hits)
 
     def _cast_outlines(self, first: _Cast, key: Tensor, scene: Scene) -> tuple[Tensor, Hits]:
-        """Second pass: rows (m,) of the pixels that need several rays, and the (m * s * s) hits of those."""
+        """Second pass: rows (m,) of the supersampled pixels, and their (m * s * s) hits."""
         rays, candidates, s = first.rays, first.candidates, self.supersampling
         outline = _to_tiles(_outlines(_from_tiles(key.view_as(first.hit), first.camera.size)))[:, 0]
         distance = first.local.distance[candidates.primitive].clamp_min(0.1)
         pixel = rays.pitch.amax(1)[candidates.packet] * distance
-        busy = torch.zeros(len(outline), dtype=torch.bool, device=self.device)
+        busy = torch.zeros(len(outline), dtype=torch.bool)
         busy[candidates.packet[first.local.thickness[candidates.primitive] < _THIN_PX * pixel]] = True
         tile, slot = ((outline | busy[:, None]) & rays.valid).nonzero(as_tuple=True)
 
@@ -237,16 +208,16 @@ class Renderer:
         d, r, b = (a[tile, :, slot] for a in (rays.directions, rays.right, rays.down))  # [m, 3]
         sub = torch.stack([d + u * r + v * b for v in offsets for u in offsets], 1)  # [m, s*s, 3]
         sub = sub / (sub[..., 0] ** 2 + sub[..., 1] ** 2 + sub[..., 2] ** 2).sqrt()[..., None]
-        # Pixels of a tile share packets of _PACKET_PX pixels, the last one filled up with its tile's first ray.
+        # Pixels of a tile share packets; the last one is filled up with its tile's first ray.
         counts = torch.bincount(tile, minlength=len(outline))
         packets = (counts + _PACKET_PX - 1) // _PACKET_PX
         first_pixel, first_packet = counts.cumsum(0) - counts, packets.cumsum(0) - packets
-        rank = torch.arange(len(tile), device=tile.device) - first_pixel[tile]
+        rank = torch.arange(len(tile)) - first_pixel[tile]
         packet, place = first_packet[tile] + rank // _PACKET_PX, rank % _PACKET_PX
-        owner = torch.repeat_interleave(torch.arange(len(outline), device=tile.device), packets)
+        owner = torch.repeat_interleave(torch.arange(len(outline)), packets)
         packed = sub[first_pixel[owner]][:, None, :1].expand(-1, _PACKET_PX, s * s, -1).clone()
         packed[packet, place] = sub
-        packed = _turned(packed.view(len(owner), _PACKET_PX * s * s, 3).transpose(1, 2), scene)
+        packed = _to_street(packed.view(len(owner), _PACKET_PX * s * s, 3).transpose(1, 2), scene)
         t, hit = cast(first.local, packed, _for_packets(candidates, owner, len(outline)))
         t, hit = (a.view(len(owner), _PACKET_PX, s * s)[packet, place].reshape(-1) for a in (t, hit))
         direction = packed.transpose(1, 2).reshape(len(owner), _PACKET_PX, s * s, 3)[packet, place].reshape(-1, 3)
@@ -254,17 +225,17 @@ class Renderer:
         return tile * outline.shape[1] + slot, _hits(first.start, direction, t, hit, pitch)
 
     def _view(self, scene: Scene, first: _Cast, color: Tensor) -> CameraView:
-        """Tiles back to images, on the CPU."""
+        """Assemble images from tiles."""
         size, hit, rays = first.camera.size, first.hit, first.rays
         axis = rays.directions[:, 0] * rays.axis[0] + rays.directions[:, 1] * rays.axis[1]
         depth = first.t * (axis + rays.directions[:, 2] * rays.axis[2])
         depth = torch.where(torch.isfinite(first.t), depth, torch.inf)
         row = hit.clamp_min(0)
-        classes = torch.from_numpy(scene.cls).to(self.device)[row]
+        classes = torch.as_tensor(scene.cls)[row]
         classes = torch.where(hit == GROUND_ID, int(SceneClass.GROUND), classes)
         classes = torch.where(hit == SKY_ID, int(SceneClass.SKY), classes)
         classes = torch.where(rays.valid, classes, int(SceneClass.VOID))
-        instances = torch.where(hit >= 0, torch.from_numpy(scene.instance).to(self.device)[row], -1)
+        instances = torch.where(hit >= 0, torch.as_tensor(scene.instance)[row], -1)
         image = (color.view(*hit.shape, 3) * 255 + 0.5).to(torch.uint8) * rays.valid[..., None]
         return CameraView(
             image=_from_tiles(image, size).permute(2, 0, 1).contiguous().cpu(),
@@ -275,7 +246,7 @@ class Renderer:
 
 
 class _Cast(NamedTuple):
-    """A camera's first pass; tiles (n, 256) unless said otherwise."""
+    """A camera's first pass; ``t`` and ``hit`` are tiles (n, 256)."""
 
     camera: Camera
     rays: CameraRays
@@ -291,8 +262,8 @@ def _joined(hits: list[Hits]) -> Hits:
     return Hits(*(torch.cat(parts) for parts in zip(*hits, strict=True)))
 
 
-def _turned(rays: Tensor, scene: Scene) -> Tensor:
-    """Directions (n, 3, R) from the ego frame to the street frame, written out: see ``raycast``."""
+def _to_street(rays: Tensor, scene: Scene) -> Tensor:
+    """Turn directions (n, 3, R) from the ego frame to the street frame, elementwise (see ``raycast``)."""
     c, s = float(scene.ego2street[0, 0]), float(scene.ego2street[1, 0])
     x, y, z = rays.unbind(1)
     return torch.stack([c * x - s * y, s * x + c * y, z], 1)
@@ -315,15 +286,15 @@ def _outlines(key: Tensor) -> Tensor:
 
 
 def _for_packets(candidates: Candidates, owner: Tensor, tiles: int) -> Candidates:
-    """The tiles' candidates repeated for packets (m,) that belong to tiles ``owner``."""
+    """Repeat the tiles' candidates for packets (m,) of the tiles ``owner``."""
     counts = torch.bincount(candidates.packet, minlength=tiles)
     first = counts.cumsum(0) - counts
-    packet = torch.repeat_interleave(torch.arange(len(owner), device=owner.device), counts[owner])
+    packet = torch.repeat_interleave(torch.arange(len(owner)), counts[owner])
     start = counts[owner].cumsum(0) - counts[owner]
-    rank = torch.arange(len(packet), device=owner.device) - start[packet]
+    rank = torch.arange(len(packet)) - start[packet]
     return Candidates(packet, candidates.primitive[first[owner[packet]] + rank], rank)
 
 
 def stack_or_list(tensors: list[Tensor]) -> Tensor | list[Tensor]:
-    """One tensor where all shapes agree, else the list."""
+    """Stack tensors of one shape; else return the list."""
     return torch.stack(tensors) if len({a.shape for a in tensors}) == 1 else tensors

@@ -22,7 +22,7 @@ _HAZE_M = 1100.0
 
 
 class SceneTables(NamedTuple):
-    """A scene's rows as float32 and int64 tensors on the device."""
+    """A scene's rows as float32 and int64 tensors."""
 
     scene: Scene
     kind: Tensor
@@ -36,37 +36,28 @@ class SceneTables(NamedTuple):
     light: Tensor
 
     @classmethod
-    def build(cls, scene: Scene, device: torch.device) -> SceneTables:
-        """Tables of ``scene``, its light map included."""
+    def build(cls, scene: Scene) -> SceneTables:
+        """Make the tables, light map included."""
 
         def put(array: np.ndarray) -> Tensor:
-            floats = array.dtype.kind == "f"
-            return torch.from_numpy(np.ascontiguousarray(array, np.float32 if floats else np.int64)).to(device)
+            return torch.as_tensor(np.ascontiguousarray(array, np.float32 if array.dtype.kind == "f" else np.int64))
 
         names = ("kind", "material", "center", "rotation", "half", "planes", "color", "param")
         return cls(scene=scene, light=put(light_map(scene)), **{n: put(getattr(scene, n)) for n in names})
 
 
 class Hits(NamedTuple):
-    """Hits of rays on surfaces.
+    """Hits of rays on surfaces."""
 
-    Attributes:
-        point: (n, 3) street frame, metres.
-        direction: (n, 3) unit ray directions, street frame.
-        t: (n,) distance, metres.
-        pitch: (n,) angle between neighbouring rays, radians.
-        primitive: (n,) row of the scene, ``GROUND_ID`` or ``SKY_ID``.
-    """
-
-    point: Tensor
-    direction: Tensor
-    t: Tensor
-    pitch: Tensor
-    primitive: Tensor
+    point: Tensor  # [n, 3] street frame, metres
+    direction: Tensor  # [n, 3] unit ray directions, street frame
+    t: Tensor  # [n] distance, metres
+    pitch: Tensor  # [n] angle between neighbouring rays, radians
+    primitive: Tensor  # [n] row of the scene, GROUND_ID or SKY_ID
 
 
 def faces(tables: SceneTables, point: Tensor, primitive: Tensor) -> Tensor:
-    """(n,) which of a box's six sides a hit lies on; 0 for anything else."""
+    """(n,) index of the box side that a hit lies on; 0 for other primitives."""
     face = torch.zeros_like(primitive)
     rows = (primitive >= 0).nonzero()[:, 0]
     rows = rows[tables.kind[primitive[rows]] == BOX]
@@ -74,13 +65,12 @@ def faces(tables: SceneTables, point: Tensor, primitive: Tensor) -> Tensor:
     for part in rows.split(_CHUNK):
         k, p = primitive[part], point.index_select(0, part)
         nx, ny, nz, b = (table.index_select(0, k) for table in by_part)  # [m, 6] each
-        beyond = nx * p[:, 0:1] + ny * p[:, 1:2] + nz * p[:, 2:3] - b
-        face[part] = beyond.argmax(1)
+        face[part] = (nx * p[:, 0:1] + ny * p[:, 1:2] + nz * p[:, 2:3] - b).argmax(1)
     return face
 
 
 def shade(tables: SceneTables, hits: Hits, face: Tensor) -> Tensor:
-    """(n, 3) colours of hits whose box sides are ``face`` (n,)."""
+    """(n, 3) colours of hits on box sides ``face`` (n,)."""
     out = torch.zeros_like(hits.point)
     material = tables.material[hits.primitive.clamp_min(0)]
     material = torch.where(hits.primitive == GROUND_ID, int(Material.ROAD), material)
@@ -89,12 +79,8 @@ def shade(tables: SceneTables, hits: Hits, face: Tensor) -> Tensor:
         for rows in (material == int(m)).nonzero()[:, 0].split(_CHUNK):
             if len(rows):
                 part = Hits(*(a.index_select(0, rows) for a in hits))
-                color = (
-                    sky_color(tables.scene, part.direction, part.pitch)
-                    if m == -1
-                    else _lit(tables, part, face[rows], m)
-                )
-                out[rows] = color
+                is_sky = m == -1
+                out[rows] = sky_color(tables.scene, part) if is_sky else _lit(tables, part, face[rows], m)
     return out.clamp(0, 1)
 
 
@@ -111,7 +97,7 @@ def _lit(tables: SceneTables, hits: Hits, face: Tensor, material: int) -> Tensor
         normal = _normals(tables, hits.primitive, face, local, half, rotation)
     slant = across / dot(normal, hits.direction).abs().clamp_min(0.01)
     ambient = 1 - 0.30 * light.sun_strength
-    sun = torch.tensor(light.sun, device=normal.device)[None]
+    sun = torch.tensor(light.sun)[None]
     toward = dot(normal, sun).clamp_min(0) * light.sun_strength
     if material in (Material.ROAD, Material.SLAB):
         x, y = hits.point[:, 0], hits.point[:, 1]
@@ -124,9 +110,8 @@ def _lit(tables: SceneTables, hits: Hits, face: Tensor, material: int) -> Tensor
         if material == Material.ROAD:
             color = road_color(street, salt, x, y, fx, fy)
         else:
-            color = slab_color(
-                street, salt, hits.point, face == 4, fx, fy, tables.color.index_select(0, hits.primitive)
-            )
+            base = tables.color.index_select(0, hits.primitive)
+            color = slab_color(street, salt, hits.point, face == 4, fx, fy, base)
         shine = sky_share * (ambient * (0.62 + 0.38 * normal[:, 2]) + 0.95 * toward * sun_share)
     else:
         surface = Surface(
@@ -134,12 +119,10 @@ def _lit(tables: SceneTables, hits: Hits, face: Tensor, material: int) -> Tensor
             tables.color.index_select(0, hits.primitive), tables.param.index_select(0, hits.primitive), hits.primitive,
         )  # fmt: skip
         color = MATERIALS[Material(material)](surface)
-        # What faces down sees the road instead of the sky; close to the road there is less light.
+        # Faces that look down see the road instead of the sky; light falls off close to the road.
         low = 0.72 + 0.28 * (hits.point[:, 2] * (1 / 0.7)).clamp(0, 1)
         shine = low * (ambient * (0.68 + 0.32 * normal[:, 2]) + 0.85 * toward)
-    color = color * shine[:, None]
-    air = torch.tensor(light.horizon, device=color.device)
-    return mix(color, air, hits.t / (hits.t + _HAZE_M))
+    return mix(color * shine[:, None], torch.tensor(light.horizon), hits.t / (hits.t + _HAZE_M))
 
 
 def _normals(tables: SceneTables, k: Tensor, face: Tensor, local: Tensor, half: Tensor, rotation: Tensor) -> Tensor:
@@ -148,30 +131,25 @@ def _normals(tables: SceneTables, k: Tensor, face: Tensor, local: Tensor, half: 
     if bool((kind == BOX).all()):
         return flat
     gradient = local / (half * half)
-    # A cylinder's cap, where the axis coordinate is at its end, and its side.
     cap = (local[:, 2].abs() > half[:, 2] * (1 - 1e-4) - 1e-5) & (kind == CYLINDER)
     gradient[:, 2] = torch.where(cap, local[:, 2].sign() * 1e6, torch.where(kind == CYLINDER, 0.0, gradient[:, 2]))
     length = (gradient[:, 0] ** 2 + gradient[:, 1] ** 2 + gradient[:, 2] ** 2).sqrt().clamp_min(1e-9)
     gradient = gradient / length[:, None]
-    bent = (
-        gradient[:, 0:1] * rotation[:, :, 0]
-        + gradient[:, 1:2] * rotation[:, :, 1]
-        + gradient[:, 2:3] * rotation[:, :, 2]
-    )
-    return torch.where((kind == BOX)[:, None], flat, bent)
+    x, y, z = (gradient[:, k : k + 1] * rotation[:, :, k] for k in range(3))
+    return torch.where((kind == BOX)[:, None], flat, x + y + z)
 
 
-def sky_color(scene: Scene, d: Tensor, pitch: Tensor) -> Tensor:
-    """(n, 3) sky along unit directions (n, 3): a gradient with clouds on a plane overhead."""
-    light = scene.light
-    zenith, horizon = (torch.tensor(c, device=d.device) for c in (light.zenith, light.horizon))
+def sky_color(scene: Scene, hits: Hits) -> Tensor:
+    """(n, 3) sky along the hits' directions: a gradient with clouds on a plane overhead."""
+    light, d = scene.light, hits.direction
+    zenith, horizon = (torch.tensor(c) for c in (light.zenith, light.horizon))
     up = d[:, 2].clamp_min(0)
     color = mix(horizon, zenith, (up * 1.5).clamp(0, 1).sqrt())
     scale = 1 / (up + 0.10)
-    x, y, f = d[:, 0] * scale, d[:, 1] * scale, pitch * scale * scale
+    x, y, f = d[:, 0] * scale, d[:, 1] * scale, hits.pitch * scale * scale
     salt = scene.salt + 900
     n = octave(x, y, 2.2, f, salt) + 0.55 * octave(x, y, 0.9, f, salt + 1) + 0.3 * octave(x, y, 0.4, f, salt + 2)
     n = n + 0.15 * octave(x, y, 0.17, f, salt + 3)
     cover = step(n, -0.1, 0.9) * light.clouds * (up * 8).clamp(0, 1)
-    white = torch.tensor([0.94, 0.945, 0.95], device=d.device)
+    white = torch.tensor([0.94, 0.945, 0.95])
     return mix(color, white, cover * 0.9)

@@ -1,8 +1,7 @@
 """Textures that are filtered before they are sampled: value noise, intervals and pulse trains over a footprint.
 
-A pixel covers a piece of surface; its size in metres is the *footprint*. Interval and pulse functions return the share
-of the footprint that is covered, exactly; noise loses each octave as the footprint reaches its wavelength. So nothing
-aliases at any distance. Hashes are integer arithmetic: no tables, no generator, no state.
+The *footprint* is the size in metres of a pixel on the surface. Interval and pulse functions return the exact covered
+share of the footprint; noise loses each octave as the footprint reaches its wavelength. So nothing aliases.
 """
 
 from __future__ import annotations
@@ -60,8 +59,7 @@ def fade(footprint: Tensor, wavelength_m: float) -> Tensor:
 def band(x: Tensor, low: Tensor | float, high: Tensor | float, footprint: Tensor) -> Tensor:
     """Share of the footprint around x that lies in [low, high]."""
     f = footprint.clamp_min(1e-4)
-    a, b = x - f / 2, x + f / 2
-    return (torch.minimum(b, _like(high, x)) - torch.maximum(a, _like(low, x))).clamp_min(0) / f
+    return ((x + f / 2).clamp(max=high) - (x - f / 2).clamp(min=low)).clamp_min(0) / f  # type: ignore[arg-type]
 
 
 def pulses(x: Tensor, period: Tensor | float, width: Tensor | float, footprint: Tensor) -> Tensor:
@@ -70,7 +68,7 @@ def pulses(x: Tensor, period: Tensor | float, width: Tensor | float, footprint: 
 
     def covered(z: Tensor) -> Tensor:
         k = (z / period).floor()
-        return k * width + torch.minimum(z - k * period, _like(width, x))
+        return k * width + (z - k * period).clamp(max=width)
 
     return ((covered(x + f / 2) - covered(x - f / 2)) / f).clamp(0, 1)
 
@@ -84,7 +82,3 @@ def step(x: Tensor, low: float, high: float) -> Tensor:
 def mix(a: Tensor, b: Tensor, share: Tensor) -> Tensor:
     """(n, 3) colours a and b (or (3,)) mixed by (n,) shares of b."""
     return a + (b - a) * share[:, None]
-
-
-def _like(value: Tensor | float, x: Tensor) -> Tensor:
-    return value if isinstance(value, Tensor) else torch.tensor(value, dtype=x.dtype, device=x.device)
