@@ -26,17 +26,17 @@ class Done(NamedTuple):
 
     Attributes:
         token: The frame's.
-        density: Share of pixels with known distance; 0 where depth was declined.
-        words: How it was found, or why not.
+        density: Share of pixels with known distance; 0 if depth was declined.
+        message: How depth was found, or why not.
         failed: Whether the frame could not be read.
-        kept: Whether its file was there before.
+        existed: Whether its file existed before.
     """
 
     token: str
     density: float
-    words: str
+    message: str
     failed: bool = False
-    kept: bool = False
+    existed: bool = False
 
 
 class _Frames(Dataset[Done]):
@@ -52,7 +52,7 @@ class _Frames(Dataset[Done]):
         token = self.tokens[index]
         try:
             return self._done(token, self.data[index])
-        except Exception as error:  # whatever is wrong with a frame, the others go on
+        except Exception as error:  # the other frames go on
             return Done(token, 0.0, described(error), failed=True)
 
     def _done(self, token: str, sample: dict[str, Any]) -> Done:
@@ -61,9 +61,9 @@ class _Frames(Dataset[Done]):
         warn = WarnOnce()
         (neighbours,) = neighbours_of_frames(sample, [frame], (), warn)
         used = [neighbour.name for neighbour in neighbours]
-        held = self.depths.find(token, rig, used)
-        if held is not None:
-            return Done(token, held.density, "", kept=True)
+        known = self.depths.find(token, rig, used)
+        if known is not None:
+            return Done(token, known.density, "", existed=True)
         boxes = None if sample.get("boxes_3d") is None else sample["boxes_3d"].numpy().astype(float)
 
         def load(neighbour: Neighbour) -> Sequence[torch.Tensor] | None:
@@ -71,7 +71,7 @@ class _Frames(Dataset[Done]):
                 return neighbour.images(frame.images)
             except (ArbiviewError, OSError) as error:
                 warn_lost(warn, neighbour.name, error)
-                used.remove(neighbour.name)  # once it is mended, the frame is done again
+                used.remove(neighbour.name)  # the frame is done again once the neighbour can be read
                 return None
 
         found = motion_depth(frame.rig, frame.images, neighbours, boxes, load, self.device)
@@ -80,11 +80,7 @@ class _Frames(Dataset[Done]):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Find and write the depth of every frame that has none yet.
-
-    Returns:
-        0; 1 where frames could not be read or written, which are named.
-    """
+    """Compute and write the depth of every frame that has none yet; return 1 if a frame failed, else 0."""
     parser = command_parser(
         "depth",
         "Compute depth from motion of every frame of a drive, for surface='motion'. Frames whose depth is there, from "
@@ -112,15 +108,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _summary(done: Sequence[Done], depths: DepthFolder) -> int:
-    made = [one for one in done if not one.kept and not one.failed]
-    declined = [one for one in made if one.density == 0]
     failed = [one for one in done if one.failed]
+    existed = [one for one in done if one.existed]
     known = [one.density for one in done if one.density > 0]
     share = f", {sum(known) / len(known):.0%} of their pixels on average" if known else ""
-    kept = len(done) - len(made) - len(failed)
-    print(f"{depths.root}: {len(known)} of {len(done)} frames have depth{share}; {kept} were there before")
-    for one in declined:
-        print(f"  {one.token}: {one.words}")
-    for one in failed:
-        print(f"  {one.token}: failed: {one.words}", file=sys.stderr)
+    print(f"{depths.root}: {len(known)} of {len(done)} frames have depth{share}; {len(existed)} were there before")
+    for one in done:
+        if one.failed:
+            print(f"  {one.token}: failed: {one.message}", file=sys.stderr)
+        elif one.density == 0 and not one.existed:
+            print(f"  {one.token}: {one.message}")
     return 1 if failed else 0

@@ -1,4 +1,4 @@
-"""Work through a data set in clean processes, behind a progress bar."""
+"""Parallel work through a data set in clean processes, behind a progress bar."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def results(
     """Yield each job's result, in order.
 
     Args:
-        jobs: Map-style: done where they are read. Picklable where there is more than one worker.
-        workers: Processes of one thread each, from a server that has loaded nothing but this package: no thread or
-            CUDA context is forked. With 1 the work is done in this process, on the threads that it has.
+        jobs: Map-style data set whose items do the work; picklable for more than one worker.
+        workers: Number of one-thread processes, started by a fork server so that no thread or CUDA context is forked.
+            1 works in this process, on its own threads.
         label: Title of the progress bar.
         note: Text beside the bar after each result.
     """
@@ -47,14 +47,7 @@ def results(
 def with_progress(
     done: Iterable[Result], count: int, label: str, note: Callable[[Result], str] | None = None
 ) -> Iterator[Result]:
-    """Yield results as they come, behind a progress bar with frames/s and the remaining time.
-
-    Args:
-        done: The results.
-        count: Number of results.
-        label: Title of the bar.
-        note: Text beside the bar after each result.
-    """
+    """Yield ``count`` results as they come, behind a progress bar with frames/s and the remaining time."""
     with tqdm(total=count, unit="frame", desc=label) as bar:
         for one in done:
             if note is not None:
@@ -68,18 +61,14 @@ def _as_it_is(value: Any) -> Any:
 
 
 def _begin(_: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the parent answers
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # handled by the parent
     threads = one_thread()
     threads.__enter__()
     threading.Thread(target=_end_with_parent, args=(threads,), daemon=True).start()
 
 
 def _end_with_parent(threads: object) -> None:
-    """End this worker with its parent: a killed one would leave it working beside those of the next run.
-
-    Args:
-        threads: Kept as long as the worker lives.
-    """
+    """End this worker with its parent, so that a killed run leaves no process behind; keeps ``threads`` alive."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

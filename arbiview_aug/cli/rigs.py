@@ -12,10 +12,11 @@ from arbiview_aug.cli.arguments import command_parser, data
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE
 from arbiview_aug.datasets.registry import open_data, split_kind
 from arbiview_aug.errors import ArbiviewError
+from arbiview_aug.evaluate.report.tables import markdown_table
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print the rigs and, for two or more, what separates the others from the first; write the picture."""
+    """Print the rigs and the differences of the others from the first; write the picture."""
     parser = command_parser("inspect", "Show rigs: tables, differences, a picture.", "nuscenes waymo")
     parser.add_argument(
         "rigs",
@@ -26,7 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--output", default="inspect.png", metavar="FILE", help="the picture")
     arguments = parser.parse_args(argv)
-    # Drawing is only needed here: --help and wrong rigs answer without it.
+    # Imported late so that --help is quick.
     from arbiview_aug.evaluate.report.pictures import save_picture
     from arbiview_aug.evaluate.report.rig_picture import draw_rigs
 
@@ -43,35 +44,28 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def differences(source: Rig, target: Rig) -> str:
-    """A table: for each target camera the source camera that looks most nearly the same way, and what separates them.
+    """Table of each target camera against the source camera that looks most nearly the same way.
 
-    Heights are over each rig's own road, as retargeting aligns them (see ``Rig.in_frame_of``).
+    Heights are over each rig's own road (see ``Rig.in_frame_of``).
     """
-    mounted = target.in_frame_of(source)
     axes = source.cam2ego[:, :3, 2]
-    width = max(len(n) for n in target.names)
-    other_width = max(len("nearest"), *(len(n) for n in source.names))
-    lines = [
-        f"From {source.name or 'the first rig'} to {target.name or 'the other rig'}:",
-        f"  {'camera':<{width}}  {'nearest':<{other_width}}  {'turned':>9}  {'moved x':>7} {'y':>6} {'z':>6}"
-        f"  {'field of view':>13}  {'pixels per deg':>14}",
-    ]
-    for camera in mounted:
+    rows = []
+    for camera in target.in_frame_of(source):
         cosine = axes @ camera.cam2ego[:3, 2]
         nearest = source[int(np.argmax(cosine))]
         turned = float(np.degrees(np.arccos(np.clip(cosine.max(), -1, 1))))
-        x, y, z = camera.center_m - nearest.center_m
-        lines.append(
-            f"  {camera.name:<{width}}  {nearest.name:<{other_width}}  {turned:5.1f} deg  {x:+7.2f} {y:+6.2f} {z:+6.2f}"
-            f"  {nearest.fov_deg[0]:5.1f} > {camera.fov_deg[0]:5.1f}"
-            f"  {_pixels_per_deg(nearest.K):5.1f} > {_pixels_per_deg(camera.K):6.1f}"
+        density = [float(np.radians(c.K[0, 0])) for c in (nearest, camera)]  # on the optical axis
+        rows.append(
+            [
+                *(camera.name, nearest.name, f"{turned:.1f} deg"),
+                *(f"{moved:+.2f}" for moved in camera.center_m - nearest.center_m),
+                f"{nearest.fov_deg[0]:.1f} > {camera.fov_deg[0]:.1f}",
+                f"{density[0]:.1f} > {density[1]:.1f}",
+            ]
         )
-    return "\n".join(lines)
-
-
-def _pixels_per_deg(K: np.ndarray) -> float:
-    """On the optical axis."""
-    return float(K[0, 0] * np.pi / 180)
+    head = ["camera", "nearest", "turned", "moved x", "y", "z", "field of view", "pixels per deg"]
+    title = f"From {source.name or 'the first rig'} to {target.name or 'the other rig'}:"
+    return f"{title}\n\n{markdown_table(head, rows, left=2)}"
 
 
 def _load(name: str) -> Rig:

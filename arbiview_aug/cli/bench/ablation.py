@@ -146,12 +146,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @benchmark
 def measure(
-    data: Sequence[str],
-    steps: Sequence[str],
-    *,
-    reduce: Reduce = 2,
-    seed: int = 0,
-    size: tuple[int, int] = (256, 704),
+    data: Sequence[str], steps: Sequence[str], *, reduce: Reduce = 2, seed: int = 0, size: tuple[int, int] = (256, 704)
 ) -> dict[str, Any]:
     """Measure the named steps on the first frame of each folder with LiDAR, or on a synthetic street."""
     found = {}

@@ -13,7 +13,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import add_target, count
 from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, recorded
 from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
-from arbiview_aug.cli.bench.timing import Quartiles, machine_line, quartiles, show
+from arbiview_aug.cli.bench.timing import machine_line, quartiles, show
 from arbiview_aug.datasets import RetargetedDataset, open_data
 from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.environment import one_thread
@@ -66,31 +65,6 @@ class Repeated(Dataset[Any]):
                 sample[key] = sample[key].clone()
                 sample[key][:, 2] += lap * _APART_M
         return sample
-
-
-@dataclass(frozen=True)
-class Rate:
-    """Rate of a data set with a number of workers.
-
-    Attributes:
-        name: The data set.
-        workers: Number of workers; 0 is the process itself.
-        frames_per_s: Wall-clock median over the epochs.
-        best_per_s: The fastest epoch's.
-        ms: Quartiles of the time per frame.
-        cpu_ms: CPU time per frame, over all workers; None except on Linux.
-        unique_mib: Mean private memory of a worker at the end; None without workers.
-        peak_mib: Largest resident set of a worker; None without workers.
-    """
-
-    name: str
-    workers: int
-    frames_per_s: float
-    best_per_s: float
-    ms: Quartiles
-    cpu_ms: float | None
-    unique_mib: float | None
-    peak_mib: float | None
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -158,7 +132,7 @@ def measure(
         "frames": frames,
         "epochs": epochs,
         "counting": {"processes": most, "against_one": together / alone},
-        "rates": [asdict(rate) for rate in rates],
+        "rates": rates,
     }
 
 
@@ -184,8 +158,14 @@ def table(report: Mapping[str, Any]) -> str:
     )
 
 
-def loader_rates(datasets: Mapping[str, Dataset[Any]], workers: Sequence[int], epochs: int) -> list[Rate]:
-    """Measure all data sets with all numbers of workers, epoch by epoch in turn; one thread in this process."""
+def loader_rates(datasets: Mapping[str, Dataset[Any]], workers: Sequence[int], epochs: int) -> list[dict[str, Any]]:
+    """Measure all data sets with all numbers of workers, epoch by epoch in turn; one thread in this process.
+
+    Returns:
+        Rows with ``name``, ``workers`` (0 is the process itself), ``frames_per_s`` (median), ``best_per_s``, ``ms``
+        (quartiles), and ``cpu_ms`` (over all workers), ``unique_mib`` (mean private memory of a worker) and
+        ``peak_mib`` (largest resident set of a worker), each None where unknown.
+    """
     with one_thread():
         loaders = {
             (name, n): DataLoader(dataset, batch_size=None, num_workers=n, persistent_workers=n > 0)
@@ -220,21 +200,18 @@ def counted(processes: int) -> int:
     return sum(int(process.communicate()[0]) for process in running)
 
 
-def _rate(key: tuple[str, int], dataset: Any, epochs_s: list[float], used_s: float, pids: list[int]) -> Rate:
+def _rate(key: tuple[str, int], dataset: Any, epochs_s: list[float], used_s: float, pids: list[int]) -> dict[str, Any]:
     (name, workers), frames = key, len(dataset)
-    found = quartiles(1e3 * np.array(epochs_s) / frames)
+    ms = quartiles(1e3 * np.array(epochs_s) / frames)
+    row = {"name": name, "workers": workers, "frames_per_s": 1e3 / ms.median_ms, "best_per_s": frames / min(epochs_s)}
     unique = [_mib(pid, "smaps_rollup", "Private_(?:Clean|Dirty)") for pid in pids] if workers else []
     peaks = [_mib(pid, "status", "VmHWM") for pid in pids] if workers else []
-    return Rate(
-        name=name,
-        workers=workers,
-        frames_per_s=1e3 / found.median_ms,
-        best_per_s=frames / min(epochs_s),
-        ms=found,
-        cpu_ms=1e3 * used_s / frames / len(epochs_s) if used_s else None,
-        unique_mib=float(np.mean(unique)) if all(unique) and unique else None,
-        peak_mib=max(peaks) if all(peaks) and peaks else None,
-    )
+    return row | {
+        "ms": ms._asdict(),
+        "cpu_ms": 1e3 * used_s / frames / len(epochs_s) if used_s else None,
+        "unique_mib": float(np.mean(unique)) if all(unique) and unique else None,
+        "peak_mib": max(peaks) if all(peaks) and peaks else None,
+    }
 
 
 def _children() -> set[int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -39,18 +38,16 @@ def save_plot(rows: Sequence[Mapping[str, Any]], steps: Sequence[str], title: st
     front = sorted((row["median_ms"], row["psnr_db"]) for row in rows if row["front"])
     axes.step(*zip(*front, strict=True), where="post", color="black", linewidth=0.8, alpha=0.6)
     named = sorted((row for row in rows if row["name"] in steps), key=lambda row: row["median_ms"])
-    middle = math.sqrt(front[0][0] * max(row["median_ms"] for row in rows))
-    left = sum(row["median_ms"] <= middle for row in named)
     for k, row in enumerate(named):
-        on_left = k < left
+        left = k < len(named) / 2
         axes.annotate(
             row["name"],
             (row["median_ms"], row["psnr_db"]),
             # One line apart, below and above the front: steps may lie close together.
-            xytext=(14, -14 - 12 * (left - k)) if on_left else (-14, 6 + 12 * (k - left)),
+            xytext=(14, -14 - 12 * (len(named) // 2 - k)) if left else (-14, 6 + 12 * (k - len(named) // 2)),
             textcoords="offset points",
             fontsize=8,
-            ha="left" if on_left else "right",
+            ha="left" if left else "right",
             arrowprops={"arrowstyle": "-", "linewidth": 0.5, "alpha": 0.6},
         )
     axes.set_xscale("log")

@@ -33,11 +33,7 @@ def put_text(picture: Picture, text: str, xy: tuple[int, int], scale: float) -> 
 
 
 def contact_sheet(
-    rows: Sequence[Sequence[Image]],
-    labels: Sequence[Sequence[str]],
-    titles: Sequence[str],
-    *,
-    width_px: int = 1800,
+    rows: Sequence[Sequence[Image]], labels: Sequence[Sequence[str]], titles: Sequence[str], *, width_px: int = 1800
 ) -> Picture:
     """Lay out rows of captioned images; the images of a row share a height and fill the width.
 

@@ -45,12 +45,13 @@ def test_rates(samples: ModuleType) -> None:
     datasets = {PLAIN: plain, "retargeted": RetargetedDataset(plain, RigRetarget(samples.rig().turned(yaw_deg=20)))}
     before = set(multiprocessing.active_children())
     rates = loader_rates(datasets, (0, 1), 2)
-    assert [(rate.name, rate.workers) for rate in rates] == [(name, n) for name in datasets for n in (0, 1)]
+    assert [(rate["name"], rate["workers"]) for rate in rates] == [(name, n) for name in datasets for n in (0, 1)]
     for rate in rates:
-        assert 0 < rate.frames_per_s <= rate.best_per_s and rate.ms.q1_ms <= rate.ms.median_ms <= rate.ms.q3_ms
-        assert (rate.unique_mib is None) == (rate.workers == 0)
-        if rate.unique_mib is not None:
-            assert rate.peak_mib is not None and 0 < rate.unique_mib < rate.peak_mib
+        assert 0 < rate["frames_per_s"] <= rate["best_per_s"]
+        assert rate["ms"]["q1_ms"] <= rate["ms"]["median_ms"] <= rate["ms"]["q3_ms"]
+        assert (rate["unique_mib"] is None) == (rate["workers"] == 0)
+        if rate["unique_mib"] is not None:
+            assert rate["peak_mib"] is not None and 0 < rate["unique_mib"] < rate["peak_mib"]
     assert set(multiprocessing.active_children()) <= before  # none is left behind
 
 
@@ -80,7 +81,7 @@ def test_two_workers_against_one(
     load, machine = os.getloadavg()[0], [counted(2) / counted(1)]
     rates = loader_rates({"retargeted": dataset}, (0, 1, 2), EPOCHS)
     machine.append(counted(2) / counted(1))
-    best = {rate.workers: rate.best_per_s for rate in rates}
+    best = {rate["workers"]: rate["best_per_s"] for rate in rates}
     scaling, given = best[2] / best[1], min(machine)
     report = (
         f"frames/s: {', '.join(f'{n} workers {rate:.1f}' for n, rate in best.items())}; two against one {scaling:.2f}; "
