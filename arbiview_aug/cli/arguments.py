@@ -40,14 +40,7 @@ class _HelpFormatter(argparse.HelpFormatter):
 def command_parser(
     command: str, description: str, example: str, program: str = "python -m arbiview_aug"
 ) -> argparse.ArgumentParser:
-    """Create the parser of a command, without its options.
-
-    Args:
-        command: Its name, as typed after ``program``.
-        description: One sentence on what it does.
-        example: Arguments that show it at work.
-        program: Prefix of the command.
-    """
+    """Create the parser of a command, without its options; ``example`` shows arguments at work."""
     prog = f"{program} {command}".strip()
     return argparse.ArgumentParser(
         prog=prog, description=description, epilog=f"example: {prog} {example}", formatter_class=_HelpFormatter
@@ -65,13 +58,7 @@ def data(text: str) -> str:
 
 
 def add_data(parser: argparse.ArgumentParser, without: str | None = None, **options: Any) -> None:
-    """Add ``--data``.
-
-    Args:
-        parser: The parser.
-        without: Description of the data used without it; None makes it required.
-        **options: Passed to ``add_argument``.
-    """
+    """Add ``--data``; ``without`` describes the data used without it, None makes it required."""
     kinds = "; ".join(f"{kind}: {reader.description}" for kind, reader in READERS.items())
     default = "" if without is None else f" (default: {without})"
     text = f"real frames, by their path alone or with their kind. {kinds}{default}"

@@ -39,9 +39,7 @@ class OverlapScore(NamedTuple):
     fitted_psnr_db: float | None
 
 
-def overlap_psnr(
-    one: npt.NDArray[Any], two: npt.NDArray[Any], both: BoolArray, *, fitted: bool = True, tile_px: int = TILE_PX
-) -> float | None:
+def overlap_psnr(one: npt.NDArray[Any], two: npt.NDArray[Any], both: BoolArray, *, fitted: bool = True) -> float | None:
     """PSNR in dB between two renderings of one view on the odd tiles.
 
     Args:
@@ -49,12 +47,11 @@ def overlap_psnr(
         two: The other.
         both: (h, w) bool, where both sources see the view.
         fitted: Whether to map ``one`` to ``two`` first, by a gain and an offset per channel fitted on the even tiles.
-        tile_px: Size of the tiles.
 
     Returns:
         The PSNR, or None with fewer than ``MIN_PIXELS`` pixels to fit or to test.
     """
-    odd = odd_tiles(both.shape, tile_px)
+    odd = odd_tiles(both.shape, TILE_PX)
     fit, test = both & ~odd, both & odd
     if fit.sum() < MIN_PIXELS or test.sum() < MIN_PIXELS:
         return None

@@ -27,7 +27,11 @@ from arbiview_aug.scene.point_cloud import own_car
 NEAREST_M = 1.0
 """Closer points lie on the own car."""
 
-_OCCLUSION_FACTOR = 1.1
+_CELL_PX = 8  # of the z-buffer
+_OCCLUSION_FACTOR, _OCCLUSION_TOLERANCE_M = 1.1, 0.3
+_GROUND_BAND_M = 0.3
+_SECTOR_DEG = 1.0
+_GAIN_PRIOR = 0.1
 _DARK, _SATURATED = 8, 235
 _MIN_SHARED_POINTS = 20
 
@@ -47,7 +51,7 @@ class ColouredPoints:
     Attributes:
         points: (n, 3) in the ego frame.
         colours: (n, 3) RGB, 0-255.
-        on_ground: (n,) bool, within ``ground_band_m`` of the rig's road plane.
+        on_ground: (n,) bool, within 0.3 m of the rig's road plane.
     """
 
     points: FloatArray
@@ -62,17 +66,11 @@ class ColouredPoints:
         return ColouredPoints(self.points[keep], self.colours[keep], self.on_ground[keep])
 
 
-def visible_points(camera: Camera, points: FloatArray, *, cell_px: int = 8, tolerance_m: float = 0.3) -> VisiblePoints:
-    """Find the points that a camera sees, with a coarse z-buffer.
+def visible_points(camera: Camera, points: FloatArray) -> VisiblePoints:
+    """Find the points (P, >=3) that a camera sees, with a coarse z-buffer; ignores its mask.
 
     LiDAR is sparse, so points behind a surface show through its gaps. A point is occluded if another one within 5 x 3
-    cells is closer by more than ``tolerance_m`` and a tenth of its depth.
-
-    Args:
-        camera: The camera; its mask is ignored.
-        points: (P, >=3) in the ego frame.
-        cell_px: Size of the z-buffer's cells.
-        tolerance_m: Depth difference within a surface.
+    cells is closer by more than 0.3 m and a tenth of its depth.
     """
     h, w = camera.size
     uv, depth, valid = camera.project(points[:, :3])
@@ -81,11 +79,11 @@ def visible_points(camera: Camera, points: FloatArray, *, cell_px: int = 8, tole
     inside = (uv >= 0).all(1) & (uv[:, 0] < w - 1) & (uv[:, 1] < h - 1)
     index = np.flatnonzero(valid & (depth > NEAREST_M) & inside)
     uv, depth = uv[index], depth[index]
-    x, y = (uv / cell_px).astype(int).T + 1  # one cell of border for the erosion
-    nearest = np.full((h // cell_px + 3, w // cell_px + 3), np.inf, np.float32)
+    x, y = (uv / _CELL_PX).astype(int).T + 1  # one cell of border for the erosion
+    nearest = np.full((h // _CELL_PX + 3, w // _CELL_PX + 3), np.inf, np.float32)
     np.minimum.at(nearest, (y, x), depth.astype(np.float32))
     nearest = cv2.erode(nearest, np.ones((3, 5), np.uint8)).astype(np.float32)
-    seen = depth < nearest[y, x] * _OCCLUSION_FACTOR + tolerance_m
+    seen = depth < nearest[y, x] * _OCCLUSION_FACTOR + _OCCLUSION_TOLERANCE_M
     return VisiblePoints(index[seen], uv[seen], depth[seen])
 
 
@@ -102,18 +100,10 @@ def colours_at(image: npt.NDArray[Any], uv: FloatArray) -> npt.NDArray[np.float3
     return np.asarray(samples.reshape(-1, *image.shape[2:])[: len(uv)], dtype=np.float32)
 
 
-def coloured_points(
-    rig: Rig, images: Sequence[Image], points: FloatArray, *, ground_band_m: float = 0.3
-) -> ColouredPoints:
-    """Colour LiDAR points by the camera that sees each closest to its axis.
+def coloured_points(rig: Rig, images: Sequence[Image], points: FloatArray) -> ColouredPoints:
+    """Colour LiDAR points (P, >=3) by the camera that sees each closest to its axis.
 
     Drops returns of the own car and points that no camera sees outside its car-body mask.
-
-    Args:
-        rig: The source rig.
-        images: One per camera.
-        points: (P, >=3) in the ego frame.
-        ground_band_m: Largest distance of ground points from the road plane.
     """
     _check_images(rig, images)
     points = points[~own_car(points), :3].astype(np.float64)
@@ -126,15 +116,15 @@ def coloured_points(
         colours[index[better]] = colours_at(image, uv[better])
         best_cosine[index[better]] = cosine[better]
     seen = best_cosine > -1.0
-    on_ground = np.abs(points[:, 2] - rig.ground_z_m) < ground_band_m
+    on_ground = np.abs(points[:, 2] - rig.ground_z_m) < _GROUND_BAND_M
     return ColouredPoints(points[seen], colours[seen], on_ground[seen])
 
 
-def equalising_gains(rig: Rig, images: Sequence[Image], points: FloatArray, *, prior: float = 0.1) -> FloatArray:
+def equalising_gains(rig: Rig, images: Sequence[Image], points: FloatArray) -> FloatArray:
     """Fit (N,) gains that give points seen by two cameras one brightness.
 
     Least squares on log-gains g: g_a - g_b = -median(log brightness_a - log brightness_b) for each pair of cameras with
-    at least 20 shared points that are neither dark nor saturated. ``prior`` weighs g = 0; so is their sum.
+    at least 20 shared points that are neither dark nor saturated, with weak priors g = 0 and sum g = 0.
     """
     _check_images(rig, images)
     light: list[dict[int, float]] = []
@@ -153,7 +143,7 @@ def equalising_gains(rig: Rig, images: Sequence[Image], points: FloatArray, *, p
                 row[a], row[b] = 1, -1
                 rows.append(row)
                 targets.append(-np.median([light[a][k] - light[b][k] for k in shared]))
-    A = np.vstack([*rows, prior * np.eye(count), np.ones((1, count))])
+    A = np.vstack([*rows, _GAIN_PRIOR * np.eye(count), np.ones((1, count))])
     rhs = np.concatenate([targets, np.zeros(count + 1)])
     return np.asarray(np.exp(np.linalg.lstsq(A, rhs, rcond=None)[0]))
 
@@ -164,10 +154,10 @@ def equalised(rig: Rig, images: Sequence[Image], points: FloatArray) -> list[npt
     return [np.clip(image * gain, 0, 255).astype(np.uint8) for image, gain in zip(images, gains, strict=True)]
 
 
-def lidar_split(points: FloatArray, width_deg: float = 1.0) -> tuple[BoolArray, BoolArray]:
+def lidar_split(points: FloatArray) -> tuple[BoolArray, BoolArray]:
     """Masks (fit, test) over alternate azimuth sectors: points for a LiDAR surface, and points that score it."""
     azimuth_deg = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
-    fit = np.asarray(np.floor(azimuth_deg / width_deg) % 2 == 0)
+    fit = np.asarray(np.floor(azimuth_deg / _SECTOR_DEG) % 2 == 0)
     return fit, ~fit
 
 

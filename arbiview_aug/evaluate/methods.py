@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
-import torch
-
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.evaluate.baselines import BASELINES, Renderer
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays
@@ -115,7 +113,9 @@ def retargeting(
 
     def render_alone(sample: Sample, camera: int, target: Rig) -> RenderedView:
         """Render with the depth and the gain estimated from all cameras' overlaps."""
-        given, (depth, gains) = one_camera(sample, camera), overlaps.get(sample)
+        if not estimates or estimates[0][0] is not sample:  # several views of a sample are rendered in a row
+            estimates[:] = [(sample, *_overlap_estimates(sample, corrected, harmoniser))]
+        given, (_, depth, gains) = one_camera(sample, camera), estimates[0]
         cache = None
         if depth is not None:
             cache, found = RefinementCache(), depth
@@ -132,43 +132,25 @@ def retargeting(
     if not name and path != "favs":
         label += f", {path}" + (f" {steps}" if steps else "")
     learns = isinstance(config, FavsConfig) and config.overlap_depth
-    overlaps = _LastOverlaps(surface if learns else None, Harmoniser(harmonise))
+    corrected, harmoniser = surface if learns else None, Harmoniser(harmonise)
+    estimates: list[tuple[Sample, OverlapDepth | None, Sequence[float] | None]] = []
     reads_points = "points" in SURFACES[surface].reads and not isinstance(config, PaperConfig)
-    alone = render_alone if overlaps.are_used or completes else None
+    alone = render_alone if learns or harmoniser.is_on or completes else None
     return Method(label, render, reads_points, alone, plans=not isinstance(config, PaperConfig))
 
 
-class _LastOverlaps:
-    """Depth and gains from the overlaps of the last sample, cached over its views.
-
-    Args:
-        surface: The surface to correct; None for no depth.
-        harmoniser: Estimates the gains.
-    """
-
-    def __init__(self, surface: SurfaceName | None, harmoniser: Harmoniser) -> None:
-        self._surface, self._harmoniser = surface, harmoniser
-        self._last: tuple[Sample, tuple[OverlapDepth | None, Sequence[float] | None]] | None = None
-
-    @property
-    def are_used(self) -> bool:
-        return self._surface is not None or self._harmoniser.is_on
-
-    def get(self, sample: Sample) -> tuple[OverlapDepth | None, Sequence[float] | None]:
-        """Depth and gains of a sample, None where they are not used."""
-        if self._last is None or self._last[0] is not sample:
-            rig, images = sample["rig"], list(sample["images"])
-            gains = self._harmoniser.report(rig, images).gains if self._harmoniser.is_on else None
-            self._last = sample, (self._depth(sample, rig, images), gains)
-        return self._last[1]
-
-    def _depth(self, sample: Sample, rig: Rig, images: list[torch.Tensor]) -> OverlapDepth | None:
-        if self._surface is None:
-            return None
-        (scene,) = read_scenes(sample, read_frames(sample, None), (), self._surface) or [Scene()]
-        row = SURFACES[scene.best if self._surface == "auto" else self._surface]
-        boxes = scene.boxes if row.overlap_depth and "boxes" in row.reads else None
-        return overlap_depth(rig, images, boxes)  # as ``FramePlanner`` measures it
+def _overlap_estimates(
+    sample: Sample, surface: SurfaceName | None, harmoniser: Harmoniser
+) -> tuple[OverlapDepth | None, Sequence[float] | None]:
+    """Depth (with a surface to correct) and gains (if harmonising is on) from a sample's overlaps."""
+    rig, images = sample["rig"], list(sample["images"])
+    gains = harmoniser.report(rig, images).gains if harmoniser.is_on else None
+    if surface is None:
+        return None, gains
+    (scene,) = read_scenes(sample, read_frames(sample, None), (), surface) or [Scene()]
+    row = SURFACES[scene.best if surface == "auto" else surface]
+    boxes = scene.boxes if row.overlap_depth and "boxes" in row.reads else None
+    return overlap_depth(rig, images, boxes), gains  # as ``FramePlanner`` measures it
 
 
 def one_camera(sample: Sample, camera: int) -> dict[str, Any]:

@@ -89,13 +89,9 @@ def recorded(
     size: tuple[int, int] = (512, 1408),
     neighbours: Neighbours | None = None,
 ) -> Iterator[Recorded]:
-    """Open a user's frames, or write synthetic ones as JPEGs to a temporary folder.
+    """Open a user's frames, or write synthetic ones of ``size`` (h, w) as JPEGs to a temporary folder.
 
-    Args:
-        data: The user's data; None for synthetic streets.
-        frames: Number of synthetic frames.
-        size: (h, w) of synthetic images.
-        neighbours: Write one synthetic frame with these neighbours instead, as a drive.
+    With ``neighbours`` it writes one frame with these neighbours, as a drive.
     """
     if data is not None:
         yield Recorded(data_name(data), Path(data))

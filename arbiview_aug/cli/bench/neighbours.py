@@ -91,15 +91,7 @@ def measure(
     size: tuple[int, int] = SIZE,
     repeats: int = REPEATS,
 ) -> dict[str, Any]:
-    """Measure the costs of a data set whose samples have neighbours.
-
-    Args:
-        data: The data set.
-        name: Its name.
-        counts: Numbers of neighbours, limited by those available.
-        surfaces: Those that the sample does not offer are left out.
-        size: (h, w) of every view.
-        repeats: Rounds.
+    """Measure the costs of a data set whose samples have neighbours; surfaces that it does not offer are left out.
 
     Raises:
         DataError: No frame has neighbours.

@@ -105,14 +105,7 @@ def measure(
     full_size: tuple[int, int] | None = None,
     small_size: tuple[int, int] = SIZE,
 ) -> dict[str, Any]:
-    """Time all candidates.
-
-    Args:
-        data: A frame folder; None for random smooth images on nuScenes' rig.
-        repeats: Rounds at full size.
-        full_size: (h, w) of the random images, for tests.
-        small_size: (h, w) of the small output.
-    """
+    """Time all candidates on a frame folder, or on random smooth images (of ``full_size``) on nuScenes' rig."""
     rig, images, halves = _inputs(data, full_size)
     rounds = {"full size": repeats, "small": repeats * _SMALL_ROUNDS}
     rows = _run(_full_size(rig, images), rounds["full size"], "full size")

@@ -45,15 +45,8 @@ def benchmark_parser(
 ) -> argparse.ArgumentParser:
     """Create a parser with the options that benchmarks share.
 
-    Args:
-        name: The benchmark.
-        description: For ``--help``.
-        data: Description of the data used without ``--data``; None for no ``--data``.
-        view_size: Default of ``--size`` (h, w); None for no such option.
-        reduce: Whether there is ``--reduce``.
-        repeats: Default of ``--repeats``; None for no such option.
-        output: Default of ``--output``, a file or a folder.
-        example: Arguments that show it at work.
+    ``data`` describes the default of ``--data``; ``view_size`` (h, w) and ``repeats`` are defaults of ``--size`` and
+    ``--repeats``. With None an option is left out. ``output`` is a file or a folder.
     """
     parser = command_parser(f"bench {name}", description, example)
     if data is not None:

@@ -80,17 +80,9 @@ def timed_rounds(
     enough_ms: float = math.inf,
     clock: Clock = process_ms,
 ) -> dict[str, npt.NDArray[np.float64]]:
-    """Time each candidate in every round.
+    """Time each candidate in every round: (n,) milliseconds by name.
 
-    Args:
-        candidates: Functions by name.
-        rounds: Maximum number of rounds.
-        label: Title of the progress bar.
-        enough_ms: Total time after which a candidate skips further rounds, once it has run in ``_LEAST_ROUNDS``.
-        clock: Runs a candidate and returns its milliseconds.
-
-    Returns:
-        (n,) milliseconds by name.
+    A candidate whose times sum to ``enough_ms`` skips further rounds, once it has run in ``_LEAST_ROUNDS``.
     """
     times: dict[str, list[float]] = {name: [] for name in candidates}
     for _ in tqdm(range(rounds), desc=label, unit="round", leave=False):

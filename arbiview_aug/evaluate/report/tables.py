@@ -68,12 +68,7 @@ _HELD_OUT = "Methods get the points of every other degree of azimuth; the points
 
 
 def evaluation_tables(done: Evaluation, methods: Sequence[str]) -> list[Table]:
-    """Tabulate views against their reference (a row per method and target) and agreement (a row per method).
-
-    Args:
-        done: The measurements.
-        methods: Names, in the order of the rows.
-    """
+    """Tabulate views against their reference (a row per method and target) and agreement (a row per method)."""
     assert done.first is not None
     names = [name for name in methods if name not in done.declined]
     rows: dict[str, dict[str, float]] = {}
