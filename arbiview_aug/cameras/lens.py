@@ -26,8 +26,7 @@ MIN_DEPTH = 1e-6
 """Smallest z / |p| of a point in front of a pinhole or radtan camera (89.99994 degrees off axis)."""
 
 _NEWTON_STEPS = 40
-_FARTHEST = 1e12
-"""Largest distorted coordinate: polynomials at grazing angles can overflow float32 maps."""
+_MAX_COORDINATE = 1e12  # polynomials at grazing angles can overflow float32 maps
 
 
 @dataclass(frozen=True)
@@ -99,31 +98,32 @@ class RadTan(Lens):
         valid = valid & (a * a + b * b <= self.fold_limit**2)
         a, b = np.where(valid, a, 0.0), np.where(valid, b, 0.0)
         xd, yd = self._polynomial(a, b)
-        return np.clip(xd, -_FARTHEST, _FARTHEST), np.clip(yd, -_FARTHEST, _FARTHEST), valid
+        limit = _MAX_COORDINATE
+        return np.clip(xd, -limit, limit), np.clip(yd, -limit, limit), valid
 
     def undistort(self, xd: FloatArray, yd: FloatArray) -> FloatArray:
         """Newton's method in two unknowns, inside the fold; pixels leave the iteration as they converge."""
         limit = min(self.fold_limit, 1e6)
         x_all, y_all = np.ravel(xd), np.ravel(yd)
         a_all, b_all = x_all.copy(), y_all.copy()
-        open_ = np.arange(a_all.size)
+        active = np.arange(a_all.size)
         with np.errstate(all="ignore"):  # non-finite values are replaced below
             for _ in range(_NEWTON_STEPS):
-                a, b = a_all[open_], b_all[open_]
+                a, b = a_all[active], b_all[active]
                 shrink = np.minimum(1.0, limit / np.maximum(np.hypot(a, b), 1e-300))
                 a, b = a * shrink, b * shrink
                 fa, fb = self._polynomial(a, b)
                 aa, ab, bb = self._jacobian(a, b)
                 determinant = aa * bb - ab * ab
                 determinant = np.where(np.abs(determinant) < 1e-6, 1e-6, determinant)
-                ea, eb = fa - x_all[open_], fb - y_all[open_]
+                ea, eb = fa - x_all[active], fb - y_all[active]
                 da, db = (bb * ea - ab * eb) / determinant, (aa * eb - ab * ea) / determinant
                 length = np.hypot(da, db)
                 damping = np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))
-                a_all[open_], b_all[open_] = a - da * damping, b - db * damping
+                a_all[active], b_all[active] = a - da * damping, b - db * damping
                 # Convergence is quadratic: a step of 1e-8 leaves an error near 1e-16.
-                open_ = open_[~(length < 1e-8)]
-                if not open_.size:
+                active = active[~(length < 1e-8)]
+                if not active.size:
                     break
             lost = ~np.isfinite(a_all + b_all)
         a_all[lost], b_all[lost] = 0.0, 0.0

@@ -209,9 +209,8 @@ def frame_from(
         size = tuple(image.shape[-2:])
         if size != camera.size:
             fix = "height and width are swapped" if size == camera.size[::-1] else "use rig.resized((h, w)) or crop"
-            raise SampleError(
-                f"camera {camera.name!r}: expected an image of (h, w) = {camera.size}, as calibrated, got {size}; {fix}"
-            )
+            expected = f"an image of (h, w) = {camera.size}, as calibrated"
+            raise SampleError(f"camera {camera.name!r}: expected {expected}, got {size}; {fix}")
     return Frame(images, _with_masks(rig, sample, lead, index))
 
 

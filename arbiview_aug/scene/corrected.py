@@ -19,12 +19,8 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE, StaticSurface
 
-_STEPS = 2
-"""Fixed-point iterations; a third one changes two real frames by at most 0.02 dB."""
-
-_TOLERANCE_SCALE = 8.0
-"""Maps may err by 1/8 px, as distances are measured to a pixel of a view 400 px wide."""
-
+_STEPS = 2  # fixed-point iterations; a third one changes two real frames by at most 0.02 dB
+_TOLERANCE_SCALE = 8.0  # maps may err by 1/8 px, as distances are measured to a pixel of a view 400 px wide
 _ROW = 4096  # remap's sizes must stay below 32767
 
 
