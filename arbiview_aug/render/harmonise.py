@@ -85,21 +85,13 @@ _RANGES: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class PhotometricReport:
-    """The gains of a frame, and why; ``str`` prints them.
+    """The gains of a frame, and why; ``str`` prints them."""
 
-    Attributes:
-        gains: One for each source camera, median 1 before clipping; all 1 if they were declined.
-        accepted: Whether the images are changed.
-        reason: Why, or why not.
-        raw_db_before: PSNR between neighbours on held-out tiles, mean over pairs; None without a fit.
-        raw_db_after: The same with the estimated gains, accepted or not.
-    """
-
-    gains: tuple[float, ...]
-    accepted: bool
-    reason: str
-    raw_db_before: float | None = None
-    raw_db_after: float | None = None
+    gains: tuple[float, ...]  # one for each source camera, median 1 before clipping; all 1 if they were declined
+    accepted: bool  # whether the images are changed
+    reason: str  # why, or why not
+    raw_db_before: float | None = None  # PSNR between neighbours on held-out tiles, mean over pairs; None without a fit
+    raw_db_after: float | None = None  # the same with the estimated gains, accepted or not
 
     def __str__(self) -> str:
         if not self.accepted:

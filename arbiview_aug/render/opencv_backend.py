@@ -73,8 +73,8 @@ def render_opencv(
             if curves is not None:
                 curves[band.source].apply(second)
             if change is not None:
-                apart = np.abs(part.astype(np.float32) - second).mean(-1)
-                change[band.y : band.y + bh, band.x : band.x + bw] += apart * band.weight
+                difference = np.abs(part.astype(np.float32) - second).mean(-1)
+                change[band.y : band.y + bh, band.x : band.x + bw] += difference * band.weight
             part[...] = cv2.blendLinear(part, second, 1 - band.weight, band.weight)
         cv2.split(buffer, list(view.numpy()))
     return [view.to(dtype) for view in views]

@@ -61,24 +61,16 @@ _NEAREST_BACKGROUND = 0.5  # larger changes belong to objects, not to the backgr
 
 @dataclass(frozen=True)
 class OverlapReport:
-    """The result for one pair of neighbours; ``str`` prints it.
+    """The result for one pair of neighbours; ``str`` prints it."""
 
-    Attributes:
-        first: Name of one camera.
-        second: Name of the other.
-        accepted: Whether the surface changes.
-        reason: Why, or why not.
-        db_before: PSNR between the two in their half-way view on held-out tiles, after a gain and an offset per
-            channel fitted on others; None without a fit.
-        db_after: The same with the estimated distances, accepted or not.
-    """
-
-    first: str
+    first: str  # names of the two cameras
     second: str
-    accepted: bool
-    reason: str
+    accepted: bool  # whether the surface changes
+    reason: str  # why, or why not
+    # PSNR between the two in their half-way view on held-out tiles, after a gain and an offset per channel fitted on
+    # others; None without a fit.
     db_before: float | None = None
-    db_after: float | None = None
+    db_after: float | None = None  # the same with the estimated distances, accepted or not
 
     def __str__(self) -> str:
         return f"{self.first} and {self.second}: {'' if self.accepted else 'distances as they were, '}{self.reason}"
@@ -86,17 +78,11 @@ class OverlapReport:
 
 @dataclass(frozen=True, eq=False)
 class OverlapDepth:
-    """Depth from the overlaps of one frame.
+    """Depth from the overlaps of one frame."""
 
-    Attributes:
-        corrections: One for each accepted pair.
-        reports: One for each pair of neighbours, in the order of their names.
-        matched: Number of pairs that were matched.
-    """
-
-    corrections: tuple[Correction, ...]
-    reports: tuple[OverlapReport, ...]
-    matched: int
+    corrections: tuple[Correction, ...]  # one for each accepted pair
+    reports: tuple[OverlapReport, ...]  # one for each pair of neighbours, in the order of their names
+    matched: int  # number of pairs that were matched
 
     @property
     def nbytes(self) -> int:

@@ -26,22 +26,14 @@ from arbiview_aug.scene.scene import Scene
 
 @dataclass(frozen=True)
 class RenderPlan:
-    """Everything needed to render a target rig from a source rig's images; plain data, picklable.
-
-    Attributes:
-        source: The source rig.
-        target: The target rig in the source's ego frame, on the source's road.
-        layout: The sources' places in the atlas.
-        targets: One plan for each target camera.
-        counters: Work done while building: pairs by surface, cells interpolated and exact, bands.
-        on_devices: The maps as tensors, by device (``torch_backend.maps_on``); not pickled.
-    """
+    """Everything needed to render a target rig from a source rig's images; plain data, picklable."""
 
     source: Rig
-    target: Rig
-    layout: AtlasLayout
-    targets: tuple[ViewPlan, ...]
-    counters: dict[str, int] = field(default_factory=dict)
+    target: Rig  # in the source's ego frame, on the source's road
+    layout: AtlasLayout  # the sources' places in the atlas
+    targets: tuple[ViewPlan, ...]  # one plan for each target camera
+    counters: dict[str, int] = field(default_factory=dict)  # pairs by surface, cells interpolated and exact, bands
+    # The maps as tensors, by device (``torch_backend.maps_on``); not pickled.
     on_devices: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -15,25 +15,15 @@ from arbiview_aug.render.tone_curve import TonePatch, patches
 
 @dataclass(frozen=True)
 class SourceUse:
-    """How one target uses one source; ``explain`` prints it.
+    """How one target uses one source; ``explain`` prints it."""
 
-    Attributes:
-        source: Index of the source camera in the source rig.
-        surface: The surface its pixels are read over.
-        reason: Why that surface.
-        baseline_m: Distance between the two optical centres.
-        parallax_px: Expected displacement from unknown depth: the median over the pixels that the source wins.
-        share: Share of the target's pixels that it wins.
-        level: Halvings of its image before it is read.
-    """
-
-    source: int
-    surface: str
-    reason: str
-    baseline_m: float
-    parallax_px: float
-    share: float
-    level: int
+    source: int  # index of the source camera in the source rig
+    surface: str  # the surface its pixels are read over
+    reason: str  # why that surface
+    baseline_m: float  # distance between the two optical centres
+    parallax_px: float  # expected displacement from unknown depth: the median over the pixels that the source wins
+    share: float  # share of the target's pixels that it wins
+    level: int  # halvings of its image before it is read
 
 
 @dataclass(frozen=True)

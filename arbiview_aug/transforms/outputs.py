@@ -23,27 +23,16 @@ from arbiview_aug.sample.inputs import CALIBRATION_KEYS, Frame
 # --- one sample -------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class SampleWriter:
-    """Writes rendered frames as a sample of the form that they were read from.
+    """Writes rendered frames as a sample of the form that they were read from."""
 
-    Attributes:
-        outputs: Further keys that are requested.
-        generated: Whether to write ``generated``.
-        lenses: Whether to write ``lens`` and ``distortion``.
-        masks: Whether to write ``ignore``.
-        pass_keys: Keys to keep although they look bound to the source's pixels.
-        label_fill: Value of label pixels that no source sees.
-        label_frame: ``source`` or ``target``.
-        warn: Issues a warning about a topic.
-    """
-
-    outputs: tuple[str, ...]
-    generated: bool
-    lenses: bool
-    masks: bool
-    pass_keys: tuple[str, ...]
-    label_fill: float
-    label_frame: str
-    warn: Callable[[str, str], None]
+    outputs: tuple[str, ...]  # requested keys
+    generated: bool  # whether to write ``generated``
+    lenses: bool  # ``lens`` and ``distortion``
+    masks: bool  # ``ignore``
+    pass_keys: tuple[str, ...]  # keys to keep although they look bound to the source's pixels
+    label_fill: float  # value of label pixels that no source sees
+    label_frame: str  # ``source`` or ``target``
+    warn: Callable[[str, str], None]  # takes a topic and a message
 
     def write(
         self,
@@ -193,12 +182,9 @@ def _checked_fill(key: str, fill: float, dtype: torch.dtype) -> float:
 
 # --- labels in the ego frame ------------------------------------------------------------------------------------------
 def move_to_target(out: dict[str, Any], ego2ego: torch.Tensor, lead: tuple[int, ...]) -> None:
-    """Move an output sample's poses, points and boxes into the target's ego frame, by the translation of ``ego2ego``.
+    """Move an output sample's poses, points and boxes by the translation of ``ego2ego`` (*lead, 4, 4).
 
-    Args:
-        out: The output; its entries are replaced, never written to.
-        ego2ego: (*lead, 4, 4) source's ego frame to target's.
-        lead: Leading dimensions.
+    Entries are replaced, never written to.
     """
     # Sums instead of matrix products, which autocast and TF32 would round.
     out["ego2ego"], offset_m = ego2ego.to(out["cam2ego"].device), ego2ego[..., :3, 3]

@@ -64,7 +64,6 @@ class _RigPair:
         return self.plan_key(self.road)
 
     def plan_key(self, scene: Scene) -> bytes:
-        """Key of the plan in a scene."""
         assert isinstance(self._config, FavsConfig)
         return plan_key(self.source, self.target, self._surface, self._config, scene)
 
