@@ -137,13 +137,7 @@ def open_frames(arguments: argparse.Namespace, surfaces: Sequence[SurfaceName], 
 
 
 def target_rigs(arguments: argparse.Namespace, chosen: Rig | None, source: Rig) -> dict[str, Rig]:
-    """Rigs to render, by name.
-
-    Args:
-        arguments: With ``data``, ``yaws``, ``quality`` and ``size``.
-        chosen: The rig of ``--target``.
-        source: The source rig.
-    """
+    """Rigs to render, by name; ``chosen`` is the rig of ``--target``."""
     if arguments.yaws is None:
         rig = chosen or (load_rig(REAL_TARGET) if arguments.data else demo_target_rig(source.sizes[0]))
         found = {rig.name or "target": rig}

@@ -94,13 +94,7 @@ def overlap_scores(
 def source_overlap(
     sample: Mapping[str, Any], method: Method, *, size: tuple[int, int] = VIEW_SIZE
 ) -> list[OverlapScore]:
-    """Overlap metrics of a method: adjacent source cameras, each rendered alone (``Method.alone``) to a half-way view.
-
-    Args:
-        sample: With ``rig`` and ``images``.
-        method: The method.
-        size: (h, w) of the half-way views.
-    """
+    """Overlap metrics of a method: adjacent sources, each rendered alone (``Method.alone``) to their half-way view."""
     rig: Rig = sample["rig"]
 
     def from_one(view: Camera, k: int) -> tuple[Image, BoolArray]:
@@ -115,14 +109,9 @@ def source_overlap(
 def target_consistency(
     rig: Rig, views: Sequence[RenderedView], *, size: tuple[int, int] = VIEW_SIZE
 ) -> list[OverlapScore]:
-    """Overlap metrics of rendered views, resampled to half-way views over the street surface.
+    """Overlap metrics of rendered views (one per camera), resampled to half-way views over the street surface.
 
     Compare methods of one surface: views rendered over the street agree even where it is wrong.
-
-    Args:
-        rig: The target rig, on its own road.
-        views: One for each of its cameras.
-        size: (h, w) of the half-way views.
     """
 
     def from_one(view: Camera, k: int) -> tuple[Image, BoolArray]:

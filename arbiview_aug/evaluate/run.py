@@ -59,7 +59,7 @@ def evaluate(
     *,
     agreement: bool = True,
 ) -> Evaluation:
-    """Run every method on every frame and target.
+    """Run every method on every named frame and target.
 
     Args:
         frames: Names and frames.

@@ -44,17 +44,17 @@ def _stages_1_and_4(*without: str) -> PaperConfig:
 
 
 class Row(NamedTuple):
-    """Settings of ``retargeting``; ``held`` caches depth from overlap, ``reduce`` shrinks the targets by a factor."""
+    """Settings of ``retargeting``; ``cached`` caches depth from overlap, ``reduce`` shrinks the targets by a factor."""
 
     quality: Quality | FavsConfig | PaperConfig
     surface: SurfaceName = "street"
     harmonise: bool = False
-    held: bool = False
+    cached: bool = False
     reduce: Reduce = 1
 
     def method(self, name: str) -> Method:
         """Create the method, with empty caches."""
-        refinement = RefinementCache() if self.held else None
+        refinement = RefinementCache() if self.cached else None
         options: dict[str, Any] = {"harmonise": self.harmonise, "refinement": refinement, "transforms": 1}
         return retargeting(self.quality, self.surface, name, **options)
 
@@ -79,7 +79,7 @@ ROWS: dict[str, Row] = {
     "fast, a quarter as large, aliased": Row(FavsConfig(antialias=False), reduce=4),
     "fast, harmonised": Row("fast", harmonise=True),
     "accurate": Row("accurate"),
-    "accurate, held": Row("accurate", held=True),
+    "accurate, held": Row("accurate", cached=True),
 }
 
 

@@ -162,9 +162,8 @@ def loader_rates(datasets: Mapping[str, Dataset[Any]], workers: Sequence[int], e
     """Measure all data sets with all numbers of workers, epoch by epoch in turn; one thread in this process.
 
     Returns:
-        Rows with ``name``, ``workers`` (0 is the process itself), ``frames_per_s`` (median), ``best_per_s``, ``ms``
-        (quartiles), and ``cpu_ms`` (over all workers), ``unique_mib`` (mean private memory of a worker) and
-        ``peak_mib`` (largest resident set of a worker), each None where unknown.
+        Rows; ``ms`` has quartiles, ``cpu_ms`` is of all workers, ``unique_mib`` the mean private memory of a worker,
+        ``peak_mib`` the largest resident set. The last three are None where unknown.
     """
     with one_thread():
         loaders = {

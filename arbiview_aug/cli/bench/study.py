@@ -88,20 +88,13 @@ def study(
     consistency: bool = False,
     label: str = "",
 ) -> dict[str, dict[str, Any]]:
-    """Score and time methods, which take turns on each frame and target.
+    """Score and time methods on sets of targets; they take turns on each frame and target.
 
-    Args:
-        methods: One row each.
-        frames: Samples and their references.
-        targets: Sets of rigs to render, by name.
-        repeats: Timed calls after the first; none for methods without a plan.
-        clock: Runs a call and returns its milliseconds.
-        consistency: Whether to compare neighbouring views (``consistency_...``).
-        label: Title of the progress bar.
+    Methods with a plan are timed ``repeats`` more times after the first call.
 
     Returns:
-        By method: mean metrics for each set of targets (``evaluate.frames.scores``, even exposures), ``ms`` of every
-        repeated call, and ``plan_ms``, the additional milliseconds of the first call.
+        By method: mean metrics for each set of targets (``evaluate.frames.scores``, even exposures; ``consistency_...``
+        if asked for), ``ms`` of every repeated call, and ``plan_ms``, the additional milliseconds of the first call.
     """
     rows: dict[str, dict[str, list[Any]]] = {m.name: {key: [] for key in (*targets, "ms", "plan_ms")} for m in methods}
     pairs: dict[str, list[OverlapScore]] = {method.name: [] for method in methods}

@@ -69,20 +69,20 @@ class Setting:
         surface: As in ``RigRetarget``.
         reduce: Images are decoded at 1 / this.
         execution: ``opencv`` or ``torch`` on the CPU, or ``cuda``: torch on a GPU.
-        held: Whether depth from overlap is cached.
+        cached: Whether depth from overlap is cached.
     """
 
     quality: Quality
     surface: SurfaceName
     reduce: Reduce
     execution: Execution
-    held: bool = False
+    cached: bool = False
 
     @property
     def name(self) -> str:
         """Name in tables."""
-        held = ["depth held"] if self.held else []
-        return ", ".join([self.quality, self.surface, *held, f"1/{self.reduce}", self.execution])
+        depth = ["depth held"] if self.cached else []
+        return ", ".join([self.quality, self.surface, *depth, f"1/{self.reduce}", self.execution])
 
     def transform(self, target: Rig) -> RigRetarget:
         """Create the setting's transform, which caches the last plan alone."""
@@ -91,7 +91,7 @@ class Setting:
             quality=self.quality,
             surface=self.surface,
             execution="torch" if self.execution == "cuda" else self.execution,
-            refinement=RefinementCache() if self.held else None,
+            refinement=RefinementCache() if self.cached else None,
             cache_bytes=0,
             holes="black",
         )
@@ -137,7 +137,7 @@ def settings(
             if quality != "accurate":
                 found.append(Setting(quality, surface, reduce, execution))
             elif surface in _CORRECTED:
-                found += [Setting(quality, surface, reduce, execution, held) for held in (False, True)]
+                found += [Setting(quality, surface, reduce, execution, cached) for cached in (False, True)]
     return found
 
 

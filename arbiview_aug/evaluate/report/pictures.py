@@ -35,16 +35,9 @@ def put_text(picture: Picture, text: str, xy: tuple[int, int], scale: float) -> 
 def contact_sheet(
     rows: Sequence[Sequence[Image]], labels: Sequence[Sequence[str]], titles: Sequence[str], *, width_px: int = 1800
 ) -> Picture:
-    """Lay out rows of captioned images; the images of a row share a height and fill the width.
+    """Lay out titled rows of images (h, w, 3), scale 0-255, with captions; a row's images share a height.
 
-    Args:
-        rows: Images (h, w, 3) on the scale 0-255, row by row.
-        labels: One caption per image; too long ones are cut.
-        titles: One line above each row.
-        width_px: Width of the sheet.
-
-    Returns:
-        (h, width_px, 3) picture.
+    Rows fill the width; captions that are too long are cut.
     """
     strips = []
     for images, captions, title in zip(rows, labels, titles, strict=True):
@@ -73,12 +66,7 @@ def _row(images: Sequence[Image], captions: Sequence[str], width_px: int) -> Pic
 
 
 def outline_coverage(image: Image, coverage: BoolArray) -> Picture:
-    """Hatch and outline the holes of an image (h, w, 3) on the scale 0-255.
-
-    Args:
-        image: The image.
-        coverage: (h, w) bool, where some source saw it.
-    """
+    """Hatch and outline the holes of an image (h, w, 3) on the scale 0-255, given its coverage (h, w)."""
     picture = to_bytes(image).copy()
     hole = ~coverage
     if not hole.any():

@@ -25,8 +25,8 @@ def test_settings_differ_and_leave_out_what_is_the_same() -> None:
     found = settings(["far", "street", "lidar"])
     assert len({setting.name for setting in found}) == len(found)
     assert {s.surface for s in found if s.quality == "accurate"} == {"street"}
-    assert {s.held for s in found if s.quality == "accurate"} == {True, False}
-    assert not any(s.held for s in found if s.quality != "accurate")
+    assert {s.cached for s in found if s.quality == "accurate"} == {True, False}
+    assert not any(s.cached for s in found if s.quality != "accurate")
     assert {(s.surface, s.execution) for s in found if s.quality == "paper"} == {("far", "opencv")}
     assert {s.reduce for s in found} == {1, 2, 4} and {s.execution for s in found} == {"opencv", "torch"}
     assert Setting("accurate", "street", 2, "torch", True).name == "accurate, street, depth held, 1/2, torch"
