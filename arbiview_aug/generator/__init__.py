@@ -1,12 +1,12 @@
-"""Completing what no camera saw: the CVC-SSL model, a latent diffusion with geometry-guided cross-view attention.
+"""Completion of pixels that no camera saw, by CVC-SSL: latent diffusion with geometry-guided cross-view attention.
 
 Needs diffusers and safetensors, imported where they are used: ``pip install arbiview_aug[generator]``.
 
-- ``correspondence``: where a token looks in other views; ``attention``: how it reads them;
-- ``conditioning``: what else the denoiser is told; ``geometry``: a frame's cameras for both;
-- ``denoiser``: the U-Net with all of it; ``autoencoder``: between images and latents;
-- ``sampler``: the reverse process; ``completion``: inference on a frame; ``batches``: on what transforms give;
-- ``networks``: denoiser and autoencoder; ``generator``: ``Generator``, which loads and saves them.
+- ``correspondence``, ``attention``: geometry-guided cross-view attention;
+- ``conditioning``, ``geometry``: conditions and cameras as tensors;
+- ``denoiser``, ``autoencoder``, ``networks``: the networks; ``sampler``: the reverse process;
+- ``completion``: inference on a frame; ``batches``: on the output of transforms;
+- ``generator``: ``Generator``, which loads and saves them; ``fillers``, ``inpainting``: filling without a network.
 """
 
 from arbiview_aug.generator.batches import CompletedLoader

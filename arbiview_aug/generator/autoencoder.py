@@ -1,4 +1,4 @@
-"""Between images and latents: Z = E(x), x̃ = D(Z) (appendix: Latent Diffusion Models)."""
+"""Autoencoder between images and latents: Z = E(x), x̃ = D(Z) (appendix: Latent Diffusion Models)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from arbiview_aug.errors import GeneratorError
 
 
 class Autoencoder(nn.Module):
-    """diffusers' ``AutoencoderKL`` with images in [0, 1] and latents of about unit variance; pixels without one.
+    """diffusers' ``AutoencoderKL`` with images in [0, 1] and latents of unit variance, or squares of pixels.
 
     Args:
-        vae: The ``AutoencoderKL``; None for latents that are the pixels, in [-1, 1].
-        scale: What latents are multiplied by; held as a number, since half precision would round it.
-        patch: Without a ``vae``, side of the square of pixels that a latent pixel holds.
+        vae: The ``AutoencoderKL``; None for pixels in [-1, 1].
+        scale: Factor of the latents; no buffer, since half precision would round it.
+        patch: Side of the square of pixels in a latent pixel, without a ``vae``.
     """
 
     def __init__(self, vae: Any | None, scale: float = 1.0, patch: int = 1) -> None:
@@ -27,7 +27,7 @@ class Autoencoder(nn.Module):
         self.patch = patch
 
     def encode(self, images: torch.Tensor) -> torch.Tensor:
-        """Latents (..., C, H / f, W / f) of images (..., 3, H, W) in [0, 1]: the mean, without sampling.
+        """Encode images (..., 3, H, W) in [0, 1] to latents (..., C, H / f, W / f), without sampling.
 
         Raises:
             GeneratorError: With weights in float16.
@@ -41,7 +41,7 @@ class Autoencoder(nn.Module):
         return latents.reshape(*images.shape[:-3], *latents.shape[-3:])
 
     def decode(self, latents: torch.Tensor) -> torch.Tensor:
-        """Images (..., 3, H, W) of latents (..., C, h, w), in [0, 1] up to over- and undershoot: clamp them.
+        """Decode latents (..., C, h, w) to images (..., 3, H, W), in [0, 1] up to over- and undershoot.
 
         Raises:
             GeneratorError: With weights in float16.

@@ -1,7 +1,7 @@
-"""A generator's own folder: ``config.json`` and one safetensors file that it names.
+"""A generator's own folder: ``config.json`` and the safetensors file that it names.
 
-The configuration is written last and moved into place in one step, so a folder always holds a whole checkpoint: a full
-disk or a killed process leaves the old one. Nothing is ever unpickled.
+The configuration is replaced last and atomically, so a folder always holds a complete checkpoint, also after a full
+disk or a killed process. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -20,19 +20,14 @@ from arbiview_aug.errors import GeneratorError
 
 FORMAT = 1
 CONFIG_FILE = "config.json"
-_SHOWN = 4  # names in an error
+_MAX_NAMES = 4  # in an error
 
 
 def write_checkpoint(folder: Path, config: Mapping[str, Any], tensors: Mapping[str, torch.Tensor]) -> None:
-    """Replace the checkpoint in a folder, or make it.
-
-    Args:
-        folder: Made if it is not there.
-        config: Plain data.
-        tensors: By name.
+    """Write a checkpoint to a folder, which is created if needed, or replace the one there.
 
     Raises:
-        OSError: The disk is full, or the folder cannot be written; what was there is as it was.
+        OSError: The disk is full, or the folder cannot be written; the former checkpoint is unchanged.
     """
     save_file = optional_package("safetensors.torch", "generator").save_file
     folder.mkdir(parents=True, exist_ok=True)
@@ -44,20 +39,22 @@ def write_checkpoint(folder: Path, config: Mapping[str, Any], tensors: Mapping[s
         weights.replace(named)
         text.write_text(json.dumps({"format": FORMAT, "weights": named.name, **config}, indent=1) + "\n")
         _synchronise(text)
-        text.replace(folder / CONFIG_FILE)  # from here on the new one counts
+        text.replace(folder / CONFIG_FILE)
     except Exception as error:
         for left in (weights, text):
             left.unlink(missing_ok=True)
         if isinstance(error, OSError):
             raise
-        raise OSError(f"{folder}: the checkpoint could not be written: {error}") from error  # safetensors' own errors
+        raise OSError(
+            f"{folder}: the checkpoint could not be written: {error}"
+        ) from error  # safetensors has its own errors
     for old in folder.glob("weights-*.safetensors"):
         if old != named:
             old.unlink(missing_ok=True)
 
 
 def read_checkpoint(folder: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-    """The configuration and the tensors, on the CPU, of a folder by ``write_checkpoint``.
+    """Read a checkpoint: its configuration, and its tensors on the CPU.
 
     Raises:
         GeneratorError: No checkpoint, one of another format, or a broken one.
@@ -66,12 +63,12 @@ def read_checkpoint(folder: Path) -> tuple[dict[str, Any], dict[str, torch.Tenso
     config, weights = read_config(folder)
     try:
         return config, safetensors.load_file(folder / weights)
-    except Exception as error:  # safetensors has an error of its own
+    except Exception as error:  # safetensors has its own errors
         raise GeneratorError(f"{folder}: expected readable weights in {weights}: {error}") from None
 
 
 def read_config(folder: Path) -> tuple[dict[str, Any], str]:
-    """The configuration of a folder by ``write_checkpoint``, and the name of its weights, which says what is in them.
+    """Read a checkpoint's configuration and the name of its weights, which contains their checksum.
 
     Raises:
         GeneratorError: No checkpoint, or one of another format.
@@ -90,32 +87,29 @@ def read_config(folder: Path) -> tuple[dict[str, Any], str]:
 
 
 def check_tensors(expected: Mapping[str, torch.Tensor], found: Mapping[str, torch.Tensor], where: str) -> None:
-    """Whether weights are those of a model: all of them, no others, of its shapes.
+    """Check that weights have exactly the names and shapes of a model's.
 
     Raises:
-        GeneratorError: Which are missing, extra or of another shape, and what was expected.
+        GeneratorError: Names that are missing, extra or of another shape.
     """
-    wrong = []
-    missing = sorted(set(expected) - set(found))
-    if missing:
-        wrong.append(f"{len(missing)} missing: {_shown(missing)}")
-    extra = sorted(set(found) - set(expected))
-    if extra:
-        wrong.append(f"{len(extra)} that do not belong: {_shown(extra)}")
     shapes = [
-        f"{name} of {tuple(expected[name].shape)}, got {tuple(found[name].shape)}"
-        for name in sorted(set(expected) & set(found))
-        if expected[name].shape != found[name].shape
+        f"{name} of {tuple(value.shape)}, got {tuple(found[name].shape)}"
+        for name, value in sorted(expected.items())
+        if name in found and found[name].shape != value.shape
     ]
-    if shapes:
-        wrong.append(f"{len(shapes)} of another shape: expected {_shown(shapes)}")
+    problems = {
+        "missing:": sorted(expected.keys() - found.keys()),
+        "that do not belong:": sorted(found.keys() - expected.keys()),
+        "of another shape: expected": shapes,
+    }
+    wrong = [f"{len(names)} {problem} {_abbreviated(names)}" for problem, names in problems.items() if names]
     if wrong:
         raise GeneratorError(f"{where}: expected {len(expected)} tensors; " + "; ".join(wrong))
 
 
-def _shown(names: list[str]) -> str:
-    more = f", and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more
+def _abbreviated(names: list[str]) -> str:
+    more = f", and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+    return ", ".join(names[:_MAX_NAMES]) + more
 
 
 def _synchronise(path: Path) -> None:

@@ -1,14 +1,13 @@
-"""What the denoiser is told besides the noise: condition latent, mask, confidence, viewing rays, and f_pose.
+"""Conditions of the denoiser: condition latent, mask, confidence, viewing rays, and f_pose of L_main.
 
-The paper feeds "the pseudo images … and their poses" to the model and names a pose condition encoding f_pose without
-giving it. Here each view has
+The paper does not define its pose condition encoding f_pose. Here each view has
 
-- channels beside its noisy latent: the condition latent (FAVS at the view's pose, holes pre-filled), the mask of what
-  FAVS covers, its confidence, and the Plücker rays of its pixels;
+- channels beside its noisy latent: the condition latent (FAVS at the view's pose, holes pre-filled), the coverage mask
+  of FAVS, its confidence, and the Plücker rays of its pixels;
 - one token, MLP(Fourier(R, t, K)), appended to the embedding of the empty prompt.
 
-Poses are relative to a reference camera: of a target, the source that looks most alike; of a source, itself. So turning
-the whole rig, or listing its cameras in another order, changes nothing.
+Poses are relative to a reference camera, the most similar source for a target and itself for a source. The result is
+invariant to rotations of the whole rig and to the order of its cameras.
 """
 
 from __future__ import annotations
@@ -30,15 +29,15 @@ POSE_WIDTH = 16
 """Numbers of a pose: R (9), t (3), K (4)."""
 
 _OCTAVES = 4
-"""Fourier frequencies π, 2π, 4π, 8π: the highest turns once in 0.25 of a rotation entry; 1° is a tenth of it."""
+"""Number of Fourier frequencies π, 2π, 4π, 8π."""
 
 
 class Views(NamedTuple):
     """The conditions of the views of B frames, N views each, on the latent grid.
 
     Attributes:
-        latent: (B, N, C, h, w) FAVS at the view's pose, pre-filled; of a source, its image.
-        mask: (B, N, 1, h, w) share of each latent pixel that is known, in [0, 1].
+        latent: (B, N, C, h, w) FAVS at a target's pose, pre-filled; a source's image.
+        mask: (B, N, 1, h, w) known share of each latent pixel, in [0, 1].
         confidence: (B, N, 1, h, w) in [0, 1].
         rays: (B, N, 6, h, w) Plücker rays, see ``plucker_rays``.
         pose: (B, N, 16) see ``pose_vector``.
@@ -51,7 +50,7 @@ class Views(NamedTuple):
     pose: torch.Tensor
 
     def dropped(self, drop: torch.Tensor) -> Views:
-        """Without conditions in the frames ``drop`` (B,) bool: for classifier-free guidance."""
+        """Zero the conditions of the frames ``drop`` (B,) bool, for classifier-free guidance."""
         return Views(*(value * ~drop.view(-1, *(1,) * (value.dim() - 1)) for value in self))
 
     def channels(self, noisy: torch.Tensor) -> torch.Tensor:
@@ -60,13 +59,13 @@ class Views(NamedTuple):
 
 
 def input_channels(latent_channels: int) -> int:
-    """Channels that ``Views.channels`` has."""
+    """Number of channels of ``Views.channels``."""
     return 2 * latent_channels + 2 + RAY_CHANNELS
 
 
 # --- geometry ---------------------------------------------------------------------------------------------------------
 def reference_camera(target: Camera, sources: Sequence[Camera]) -> Camera:
-    """The source whose optical axis is nearest to the target's; by content where several are."""
+    """The source whose optical axis is nearest to the target's; ties are broken by content."""
 
     def likeness(camera: Camera) -> tuple[float, bytes]:
         return float(camera.cam2ego[:3, 2] @ target.cam2ego[:3, 2]), camera.content_key
@@ -83,13 +82,7 @@ def relative_pose(camera: Camera, reference: Camera) -> tuple[FloatArray, FloatA
 
 
 def plucker_rays(camera: Camera, reference: Camera, size: tuple[int, int]) -> torch.Tensor:
-    """(6, h, w) float32 direction d and moment o x d of each pixel's ray in the reference's frame; 0 off the lens.
-
-    Args:
-        camera: At any size.
-        reference: Whose frame.
-        size: (h, w) of the latent grid.
-    """
+    """(6, h, w) float32 direction d and moment o x d of each pixel's ray in the reference's frame; 0 off the lens."""
     small = camera.resize(size)
     R, o = relative_pose(camera, reference)
     directions, valid = small.unproject_cam(small.pixel_grid())
@@ -127,7 +120,7 @@ class PoseContext(nn.Module):
 
     Args:
         width: Cross-attention width of the U-Net.
-        prompt_tokens: Tokens of the empty prompt: 77 for Stable Diffusion, 0 where there is no text.
+        prompt_tokens: Tokens of the empty prompt: 77 for Stable Diffusion, 0 without text.
     """
 
     empty_prompt: torch.Tensor
@@ -139,12 +132,12 @@ class PoseContext(nn.Module):
         self.register_buffer("empty_prompt", torch.zeros(prompt_tokens, width))
 
     def forward(self, pose: torch.Tensor) -> torch.Tensor:
-        """(n, prompt_tokens + 1, width) contexts of poses (n, 16), all zeros where the pose was dropped (is 0)."""
+        """(n, prompt_tokens + 1, width) contexts of poses (n, 16); the token of a dropped pose, which is 0, is 0."""
         pose = pose.float()
         angles = pose[..., None] * (math.pi * 2.0 ** torch.arange(_OCTAVES, device=pose.device))
         features = torch.cat([pose, angles.sin().flatten(-2), angles.cos().flatten(-2)], -1)
         dtype = self.empty_prompt.dtype
-        given = pose.abs().amax(-1, keepdim=True) > 0  # no pose is all zeros: R is not
-        token = self.mlp(features.to(dtype)) * given
+        is_given = pose.abs().amax(-1, keepdim=True) > 0  # a pose is never 0, since R is not
+        token = self.mlp(features.to(dtype)) * is_given
         prompt = self.empty_prompt.expand(len(pose), -1, -1)
         return torch.cat([prompt, token[:, None]], 1)

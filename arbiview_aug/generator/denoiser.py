@@ -48,20 +48,6 @@ class Rows(NamedTuple):
     pair: torch.Tensor
 
 
-class Preconditioned(NamedTuple):
-    """Input of the network and parts of its output, see ``Denoiser._preconditioned``.
-
-    Attributes:
-        input: (B, N, C, h, w) float32 z, the normalised x_t.
-        linear: (B, N, C, h, w) v of the best linear estimate.
-        scale: (B, N, 1, h, w) factor of the network's output in v.
-    """
-
-    input: torch.Tensor
-    linear: torch.Tensor
-    scale: torch.Tensor
-
-
 class Denoiser(nn.Module):
     """ε_θ(x_t, t, f_pose) of L_main for N target views at once, and x0 in one step at t = ``REGRESSION``.
 
@@ -159,19 +145,21 @@ class Denoiser(nn.Module):
         is_regression = (t == REGRESSION)[:, :, None, None, None]
         x = noisy
         if self.signal is not None:
-            preconditioned = self._preconditioned(noisy, t, targets)
-            x = preconditioned.input.masked_fill(is_regression, 0)
+            z, linear, scale = self._preconditioned(noisy, t, targets)
+            x = z.masked_fill(is_regression, 0)
         h = self._run(x, t, targets, windows, sources, None, rows)
         unet = self.unet
         if unet.conv_norm_out is not None:
             h = unet.conv_act(unet.conv_norm_out(h))
         predicted, change = (head(h).unflatten(0, noisy.shape[:2]) for head in (unet.conv_out, self.regression))
         if self.signal is not None:
-            predicted = preconditioned.linear - preconditioned.scale * predicted.float()
+            predicted = linear - scale * predicted.float()
         return torch.where(is_regression, noisy.to(change.dtype) + change, predicted)
 
-    def _preconditioned(self, noisy: torch.Tensor, t: torch.Tensor, targets: Views) -> Preconditioned:
-        """Precondition the residual of the condition (Karras et al. 2022, around the condition c instead of 0).
+    def _preconditioned(
+        self, noisy: torch.Tensor, t: torch.Tensor, targets: Views
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """z, the v of the best linear estimate, and σ / √D (Karras et al. 2022, around the condition c instead of 0).
 
         With x_t = a x0 + s ε and x0 = c + r, r of variance σ², z = (x_t − a c) / √D with D = a² σ² + s² has unit
         variance, and the best linear estimate is x0 = c + a σ² / √D z. The network sees z, and σ s / √D times its
@@ -180,7 +168,7 @@ class Denoiser(nn.Module):
         a, s, deviation, root = self._deviations(t, targets)
         condition = targets.latent.float()
         z = (noisy.float() - a * condition) / root
-        return Preconditioned(z, -s * condition + a * s * (1 - deviation**2) / root * z, deviation / root)
+        return z, -s * condition + a * s * (1 - deviation**2) / root * z, deviation / root
 
     def output_scale(self, t: torch.Tensor, targets: Views) -> torch.Tensor:
         """(B, N, 1, h, w) factor of the network's output in ``forward``'s at t (B, N).

@@ -1,7 +1,4 @@
-"""Holes of target views filled by default: continued from their borders, the frame's mean colour farther outside.
-
-Telea's method (2004) runs on the view reduced to ``CELLS`` cells along its shorter side.
-"""
+"""Default filling of holes: Telea's inpainting (2004) at reduced size near borders, the mean colour farther away."""
 
 from __future__ import annotations
 
@@ -20,22 +17,21 @@ from arbiview_aug.render.rendered import RenderedFrame
 from arbiview_aug.sample.batching import stacked
 
 Holes = Literal["fill", "mean", "black"]
-"""What pixels get that no source sees."""
+"""How pixels are filled that no source sees."""
 
 CELLS = 64
 """Cells along a view's shorter side."""
 
 REACH = 1 / 8
-"""Views are continued outside the sources' images by this share of their shorter side. Against the true street, rigs
-higher, lower, turned, pitched and wider: closer than 1/16 it is 2 to 10 dB better than the mean colour, up to 1/8 -0.6
-to 5.5 dB, up to 1/4 -1.8 to 4.7 dB."""
+"""Share of a view's shorter side by which it is continued outside the sources' images; measured on synthetic streets:
+2 to 10 dB better than the mean colour up to 1/16, -0.6 to 5.5 dB up to 1/8, -1.8 to 4.7 dB up to 1/4."""
 
-_LEAST_SHARE = 64
-"""In 255ths: cells of which less is seen are holes; their colour would be noise."""
+_MIN_COVERAGE = 64
+"""In 255ths: cells with less coverage are holes; their colour would be noise."""
 
 
 def fill_frame(rendered: RenderedFrame, how: Holes) -> RenderedFrame:
-    """Fill what no source sees of a rendered frame, as ``fill_holes`` does; its images are written into."""
+    """Fill the holes of a rendered frame by ``fill_holes``, in place where possible."""
     if how == "black":
         return rendered
     images = fill_holes(rendered.images, list(rendered.coverage), rendered.occluded, how)
@@ -48,22 +44,18 @@ def fill_holes(
     occluded: Sequence[BoolArray | None],
     how: Holes,
 ) -> list[torch.Tensor]:
-    """Fill what no source sees; covered pixels stay as they are, bit for bit, and keep their gradients.
+    """Fill uncovered pixels; covered ones are unchanged and keep their gradients.
 
     Args:
         views: M views (3, h, w), uint8 or float in [0, 1], black where uncovered. Those on the CPU without gradients
-            are written into.
+            are modified.
         coverage: (h, w) bool of each.
-        occluded: (h, w) bool of each, which uncovered pixels some source's image contains (``ViewPlan.occluded``);
-            None for none. All others lie outside.
-        how: ``fill``: occluded pixels, and those outside up to ``REACH`` from what is seen, are continued from their
-            borders; farther outside they become the mean colour. ``mean``: all become the mean colour of the frame's
-            covered pixels. ``black``: they stay.
-
-    Returns:
-        M views.
+        occluded: (h, w) bool of each, uncovered pixels that some source's image contains (``ViewPlan.occluded``), or
+            None. All other uncovered pixels lie outside the images.
+        how: ``fill``: continue occluded pixels, and those outside up to ``REACH``, from their borders, and set others
+            to the mean colour. ``mean``: set all to the mean colour of the frame's covered pixels. ``black``: none.
     """
-    if how == "black" or all(seen.cpu().numpy().all() for seen in coverage):  # 100 times as fast as torch's
+    if how == "black" or all(seen.cpu().numpy().all() for seen in coverage):  # numpy is 100 times faster here
         return list(views)
     colour = mean_colour(views, coverage)
     return [_filled(*of_view, colour, how) for of_view in zip(views, coverage, occluded, strict=True)]
@@ -74,13 +66,13 @@ def mean_colour(views: Sequence[torch.Tensor], coverage: Sequence[torch.Tensor])
     total, count = np.zeros(3), 0
     for view, seen in zip(views, coverage, strict=True):
         step = _cell_px(seen.shape)
-        there = seen[::step, ::step]
-        total += view.detach()[:, ::step, ::step][:, there].double().sum(1).cpu().numpy()
-        count += int(there.sum())
+        sampled = seen[::step, ::step]
+        total += view.detach()[:, ::step, ::step][:, sampled].double().sum(1).cpu().numpy()
+        count += int(sampled.sum())
     if count == 0:
         return np.full(3, 255 * GREY, np.float32)
-    levels = 1 if views[0].dtype == torch.uint8 else 255
-    return np.clip(levels * total / count, 0, 255).astype(np.float32)
+    scale = 1 if views[0].dtype == torch.uint8 else 255
+    return np.clip(scale * total / count, 0, 255).astype(np.float32)
 
 
 def _filled(
@@ -101,16 +93,15 @@ def _filled(
         arrays = list((planes if planes.dtype == torch.uint8 else planes.float()).numpy())
         small = _continued(arrays, covered[box], inside, colour, cell, min(hole.shape))
     h, w = hole[box].shape
-    made = [cv2.resize(plane, (w, h), interpolation=cv2.INTER_LINEAR) for plane in cv2.split(small)]
+    filled_planes = [cv2.resize(plane, (w, h), interpolation=cv2.INTER_LINEAR) for plane in cv2.split(small)]
     if view.dtype == torch.uint8 and view.device.type == "cpu":
-        for plane, values in zip(view[:, box[0], box[1]].numpy(), made, strict=True):
+        for plane, values in zip(view[:, box[0], box[1]].numpy(), filled_planes, strict=True):
             cv2.copyTo(values, hole[box], plane)
         return view
-    new = torch.from_numpy(np.stack(made)).to(view.device)
+    new = torch.from_numpy(np.stack(filled_planes)).to(view.device)
     new = new if view.dtype == torch.uint8 else (new.float() / 255).to(view.dtype)
     filled = view.clone() if view.requires_grad else view
-    place = filled[:, box[0], box[1]]
-    filled[:, box[0], box[1]] = torch.where(seen[box], place, new)
+    filled[:, box[0], box[1]] = torch.where(seen[box], filled[:, box[0], box[1]], new)
     return filled
 
 
@@ -122,15 +113,9 @@ def _continued(
     cell_px: int,
     side_px: int,
 ) -> npt.NDArray[np.uint8]:
-    """(ceil(h / cell), ceil(w / cell), 3) what a view shows in its holes, a pixel for each cell.
+    """(ceil(h / cell), ceil(w / cell), 3) inpainted view of planes (h, w), ``colour`` (3,) far from pixels ``inside``.
 
-    Args:
-        planes: 3 of (h, w), uint8 or float32 in [0, 1], 0 where uncovered.
-        covered: (h, w) 0 and 1.
-        inside: (h, w) 0 and 1, what is covered or occluded.
-        colour: (3,) far outside, in 255ths.
-        cell_px: Side of a cell.
-        side_px: The view's shorter side.
+    ``covered`` and ``inside`` (covered or occluded) are (h, w), 0 and 1; ``side_px`` is the view's shorter side.
     """
     h, w = covered.shape
     size = -(-w // cell_px), -(-h // cell_px)
@@ -139,11 +124,11 @@ def _continued(
         small = cv2.convertScaleAbs(small, alpha=255)
     share: Any = cv2.resize(covered * np.uint8(255), size, interpolation=cv2.INTER_AREA)
     small = cv2.divide(small, cv2.merge([share] * 3), scale=255)
-    known = share >= _LEAST_SHARE
-    # Telea's method marches from the mean colour too: both meet half-way.
+    known = share >= _MIN_COVERAGE
+    # Telea's method also marches from the mean colour: both meet half-way.
     reach = round(2 * REACH * side_px / cell_px)
-    near: Any = cv2.resize(inside * np.uint8(255), size, interpolation=cv2.INTER_AREA)
-    far = cv2.dilate(near, np.ones((2 * reach + 1,) * 2, np.uint8)) == 0
+    inside_share: Any = cv2.resize(inside * np.uint8(255), size, interpolation=cv2.INTER_AREA)
+    far = cv2.dilate(inside_share, np.ones((2 * reach + 1,) * 2, np.uint8)) == 0
     small[far] = np.round(colour)
     known |= far
     if not known.any():
@@ -154,13 +139,13 @@ def _continued(
 
 
 def _in_cells(indices: slice, cell_px: int, side_px: int) -> slice:
-    """Indices widened by what Telea's method looks at, to whole cells: views are reduced several times faster so."""
+    """Widen indices by Telea's margin to whole cells, which are reduced several times faster."""
     margin = int(RADIUS_PX) + 1
     first, last = indices.start // cell_px - margin, (indices.stop - 1) // cell_px + 1 + margin
     return slice(max(first, 0) * cell_px, min(last * cell_px, side_px))
 
 
 def _cell_px(size: tuple[int, ...]) -> int:
-    """Side of a cell: one that divides both sides (h, w) of the view, where there is such a one."""
+    """Side of a cell; preferably a divisor of both sides (h, w) of the view."""
     most = max(1, min(size) // CELLS)
     return max((n for n in range(most // 2 + 1, most + 1) if not any(side % n for side in size)), default=most)

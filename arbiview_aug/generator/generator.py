@@ -1,4 +1,4 @@
-"""The generator: denoiser and autoencoder of one configuration; made, loaded, saved, and asked for missing pixels."""
+"""The generator: creation, loading, saving and use of a denoiser and an autoencoder (Sec. CVC-SSL)."""
 
 from __future__ import annotations
 
@@ -32,34 +32,27 @@ def has_shipped() -> bool:
 
 
 def shipped_weights() -> str:
-    """Name of the file of the package's weights, after their content.
-
-    Raises:
-        GeneratorError: The package was installed without its data.
-    """
+    """File name of the package's weights, which contains their checksum."""
     return read_config(_SHIPPED)[1]
 
 
 def _networks() -> tuple[Any, Any]:
-    """diffusers' classes of a U-Net and an autoencoder.
-
-    Importing them imports ``torch._dynamo``, which torch 2.6 cannot do while tensors are made on meta.
-    """
+    """diffusers' classes; torch 2.6 cannot import them (``torch._dynamo``) while tensors are created on meta."""
     diffusers = optional_package("diffusers", "generator")
     return diffusers.UNet2DConditionModel, diffusers.AutoencoderKL
 
 
 class Generator(GeneratorNetworks):
-    """Completes target views where no camera saw anything (Sec. CVC-SSL).
+    """Generator of the pixels that no camera saw (Sec. CVC-SSL).
 
-    ``from_pretrained`` loads one, ``from_config`` makes an untrained one, ``from_stable_diffusion`` one on top of
-    Stable Diffusion. ``to`` moves it to a GPU or to bfloat16.
+    ``from_pretrained`` loads one, ``from_config`` creates an untrained one, ``from_stable_diffusion`` one with Stable
+    Diffusion's weights. ``to`` moves it to a GPU or to bfloat16.
     """
 
-    # --- made ---------------------------------------------------------------------------------------------------------
+    # --- creation -----------------------------------------------------------------------------------------------------
     @classmethod
     def from_config(cls, config: GeneratorConfig) -> Generator:
-        """An untrained generator, its weights drawn from torch's RNG."""
+        """Create an untrained generator with weights drawn from torch's RNG."""
         unet_class, vae_class = _networks()
         latent = config.autoencoder.latent_channels
         unet = unet_class(**config.unet.arguments(input_channels(latent), latent))
@@ -80,13 +73,13 @@ class Generator(GeneratorNetworks):
         *,
         empty_prompt: torch.Tensor | None = None,
     ) -> Generator:
-        """An untrained generator on Stable Diffusion's weights: it computes what Stable Diffusion does.
+        """Create an untrained generator with Stable Diffusion's weights, whose output it has at first.
 
         Args:
             where: A folder or hub id in diffusers' layout.
-            config: ``paper()`` unless given; the weights must be those of its networks.
-            empty_prompt: (prompt tokens, width) the text encoder's last hidden state for ""; from the folder's text
-                encoder, for which transformers is needed, where None.
+            config: Settings, ``paper()`` by default; the weights must fit its networks.
+            empty_prompt: (prompt tokens, width) the text encoder's last hidden state for ""; by default computed by the
+                folder's text encoder, which needs transformers.
 
         Raises:
             GeneratorError: Weights that are missing, extra, or of another architecture.
@@ -97,7 +90,7 @@ class Generator(GeneratorNetworks):
             raise GeneratorError("from_stable_diffusion: expected a config with an autoencoder, got one on pixels")
         unet = load_part("UNet2DConditionModel", where, "unet", config.unet.arguments(latent, latent) | PLAIN_UNET)
         shape = config.autoencoder.arguments()
-        del shape["scaling_factor"]  # the file's counts
+        del shape["scaling_factor"]  # the file's own is used
         vae = load_part("AutoencoderKL", where, "vae", shape)
         config = replace(config, autoencoder=replace(config.autoencoder, scale=float(vae.config.scaling_factor)))
         if empty_prompt is None and config.prompt_tokens:
@@ -113,7 +106,7 @@ class Generator(GeneratorNetworks):
     # --- folders ------------------------------------------------------------------------------------------------------
     @classmethod
     def from_pretrained(cls, folder: str | Path) -> Generator:
-        """The generator of a folder by ``save_pretrained``, in float32 on the CPU, ready to run, its weights frozen.
+        """Load a folder of ``save_pretrained``, frozen, in float32, on the CPU.
 
         Raises:
             GeneratorError: No such folder; settings or weights that are missing, extra or of another shape.
@@ -122,17 +115,16 @@ class Generator(GeneratorNetworks):
         config = GeneratorConfig.from_dict(data.get("generator", {}), f"{folder}/config.json")
         _networks()
         with torch.device("meta"):
-            made = cls.from_config(config)
-        check_tensors(made.state_dict(), tensors, str(folder))
-        made.load_state_dict(
-            {name: t.float() if t.is_floating_point() else t for name, t in tensors.items()}, assign=True
-        )
-        # As a part of a user's module they must not be found by its optimiser, or waited for by DDP.
-        return made.eval().requires_grad_(False)
+            generator = cls.from_config(config)
+        check_tensors(generator.state_dict(), tensors, str(folder))
+        weights = {name: t.float() if t.is_floating_point() else t for name, t in tensors.items()}
+        generator.load_state_dict(weights, assign=True)
+        # Inside a user's module its parameters must not be found by the optimiser or DDP.
+        return generator.eval().requires_grad_(False)
 
     @classmethod
     def shipped(cls) -> Generator:
-        """The ``compact`` generator that comes with the package; see ``weights/README.md`` for what it was trained on.
+        """Load the ``compact`` generator that comes with the package, see ``weights/README.md``.
 
         Raises:
             GeneratorError: The package was installed without its data.
@@ -140,11 +132,11 @@ class Generator(GeneratorNetworks):
         return cls.from_pretrained(_SHIPPED)
 
     def save_pretrained(self, folder: str | Path, *, dtype: torch.dtype | None = None) -> None:
-        """Write the generator to a folder of its own; a checkpoint that is there is replaced once the new one is whole.
+        """Write the generator to a folder of its own, atomically.
 
         Args:
-            folder: Made if it is not there.
-            dtype: Of the stored weights; as they are where None. float16 halves a file, and is loaded as float32.
+            folder: Created if needed.
+            dtype: Of the stored weights, by default their own; float16 halves the file and is loaded as float32.
 
         Raises:
             OSError: The disk is full, or the folder cannot be written.
@@ -155,6 +147,6 @@ class Generator(GeneratorNetworks):
         scaled = replace(self.config.autoencoder, scale=self.autoencoder.scale)
         write_checkpoint(Path(folder), {"generator": replace(self.config, autoencoder=scaled).to_dict()}, tensors)
 
-    # --- used ---------------------------------------------------------------------------------------------------------
+    # --- use ----------------------------------------------------------------------------------------------------------
     complete_views = complete
     complete_batch = complete_batch

@@ -1,4 +1,4 @@
-"""Holes filled from their borders: the classical baseline, and what a generator starts from."""
+"""Inpainting of holes from their borders: the classical baseline, and the generator's starting point."""
 
 from __future__ import annotations
 
@@ -7,40 +7,35 @@ import numpy as np
 import torch
 
 RADIUS_PX = 3.0
-"""Of Telea's neighbourhood: the value OpenCV's own example uses; larger ones blur and take longer."""
+"""Radius of Telea's neighbourhood, from OpenCV's example."""
 
 _MARGIN_PX = 8
-"""Around holes: the neighbourhood, its gradients, and the band in which distances are held; more changes nothing."""
+"""Margin around holes that Telea's method reads."""
 
 GREY = 0.5
-"""Where nothing at all is known."""
+"""Value of images without known pixels."""
 
 
 def telea(image: torch.Tensor, hole: torch.Tensor) -> torch.Tensor:
-    """The image with its holes filled by Telea's fast marching (2004); every other pixel stays as it is, bit for bit.
+    """Fill the holes (h, w) of an image (3, h, w), uint8 or float in [0, 1], by Telea's fast marching (2004).
 
-    The filled values have 8 bits. Not differentiable.
-
-    Args:
-        image: (3, h, w) uint8, or float in [0, 1]; its values in the holes do not matter.
-        hole: (h, w) bool.
+    All other pixels are unchanged. Filled values have 8 bits and no gradients.
     """
     if not hole.any():
         return image
-    whole = image.dtype == torch.uint8
+    is_uint8 = image.dtype == torch.uint8
     if hole.all():
-        return torch.full_like(image, round(GREY * 255) if whole else GREY)
+        return torch.full_like(image, round(GREY * 255) if is_uint8 else GREY)
     box = tuple(_with_margin(hole.any(1 - axis).nonzero(), side) for axis, side in enumerate(hole.shape))
     part, marks = image[:, box[0], box[1]].detach(), hole[box]
-    picture = part if whole else (part.float() * 255).round().clamp(0, 255).to(torch.uint8)
-    planes = np.ascontiguousarray(picture.cpu().permute(1, 2, 0).numpy())
-    done = cv2.inpaint(planes, marks.cpu().numpy().astype(np.uint8), RADIUS_PX, cv2.INPAINT_TELEA)
-    made = torch.from_numpy(done).permute(2, 0, 1).to(image.device)
+    pixels = part if is_uint8 else (part.float() * 255).round().clamp(0, 255).to(torch.uint8)
+    planes = np.ascontiguousarray(pixels.cpu().permute(1, 2, 0).numpy())
+    inpainted = cv2.inpaint(planes, marks.cpu().numpy().astype(np.uint8), RADIUS_PX, cv2.INPAINT_TELEA)
+    values = torch.from_numpy(inpainted).permute(2, 0, 1).to(image.device)
     filled = image.detach().clone()
-    filled[:, box[0], box[1]] = torch.where(marks, made if whole else (made.float() / 255).to(image.dtype), part)
+    filled[:, box[0], box[1]] = torch.where(marks, values if is_uint8 else (values.float() / 255).to(image.dtype), part)
     return filled
 
 
-def _with_margin(there: torch.Tensor, side: int) -> slice:
-    """Indices from the first to the last with what Telea's method looks at around them."""
-    return slice(max(int(there.min()) - _MARGIN_PX, 0), min(int(there.max()) + 1 + _MARGIN_PX, side))
+def _with_margin(indices: torch.Tensor, side: int) -> slice:
+    return slice(max(int(indices.min()) - _MARGIN_PX, 0), min(int(indices.max()) + 1 + _MARGIN_PX, side))

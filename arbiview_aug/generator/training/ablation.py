@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.correspondence import Correspondence
 from arbiview_aug.generator.denoiser import REGRESSION, Rows
@@ -139,15 +140,11 @@ def ablate(
 
 
 def text_of(table: dict[str, dict[str, Any]]) -> str:
-    """Format the table: dB inside the holes."""
-    right = f"seen by a source:{'with':>8}{'without':>9}{'wrong rig':>11}"
-    head = f"{'variant':<24}{'one step':>10}{'sample':>9}  | {right}  | top-1"
-    lines = ["PSNR inside the holes; left: against Telea's, held-out targets; right: one-step", head]
+    """Format the scores: gains over Telea on held-out targets, then PSNR where a source sees the hole, in one step."""
+    rows = []
     for variant, row in table.items():
         gain, seen = row["against Telea"], row["seen by a source"]
-        ways = [seen[f"one step, {name}"] for name in ("attention", "no attention", "wrong rig")]
-        lines.append(
-            f"{variant:<24}{gain['one_step']['mean']:>+10.2f}{gain['sample']['mean']:>+9.2f}  |                  "
-            f"{ways[0]:>8.2f}{ways[1]:>9.2f}{ways[2]:>11.2f}  | {row['top-1']:.0%}"
-        )
-    return "\n".join(lines)
+        cells = [f"{gain[way]['mean']:+.2f}" for way in ("one_step", "sample")]
+        cells += [f"{seen[f'one step, {name}']:.2f}" for name in ("attention", "no attention", "wrong rig")]
+        rows.append([variant, *cells, f"{row['top-1']:.0%}"])
+    return markdown_table(("dB in the holes", "one step", "sample", "seen", "without", "wrong rig", "top-1"), rows)

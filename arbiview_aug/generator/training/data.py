@@ -1,4 +1,4 @@
-"""Frames to train on: any of the package's readers, at the training size, split by scenes."""
+"""Training frames of any of the package's readers, at the training size, split by scenes (Sec. Dataset)."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ SHARES = (0.6, 0.2)
 """Shares of the scenes for training and validation; the rest are held out (Sec. Dataset)."""
 
 _BLOCKS = 10
-"""Scenes that one drive without scenes is cut into."""
+"""Number of scenes into which a drive without scenes is cut."""
 
-HELD_BYTES = 4 * 2**30
-"""Memory for frames, of all workers together: 8 000 of six 128 x 224 images."""
+CACHE_BYTES = 4 * 2**30
+"""Memory for frames, of all workers together: 8,000 of six 128 x 224 images."""
 
 
 class TrainingFrame(NamedTuple):
@@ -36,8 +36,8 @@ class TrainingFrame(NamedTuple):
 
     Attributes:
         images: N tensors (3, h, w) uint8, at the training size.
-        rig: Their N cameras at that size, with masks of the own car.
-        token: Names it.
+        rig: Their N cameras at that size, with masks of their own car.
+        token: Its name.
     """
 
     images: list[torch.Tensor]
@@ -54,17 +54,17 @@ class Split(NamedTuple):
 
 
 class Frames:
-    """Frames of a data set at the training size, held in memory once they are read.
+    """Frames of a data set at the training size, cached in memory.
 
     Args:
         dataset: A map-style data set of this package.
         size: (h, w).
-        scenes: For each frame the name of its scene.
+        scenes: Name of the scene of each frame.
     """
 
     def __init__(self, dataset: Dataset[dict[str, Any]], size: tuple[int, int], scenes: Sequence[str]) -> None:
         self.dataset, self.size, self.scenes = dataset, size, list(scenes)
-        self._held: LRUCache[int, TrainingFrame] = LRUCache(HELD_BYTES, _bytes_of)
+        self._cache: LRUCache[int, TrainingFrame] = LRUCache(CACHE_BYTES, _bytes_of)
 
     def __len__(self) -> int:
         return len(self.scenes)
@@ -72,8 +72,8 @@ class Frames:
     def __getitem__(self, index: int) -> TrainingFrame:
         worker = get_worker_info()
         if worker is not None:
-            self._held.limit = HELD_BYTES // worker.num_workers
-        return self._held.get(index, lambda: self._read(index))
+            self._cache.limit = CACHE_BYTES // worker.num_workers
+        return self._cache.get(index, lambda: self._read(index))
 
     def _read(self, index: int) -> TrainingFrame:
         sample = self.dataset[index]
@@ -81,44 +81,31 @@ class Frames:
         return TrainingFrame([resized(image, self.size) for image in sample["images"]], rig, str(sample["token"]))
 
     def prepare(self, indices: Sequence[int], *, workers: int = 0, show: bool = True) -> None:
-        """Read frames before workers fork: they share the memory.
-
-        Args:
-            indices: Which.
-            workers: Processes that read; 0 reads here.
-            show: Progress bar.
-        """
+        """Read frames with ``workers`` processes, before those that make items fork and share the memory."""
         read: DataLoader[TrainingFrame] = DataLoader(
             self,  # type: ignore[arg-type]
             batch_size=None,
             sampler=indices,
             num_workers=workers,
             multiprocessing_context=forked(workers),
-            collate_fn=_as_it_is,
+            collate_fn=_unchanged,
         )
         for index, frame in zip(indices, tqdm(read, desc="frames", unit="frame", disable=not show), strict=True):
-            if workers:  # out of the memory that processes share: each tensor there keeps a file open
+            if workers:  # copied, since each tensor in shared memory keeps a file open
                 frame = frame._replace(images=[image.clone() for image in frame.images])
-            self._held.get(index, partial(_as_it_is, frame))
+            self._cache.get(index, partial(_unchanged, frame))
 
     def check_fits(self, indices: Sequence[int]) -> None:
-        """Refuse frames that cannot all be held.
-
-        Raises:
-            TrainingError: With the fix.
-        """
+        """Raise TrainingError if these frames do not fit into memory together."""
         needed = len(indices) * _bytes_of(self[indices[0]])
-        if needed > HELD_BYTES:
+        if needed > CACHE_BYTES:
             raise TrainingError(
-                f"scenes: expected frames of at most {HELD_BYTES / 2**30:g} GiB together, since workers cannot render "
+                f"scenes: expected frames of at most {CACHE_BYTES / 2**30:g} GiB together, since workers cannot render "
                 f"on a GPU, got {needed / 2**30:.1f} GiB; take fewer, or workers=0"
             )
 
     def split(self, seed: int = 0) -> Split:
-        """60/20/20 by scenes: no scene is in two parts. Depends on the seed and the scenes' names alone.
-
-        A data set of one or two scenes has no held-out ones.
-        """
+        """Split 60/20/20 by whole scenes; depends on the seed and the scenes' names alone."""
         names = sorted(set(self.scenes))
         order = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed)).tolist()
         first = max(1, round(SHARES[0] * len(names)))
@@ -135,7 +122,7 @@ def _bytes_of(frame: TrainingFrame) -> int:
 
 
 def forked(workers: int) -> str | None:
-    """Start method of workers: fork, so that they share this process's frames (not the default from Python 3.14)."""
+    """Start method of workers: fork, to share this process's frames (not the default from Python 3.14)."""
     return "fork" if workers else None
 
 
@@ -152,24 +139,24 @@ def one_thread_worker(worker: int) -> None:
     ignore_stop_requests()
 
 
-def _as_it_is(value: Any) -> Any:
+def _unchanged(value: Any) -> Any:
     return value
 
 
 def open_frames(
     data: str, size: tuple[int, int], *, scenes: int, seed: int = 0, device: torch.device | str = "cpu"
 ) -> Frames:
-    """The frames that ``--data`` names.
+    """Open the frames that ``--data`` names.
 
     Args:
-        data: ``synthetic``, or ``KIND:PATH`` as ``open_data`` takes it.
+        data: ``synthetic``, or ``KIND:PATH`` as in ``open_data``.
         size: (h, w) of the images.
-        scenes: How many synthetic streets.
-        seed: Of the streets.
-        device: Where streets are rendered; on a GPU prepare the frames, since workers cannot render there.
+        scenes: Number of synthetic streets.
+        seed: Seed of the streets.
+        device: Device on which streets are rendered; workers cannot render on a GPU.
 
     Raises:
-        TrainingError: None of these.
+        TrainingError: An unknown kind of data.
         DataError: The folder holds no such data.
     """
     kind, _, folder = data.partition(":")

@@ -1,7 +1,6 @@
 """Hole masks: FAVS coverage of cameras drawn from the retarget distribution.
 
-Algorithm 1 alone trains next to no hole filling: its pseudo pair holds 89 to 100 % of the real view. At inference a
-turn of the rig leaves 0.5 to 14 % of a view open, another field of view 21 to 51 %, another pitch 19 to 30 %.
+Algorithm 1 alone hardly trains hole filling: its pseudo pair shows 89 to 100 % of the real view.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from arbiview_aug.render.plan import build_plan
 _YAW_DEG = (13.75, 35.0)  # the paper's rotations
 _PITCH_DEG = (5.0, 12.0)
 _FOCAL = (0.4, 0.85)  # of a 65° lens: 74 to 115°
-_LEAST, _MOST = 0.02, 0.75
+_MIN_HOLES, _MAX_HOLES = 0.02, 0.75
 _TRIES = 8
 
 
@@ -33,7 +32,7 @@ def one_of(rng: torch.Generator, count: int) -> int:
 
 
 def retarget(camera: Camera, rng: torch.Generator) -> Camera:
-    """A target camera as another vehicle might have it: turned aside, pitched, or with a wider lens."""
+    """Draw a target camera: turned aside, pitched, or with a wider lens."""
     kind, sign = one_of(rng, 3), 1 if one_of(rng, 2) else -1
     if kind == 0:
         return camera.turned(yaw_deg=sign * uniform(rng, *_YAW_DEG))
@@ -50,24 +49,17 @@ def with_focal(camera: Camera, factor: float) -> Camera:
 
 
 def mask_bank(rig: Rig, count: int, seed: int) -> torch.Tensor:
-    """(count, h, w) bool: what FAVS covers of so many drawn targets, each with holes of 2 to 75 %.
-
-    Args:
-        rig: Of the frames, all cameras of one size.
-        count: How many.
-        seed: Of the draws.
-    """
+    """(count, h, w) bool coverage of drawn targets with holes of 2 to 75 %; all cameras of the rig have one size."""
     rng = torch.Generator().manual_seed(seed)
     masks: list[np.ndarray] = []
     while len(masks) < count:
         for _ in range(_TRIES):
             camera = retarget(rig[one_of(rng, len(rig))], rng)
-            covered = build_plan(
-                rig, Rig([replace(camera, mask=None)], ground_z_m=rig.ground_z_m), surface="far"
-            ).coverage[0]
-            if _LEAST <= 1 - covered.mean() <= _MOST:
+            target = Rig([replace(camera, mask=None)], ground_z_m=rig.ground_z_m)
+            covered = build_plan(rig, target, surface="far").coverage[0]
+            if _MIN_HOLES <= 1 - covered.mean() <= _MAX_HOLES:
                 break
-        else:  # a rig that covers everything, or next to nothing: a hole at the side
+        else:  # the rig covers everything or almost nothing: a hole at the side
             covered = np.ones(rig[0].size, bool)
             covered[:, : max(1, round(covered.shape[1] * uniform(rng, 0.1, 0.5)))] = False
         masks.append(covered)

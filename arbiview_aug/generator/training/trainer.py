@@ -140,7 +140,10 @@ class Trainer:
             OSError: The last state could not be saved.
         """
         config = self.config
-        writer = self._writer() if self.is_main else None
+        writer = None
+        if self.is_main:
+            tensorboard = optional_package("torch.utils.tensorboard", "generator")
+            writer = tensorboard.SummaryWriter(str(self.output / "logs"), purge_step=self.done or None)
         bar = tqdm(total=config.steps, initial=self.done, desc="train", unit="step", disable=not self.show)
         try:
             with self._stop:
@@ -240,10 +243,6 @@ class Trainer:
             self.say(f"step {self.done}: not saved, going on with the last good state: {error}")
 
     # --- logs ---------------------------------------------------------------------------------------------------------
-    def _writer(self) -> Any:
-        tensorboard = optional_package("torch.utils.tensorboard", "generator")
-        return tensorboard.SummaryWriter(str(self.output / "logs"), purge_step=self.done or None)
-
     def _log(self, writer: Any, bar: Any, terms: Mapping[str, float]) -> None:
         for name, value in terms.items():
             writer.add_scalar(f"loss/{name}", value, self.done)
