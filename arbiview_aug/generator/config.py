@@ -59,26 +59,13 @@ def from_plain(kind: type[_Config], data: Any, where: str, error: type[ArbiviewE
 class UNetConfig:
     """The U-Net, in the terms of diffusers' ``UNet2DConditionModel``."""
 
-    widths: tuple[int, ...]
-    """Channels of each level, the finest first; multiples of 32, the width of an attention head."""
-
-    transformers: tuple[bool, ...]
-    """Whether a level has self- and cross-attention inside its blocks."""
-
-    cross_view: tuple[bool, ...] = ()
-    """Whether views read each other at a level; empty: at all. The finest costs most."""
-
-    layers: int = 2
-    """Residual layers of an encoder block; decoder blocks have one more."""
-
-    context_width: int = 128
-    """Width of the cross-attention context: 768 in Stable Diffusion 1.x."""
-
-    heads: tuple[int, ...] = ()
-    """Heads of the attention inside the blocks; empty: 32 channels each."""
-
+    widths: tuple[int, ...]  # channels of each level, the finest first; multiples of 32, the width of an attention head
+    transformers: tuple[bool, ...]  # whether a level has self- and cross-attention inside its blocks
+    cross_view: tuple[bool, ...] = ()  # whether views read each other at a level; empty: at all. The finest costs most
+    layers: int = 2  # residual layers of an encoder block; decoder blocks have one more
+    context_width: int = 128  # width of the cross-attention context: 768 in Stable Diffusion 1.x
+    heads: tuple[int, ...] = ()  # heads of the attention inside the blocks; empty: 32 channels each
     norm_groups: int = 32
-    """Groups of the group norms."""
 
     def __post_init__(self) -> None:
         widths, count = self.widths, len(self.widths)
@@ -107,23 +94,12 @@ class UNetConfig:
 class AutoencoderConfig:
     """The autoencoder between images and latents: diffusers' ``AutoencoderKL``, or squares of pixels without one."""
 
-    widths: tuple[int, ...] = ()
-    """Channels of each level, one level more than halvings; empty: squares of pixels, which lose nothing."""
-
-    patch: int = 1
-    """Side of the square of pixels in a latent pixel, without an ``AutoencoderKL``."""
-
+    widths: tuple[int, ...] = ()  # channels of each level, one level more than halvings; empty: squares of pixels
+    patch: int = 1  # side of the square of pixels in a latent pixel, without an AutoencoderKL
     layers: int = 2
-    """Residual layers of an encoder block."""
-
-    latent_channels: int = 3
-    """Channels of a latent; 3 patch² for squares of pixels."""
-
+    latent_channels: int = 3  # channels of a latent; 3 patch² for squares of pixels
     norm_groups: int = 16
-    """Groups of the group norms."""
-
-    scale: float = 1.0
-    """Factor that gives latents unit variance; set from the data after training."""
+    scale: float = 1.0  # factor that gives latents unit variance; set from the data after training
 
     def __post_init__(self) -> None:
         widths, pixels = self.widths, 3 * self.patch**2
@@ -154,53 +130,23 @@ class GeneratorConfig:
     """A generator: its networks, its diffusion and how it samples by default."""
 
     name: str
-    """Display name."""
-
-    image_size: tuple[int, int]
-    """(h, w) in pixels at which views are completed; multiples of the autoencoder's factor."""
-
+    image_size: tuple[int, int]  # (h, w) in pixels at which views are completed; multiples of the autoencoder's factor
     unet: UNetConfig
     autoencoder: AutoencoderConfig = field(default_factory=AutoencoderConfig)
 
     prediction: Prediction = "v_prediction"
-    """Output of the denoiser."""
-
-    zero_snr: bool = True
-    """Zero terminal SNR: nothing of the image is left at t = 999; never with ε."""
-
-    residual: bool = True
-    """Diffuse the difference between the image and the pre-filled condition, see ``Denoiser``; never with ε. The first
-    of several steps is then the regression, whose result is noised again."""
-
-    prefilled: bool = True
-    """Fill holes of the condition by Telea's inpainting; else they are mid-grey, as in Algorithm 1."""
-
-    one_step: bool = True
-    """Whether the one-step regression was trained."""
-
-    frozen_unet: bool = False
-    """Train only attention, pose, the one-step head and the widened ``conv_in``."""
-
-    prompt_tokens: int = 0
-    """Tokens of the empty prompt's embedding."""
-
-    facing_m: float = FACING_M
-    """Distance of the depth level that faces the camera."""
-
-    steps: int = 4
-    """Denoising steps; 1 is the one-step regression."""
-
-    guidance: float = 1.0
-    """Classifier-free guidance; 1 is none and takes half the time."""
-
-    guidance_rescale: float = 0.7
-    """φ of the rescaled guidance (Lin et al. 2023)."""
-
-    strength: float = 1.0
-    """Share of the diffusion by which pre-filled latents are noised: 0.6 starts at t = 599."""
-
-    temperature: float = 0.5
-    """Standard deviation of the initial noise; at 1 a perfect sampler is 3 dB below the posterior's mean."""
+    zero_snr: bool = True  # zero terminal SNR: nothing of the image is left at t = 999; never with ε
+    residual: bool = True  # diffuse the difference between image and pre-filled condition; never with ε
+    prefilled: bool = True  # inpaint the condition's holes by Telea's method; else mid-grey, as in Algorithm 1
+    one_step: bool = True  # whether the one-step regression was trained
+    frozen_unet: bool = False  # train only attention, pose, the one-step head and the widened conv_in
+    prompt_tokens: int = 0  # tokens of the empty prompt's embedding
+    facing_m: float = FACING_M  # distance of the depth level that faces the camera
+    steps: int = 4  # denoising steps; 1 is the one-step regression
+    guidance: float = 1.0  # classifier-free guidance; 1 is none and takes half the time
+    guidance_rescale: float = 0.7  # φ of the rescaled guidance (Lin et al. 2023)
+    strength: float = 1.0  # share of the diffusion by which pre-filled latents are noised: 0.6 starts at t = 599
+    temperature: float = 0.5  # deviation of the initial noise; at 1 a sample is 3 dB below the posterior's mean
 
     def __post_init__(self) -> None:
         factor, epsilon = self.autoencoder.factor, self.prediction == "epsilon"

@@ -53,7 +53,6 @@ class Denoiser(nn.Module):
 
     Args:
         unet: A diffusers ``UNet2DConditionModel`` as ``UNetConfig`` describes; ``conv_in`` is widened by zeros.
-        levels: Depth levels of the attention.
         prompt_tokens: Tokens of the empty prompt's embedding.
         cross_view: Whether views read each other at each level, the finest first; empty: at all.
         signal: (T,) √ᾱ_t of the schedule: the network then predicts the residual between image and condition. None
@@ -70,7 +69,6 @@ class Denoiser(nn.Module):
     def __init__(
         self,
         unet: Any,
-        levels: int = len(LEVELS),
         prompt_tokens: int = 0,
         cross_view: Sequence[bool] = (),
         signal: torch.Tensor | None = None,
@@ -83,7 +81,7 @@ class Denoiser(nn.Module):
         used = tuple(cross_view) or (True,) * len(widths)
         of_blocks = zip((*widths, widths[-1], *widths[::-1]), (*used, used[-1], *used[::-1]), strict=True)
         self.cross_view = nn.ModuleDict(
-            {str(k): CrossViewAttention(width, levels) for k, (width, is_used) in enumerate(of_blocks) if is_used}
+            {str(k): CrossViewAttention(width, len(LEVELS)) for k, (width, is_used) in enumerate(of_blocks) if is_used}
         )
         self.context = PoseContext(int(unet.config.cross_attention_dim), prompt_tokens)
         self.regression = nn.Conv2d(widths[0], self.latent_channels, 3, padding=1)

@@ -16,7 +16,6 @@ from arbiview_aug.generator.checkpoint import CONFIG_FILE, check_tensors, read_c
 from arbiview_aug.generator.completion import complete
 from arbiview_aug.generator.conditioning import input_channels
 from arbiview_aug.generator.config import GeneratorConfig, paper
-from arbiview_aug.generator.correspondence import LEVELS
 from arbiview_aug.generator.denoiser import Denoiser
 from arbiview_aug.generator.networks import GeneratorNetworks
 from arbiview_aug.generator.sampler import noise_schedule
@@ -62,7 +61,7 @@ class Generator(GeneratorNetworks):
             with torch.device("cpu"):  # also where the weights are on meta
                 schedule = noise_schedule(prediction=config.prediction, zero_snr=config.zero_snr)
             signal = schedule.alphas_cumprod.double().sqrt().float()
-        denoiser = Denoiser(unet, len(LEVELS), config.prompt_tokens, config.unet.cross_view, signal)
+        denoiser = Denoiser(unet, config.prompt_tokens, config.unet.cross_view, signal)
         return cls(config, denoiser, Autoencoder(vae, config.autoencoder.scale, config.autoencoder.patch))
 
     @classmethod
@@ -95,7 +94,7 @@ class Generator(GeneratorNetworks):
         config = replace(config, autoencoder=replace(config.autoencoder, scale=float(vae.config.scaling_factor)))
         if empty_prompt is None and config.prompt_tokens:
             empty_prompt = embedded_empty_prompt(where)
-        denoiser = Denoiser(unet, len(LEVELS), config.prompt_tokens, config.unet.cross_view)
+        denoiser = Denoiser(unet, config.prompt_tokens, config.unet.cross_view)
         if empty_prompt is not None:
             expected = tuple(denoiser.context.empty_prompt.shape)
             if tuple(empty_prompt.shape) != expected:

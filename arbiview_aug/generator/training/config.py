@@ -25,41 +25,19 @@ def _is_share(value: float) -> bool:
 class PseudoViewConfig:
     """Pseudo views (Algorithm 1) and what is added to them; probabilities are per training item."""
 
-    pairs: int = 1
-    """K of Algorithm 1: left and right pairs of pseudo poses per draw of a real view; each is an item of its own."""
-
-    yaw_deg: tuple[float, float] = (5.0, 35.0)
-    """Range of a pseudo pose's turn to its side."""
-
-    pitch_deg: float = 8.0
+    pairs: int = 1  # K of Algorithm 1: pairs of pseudo poses per draw of a real view; each is an item of its own
+    yaw_deg: tuple[float, float] = (5.0, 35.0)  # range of a pseudo pose's turn to its side
+    pitch_deg: float = 8.0  # half-widths of the other turns and moves
     lateral_m: float = 1.0
     vertical_m: float = 0.3
-    """Half-widths of the other turns and moves."""
-
-    moved: float = 0.5
-    """Probability that pseudo poses are translated; without translation infinity is the only depth level."""
-
-    focal: tuple[float, float] = (0.7, 1.3)
-    """Factor of the focal length."""
-
-    transplanted: float = 0.8
-    """Probability of a target's coverage mask; Algorithm 1 leaves next to no holes."""
-
-    hidden: float = 0.5
-    """Share of these masks that hide the pixels from the source branches too, as at inference. In the rest the
-    branches show them, from which cross-view attention learns to read."""
-
-    leave_one_out: float = 0.1
-    """Probability that the real view is not among FAVS's sources."""
-
-    virtual: float = 0.3
-    """Probability that the target is the real view re-rendered under a random turn and focal length."""
-
-    real_sources: float = 0.3
-    """Probability that the source branches are the nearest real cameras, as at inference."""
-
-    mask_bank: int = 128
-    """Coverage masks drawn from the retarget distribution before training."""
+    moved: float = 0.5  # probability that pseudo poses are translated; otherwise infinity is the only depth level
+    focal: tuple[float, float] = (0.7, 1.3)  # range of the factor of the focal length
+    transplanted: float = 0.8  # probability of a target's coverage mask; Algorithm 1 leaves next to no holes
+    hidden: float = 0.5  # share of these masks that hide the pixels from the source branches too, as at inference
+    leave_one_out: float = 0.1  # probability that the real view is not among FAVS's sources
+    virtual: float = 0.3  # probability that the target is the real view under a random turn and focal length
+    real_sources: float = 0.3  # probability that the source branches are the nearest real cameras, as at inference
+    mask_bank: int = 128  # coverage masks drawn from the retarget distribution before training
 
     def __post_init__(self) -> None:
         shares = ("moved", "transplanted", "hidden", "leave_one_out", "virtual", "real_sources")
@@ -73,35 +51,16 @@ class PseudoViewConfig:
 class LossConfig:
     """L_total = L_main + geo · L_geo + perceptual · L_perceptual (Sec. Loss Function Design)."""
 
-    geo: float = 0.1
-    """α of the paper."""
-
-    geo_mode: GeoMode = "normalised"
-    """``frobenius_sum``: as printed, a sum that grows with resolution; ``normalised``: mean over rows."""
-
-    perceptual: float = 0.01
-    """β of the paper."""
-
-    perceptual_below_t: int = 300
-    """Latest time with L_perceptual: the x0 error is 0.57 times the ε error at t = 200, 14.6 times at t = 999."""
-
-    perceptual_every: int = 4
-    """Steps between two L_perceptual: decoding costs more than the U-Net."""
-
-    perceptual_crop: int = 64
-    """Side in pixels of the square that is compared."""
-
-    snr_limit: float = 5.0
-    """γ of Min-SNR-γ (Hang et al. 2023); 0 weighs all times alike, as printed. Unused by residual generators."""
-
-    snr_floor: float = 0.1
-    """Lower bound of the weight: Min-SNR alone is .0047 at t = 999, where few-step samplers start."""
-
-    known: float = 0.2
-    """Weight of pixels that the condition shows, relative to its holes: they are pasted back at inference."""
-
-    regression: float = 0.3
-    """Share of the items that train the one-step regression instead of the diffusion; 0 switches it off."""
+    geo: float = 0.1  # α of the paper
+    geo_mode: GeoMode = "normalised"  # mean over rows; frobenius_sum: as printed, grows with resolution
+    perceptual: float = 0.01  # β of the paper
+    perceptual_below_t: int = 300  # the x0 error is 0.57 times the ε error at t = 200, 14.6 times at t = 999
+    perceptual_every: int = 4  # steps between two L_perceptual: decoding costs more than the U-Net
+    perceptual_crop: int = 64  # side in pixels of the square that is compared
+    snr_limit: float = 5.0  # γ of Min-SNR-γ (Hang et al. 2023); 0 as printed. Unused by residual generators
+    snr_floor: float = 0.1  # lower bound of the weight: Min-SNR is .0047 at t = 999, where few-step samplers start
+    known: float = 0.2  # weight of known pixels relative to holes: they are pasted back at inference
+    regression: float = 0.3  # share of the items that train the one-step regression; 0 switches it off
 
     def __post_init__(self) -> None:
         _check(self, "normalised or frobenius_sum", lambda m: m in ("normalised", "frobenius_sum"), "geo_mode")
@@ -118,11 +77,8 @@ class AutoencoderTraining:
     steps: int = 3000
     batch: int = 32
     lr: float = 3e-4
-    kl: float = 1e-6
-    """Weight of the KL term: Stable Diffusion's (Rombach et al. 2022)."""
-
-    perceptual: float = 0.1
-    """Weight of the VGG term."""
+    kl: float = 1e-6  # weight of the KL term: Stable Diffusion's (Rombach et al. 2022)
+    perceptual: float = 0.1  # weight of the VGG term
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,40 +88,20 @@ class TrainConfig:
     generator: GeneratorConfig
     pseudo_views: PseudoViewConfig = field(default_factory=PseudoViewConfig)
     loss: LossConfig = field(default_factory=LossConfig)
-    autoencoder: AutoencoderTraining | None = None
-    """None if latents are pixels, or the autoencoder is pretrained."""
-
+    autoencoder: AutoencoderTraining | None = None  # None if latents are pixels, or the autoencoder is pretrained
     steps: int
-    batch: int
-    """Items per process and step."""
-
+    batch: int  # items per process and step
     lr: float
-    warmup: int = 100
-    """Steps of linear warm-up, before the cosine to 0."""
-
+    warmup: int = 100  # steps of linear warm-up, before the cosine to 0
     weight_decay: float = 1e-2
-    clip: float = 1.0
-    """Largest gradient norm."""
-
-    ema: float = 0.999
-    """Decay of the averaged weights; (1 + step) / (10 + step) while that is smaller."""
-
-    drop: float = 0.1
-    """Probability that condition, pose and sources are dropped together, for classifier-free guidance."""
-
-    attention: bool = True
-    """Whether views read each other; off for the ablation only."""
-
+    clip: float = 1.0  # largest gradient norm
+    ema: float = 0.999  # decay of the averaged weights; (1 + step) / (10 + step) while that is smaller
+    drop: float = 0.1  # probability that condition, pose and sources are dropped together, for classifier-free guidance
+    attention: bool = True  # whether views read each other; off for the ablation only
     precision: Literal["no", "bf16"] = "no"
-    checkpointing: bool = False
-    """Gradient checkpointing: recompute blocks in the backward pass."""
-
-    scenes: int = 240
-    """Number of synthetic streets."""
-
-    workers: int = 0
-    """Processes that make items, on the CPU; 0 makes them in this one, on the GPU if there is one."""
-
+    checkpointing: bool = False  # gradient checkpointing: recompute blocks in the backward pass
+    scenes: int = 240  # synthetic streets
+    workers: int = 0  # processes that make items, on the CPU; 0 makes them in this one, on the GPU if there is one
     seed: int = 0
     save_every: int = 500
     validate_every: int = 500

@@ -92,7 +92,7 @@ def answer_is_shown(k: int, **changes: Any) -> tuple[bool, bool]:
     made = items(**changes)
     plain = made[k]
     name = plain.tokens[0].split("/")[1]
-    for frame in made.frames._held._values.values():
+    for frame in made.frames._cache._values.values():
         place = frame.rig.names.index(name)
         image = frame.images[place].clone()
         image[:, ~HOLE[0]] = 255 - image[:, ~HOLE[0]]
