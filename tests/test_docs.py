@@ -21,6 +21,7 @@ from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import shipped_rigs
 from arbiview_aug.cli.bench import generator, neighbours, trade
 from arbiview_aug.cli.bench.ablation import NOTES, ROWS, STEPS, markdown
+from arbiview_aug.datasets import registry
 from arbiview_aug.evaluate import paper_study
 from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.evaluate.methods import study_methods
@@ -154,6 +155,11 @@ def check_filled(names: dict[str, Any]) -> None:
     assert names["filled"] > 0.03
 
 
+def check_read(names: dict[str, Any]) -> None:
+    assert names["sample"]["images"].shape == (6, 3, 45, 80) and names["sample"]["token"] == "000"
+    assert names["sample"]["rig"] == arbiview_aug.datasets.reduced_rig(names["rig"], 2)
+
+
 def check_completed(names: dict[str, Any]) -> None:
     assert 0.05 < names["completed"]["generated"].float().mean() < 0.5
 
@@ -162,6 +168,7 @@ CHECKS: dict[str, Callable[[dict[str, Any]], None]] = {
     "rigs.md": check_truck,
     "drives.md": check_filled,
     "holes.md": check_completed,
+    "contributing.md": check_read,
 }
 """What the names that a page's code leaves must be."""
 
@@ -169,6 +176,7 @@ CHECKS: dict[str, Callable[[dict[str, Any]], None]] = {
 @pytest.mark.parametrize("page", [p for p in DOCS if "```python" in text_of(p)], ids=name_of)
 def test_the_code_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "READERS", dict(registry.READERS))
     names = run_page(page)
     CHECKS.get(page.name, lambda _: None)(names)
 

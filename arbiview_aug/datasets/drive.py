@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -33,7 +34,10 @@ class Recording(Dataset[dict[str, Any]]):
     root: Path
     tokens: list[str]
     load_points: bool
-    _index: dict[str, int]
+
+    @cached_property
+    def _index(self) -> dict[str, int]:
+        return {token: k for k, token in enumerate(self.tokens)}
 
     def __len__(self) -> int:
         return len(self.tokens)

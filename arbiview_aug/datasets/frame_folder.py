@@ -129,7 +129,6 @@ class FrameFolder(Recording):
         self.root, self.reduce, self.load_points, self.neighbours = Path(root), reduce, load_points, neighbours
         self._frames = _find_frames(self.root)
         self.tokens = [frame.name for frame in self._frames]
-        self._index = {token: k for k, token in enumerate(self.tokens)}
         self._last_rig: tuple[str, Rig] | None = None
         self._times_s, order = _read_sequence(self.root, self._index)
         self._warn = WarnOnce()

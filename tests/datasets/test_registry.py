@@ -21,7 +21,6 @@ class Toy(Recording):
 
     def __init__(self, root: Path) -> None:
         self.root, self.tokens, self.load_points = root, ["street"], True
-        self._index = {"street": 0}
         self._drive = SyntheticDrive(demo_source_rig((48, 132)), num_frames=1, lidar=False)
 
     def __getitem__(self, index: int) -> dict[str, Any]:

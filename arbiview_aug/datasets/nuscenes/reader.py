@@ -112,7 +112,6 @@ class NuScenesDataset(Recording):
         samples = _chosen_samples(tables, split_scenes)
         self.tokens = [row["token"] for row in samples]
         self.scene_tokens: list[str] = [row["scene_token"] for row in samples]
-        self._index = {token: k for k, token in enumerate(self.tokens)}
         scene = {token: k for k, token in enumerate(dict.fromkeys(self.scene_tokens))}
         scenes = [scene[token] for token in self.scene_tokens]
         self.channels = _chosen_channels(tables, channels)
