@@ -140,12 +140,14 @@ def show(table: str, report: Mapping[str, Any], path: Path, *, as_json: bool = F
         DataError: It cannot be written.
     """
     text = json.dumps(report, indent=1)
+    print(text if as_json else table)  # first, so that an unwritable file does not lose the figures
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text + "\n")
     except OSError as error:
         raise DataError(f"--output {path}: expected a file that can be written to, got {error.strerror}") from None
-    print(text if as_json else f"{table}\nreport: {path}")
+    if not as_json:
+        print(f"report: {path}")
 
 
 def _status_kib(field: str) -> int:

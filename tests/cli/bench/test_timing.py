@@ -55,7 +55,8 @@ def test_peak_memory_is_seen_although_it_is_given_back() -> None:
     assert small is not None and small < 32  # the kernel counts in batches, for each core
 
 
-def test_report_that_cannot_be_written(tmp_path: Path) -> None:
+def test_report_that_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="expected a file that can be written to"):
-        show("", {}, tmp_path / "file" / "report.json")
+        show("the table", {}, tmp_path / "file" / "report.json")
+    assert "the table" in capsys.readouterr().out, "the figures are not lost"
