@@ -27,7 +27,7 @@ from arbiview_aug.generator.training.trainer import Trainer
 COMMANDS = ("train", "ablate", "evaluate")
 
 _TIMEOUT = timedelta(hours=3)
-"""Of the other processes, while one trains the autoencoder or scores."""
+"""Timeout of the other processes, while one trains the autoencoder or scores."""
 
 
 def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> int:
