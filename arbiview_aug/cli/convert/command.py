@@ -151,24 +151,16 @@ def _settings(arguments: argparse.Namespace) -> Settings:
                 "python -m arbiview_aug depth --data DIR, or name its folder (--motion-depth), or estimate it from "
                 "other frames (--neighbours 2)"
             )
+    unchanged = ("version", "path", "holes", "steps", "quality", "surface", "size", "fit", "reduce", "neighbours")
     return Settings(
         root=root,
         kind=kind,
-        version=arguments.version,
         target=load_rig(arguments.target),
         output=Path(arguments.output).absolute(),
-        path=arguments.path,
-        holes=arguments.holes,
         generator=None if arguments.generator is None else arguments.generator.absolute(),
-        steps=arguments.steps,
-        quality=arguments.quality,
-        surface=arguments.surface,
-        size=arguments.size,
-        fit=arguments.fit,
-        reduce=arguments.reduce,
-        neighbours=arguments.neighbours,
         motion_depth=None if depth is None else depth.absolute(),
         suffix=f".{arguments.images}",  # type: ignore[arg-type]
+        **{name: getattr(arguments, name) for name in unchanged},
     )
 
 

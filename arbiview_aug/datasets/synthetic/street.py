@@ -42,7 +42,6 @@ def make_scene(seed: int, index: int) -> Scene:
     world.add_blocks()
     world.add_buildings()
     world.add_background()
-    world.add_street_ends()
     world.add_parked()
     parked = len(world.builder.boxes)
     world.add_moving()
@@ -211,7 +210,7 @@ class _World:
                     x += width + gap
 
     def add_background(self) -> None:
-        """A closed row of houses or trees far behind, so that gaps do not open onto an empty plain."""
+        """A closed row of houses or trees far behind, and tall buildings where the street ends."""
         rng, base = self.rng, self.street.kerb_m
         for side in (-1, 1):
             for start, end in self.blocks:
@@ -228,14 +227,10 @@ class _World:
                             xyz = (x + 6 * k, self.side_y(side, distance - rng.uniform(0, 6)), base)
                             objects.add_bush(self.builder, rng, xyz, scale=rng.uniform(4, 8))
                     x += width + 0.1
-
-    def add_street_ends(self) -> None:
-        """Something tall where the street ends."""
-        rng = self.rng
         for direction in (-1, 1):
             if rng.random() < 0.7:
-                x = _span(direction * rng.uniform(185, 240), direction * 258.0)
-                objects.add_building(self.builder, rng, x, (-60, 60), 0.0, rng.uniform(14, 45))
+                xs = _span(direction * rng.uniform(185, 240), direction * 258.0)
+                objects.add_building(self.builder, rng, xs, (-60, 60), 0.0, rng.uniform(14, 45))
 
     def add_parked(self) -> None:
         """Rows of parked vehicles along the kerbs."""
