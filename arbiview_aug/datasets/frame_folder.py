@@ -75,33 +75,10 @@ class _Frame:
 class FrameFolder(Recording):
     """A folder that is a frame (it has ``calib.json``), or a folder of such folders, in the order of their names.
 
-    ``calib.json`` holds (other keys are ignored; those that look like a misspelt key give a warning, or an error where
-    geometry would be lost)::
-
-        {
-          "cameras": [                       one or more, in the order of the sample's images
-            {
-              "name": "CAM_FRONT",           unique
-              "file": "front.jpg",           JPEG or PNG, relative to the folder
-              "width": 1600, "height": 900,  pixels; the image must agree
-              "K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],      pixels, (0, 0) is the centre of the top-left pixel
-              "distortion": null,            or {"model": "radtan" | "fisheye", "coeffs": [...]} in OpenCV's order
-              "cam2ego": 4x4,                camera (right, down, forward) to ego (forward, left, up), metres
-              "mask": "front_mask.png"       optional; bright = scene, black = own car
-            }
-          ],
-          "ground_z_m": 0.0,                 height of the road in the ego frame; 0 if left out
-          "ego2world": 4x4,                  optional: the ego's pose, for sequences
-          "boxes_3d": [[x, y, z, length, width, height, yaw], ...],   optional: centre, metres, radians, ego frame
-          "lidar": {"file": "lidar.npy"}     optional: names the points; lidar.npy is found without it
-        }
-
-    A folder of frames may hold ``sequence.json``, the frames of one drive in the order in which they were recorded::
-
-        {"frames": ["000", {"name": "001", "time_s": 0.1}, ...]}      names of folders; seconds if known
-
-    The points are a float .npy of shape (P, >=3), x y z first, in the ego frame, metres. All files lie below ``root``,
-    which may be a link: names and links that leave it are refused.
+    ``docs/formats.md`` describes ``calib.json``, the points (a float .npy of shape (P, >=3), x y z first, in the ego
+    frame, metres) and ``sequence.json``, which may stand in a folder of frames and lists those of one drive in the
+    order of their recording. All files lie below ``root``, which may be a link: names and links that leave it are
+    refused.
 
     A sample is a dict: ``images`` (N, 3, h, w) uint8 RGB, or a list if sizes differ; ``rig`` (names, lenses, masks,
     ground); ``K`` (N, 3, 3) and ``cam2ego`` (N, 4, 4) float64; ``token`` (the folder's name); and, if the frame has
@@ -217,7 +194,7 @@ class FrameFolder(Recording):
 
     def _rig(self, calib: Mapping[str, Any], frame: _Frame) -> Rig:
         """The frame's rig; the last one itself if the calibration is the same."""
-        masks = [_mask_file(entry, frame) if isinstance(entry, Mapping) else None for entry in calib["cameras"]]
+        masks = [_mask_file(entry, frame) for entry in calib["cameras"]]
         bare = [_calibration_of(entry) for entry in calib["cameras"]]
         data = {"name": calib.get("name", calib.get("dataset", "")), "cameras": bare}
         data |= {key: calib[key] for key in ("ground_z_m", *misnamed(calib, ("ground_z_m",))) if key in calib}
@@ -239,7 +216,7 @@ def _find_frames(root: Path) -> list[_Frame]:
     if not frames:
         raise DataError(
             f"frame folder {root}: expected {CALIBRATION_FILE}, or folders that have one, found neither; "
-            "FrameFolder's documentation has the format"
+            "docs/formats.md has the format"
         )
     return frames
 
@@ -278,39 +255,33 @@ def _read_calibration(frame: _Frame) -> dict[str, Any]:
     if not isinstance(calib, dict) or not isinstance(calib.get("cameras"), list):
         got = type(calib).__name__ + (hint(calib, ("cameras",)) if isinstance(calib, dict) else "")
         raise DataError(f"{path}: expected an object with a list 'cameras', got {got}")
+    for k, entry in enumerate(calib["cameras"]):
+        if not isinstance(entry, dict):
+            raise CalibrationError(f"{path}: camera {k}: expected a mapping, got {type(entry).__name__}")
     return calib
 
 
-def _calibration_of(entry: Any) -> Any:
+def _calibration_of(entry: Mapping[str, Any]) -> dict[str, Any]:
     """Entries of a camera that decide the rig, without timestamps and files."""
-    if not isinstance(entry, Mapping):
-        return entry
     read = ("name", "width", "height", "K", "cam2ego", "distortion")
     return {key: entry[key] for key in (*read, *misnamed(entry, read)) if key in entry}
 
 
-def _image_file(entry: Any, frame: _Frame) -> Path:
-    label, file = _file_of(entry, "file")
+def _image_file(entry: Mapping[str, Any], frame: _Frame) -> Path:
+    label, file = f"camera {entry.get('name')!r}: file", entry.get("file")
     if not isinstance(file, str) or not file:
-        got = f"{file!r}{hint(entry, ('file',)) if isinstance(entry, Mapping) else ''}"
+        got = f"{file!r}{hint(entry, ('file',))}"
         raise DataError(f"{frame.where}: {label}: expected an image's file name, got {got}")
     return frame.file(file, label)
 
 
-def _mask_file(entry: Any, frame: _Frame) -> Path | None:
-    label, file = _file_of(entry, "mask")
+def _mask_file(entry: Mapping[str, Any], frame: _Frame) -> Path | None:
+    label, file = f"camera {entry.get('name')!r}: mask", entry.get("mask")
     if file is None:
         return None
     if not isinstance(file, str) or not file:
         raise CalibrationError(f"{frame.where}: {label}: expected an image's file name, got {file!r}")
     return frame.mask(file, label)
-
-
-def _file_of(entry: Any, key: str) -> tuple[str, Any]:
-    """Label for messages and name of a camera's file."""
-    if not isinstance(entry, Mapping):
-        return f"camera {entry!r}: {key}", None
-    return f"camera {entry.get('name')!r}: {key}", entry.get(key)
 
 
 def _with_mask(camera: Camera, path: Path | None, frame: _Frame) -> Camera:

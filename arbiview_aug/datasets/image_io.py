@@ -6,11 +6,10 @@ orientation, and may leave the output array untouched if decoding into it fails.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import cv2
 import numpy as np
@@ -34,19 +33,16 @@ _REDUCED_FLAGS = {
 _RGB_FLAG: int | None = getattr(cv2, "IMREAD_COLOR_RGB", None)
 _FLAGS = cv2.IMREAD_IGNORE_ORIENTATION | (cv2.IMREAD_COLOR if _RGB_FLAG is None else _RGB_FLAG)
 
-_PNG_START = b"\x89PNG\r\n\x1a\n"
-_PNG_END = b"IEND\xaeB`\x82"
-_JPEG_END = b"\xff\xd9"
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0..15, without DHT, JPG and DAC
-_BARE_MARKERS = frozenset({0x01, *range(0xD0, 0xD9)})  # TEM, RST0..7, SOI: no length follows
 
 
 class ImageHeader(NamedTuple):
-    """Format and (h, w) of an image file, and the offset of a JPEG's first scan."""
+    """Format and (h, w) of an image file."""
 
-    format: Literal["JPEG", "PNG"]
+    format: str
     size: tuple[int, int]
-    scan_offset: int
 
 
 def decode_images(
@@ -138,25 +134,40 @@ def read_header(path: Path, label: str | None = None) -> ImageHeader:
     """
     label = label or _label(path.stem, path)
     try:
-        with path.open("rb") as file:
-            start = file.read(26)
-            if not start:
-                raise DataError(f"{label}: expected a JPEG or PNG, got an empty file (0 bytes); copy it again")
-            if start.startswith(_PNG_START):
-                header = _read_png_header(start, label)
-            elif start.startswith(b"\xff\xd8"):
-                header = _read_jpeg_header(file, label)
-            else:
-                raise DataError(f"{label}: expected a JPEG or PNG, got a file that begins with {start[:8]!r}")
-            _check_complete(file, header, label)
-            return header
+        data = path.read_bytes()
     except FileNotFoundError:
         raise DataError(f"{label}: expected an image file, found none; check the path and the data root") from None
-    except DataError:
-        raise
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
         got = getattr(error, "strerror", None) or error
         raise DataError(f"{label}: expected a readable image file, got {got}") from None
+    if not data:
+        raise DataError(f"{label}: expected a JPEG or PNG, got an empty file (0 bytes); copy it again")
+    if data.startswith(_JPEG_START):
+        format, size, ended = "JPEG", *_jpeg_size(data)
+    elif data.startswith(_PNG_START):
+        format, size, ended = "PNG", (_number(data, 20, 4), _number(data, 16, 4)), data.rfind(_PNG_END) > 0
+    else:
+        raise DataError(f"{label}: expected a JPEG or PNG, got a file that begins with {data[:8]!r}")
+    if not ended:
+        raise DataError(f"{label}: expected a complete {format}, got a truncated file; copy it again")
+    return ImageHeader(format, size)
+
+
+def _jpeg_size(data: bytes) -> tuple[tuple[int, int], bool]:
+    """(h, w) from a JPEG's frame header, and whether the end follows the first scan.
+
+    Segments before the scan may hold thumbnails with ends of their own; padding or maker notes may follow the end.
+    """
+    size, at = (0, 0), len(_JPEG_START)
+    while data[at : at + 1] == b"\xff" and (marker := _number(data, at + 1, 1)) != 0xDA:
+        if marker in _FRAME_HEADERS:
+            size = _number(data, at + 5, 2), _number(data, at + 7, 2)
+        at += 1 if marker == 0xFF else 2 + _number(data, at + 2, 2)  # fill bytes may precede a marker
+    return size, size != (0, 0) and data.rfind(_JPEG_END) >= at
+
+
+def _number(data: bytes, at: int, length: int) -> int:
+    return int.from_bytes(data[at : at + length], "big")
 
 
 def _label(name: str, path: Path) -> str:
@@ -170,57 +181,6 @@ def _check_size(size: tuple[int, int], calibrated: tuple[int, int], label: str) 
             fix = "the calibration's width and height look swapped"
         h, w = size
         raise DataError(f"{label}: expected {calibrated[1]}x{calibrated[0]} (w x h) as calibrated, got {w}x{h}; {fix}")
-
-
-def _read_png_header(start: bytes, label: str) -> ImageHeader:
-    if len(start) < 24 or start[12:16] != b"IHDR":
-        raise _truncated("PNG", "no header", label)
-    size = int.from_bytes(start[20:24], "big"), int.from_bytes(start[16:20], "big")
-    return ImageHeader("PNG", size, 0)
-
-
-def _read_jpeg_header(file: BinaryIO, label: str) -> ImageHeader:
-    """Walk the segments to the frame header (SOF), which has the size, and on to the first scan (SOS)."""
-    size: tuple[int, int] | None = None
-    file.seek(2)
-    while True:
-        byte = file.read(1)
-        while byte == b"\xff":  # fill bytes before a marker
-            byte = file.read(1)
-        if not byte:
-            raise _truncated("JPEG", "it ends within its header", label)
-        marker = byte[0]
-        if marker in _BARE_MARKERS:
-            continue
-        length = int.from_bytes(file.read(2), "big")
-        if length < 2:
-            raise _truncated("JPEG", "a header segment has no length", label)
-        if marker == 0xDA:
-            if size is None:
-                raise DataError(f"{label}: expected a JPEG, got one without a frame header; copy the file again")
-            return ImageHeader("JPEG", size, file.tell())
-        if marker in _FRAME_HEADERS:
-            segment = file.read(length - 2)
-            size = int.from_bytes(segment[1:3], "big"), int.from_bytes(segment[3:5], "big")
-        else:
-            file.seek(length - 2, os.SEEK_CUR)
-
-
-def _check_complete(file: BinaryIO, header: ImageHeader, label: str) -> None:
-    end = _JPEG_END if header.format == "JPEG" else _PNG_END
-    file.seek(0, os.SEEK_END)
-    file.seek(max(0, file.tell() - 16))
-    if file.read().endswith(end):
-        return
-    # Bytes may follow the end (padding, maker notes). Thumbnails in a JPEG's header have end markers too: search from
-    # the scan, in which none occurs.
-    file.seek(header.scan_offset)
-    if end not in file.read():
-        raise _truncated(header.format, "its end marker is missing", label)
-
-
-def _truncated(format: str, what: str, label: str) -> DataError:
-    return DataError(f"{label}: expected a complete {format}, got a truncated file ({what}); copy it again")
 
 
 def _decode_into(out: ByteArray, path: Path, label: str, header: ImageHeader, reduce: int) -> None:
