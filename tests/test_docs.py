@@ -7,7 +7,7 @@ import json
 import re
 import shlex
 from collections.abc import Callable, Iterator
-from functools import cache, partial
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args
@@ -236,8 +236,8 @@ def test_the_trade_is_the_commands() -> None:
 
 def test_the_neighbours_table_is_the_commands() -> None:
     (table,) = tables(measured("neighbours"))
-    counts = partial(neighbours.counts_of, counts=neighbours.COUNTS)
-    names = [neighbours.row_name(surface, n) for surface in neighbours.NEEDS for n in counts(surface)]
+    counts = dict.fromkeys(neighbours.NEEDS, neighbours.COUNTS) | {"motion": neighbours.MOTION_COUNTS}
+    names = [neighbours.row_name(surface, n) for surface in neighbours.NEEDS for n in counts[surface]]
     assert table[0] == ["", *(heading for heading, _ in neighbours.COLUMNS)] and [row[0] for row in table[2:]] == names
     assert all(re.fullmatch(r"[\d.]+%?", cell) for row in table[2:] for cell in row[1:])
     assert neighbours.NOTES in measured("neighbours")

@@ -17,8 +17,7 @@ from arbiview_aug.cli.bench.study import benchmark, benchmark_parser, study
 from arbiview_aug.cli.bench.timing import clock_of, machine_line, quartiles, show
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.frames import make_frame
-from arbiview_aug.evaluate.images import RenderedView
-from arbiview_aug.evaluate.methods import Method, Sample, retargeting
+from arbiview_aug.evaluate.methods import retargeting
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.generator import Generator
 
@@ -83,14 +82,9 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     for steps in arguments.steps:
         if steps > 1 or generator.config.one_step:
             methods.append(make(name=row_name(steps), path="diffusion", generator=generator, steps=steps))
-    calls: dict[str, list[int]] = {method.name: [] for method in methods}
-    methods = [_counted(method, generator, calls[method.name]) for method in methods]
     options: dict[str, Any] = {"repeats": arguments.repeats, "clock": clock_of(device), "consistency": True}
     found = study(methods, frames, {"wide": [target]}, label="generator", **options)
-    rows = {
-        name: quartiles(np.array(row["ms"]))._asdict() | {"calls": float(np.mean(calls[name])), **row["wide"]}
-        for name, row in found.items()
-    }
+    rows = {name: quartiles(np.array(row["ms"]))._asdict() | row["wide"] for name, row in found.items()}
     return {
         "clock": CLOCKS[device.type],
         "generator": generator.config.name,
@@ -103,21 +97,8 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _counted(method: Method, generator: Generator, calls: list[int]) -> Method:
-    """Append the number of denoiser calls of each render to ``calls``."""
-
-    def render(sample: Sample, target: Rig) -> list[RenderedView]:
-        before = generator.calls
-        views = method.render(sample, target)
-        calls.append(generator.calls - before)
-        return views
-
-    return replace(method, render=render)
-
-
 COLUMNS = (
     ("ms", "{median_ms:.0f}"),
-    ("calls", "{calls:.0f}"),
     ("holes dB", "{true_hole_psnr_db:.2f}"),
     ("MAE", "{true_hole_mae:.1f}"),
     ("sharp", "{true_hole_gradient_ratio:.2f}"),
@@ -126,9 +107,8 @@ COLUMNS = (
     ("agree dB", "{consistency_fitted_psnr_db:.2f}"),
 )
 NOTES = (
-    "ms a frame with its plan cached; calls: of the denoiser, a frame; holes dB, MAE: against the truth, where no "
-    "source sees; sharp: gradient energy there against the truth; agree dB: of neighbouring views, what is made up "
-    "included."
+    "ms a frame with its plan cached; holes dB, MAE: against the truth, where no source sees; sharp: gradient energy "
+    "there against the truth; agree dB: of neighbouring views, what is made up included."
 )
 
 

@@ -1,16 +1,13 @@
 """``python -m arbiview_aug bench loader``: frames per second of a ``DataLoader``, and memory per worker.
 
-Workers persist, and a first epoch warms them. Rates are wall-clock, so other work on the machine slows them: the load
-and the speed-up of processes that only count are reported beside them.
+Workers persist, and a first epoch warms them. Rates are wall-clock, so other work on the machine slows them.
 """
 
 from __future__ import annotations
 
+import argparse
 import multiprocessing
 import os
-import re
-import subprocess
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,28 +21,15 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import add_target, count
 from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, recorded
 from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
-from arbiview_aug.cli.bench.timing import machine_line, quartiles, show
+from arbiview_aug.cli.bench.timing import machine_line, memory_mib, quartiles, show
 from arbiview_aug.datasets import RetargetedDataset, open_data
-from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.scene.scene import SURFACES
-from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
-WORKERS = (0, 1, 2)
-FRAMES, EPOCHS = 48, 3
 PLAIN = "read only"
 _APART_M = 1e-4
-_MIB = 2**20
-
-_COUNTING = """
-import time
-end, n = time.perf_counter() + 1.0, 0
-while time.perf_counter() < end:
-    n += 1
-print(n)
-"""
 
 
 class Repeated(Dataset[Any]):
@@ -79,60 +63,40 @@ def main(argv: Sequence[str] | None = None) -> int:
         example="--data FOLDER --workers 0 2",
     )
     add_target(parser)
-    parser.add_argument("--workers", type=int, nargs="+", default=list(WORKERS), metavar="N", help="workers")
+    parser.add_argument("--workers", type=int, nargs="+", default=[0, 1, 2], metavar="N", help="workers")
     parser.add_argument("--surface", nargs="+", choices=tuple(SURFACES), default=["auto"], help="scene geometry")
-    parser.add_argument("--frames", type=count, default=FRAMES, metavar="N", help="frames in an epoch")
-    parser.add_argument("--epochs", type=count, default=EPOCHS, metavar="N", help="epochs to measure")
+    parser.add_argument("--frames", type=count, default=48, metavar="N", help="frames in an epoch")
+    parser.add_argument("--epochs", type=count, default=3, metavar="N", help="epochs to measure")
     arguments = parser.parse_args(argv)
     if min(arguments.workers) < 0:
         parser.error(f"argument --workers: expected whole numbers from 0, got {min(arguments.workers)}")
     h, w = (SOURCES_OVER_VIEWS * side for side in arguments.size)
     with recorded(arguments.data, size=(h, w)) as data:
-        report = measure(
-            data,
-            data.target(arguments.target, arguments.size),
-            workers=arguments.workers,
-            reduce=arguments.reduce,
-            surfaces=arguments.surface,
-            frames=arguments.frames,
-            epochs=arguments.epochs,
-        )
+        report = measure(data, arguments)
     show(table(report), report, Path(arguments.output))
     return 0
 
 
 @benchmark
-def measure(
-    data: Recorded,
-    target: Rig,
-    *,
-    workers: Sequence[int] = WORKERS,
-    reduce: Reduce = 2,
-    surfaces: Sequence[SurfaceName] = ("auto",),
-    frames: int = FRAMES,
-    epochs: int = EPOCHS,
-) -> dict[str, Any]:
+def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     """Measure the rates of reading alone and of retargeting over each surface."""
-    plain: Dataset[Any] = Repeated(open_data(data.root, reduce=reduce), frames)
+    target = data.target(arguments.target, arguments.size)
+    plain: Dataset[Any] = Repeated(open_data(data.root, reduce=arguments.reduce), arguments.frames)
     datasets: dict[str, Dataset[Any]] = {PLAIN: plain}
-    rig = data.sample(0, reduce)["rig"]
-    for surface in surfaces:
+    rig: Rig = data.sample(0, arguments.reduce)["rig"]
+    for surface in arguments.surface:
         retarget = RigRetarget(target, surface=surface)
         retarget.prepare(rig)  # workers share static plans
         datasets[f"retargeted, {surface}"] = RetargetedDataset(plain, retarget)
-    most = max(workers)
-    alone, together = counted(1), counted(max(most, 1))
-    rates = loader_rates(datasets, workers, epochs)
     return {
         "clock": "on the wall",
         "data": data.name,
         "sources": [list(of_camera) for of_camera in rig.sizes],
         "target": target.name or "target",
         "size": list(target.sizes[0]),
-        "frames": frames,
-        "epochs": epochs,
-        "counting": {"processes": most, "against_one": together / alone},
-        "rates": rates,
+        "frames": arguments.frames,
+        "epochs": arguments.epochs,
+        "rates": loader_rates(datasets, arguments.workers, arguments.epochs),
     }
 
 
@@ -142,28 +106,23 @@ COLUMNS = (
     ("best", "{best_per_s:.1f}"),
     ("CPU ms", "{cpu_ms:.1f}"),
     ("unique MiB", "{unique_mib:.0f}"),
-    ("peak MiB", "{peak_mib:.0f}"),
 )
 
 
 def table(report: Mapping[str, Any]) -> str:
     """Title and Markdown table of a report."""
     h, w = report["size"]
-    counting = report["counting"]
-    return (
-        f"{report['data']}, {len(report['sources'])} cameras to {report['target']} at {w}x{h}, epochs of "
-        f"{report['frames']} frames; {counting['processes']} processes that only count do "
-        f"{counting['against_one']:.2f} times one's work; {machine_line(report)}\n\n"
-        + metric_table(report["rates"], COLUMNS)
-    )
+    cameras = f"{len(report['sources'])} cameras to {report['target']} at {w}x{h}"
+    head = f"{report['data']}, {cameras}, epochs of {report['frames']} frames; {machine_line(report)}"
+    return f"{head}\n\n{metric_table(report['rates'], COLUMNS)}"
 
 
 def loader_rates(datasets: Mapping[str, Dataset[Any]], workers: Sequence[int], epochs: int) -> list[dict[str, Any]]:
     """Measure all data sets with all numbers of workers, epoch by epoch in turn; one thread in this process.
 
     Returns:
-        Rows; ``ms`` has quartiles, ``cpu_ms`` is of all workers, ``unique_mib`` the mean private memory of a worker,
-        ``peak_mib`` the largest resident set. The last three are None where unknown.
+        Rows; ``ms`` has quartiles, ``cpu_ms`` is of all workers, ``unique_mib`` the mean private memory of a worker.
+        The last two are None where unknown.
     """
     with one_thread():
         loaders = {
@@ -193,23 +152,18 @@ def _epoch_s(loader: DataLoader[Any]) -> float:
     return time.perf_counter() - start
 
 
-def counted(processes: int) -> int:
-    """Total count that processes reach in one second: the machine's free capacity."""
-    running = [subprocess.Popen([sys.executable, "-c", _COUNTING], stdout=subprocess.PIPE) for _ in range(processes)]
-    return sum(int(process.communicate()[0]) for process in running)
-
-
 def _rate(key: tuple[str, int], dataset: Any, epochs_s: list[float], used_s: float, pids: list[int]) -> dict[str, Any]:
     (name, workers), frames = key, len(dataset)
     ms = quartiles(1e3 * np.array(epochs_s) / frames)
     row = {"name": name, "workers": workers, "frames_per_s": 1e3 / ms.median_ms, "best_per_s": frames / min(epochs_s)}
-    unique = [_mib(pid, "smaps_rollup", "Private_(?:Clean|Dirty)") for pid in pids] if workers else []
-    peaks = [_mib(pid, "status", "VmHWM") for pid in pids] if workers else []
+    try:
+        unique = [memory_mib("smaps_rollup", "Private_(?:Clean|Dirty)", pid) for pid in pids] if workers else []
+    except OSError:
+        unique = []
     return row | {
         "ms": ms._asdict(),
         "cpu_ms": 1e3 * used_s / frames / len(epochs_s) if used_s else None,
-        "unique_mib": float(np.mean(unique)) if all(unique) and unique else None,
-        "peak_mib": max(peaks) if all(peaks) and peaks else None,
+        "unique_mib": float(np.mean(unique)) if unique else None,
     }
 
 
@@ -227,12 +181,3 @@ def _cpu_s(pids: Sequence[int]) -> float:
             return 0.0
         total += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")  # utime, stime
     return total
-
-
-def _mib(pid: int, file: str, fields: str) -> float:
-    """Sum of memory figures of a process; 0 except on Linux."""
-    try:
-        text = Path(f"/proc/{pid}/{file}").read_text()
-    except OSError:
-        return 0.0
-    return sum(int(kib) for kib in re.findall(rf"^{fields}:\s+(\d+) kB", text, re.MULTILINE)) * 1024 / _MIB

@@ -6,6 +6,7 @@ neighbours, the nearest first. Plans that depend on the frame are built anew for
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -37,7 +38,6 @@ MOTION_COUNTS, MOTION_ROUNDS = (0, 2), 3
 """Depth from motion reads one neighbour on each side and takes seconds. Without neighbours the street is used."""
 
 UP_M, PITCH_DEG, FOV_DEG = 0.6, -15.0, 100.0
-REPEATS = 7
 _FRAMES_TRIED = 16
 _ENOUGH_MS = 2000.0
 
@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         data="a synthetic street, driven along",
         view_size=SIZE,
         reduce=True,
-        repeats=REPEATS,
+        repeats=7,
         output="output/neighbours.json",
         example="--data FOLDER --counts 0 2",
     )
@@ -69,58 +69,41 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(str(error))
     h, w = arguments.size
     with recorded(arguments.data, size=(2 * h, 2 * w), neighbours=wanted) as data:
-        report = measure(
-            open_data(data.root, reduce=arguments.reduce, neighbours=wanted),
-            data.name,
-            counts=arguments.counts,
-            surfaces=arguments.surface,
-            size=arguments.size,
-            repeats=arguments.repeats,
-        )
+        frames = open_data(data.root, reduce=arguments.reduce, neighbours=wanted)
+        report = measure(frames, data.name, arguments)
     show(markdown(report), report, Path(arguments.output))
     return 0
 
 
 @benchmark
-def measure(
-    data: Any,
-    name: str,
-    *,
-    counts: Sequence[int] = COUNTS,
-    surfaces: Sequence[SurfaceName] = tuple(NEEDS),
-    size: tuple[int, int] = SIZE,
-    repeats: int = REPEATS,
-) -> dict[str, Any]:
+def measure(data: Any, name: str, arguments: argparse.Namespace) -> dict[str, Any]:
     """Measure the costs of a data set whose samples have neighbours; surfaces that it does not offer are left out.
 
     Raises:
         DataError: No frame has neighbours.
     """
     data.load_points = False
-    index, sample = _frame_with_most(data, max(counts))
-    neighbours = nearest(sample)[: max(counts)]
-    target = lowered(sample["rig"], size)
+    most = max(arguments.counts)
+    index, sample = _frame_with_most(data, most)
+    neighbours = nearest(sample)[:most]
+    target = lowered(sample["rig"], arguments.size)
     costs: list[dict[str, Any]] = []
-    for surface in surfaces:
-        needs = NEEDS[surface]
+    for surface in arguments.surface:
+        needs, is_motion = NEEDS[surface], surface == "motion"
         if needs is None or needs in sample:
-            numbers = sorted({0, *(min(n, len(neighbours)) for n in counts_of(surface, counts))})
-            rounds = min(repeats, MOTION_ROUNDS) if surface == "motion" else repeats
+            counts = MOTION_COUNTS if is_motion else arguments.counts
+            numbers = sorted({0, *(min(n, len(neighbours)) for n in counts)})
+            rounds = min(arguments.repeats, MOTION_ROUNDS) if is_motion else arguments.repeats
             costs += _costs(data, index, surface, target, numbers, rounds)
     return {
         "clock": "CPU time of the process, milliseconds, one thread",
         "data": name,
         "sources": [list(of_camera) for of_camera in sample["rig"].sizes],
-        "size": list(size),
+        "size": list(arguments.size),
         "travel_m": [travel_m(sample, neighbour) for neighbour in neighbours],
-        "rounds": repeats,
+        "rounds": arguments.repeats,
         "costs": costs,
     }
-
-
-def counts_of(surface: str, counts: Sequence[int]) -> Sequence[int]:
-    """Numbers of neighbours that a surface is measured with."""
-    return MOTION_COUNTS if surface == "motion" else counts
 
 
 def lowered(rig: Rig, size: tuple[int, int]) -> Rig:
@@ -146,17 +129,12 @@ def travel_m(sample: Mapping[str, Any], neighbour: Mapping[str, Any]) -> float:
 def _frame_with_most(data: Any, wanted: int) -> tuple[int, dict[str, Any]]:
     """First frame with the wanted number of neighbours, else with the most, from the middle of the data outward."""
     order = sorted(range(len(data)), key=lambda k: abs(k - len(data) // 2))[:_FRAMES_TRIED]
-    best: tuple[int, dict[str, Any]] | None = None
-    for index in order:
-        sample = data[index]
-        if best is None or len(sample["neighbours"]) > len(best[1]["neighbours"]):
-            best = index, sample
-        if len(best[1]["neighbours"]) >= wanted:
-            break
-    if best is None or not best[1]["neighbours"]:
+    index = max(order, key=lambda k: min(len(data[k]["neighbours"]), wanted))
+    sample = data[index]
+    if not sample["neighbours"]:
         fix = "a frame folder needs sequence.json and ego2world in its frames"
         raise DataError(f"data {data.root}: expected frames of a drive that moves, got none with neighbours; {fix}")
-    return best
+    return index, sample
 
 
 def _costs(

@@ -8,9 +8,8 @@ maps that read a source of the output's own size at
 A time is the median over the rounds; a ratio is the median of candidate / floor within a round.
 
 ``frame`` executes the cached plan; ``interleaved`` images lie channels-last in one block, as this package's readers
-give them. ``whole call`` is ``RigRetarget`` with black holes; ``filled``: with filled holes, the default; ``holes``:
-the filling alone. ``plan`` builds the plan of a new calibration; its ratio is to the frame. ``harmonised`` is the frame
-with known gains for all cameras.
+give them. ``whole call`` is ``RigRetarget`` with black holes; ``filled``: with filled holes, the default. ``plan``
+builds the plan of a new calibration; its ratio is to the frame. ``harmonised`` is the frame with known gains.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.evaluate.targets import without_masks
-from arbiview_aug.generator.fillers import Holes, fill_holes
+from arbiview_aug.generator.fillers import Holes
 from arbiview_aug.image_ops import Scratch
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import build_plan
@@ -46,8 +45,6 @@ REPEATS = 15
 _SMALL_ROUNDS = 3
 """Factor of rounds for small frames, whose times are noisier."""
 _NEW_CALIBRATION_M = 0.01
-_EGO_MOTION = (0.4, 0.07)
-"""Largest movement (m) and turn (deg) between a camera's and the LiDAR's time on nuScenes."""
 _GAINS = (0.8, 1.1, 0.9, 1.25, 1.05, 0.95)
 """Gains of the sources, as far apart as on a real frame."""
 
@@ -149,9 +146,7 @@ def _full_size(rig: Rig, images: torch.Tensor) -> list[_Candidate]:
         _Candidate(f"{label} frame, harmonised", _frame(rig, target, images, _GAINS), frame),
         _Candidate(f"{label} whole call", _call(rig, target, images, "black"), floor),
         _Candidate(f"{label} whole call, filled", _call(rig, target, images, "fill"), floor),
-        _holes(rig, target, images, label, floor),
         _Candidate(f"{label} plan", _plan(rig, target), frame, 1.5),
-        _Candidate(f"{label} plan, ego motion", _plan_with_ego_motion(rig, target), frame),
     ]
 
 
@@ -167,10 +162,8 @@ def _small_size(rig: Rig, images: torch.Tensor, halves: torch.Tensor, size: tupl
         _Candidate(f"{half}, harmonised", _frame(half_rig, target, halves, _GAINS), half),
         _Candidate(f"{label} whole call, from half size", _call(half_rig, target, halves, "black"), floor),
         _Candidate(f"{label} whole call, filled", _call(half_rig, target, halves, "fill"), floor),
-        _holes(half_rig, target, halves, label, floor),
         _Candidate(f"{label} plan, from full size", _plan(rig, target), full, 1.5),
         _Candidate(f"{label} plan, from half size", _plan(half_rig, target), half, 1.5),
-        _Candidate(f"{label} plan, ego motion", _plan_with_ego_motion(half_rig, target), half),
     ]
 
 
@@ -201,15 +194,6 @@ def _call(source: Rig, target: Rig, images: torch.Tensor, holes: Holes) -> Calla
     return lambda: retarget({"images": images})
 
 
-def _holes(source: Rig, target: Rig, images: torch.Tensor, label: str, floor: str) -> _Candidate:
-    """Fill the holes of one frame's views; the time does not depend on their content."""
-    plan = build_plan(source, target)
-    views, coverage = render_opencv(plan, list(images)), [torch.from_numpy(seen) for seen in plan.coverage]
-    share = 1 - statistics.mean(float(seen.float().mean()) for seen in coverage)
-    occluded = [view.occluded for view in plan.targets]
-    return _Candidate(f"{label} holes, {share:.1%}", lambda: fill_holes(views, coverage, occluded, "fill"), floor)
-
-
 def _plan(source: Rig, target: Rig) -> Callable[[], Any]:
     """Plan a new calibration in each call."""
     calls = iter(range(1, 1 << 30))
@@ -217,21 +201,6 @@ def _plan(source: Rig, target: Rig) -> Callable[[], Any]:
     def run() -> None:
         x_m = _NEW_CALIBRATION_M * next(calls)
         build_plan(source.shifted(x_m=x_m), target.shifted(x_m=x_m))
-
-    return run
-
-
-def _plan_with_ego_motion(source: Rig, target: Rig) -> Callable[[], Any]:
-    """Plan in each call with every source camera moved on its own, as by ego motion between exposures."""
-    rng = np.random.default_rng(0)
-    move_m, turn_deg = _EGO_MOTION
-
-    def run() -> None:
-        cameras = [
-            camera.shifted(x_m=rng.uniform(-move_m, move_m)).turned(yaw_deg=rng.uniform(-turn_deg, turn_deg))
-            for camera in source
-        ]
-        build_plan(source.with_cameras(cameras), target)
 
     return run
 

@@ -29,7 +29,6 @@ from arbiview_aug.errors import DataError
 Clock = Callable[[Callable[[], Any]], float]
 """Milliseconds of a call."""
 
-_MIB = 2**20
 _LEAST_ROUNDS = 3  # a median of fewer is a single time
 
 
@@ -101,12 +100,20 @@ def peak_mib(run: Callable[[], Any]) -> float | None:
         ctypes.CDLL(None).malloc_trim(0)
     try:
         Path("/proc/self/clear_refs").write_text("5")  # resets the peak
-        before = _status_kib("VmRSS")
+        before = memory_mib("status", "VmRSS")
         run()
-        return (_status_kib("VmHWM") - before) * 1024 / _MIB
+        return memory_mib("status", "VmHWM") - before
     except OSError:
         run()
         return None
+
+
+def memory_mib(file: str, fields: str, pid: int | str = "self") -> float:
+    """Sum the fields (a pattern) of a process's memory file below /proc; OSError except on Linux."""
+    found = re.findall(rf"^{fields}:\s+(\d+) kB", Path(f"/proc/{pid}/{file}").read_text(), re.MULTILINE)
+    if not found:
+        raise OSError(f"no {fields}")
+    return sum(map(int, found)) / 1024
 
 
 def machine(load_before: tuple[float, float, float]) -> dict[str, Any]:
@@ -148,10 +155,3 @@ def show(table: str, report: Mapping[str, Any], path: Path, *, as_json: bool = F
         raise DataError(f"--output {path}: expected a file that can be written to, got {error.strerror}") from None
     if not as_json:
         print(f"report: {path}")
-
-
-def _status_kib(field: str) -> int:
-    found = re.search(rf"^{field}:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
-    if found is None:
-        raise OSError(f"no {field}")
-    return int(found[1])

@@ -14,9 +14,9 @@ import pytest
 
 from arbiview_aug import RigRetarget
 from arbiview_aug.__main__ import main
-from arbiview_aug.cli.bench.neighbours import COLUMNS, lowered, measure, nearest, travel_m
+from arbiview_aug.cli.bench.neighbours import COLUMNS, lowered, nearest, travel_m
 from arbiview_aug.cli.bench.timing import timed_rounds
-from arbiview_aug.datasets import FrameFolder, Neighbours
+from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.frame_writer import write_drive
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import one_thread
@@ -40,31 +40,19 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_costs(drive: Path) -> None:
-    report = measure(
-        FrameFolder(drive, neighbours=Neighbours(count=4)),
-        "drive",
-        counts=(0, 1, 8),
-        surfaces=("street",),
-        size=(32, 88),
-        repeats=1,
-    )
-    none, one, three = json.loads(json.dumps(report))["costs"]
-    assert [cost["neighbours"] for cost in (none, one, three)] == [0, 1, 3]  # there are no more
-    np.testing.assert_allclose(report["travel_m"], [1.5, 1.5, 3.0], atol=1e-6)
-    assert none["filled"] == 0 < one["filled"] < three["filled"]
-    assert none["ratio"] == 1 and all(cost[part][0] >= 0 for cost in (one, three) for part in ("plan", "fill", "frame"))
-
-
-@pytest.mark.slow
 def test_command(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "new" / "neighbours.json"
     arguments = ["bench", "neighbours", *QUICK, "--surface", "street", "--output", str(path)]
-    assert main([*arguments, "--data", str(drive), "--counts", "2"]) == 0
+    assert main([*arguments, "--data", str(drive), "--counts", "0", "1", "8"]) == 0
     report, printed = json.loads(path.read_text()), capsys.readouterr().out
-    assert [cost["name"] for cost in report["costs"]] == ["street, no neighbours", "street, 2 neighbours"]
+    none, one, three = report["costs"]
+    assert [cost["neighbours"] for cost in (none, one, three)] == [0, 1, 3]  # there are no more
+    assert [cost["name"] for cost in (none, one)] == ["street, no neighbours", "street, 1 neighbour"]
+    np.testing.assert_allclose(report["travel_m"], [1.5, 1.5, 3.0], atol=1e-6)
+    assert none["filled"] == 0 < one["filled"] < three["filled"]
+    assert none["ratio"] == 1 and all(cost[part][0] >= 0 for cost in (one, three) for part in ("plan", "fill", "frame"))
     assert all(heading in printed for heading, _ in COLUMNS) and f"report: {path}" in printed
-    assert "neighbours up to 1.5 m away" in printed and report["machine"]["cpu"] and report["versions"]["torch"]
+    assert "neighbours up to 3.0 m away" in printed and report["machine"]["cpu"] and report["versions"]["torch"]
 
 
 def test_frames_of_no_drive(ddad_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
