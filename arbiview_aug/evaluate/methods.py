@@ -66,13 +66,10 @@ def retargeting(
     surface: SurfaceName = "auto",
     name: str = "",
     *,
-    outputs: Sequence[str] = (),
-    harmonise: Harmonise = None,
-    refinement: RefinementCache | None = None,
     path: RenderPath = "favs",
-    generator: Generator | None = None,
-    steps: int | None = None,
+    harmonise: Harmonise = None,
     transforms: int = _CACHED_TRANSFORMS,
+    **settings: Any,
 ) -> Method:
     """Wrap ``RigRetarget`` as a method, with its arguments; holes stay black with ``path="favs"``.
 
@@ -80,33 +77,19 @@ def retargeting(
         quality: Preset or configuration.
         surface: Scene geometry.
         name: Name in tables; by default made of quality, surface and path.
-        outputs: Further outputs, such as ``confidence``.
-        harmonise: Exposure gains.
-        refinement: Cache of depth from overlap.
         path: Filling of holes; a source camera alone is never completed.
-        generator: The generator of ``path="diffusion"``; by default the shipped one.
-        steps: Steps of the generator.
+        harmonise: Exposure gains.
         transforms: Number of target rigs whose transforms are cached.
+        settings: Further arguments.
     """
-    completes = path != "favs"
-    if path == "diffusion" and generator is None:
-        generator = Generator.shipped()  # once, not for each target
+    completes, steps = path != "favs", settings.get("steps")
+    if path == "diffusion" and settings.get("generator") is None:
+        settings["generator"] = Generator.shipped()  # once, not for each target
+    settings |= {"path": path, "harmonise": harmonise, "holes": "fill" if completes else "black", "cache_bytes": 0}
 
     @lru_cache(transforms)
     def transform(target: Rig) -> RigRetarget:
-        return RigRetarget(
-            target,
-            quality=quality,
-            surface=surface,
-            outputs=outputs,
-            harmonise=harmonise,
-            refinement=refinement,
-            path=path,
-            generator=generator,
-            steps=steps,
-            cache_bytes=0,
-            holes="fill" if completes else "black",
-        )
+        return RigRetarget(target, quality=quality, surface=surface, **settings)
 
     def render(sample: Sample, target: Rig) -> list[RenderedView]:
         return views_of(transform(target)(sample))

@@ -83,7 +83,7 @@ def test_rig_figure_has_a_column_per_rig() -> None:
         assert {text.get_text().splitlines()[0] for text in axes.texts} == set(rig.names), "only its own names"
         assert len(axes.patches) == len(load_rig("waymo")) + len(load_rig("argoverse2")), "the other behind it"
         assert sum(patch.get_facecolor()[3] > 0 for patch in axes.patches) == len(rig), "its own wedges are filled"
-    heights = {text.get_text() for text in two.axes[3].texts}
+    heights = {line for text in two.axes[3].texts for line in text.get_text().splitlines()}
     assert heights == {f"{c.name} {c.center_m[2] - rig.ground_z_m:.2f} m" for c in rig}, "over its own road"
     picture = draw_rigs([load_rig("waymo")])
     assert picture.shape == (1050, 800, 3) and picture.std() > 20

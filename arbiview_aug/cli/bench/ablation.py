@@ -55,8 +55,8 @@ class Row(NamedTuple):
     def method(self, name: str) -> Method:
         """Create the method, with empty caches."""
         refinement = RefinementCache() if self.cached else None
-        options: dict[str, Any] = {"harmonise": self.harmonise, "refinement": refinement, "transforms": 1}
-        return retargeting(self.quality, self.surface, name, **options)
+        given = self.quality, self.surface, name
+        return retargeting(*given, harmonise=self.harmonise, refinement=refinement, transforms=1)
 
     def fits(self, frame: ScoredFrame) -> bool:
         """Whether a frame has boxes or the truth, where the row needs them (LiDAR points cannot score antialiasing)."""

@@ -20,14 +20,11 @@ def save_plot(rows: Sequence[Mapping[str, Any]], steps: Sequence[str], title: st
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for row in rows:
-        middle, low, high = row["median_ms"], row["q1_ms"], row["q3_ms"]
-        colour = _COLOURS[row["quality"]]
-        spread = [[max(middle - low, 0)], [max(high - middle, 0)]]
-        on_front = row["front"]
+        middle, colour, on_front = row["median_ms"], _COLOURS[row["quality"]], row["front"]
         axes.errorbar(
             middle,
             row["psnr_db"],
-            xerr=spread,
+            xerr=[[middle - row["q1_ms"]], [row["q3_ms"] - middle]],
             fmt=_MARKERS[row["execution"]],
             color=colour,
             markersize=8 if on_front else 5,
@@ -50,10 +47,8 @@ def save_plot(rows: Sequence[Mapping[str, Any]], steps: Sequence[str], title: st
             ha="left" if left else "right",
             arrowprops={"arrowstyle": "-", "linewidth": 0.5, "alpha": 0.6},
         )
-    axes.set_xscale("log")
-    axes.set_xlabel("CPU milliseconds a frame, one thread (median, quartiles)")
-    axes.set_ylabel("PSNR where some source sees, dB")
-    axes.set_title(title, fontsize=10)
+    times = "CPU milliseconds a frame, one thread (median, quartiles)"
+    axes.set(title=title, xscale="log", xlabel=times, ylabel="PSNR where some source sees, dB")
     axes.grid(True, which="both", alpha=0.2)
     for label in dict.fromkeys(row["quality"] for row in rows):
         axes.plot([], [], "o", color=_COLOURS[label], label=label)

@@ -16,9 +16,6 @@ if TYPE_CHECKING:
 
 COLOURS = ("#1f64c8", "#d65414", "#1e8c3c", "#8c3caa", "#966e14")
 
-_LABEL_GAP_DEG, _LABEL_STEP_M = 20.0, 1.0
-"""Labels of cameras that look in nearly the same direction stand this far apart."""
-
 
 def draw_rigs(rigs: Sequence[Rig]) -> Picture:
     """Draw ``rig_figure`` as (h, w, 3) pixels."""
@@ -48,7 +45,7 @@ def rig_figure(rigs: Sequence[Rig]) -> Figure:
                     axes.fill(*outline.T, facecolor=(colour, 0.15 if own else 0), edgecolor=(colour, 1 if own else 0.3))
             if own:
                 _label_from_above(above, rig)
-                _label_from_side(side, rig, colour)
+                _label_from_side(side, rig)
                 above.set_title(f"{rig.name or 'rig'}: {len(rig)} cameras", color=colour)
         above.set(xlabel="left (m)", ylabel="forward (m)", aspect="equal")
         side.set(xlabel="forward (m)", ylabel="height over the road (m)", aspect="equal")
@@ -63,17 +60,11 @@ def rig_figure(rigs: Sequence[Rig]) -> Figure:
 
 def _label_from_above(axes: Any, rig: Rig) -> None:
     """Write each camera's name and field of view at the end of its wedge."""
-    placed: list[tuple[float, float]] = []
-    for camera in sorted(rig, key=_radius_m):
-        radius = _radius_m(camera) + 0.2
-        for azimuth, taken in placed:
-            if abs((camera.azimuth_deg - azimuth + 180) % 360 - 180) < _LABEL_GAP_DEG:
-                radius = max(radius, taken + _LABEL_STEP_M)
-        placed.append((camera.azimuth_deg, radius))
+    for camera in rig:
         forward, left = np.cos(np.radians(camera.azimuth_deg)), np.sin(np.radians(camera.azimuth_deg))
         axes.text(
-            camera.center_m[1] + radius * left,
-            camera.center_m[0] + radius * forward,
+            camera.center_m[1] + (_radius_m(camera) + 0.2) * left,
+            camera.center_m[0] + (_radius_m(camera) + 0.2) * forward,
             f"{camera.name}\n{camera.fov_deg[0]:.0f}° x {camera.fov_deg[1]:.0f}°",
             fontsize=8,
             ha="right" if left > 0.3 else "left" if left < -0.3 else "center",
@@ -81,20 +72,13 @@ def _label_from_above(axes: Any, rig: Rig) -> None:
         )
 
 
-def _label_from_side(axes: Any, rig: Rig, colour: str) -> None:
-    """List names and heights beside the drawing, joined to the cameras: rear ones left, front ones right."""
+def _label_from_side(axes: Any, rig: Rig) -> None:
+    """List names and heights beside the drawing: rear cameras left, front ones right."""
     order = sorted(rig, key=lambda camera: (camera.center_m[0], camera.azimuth_deg))
-    for x, cameras in ((0.01, order[: len(order) // 2]), (0.99, order[len(order) // 2 :])):
-        for k, camera in enumerate(sorted(cameras, key=lambda camera: -camera.center_m[2])):
-            axes.annotate(
-                f"{camera.name} {camera.center_m[2] - rig.ground_z_m:.2f} m",
-                (camera.center_m[0], camera.center_m[2] - rig.ground_z_m),
-                (x, 0.92 - 0.09 * k),
-                textcoords="axes fraction",
-                fontsize=8,
-                ha="left" if x < 0.5 else "right",
-                arrowprops={"arrowstyle": "-", "color": colour, "alpha": 0.4},
-            )
+    for side, cameras in (("left", order[: len(order) // 2]), ("right", order[len(order) // 2 :])):
+        lines = [f"{camera.name} {camera.center_m[2] - rig.ground_z_m:.2f} m" for camera in cameras]
+        x = 0.01 if side == "left" else 0.99
+        axes.text(x, 0.96, "\n".join(lines), transform=axes.transAxes, ha=side, va="top", fontsize=8)
 
 
 def _wedge_from_above(camera: Camera) -> np.ndarray:
