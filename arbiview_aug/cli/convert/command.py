@@ -30,7 +30,7 @@ from arbiview_aug.cli.arguments import (
 from arbiview_aug.cli.convert.job import Done, Jobs, OnError
 from arbiview_aug.cli.convert.ray_runner import ray_results
 from arbiview_aug.cli.convert.report import write_report
-from arbiview_aug.cli.convert.settings import FOLDER, Settings, check_output
+from arbiview_aug.cli.convert.settings import FOLDER, RETARGET_OPTIONS, Settings, check_output
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.motion_depth import FOLDER as DEPTH_FOLDER
@@ -151,7 +151,6 @@ def _settings(arguments: argparse.Namespace) -> Settings:
                 "python -m arbiview_aug depth --data DIR, or name its folder (--motion-depth), or estimate it from "
                 "other frames (--neighbours 2)"
             )
-    unchanged = ("version", "path", "holes", "steps", "quality", "surface", "size", "fit", "reduce", "neighbours")
     return Settings(
         root=root,
         kind=kind,
@@ -160,7 +159,7 @@ def _settings(arguments: argparse.Namespace) -> Settings:
         generator=None if arguments.generator is None else arguments.generator.absolute(),
         motion_depth=None if depth is None else depth.absolute(),
         suffix=f".{arguments.images}",  # type: ignore[arg-type]
-        **{name: getattr(arguments, name) for name in unchanged},
+        **{name: getattr(arguments, name) for name in ("version", *RETARGET_OPTIONS, "reduce", "neighbours")},
     )
 
 
@@ -192,11 +191,9 @@ def _run(jobs: Jobs, arguments: argparse.Namespace, tally: _Tally) -> Iterator[D
 
     if arguments.runner == "ray":
         yield from ray_results(jobs, arguments.workers, "convert", count_result)
-    elif arguments.workers > 1 and len(jobs) > 1:
-        yield from results(jobs, min(arguments.workers, len(jobs)), "convert", count_result)
     else:
         with one_thread():
-            yield from results(jobs, 1, "convert", count_result)
+            yield from results(jobs, min(arguments.workers, len(jobs)), "convert", count_result)
 
 
 class _Tally:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from arbiview_aug.atomic_io import inside, link_whole, write_whole
-from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.convert.manifest import Record
 from arbiview_aug.cli.convert.settings import FOLDER, Settings
-from arbiview_aug.cli.convert.writer import Writer
+from arbiview_aug.cli.convert.writer import Converted, Writer
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, POINTS_FILE, SEQUENCE_FILE, FrameFolder
 from arbiview_aug.errors import DataError
 
@@ -32,27 +31,20 @@ class FrameFolders(Writer):
     def stem(self, index: int, camera: int, name: str) -> str:
         return f"{self.data.tokens[index]}/{camera:02}"
 
-    def rest(
-        self,
-        index: int,
-        sample: Mapping[str, Any],
-        out: Mapping[str, Any],
-        rig: Rig,
-        views: Sequence[Mapping[str, str]],
-    ) -> tuple[dict[str, bytes], dict[str, Any]]:
+    def rest(self, converted: Converted) -> tuple[dict[str, bytes], dict[str, Any]]:
         """Link the points and write the calibration, last: it makes the folder a frame."""
-        calibration, *_ = files = self.data.files(index)
+        calibration, *_ = files = self.data.files(converted.index)
         source = json.loads(calibration.read_text(encoding="utf-8"))
-        calib = rig.to_dict()
-        for entry, names in zip(calib["cameras"], views, strict=True):
+        calib = converted.rig.to_dict()
+        for entry, names in zip(calib["cameras"], converted.views, strict=True):
             for suffix, name in names.items():
                 key = {".jpg": "file", ".png": "file"}.get(suffix, suffix.split(".")[1])
                 entry[key] = Path(name).name
         kept = {key: value for key, value in source.items() if key not in (*calib, "dataset", "lidar")}
         folder = calibration.parent.name
-        if "points" in sample:
+        if "points" in converted.sample:
             points = inside(self.output, f"{folder}/{POINTS_FILE}", f"--output {self.output}")
-            link_whole(files[-1], points, owner=str(index))
+            link_whole(files[-1], points, owner=str(converted.index))
             kept["lidar"] = {"file": POINTS_FILE}
         text = json.dumps({**calib, **kept}, indent=1).encode()
         return {f"{folder}/{CALIBRATION_FILE}": text}, {}

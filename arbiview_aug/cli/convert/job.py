@@ -17,7 +17,7 @@ from arbiview_aug.cli.arguments import gathered_warnings
 from arbiview_aug.cli.convert.manifest import Manifest, Record
 from arbiview_aug.cli.convert.settings import Settings
 from arbiview_aug.cli.convert.views import encode_views, rig_of
-from arbiview_aug.cli.convert.writer import Writer
+from arbiview_aug.cli.convert.writer import Converted, Writer
 from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.motion_depth import WithMotionDepth
 from arbiview_aug.datasets.registry import find_reader
@@ -122,7 +122,7 @@ class Jobs(Dataset[Done]):
             stem = self.format.stem(index, k, camera.name)
             names.append({suffix: stem + suffix for suffix in view})
             files |= {stem + suffix: coded for suffix, coded in view.items()}
-        rest, facts = self.format.rest(index, sample, out, rig, names)
+        rest, facts = self.format.rest(Converted(index, sample, out, rig, names))
         files |= rest
         paths = {inside(output, name, f"--output {output}"): content for name, content in files.items()}
         write_whole(paths, owner=str(index))

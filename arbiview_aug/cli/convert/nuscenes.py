@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from itertools import chain
 from pathlib import Path, PurePosixPath
@@ -17,12 +17,11 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.atomic_io import check_name, checksum, inside, link_whole, whole_file
-from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.convert.manifest import Record
 from arbiview_aug.cli.convert.nuscenes_rows import NewCameras, Remaining, kept_sensors, view_stem
 from arbiview_aug.cli.convert.settings import FOLDER, Settings
 from arbiview_aug.cli.convert.visibility import visible_shares
-from arbiview_aug.cli.convert.writer import Writer
+from arbiview_aug.cli.convert.writer import Converted, Writer
 from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
 from arbiview_aug.datasets.nuscenes.tables import (
     COUNTS,
@@ -89,6 +88,9 @@ class NuScenes(Writer):
     def __init__(self, settings: Settings, data: NuScenesDataset) -> None:
         self.output, self.data, self.suffix = settings.output, data, settings.suffix
         self.target = settings.target
+        self.tables = Tables(data.root, data.version, None)
+        self.there = [name for name in _TABLES if self.tables.path(name).is_file()]
+        """Existing tables in writing order."""
         lenses = [f"{camera.name} ({camera.lens})" for camera in self.target if not camera.is_rectilinear]
         if lenses:
             name = self.target.name or "the target"
@@ -106,13 +108,9 @@ class NuScenes(Writer):
             )
 
     def facts(self) -> dict[str, Any]:
-        tables = {name: checksum(self._opened().path(name)) for name in self._tables()}
-        return {
-            "kind": "nuscenes",
-            "root": self.data.root.resolve().name,
-            "version": self.data.version,
-            "tables": tables,
-        }
+        tables = {name: checksum(self.tables.path(name)) for name in self.there}
+        root = self.data.root.resolve().name
+        return {"kind": "nuscenes", "root": root, "version": self.data.version, "tables": tables}
 
     def check(self) -> None:
         """Read all tables once.
@@ -134,7 +132,7 @@ class NuScenes(Writer):
         for camera in self.target:
             longest = view_stem(max(names, key=len), camera.name) + ".confidence.png"
             check_name(longest, f"rig {self.target.name!r}: camera {camera.name!r}")
-        tables, there = self._opened(), self._tables()
+        tables, there = self.tables, self.there
         references = [(table, key, of) for table, key, of in _REFERENCES if table in there and of in there]
         own = {of: Tokens(tables, of) for _, _, of in references}
         named = {(table, key): Tokens(tables, table, key) for table, key, _ in references}
@@ -175,24 +173,18 @@ class NuScenes(Writer):
     def stem(self, index: int, camera: int, name: str) -> str:
         return view_stem(self.data.files(index)[-1].name, name)
 
-    def rest(
-        self,
-        index: int,
-        sample: Mapping[str, Any],
-        out: Mapping[str, Any],
-        rig: Rig,
-        views: Sequence[Mapping[str, str]],
-    ) -> tuple[dict[str, bytes], dict[str, Any]]:
+    def rest(self, converted: Converted) -> tuple[dict[str, bytes], dict[str, Any]]:
         """No files, but the visible share of each annotation's box in the new cameras."""
+        sample = converted.sample
         if "boxes_3d" not in sample:
             return {}, {"visible": {}}
-        boxes, coverage = sample["boxes_3d"].numpy(), [mask.numpy() for mask in out["coverage"]]
-        shares = np.round(visible_shares(rig, coverage, boxes), 3).tolist()
+        coverage = [mask.numpy() for mask in converted.out["coverage"]]
+        shares = np.round(visible_shares(converted.rig, coverage, sample["boxes_3d"].numpy()), 3).tolist()
         return {}, {"visible": dict(zip(sample["box_tokens"], shares, strict=True))}
 
     def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
         """Write the tables and link the files of the remaining sensors."""
-        source, there = self._opened(), self._tables()
+        source = self.tables
         remaining = Remaining(source, left_out)
         cameras = NewCameras(records, self.suffix)
         keyframes, poses = remaining.moments()
@@ -213,7 +205,7 @@ class NuScenes(Writer):
         }
         for path in self._maps():
             link_whole(*self._kept(path.relative_to(self.data.root).as_posix(), "maps"))
-        for name in there:
+        for name in self.there:
             _write_table(self.output / self.data.version / f"{name}.json", rows.get(name, partial(source.rows, name))())
         return self._notes()
 
@@ -244,13 +236,6 @@ class NuScenes(Writer):
 
     def _where(self, table: str, row: Row) -> str:
         return f"nuScenes {self.data.root} {self.data.version}: table {table}: row {row.get('token')!r}: filename"
-
-    def _opened(self) -> Tables:
-        return Tables(self.data.root, self.data.version, None)
-
-    def _tables(self) -> list[str]:
-        """Existing tables in writing order."""
-        return [name for name in _TABLES if (self.data.root / self.data.version / f"{name}.json").is_file()]
 
 
 def _write_table(path: Path, rows: Iterable[Row]) -> None:

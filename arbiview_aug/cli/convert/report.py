@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from arbiview_aug.cli.convert.settings import FOLDER, Settings
 from arbiview_aug.cli.convert.views import coverage_of
 from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.registry import open_data
-from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
+from arbiview_aug.evaluate.frames import make_frame
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.report.html import html_report
@@ -51,7 +51,9 @@ def write_report(settings: Settings, data: Recording, tokens: Sequence[str], cou
     """Score ``count`` converted frames, spread evenly over ``tokens``, and write the page."""
     picked = [tokens[int(k)] for k in np.unique(np.linspace(0, len(tokens) - 1, min(count, len(tokens))).round())]
     target = settings.sized_target
-    done = evaluate(_frames(data, picked), lambda _: {target.name or "target": target}, [converted(settings)])
+    # The views were rendered at the recorded exposures.
+    frames = ((token, make_frame(data.by_token(token), exposures=("raw",))) for token in picked)
+    done = evaluate(frames, lambda _: {target.name or "target": target}, [converted(settings)])
     title = f"{data.root.resolve().name} as {target.name or 'the target'} would have seen it"
     notes = [f"{len(picked)} of {len(tokens)} frames, as they were written to {settings.output}."]
     if settings.path != "favs" or settings.holes != "black":
@@ -62,9 +64,3 @@ def write_report(settings: Settings, data: Recording, tokens: Sequence[str], cou
     page = html_report(title, done, [CONVERTED], evaluation_tables(done, [CONVERTED]), notes)
     write_whole({settings.output / FOLDER / "report.html": page.encode()})
     return done
-
-
-def _frames(data: Recording, tokens: Sequence[str]) -> Iterator[tuple[str, ScoredFrame]]:
-    """Yield frames at their recorded exposures, which the views were rendered at."""
-    for token in tokens:
-        yield token, make_frame(data.by_token(token), exposures=("raw",))

@@ -21,6 +21,9 @@ from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import RenderPath
 
+RETARGET_OPTIONS = ("path", "holes", "steps", "quality", "surface", "size", "fit")
+"""Settings that ``RigRetarget`` takes under the same names."""
+
 FOLDER = "conversion"
 """Subfolder of an output with manifest, provenance and report."""
 
@@ -29,7 +32,7 @@ FOLDER = "conversion"
 class Settings:
     """Source, output and everything that decides the output's bytes.
 
-    ``path``, ``holes``, ``steps``, ``quality``, ``surface``, ``size`` and ``fit`` are those of ``RigRetarget``.
+    ``RETARGET_OPTIONS`` are those of ``RigRetarget``.
 
     Attributes:
         root: Folder of the source.
@@ -81,15 +84,9 @@ class Settings:
         """The transform; each process or actor makes one."""
         return RigRetarget(
             self.target,
-            path=self.path,
-            holes=self.holes,
             generator=None if self.generator is None else Generator.from_pretrained(self.generator),
-            steps=self.steps,
-            quality=self.quality,
-            surface=self.surface,
-            size=self.size,
-            fit=self.fit,
             outputs=() if self.quality == "paper" else ("confidence",),
+            **{name: getattr(self, name) for name in RETARGET_OPTIONS},
         )
 
     def rendering(self) -> dict[str, Any]:

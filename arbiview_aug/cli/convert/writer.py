@@ -4,11 +4,31 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.convert.manifest import Record
 from arbiview_aug.cli.convert.settings import Settings
+
+
+@dataclass(frozen=True)
+class Converted:
+    """A converted sample.
+
+    Attributes:
+        index: Number of the sample in the source.
+        sample: The sample as read.
+        out: The retargeted sample.
+        rig: Its cameras.
+        views: For each camera the names of its files, by what follows their stem.
+    """
+
+    index: int
+    sample: Mapping[str, Any]
+    out: Mapping[str, Any]
+    rig: Rig
+    views: Sequence[Mapping[str, str]]
 
 
 class Writer(ABC):
@@ -38,31 +58,12 @@ class Writer(ABC):
         """Path of a view below the output, without its suffix."""
 
     @abstractmethod
-    def rest(
-        self,
-        index: int,
-        sample: Mapping[str, Any],
-        out: Mapping[str, Any],
-        rig: Rig,
-        views: Sequence[Mapping[str, str]],
-    ) -> tuple[dict[str, bytes], dict[str, Any]]:
-        """Files of a sample besides its views, and further entries of its record.
-
-        Args:
-            index: Number of the sample in the source.
-            sample: The sample as read.
-            out: The retargeted sample.
-            rig: Its cameras.
-            views: For each camera the names of its files, by what follows their stem.
-        """
+    def rest(self, converted: Converted) -> tuple[dict[str, bytes], dict[str, Any]]:
+        """Files of a sample besides its views, and further entries of its record."""
 
     @abstractmethod
     def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
-        """Write what belongs to all samples.
-
-        Args:
-            records: Records of the converted samples.
-            left_out: Tokens of the others.
+        """Write what belongs to all samples: ``records`` of the converted ones, tokens of those ``left_out``.
 
         Returns:
             Notes for people.

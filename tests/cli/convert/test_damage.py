@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import copy
 import json
-from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from arbiview_aug.cli.convert.nuscenes_rows import Remaining
 from arbiview_aug.datasets import NuScenesDataset
-from arbiview_aug.datasets.nuscenes.tables import Tables
 from arbiview_aug.errors import DataError
 from tests.cli.convert import damage as damaging
 from tests.cli.convert.damage import ALLOWED, LEFT_OUT, VERSION, Damage, Range, damages
@@ -54,21 +51,6 @@ def test_chains_that_do_not_end(tried: Range, table: str, key: str, length: int)
     assert kind == "refused"
     assert f"table {table}: expected {key} that lead to an end, got a circle through row '" in words
     assert f"empty one row's {key}" in words
-
-
-def test_chains_that_do_not_end_in_an_output_begun_before(tried: Range) -> None:
-    """Its tables are not looked through again: the walk itself ends."""
-    path = tried.source / VERSION / "sample_annotation.json"
-    sound = path.read_bytes()
-    damage = changed(tried, "sample_annotation", circle("next", 1))
-    assert damage.content is not None
-    path.write_bytes(damage.content)
-    try:
-        remaining = Remaining(Tables(tried.source, VERSION, None), {LEFT_OUT})
-        with pytest.raises(DataError, match="expected chains that end, got a circle through row 'goes-"):
-            list(remaining.sample_annotation(defaultdict(float)))
-    finally:
-        path.write_bytes(sound)
 
 
 def put(key: str, value: Any, row: int = -1) -> Callable[[Rows], None]:
