@@ -22,21 +22,13 @@ from arbiview_aug.temporal.motion_depth import motion_depth
 
 
 class Done(NamedTuple):
-    """Result of a frame.
-
-    Attributes:
-        token: The frame's.
-        density: Share of pixels with known distance; 0 if depth was declined.
-        message: How depth was found, or why not.
-        failed: Whether the frame could not be read.
-        existed: Whether its file existed before.
-    """
+    """Result of a frame."""
 
     token: str
-    density: float
-    message: str
-    failed: bool = False
-    existed: bool = False
+    density: float  # share of pixels with known distance; 0 if depth was declined
+    message: str  # how depth was found, or why not
+    failed: bool = False  # whether the frame could not be read
+    existed: bool = False  # whether its file existed before
 
 
 class _Frames(Dataset[Done]):

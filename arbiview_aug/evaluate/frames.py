@@ -79,10 +79,8 @@ def make_frame(
     """
     truth = None if truth is None else lru_cache(_CACHED_TRUTHS)(truth)
     given = {key: value for key, value in sample.items() if key != "points"}
-    if "points" not in sample:
-        return ScoredFrame(given, truth=truth)
-    if not exposures:
-        return ScoredFrame({**given, "points": sample["points"]} if hand_over_points else given, truth=truth)
+    if "points" not in sample or not exposures:
+        return ScoredFrame(dict(sample) if hand_over_points else given, truth=truth)
     rig, images = sample["rig"], as_arrays(sample["images"])
     cloud = sample["points"].numpy().astype(np.float64)
     if hand_over_points:

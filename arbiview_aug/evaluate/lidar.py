@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import cv2
@@ -135,14 +136,13 @@ def equalising_gains(rig: Rig, images: Sequence[Image], points: FloatArray) -> F
         light.append(dict(zip(index[usable].tolist(), np.log(brightness[usable]).tolist(), strict=True)))
     count = len(rig)
     rows, targets = [], []
-    for a in range(count):
-        for b in range(a + 1, count):
-            shared = light[a].keys() & light[b].keys()
-            if len(shared) >= _MIN_SHARED_POINTS:
-                row = np.zeros(count)
-                row[a], row[b] = 1, -1
-                rows.append(row)
-                targets.append(-np.median([light[a][k] - light[b][k] for k in shared]))
+    for a, b in combinations(range(count), 2):
+        shared = light[a].keys() & light[b].keys()
+        if len(shared) >= _MIN_SHARED_POINTS:
+            row = np.zeros(count)
+            row[a], row[b] = 1, -1
+            rows.append(row)
+            targets.append(-np.median([light[a][k] - light[b][k] for k in shared]))
     A = np.vstack([*rows, _GAIN_PRIOR * np.eye(count), np.ones((1, count))])
     rhs = np.concatenate([targets, np.zeros(count + 1)])
     return np.asarray(np.exp(np.linalg.lstsq(A, rhs, rcond=None)[0]))

@@ -175,8 +175,7 @@ def _six(study: Study) -> str:
         rows.append([f"{name} ({published['name']})" if published else name, *(cell(published, f) for _, f in _FOUR)])
         for methods in sets.values():
             means = methods.get(name, {}).get("paper", {})
-            raw = {metric.removeprefix("raw_"): value for metric, value in means.items() if metric.startswith("raw_")}
-            rows[-1] += [cell(raw, form) for _, form in _FOUR]
+            rows[-1] += [cell(means, form.replace("{", "{raw_")) for _, form in _FOUR]
     return markdown_table(head, rows)
 
 

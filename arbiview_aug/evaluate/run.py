@@ -46,8 +46,7 @@ class Evaluation:
         row: dict[str, float] = {}
         for kind in ("overlap", "consistency"):
             found = [p for p in self.pairs if p["method"] == method and p["kind"] == kind]
-            fields = OverlapScore._fields
-            row |= summary(kind, [OverlapScore(*(pair[name] for name in fields)) for pair in found])
+            row |= summary(kind, [OverlapScore._make(map(pair.get, OverlapScore._fields)) for pair in found])
         return row
 
 

@@ -44,12 +44,9 @@ class SampleWriter:
         target: Rig,
         params: Mapping[str, float],
     ) -> dict[str, Any]:
-        """Write the output sample.
+        """Write the output sample of a sample, its frames and its leading dimensions; the input is not changed.
 
         Args:
-            sample: The input; it is not changed.
-            frames: Its frames.
-            lead: Its leading dimensions.
             rendered: The rendered frames.
             labels: The sample's keys that hold label maps.
             target: The target rig in its own ego frame.

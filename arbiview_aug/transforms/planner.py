@@ -77,17 +77,12 @@ class _RigPair:
 class FramePlanner:
     """Plans frames, and caches the plans of calibrations that come back.
 
+    Arguments that are not listed are those of ``RigRetarget``.
+
     Args:
-        config: Settings.
-        surface: As in ``RigRetarget``.
-        harmoniser: Estimates a tone curve for each source.
-        refinement: Cache for depth from overlap, for settings that use it.
-        cache_bytes: Memory for cached plans.
         reach: What neighbouring frames may fill; None leaves them out.
         mixed: Whether at least half of the samples stay untouched.
-        strict: Raise an error instead of warning of what harms a detector.
         unseen: A sentence on pixels that no source sees, for the warning of targets that are hardly covered.
-        warn: Issues warnings.
 
     Raises:
         ValueError: Settings that contradict each other.
@@ -171,11 +166,7 @@ class FramePlanner:
         return plans
 
     def render_plan(self, source: Rig, target: Rig, scene: Scene | None = None) -> RenderPlan:
-        """The cached render plan of a pair of rigs in a scene.
-
-        Raises:
-            ValueError: With ``quality="paper"``.
-        """
+        """The cached render plan of a pair of rigs in a scene; ValueError with ``quality="paper"``."""
         if isinstance(self.config, PaperConfig):
             raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
         pair = self._pair(source, target)

@@ -31,17 +31,11 @@ SOURCES_OVER_VIEWS = 2
 
 @dataclass(frozen=True)
 class Recorded:
-    """Frames on disk.
+    """Frames on disk."""
 
-    Attributes:
-        name: Shown in tables.
-        root: The folder, or ``KIND:PATH``.
-        truth: Renders the true views of a frame for a rig; None on real frames.
-    """
-
-    name: str
-    root: Path
-    truth: Callable[[int, Rig], RenderedViews] | None = None
+    name: str  # shown in tables
+    root: Path  # the folder, or ``KIND:PATH``
+    truth: Callable[[int, Rig], RenderedViews] | None = None  # renders a frame's true views for a rig
 
     def sample(self, index: int, reduce: Reduce = 1) -> dict[str, Any]:
         """Read a frame with images at 1 / ``reduce``."""

@@ -122,10 +122,10 @@ def _timed(
     times: list[float] = []
 
     def render(sample: Sample, rig: Rig) -> list[RenderedView]:
-        found: list[RenderedView] = []
+        views: list[list[RenderedView]] = []
         for _ in range(1 + repeats):
-            times.append(clock(lambda: found.__setitem__(slice(None), method.render(sample, rig))))
-        return found
+            times.append(clock(lambda: views.append(method.render(sample, rig))))
+        return views[-1]
 
     views, metrics = scores(frame, render, target, ("even",))
     return views, metrics, times

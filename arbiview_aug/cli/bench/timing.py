@@ -124,12 +124,10 @@ def machine(load_before: tuple[float, float, float]) -> dict[str, Any]:
 
 def cpu_model() -> str:
     """Processor as the kernel names it; without /proc, at least the architecture."""
-    try:
-        text = Path("/proc/cpuinfo").read_text()
-    except OSError:
-        text = ""
-    names = [line.partition(":")[2].strip() for line in text.splitlines() if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
+    with suppress(OSError):
+        if found := re.search(r"^model name\s*: (.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
+            return found[1].strip()
+    return platform.processor() or platform.machine()
 
 
 def machine_line(report: Mapping[str, Any]) -> str:

@@ -56,27 +56,17 @@ REPEATS = 9
 REFERENCE: Reduce = 2
 """Decoding factor of the images whose colours score."""
 _ENOUGH_MS = 1000.0  # keeps a sweep of 63 settings at three minutes
-_CORRECTED = ("street", "objects")
-"""Surfaces that depth from overlap can correct."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A point of the sweep.
-
-    Attributes:
-        quality: As in ``RigRetarget``.
-        surface: As in ``RigRetarget``.
-        reduce: Images are decoded at 1 / this.
-        execution: ``opencv`` or ``torch`` on the CPU, or ``cuda``: torch on a GPU.
-        cached: Whether depth from overlap is cached.
-    """
+    """A point of the sweep."""
 
     quality: Quality
     surface: SurfaceName
-    reduce: Reduce
-    execution: Execution
-    cached: bool = False
+    reduce: Reduce  # images are decoded at 1 / this
+    execution: Execution  # ``opencv`` or ``torch`` on the CPU, or ``cuda``: torch on a GPU
+    cached: bool = False  # whether depth from overlap is cached
 
     @property
     def name(self) -> str:
@@ -136,7 +126,7 @@ def settings(
         for surface in surfaces:
             if quality != "accurate":
                 found.append(Setting(quality, surface, reduce, execution))
-            elif surface in _CORRECTED:
+            elif SURFACES[surface].overlap_depth:
                 found += [Setting(quality, surface, reduce, execution, cached) for cached in (False, True)]
     return found
 
