@@ -75,7 +75,7 @@ def decode_images(
     """
     check_reduce(reduce)
     files = [Path(path) for path in paths]
-    labels = [_label(names[k] if names else file.stem, file) for k, file in enumerate(files)]
+    labels = [f"camera {(names[k] if names else file.stem)!r}: image {file}" for k, file in enumerate(files)]
     headers = [read_header(file, label) for file, label in zip(files, labels, strict=True)]
     if sizes is not None:
         for header, label, size in zip(headers, labels, sizes, strict=True):
@@ -126,13 +126,12 @@ def reduced_rig(rig: Rig, reduce: Reduce) -> Rig:
     return rig if reduce == 1 else rig.with_cameras([reduced_camera(camera, reduce) for camera in rig])
 
 
-def read_header(path: Path, label: str | None = None) -> ImageHeader:
+def read_header(path: Path, label: str) -> ImageHeader:
     """Read format and size of a JPEG or PNG file; ``label`` names camera and file in messages.
 
     Raises:
         DataError: A missing, empty or truncated file, or one of another format.
     """
-    label = label or _label(path.stem, path)
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -170,10 +169,6 @@ def _number(data: bytes, at: int, length: int) -> int:
     return int.from_bytes(data[at : at + length], "big")
 
 
-def _label(name: str, path: Path) -> str:
-    return f"camera {name!r}: image {path}"
-
-
 def _check_size(size: tuple[int, int], calibrated: tuple[int, int], label: str) -> None:
     if size != calibrated:
         fix = "use the calibration of these images, or resize its camera (Camera.resize) with them"
@@ -188,13 +183,12 @@ def _decode_into(out: ByteArray, path: Path, label: str, header: ImageHeader, re
     if header.format == "JPEG" and _decode_jpeg_in_place(out, path, reduce):
         return
     # For PNGs cv2's reduced flags round sizes down, to another scale than for JPEGs.
-    own_scale = header.format == "JPEG"
-    image = cv2.imread(str(path), _FLAGS | (_REDUCED_FLAGS[reduce] if own_scale else 0))
+    image = cv2.imread(str(path), _FLAGS | (_REDUCED_FLAGS[reduce] if header.format == "JPEG" else 0))
     if image is None:
         raise DataError(f"{label}: expected an image, got a {header.format} that cannot be decoded; copy it again")
     if _RGB_FLAG is None:
         cv2.cvtColor(image, cv2.COLOR_BGR2RGB, image)
-    if reduce > 1 and not own_scale:
+    if reduce > 1 and header.format == "PNG":
         h, w = image.shape[:2]
         image = cv2.copyMakeBorder(image, 0, -h % reduce, 0, -w % reduce, cv2.BORDER_REPLICATE)
         image = cv2.resize(image, out.shape[1::-1], interpolation=cv2.INTER_AREA)

@@ -52,11 +52,7 @@ class MixedDataset(Dataset[Any]):
     access. Samplers, subsets and the length are those of either dataset.
 
     Unlike with ``RigRetarget(p=...)``, the two may differ in keys and number of cameras. ``default_collate`` cannot
-    stack such items: use ``DataLoader(..., batch_size=None)`` for single items, or ``collate_fn=list`` for batches that
-    are lists of samples.
-
-    The transform within ``retargeted`` does not know that it is mixed: ``RigRetarget(surface="street")`` allows cameras
-    to move over the static street.
+    stack such items: use ``DataLoader(..., batch_size=None)`` for single items, or ``collate_fn=list``.
 
     Args:
         raw: Map-style dataset of untouched samples.

@@ -24,14 +24,7 @@ from arbiview_aug.datasets.nuscenes.recordings import LIDAR, IntArray, read_reco
 from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Row, Tables
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError
 
-CAMERA_RING = (
-    "CAM_FRONT",
-    "CAM_FRONT_RIGHT",
-    "CAM_BACK_RIGHT",
-    "CAM_BACK",
-    "CAM_BACK_LEFT",
-    "CAM_FRONT_LEFT",
-)
+CAMERA_RING = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_FRONT_LEFT")
 """Order of the cameras in a sample, clockwise from above; other cameras follow by name."""
 
 _POINT_FLOATS = 5  # x y z intensity ring
@@ -53,22 +46,16 @@ class NuScenesDataset(Recording):
     ``time_s``; with ``load_points`` the ``points`` (P, 5) float32: x y z intensity ring; with ``load_boxes`` the
     ``boxes_3d`` (B, 9) float32: centre, length, width, height in metres, yaw in radians, velocity x y in m/s over the
     ground (NaN where unknown), with ``box_names`` (categories) and ``box_tokens``. The numbers of points and boxes
-    vary: batch with ``batch_size=None`` or a ``collate_fn`` that keeps them as lists. If none of the samples is
-    annotated, they have no boxes, with a warning.
-
-    Cameras and LiDAR record at different times. With ``compensate_ego_motion`` a camera's pose is that of its exposure
-    in the ego frame at the LiDAR's time: inv(ego2global at LiDAR time) @ ego2global at camera time @ calibrated_sensor.
-    Without, it is the mounting alone, which at 9 m/s is 0.4 m away from the pixels.
+    vary: batch with ``batch_size=None`` or a ``collate_fn`` that keeps them as lists. If no sample is annotated, they
+    have no boxes, with a warning.
 
     With ``neighbours`` a sample also has other frames of its scene, keyframes and sweeps, by the distance that the
     vehicle travelled between the images of the first of ``channels``. A sweep has its own time and ego pose, the image
-    of each other camera nearest in time, posed as above, and the boxes interpolated to its time. Images are decoded on
-    access.
+    of each other camera nearest in time, and the boxes interpolated to its time. Images are decoded on access.
 
     All files lie below the root, which may be a link: names and links that leave it are refused when they are read.
 
-    The ego's origin is on the road (``ground_z_m`` = 0). Boxes stand upright: roll and pitch of the ego (below 2
-    degrees) are left out of their yaw.
+    The ego's origin is on the road (``ground_z_m`` = 0). Boxes stand upright: roll and pitch of the ego are left out.
 
     Args:
         root: The folder with ``samples`` and the folder of tables. Either this or ``nusc``.
@@ -76,7 +63,8 @@ class NuScenesDataset(Recording):
         nusc: A loaded devkit ``NuScenes`` object, whose tables are used.
         split_scenes: Names or tokens of the scenes to keep; None keeps all.
         channels: Camera channels in the order wanted; None takes all in the order of ``CAMERA_RING``.
-        compensate_ego_motion: See above.
+        compensate_ego_motion: Pose each camera as at its exposure, in the ego frame at the LiDAR's time. Without, its
+            pose is the mounting alone, which at 9 m/s is 0.4 m away from the pixels.
         load_points: Whether to read the LiDAR's points.
         load_boxes: Whether to read the boxes.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size; the rig follows (see ``decode_images``).

@@ -26,7 +26,7 @@ LIDAR_BEAMS_DEG = (-30.67, 10.67)
 """Elevations of the lowest and the highest of 32 beams (Velodyne HDL-32E)."""
 LIDAR_COLUMNS = 1088
 LIDAR_RANGE_M = (1.0, 90.0)
-LIDAR_NOISE_M = 0.02
+LIDAR_NOISE_M = 0.02  # one sigma
 _BEAMS = 32
 
 
@@ -55,8 +55,7 @@ class RenderedViews(NamedTuple):
 class SyntheticDrive(Dataset[dict[str, Any]]):
     """Procedural streets as camera samples with LiDAR-like points and 3D boxes, in the rig's ego frame.
 
-    Scene ``index`` depends on (seed, index) alone: different rigs see the same street from the same place, standing on
-    its road. Datasets with different seeds share no street.
+    Scene ``index`` depends on (seed, index) alone: different rigs see the same street from the same place on its road.
 
     ``drive[i]`` is a dict: ``images`` (N, 3, h, w) uint8 (a list where sizes differ), ``rig``, ``K`` (N, 3, 3) and
     ``cam2ego`` (N, 4, 4) float64, ``points`` (P, 4) float32 x y z intensity (0 to 255), ``boxes_3d`` (B, 7) float32
@@ -167,10 +166,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         return RenderedViews(*(stack_or_list([v[k] for v in views]) for k in range(4)))
 
     def points(self, index: int) -> Tensor:
-        """(P, 4) float32 LiDAR-like points x y z intensity (0 to 255) of scene ``index``, in the rig's ego frame.
-
-        32 beams from 1.9 m over the road, first returns within 90 m, with Gaussian range noise of 2 cm (one sigma).
-        """
+        """(P, 4) float32 LiDAR-like points x y z intensity (0 to 255) of scene ``index``, in the rig's ego frame."""
         index = self._checked_index(index)
         scene = self.scene(index)
         elevation = np.radians(np.linspace(*LIDAR_BEAMS_DEG, _BEAMS))

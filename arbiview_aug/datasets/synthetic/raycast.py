@@ -105,19 +105,18 @@ def find_candidates(local: LocalScene, rays: Tensor) -> Candidates:
     # Cull first by sixteenths of all packets together, then by packet.
     groups = torch.arange(len(sides)) * 16 // max(1, len(sides))
     seen = torch.zeros(len(sides), len(local.order), dtype=torch.bool)
-    for group in range(16):
+    for group in groups.unique():
         rows = (groups == group).nonzero()[:, 0]
-        if not len(rows):
-            continue
         coarse = pyramids(rays[rows].permute(1, 0, 2).reshape(1, 3, -1))
         some = _inside(coarse, local.corners)[0].nonzero()[:, 0]
-        if len(some):
-            seen[rows[:, None], some[None]] = _inside(sides[rows], local.corners[some])
+        seen[rows[:, None], some[None]] = _inside(sides[rows], local.corners[some])
     packet, primitive = seen.nonzero(as_tuple=True)
-    counts = seen.sum(1)
-    first = counts.cumsum(0) - counts
-    rank = torch.arange(len(packet)) - first[packet]
-    return Candidates(packet, primitive, rank)
+    return Candidates(packet, primitive, ranks(packet, seen.sum(1)))
+
+
+def ranks(group: Tensor, counts: Tensor) -> Tensor:
+    """(n,) rank of each entry within its group (n,), sorted, of which group k has ``counts[k]`` entries."""
+    return torch.arange(len(group)) - (counts.cumsum(0) - counts)[group]
 
 
 def _inside(sides: Tensor, corners: Tensor) -> Tensor:

@@ -23,6 +23,7 @@ from arbiview_aug.datasets.synthetic.raycast import (
     LocalScene,
     cast,
     find_candidates,
+    ranks,
     scene_from,
 )
 from arbiview_aug.datasets.synthetic.scene import Scene, SceneClass
@@ -87,9 +88,8 @@ def _differences(rays: np.ndarray, valid: np.ndarray, axis: int) -> np.ndarray:
     before, after = np.arange(n).clip(1) - 1, np.arange(n).clip(max=n - 2) + 1
     sides = []
     for a, b in ((np.arange(n), after), (before, np.arange(n))):
-        good = (valid.take(a, axis) & valid.take(b, axis))[..., None] & (
-            (a != b)[:, None, None] if axis == 0 else (a != b)[None, :, None]
-        )
+        apart = (a != b)[:, None] if axis == 0 else a != b
+        good = (valid.take(a, axis) & valid.take(b, axis) & apart)[..., None]
         sides.append((np.where(good, rays.take(b, axis) - rays.take(a, axis), 0), good))
     count = sides[0][1].astype(int) + sides[1][1]
     return (sides[0][0] + sides[1][0]) / np.maximum(count, 1)
@@ -212,7 +212,7 @@ class Renderer:
         counts = torch.bincount(tile, minlength=len(outline))
         packets = (counts + _PACKET_PX - 1) // _PACKET_PX
         first_pixel, first_packet = counts.cumsum(0) - counts, packets.cumsum(0) - packets
-        rank = torch.arange(len(tile)) - first_pixel[tile]
+        rank = ranks(tile, counts)
         packet, place = first_packet[tile] + rank // _PACKET_PX, rank % _PACKET_PX
         owner = torch.repeat_interleave(torch.arange(len(outline)), packets)
         packed = sub[first_pixel[owner]][:, None, :1].expand(-1, _PACKET_PX, s * s, -1).clone()
@@ -290,8 +290,7 @@ def _for_packets(candidates: Candidates, owner: Tensor, tiles: int) -> Candidate
     counts = torch.bincount(candidates.packet, minlength=tiles)
     first = counts.cumsum(0) - counts
     packet = torch.repeat_interleave(torch.arange(len(owner)), counts[owner])
-    start = counts[owner].cumsum(0) - counts[owner]
-    rank = torch.arange(len(packet)) - start[packet]
+    rank = ranks(packet, counts[owner])
     return Candidates(packet, candidates.primitive[first[owner[packet]] + rank], rank)
 
 

@@ -104,11 +104,11 @@ class Light:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """One street scene; depends on (seed, index) alone.
+    """One street scene; P primitives and B labelled boxes in the street frame.
 
     Attributes:
         kind: (P,) BOX, ELLIPSOID or CYLINDER.
-        center: (P, 3) street frame, metres.
+        center: (P, 3) metres.
         rotation: (P, 3, 3) local axes as columns in the street frame.
         half: (P, 3) half extents along the local axes; a cylinder's axis is its local z.
         planes: (P, 6, 4) outward half-spaces n·p <= b of boxes, street frame: front, rear, left, right, top, bottom.
@@ -178,6 +178,7 @@ class Scene:
 
 
 _ZEROS = (0.0, 0.0, 0.0, 0.0)
+_NO_TURN, _NO_PLANES = np.eye(3), np.zeros((6, 4))
 _SIGNS = np.array([[x, y, z] for x in (1, -1) for y in (1, -1) for z in (1, -1)], dtype=np.float64)
 
 
@@ -239,8 +240,7 @@ class Placed:
     ) -> None:
         """Add a box from its bounds; ``taper``: how far front, rear, left and right lean inward at the top, metres."""
         lo, hi = np.array([x, y, z], np.float64).T
-        half = (hi - lo) / 2
-        hx, hy, hz = half
+        hx, hy, hz = half = (hi - lo) / 2
         front, rear, left, right = taper
         normals = np.array(
             [[2 * hz, 0, front], [-2 * hz, 0, rear], [0, 2 * hz, left], [0, -2 * hz, right], [0, 0, 1], [0, 0, -1]]
@@ -251,7 +251,7 @@ class Placed:
         top = corners[:, 2] > 0
         corners[:, 0] -= np.where(top, np.where(corners[:, 0] > 0, front, -rear), 0)
         corners[:, 1] -= np.where(top, np.where(corners[:, 1] > 0, left, -right), 0)
-        planes = np.concatenate([normals, offsets[:, None]], axis=1) / norm[:, None]
+        planes = np.column_stack([normals, offsets]) / norm[:, None]
         self._add(BOX, (hi + lo) / 2, half, material, color, param, corners=corners, planes=planes)
 
     def ellipsoid(self, center: Vector, radii: Vector, material: Material, color: Vector) -> None:
@@ -270,7 +270,7 @@ class Placed:
         param: Param = _ZEROS,
     ) -> None:
         """Add a capped elliptic cylinder, upright or (wheels) with its axis along the object's y."""
-        axes = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]) if lateral else np.eye(3)
+        axes = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]) if lateral else _NO_TURN
         self._add(CYLINDER, np.array(center), np.array([*radii, half_length]), material, color, param, axes=axes)
 
     def _add(
@@ -282,23 +282,19 @@ class Placed:
         color: Vector,
         param: Param = _ZEROS,
         *,
-        axes: FloatArray | None = None,
+        axes: FloatArray = _NO_TURN,
         corners: FloatArray | None = None,
-        planes: FloatArray | None = None,
+        planes: FloatArray = _NO_PLANES,
     ) -> None:
-        rotation = self.rotation @ (np.eye(3) if axes is None else axes)
-        center = self.origin + self.rotation @ middle
-        world_planes = np.zeros((6, 4))
-        if planes is not None:
-            world_planes[:, :3] = planes[:, :3] @ rotation.T
-            world_planes[:, 3] = planes[:, 3] + world_planes[:, :3] @ center
+        rotation, center = self.rotation @ axes, self.origin + self.rotation @ middle
+        normals = planes[:, :3] @ rotation.T
         self.builder.primitives.append(
             {
                 "kind": kind,
                 "center": center,
                 "rotation": rotation,
                 "half": half,
-                "planes": world_planes,
+                "planes": np.column_stack([normals, planes[:, 3] + normals @ center]),
                 "corners": center + (_SIGNS * half if corners is None else corners) @ rotation.T,
                 "material": material,
                 "cls": self.cls,

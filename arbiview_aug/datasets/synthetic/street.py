@@ -139,11 +139,8 @@ class _World:
     def is_clear(self, x: float, y: float, length: float, width: float, yaw: float) -> bool:
         """True if a footprint overlaps neither the ego vehicle nor another one."""
         c, s = math.cos(yaw), math.sin(yaw)
-        ends = [
-            (x + c * a - s * b, y + s * a + c * b)
-            for a in (-length / 2, 0, length / 2)
-            for b in (-width / 2, width / 2)
-        ]
+        offsets = [(a, b) for a in (-length / 2, 0, length / 2) for b in (-width / 2, width / 2)]
+        ends = [(x + c * a - s * b, y + s * a + c * b) for a, b in offsets]
         ego = (np.array(ends) - self.ego2street[:2, 3]) @ self.ego2street[:2, :2]
         lo, hi = ego.min(0), ego.max(0)
         if hi[0] > CLEAR_X_M[0] and lo[0] < CLEAR_X_M[1] and hi[1] > -CLEAR_Y_M and lo[1] < CLEAR_Y_M:
