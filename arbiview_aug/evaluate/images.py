@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.errors import SampleError
-
-if TYPE_CHECKING:
-    import torch
 
 Image = npt.NDArray[np.uint8] | npt.NDArray[np.floating[Any]]
 """(h, w, 3) RGB on the scale 0-255, uint8 or float."""
@@ -54,8 +52,6 @@ def as_arrays(images: torch.Tensor | Sequence[torch.Tensor]) -> list[Image]:
 
 def as_tensors(images: Sequence[Image]) -> list[torch.Tensor]:
     """Convert arrays on the scale 0-255 to uint8 tensors (3, h, w)."""
-    import torch
-
     return [torch.from_numpy(np.ascontiguousarray(to_bytes(image).transpose(2, 0, 1))) for image in images]
 
 

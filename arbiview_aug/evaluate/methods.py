@@ -31,6 +31,9 @@ OURS: tuple[Quality, ...] = ("draft", "fast", "accurate")
 INPAINTED, GENERATED = "fast, inpainted", "generator"
 """Rows of ``fast`` with holes filled by Telea's inpainting, and by the shipped weights."""
 
+WEIGHTS = ("distance", "gradient", "quality", "primary")
+"""Weights of the paper's stage 4."""
+
 _CACHED_TRANSFORMS = 8  # the targets of a set; full-size plans take 50 MB each
 
 
@@ -174,14 +177,14 @@ def paper_stages() -> dict[str, PaperConfig]:
         "paper without stage 2, matching": replace(full, use_feature_matching=False),
         "paper without stage 3, objects": replace(full, use_object_alignment=False),
         "paper without stages 2 and 3": replace(full, use_feature_matching=False, use_object_alignment=False),
-        "paper without stage 4, weights": replace(
-            full,
-            use_distance_weight=False,
-            use_gradient_weight=False,
-            use_quality_weight=False,
-            use_primary_weight=False,
-        ),
+        "paper without stage 4, weights": without_weights(full, *WEIGHTS),
     }
+
+
+def without_weights(config: PaperConfig, *weights: str) -> PaperConfig:
+    """Switch off some of the ``WEIGHTS``."""
+    off: dict[str, Any] = {f"use_{weight}_weight": False for weight in weights}
+    return replace(config, **off)
 
 
 def study_methods() -> list[Method]:

@@ -94,10 +94,8 @@ def measure_paper(
         collected: dict[str, dict[str, list[dict[str, float]]]] = {m.name: {kind: [] for kind in SETS} for m in rows}
         for frame in found:
             for kind in SETS:
-                # Raw exposures only where the paper has numbers; synthetic cameras have one exposure.
+                # Raw exposures only where the paper has numbers.
                 exposures: tuple[Exposure, ...] = ("raw", "even") if kind == "paper" else ("even",)
-                if "even" not in frame.lidar:
-                    exposures = ("raw",)
                 targets = named_targets(kind, frame.sample["rig"])
                 steps += len(targets) * len(rows)
                 for (target_name, target), method in product(targets.items(), rows):

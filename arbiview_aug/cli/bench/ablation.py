@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,7 +26,7 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.agreement import source_overlap, summary
 from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
-from arbiview_aug.evaluate.methods import Method, paper_stages, retargeting
+from arbiview_aug.evaluate.methods import WEIGHTS, Method, paper_stages, retargeting, without_weights
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import UP_M, paper_targets, shifted_target
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality
@@ -35,12 +34,7 @@ from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.scene.surface import SurfaceName
 
 SYNTHETIC = "synthetic street"
-_WEIGHTS = ("distance", "gradient", "quality", "primary")
-
-
-def _stages_1_and_4(*without: str) -> PaperConfig:
-    off: dict[str, Any] = {f"use_{weight}_weight": False for weight in without}
-    return replace(paper_stages()["paper without stages 2 and 3"], **off)
+_STAGES_1_AND_4 = paper_stages()["paper without stages 2 and 3"]
 
 
 class Row(NamedTuple):
@@ -67,8 +61,8 @@ class Row(NamedTuple):
 
 ROWS: dict[str, Row] = {
     **{name: Row(config, "far") for name, config in paper_stages().items()},
-    **{f"stages 1 and 4 without w_{w}": Row(_stages_1_and_4(w), "far") for w in _WEIGHTS},
-    "stage 1": Row(_stages_1_and_4(*_WEIGHTS), "far"),
+    **{f"stages 1 and 4 without w_{w}": Row(without_weights(_STAGES_1_AND_4, w), "far") for w in WEIGHTS},
+    "stage 1": Row(without_weights(_STAGES_1_AND_4, *WEIGHTS), "far"),
     "draft": Row("draft"),
     "fast without blended seams": Row(FavsConfig(seam_width=0.0)),
     "fast": Row("fast"),
@@ -97,7 +91,7 @@ STEPS: dict[str, Step] = {
     "stages 2 and 3": Step("paper", "paper without stages 2 and 3"),
     "stage 4, weights": Step("paper", "paper without stage 4, weights"),
     "stages 2, 3 and 4": Step("paper", "stage 1"),
-    **{f"w_{w}": Step("paper without stages 2 and 3", f"stages 1 and 4 without w_{w}") for w in _WEIGHTS},
+    **{f"w_{w}": Step("paper without stages 2 and 3", f"stages 1 and 4 without w_{w}") for w in WEIGHTS},
     "bilinear, not nearest": Step("fast without blended seams", "draft"),
     "blended seams": Step("fast", "fast without blended seams"),
     "ground, not far": Step("fast, ground", "fast, far"),

@@ -159,15 +159,15 @@ def _parser() -> argparse.ArgumentParser:
     executions = [*get_args(Execution)] if torch.cuda.is_available() else ["opencv", "torch"]
     surfaces = [name for name in SURFACES if name != "auto"]
     parser.add_argument("--frames", type=count, default=1, metavar="N", help="frames for accuracy")
-    parser.add_argument("--quality", nargs="+", choices=get_args(Quality), help="(default: all)")
+    qualities = [*get_args(Quality)]
+    parser.add_argument("--quality", nargs="+", choices=qualities, default=qualities, help="presets")
     parser.add_argument("--surface", nargs="+", choices=surfaces, help="(default: what the samples offer)")
-    parser.add_argument("--reduce", nargs="+", type=int, choices=REDUCES, help="decode at 1/N (default: 1 2 4)")
-    parser.add_argument("--execution", nargs="+", choices=executions, help="(default: all that there are)")
+    parser.add_argument("--reduce", nargs="+", type=int, choices=REDUCES, default=[*REDUCES], help="decode at 1/N")
+    parser.add_argument("--execution", nargs="+", choices=executions, default=executions, help="backends")
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument("--budget-ms", type=float, metavar="MS", help="recommend the most accurate within it")
     limit.add_argument("--min-psnr", type=float, metavar="DB", help="recommend the fastest that reaches it")
     parser.add_argument("--json", action="store_true", help="print the JSON instead of the tables")
-    parser.set_defaults(executions=executions)
     return parser
 
 
@@ -176,8 +176,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     """Score and time all settings."""
     source: Rig = data.sample(0, REFERENCE)["rig"]
     target = data.target(arguments.target, arguments.size)
-    qualities: Sequence[Quality] = arguments.quality or get_args(Quality)
-    if "paper" in qualities:  # homographies know no lens; all settings share the target
+    if "paper" in arguments.quality:  # homographies know no lens; all settings share the target
         target = target.undistorted()
 
     @cache
@@ -186,9 +185,9 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
 
     wanted = settings(
         [s for s in _surfaces(frame(0, REFERENCE).scored_sample) if not arguments.surface or s in arguments.surface],
-        qualities=qualities,
-        reduces=arguments.reduce or REDUCES,
-        executions=arguments.execution or arguments.executions,
+        qualities=arguments.quality,
+        reduces=arguments.reduce,
+        executions=arguments.execution,
     )
     rows: list[dict[str, Any]] = []
     for one in tqdm(wanted, desc="accuracy", unit="setting", leave=False):
