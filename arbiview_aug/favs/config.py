@@ -11,40 +11,34 @@ Quality = Literal["draft", "fast", "accurate", "paper"]
 
 @dataclass(frozen=True, kw_only=True)
 class FavsConfig:
-    """Settings of planned rendering. ``docs/benchmarks.md`` (Ablation) says what each one is worth."""
+    """Settings of planned rendering. ``docs/benchmarks.md`` (Ablation) says what each one is worth.
+
+    Attributes:
+        interpolation: Sampling of the sources. ``cubic`` applies only where a target camera magnifies what it reads at
+            its own centre (``arbiview_aug.render.view_planner.MAGNIFIED``).
+        antialias: Read from a source halved until the target no longer minifies it by two or more.
+        seam_width: Width of the blended band along a seam, as a fraction of the target's width; 0 switches blending
+            off. Wider bands show double images of near objects, narrower ones the exposure step.
+        distance_gamma: γ of w_distance = (d / d_max)^γ.
+        primary_bonus: w_primary of a source at the target's own centre: it is exact, so it wins wherever it sees.
+        far_parallax_px: Largest shift of scene points beyond 2 m at which ``auto`` takes a pair of cameras as far.
+        grid_step_px: Spacing of the coarse grid on which maps are evaluated in float64 before interpolation.
+        map_tolerance_px: Largest interpolation error of a grid cell; others are evaluated exactly. With the fixed-point
+            maps' rounding of 1/64 px, maps stay within 1/32 px of float64.
+        overlap_depth: Correct the street's distances in every frame by stereo between overlapping cameras.
+        certainty: Store the geometry's accuracy in plans, one byte a pixel; ``outputs=("confidence",)`` needs it.
+    """
 
     interpolation: Literal["nearest", "linear", "cubic"] = "cubic"
-    """Sampling of the sources. ``cubic`` applies only where a target camera magnifies what it reads at its own centre
-    (``arbiview_aug.render.view_planner.MAGNIFIED``)."""
-
     antialias: bool = True
-    """Read from a source halved until the target no longer minifies it by two or more."""
-
     seam_width: float = 0.03
-    """Width of the blended band along a seam, as a fraction of the target's width; 0 switches blending off. Wider bands
-    show double images of near objects, narrower ones the exposure step."""
-
     distance_gamma: float = 1.0
-    """γ of w_distance = (d / d_max)^γ."""
-
     primary_bonus: float = 1e6
-    """w_primary of a source at the target's own centre: it is exact, so it wins wherever it sees."""
-
     far_parallax_px: float = 0.5
-    """``auto`` takes a pair of cameras as far where no scene point beyond 2 m could shift by more than this."""
-
     grid_step_px: int = 8
-    """Spacing of the coarse grid on which maps are evaluated in float64 before interpolation."""
-
     map_tolerance_px: float = 1 / 64
-    """Largest interpolation error of a grid cell; others are evaluated exactly. With the fixed-point maps' rounding of
-    1/64 px, maps stay within 1/32 px of float64."""
-
     overlap_depth: bool = False
-    """Correct the street's distances in every frame by stereo between overlapping cameras."""
-
     certainty: bool = False
-    """Store one byte per pixel in plans for the geometry's accuracy, which ``outputs=("confidence",)`` needs."""
 
     def __post_init__(self) -> None:
         check_ranges(self, _RANGES)
@@ -71,67 +65,60 @@ class PaperConfig:
 
     The paper names its parameters but gives no values, except for ``ratio``. Lengths named ``_px`` are target pixels at
     a target width of 800 px and scale with the width.
+
+    Attributes:
+        use_feature_matching: Stage 2: correct H_geometric by matched features.
+        use_object_alignment: Stage 3: shift H_base by the objects' mean offset.
+        use_detections: Stage 3: take types of objects from the sample's detections; if off, all types are geometric.
+        use_distance_weight: Stage 4: w_distance.
+        use_gradient_weight: Stage 4: w_gradient.
+        use_quality_weight: Stage 4: w_quality.
+        use_primary_weight: Stage 4: w_primary.
+        ratio: Lowe's ratio d1 / d2, the paper's value.
+        max_features: Number of the strongest SIFT keypoints per overlap; the most seen in real frames is 1108.
+        overlap_margin_px: Margin around the overlap's bounding box, about the reach of a SIFT descriptor.
+        min_overlap_px: Smallest width of an overlap to match: descriptors reach across narrower ones.
+        ransac_px: Largest reprojection error of an inlier of M.
+        min_matches: Criterion 1, min_matches: four matches always fit a homography exactly.
+        max_area_ratio: Criterion 2: bound of ``check_homography``, relative to the cameras' focal lengths.
+        consistent_px: Largest corner motion at which H_base = H_feature: half a degree at 60 degrees of view.
+        inconsistent_px: Criterion 3, threshold: corner motion from which H_base = H_geometric; α is linear below it.
+        cluster_radius_px: DBSCAN's ε: a car's width, 1.8 m, at 40 m and 60 degrees of view.
+        min_samples: DBSCAN's min_samples.
+        cluster_spread_px: Spread s_j of a cluster's offsets at which confidence_j = 1 / (1 + (s_j / this)²) is 1/2.
+        type_weights: type_weight_j by type. Without detections the type is geometric: ``ground`` on the road,
+            ``upright`` across the horizon, ``far`` above it. The offset of near road is mostly its own parallax.
+        other_type_weight: type_weight_j of any other type of a detector.
+        ground_reach_m: Distance within which a cluster's top must meet the road for the type ``ground``.
+        beta: β, the adjustment strength in [0, 1]: ΔT moves the background along with the objects.
+        max_shift_px: Longest ΔT: longer ones come from mismatches or a single near object.
+        distance_gamma: γ of w_distance = (d / d_max)^γ.
+        gradient_sigma: σ of w_gradient, in grey levels per pixel.
+        unmatched_quality: w_quality of a source without accepted matches; it rises to 1 with the share of inliers.
+        primary_bonus: w_primary of the primary camera.
     """
 
     use_feature_matching: bool = True
-    """Stage 2: correct H_geometric by matched features."""
-
     use_object_alignment: bool = True
-    """Stage 3: shift H_base by the objects' mean offset."""
-
     use_detections: bool = True
-    """Stage 3: take types of objects from the sample's detections; if off, all types are geometric."""
-
     use_distance_weight: bool = True
-    """Stage 4: w_distance."""
-
     use_gradient_weight: bool = True
-    """Stage 4: w_gradient."""
-
     use_quality_weight: bool = True
-    """Stage 4: w_quality."""
-
     use_primary_weight: bool = True
-    """Stage 4: w_primary."""
-
     # --- stage 2 ----
     ratio: float = 0.75
-    """Lowe's ratio d1 / d2, the paper's value."""
-
     max_features: int = 2000
-    """Number of the strongest SIFT keypoints per overlap; the most seen in real frames is 1108."""
-
     overlap_margin_px: float = 8.0
-    """Margin around the overlap's bounding box, about the reach of a SIFT descriptor."""
-
     min_overlap_px: float = 16.0
-    """Smallest width of an overlap to match: descriptors reach across narrower ones."""
-
     ransac_px: float = 2.0
-    """Largest reprojection error of an inlier of M."""
-
     min_matches: int = 10
-    """Criterion 1, min_matches: four matches always fit a homography exactly."""
-
     max_area_ratio: float = 16.0
-    """Criterion 2: bound of ``check_homography``, relative to the cameras' focal lengths."""
-
     consistent_px: float = 6.0
-    """Largest corner motion at which H_base = H_feature: half a degree at 60 degrees of view."""
-
     inconsistent_px: float = 24.0
-    """Criterion 3, threshold: corner motion from which H_base = H_geometric; α rises linearly up to it."""
-
     # --- stage 3 ----
     cluster_radius_px: float = 30.0
-    """DBSCAN's ε: a car's width, 1.8 m, at 40 m and 60 degrees of view."""
-
     min_samples: int = 4
-    """DBSCAN's min_samples."""
-
     cluster_spread_px: float = 2.0
-    """Spread s_j of the offsets in a cluster at which confidence_j = 1 / (1 + (s_j / this)²) is one half."""
-
     type_weights: tuple[tuple[str, float], ...] = (
         ("upright", 1.0),
         ("far", 1.0),
@@ -139,33 +126,15 @@ class PaperConfig:
         ("vehicle", 1.0),
         ("pedestrian", 1.0),
     )
-    """type_weight_j by type. Without detections the type is geometric: ``ground`` on the road, ``upright`` across the
-    horizon, ``far`` above it. The offset of near road is mostly its own parallax."""
-
     other_type_weight: float = 0.5
-    """type_weight_j of any other type of a detector."""
-
     ground_reach_m: float = 40.0
-    """Distance within which a cluster's top must meet the road for the type ``ground``."""
-
     beta: float = 0.5
-    """β, the adjustment strength in [0, 1]: ΔT moves the background along with the objects."""
-
     max_shift_px: float = 12.0
-    """Longest ΔT: longer ones come from mismatches or a single near object."""
-
     # --- stage 4 ----
     distance_gamma: float = 1.0
-    """γ of w_distance = (d / d_max)^γ."""
-
     gradient_sigma: float = 16.0
-    """σ of w_gradient, in grey levels per pixel."""
-
     unmatched_quality: float = 0.5
-    """w_quality of a source without accepted matches; it rises to 1 with the share of inliers."""
-
     primary_bonus: float = 4.0
-    """w_primary of the primary camera."""
 
     def __post_init__(self) -> None:
         check_ranges(self, _PAPER_RANGES)

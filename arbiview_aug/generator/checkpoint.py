@@ -6,48 +6,36 @@ disk or a killed process. Nothing is unpickled.
 
 from __future__ import annotations
 
+import hashlib
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
-from arbiview_aug.atomic_io import checksum
+from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError
 
 FORMAT = 1
 CONFIG_FILE = "config.json"
-_MAX_NAMES = 4  # in an error
+_MAX_MESSAGE = 500  # characters of torch's message, which names every tensor
 
 
 def write_checkpoint(folder: Path, config: Mapping[str, Any], tensors: Mapping[str, torch.Tensor]) -> None:
     """Write a checkpoint to a folder, which is created if needed, or replace the one there.
 
     Raises:
-        OSError: The disk is full, or the folder cannot be written; the former checkpoint is unchanged.
+        OutputError: The disk is full, or the folder cannot be written; the former checkpoint is unchanged.
     """
-    save_file = optional_package("safetensors.torch", "generator").save_file
-    folder.mkdir(parents=True, exist_ok=True)
-    weights, text = folder / f".weights.{os.getpid()}.tmp", folder / f".config.{os.getpid()}.tmp"
-    try:
-        save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, weights)
-        _synchronise(weights)
-        named = folder / f"weights-{checksum(weights)[:12]}.safetensors"
-        weights.replace(named)
-        text.write_text(json.dumps({"format": FORMAT, "weights": named.name, **config}, indent=1) + "\n")
-        _synchronise(text)
-        text.replace(folder / CONFIG_FILE)
-    except Exception as error:
-        for left in (weights, text):
-            left.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise
-        raise OSError(
-            f"{folder}: the checkpoint could not be written: {error}"
-        ) from error  # safetensors has its own errors
+    save = optional_package("safetensors.torch", "generator").save
+    weights = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()})
+    named = folder / f"weights-{hashlib.sha256(weights).hexdigest()[:12]}.safetensors"
+    text = json.dumps({"format": FORMAT, "weights": named.name, **config}, indent=1) + "\n"
+    write_whole({named: weights})
+    write_whole({folder / CONFIG_FILE: text.encode()})
     for old in folder.glob("weights-*.safetensors"):
         if old != named:
             old.unlink(missing_ok=True)
@@ -86,32 +74,14 @@ def read_config(folder: Path) -> tuple[dict[str, Any], str]:
     return config, str(weights)
 
 
-def check_tensors(expected: Mapping[str, torch.Tensor], found: Mapping[str, torch.Tensor], where: str) -> None:
-    """Check that weights have exactly the names and shapes of a model's.
+def load_weights(module: nn.Module, tensors: Mapping[str, torch.Tensor], folder: Path, assign: bool = False) -> None:
+    """Load exactly the weights of a module; ``assign`` replaces its tensors instead of copying into them.
 
     Raises:
         GeneratorError: Names that are missing, extra or of another shape.
     """
-    shapes = [
-        f"{name} of {tuple(value.shape)}, got {tuple(found[name].shape)}"
-        for name, value in sorted(expected.items())
-        if name in found and found[name].shape != value.shape
-    ]
-    problems = {
-        "missing:": sorted(expected.keys() - found.keys()),
-        "that do not belong:": sorted(found.keys() - expected.keys()),
-        "of another shape: expected": shapes,
-    }
-    wrong = [f"{len(names)} {problem} {_abbreviated(names)}" for problem, names in problems.items() if names]
-    if wrong:
-        raise GeneratorError(f"{where}: expected {len(expected)} tensors; " + "; ".join(wrong))
-
-
-def _abbreviated(names: list[str]) -> str:
-    more = f", and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
-    return ", ".join(names[:_MAX_NAMES]) + more
-
-
-def _synchronise(path: Path) -> None:
-    with path.open("rb+") as file:
-        os.fsync(file.fileno())
+    try:
+        module.load_state_dict(tensors, assign=assign)
+    except RuntimeError as error:
+        text = " ".join(str(error).split())[:_MAX_MESSAGE]
+        raise GeneratorError(f"{folder}: expected the weights of this configuration: {text}") from None

@@ -142,9 +142,9 @@ def complete(
         size, device = config.image_size, generator.device
         target_parts = [_prefilled(images[m], known[m], trust[m], size) for m in todo]
         branches = sorted({k for m in todo for k in nearest_sources(targets[m], sources)})
-        source_parts = [(_at_size(source_images[k], size), _valid_pixels(sources[k], size)) for k in branches]
-        parts = [*zip(*target_parts, strict=True), *zip(*source_parts, strict=True)]
-        conditions = Conditions(*(torch.stack(part)[None].to(device) for part in parts))
+        seen = [valid_pixels(sources[k].resize(size)).float() for k in branches]
+        parts = [*zip(*target_parts, strict=True), [_at_size(source_images[k], size) for k in branches], seen]
+        conditions = Conditions(*(torch.stack(list(part))[None].to(device) for part in parts))
         cameras = [targets[m] for m in todo], [sources[k] for k in branches]
         geometry = frame_geometry(*cameras, sources.ground_z_m, config).to(device)
         noise = torch.stack([_noise(config, seed, frame, camera.name) for camera in cameras[0]])[None].to(device)
@@ -181,14 +181,9 @@ def denoised(
     conditions: Conditions,
     noise: torch.Tensor,
 ) -> torch.Tensor:
-    """(B, N, 3, H, W) float32 images in [0, 1] of the N targets of B frames, all on one device.
+    """Sample the N targets of B frames from noise (B, N, C, h, w): (B, N, 3, H, W) float32 in [0, 1].
 
-    Args:
-        generator: The model.
-        config: Its configuration; ``steps`` and ``guidance`` may differ.
-        geometry: Of the targets and sources.
-        conditions: Of the targets and sources.
-        noise: (B, N, C, h, w) standard normal.
+    ``config`` may differ from the generator's in ``steps`` and ``guidance``.
     """
     denoiser, autoencoder = generator.denoiser, generator.autoencoder
     views, source_views = conditions.encoded(config, autoencoder, geometry)
@@ -223,13 +218,7 @@ def denoised(
 
 
 def shown_condition(config: GeneratorConfig, prefilled: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
-    """The condition (..., 3, H, W) as in training: inpainted, or with grey holes if the config is not ``prefilled``.
-
-    Args:
-        config: Settings.
-        prefilled: (..., 3, H, W) in [0, 1], holes inpainted.
-        known: (..., H, W) bool, or shares in [0, 1].
-    """
+    """The condition (..., 3, H, W) as in training: inpainted, or with grey holes if the config is not ``prefilled``."""
     return prefilled if config.prefilled else torch.where(known[..., None, :, :] >= 0.5, prefilled, 0.5)
 
 
@@ -273,10 +262,9 @@ def _at_size(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     return small.float() / 255 if small.dtype == torch.uint8 else small.float()
 
 
-def _valid_pixels(camera: Camera, size: tuple[int, int]) -> torch.Tensor:
-    """(H, W) float32: 1 on the scene, 0 on the camera's own car."""
-    mask = camera.resize(size).mask
-    return torch.ones(size) if mask is None else torch.tensor(mask, dtype=torch.float32)
+def valid_pixels(camera: Camera) -> torch.Tensor:
+    """(H, W) bool: True on the scene, False on the camera's own car."""
+    return torch.ones(camera.size, dtype=torch.bool) if camera.mask is None else torch.tensor(camera.mask)
 
 
 def _noise(config: GeneratorConfig, seed: int, frame: str | int, camera: str) -> torch.Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, is_dataclass
+from dataclasses import dataclass, field, is_dataclass
 from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
 from arbiview_aug.errors import ArbiviewError, GeneratorError
@@ -163,19 +163,6 @@ class GeneratorConfig:
         """(h, w) of the latents."""
         h, w = self.image_size
         return h // self.autoencoder.factor, w // self.autoencoder.factor
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any], where: str = "generator config") -> GeneratorConfig:
-        """Build a config from plain data.
-
-        Raises:
-            GeneratorError: Unknown or missing keys, impossible values.
-        """
-        return from_plain(cls, data, where)
 
 
 # --- configurations ---------------------------------------------------------------------------------------------------

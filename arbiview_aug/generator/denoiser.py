@@ -111,7 +111,7 @@ class Denoiser(nn.Module):
             sources: Conditions of S views; their latents are clean.
             windows: Of the sources in the sources, one for each token grid, the finest first.
         """
-        t = torch.zeros(sources.latent.shape[:2], dtype=torch.long, device=sources.latent.device)
+        t = torch.zeros(len(sources.latent), dtype=torch.long, device=sources.latent.device)
         outputs: Sources = []
         clean = sources.latent if self.signal is None else torch.zeros_like(sources.latent)  # their residual is 0
         self._run(clean, t, sources, windows, None, outputs, None)
@@ -130,7 +130,7 @@ class Denoiser(nn.Module):
 
         Args:
             noisy: (B, N, C, h, w) x_t; the pre-filled latent at t = ``REGRESSION``.
-            t: (B,) or (B, N) int64 in [0, ``REGRESSION``].
+            t: (B,) int64 in [0, ``REGRESSION``].
             targets: Their conditions.
             windows: Of the targets in [sources, targets], one for each token grid, the finest first.
             sources: From ``read_sources``.
@@ -139,8 +139,7 @@ class Denoiser(nn.Module):
         Returns:
             (B, N, C, h, w): the schedule's prediction (ε or v), or x0 at t = ``REGRESSION``.
         """
-        t = t[:, None].expand(noisy.shape[:2]) if t.dim() == 1 else t
-        is_regression = (t == REGRESSION)[:, :, None, None, None]
+        is_regression = (t == REGRESSION).view(-1, 1, 1, 1, 1)
         x = noisy
         if self.signal is not None:
             z, linear, scale = self._preconditioned(noisy, t, targets)
@@ -169,21 +168,21 @@ class Denoiser(nn.Module):
         return z, -s * condition + a * s * (1 - deviation**2) / root * z, deviation / root
 
     def output_scale(self, t: torch.Tensor, targets: Views) -> torch.Tensor:
-        """(B, N, 1, h, w) factor of the network's output in ``forward``'s at t (B, N).
+        """(B, N, 1, h, w) factor of the network's output in ``forward``'s at t (B,).
 
         Errors divided by it have one size at all t, in holes and outside. 1 without preconditioning.
         """
         if self.signal is None:
             return torch.ones_like(targets.mask, dtype=torch.float32)
         _, _, deviation, root = self._deviations(t, targets)
-        return torch.where((t == REGRESSION)[:, :, None, None, None], deviation, deviation / root)
+        return torch.where((t == REGRESSION).view(-1, 1, 1, 1, 1), deviation, deviation / root)
 
     def _deviations(
         self, t: torch.Tensor, targets: Views
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """a, s, σ and √D of ``_preconditioned``."""
         assert self.signal is not None
-        a = self.signal.to(t.device)[t.clamp(max=TIMESTEPS - 1)][:, :, None, None, None]
+        a = self.signal.to(t.device)[t.clamp(max=TIMESTEPS - 1)].view(-1, 1, 1, 1, 1)
         s = (1 - a**2).sqrt()
         inside, outside = self.deviation.float()
         deviation = inside + (outside - inside) * targets.mask.float()
@@ -202,7 +201,7 @@ class Denoiser(nn.Module):
         """Run all blocks of the U-Net; a source run appends its keys and values to ``outputs``."""
         unet, count = self.unet, noisy.shape[:2]
         x = views.channels(noisy).flatten(0, 1).to(self.dtype)
-        emb = unet.time_embedding(unet.time_proj(t.flatten()).to(self.dtype))
+        emb = unet.time_embedding(unet.time_proj(t.repeat_interleave(count[1])).to(self.dtype))
         context = self.context(views.pose.flatten(0, 1))
         blocks, attended = 0, 0  # blocks of the U-Net so far, and cross-view blocks
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,10 @@ from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator.autoencoder import Autoencoder
 from arbiview_aug.generator.batches import complete_batch
-from arbiview_aug.generator.checkpoint import CONFIG_FILE, check_tensors, read_checkpoint, read_config, write_checkpoint
+from arbiview_aug.generator.checkpoint import CONFIG_FILE, load_weights, read_checkpoint, read_config, write_checkpoint
 from arbiview_aug.generator.completion import complete
 from arbiview_aug.generator.conditioning import input_channels
-from arbiview_aug.generator.config import GeneratorConfig, paper
+from arbiview_aug.generator.config import GeneratorConfig, from_plain, paper
 from arbiview_aug.generator.denoiser import Denoiser
 from arbiview_aug.generator.networks import GeneratorNetworks
 from arbiview_aug.generator.sampler import noise_schedule
@@ -110,14 +110,14 @@ class Generator(GeneratorNetworks):
         Raises:
             GeneratorError: No such folder; settings or weights that are missing, extra or of another shape.
         """
-        data, tensors = read_checkpoint(Path(folder))
-        config = GeneratorConfig.from_dict(data.get("generator", {}), f"{folder}/config.json")
+        folder = Path(folder)
+        data, tensors = read_checkpoint(folder)
+        config = from_plain(GeneratorConfig, data.get("generator", {}), f"{folder}/config.json")
         _networks()
         with torch.device("meta"):
             generator = cls.from_config(config)
-        check_tensors(generator.state_dict(), tensors, str(folder))
         weights = {name: t.float() if t.is_floating_point() else t for name, t in tensors.items()}
-        generator.load_state_dict(weights, assign=True)
+        load_weights(generator, weights, folder, assign=True)
         # Inside a user's module its parameters must not be found by the optimiser or DDP.
         return generator.eval().requires_grad_(False)
 
@@ -138,13 +138,13 @@ class Generator(GeneratorNetworks):
             dtype: Of the stored weights, by default their own; float16 halves the file and is loaded as float32.
 
         Raises:
-            OSError: The disk is full, or the folder cannot be written.
+            OutputError: The disk is full, or the folder cannot be written.
         """
         tensors = self.state_dict()
         if dtype is not None:
             tensors = {name: t.to(dtype) if t.is_floating_point() else t for name, t in tensors.items()}
         scaled = replace(self.config.autoencoder, scale=self.autoencoder.scale)
-        write_checkpoint(Path(folder), {"generator": replace(self.config, autoencoder=scaled).to_dict()}, tensors)
+        write_checkpoint(Path(folder), {"generator": asdict(replace(self.config, autoencoder=scaled))}, tensors)
 
     # --- use ----------------------------------------------------------------------------------------------------------
     complete_views = complete

@@ -182,16 +182,6 @@ def test_it_trains_under_autocast(generator: Generator, geometry: FrameGeometry)
     assert (out.float() - exact).abs().mean() < 0.05 * exact.abs().mean()
 
 
-def test_times_may_differ_between_views(generator: Generator, geometry: FrameGeometry) -> None:
-    """A batch may mix regression and diffusion."""
-    denoiser = generator.denoiser
-    targets, noisy = views(geometry, "target"), torch.randn(1, 2, 3, 6, 10)
-    with torch.no_grad():
-        read = denoiser.read_sources(views(geometry, "source", 1), geometry.source_windows())
-        out = denoiser(noisy, torch.tensor([[REGRESSION, 20]]), targets, geometry.target_windows(), read)
-    assert torch.isfinite(out).all()
-
-
 def test_rows_for_the_geometric_loss(generator: Generator, geometry: FrameGeometry) -> None:
     """One entry a block; rows sum to 1; of untrained attention they are about uniform (1/3 off for a whole window)."""
     torch.manual_seed(0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -15,14 +14,13 @@ from tqdm import tqdm
 
 from arbiview_aug.errors import GeneratorError, TrainingError
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.checkpoint import CONFIG_FILE, check_tensors, read_checkpoint, write_checkpoint
-from arbiview_aug.generator.training.checkpointing import Average, StopRequests, has_state, load_state, save_state
+from arbiview_aug.generator.checkpoint import CONFIG_FILE, load_weights, read_checkpoint, write_checkpoint
 from arbiview_aug.generator.training.config import AutoencoderTraining, TrainConfig
 from arbiview_aug.generator.training.data import Frames, item_workers
 from arbiview_aug.generator.training.losses import Perceptual
 from arbiview_aug.generator.training.masks import one_of
 
-FOLDER, UNFINISHED = "autoencoder", "autoencoder-state"
+FOLDER = "autoencoder"
 _SCALE_IMAGES = 64
 """Number of images that set the latents' scale, to within 0.1 %."""
 
@@ -38,11 +36,11 @@ def train_autoencoder(
     perceptual: Perceptual | None = None,
     show: bool = True,
     say: Callable[[str], None] = print,
-) -> bool:
-    """Train a generator's autoencoder in place, or load the one in ``output``.
+) -> None:
+    """Train a generator's autoencoder in place and save it, or load the one in ``output``.
 
     L1 + KL, and VGG's distance if there are weights (Rombach et al. 2022, without their discriminator). Afterwards
-    latents are scaled to unit variance. Saved and resumed like the main run.
+    latents are scaled to unit variance. The stage takes minutes; a stopped one starts again.
 
     Args:
         config: Settings; does nothing without an autoencoder stage.
@@ -53,64 +51,48 @@ def train_autoencoder(
         show: Show a progress bar.
         say: Called with messages.
 
-    Returns:
-        Whether it is done; False if SIGTERM or SIGINT stopped it, after saving its state.
-
     Raises:
         TrainingError: The saved one has another architecture; a loss is not finite.
-        OSError: It could not be saved.
+        OutputError: It could not be saved.
     """
-    stage, vae = config.autoencoder, generator.autoencoder.vae
+    stage, vae, folder = config.autoencoder, generator.autoencoder.vae, output / FOLDER
     if stage is None or vae is None:
-        return True
-    folder, unfinished = output / FOLDER, output / UNFINISHED
+        return
     if (folder / CONFIG_FILE).is_file():
         _load(generator, folder)
-        return True
-    training = frames.split(config.seed).training
-    device = generator.denoiser.regression.weight.device
+        return
     if perceptual is not None:
-        perceptual.to(device)
+        perceptual.to(generator.device)
     optimiser = torch.optim.AdamW(vae.parameters(), lr=stage.lr)
-    average = Average(vae, 0.0)  # the state's format wants one: the weights themselves
-    done = load_state(unfinished, config, vae, average, optimiser) if has_state(unfinished) else 0
     vae.train()
-    batches = _Batches(frames, training, stage.batch, config.seed)
+    batches = _Batches(frames, frames.split(config.seed).training, stage.batch, config.seed)
     loader: DataLoader[torch.Tensor] = DataLoader(
-        batches, batch_size=None, sampler=range(done, stage.steps), **item_workers(config.workers)
+        batches, batch_size=None, sampler=range(stage.steps), **item_workers(config.workers)
     )
-    bar = tqdm(loader, desc="autoencoder", unit="step", initial=done, total=stage.steps, disable=not show)
-    with StopRequests() as stop:
-        for step, on_cpu in enumerate(bar, done):
-            rng = torch.Generator().manual_seed((2 * config.seed + 1) * 2**32 + step)
-            images = on_cpu.to(device).float() / 255
-            terms = _terms(vae, images, stage, perceptual, rng, bf16=config.precision == "bf16")
-            numbers = torch.stack(list(terms.values())).detach().tolist()
-            values = dict(zip(terms, numbers, strict=True))
-            for name, value in values.items():
-                if not math.isfinite(value):
-                    raise TrainingError(f"autoencoder, step {step}: loss term {name} is {value}; lower its lr")
-            torch.stack(list(terms.values())).sum().backward()
-            torch.nn.utils.clip_grad_norm_(vae.parameters(), 1.0)
-            optimiser.step()
-            optimiser.zero_grad(set_to_none=True)
-            bar.set_postfix({name: f"{value:.4f}" for name, value in values.items()})
-            if step % _MESSAGE_EVERY == 0:
-                say(f"autoencoder, step {step}: L1 {255 * values['l1']:.2f} grey levels")
-            if stop.asked or (step + 1) % config.save_every == 0:
-                average.update(vae, step)
-                save_state(unfinished, config, step + 1, vae, average, optimiser)
-            if stop.asked:
-                say(f"stopped after step {step + 1} of the autoencoder; saved: the same command goes on from there")
-                return False
+    bar = tqdm(loader, desc="autoencoder", unit="step", disable=not show)
+    for step, on_cpu in enumerate(bar):
+        rng = torch.Generator().manual_seed((2 * config.seed + 1) * 2**32 + step)
+        images = on_cpu.to(generator.device).float() / 255
+        terms = _terms(vae, images, stage, perceptual, rng, bf16=config.precision == "bf16")
+        numbers = torch.stack(list(terms.values())).detach().tolist()
+        values = dict(zip(terms, numbers, strict=True))
+        for name, value in values.items():
+            if not math.isfinite(value):
+                raise TrainingError(f"autoencoder, step {step}: loss term {name} is {value}; lower its lr")
+        torch.stack(list(terms.values())).sum().backward()
+        torch.nn.utils.clip_grad_norm_(vae.parameters(), 1.0)
+        optimiser.step()
+        optimiser.zero_grad(set_to_none=True)
+        bar.set_postfix({name: f"{value:.4f}" for name, value in values.items()})
+        if step % _MESSAGE_EVERY == 0:
+            say(f"autoencoder, step {step}: L1 {255 * values['l1']:.2f} grey levels")
     vae.eval()
+    batches.count = _SCALE_IMAGES
     with torch.no_grad():
-        images = _Batches(frames, training, _SCALE_IMAGES, config.seed)[stage.steps].to(device).float() / 255
+        images = batches[stage.steps].to(generator.device).float() / 255
         deviation = torch.cat([vae.encode(part * 2 - 1).latent_dist.mode() for part in images.split(8)]).std()
     generator.autoencoder.scale = float(1 / deviation)
     write_checkpoint(folder, {"scale": generator.autoencoder.scale, "training": asdict(stage)}, vae.state_dict())
-    shutil.rmtree(unfinished, ignore_errors=True)
-    return True
 
 
 def _terms(
@@ -138,10 +120,9 @@ def _load(generator: Generator, folder: Path) -> None:
     assert vae is not None
     try:
         data, tensors = read_checkpoint(folder)
-        check_tensors(vae.state_dict(), tensors, str(folder))
+        load_weights(vae, tensors, folder)
     except GeneratorError as error:
         raise TrainingError(f"{error}; delete {folder} to train another autoencoder") from None
-    vae.load_state_dict(tensors)
     generator.autoencoder.scale = float(data["scale"])
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import torch
@@ -18,7 +18,10 @@ from torch import nn
 
 from arbiview_aug.errors import GeneratorError, TrainingError
 from arbiview_aug.generator.checkpoint import CONFIG_FILE, read_checkpoint, read_config, write_checkpoint
+from arbiview_aug.generator.config import from_plain
 from arbiview_aug.generator.training.config import TrainConfig
+
+STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 class Average:
@@ -66,13 +69,13 @@ def save_state(
     """Write the state after ``step`` steps.
 
     Raises:
-        OSError: The disk is full, or the folder cannot be written; the last state is unchanged.
+        OutputError: The disk is full, or the folder cannot be written; the last state is unchanged.
     """
     tensors = {f"weights.{n}": p.detach() for n, p in module.named_parameters() if p.requires_grad}
     tensors |= {f"average.{name}": value for name, value in average.values.items()}
     for k, state in optimiser.state_dict()["state"].items():
         tensors |= {f"optimiser.{k}.{key}": torch.as_tensor(value) for key, value in state.items()}
-    write_checkpoint(folder, {"step": step, "training": config.to_dict()}, tensors)
+    write_checkpoint(folder, {"step": step, "training": asdict(config)}, tensors)
 
 
 def saved_config(folder: Path, otherwise: TrainConfig) -> TrainConfig:
@@ -86,7 +89,7 @@ def saved_config(folder: Path, otherwise: TrainConfig) -> TrainConfig:
 
 def _training_config(folder: Path, data: Mapping[str, Any]) -> TrainConfig:
     try:
-        return TrainConfig.from_dict(data["training"])
+        return from_plain(TrainConfig, data["training"], "config", TrainingError)
     except (GeneratorError, KeyError) as error:
         raise TrainingError(f"{folder}: expected the state of a training run: {error}") from None
 
@@ -104,7 +107,7 @@ def load_state(
         step = int(data["step"])
     except (GeneratorError, KeyError) as error:
         raise TrainingError(f"{folder}: expected the state of a training run: {error}") from None
-    before, now = _training_config(folder, data).to_dict(), config.to_dict()
+    before, now = asdict(_training_config(folder, data)), asdict(config)
     changed = [key for key in now if key not in _MAY_DIFFER and before[key] != now[key]]
     if changed:
         raise TrainingError(
@@ -135,27 +138,13 @@ def has_state(folder: Path) -> bool:
     return (folder / CONFIG_FILE).is_file()
 
 
-class StopRequests:
-    """Context in which SIGTERM and SIGINT set ``asked`` instead of ending the process."""
-
-    def __init__(self) -> None:
-        self.asked = False
-        self._before: dict[signal.Signals, Any] = {}
-
-    def __enter__(self) -> StopRequests:
-        for number in (signal.SIGTERM, signal.SIGINT):
-            self._before[number] = signal.signal(number, self._ask)
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for number, handler in self._before.items():
+@contextmanager
+def stop_requests() -> Iterator[list[int]]:
+    """Collect SIGTERM and SIGINT in a list instead of ending the process."""
+    asked: list[int] = []
+    before = {number: signal.signal(number, lambda number, _: asked.append(number)) for number in STOP_SIGNALS}
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
             signal.signal(number, handler)
-
-    def _ask(self, number: int, frame: FrameType | None) -> None:
-        self.asked = True
-
-
-def ignore_stop_requests() -> None:
-    """Ignore both signals in a worker: the main process saves first and then ends its workers."""
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)

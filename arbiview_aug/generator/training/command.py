@@ -70,17 +70,15 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
         "say": say,
     }
 
-    def make(config: TrainConfig) -> tuple[Generator, bool]:
+    def make(config: TrainConfig) -> Generator:
         generator = fresh(config, arguments.weights).to(device)
         with processes.main_process_first():  # the others load the autoencoder that it saved
-            is_ready = train_autoencoder(config, frames, generator, output, **options)
-        return generator, is_ready
+            train_autoencoder(config, frames, generator, output, **options)
+        return generator
 
-    generator, is_ready = make(config)
-    if not is_ready:
-        return 0
+    generator = make(config)
     if arguments.command == "ablate":
-        ablate(config, frames, lambda variant: make(variant)[0], output, views=arguments.views, **options)
+        ablate(config, frames, make, output, views=arguments.views, **options)
     elif arguments.stage == "autoencoder":
         say(f"the autoencoder is in {output / 'autoencoder'}")
     else:

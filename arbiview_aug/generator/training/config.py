@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
@@ -115,20 +115,6 @@ class TrainConfig:
         _check(self, "a value in [0, 1)", lambda p: 0 <= p < 1, "ema", "drop")
         _check(self, "at least 0", lambda n: n >= 0, "warmup", "workers")
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> TrainConfig:
-        """Build a config from plain data.
-
-        Raises:
-            TrainingError: Unknown or missing keys, impossible values.
-            GeneratorError: Impossible values of the generator.
-        """
-        return from_plain(cls, data, "config", TrainingError)
-
 
 # --- overrides --------------------------------------------------------------------------------------------------------
 def overridden(config: TrainConfig, settings: Sequence[str]) -> TrainConfig:
@@ -138,7 +124,7 @@ def overridden(config: TrainConfig, settings: Sequence[str]) -> TrainConfig:
         TrainingError: An unknown key, or a value of another type.
         GeneratorError: Settings of the generator that do not fit together.
     """
-    data = config.to_dict()
+    data = asdict(config)
     for setting in settings:
         name, equals, text = setting.partition("=")
         if not equals:
@@ -148,7 +134,7 @@ def overridden(config: TrainConfig, settings: Sequence[str]) -> TrainConfig:
         except ValueError:
             value = text.strip()  # a string without quotes
         _override(data, name.strip().split("."), tuple(value) if isinstance(value, list) else value, setting)
-    return TrainConfig.from_dict(data)
+    return from_plain(TrainConfig, data, "config", TrainingError)
 
 
 def _override(data: dict[str, Any], path: Sequence[str], value: Any, setting: str) -> None:

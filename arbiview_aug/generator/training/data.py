@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -17,7 +18,7 @@ from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
 from arbiview_aug.datasets.registry import READERS, open_data
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import TrainingError
-from arbiview_aug.generator.training.checkpointing import ignore_stop_requests
+from arbiview_aug.generator.training.checkpointing import STOP_SIGNALS
 from arbiview_aug.image_ops import resized
 from arbiview_aug.lru_cache import LRUCache
 
@@ -133,10 +134,11 @@ def item_workers(count: int) -> dict[str, Any]:
 
 
 def one_thread_worker(worker: int) -> None:
-    """Initialise a worker: one thread; the parent handles signals."""
+    """Initialise a worker: one thread, no signals: the main process saves first and then ends its workers."""
     cv2.setNumThreads(0)
     torch.set_num_threads(1)
-    ignore_stop_requests()
+    for number in STOP_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _unchanged(value: Any) -> Any:

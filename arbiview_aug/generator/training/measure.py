@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -41,6 +40,11 @@ def hole_psnr(images: torch.Tensor, truth: torch.Tensor, holes: torch.Tensor) ->
     return -10 * torch.log10(mse.clamp(min=1e-10))
 
 
+def mean_hole_psnr(images: Mapping[str, torch.Tensor], batch: Batch) -> dict[str, float]:
+    """Mean of ``hole_psnr`` over a batch's items for each method's images."""
+    return {name: float(hole_psnr(image, batch.truth, batch.holes).nanmean()) for name, image in images.items()}
+
+
 class Interval(NamedTuple):
     """A mean and its 95 % bootstrap interval."""
 
@@ -71,14 +75,8 @@ def picture(batch: Batch, samples: torch.Tensor) -> np.ndarray:
     """(height, width, 3) uint8: a row for each item of a batch with samples (B, N, 3, H, W), a column for each view."""
     scale = max(1, -(-_MIN_WIDTH_PX // samples.shape[-1]))
     mask = batch.known[:, :1, None].float().expand_as(batch.favs[:, :1])
-    columns = [
-        batch.sources[:, :2],
-        batch.favs[:, :1],
-        mask,
-        batch.condition[:, :1],
-        samples[:, :1],
-        batch.truth[:, :1],
-    ]
+    others = (batch.condition, samples, batch.truth)
+    columns = [batch.sources[:, :2], batch.favs[:, :1], mask, *(views[:, :1] for views in others)]
     views = torch.nn.functional.pad(
         torch.cat(columns, 1).repeat_interleave(scale, -1).repeat_interleave(scale, -2), (0, _GAP_PX, 0, _GAP_PX)
     )  # [B, columns, 3, h, w]
@@ -88,10 +86,3 @@ def picture(batch: Batch, samples: torch.Tensor) -> np.ndarray:
     for k, name in enumerate(COLUMNS):
         cv2.putText(head, name, (k * width // len(COLUMNS) + 3, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1)
     return np.concatenate([head, pixels])
-
-
-def save_png(path: Path, image: np.ndarray) -> None:
-    """Write an RGB picture."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
-        raise OSError(f"{path}: the picture could not be written")

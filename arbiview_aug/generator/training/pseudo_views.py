@@ -26,7 +26,7 @@ from torch.utils.data import Dataset
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.favs.config import FavsConfig
-from arbiview_aug.generator.completion import Conditions, nearest_sources, seeded
+from arbiview_aug.generator.completion import Conditions, nearest_sources, seeded, valid_pixels
 from arbiview_aug.generator.config import GeneratorConfig
 from arbiview_aug.generator.geometry import FrameGeometry, batched, frame_geometry
 from arbiview_aug.generator.inpainting import telea
@@ -181,7 +181,7 @@ class PseudoViews(Dataset[Batch]):
             others = [n for n in range(len(cameras)) if not (shows_answer and n == i)]
             used = [others[n] for n in nearest_sources(target, rig.with_cameras([cameras[n] for n in others]))]
             branches = [cameras[n] for n in used]
-            seen = torch.stack([_valid_pixels(camera).to(known.device) for camera in branches])
+            seen = torch.stack([valid_pixels(camera).to(known.device) for camera in branches])
             sources = torch.stack([images[n].float() / 255 for n in used])
         geometry = frame_geometry([target], branches, rig.ground_z_m, self.generator)
         return Batch(
@@ -206,7 +206,7 @@ class PseudoViews(Dataset[Batch]):
         yaw, pitch = (uniform(rng, -limit, limit) for limit in (_VIRTUAL_YAW_DEG, _VIRTUAL_PITCH_DEG))
         focal = uniform(rng, *self.config.focal)
         if not virtual:
-            return camera, image.float() / 255, _valid_pixels(camera).to(image.device)
+            return camera, image.float() / 255, valid_pixels(camera).to(image.device)
         target = replace(with_focal(camera.turned(yaw_deg=yaw, pitch_deg=pitch), focal), mask=None)
         rendered = favs([image], Rig([camera]), [target])
         return target, rendered.images[0], rendered.covered[0]
@@ -226,7 +226,3 @@ class PseudoViews(Dataset[Batch]):
                 camera = camera.shifted(x_m, y_m, up)
             cameras.append(replace(camera, name=name, mask=None))
         return cameras
-
-
-def _valid_pixels(camera: Camera) -> torch.Tensor:
-    return torch.ones(camera.size, dtype=torch.bool) if camera.mask is None else torch.tensor(camera.mask)

@@ -18,7 +18,7 @@ from arbiview_aug.generator.training.pseudo_views import Batch
 
 
 class Draws(NamedTuple):
-    """Random draws of a step, on the CPU: the same on every device and in a resumed run.
+    """Random draws of a step, on the batch's device.
 
     Attributes:
         t: (B,) int64 times; ``REGRESSION`` for the items that train the one-step head.
@@ -38,14 +38,15 @@ def without_attention(geometry: FrameGeometry) -> FrameGeometry:
     return geometry.with_reads(lambda reads: reads._replace(valid=torch.zeros_like(reads.valid)))
 
 
-def draw(config: TrainConfig, batch: int, views: int, rng: torch.Generator) -> Draws:
-    """Draw times, noise and dropped conditions of one step."""
+def draw(config: TrainConfig, batch: Batch, rng: torch.Generator) -> Draws:
+    """Draw times, noise and dropped conditions for a batch, on the CPU: the same on every device."""
     latent = config.generator
-    t = torch.randint(TIMESTEPS, (batch,), generator=rng)
-    is_regression = torch.rand(batch, generator=rng) < config.loss.regression
-    drop = (torch.rand(batch, generator=rng) < config.drop) & ~is_regression
-    size = (batch, views, latent.autoencoder.latent_channels, *latent.latent_size)
-    return Draws(torch.where(is_regression, REGRESSION, t), torch.randn(size, generator=rng), drop, rng)
+    count, device = len(batch.tokens), batch.truth.device
+    t = torch.randint(TIMESTEPS, (count,), generator=rng)
+    is_regression = torch.rand(count, generator=rng) < config.loss.regression
+    drop = (torch.rand(count, generator=rng) < config.drop) & ~is_regression
+    eps = torch.randn((*batch.truth.shape[:2], latent.autoencoder.latent_channels, *latent.latent_size), generator=rng)
+    return Draws(torch.where(is_regression, REGRESSION, t).to(device), eps.to(device), drop.to(device), rng)
 
 
 class Step(nn.Module):
@@ -68,13 +69,7 @@ class Step(nn.Module):
         self.diffusion = Diffusion(schedule.alphas_cumprod, config.generator.prediction)
 
     def forward(self, batch: Batch, draws: Draws, perceptual: bool = False) -> dict[str, torch.Tensor]:
-        """Compute ``main``, ``regression``, ``geo`` and, if asked for, ``perceptual``: scalars without their weights.
-
-        Args:
-            batch: On the module's device.
-            draws: Likewise.
-            perceptual: Whether this step has L_perceptual.
-        """
+        """Compute ``main``, ``regression``, ``geo`` and, if asked for, ``perceptual``: without their weights."""
         config, loss = self.config, self.config.loss
         autoencoder, vgg = self._frozen
         geometry = batch.geometry if config.attention else without_attention(batch.geometry)
@@ -93,7 +88,7 @@ class Step(nn.Module):
         rows: list[Rows] | None = [] if loss.geo else None
         sources = self.denoiser.read_sources(source_views, geometry.source_windows())
         predicted = self.denoiser(start, draws.t, views, windows, sources, rows).float()
-        unit = self.denoiser.output_scale(draws.t[:, None].expand(x0.shape[:2]), views)
+        unit = self.denoiser.output_scale(draws.t, views)
         error = masked_mse(predicted / unit, target / unit, pixel_weight)
         weight = torch.ones_like(error)
         if not config.generator.residual:  # its unit makes all times alike

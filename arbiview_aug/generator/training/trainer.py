@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,16 +13,17 @@ from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import TrainingError
+from arbiview_aug.errors import DataError, OutputError, TrainingError
+from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import shown_condition
 from arbiview_aug.generator.conditioning import pooled
-from arbiview_aug.generator.training.checkpointing import Average, StopRequests, has_state, load_state, save_state
+from arbiview_aug.generator.training.checkpointing import Average, has_state, load_state, save_state, stop_requests
 from arbiview_aug.generator.training.config import TrainConfig
 from arbiview_aug.generator.training.data import Frames, item_workers
 from arbiview_aug.generator.training.losses import Perceptual
 from arbiview_aug.generator.training.masks import mask_bank
-from arbiview_aug.generator.training.measure import hole_psnr, picture, sampled, save_png
+from arbiview_aug.generator.training.measure import mean_hole_psnr, picture, sampled
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
 from arbiview_aug.generator.training.step import Step, draw
 
@@ -93,7 +94,6 @@ class Trainer:
         # The optimiser is not placed: AdamW's step counters on a GPU would be waited for one by one.
         self.model, self._optimiser = self.accelerator.prepare(step, self.optimiser, device_placement=[True, False])
         self.step = step
-        self._stop = StopRequests()
         masks = mask_bank(
             frames[self.split.training[0]].rig, config.pseudo_views.mask_bank, config.seed + _SEEDS["masks"]
         )
@@ -137,7 +137,7 @@ class Trainer:
 
         Raises:
             TrainingError: A loss is not finite.
-            OSError: The last state could not be saved.
+            OutputError: The last state could not be saved.
         """
         config = self.config
         writer = None
@@ -146,7 +146,7 @@ class Trainer:
             writer = tensorboard.SummaryWriter(str(self.output / "logs"), purge_step=self.done or None)
         bar = tqdm(total=config.steps, initial=self.done, desc="train", unit="step", disable=not self.show)
         try:
-            with self._stop:
+            with stop_requests() as asked:
                 for batch in self._batches():
                     terms = self.train_step(batch)
                     self.done += 1
@@ -156,7 +156,7 @@ class Trainer:
                         self._log(writer, bar, terms)
                     if self.done % config.validate_every == 0 or last:
                         self._validate(writer)
-                    if self._should_stop():
+                    if self._should_stop(asked):
                         break
                     if self.done % config.save_every == 0 and not last:
                         self._save_or_warn()
@@ -178,14 +178,11 @@ class Trainer:
         config = self.config
         number = self.done * self.accelerator.num_processes + self.accelerator.process_index
         rng = torch.Generator().manual_seed((10 * config.seed + _SEEDS["draws"]) * 2**32 + number)
-        draws = draw(config, len(batch.tokens), batch.truth.shape[1], rng)
-        on_device = draws._replace(
-            t=draws.t.to(self.device), eps=draws.eps.to(self.device), drop=draws.drop.to(self.device)
-        )
+        batch = batch.to(self.device)
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(config, self.done)
         with_perceptual = self.perceptual is not None and self.done % config.loss.perceptual_every == 0
-        terms = self.model(batch.to(self.device), on_device, with_perceptual)
+        terms = self.model(batch, draw(config, batch, rng), with_perceptual)
         total = self.step.total(terms)
         numbers = torch.stack([*terms.values(), total]).detach().tolist()  # one wait for a GPU
         values = dict(zip((*terms, "total"), numbers, strict=True))
@@ -217,15 +214,15 @@ class Trainer:
         )
 
     # --- stopping and saving ------------------------------------------------------------------------------------------
-    def _should_stop(self) -> bool:
-        asked = torch.tensor(float(self._stop.asked), device=self.device)
-        return bool(self.accelerator.reduce(asked, "sum") > 0)  # all processes stop after the same step
+    def _should_stop(self, asked: Sequence[int]) -> bool:
+        count = torch.tensor(float(len(asked)), device=self.device)
+        return bool(self.accelerator.reduce(count, "sum") > 0)  # all processes stop after the same step
 
     def save(self) -> None:
         """Write the state, and the generator with averaged weights.
 
         Raises:
-            OSError: One could not be written; the last saved one is unchanged.
+            OutputError: One could not be written; the last saved one is unchanged.
         """
         try:
             if self.is_main:
@@ -239,7 +236,7 @@ class Trainer:
     def _save_or_warn(self) -> None:
         try:
             self.save()
-        except OSError as error:
+        except OutputError as error:
             self.say(f"step {self.done}: not saved, going on with the last good state: {error}")
 
     # --- logs ---------------------------------------------------------------------------------------------------------
@@ -257,8 +254,8 @@ class Trainer:
                 writer.add_scalar(f"hole_psnr/{name}", value, self.done)
             writer.add_image("validation", image, self.done, dataformats="HWC")
             try:
-                save_png(self.output / "validation" / f"{self.done:06d}.png", image)
-            except OSError as error:
+                save_picture(self.output / "validation" / f"{self.done:06d}.png", image)
+            except DataError as error:
                 self.say(str(error))
             numbers = ", ".join(f"{name} {value:.2f}" for name, value in scores.items())
             self.say(f"step {self.done}: PSNR inside the holes, dB: {numbers}")
@@ -274,8 +271,7 @@ class Trainer:
             if config.loss.regression:
                 methods["one_step"] = sampled(self.generator, batch, steps=1, seed=0)
             methods[f"{steps}_steps"] = samples = sampled(self.generator, batch, steps=steps, seed=0)
-        scores = {name: float(hole_psnr(image, batch.truth, batch.holes).nanmean()) for name, image in methods.items()}
-        return scores, picture(batch, samples)
+        return mean_hole_psnr(methods, batch), picture(batch, samples)
 
 
 def learning_rate(config: TrainConfig, step: int) -> float:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 
 import pytest
 
 from arbiview_aug.errors import GeneratorError, TrainingError
+from arbiview_aug.generator.config import from_plain
 from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden, paper, tiny
 
 
@@ -14,7 +16,7 @@ from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overrid
 def test_presets_survive_json(name: str) -> None:
     config = CONFIGS[name]()
     assert config.generator.name == name
-    assert TrainConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+    assert from_plain(TrainConfig, json.loads(json.dumps(asdict(config))), "config") == config
 
 
 def test_the_papers_settings() -> None:
@@ -55,6 +57,6 @@ def test_wrong_overrides_are_refused(setting: str, message: str) -> None:
 
 def test_unknown_keys_of_plain_data_are_refused() -> None:
     with pytest.raises(TrainingError, match="got strange"):
-        TrainConfig.from_dict({**tiny().to_dict(), "strange": 1})
+        from_plain(TrainConfig, {**asdict(tiny()), "strange": 1}, "config", TrainingError)
     with pytest.raises(GeneratorError, match="multiples of 32"):
         overridden(tiny(), ["generator.unet.widths=[5, 5, 5]"])

@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch.overrides import TorchFunctionMode
 
-from arbiview_aug.errors import TrainingError
+from arbiview_aug.errors import OutputError, TrainingError
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.checkpoint import read_checkpoint
 from arbiview_aug.generator.denoiser import REGRESSION
@@ -95,16 +95,16 @@ def test_a_full_disk_leaves_the_last_state(tmp_path: Path, monkeypatch: pytest.M
     def full(*_: Any, **__: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("arbiview_aug.generator.checkpoint._synchronise", full)
+    monkeypatch.setattr("os.fsync", full)
     with torch.no_grad():
         next(iter(made.generator.denoiser.parameters())).add_(1)
     made._save_or_warn()
     assert "No space left" in made.said[-1]  # type: ignore[attr-defined]
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OutputError, match="No space left"):
         made.save()
     assert same(tensors(tmp_path), good)
     Generator.from_pretrained(tmp_path / "generator")
-    (tmp_path / "state" / ".weights.1.tmp").write_bytes(b"half of it")  # a killed process leaves these
+    (tmp_path / "state" / ".config.json.part").write_bytes(b"half of it")  # a killed process leaves these
     monkeypatch.undo()
     assert run(tmp_path, steps=2).done == 2
 
@@ -242,7 +242,7 @@ def test_others_are_not_left_waiting_where_saving_fails(tmp_path: Path, monkeypa
     monkeypatch.setattr(made.accelerator, "wait_for_everyone", lambda: waited.append(1))
 
     def full(*_: Any) -> None:
-        raise OSError(28, "No space left on device")
+        raise OutputError("No space left on device")
 
     monkeypatch.setattr("arbiview_aug.generator.training.trainer.save_state", full)
     made._save_or_warn()
@@ -299,8 +299,8 @@ def test_an_untrained_network_errs_by_one_unit_at_all_times(tmp_path: Path) -> N
     eps = torch.randn(truth.shape, generator=torch.Generator().manual_seed(0))
     found = []
     for t in (50, 300, 600, 999, REGRESSION):
-        times = torch.full((8, 1), t)
-        at = times[:, 0].clamp(max=999)
+        times = torch.full((8,), t)
+        at = times.clamp(max=999)
         x = condition if t == REGRESSION else made.step.diffusion.noisy(truth, eps, at)
         with torch.no_grad():
             got = made.generator.denoiser(x, times, views, batch.geometry.target_windows(), read)
