@@ -26,7 +26,8 @@ def telea(image: torch.Tensor, hole: torch.Tensor) -> torch.Tensor:
     is_uint8 = image.dtype == torch.uint8
     if hole.all():
         return torch.full_like(image, round(GREY * 255) if is_uint8 else GREY)
-    box = tuple(_with_margin(hole.any(1 - axis).nonzero(), side) for axis, side in enumerate(hole.shape))
+    rows, columns = (hole.any(1 - axis).nonzero() for axis in (0, 1))
+    box = tuple(slice(max(int(i.min()) - _MARGIN_PX, 0), int(i.max()) + 1 + _MARGIN_PX) for i in (rows, columns))
     part, marks = image[:, box[0], box[1]].detach(), hole[box]
     pixels = part if is_uint8 else (part.float() * 255).round().clamp(0, 255).to(torch.uint8)
     planes = np.ascontiguousarray(pixels.cpu().permute(1, 2, 0).numpy())
@@ -35,7 +36,3 @@ def telea(image: torch.Tensor, hole: torch.Tensor) -> torch.Tensor:
     filled = image.detach().clone()
     filled[:, box[0], box[1]] = torch.where(marks, values if is_uint8 else (values.float() / 255).to(image.dtype), part)
     return filled
-
-
-def _with_margin(indices: torch.Tensor, side: int) -> slice:
-    return slice(max(int(indices.min()) - _MARGIN_PX, 0), min(int(indices.max()) + 1 + _MARGIN_PX, side))

@@ -86,30 +86,21 @@ def ablate(
     make: Callable[[TrainConfig], Generator],
     output: Path,
     *,
-    variants: Sequence[str] = tuple(VARIANTS),
     views: int = 64,
     perceptual: Perceptual | None = None,
     show: bool = True,
     say: Callable[[str], None] = print,
 ) -> dict[str, dict[str, Any]]:
-    """Train and score each variant, and write ``ablation.json``; a stopped study resumes.
+    """Train and score each variant on synthetic streets, and write ``ablation.json``; a stopped study resumes.
 
-    Args:
-        config: Settings that the variants change.
-        frames: Synthetic streets.
-        make: Returns an untrained generator for a variant's settings, the same each time.
-        output: Folder; gets one for each variant.
-        variants: Keys of ``VARIANTS``.
-        views: Number of held-out views to score.
-        perceptual: As for ``Trainer``.
-        show: Show progress bars.
-        say: Called with the scores.
+    ``make`` returns an untrained generator for a variant's settings, the same each time. Each variant gets a folder in
+    ``output`` and is scored on ``views`` held-out views. The other arguments are those of ``Trainer``.
     """
     split = frames.split(config.seed)
     indices = (split.held_out or split.validation or split.training)[:views]
     table: dict[str, dict[str, Any]] = {}
-    for variant in variants:
-        changed = overridden(config, VARIANTS[variant])
+    for variant, settings in VARIANTS.items():
+        changed = overridden(config, settings)
         folder = output / variant.replace(" ", "_").replace("+", "with")
         trainer = Trainer(changed, frames, make(changed), folder, perceptual=perceptual, show=show, say=say)
         if not trainer.train():

@@ -40,16 +40,8 @@ def train_autoencoder(
     """Train a generator's autoencoder in place and save it, or load the one in ``output``.
 
     L1 + KL, and VGG's distance if there are weights (Rombach et al. 2022, without their discriminator). Afterwards
-    latents are scaled to unit variance. The stage takes minutes; a stopped one starts again.
-
-    Args:
-        config: Settings; does nothing without an autoencoder stage.
-        frames: The data; training scenes are used.
-        generator: The model.
-        output: The run's folder.
-        perceptual: None leaves the term out.
-        show: Show a progress bar.
-        say: Called with messages.
+    latents are scaled to unit variance. The stage takes minutes; a stopped one starts again. Does nothing without
+    settings of this stage; the other arguments are those of ``Trainer``.
 
     Raises:
         TrainingError: The saved one has another architecture; a loss is not finite.

@@ -26,7 +26,6 @@ from arbiview_aug.generator.training.pseudo_views import Rendered, favs
 MIN_HOLES = 0.05
 """Smallest share of holes in a drawn target."""
 
-MEAN_OF = 8
 _TRIES = 20
 
 
@@ -37,7 +36,7 @@ def held_out_scores(
     *,
     seeds: Sequence[int] = (0,),
     steps: int = 4,
-    mean_of: int = MEAN_OF,
+    mean_of: int = 8,
     show: bool = True,
 ) -> dict[str, list[float]]:
     """Score each filling method by PSNR (dB) inside the holes, one value for each (seed, scene).

@@ -98,14 +98,9 @@ class Rendered(NamedTuple):
 
 
 def favs(images: Sequence[torch.Tensor], rig: Rig, targets: Sequence[Camera]) -> Rendered:
-    """Render cameras at target poses of the same ego frame by FAVS.
+    """Render N images (3, H, W), uint8 or in [0, 1], at M target cameras of one size in the rig's ego frame by FAVS.
 
     On the surface ``far`` if all centres coincide, else on ``street``: training has images and poses alone.
-
-    Args:
-        images: N images (3, H, W), uint8 or in [0, 1].
-        rig: Their cameras.
-        targets: M cameras of one size.
     """
     target = Rig([replace(c, name=str(k), mask=None) for k, c in enumerate(targets)], ground_z_m=rig.ground_z_m)
     is_moved = any(abs(c.center_m - rig[k].center_m).max() > 1e-6 for c in targets for k in nearest_sources(c, rig)[:1])
@@ -119,16 +114,9 @@ def favs(images: Sequence[torch.Tensor], rig: Rig, targets: Sequence[Camera]) ->
 
 
 class PseudoViews(Dataset[Batch]):
-    """Items 0, 1, 2, …, without end.
+    """Items 0, 1, 2, …, without end, drawn from the frames ``indices``.
 
-    Args:
-        frames: The data.
-        indices: Indices of the frames to draw from.
-        config: Settings.
-        generator: Settings of the generator: sizes and depth levels.
-        masks: (n, h, w) bool to transplant.
-        seed: Seed of all draws.
-        device: Device on which FAVS renders; the CPU in workers.
+    Masks (n, h, w) bool are transplanted. FAVS renders on ``device``, which is the CPU in workers.
     """
 
     def __init__(

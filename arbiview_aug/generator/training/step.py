@@ -50,14 +50,7 @@ def draw(config: TrainConfig, batch: Batch, rng: torch.Generator) -> Draws:
 
 
 class Step(nn.Module):
-    """The loss terms of a batch, as one module that distributed training can wrap.
-
-    Args:
-        config: Settings.
-        denoiser: The trained network.
-        autoencoder: Frozen.
-        perceptual: None switches L_perceptual off.
-    """
+    """The loss terms of a batch, as one module that distributed training can wrap; no VGG switches L_perceptual off."""
 
     def __init__(
         self, config: TrainConfig, denoiser: Denoiser, autoencoder: Autoencoder, perceptual: Perceptual | None
