@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.arguments import add_target, count
+from arbiview_aug.cli.arguments import add_target, count, seed
 from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, recorded
 from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
 from arbiview_aug.cli.bench.timing import machine_line, memory_mib, quartiles, show
@@ -63,13 +63,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         example="--data FOLDER --workers 0 2",
     )
     add_target(parser)
-    parser.add_argument("--workers", type=int, nargs="+", default=[0, 1, 2], metavar="N", help="workers")
+    parser.add_argument("--workers", type=seed, nargs="+", default=[0, 1, 2], metavar="N", help="workers")
     parser.add_argument("--surface", nargs="+", choices=tuple(SURFACES), default=["auto"], help="scene geometry")
     parser.add_argument("--frames", type=count, default=48, metavar="N", help="frames in an epoch")
     parser.add_argument("--epochs", type=count, default=3, metavar="N", help="epochs to measure")
     arguments = parser.parse_args(argv)
-    if min(arguments.workers) < 0:
-        parser.error(f"argument --workers: expected whole numbers from 0, got {min(arguments.workers)}")
     h, w = (SOURCES_OVER_VIEWS * side for side in arguments.size)
     with recorded(arguments.data, size=(h, w)) as data:
         report = measure(data, arguments)

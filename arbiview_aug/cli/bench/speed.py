@@ -80,8 +80,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         text = table(report)
     else:
         device = device_named(arguments.device)
-        rig, images, _ = _inputs(data, None)
-        report = measure_device(rig, list(images), _name(data), device, arguments.repeats)
+        name, rig, images, _ = _inputs(data, None)
+        report = measure_device(rig, list(images), name, device, arguments.repeats)
         text = device_table(report)
     show(text, report, Path(arguments.output))
     return 0
@@ -103,14 +103,14 @@ def measure(
     small_size: tuple[int, int] = SIZE,
 ) -> dict[str, Any]:
     """Time all candidates on a frame folder, or on random smooth images (of ``full_size``) on nuScenes' rig."""
-    rig, images, halves = _inputs(data, full_size)
+    name, rig, images, halves = _inputs(data, full_size)
     rounds = {"full size": repeats, "small": repeats * _SMALL_ROUNDS}
     rows = _run(_full_size(rig, images), rounds["full size"], "full size")
     rows += _run(_small_size(rig, images, halves, small_size), rounds["small"], "small")
     return {
         "floor": "six cv2.remap, linear, float32 maps, x' = 0.97 x + 0.02 y + 3, y' = 0.95 y + 0.01 x + 5",
         "clock": "CPU time of the process, milliseconds",
-        "data": _name(data),
+        "data": name,
         "sources": [list(size) for size in rig.sizes],
         "rounds": rounds,
         "measures": rows,
@@ -128,10 +128,6 @@ COLUMNS = (
 def table(report: Mapping[str, Any]) -> str:
     """Machine and Markdown table of a report."""
     return f"{machine_line(report)}\n\n{metric_table(report['measures'], COLUMNS, ('name', 'of'))}"
-
-
-def _name(data: str | Path | None) -> str:
-    return "random smooth images" if data is None else data_name(data)
 
 
 # --- candidates -------------------------------------------------------------------------------------------------------
@@ -214,16 +210,17 @@ def _run(candidates: Sequence[_Candidate], rounds: int, label: str) -> list[dict
     return rows
 
 
-def _inputs(data: str | Path | None, full_size: tuple[int, int] | None) -> tuple[Rig, torch.Tensor, torch.Tensor]:
-    """Rig, images (N, 3, H, W) uint8 in one channels-last block, and the same at half size."""
+def _inputs(data: str | Path | None, full_size: tuple[int, int] | None) -> tuple[str, Rig, torch.Tensor, torch.Tensor]:
+    """Name, rig, images (N, 3, H, W) uint8 in one channels-last block, and the same at half size."""
     if data is None:
         rig = load_rig("nuscenes") if full_size is None else load_rig("nuscenes").resized(full_size)
         half_size = reduced_rig(rig, 2).sizes[0]
-        return rig, _smooth_images(len(rig), rig.sizes[0]), _smooth_images(len(rig), half_size)
+        images, halves = (_smooth_images(len(rig), size) for size in (rig.sizes[0], half_size))
+        return "random smooth images", rig, images, halves
     sample, half = open_data(data)[0], open_data(data, reduce=2)[0]
     if not isinstance(sample["images"], torch.Tensor):
         raise DataError(f"--data {data}: expected images of one size, got several")
-    return without_masks(sample["rig"]), sample["images"], half["images"]
+    return data_name(data), without_masks(sample["rig"]), sample["images"], half["images"]
 
 
 def _smooth_images(count: int, size: tuple[int, int]) -> torch.Tensor:
