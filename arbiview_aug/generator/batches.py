@@ -1,4 +1,4 @@
-"""Completion of a transform's output: of one frame, of a batch, of the batches of a loader."""
+"""Completion of a transform's output: one frame, a batch, or a loader's batches."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def complete_batch(
     min_confidence: float = 0.0,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Complete collated samples on the generator's device, for a GPU, which DataLoader workers cannot use.
+    """Complete collated samples on the generator's device: DataLoader workers cannot use a GPU.
 
     The pixels are those of ``RigRetarget(path="diffusion")``.
 
@@ -149,7 +149,7 @@ class CompletedLoader:
     Args:
         loader: Yields batches from ``RigRetarget(..., outputs=("sources", "confidence"))``.
         generator: The model.
-        settings: Of ``complete_batch``.
+        settings: Keyword arguments of ``complete_batch``.
     """
 
     def __init__(

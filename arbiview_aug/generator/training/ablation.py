@@ -42,7 +42,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 """Settings of each variant, on top of the run's own."""
 
 SEEN_ITEMS = 32
-"""Number of held-out real views with a condition masked where a source branch shows the pixel."""
+"""Number of held-out real views whose condition is masked where a source branch shows the pixels."""
 
 
 def wrong_rig(geometry: FrameGeometry) -> FrameGeometry:

@@ -82,7 +82,7 @@ class Frames:
         return TrainingFrame([resized(image, self.size) for image in sample["images"]], rig, str(sample["token"]))
 
     def prepare(self, indices: Sequence[int], *, workers: int = 0, show: bool = True) -> None:
-        """Read frames with ``workers`` processes, before those that make items fork and share the memory."""
+        """Cache frames, read by ``workers`` processes, before the workers that make items fork and share the memory."""
         read: DataLoader[TrainingFrame] = DataLoader(
             self,  # type: ignore[arg-type]
             batch_size=None,

@@ -1,4 +1,4 @@
-"""L_total = L_main + α L_geo + β L_perceptual (Sec. Loss Function Design), with what the paper leaves open decided."""
+"""Terms of L_total = L_main + α L_geo + β L_perceptual (Sec. Loss Function Design)."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class Diffusion:
         return self._at(self.signal, t) * x0 + self._at(self.noise, t) * eps
 
     def target(self, x0: torch.Tensor, eps: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
-        """Prediction target: ε, or v = a ε − s x0 (Salimans & Ho 2022)."""
+        """The prediction target: ε, or v = a ε − s x0 (Salimans & Ho 2022)."""
         if self.prediction == "epsilon":
             return eps
         return self._at(self.signal, t) * eps - self._at(self.noise, t) * x0
 
     def x0(self, x: torch.Tensor, predicted: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
-        """x0 by the prediction at x_t; inaccurate at late t with ε."""
+        """Estimate x0 from the prediction at x_t; inaccurate at late t with ε."""
         a, s = self._at(self.signal, t), self._at(self.noise, t)
         if self.prediction == "epsilon":
             return (x - s * predicted) / a.clamp(min=1e-4)

@@ -91,7 +91,7 @@ class Trainer:
         if has_state(self.state_folder):
             self.done = load_state(self.state_folder, config, generator.denoiser, self.average, self.optimiser)
             self.say(f"going on after step {self.done} of {self.state_folder}")
-        # The optimiser is not placed: AdamW's step counters on a GPU would be waited for one by one.
+        # The optimiser is not placed: AdamW's step counters on a GPU would synchronise one by one.
         self.model, self._optimiser = self.accelerator.prepare(step, self.optimiser, device_placement=[True, False])
         self.step = step
         masks = mask_bank(
@@ -184,7 +184,7 @@ class Trainer:
         with_perceptual = self.perceptual is not None and self.done % config.loss.perceptual_every == 0
         terms = self.model(batch, draw(config, batch, rng), with_perceptual)
         total = self.step.total(terms)
-        numbers = torch.stack([*terms.values(), total]).detach().tolist()  # one wait for a GPU
+        numbers = torch.stack([*terms.values(), total]).detach().tolist()  # one synchronisation with a GPU
         values = dict(zip((*terms, "total"), numbers, strict=True))
         infinite = [name for name, value in values.items() if not math.isfinite(value)]
         if infinite:
