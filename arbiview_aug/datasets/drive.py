@@ -13,9 +13,11 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+import torch
 from torch.utils.data import Dataset
 
 from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import ArbiviewError, DataError
 from arbiview_aug.sample.neighbours import STILL_M
 
@@ -154,6 +156,12 @@ def parts_of_clock(names: Sequence[str], times_s: Mapping[str, float] | None, wh
 def clock_message(where: str, one: str, two: str) -> str:
     """Warning for a clock that goes back from one frame to the next."""
     return f"{where}: the clock goes back from frame {one!r} to {two!r}: they are no neighbours"
+
+
+def camera_fields(rig: Rig, images: Any, token: str) -> dict[str, Any]:
+    """A sample's images, rig and calibration tensors, and its token."""
+    K, cam2ego = torch.from_numpy(rig.K), torch.from_numpy(rig.cam2ego)
+    return {"images": images, "rig": rig, "K": K, "cam2ego": cam2ego, "token": token}
 
 
 class LazyFrame(Mapping[str, Any]):

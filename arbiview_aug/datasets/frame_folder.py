@@ -25,6 +25,7 @@ from arbiview_aug.datasets.drive import (
     Neighbours,
     Recording,
     Unreadable,
+    camera_fields,
     check_neighbours,
     parts_of_clock,
 )
@@ -128,13 +129,7 @@ class FrameFolder(Recording):
         for entries, read in ((calib, ("boxes_3d", "ego2world", "lidar")), *((c, ("mask",)) for c in calib["cameras"])):
             for found, meant in misnamed(entries, read).items():
                 self._warn(found, f"{frame.where}: {found!r} is not read; did you mean {meant!r}?")
-        sample: dict[str, Any] = {
-            "images": self._images(calib, frame, rig),
-            "rig": rig,
-            "K": torch.from_numpy(rig.K),
-            "cam2ego": torch.from_numpy(rig.cam2ego),
-            "token": frame.name,
-        }
+        sample = camera_fields(rig, self._images(calib, frame, rig), frame.name)
         if self.load_points and (points := _read_points(calib, frame)) is not None:
             sample["points"] = points
         sample |= self._boxes_pose_time(calib, frame)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -38,13 +38,6 @@ _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0..15, without DHT, JPG and DAC
 
 
-class ImageHeader(NamedTuple):
-    """Format and (h, w) of an image file."""
-
-    format: str
-    size: tuple[int, int]
-
-
 def decode_images(
     paths: Sequence[str | Path],
     *,
@@ -59,7 +52,7 @@ def decode_images(
 
     With ``reduce`` 2 or 4 each side becomes ceil(side / reduce) and a pixel covers exactly reduce by reduce pixels of
     the full image, counted from its top-left corner (see ``reduced_camera``). JPEGs are decoded at the smaller size,
-    which is faster and less aliased than sampling the full image. A complete JPEG with corrupt data is not detected.
+    which is faster. A complete JPEG with corrupt data is not detected.
 
     Args:
         paths: The files.
@@ -78,13 +71,13 @@ def decode_images(
     labels = [f"camera {(names[k] if names else file.stem)!r}: image {file}" for k, file in enumerate(files)]
     headers = [read_header(file, label) for file, label in zip(files, labels, strict=True)]
     if sizes is not None:
-        for header, label, size in zip(headers, labels, sizes, strict=True):
-            _check_size(header.size, size, label)
-    shapes = [(*reduced_size(header.size, reduce), 3) for header in headers]
+        for (_, found), label, size in zip(headers, labels, sizes, strict=True):
+            _check_size(found, size, label)
+    shapes = [(*reduced_size(size, reduce), 3) for _, size in headers]
     block = np.empty((len(files), *shapes[0]), np.uint8) if len(set(shapes)) == 1 else None
     images = [np.empty(shape, np.uint8) for shape in shapes] if block is None else [*block]
-    for file, label, header, out in zip(files, labels, headers, images, strict=True):
-        _decode_into(out, file, label, header, reduce)
+    for file, label, (format, _), out in zip(files, labels, headers, images, strict=True):
+        _decode_into(out, file, label, format, reduce)
     if block is not None:
         return torch.from_numpy(block).permute(0, 3, 1, 2)
     return [torch.from_numpy(image).permute(2, 0, 1) for image in images]
@@ -126,8 +119,8 @@ def reduced_rig(rig: Rig, reduce: Reduce) -> Rig:
     return rig if reduce == 1 else rig.with_cameras([reduced_camera(camera, reduce) for camera in rig])
 
 
-def read_header(path: Path, label: str) -> ImageHeader:
-    """Read format and size of a JPEG or PNG file; ``label`` names camera and file in messages.
+def read_header(path: Path, label: str) -> tuple[str, tuple[int, int]]:
+    """Read format and (h, w) of a JPEG or PNG file; ``label`` names camera and file in messages.
 
     Raises:
         DataError: A missing, empty or truncated file, or one of another format.
@@ -149,7 +142,7 @@ def read_header(path: Path, label: str) -> ImageHeader:
         raise DataError(f"{label}: expected a JPEG or PNG, got a file that begins with {data[:8]!r}")
     if not ended:
         raise DataError(f"{label}: expected a complete {format}, got a truncated file; copy it again")
-    return ImageHeader(format, size)
+    return format, size
 
 
 def _jpeg_size(data: bytes) -> tuple[tuple[int, int], bool]:
@@ -178,17 +171,17 @@ def _check_size(size: tuple[int, int], calibrated: tuple[int, int], label: str) 
         raise DataError(f"{label}: expected {calibrated[1]}x{calibrated[0]} (w x h) as calibrated, got {w}x{h}; {fix}")
 
 
-def _decode_into(out: ByteArray, path: Path, label: str, header: ImageHeader, reduce: int) -> None:
+def _decode_into(out: ByteArray, path: Path, label: str, format: str, reduce: int) -> None:
     """Decode into ``out`` (h, w, 3), which has the shape of the (reduced) image."""
-    if header.format == "JPEG" and _decode_jpeg_in_place(out, path, reduce):
+    if format == "JPEG" and _decode_jpeg_in_place(out, path, reduce):
         return
     # For PNGs cv2's reduced flags round sizes down, to another scale than for JPEGs.
-    image = cv2.imread(str(path), _FLAGS | (_REDUCED_FLAGS[reduce] if header.format == "JPEG" else 0))
+    image = cv2.imread(str(path), _FLAGS | (_REDUCED_FLAGS[reduce] if format == "JPEG" else 0))
     if image is None:
-        raise DataError(f"{label}: expected an image, got a {header.format} that cannot be decoded; copy it again")
+        raise DataError(f"{label}: expected an image, got a {format} that cannot be decoded; copy it again")
     if _RGB_FLAG is None:
         cv2.cvtColor(image, cv2.COLOR_BGR2RGB, image)
-    if reduce > 1 and header.format == "PNG":
+    if reduce > 1 and format == "PNG":
         h, w = image.shape[:2]
         image = cv2.copyMakeBorder(image, 0, -h % reduce, 0, -w % reduce, cv2.BORDER_REPLICATE)
         image = cv2.resize(image, out.shape[1::-1], interpolation=cv2.INTER_AREA)

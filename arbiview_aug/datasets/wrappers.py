@@ -15,9 +15,7 @@ Retarget = Callable[[Any], Any]
 
 
 class RetargetedDataset(Dataset[Any]):
-    """A map-style dataset whose samples pass through ``retarget``.
-
-    ``__getitems__`` (DataLoader's batched access) uses the dataset's own if it has one.
+    """A map-style dataset whose samples pass through ``retarget``; batched access uses the dataset's ``__getitems__``.
 
     Args:
         dataset: Map-style dataset.

@@ -196,7 +196,7 @@ def test_a_thumbnail_in_the_header_does_not_hide_a_truncation(jpeg: Path) -> Non
     thumbnail = b"\xff\xd8\xff\xd9"
     whole = data[:2] + b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail + data[2:]
     jpeg.write_bytes(whole)
-    assert read_header(jpeg, "jpeg").size == (90, 160)
+    assert read_header(jpeg, "jpeg") == ("JPEG", (90, 160))
     jpeg.write_bytes(whole[:-20])
     with pytest.raises(DataError, match="truncated file"):
         decode_images([jpeg])

@@ -88,8 +88,7 @@ def _parser() -> argparse.ArgumentParser:
         "--holes",
         choices=get_args(Holes),
         default="fill",
-        help="what no camera saw, with --path favs: continued from its borders and marked in .generated.png (default), "
-        "the mean colour, or black",
+        help="what no camera saw, with --path favs: continued from its borders (default), the mean colour, or black",
     )
     parser.add_argument(
         "--generator", type=Path, metavar="DIR", help="generator of --path diffusion (default: the package's own)"
@@ -102,8 +101,7 @@ def _parser() -> argparse.ArgumentParser:
         "--fit",
         choices=get_args(Fit),
         default="crop",
-        help="with --size: keep the aspect and cut at the top and the sides (default), or add black bars there; or "
-        "stretch",
+        help="with --size: cut at the top and the sides (default), add black bars there, or stretch",
     )
     add_reduce(parser)
     parser.add_argument(
@@ -131,8 +129,7 @@ def _parser() -> argparse.ArgumentParser:
         "--on-error",
         choices=get_args(OnError),
         default="report",
-        help="samples that cannot be read or rendered: report them, convert the others and do not finish the output "
-        "(default); skip them: leave them out; or stop at once",
+        help="samples that cannot be converted: report them and do not finish (default), leave them out, or stop",
     )
     parser.add_argument("--report", type=seed, default=2, metavar="N", help="number of frames in report.html")
     return parser

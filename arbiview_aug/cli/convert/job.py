@@ -30,25 +30,17 @@ OnError = Literal["report", "skip", "fatal"]
 ``skip`` leaves the sample out and reports it, ``fatal`` stops."""
 
 State = Literal["made", "kept", "skipped", "failed", "stopped"]
+"""``kept``: made by an earlier run; ``skipped``, ``failed``: cannot be read or rendered; ``stopped``: not written."""
 
 
 class Done(NamedTuple):
-    """Result of a sample.
-
-    Attributes:
-        token: Name of the sample.
-        state: ``made``; ``kept`` from an earlier run; ``skipped`` or ``failed`` to read or render; ``stopped`` by a
-            failed write.
-        coverage: Share of its pixels that some source saw.
-        seconds: Time to read, retarget and write.
-        messages: Warnings, or the error.
-    """
+    """Result of a sample."""
 
     token: str
     state: State
-    coverage: float = 0.0
-    seconds: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    messages: tuple[str, ...] = ()
+    coverage: float = 0.0  # share of its pixels that some source saw
+    seconds: tuple[float, float, float] = (0.0, 0.0, 0.0)  # to read, retarget and write
+    messages: tuple[str, ...] = ()  # warnings, or the error
 
 
 def make_writer(settings: Settings, data: Recording) -> Writer:

@@ -207,9 +207,6 @@ class NuScenes(Writer):
             link_whole(*self._kept(path.relative_to(self.data.root).as_posix(), "maps"))
         for name in self.there:
             _write_table(self.output / self.data.version / f"{name}.json", rows.get(name, partial(source.rows, name))())
-        return self._notes()
-
-    def _notes(self) -> list[str]:
         notes = []
         if self._missing:
             notes.append(f"{self._missing} files that sample_data names are not in the source: were sweeps not copied?")

@@ -47,7 +47,13 @@ class Remaining:
         self._sensors, self._calibrated = kept_sensors(tables)
         lidar = {row["token"] for row in tables.rows("sensor") if row["channel"] == LIDAR}
         self._lidar = {row["token"] for row in tables.rows("calibrated_sensor") if row["sensor_token"] in lidar}
-        self._annotations_left_out = self._find_annotations_left_out()
+        self._annotations_left_out = {
+            row["token"]: (row.get("prev", ""), row.get("next", ""), row["instance_token"])
+            for batch in (tables.batches("sample_annotation") if left_out else ())
+            for row in batch
+            if row["sample_token"] in left_out
+        }
+        """Predecessor, successor and instance by token."""
 
     @property
     def drives(self) -> list[list[str]]:
@@ -127,17 +133,6 @@ class Remaining:
     def _changed(self, row: Row, values: Mapping[str, Any]) -> Row:
         """Set existing columns of a row; rows stay as they are if nothing is left out."""
         return {**row, **{key: value for key, value in values.items() if key in row}} if self.left_out else row
-
-    def _find_annotations_left_out(self) -> dict[str, tuple[str, str, str]]:
-        """Predecessor, successor and instance of each annotation that is left out, by token."""
-        if not self.left_out:
-            return {}
-        return {
-            row["token"]: (row.get("prev", ""), row.get("next", ""), row["instance_token"])
-            for batch in self.tables.batches("sample_annotation")
-            for row in batch
-            if row["sample_token"] in self.left_out
-        }
 
     def _remaining(self, token: str, direction: int) -> str:
         """Follow a chain (0 back, 1 forward) to its first annotation that is not left out."""

@@ -30,13 +30,7 @@ class Actor:
 
 
 def ray_results(jobs: Jobs, workers: int, label: str, note: Callable[[Done], str]) -> Iterator[Done]:
-    """Yield each job's result, in any order, from the cluster that ``RAY_ADDRESS`` names, or from this machine.
-
-    Args:
-        jobs: Jobs to run.
-        workers: Number of actors.
-        label: Label of the progress bar.
-        note: Text of the progress bar after a result.
+    """As ``cli.parallel.results``, in any order, by actors of the cluster at ``RAY_ADDRESS``, or of this machine.
 
     Raises:
         ImportError: Ray is not installed; with the command that installs it.

@@ -30,22 +30,10 @@ FOLDER = "conversion"
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Source, output and everything that decides the output's bytes.
+    """Source, output and everything that decides the output's bytes; ``convert --help`` explains each.
 
-    ``RETARGET_OPTIONS`` are those of ``RigRetarget``.
-
-    Attributes:
-        root: Folder of the source.
-        kind: Key of ``READERS``; None for the first that fits.
-        version: nuScenes' folder of tables; None for the usual one.
-        target: Rig to render, in its own ego frame.
-        output: Folder to write to.
-        generator: Folder of the generator, for ``path="diffusion"``; None for the package's own.
-        reduce: Decode the source's images at 1, 1/2 or 1/4 of their size.
-        neighbours: Number of other frames of the drive in each direction that may fill holes.
-        motion_depth: Folder of the ``depth`` command's files, for ``surface="motion"``; None estimates depth from the
-            neighbours.
-        suffix: Image format: ``.jpg`` at quality 96 and 4:4:4, or lossless ``.png``. Masks are always PNG.
+    ``root``, ``kind``, ``version`` and ``reduce`` are those of ``open_data``, ``RETARGET_OPTIONS`` those of
+    ``RigRetarget``. ``motion_depth`` is None where depth is estimated from the neighbours.
     """
 
     root: Path

@@ -16,7 +16,15 @@ from arbiview_aug.atomic_io import inside
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, Recording, Unreadable, check_neighbours
+from arbiview_aug.datasets.drive import (
+    Drive,
+    LazyFrame,
+    Neighbours,
+    Recording,
+    Unreadable,
+    camera_fields,
+    check_neighbours,
+)
 from arbiview_aug.datasets.frame_folder import checked_points
 from arbiview_aug.datasets.image_io import Reduce, check_reduce, decode_images, reduced_rig
 from arbiview_aug.datasets.nuscenes.boxes import read_annotations
@@ -128,16 +136,9 @@ class NuScenesDataset(Recording):
         cameras, lidar = recordings.keyframes[index, :-1], recordings.keyframes[index, -1]
         ego2global = recordings.ego2global(lidar)
         rig = self._rig(cameras, ego2global)
-        sample: dict[str, Any] = {
-            "images": self._images(cameras),
-            "rig": rig,
-            "K": torch.from_numpy(rig.K),
-            "cam2ego": torch.from_numpy(rig.cam2ego),
-            "ego2world": torch.from_numpy(ego2global),
-            "time_s": float(recordings.time_s(lidar)),
-            "token": self.tokens[index],
-            "scene_token": self.scene_tokens[index],
-        }
+        sample = camera_fields(rig, self._images(cameras), self.tokens[index])
+        sample |= {"ego2world": torch.from_numpy(ego2global), "time_s": float(recordings.time_s(lidar))}
+        sample["scene_token"] = self.scene_tokens[index]
         if self.load_points:
             sensor2ego = recordings.sensor2ego[recordings.rows["sensor"][lidar]]
             sample["points"] = _read_points(self._file(lidar), sensor2ego)

@@ -228,7 +228,9 @@ def _calibrations(tables: Tables, wanted: Sequence[str]) -> tuple[dict[str, int]
             calibrated[token] = len(rows)
             rows.append(row)
             channel_of.append(wanted.index(sensor["channel"]))
-    sensor2ego = tables.poses("calibrated_sensor", rows)
+    sensor2ego = np.tile(np.eye(4), (len(rows), 1, 1))
+    sensor2ego[:, :3, 3] = tables.numbers("calibrated_sensor", rows, "translation", (3,))
+    sensor2ego[:, :3, :3] = tables.rotations("calibrated_sensor", rows)
     K = np.tile(np.eye(3), (len(rows), 1, 1))
     cameras = [k for k, channel in enumerate(channel_of) if wanted[channel] != LIDAR]
     K[cameras] = tables.numbers("calibrated_sensor", [rows[k] for k in cameras], "camera_intrinsic", (3, 3))

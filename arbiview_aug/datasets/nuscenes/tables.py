@@ -162,12 +162,7 @@ class Tables:
     def column(self, table: str, rows: Sequence[Row], key: str, kind: Kind, default: Any = None) -> list[Any]:
         """Values of one column, checked at once, and row by row to name the invalid one.
 
-        Args:
-            table: Name for errors.
-            rows: Rows of the table.
-            key: Name of the column.
-            kind: Type of the values.
-            default: Replaces missing values and null; with None they are errors.
+        ``default`` replaces missing values and null; with None they are errors.
 
         Raises:
             DataError: A missing or invalid value.
@@ -218,13 +213,6 @@ class Tables:
 
         self.column(table, rows, key, Kind(f"of shape {shape}, below {_LARGEST:g} and finite", holds))
         return found[0].astype(np.float64, copy=False)
-
-    def poses(self, table: str, rows: Sequence[Row]) -> FloatArray:
-        """(len(rows), 4, 4) from the columns ``translation`` and ``rotation``."""
-        poses = np.tile(np.eye(4), (len(rows), 1, 1))
-        poses[:, :3, 3] = self.numbers(table, rows, "translation", (3,))
-        poses[:, :3, :3] = self.rotations(table, rows)
-        return poses
 
     def rotations(self, table: str, rows: Sequence[Row]) -> FloatArray:
         """(len(rows), 3, 3) from the column ``rotation``."""

@@ -14,7 +14,7 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.datasets.drive import LazyFrame, Neighbours, check_neighbours
+from arbiview_aug.datasets.drive import LazyFrame, Neighbours, camera_fields, check_neighbours
 from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, cast, find_candidates, scene_from
 from arbiview_aug.datasets.synthetic.render import Renderer, stack_or_list
 from arbiview_aug.datasets.synthetic.scene import Material, Scene, SceneClass
@@ -116,15 +116,8 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         scene = self.scene(index)
-        sample: dict[str, Any] = {
-            "images": self._images(scene),
-            "rig": self.rig,
-            "K": torch.from_numpy(self.rig.K),
-            "cam2ego": torch.from_numpy(self.rig.cam2ego),
-            "boxes_3d": self._boxes(scene),
-            "box_classes": torch.from_numpy(scene.box_classes.copy()),
-            "token": f"synthetic-{self.seed}-{self._checked_index(index)}",
-        }
+        sample = camera_fields(self.rig, self._images(scene), f"synthetic-{self.seed}-{self._checked_index(index)}")
+        sample |= {"boxes_3d": self._boxes(scene), "box_classes": torch.from_numpy(scene.box_classes.copy())}
         if self.lidar:
             sample["points"] = self.points(index)
         if self.neighbours is not None:

@@ -179,7 +179,6 @@ class _World:
                 place.box(x, y, (-0.5, self.street.kerb_m), Material.SLAB, (0.52, 0.51, 0.49))
 
     def add_buildings(self) -> None:
-        """Two rows of buildings on each side, with walls and hedges in their gaps."""
         rng, base = self.rng, self.street.kerb_m
         for side in (-1, 1):
             walk = self.street.sidewalk_m[side > 0]
@@ -230,7 +229,6 @@ class _World:
                 objects.add_building(self.builder, rng, xs, (-60, 60), 0.0, rng.uniform(14, 45))
 
     def add_parked(self) -> None:
-        """Rows of parked vehicles along the kerbs."""
         for side in (-1, 1):
             if not self.street.parking[side > 0]:
                 continue
@@ -247,7 +245,6 @@ class _World:
                     x += 5.0 + step
 
     def add_moving(self) -> None:
-        """Traffic in every lane, on the right-hand side of the road."""
         street = self.street
         for side in (-1, 1):
             for lane in range(street.lanes):
@@ -275,7 +272,6 @@ class _World:
                 y += self.rng.uniform(8, 25)
 
     def add_furniture(self) -> None:
-        """Lamp posts, trees, bushes, signs and traffic lights behind the kerbs."""
         rng, base = self.rng, self.street.kerb_m
         for side in (-1, 1):
             lamps, trees = rng.uniform(18, 32), rng.uniform(7, 15)
