@@ -27,7 +27,7 @@ from arbiview_aug.cli.arguments import (
     size,
     writable_folder,
 )
-from arbiview_aug.cli.convert.job import Done, Jobs, OnError
+from arbiview_aug.cli.convert.job import Done, Jobs, OnError, State
 from arbiview_aug.cli.convert.ray_runner import ray_results
 from arbiview_aug.cli.convert.report import write_report
 from arbiview_aug.cli.convert.settings import FOLDER, RETARGET_OPTIONS, Settings, check_output
@@ -56,17 +56,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     settings = _settings(arguments)
     check_output(settings)
     jobs, facts = _begin(settings, settings.open(), arguments)
-    tally = _Tally()
+    found: list[Done] = []
     started_s = time.perf_counter()
-    for done in _run(jobs, arguments, tally):
+    for done in _run(jobs, arguments):
+        found.append(done)
         if done.state == "stopped" or (done.state == "failed" and arguments.on_error == "fatal"):
             break
-    for line in dict.fromkeys(tally.warned):
+    for line in dict.fromkeys(line for done in found if done.is_converted for line in done.messages):
         print(f"note: {line}", file=sys.stderr)
-    print(tally.summary(settings.output, time.perf_counter() - started_s))
-    for done in tally.unconverted:
-        print(f"  {done.token}: {done.state}: {'; '.join(done.messages)}", file=sys.stderr)
-    if tally.states["stopped"] or tally.states["failed"]:
+    print(_summary(settings.output, found, time.perf_counter() - started_s))
+    for done in found:
+        if not done.is_converted:
+            print(f"  {done.token}: {done.state}: {'; '.join(done.messages)}", file=sys.stderr)
+    if any(done.state in ("stopped", "failed") for done in found):
         return 1
     _finish(jobs, facts, arguments.report, arguments.num_shards)
     return 0
@@ -179,57 +181,33 @@ def _begin(settings: Settings, data: Recording, arguments: argparse.Namespace) -
     return jobs, facts
 
 
-def _run(jobs: Jobs, arguments: argparse.Namespace, tally: _Tally) -> Iterator[Done]:
-    """Yield each sample's result, counted in ``tally``."""
-
-    def count_result(done: Done) -> str:
-        tally.add(done)
-        return f"coverage {tally.coverage:.1%}"
-
+def _run(jobs: Jobs, arguments: argparse.Namespace) -> Iterator[Done]:
     if arguments.runner == "ray":
-        yield from ray_results(jobs, arguments.workers, "convert", count_result)
+        yield from ray_results(jobs, arguments.workers, "convert", _note)
     else:
         with one_thread():
-            yield from results(jobs, min(arguments.workers, len(jobs)), "convert", count_result)
+            yield from results(jobs, min(arguments.workers, len(jobs)), "convert", _note)
 
 
-class _Tally:
-    """Counts, coverage and time of the samples so far."""
+def _note(done: Done) -> str:
+    return f"coverage {done.coverage:.1%}"
 
-    def __init__(self) -> None:
-        self.states: Counter[str] = Counter()
-        self.seconds = np.zeros(3)
-        self.unconverted: list[Done] = []
-        self.warned: list[str] = []
-        self._covered = 0.0
 
-    @property
-    def coverage(self) -> float:
-        """Share of the pixels that some source saw, so far."""
-        return self._covered / max(1, self.states["made"] + self.states["kept"])
-
-    def add(self, done: Done) -> None:
-        self.states[done.state] += 1
-        if done.state in ("made", "kept"):
-            self._covered += done.coverage
-            self.seconds += done.seconds
-            self.warned += done.messages
-        else:
-            self.unconverted.append(done)
-
-    def summary(self, output: Path, wall_s: float) -> str:
-        """Counts, coverage and shares of the time."""
-        words = {"kept": "there before", "skipped": "skipped", "failed": "failed"}
-        counts = "".join(f", {self.states[state]} {word}" for state, word in words.items() if self.states[state])
-        made, total_s = self.states["made"], float(self.seconds.sum())
-        text = f"{output}: {made} samples converted{counts}; {self.coverage:.1%} of the pixels seen"
-        if not made:
-            return text
-        read, retarget, write = self.seconds / total_s
-        return (
-            f"{text}\n{1e3 * total_s / made:.0f} ms a sample: read and decode {read:.0%}, retarget {retarget:.0%}, "
-            f"encode and write {write:.0%}; {made / wall_s:.2f} samples/s"
-        )
+def _summary(output: Path, found: Sequence[Done], wall_s: float) -> str:
+    """Counts, coverage and shares of the time."""
+    states = Counter(done.state for done in found)
+    words: dict[State, str] = {"kept": "there before", "skipped": "skipped", "failed": "failed"}
+    counts = "".join(f", {states[state]} {word}" for state, word in words.items() if states[state])
+    made, coverage = states["made"], np.mean([done.coverage for done in found if done.is_converted] or [0.0])
+    text = f"{output}: {made} samples converted{counts}; {coverage:.1%} of the pixels seen"
+    if not made:
+        return text
+    seconds = np.sum([done.seconds for done in found], axis=0)
+    read, retarget, write = seconds / seconds.sum()
+    return (
+        f"{text}\n{1e3 * seconds.sum() / made:.0f} ms a sample: read and decode {read:.0%}, retarget {retarget:.0%}, "
+        f"encode and write {write:.0%}; {made / wall_s:.2f} samples/s"
+    )
 
 
 def _finish(jobs: Jobs, facts: Mapping[str, Any], report_frames: int, shards: int) -> None:

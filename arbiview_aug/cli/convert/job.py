@@ -42,6 +42,11 @@ class Done(NamedTuple):
     seconds: tuple[float, float, float] = (0.0, 0.0, 0.0)  # to read, retarget and write
     messages: tuple[str, ...] = ()  # warnings, or the error
 
+    @property
+    def is_converted(self) -> bool:
+        """Whether the output has the sample."""
+        return self.state in ("made", "kept")
+
 
 def make_writer(settings: Settings, data: Recording) -> Writer:
     """Make the writer of the source's format; DataError if its reader names none."""
