@@ -141,7 +141,6 @@ class FrameFolder(Recording):
         return sample
 
     def _boxes_pose_time(self, calib: Mapping[str, Any], frame: _Frame) -> dict[str, Any]:
-        """A frame's boxes, pose and time, if any."""
         found: dict[str, Any] = {}
         if calib.get("boxes_3d") is not None:
             found["boxes_3d"] = _boxes(calib["boxes_3d"], frame.where)

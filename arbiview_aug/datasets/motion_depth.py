@@ -74,7 +74,6 @@ class DepthFolder:
         return depth if names == list(neighbours) else None
 
     def _read(self, token: str, rig: Rig) -> tuple[MotionDepth, list[str]]:
-        """Read a frame's depth and the names of its neighbours."""
         path = self.path(token)
         if not path.is_file():
             raise DataError(

@@ -62,7 +62,8 @@ class Jobs(Dataset[Done]):
 
     def __init__(self, settings: Settings, data: Recording, indices: Sequence[int], on_error: OnError) -> None:
         self.settings, self.data, self.indices, self.on_error = settings, data, indices, on_error
-        self.samples = settings.samples(data)
+        depth = settings.motion_depth
+        self.samples = data if depth is None else WithMotionDepth(data, depth)
         self.format, self.manifest = make_writer(settings, data), Manifest(settings.output)
 
     def __len__(self) -> int:

@@ -216,7 +216,6 @@ class NuScenes(Writer):
         return notes
 
     def _linked(self, table: str, rows: Iterable[Row]) -> Iterator[Row]:
-        """Yield rows and link their files."""
         for row in rows:
             try:
                 link_whole(*self._kept(row["filename"], self._where(table, row)))

@@ -11,7 +11,6 @@ from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.drive import Neighbours, Recording
 from arbiview_aug.datasets.image_io import Reduce
-from arbiview_aug.datasets.motion_depth import WithMotionDepth
 from arbiview_aug.datasets.registry import open_data
 from arbiview_aug.errors import DataError
 from arbiview_aug.favs.config import Quality
@@ -63,10 +62,6 @@ class Settings:
         """Open the source."""
         neighbours = Neighbours(count=self.neighbours) if self.neighbours else None
         return open_data(self.root, kind=self.kind, version=self.version, reduce=self.reduce, neighbours=neighbours)
-
-    def samples(self, data: Recording) -> Recording | WithMotionDepth:
-        """The source's samples, with stored depth from motion if any."""
-        return data if self.motion_depth is None else WithMotionDepth(data, self.motion_depth)
 
     def retarget(self) -> RigRetarget:
         """The transform; each process or actor makes one."""

@@ -24,8 +24,7 @@ def visible_shares(rig: Rig, coverage: Sequence[BoolArray], boxes: FloatArray) -
     """(B,) share of each box that the cameras show.
 
     The solid angle of covered pixels that no nearer box occludes, summed over the cameras, over that of the box's whole
-    silhouette in the camera that would show most of it if its image were twice as wide and high. Unlabelled occluders
-    are unknown here: the source's annotated level is the upper bound (``level``).
+    silhouette in the camera that would show most of it if its image were twice as wide and high.
 
     Args:
         rig: Pinhole cameras in the boxes' frame.
@@ -50,7 +49,7 @@ def visible_shares(rig: Rig, coverage: Sequence[BoolArray], boxes: FloatArray) -
 
 
 def level(share: float, source: str) -> str:
-    """Visibility token of an annotation from its visible share and its source token; empty if that is unknown."""
+    """Visibility token from a visible share, at most the ``source``'s token; empty if that is unknown."""
     if source not in LEVELS:
         return ""
     return min(source, LEVELS[int(np.searchsorted(_BOUNDS, share, side="right"))])

@@ -154,7 +154,6 @@ class NuScenesDataset(Recording):
         return sample
 
     def _rig(self, cameras: IntArray, ego2global: FloatArray) -> Rig:
-        """Rig of recorded cameras in the frame of an ego pose."""
         recordings, rig = self._recordings, []
         own2ego_of_cameras = _inverse(ego2global) @ recordings.ego2global(cameras)
         for channel, row, own2ego in zip(self.channels, cameras, own2ego_of_cameras, strict=True):

@@ -41,7 +41,7 @@ def road_color(street: Street, salt: int, x: Tensor, y: Tensor, fx: Tensor, fy: 
     tone = _cracks(street, salt, tone, x, y, f)
     tone = _stains(street, salt, tone, x, y, f)
     edge = torch.minimum(y + street.half_width_m[0], street.half_width_m[1] - y)
-    outside = _beyond_crossing(street, x, 0.0)
+    outside = ((x - street.crossing_x_m).abs() > street.crossing_half_m).float()
     dirt = step(0.55 - edge, 0.0, 0.5) * (0.6 + 0.4 * octave(x, y, 0.5, f, salt + 9)) * outside
     tone = tone * (1 - 0.28 * dirt)
     tint = torch.tensor([1.0, 1.0, 1.015])
@@ -99,12 +99,6 @@ def _stains(street: Street, salt: int, tone: Tensor, x: Tensor, y: Tensor, f: Te
     radius = 0.08 + 0.45 * h[2] * h[2]
     d = (dx * dx + dy * dy).sqrt() / radius + 0.35 * octave(x, y, 0.25, f, salt + 64)
     return tone * (1 - 0.30 * step(1 - d, 0.0, 0.6) * (h[3] < 0.45 * street.wear) * fade(f, 0.8))
-
-
-def _beyond_crossing(street: Street, x: Tensor, margin: float) -> Tensor:
-    if math.isinf(street.crossing_x_m):
-        return torch.ones_like(x)
-    return ((x - street.crossing_x_m).abs() > street.crossing_half_m + margin).float()
 
 
 def _markings(street: Street, x: Tensor, y: Tensor, fx: Tensor, fy: Tensor) -> tuple[Tensor, Tensor]:

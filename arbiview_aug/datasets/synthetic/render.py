@@ -225,7 +225,6 @@ class Renderer:
         return tile * outline.shape[1] + slot, _hits(first.start, direction, t, hit, pitch)
 
     def _view(self, scene: Scene, first: _Cast, color: Tensor) -> CameraView:
-        """Assemble images from tiles."""
         size, hit, rays = first.camera.size, first.hit, first.rays
         axis = rays.directions[:, 0] * rays.axis[0] + rays.directions[:, 1] * rays.axis[1]
         depth = first.t * (axis + rays.directions[:, 2] * rays.axis[2])
@@ -237,12 +236,8 @@ class Renderer:
         classes = torch.where(rays.valid, classes, int(SceneClass.VOID))
         instances = torch.where(hit >= 0, torch.as_tensor(scene.instance)[row], -1)
         image = (color.view(*hit.shape, 3) * 255 + 0.5).to(torch.uint8) * rays.valid[..., None]
-        return CameraView(
-            image=_from_tiles(image, size).permute(2, 0, 1).contiguous().cpu(),
-            depth_m=_from_tiles(depth, size).contiguous().cpu(),
-            classes=_from_tiles(classes.to(torch.uint8), size).contiguous().cpu(),
-            instances=_from_tiles(instances.to(torch.int16), size).contiguous().cpu(),
-        )
+        maps = [_from_tiles(a, size) for a in (depth, classes.to(torch.uint8), instances.to(torch.int16))]
+        return CameraView(*(a.contiguous().cpu() for a in (_from_tiles(image, size).permute(2, 0, 1), *maps)))
 
 
 class _Cast(NamedTuple):
