@@ -48,23 +48,19 @@ class Done(NamedTuple):
         return self.state in ("made", "kept")
 
 
-def make_writer(settings: Settings, data: Recording) -> Writer:
-    """Make the writer of the source's format; DataError if its reader names none."""
-    _, reader = find_reader(settings.root, settings.kind)
-    if reader.writer is None:
-        raise DataError(f"--data {settings.root}: expected a kind that can be written, got a {reader.description}")
-    module, _, name = reader.writer.partition(":")
-    return getattr(import_module(module), name)(settings, data)  # type: ignore[no-any-return]
-
-
 class Jobs(Dataset[Done]):
-    """Samples of a shard, by their ``indices`` in the source, each converted on access."""
+    """Samples of a shard, by their ``indices``, each converted on access; DataError if the reader names no writer."""
 
     def __init__(self, settings: Settings, data: Recording, indices: Sequence[int], on_error: OnError) -> None:
         self.settings, self.data, self.indices, self.on_error = settings, data, indices, on_error
         depth = settings.motion_depth
         self.samples = data if depth is None else WithMotionDepth(data, depth)
-        self.format, self.manifest = make_writer(settings, data), Manifest(settings.output)
+        _, reader = find_reader(settings.root, settings.kind)
+        if reader.writer is None:
+            raise DataError(f"--data {settings.root}: expected a kind that can be written, got a {reader.description}")
+        module, _, name = reader.writer.partition(":")
+        self.format: Writer = getattr(import_module(module), name)(settings, data)
+        self.manifest = Manifest(settings.output)
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -173,7 +169,5 @@ def _total_bytes(files: Sequence[Path]) -> int:
 
 
 def _below(path: Path, root: Path) -> str:
-    try:
-        return path.relative_to(root).as_posix()
-    except ValueError:  # a frame that is its own root, or a file beside it
-        return path.name
+    # Files of a frame that is its own root, or beside it, are not below ``root``.
+    return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name

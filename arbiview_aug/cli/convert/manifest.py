@@ -62,11 +62,8 @@ class Manifest:
         record = self.record(token)
         if record is None or "skipped" in record:
             return None
-        for name, size in record["files"].items():
-            file = self.output / name
-            if not file.is_file() or file.stat().st_size != size:
-                return None
-        return record
+        files = {self.output / name: size for name, size in record["files"].items()}
+        return record if all(file.is_file() and file.stat().st_size == files[file] for file in files) else None
 
     def write(self, record: Record, owner: str) -> None:
         """Write a sample's record."""

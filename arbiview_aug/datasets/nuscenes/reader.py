@@ -37,13 +37,11 @@ CAMERA_RING = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CA
 
 _POINT_FLOATS = 5  # x y z intensity ring
 
-_USUAL_VERSIONS = ("v1.0-mini", "v1.0-trainval")
-
 
 def table_folders(root: Path) -> list[str]:
     """Names of a root's folders of tables: v1.0-mini and v1.0-trainval first."""
-    found = sorted(path.name for path in root.glob("v1.0-*") if path.is_dir())
-    return [*(name for name in _USUAL_VERSIONS if name in found), *(n for n in found if n not in _USUAL_VERSIONS)]
+    found = (path.name for path in root.glob("v1.0-*") if path.is_dir())
+    return sorted(found, key=lambda name: (name not in ("v1.0-mini", "v1.0-trainval"), name))
 
 
 class NuScenesDataset(Recording):

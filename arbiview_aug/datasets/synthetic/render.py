@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -165,18 +165,12 @@ class Renderer:
             key = torch.where(hits.primitive >= 0, hits.primitive * 8 + face, hits.primitive)
             fine = [self._cast_outlines(c, k, scene) for c, k in zip(casts, key.split(sizes), strict=True)]
             hits = _joined([f[1] for f in fine])
-            means = self._means(shade(tables, hits, faces(tables, hits.point, hits.primitive)))
+            color = shade(tables, hits, faces(tables, hits.point, hits.primitive))
+            samples = color.view(-1, self.supersampling**2, 3).unbind(1)
+            means = reduce(torch.add, samples) / len(samples)  # a fixed order of summation
             for color, (chosen, _), mean in zip(colors, fine, means.split([len(f[0]) for f in fine]), strict=True):
                 color[chosen] = mean
         return [self._view(scene, c, color) for c, color in zip(casts, colors, strict=True)]
-
-    def _means(self, color: Tensor) -> Tensor:
-        """(m, 3) means of (m * s * s, 3) colours, in a fixed order of summation."""
-        samples = color.view(-1, self.supersampling**2, 3)
-        total = samples[:, 0].clone()
-        for k in range(1, samples.shape[1]):
-            total += samples[:, k]
-        return total / samples.shape[1]
 
     def _cast(self, scene: Scene, camera: Camera, ground_z_m: float) -> _Cast:
         """First pass: one ray through every pixel's centre."""
