@@ -54,6 +54,20 @@ def optional_package(name: str, extra: str | None = None) -> Any:
         raise ImportError(f"{top} is not installed: pip install {wanted}") from None
 
 
+def compiled(function: Any) -> Any:
+    """Compile a function by numba at its first call, and keep the result in a cache folder where one can be written.
+
+    Division by zero gives infinity, as in numpy. Operations keep their order, so results do not depend on the number of
+    threads or processes; kinds of CPU may differ in the last bit.
+    """
+    from numba import njit
+
+    try:
+        return njit(error_model="numpy", nogil=True, cache=True)(function)
+    except RuntimeError:  # no locator available: neither the package's folder nor the user's can be written
+        return njit(error_model="numpy", nogil=True)(function)
+
+
 @contextmanager
 def repeatable_opencv() -> Iterator[None]:
     """Run OpenCV on one thread without Intel's IPP, so that the same images give the same bits.

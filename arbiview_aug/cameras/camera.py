@@ -203,6 +203,15 @@ class Camera:
         return digest.digest()
 
     @cached_property
+    def mask_key(self) -> bytes:
+        """Digest of the mask; empty without one."""
+        return (
+            b""
+            if self.mask is None
+            else hashlib.sha256(repr(self.size).encode() + np.packbits(self.mask).tobytes()).digest()
+        )
+
+    @cached_property
     def lens_model(self) -> Lens:
         """The lens with this camera's coefficients."""
         return LENSES[self.lens](self.distortion)

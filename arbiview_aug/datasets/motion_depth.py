@@ -14,9 +14,9 @@ from arbiview_aug.atomic_io import BROKEN_ARRAY, file_name, inside, whole_file
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.drive import Neighbours
 from arbiview_aug.errors import DataError, SampleError
-from arbiview_aug.render.pixel_projection import Layer
 from arbiview_aug.sample.inputs import MOTION_KEY
 from arbiview_aug.scene.depth_maps import motion_camera
+from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.temporal.motion_depth import BEST_TRAVEL_M, MotionDepth
 
 FOLDER = "motion_depth"

@@ -22,9 +22,7 @@ class FavsConfig:
         distance_gamma: γ of w_distance = (d / d_max)^γ.
         primary_bonus: w_primary of a source at the target's own centre: it is exact, so it wins wherever it sees.
         far_parallax_px: Largest shift of scene points beyond 2 m at which ``auto`` takes a pair of cameras as far.
-        grid_step_px: Spacing of the coarse grid on which maps are evaluated in float64 before interpolation.
-        map_tolerance_px: Largest interpolation error of a grid cell; others are evaluated exactly. With the fixed-point
-            maps' rounding of 1/64 px, maps stay within 1/32 px of float64.
+        grid_step_px: Spacing of the nodes between which weights are interpolated. Positions are evaluated per pixel.
         overlap_depth: Correct the street's distances in every frame by stereo between overlapping cameras.
         certainty: Store the geometry's accuracy in plans, one byte a pixel; ``outputs=("confidence",)`` needs it.
     """
@@ -36,7 +34,6 @@ class FavsConfig:
     primary_bonus: float = 1e6
     far_parallax_px: float = 0.5
     grid_step_px: int = 8
-    map_tolerance_px: float = 1 / 64
     overlap_depth: bool = False
     certainty: bool = False
 
@@ -55,7 +52,6 @@ _RANGES: dict[str, tuple[float, float]] = {
     "distance_gamma": (0.0, 16.0),
     "primary_bonus": (1.0, 1e12),
     "far_parallax_px": (0.0, 1e3),
-    "map_tolerance_px": (1e-6, 1.0),
 }
 
 

@@ -81,6 +81,11 @@ class FixedMap:
         return np.asarray(self.xy + fraction, np.float32)
 
     @property
+    def packed(self) -> npt.NDArray[np.int32]:
+        """``xy`` as one number for each pixel, (h, w): y in the upper half, x in the lower; the same memory."""
+        return self.xy.view(np.int32)[..., 0]
+
+    @property
     def nbytes(self) -> int:
         """Memory held."""
         return self.xy.nbytes + self.frac.nbytes

@@ -21,7 +21,8 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.overlap import adjacent_pairs, half_way_view, odd_tiles
-from arbiview_aug.cameras.projection import edge_distance, ego_rays, project_rays
+from arbiview_aug.cameras.projection import ego_rays, project_rays
+from arbiview_aug.cameras.rays import edge_distance
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import check_ranges

@@ -28,7 +28,7 @@ from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.image_ops import at_level
 from arbiview_aug.render.dense_flow import dense_flow, why_ambiguous
 from arbiview_aug.render.harmonise import project_halved, reduced, source_level
-from arbiview_aug.scene.box_raster import draw_boxes
+from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.corrected import Correction
 from arbiview_aug.scene.static import Street
 from arbiview_aug.scene.surface import StaticSurface
@@ -166,7 +166,7 @@ def _strip(rig: Rig, a: int, b: int, surface: StaticSurface, boxes: FloatArray |
     rays, q, both = _seen_by_both(rig, a, b, view, pixels[rows, columns], surface)
     usable = ~odd_tiles(_VIEW_SIZE, _TILE_PX)
     if boxes is not None:
-        usable.reshape(-1)[draw_boxes(view, boxes).pixel] = False
+        usable[draw_boxes(view, boxes)[1] >= 0] = False
     usable, held_out = usable[rows, columns] & both, odd_tiles(_VIEW_SIZE, _TILE_PX // 2)[rows, columns]
     fit, test = usable & ~held_out, usable & held_out
     few = min(np.count_nonzero(fit), np.count_nonzero(test)) < MIN_PIXELS

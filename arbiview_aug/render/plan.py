@@ -1,9 +1,8 @@
 """The render plan: everything about a (source rig, target rig) pair that does not depend on image content.
 
 For every target camera (``arbiview_aug.render.view_planner``): the sources that see it, the surface of each, the
-position of every pixel, its winning source, and the bands along seams that are blended. Maps are evaluated in float64
-on a coarse grid and interpolated wherever that is exact to ``map_tolerance_px``, and pixel by pixel elsewhere
-(``arbiview_aug.render.warp_maps``).
+position of every pixel, its winning source, and the bands along seams that are blended. Compiled code evaluates every
+pixel (``arbiview_aug.render.kernels``), fast enough for calibrations or geometry that change with every frame.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ from functools import partial
 from typing import Any
 
 from arbiview_aug.cameras.lens import BoolArray
+from arbiview_aug.cameras.rays import CameraMaps
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.image_ops import Scratch
@@ -65,6 +65,7 @@ def build_plan(
     surface: str = "auto",
     config: FavsConfig | None = None,
     scene: Scene | None = None,
+    maps: CameraMaps | None = None,
 ) -> RenderPlan:
     """Plan how ``target`` is rendered from ``source``'s images.
 
@@ -76,6 +77,7 @@ def build_plan(
             ``config.far_parallax_px``, else the scene's best.
         config: Settings; the ``fast`` preset by default.
         scene: Known geometry, in the source's ego frame.
+        maps: Rays and masks of cameras, to be reused by later plans.
 
     Returns:
         The plan. Targets that no source sees have zero coverage.
@@ -84,9 +86,11 @@ def build_plan(
     target = target.in_frame_of(source)
     counters: Counter[str] = Counter()
     order = content_order(source.cameras)
-    scene = scene or Scene()
+    scene, maps = scene or Scene(), maps or CameraMaps()
     by_name = partial(scene.surface, ground_z_m=source.ground_z_m)
-    planners = [ViewPlanner(source, order, camera, surface, scene.best, by_name, config, counters) for camera in target]
+    planners = [
+        ViewPlanner(source, order, camera, surface, scene.best, by_name, config, counters, maps) for camera in target
+    ]
     used = [(region.source, region.level) for planner in planners for region in planner.regions]
     layout = AtlasLayout.for_sources(source.sizes, used)
     scratch = Scratch()

@@ -33,6 +33,7 @@ HELPFUL_DATA = (
 
 _COARSE_MASK_PX = 16  # margin that must be unmasked: weights know masks by blocks of 8 px
 _ROUNDING_PX = 1e-6  # of float64 at the outermost pixel centres; plans allow for 1e-3
+_MAP_ERROR_PX = 1 / 32  # rounding of fixed-point maps, with as much again
 _LEAST_QUALITY = 0.05  # ``quality_weight`` of the coarsest exact source
 
 
@@ -133,7 +134,7 @@ def covers_target_exactly(source: Camera, target: Camera, config: FavsConfig) ->
     lost_h, lost_w = (0 if n % halved == 0 else halved - 1 for n in source.size)
     # Positions in a rotated view are interpolated; those in a cropped or scaled one are exact.
     scaled = float(np.abs(H[2, :2]) @ (w, h)) <= 1e-9 * float(H[2, 2])
-    margin = -_ROUNDING_PX if scaled else 2 * config.map_tolerance_px * halved
+    margin = -_ROUNDING_PX if scaled else _MAP_ERROR_PX * halved
     if min(u0, v0) < margin or u1 > source_w - 1 - lost_w - margin or v1 > source_h - 1 - lost_h - margin:
         return False
     if source.mask is None:

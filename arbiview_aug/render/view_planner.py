@@ -6,31 +6,32 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, cast
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.coarse_grid import Box, runs
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.projection import clean_pixels, edge_distance, resolution
+from arbiview_aug.cameras.projection import look_apart
+from arbiview_aug.cameras.rays import CameraMaps, source_pixels
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.favs.stage4_fusion import distance_weight, primary_weight, quality_weight
-from arbiview_aug.image_ops import Scratch, level_size
+from arbiview_aug.image_ops import Scratch, at_level, level_size
 from arbiview_aug.render.atlas import AtlasLayout, FixedMap
 from arbiview_aug.render.confidence import certainty
 from arbiview_aug.render.requirements import SAME_CENTER_M, covers_target_exactly
-from arbiview_aug.render.target_rays import TargetRays
 from arbiview_aug.render.view_plan import BilinearFallback, BlendRegion, SourceUse, ViewPlan
-from arbiview_aug.render.warp_maps import WarpMap
 from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
 from arbiview_aug.scene.surface import Surface
 
-_STRIP_PX = 128  # rows worked on at once: they fit a cache, and slanted seams make narrow rectangles
+_SMALL_SIDE_PX = 64  # weights of targets with a shorter side are evaluated at every pixel
+_SLACK_PX = 1e-3  # a pixel on the very border must not drop out by a rounding of float32
+_STRIP_PX = 128  # slanted seams make narrow rectangles
 MAGNIFIED = 0.8
 """A view is read by cubics where it has this few source pixels per pixel, or fewer, and most of it is read at its own
 centre: it is sharper for it, and a cubic costs 2.6 to 4.7 times as much. On synthetic streets, dB over bilinear by
@@ -41,38 +42,52 @@ where the surface is what errs: 0.7 m higher -0.1 dB, and the detector 75 instea
 _LEAST_SHARE = 1 / 256  # a source that adds less than this to a pixel cannot change a grey level
 
 
+@dataclass(frozen=True)
+class _Geometry:
+    """A surface as a target sees it.
+
+    Attributes:
+        q: (h, w) float32 inverse distances along the pixels' rays, 1/m.
+        face: (h, w) int32 faces of solids in front of the background, -1 elsewhere; (0, 0) without any.
+        behind: (ny + 1, nx + 1) float32 inverse distances of the background on the nodes.
+        nearest: (ny, nx) float32 largest inverse distance in each cell.
+        farthest: (ny, nx) float32 least inverse distance in each cell.
+        uncertainty: (ny + 1, nx + 1) expected error of the inverse distance on the nodes, 1/m.
+    """
+
+    q: npt.NDArray[np.float32]
+    face: npt.NDArray[np.int32]
+    behind: npt.NDArray[np.float32]
+    nearest: npt.NDArray[np.float32]
+    farthest: npt.NDArray[np.float32]
+    uncertainty: FloatArray
+
+
 @dataclass
 class _Region:
-    """What one source contributes to one target."""
+    """What one source contributes to one target; all arrays on the nodes (ny + 1, nx + 1)."""
 
     source: int
     level: int
     surface: str
     reason: str
     baseline_m: float
-    pair: WarpMap
-    score: npt.NDArray[np.float32]  # [ny, nx] stage-4 weight on the nodes, 0 where not visible
-    parallax: npt.NDArray[np.float32]  # [ny, nx] expected displacement, target pixels
-    border_px: npt.NDArray[np.float32]  # [ny, nx] distance to the border of what the source sees, target pixels
+    geometry: _Geometry
+    columns: npt.NDArray[np.int64]  # (ny, 2) first and last (exclusive) cell in view of each row of cells
+    kernel: tuple[Any, ...]
+    score: npt.NDArray[np.float32]  # stage-4 weight, 0 where not visible
+    parallax: npt.NDArray[np.float32]  # expected displacement, target pixels
+    border_px: npt.NDArray[np.float32]  # distance to the border of what the source sees, target pixels
     fineness: float  # median of the pixels, as they are read, per target pixel
-    certainty: npt.NDArray[np.float32] | None  # [ny, nx] in 255ths, if asked for
-
-
-@dataclass(frozen=True)
-class _Visible:
-    """A strip of a region at full resolution."""
-
-    source: int
-    box: Box  # y0, y1, x0, x1
-    at: FixedMap  # [box h, box w] atlas positions
-    visible: npt.NDArray[np.uint8]  # [box h, box w] 255 where the source sees the pixel
-    in_image: npt.NDArray[np.uint8] | None  # [box h, box w] 255 where its image contains the pixel, if that differs
-    weight: npt.NDArray[np.float32]  # [box h, box w] seam weight
-    certainty: npt.NDArray[np.uint8] | None  # [box h, box w]
+    certainty: npt.NDArray[np.float32] | None  # in 255ths, if asked for
 
 
 class ViewPlanner:
-    """Builds one target's plan in two steps: what each source sees, then who wins and where seams are blended."""
+    """Builds one target's plan in two steps: what each source sees, then who wins and where seams are blended.
+
+    Positions, visibility and winners are evaluated at every pixel (``kernels``). Weights are smooth: they are known on
+    nodes ``config.grid_step_px`` apart, which lie on pixel centres, and interpolated between.
+    """
 
     def __init__(
         self,
@@ -84,17 +99,29 @@ class ViewPlanner:
         surface_by_name: Callable[[str], Surface],
         config: FavsConfig,
         counters: Counter[str],
+        maps: CameraMaps,
     ) -> None:
         self.source, self.camera, self.surface, self.config = source, camera, surface, config
         self.best, self.surface_by_name = best, surface_by_name
-        self.counters = counters
-        # From outside, the far wall is a narrow strip with edges, which a coarse grid could step over.
-        coarse = is_within_wall(camera.center_m) or not SURFACES[surface].has_wall
-        step = config.grid_step_px if coarse else 1
-        self.rays = TargetRays(camera, step, counters)
-        self.grid = self.rays.grid
+        self.counters, self.maps = counters, maps
+        self.rays = maps.rays(camera)
+        # From outside, the far wall is a narrow strip with edges, which cells could step over.
+        coarse = min(camera.size) >= _SMALL_SIDE_PX
+        coarse &= is_within_wall(camera.center_m) or not SURFACES[surface].has_wall
+        self.step = config.grid_step_px if coarse else 1
+        self.nodes = tuple(np.minimum(np.arange(0, n + self.step, self.step), n - 1) for n in camera.size)
+        self.node_rays = self.rays.at(*self.nodes)
+        self._geometries: dict[str, _Geometry] = {}
+        self._open = np.ones(tuple(len(n) - 1 for n in self.nodes), bool)  # cells that further sources may change
+        found = {}
+        for k in sorted(self._required(order), key=lambda k: self._baseline_m(k) >= SAME_CENTER_M):
+            region = self._region(k)
+            if region is not None:
+                found[k] = region
+                if region.baseline_m < SAME_CENTER_M:
+                    self._open &= self._around_unseen(region)
         # In content order, so that ties never depend on the order of the source list.
-        self.regions = [region for k in self._required(order) if (region := self._region(k)) is not None]
+        self.regions = [found[k] for k in order if k in found]
 
     # --- what a source sees -------------------------------------------------------------------------------------------
     def _required(self, order: list[int]) -> list[int]:
@@ -117,59 +144,191 @@ class ViewPlanner:
             return "far", f"worst-case parallax {worst:.2f} px"
         return self.best, f"centres {baseline_m:.2f} m apart"
 
+    def _around_unseen(self, region: _Region) -> BoolArray:
+        """Cells (ny, nx) that an exact source does not see whole, and those around them that seams may reach."""
+        from arbiview_aug.render.kernels import depth_range, seen_image
+
+        seen = region.score > 0
+        whole = seen[1:, 1:] & seen[1:, :-1] & seen[:-1, 1:] & seen[:-1, :-1]
+        if self.maps.clean_pixels(self.source[region.source], region.level).size:  # a mask may lie between nodes
+            visible = np.zeros(self.camera.size, bool)
+            seen_image(*self._target(region), region.kernel, visible)
+            most, least = np.empty(whole.shape, np.float32), np.empty(whole.shape, np.float32)
+            depth_range(visible.astype(np.float32), self.step, most, least)
+            whole &= least > 0
+        unseen = (~whole).astype(np.uint8)
+        side = 2 * (2 * self._seam_radius + 2) + 1
+        return cv2.dilate(unseen, np.ones((side, side), np.uint8)) > 0
+
+    @property
+    def _seam_radius(self) -> int:
+        """Half the width of a seam, in nodes."""
+        return max(1, round(self.config.seam_width * self.camera.width_px / self.step / 2))
+
+    @cached_property
+    def _directions(self) -> FloatArray:
+        """Rays of the nodes in the ego frame, float64."""
+        rays = self.node_rays.astype(np.float64).reshape(3, -1)
+        return np.moveaxis((self.camera.cam2ego[:3, :3] @ rays).reshape(self.node_rays.shape), 0, -1)
+
+    def _geometry(self, name: str) -> _Geometry:
+        if name in self._geometries:
+            return self._geometries[name]
+        from arbiview_aug.render.kernels import depth_range
+
+        surface, center = cast(Any, self.surface_by_name(name)), self.camera.center_m
+        q = np.zeros(self.camera.size, np.float32)
+        rows, columns = (np.flatnonzero(self._open.any(axis)) for axis in (1, 0))
+        y0, y1, x0, x1 = (int(n) for n in (rows[0], rows[-1] + 1, columns[0], columns[-1] + 1))
+        y0, y1, x0, x1 = (
+            min(n * self.step, limit) for n, limit in zip((y0, y1, x0, x1), np.repeat(q.shape, 2), strict=True)
+        )
+        window = y0, x0, (y1 - y0, x1 - x0)
+        camera, rays = self.camera.crop(*window), self.rays.crop(*window)
+        here = slice(y0, y1), slice(x0, x1)
+        q[here] = surface.background.image(camera, rays)
+        self.counters["dense_pixels"] += q[here].size if surface.background.is_dense else 0
+        at_nodes = np.ix_(*self.nodes)
+        behind = q[at_nodes]
+        face = np.zeros((0, 0), np.int32)
+        on_nodes = behind.astype(np.float64)
+        if surface.background.is_guess:
+            on_nodes = surface.background.inverse_distance(center, self._directions)
+        if surface.is_layered:
+            solid, face = np.zeros_like(q), np.full(q.shape, -1, np.int32)
+            solid[here], face[here] = surface.drawn(camera, rays)
+            shown = face >= 0
+            np.copyto(q, solid, where=shown)
+            self.counters["solid_pixels"] += int(np.count_nonzero(shown))
+            on_nodes = np.where(shown[at_nodes], solid[at_nodes], on_nodes)
+            if not shown.any():
+                face = np.zeros((0, 0), np.int32)
+        uncertainty = surface.uncertainty(center, self._directions, on_nodes)
+        cells = tuple(len(n) - 1 for n in self.nodes)
+        nearest, farthest = np.empty(cells, np.float32), np.empty(cells, np.float32)
+        depth_range(q, self.step, nearest, farthest)
+        self._geometries[name] = _Geometry(q, face, behind, nearest, farthest, uncertainty)
+        return self._geometries[name]
+
     def _region(self, index: int) -> _Region | None:
+        from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES, camera_parameters
+        from arbiview_aug.render.kernels import cells_in_view, seen_image
+
         source = self.source[index]
         offset_m = self.camera.center_m - source.center_m
-        baseline_m = self._baseline_m(index)
-        focal_px = float(self.camera.K[0, 0])
+        baseline_m, focal_px = self._baseline_m(index), float(self.camera.K[0, 0])
         name, reason = self._choose_surface(baseline_m, focal_px)
-        surface = self.surface_by_name(name)
-        pair = WarpMap(self.rays, source, surface)
-        if pair.nodes is None:
+        if not self._open.any():
             return None
-        self.counters[f"pairs_{name}"] += 1
-        pixels_per_pixel = resolution(pair.uv, self.grid.step)
-        edge_px = edge_distance(source, pair.uv)
-        seen = pair.valid & (edge_px > 0)
+        surface, geometry = cast(Any, self.surface_by_name(name)), self._geometry(name)
+        if look_apart(self.camera, source, float(geometry.nearest.max())):
+            return None
+        to_source = source.cam2ego[:3, :3].T
+        A = (to_source @ self.camera.cam2ego[:3, :3]).astype(np.float32)
+        o = (to_source @ offset_m).astype(np.float32)
+        kind, P = LENS_CODES.get(source.lens, -1), camera_parameters(source)
+        use = self._open.copy()
+        if kind >= 0:
+            size = np.array(source.size, np.float32)
+            cells_in_view(
+                self.node_rays, geometry.nearest, geometry.farthest, A, o, kind, P, size, source.cone_rad, use
+            )
+            use &= self._open
+        if not use.any():
+            return None
+        u, v, _ = source_pixels(self.camera, self.node_rays, geometry.behind, source)
+        valid = np.abs(u) < 0.9 * FAR_AWAY_PX
+        uv = np.stack([u, v], -1).astype(np.float64)
+        pixels_per_pixel = self._resolution(uv)
+        edge_px = self.maps.edge_distance(source, uv)
+        seen = valid & (edge_px > 0)
+        if not (seen.any() or use.any()):
+            return None
         level = self._level(pixels_per_pixel[seen], source.size) if self.config.antialias else 0
-        pair.set_tolerance(self.config.map_tolerance_px * 2**level * pair.surface.tolerance_scale)
-        seen = pair.visible_nodes(level) & (edge_px > 0)
-        parallax = self._expected_parallax(offset_m, focal_px, surface)
+        kernel = self._kernel(source, level, surface, geometry, A, o)
+        visible = np.zeros(seen.shape, bool)
+        at_nodes = np.ix_(*self.nodes)
+        face = geometry.face[at_nodes] if geometry.face.size else geometry.face
+        given = kernel[-1][:, self.nodes[0][:, None], self.nodes[1][None]] if kind < 0 else kernel[-1]
+        seen_image(self.node_rays, self.rays.parameters, geometry.q[at_nodes], face, (*kernel[:-1], given), visible)
+        self.counters[f"pairs_{name}"] += 1
+        parallax = self._expected_parallax(offset_m, focal_px, geometry)
         score = (
             distance_weight(edge_px, min(source.size) / 2, self.config.distance_gamma)
             * quality_weight(parallax, pixels_per_pixel)
             * primary_weight(baseline_m < SAME_CENTER_M, self.config.primary_bonus)
         )
+        certain = 255 * certainty(parallax / focal_px, pixels_per_pixel) if self.config.certainty else None
         return _Region(
             source=index,
             level=level,
             surface=name,
             reason=reason,
             baseline_m=baseline_m,
-            pair=pair,
-            score=self.grid.extended(np.where(seen, score, 0).astype(np.float32)),
+            geometry=geometry,
+            columns=_spans(use),
+            kernel=kernel,
+            score=np.where(visible & (edge_px > 0), score, 0).astype(np.float32),
             parallax=parallax.astype(np.float32),
             border_px=(edge_px / np.maximum(pixels_per_pixel, 1e-3)).astype(np.float32),
             fineness=float(np.median(pixels_per_pixel[seen])) / 2**level if seen.any() else 1.0,
-            certainty=self._certainty(pair, parallax / focal_px, pixels_per_pixel) if self.config.certainty else None,
+            certainty=None if certain is None else _filled(certain, valid),
         )
 
-    def _certainty(
-        self, pair: WarpMap, parallax_rad: FloatArray, pixels_per_pixel: FloatArray
-    ) -> npt.NDArray[np.float32]:
-        """Certainty on the nodes in 255ths; nodes that the source cannot see take the mean of those around them."""
-        valid = pair.valid.astype(np.float32)
-        known = np.where(pair.valid, 255 * certainty(parallax_rad, pixels_per_pixel), 0).astype(np.float32)
-        if pair.valid.all():
-            return self.grid.extended(known)
-        total, count = (cv2.blur(part, (5, 5), borderType=cv2.BORDER_REPLICATE) for part in (known, valid))
-        return self.grid.extended(np.where(pair.valid, known, total / np.maximum(count, 1e-6)))
+    def _kernel(self, source: Camera, level: int, surface: Any, geometry: _Geometry, A: Any, o: Any) -> tuple[Any, ...]:
+        """The source as ``kernels.put_source`` reads it, halved ``level`` times."""
+        from arbiview_aug.cameras.kernels import LENS_CODES, camera_parameters
 
-    def _expected_parallax(self, offset_m: FloatArray, focal_px: float, surface: Surface) -> FloatArray:
+        (h, w), scale = level_size(source.size, level), 0.5**level
+        slack = np.array([-_SLACK_PX, -_SLACK_PX, source.width_px - 1 + _SLACK_PX, source.height_px - 1 + _SLACK_PX])
+        bounds = (slack + 0.5) * scale - 0.5
+        # Halving leaves out the last row or column of an odd size: nothing is known there.
+        bounds[2:] = np.minimum(bounds[2:], (w - 0.5, h - 0.5))
+        last = (w - 1, h - 1) if level else (-1, -1)
+        kind = LENS_CODES.get(source.lens, -1)
+        given = np.zeros((2, 0, 0), np.float32)
+        if kind < 0:
+            u, v, _ = source_pixels(self.camera, self.rays.at(*map(np.arange, self.camera.size)), geometry.q, source)
+            given = at_level(np.stack([u, v]), level).astype(np.float32)
+        nothing = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32)
+        shadow, solid = nothing
+        shadow_scale = 1.0
+        if surface.is_layered or surface.is_dense:
+            # Half the size that is read is enough: silhouettes are widened by half of its pixels.
+            coarser = level + 1 if min(source.size) >> level >= 2 else level
+            half = halved_camera(source, coarser)
+            shadow, solid = surface.occlusion_map(half, self.maps.rays(half))
+            shadow_scale = 0.5 ** (coarser - level)
+        before_m = np.zeros(0, np.float32)
+        if surface.is_layered:
+            before_m = surface.before_faces(source.center_m).astype(np.float32)
+        return (
+            A,
+            o,
+            kind,
+            camera_parameters(source, scale),
+            np.array([*bounds, *last, shadow_scale], np.float32),
+            self.maps.clean_pixels(source, level),
+            before_m,
+            shadow,
+            np.ascontiguousarray(solid),
+            bool(surface.background.is_guess),
+            given,
+        )
+
+    def _resolution(self, uv: FloatArray) -> FloatArray:
+        """Source pixels per target pixel along the worse axis: the smaller singular value of the Jacobian."""
+        if min(self.camera.size) < 2:
+            return np.ones(uv.shape[:2])
+        (a, c), (b, d) = (_derivative(uv, axis, self.nodes[axis]) for axis in (1, 0))
+        half_sum, determinant = (a * a + b * b + c * c + d * d) / 2, a * d - b * c
+        return np.sqrt(np.maximum(half_sum - np.sqrt(np.maximum(half_sum**2 - determinant**2, 0)), 0))
+
+    def _expected_parallax(self, offset_m: FloatArray, focal_px: float, geometry: _Geometry) -> FloatArray:
         """Displacement (target px) that unknown depth around a surface may cause: offset across the ray x spread."""
-        along_m = self.rays.directions @ offset_m
+        along_m = self._directions @ offset_m
         across_m = np.sqrt(np.maximum(offset_m @ offset_m - along_m**2, 0))
-        return focal_px * across_m * self.rays.uncertainty(surface)
+        return focal_px * across_m * geometry.uncertainty
 
     @staticmethod
     def _level(resolution: FloatArray, size: tuple[int, int]) -> int:
@@ -184,49 +343,43 @@ class ViewPlanner:
 
     # --- who wins -----------------------------------------------------------------------------------------------------
     def finish(self, layout: AtlasLayout, scratch: Scratch) -> ViewPlan:
-        """Winners, maps into the atlas, and blended bands; strip by strip, so that the work stays in the cache."""
+        """Winners, maps into the atlas, and blended bands."""
+        from arbiview_aug.render.kernels import put_source, upsample_where
+
         h, w = self.camera.size
         fixed = FixedMap.outside((h, w))
         winner = np.full((h, w), -1, np.int8)
-        in_image: npt.NDArray[np.uint8] | None = None
-        certain = np.zeros((h, w), np.uint8) if self.config.certainty else None
+        in_image = np.zeros((h, w), np.uint8)
+        best = scratch.get("best", (h, w), np.float32)
+        best.fill(-1)  # a source that sees a pixel beats none, even with a weight of 0
         weights = self._seam_weights()
-        shared = np.count_nonzero([weight > 0 for weight in weights], axis=0) > 1
-        bands: list[BlendRegion] = []
-        won_px: Counter[int] = Counter()
-        for rows in self.grid.strips(_STRIP_PX):
-            y0, y1, _, _ = self.grid.pixels((*rows, 0, 0))
-            best = scratch.get("best", (y1 - y0, w), np.float32)
-            best.fill(-1)  # a source that sees a pixel beats none, even with a weight of 0
-            seen = []
-            for region, weight in zip(self.regions, weights, strict=True):
-                part = self._visible(region, weight, rows, layout)
-                if part is None:
-                    continue
-                seen.append(part)
-                top, bottom, left, right = part.box
-                held = best[top - y0 : bottom - y0, left:right]
-                wins: Any = cv2.bitwise_and(part.visible, cv2.compare(part.weight, held, cv2.CMP_GT))
-                cv2.copyTo(part.weight, wins, held)
-                fixed.part(slice(top, bottom), slice(left, right)).put(part.at, wins)
-                own = np.full(wins.shape, region.source, np.int8)
-                cv2.copyTo(own, wins, winner[top:bottom, left:right])
-                if part.in_image is not None:
-                    in_image = np.zeros((h, w), np.uint8) if in_image is None else in_image
-                    in_image[top:bottom, left:right] |= part.in_image
-                if certain is not None and part.certainty is not None:
-                    cv2.copyTo(part.certainty, wins, certain[top:bottom, left:right])
-            for part in seen:
-                won = cv2.inRange(winner[y0:y1], part.source, part.source)  # type: ignore[call-overload]
-                won_px[part.source] += cv2.countNonZero(won)
-            if len(seen) > 1 and self.config.seam_width > 0:
-                bands.extend(self._bands(seen, winner, shared, rows))
+        for region, weight in zip(self.regions, weights, strict=True):
+            slot = layout.slot(region.source, region.level)
+            self.counters["cells"] += int((region.columns[:, 1] - region.columns[:, 0]).sum())
+            put_source(
+                *self._target(region), region.kernel, (region.source, slot.x, slot.y), weight, self.step,
+                region.columns, best, winner, fixed.packed, fixed.frac, in_image,
+            )  # fmt: skip
+        count = np.bincount(winner.reshape(-1).view(np.uint8), minlength=256)
+        won_px = Counter({region.source: int(count[region.source]) for region in self.regions})
+        bands = tuple(self._bands(weights, winner, layout, scratch))
+        certain = None
+        if self.config.certainty:
+            certain = np.zeros((h, w), np.uint8)
+            for region in self.regions:
+                upsample_where(region.certainty, self.step, winner, region.source, certain)
         interpolation = self._interpolation(won_px)
         if interpolation == "nearest":
             fixed = fixed.rounded()
         edge = self._edge(fixed, winner, layout) if interpolation == "cubic" else None
         reports = tuple(self._reports(winner, won_px))
-        return ViewPlan(fixed, winner, tuple(bands), reports, interpolation, certain, edge, _occluded(winner, in_image))
+        occluded = (winner < 0) & (in_image > 0)
+        return ViewPlan(
+            fixed, winner, bands, reports, interpolation, certain, edge, occluded if occluded.any() else None
+        )
+
+    def _target(self, region: _Region) -> tuple[Any, ...]:
+        return self.rays.planes, self.rays.parameters, region.geometry.q, region.geometry.face
 
     def _interpolation(self, won_px: Counter[int]) -> str:
         """Cubic where it is asked for and the view magnifies, by ``MAGNIFIED``, what lies at its own centre."""
@@ -247,32 +400,15 @@ class ViewPlanner:
             own: Any = cv2.inRange(winner, region.source, region.source)  # type: ignore[call-overload]
             low, high = (slot.x + 1, slot.y + 1), (slot.x + w - 3, slot.y + h - 3)
             inside: Any = cv2.inRange(fixed.xy, low, high)  # type: ignore[call-overload]
-            if source.mask is not None and not source.mask.all():
-                clean = cv2.erode(clean_pixels(source, region.level), np.ones((4, 4), np.uint8), anchor=(1, 1))
+            clean = self.maps.clean_pixels(source, region.level)
+            if clean.size:
+                clean = np.asarray(cv2.erode(clean, np.ones((4, 4), np.uint8), anchor=(1, 1)), np.uint8)
                 at = fixed.xy - np.array([slot.x, slot.y], np.int16)
                 inside &= cv2.remap(clean, at, None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
             cv2.bitwise_or(edge, cv2.bitwise_and(own, cv2.bitwise_not(inside)), dst=edge)
         y, x = np.nonzero(edge)
         there = FixedMap(fixed.xy[y, x][None], fixed.frac[y, x][None])
         return BilinearFallback(y.astype(np.int64) * winner.shape[1] + x, there)
-
-    def _visible(
-        self, region: _Region, weight: npt.NDArray[np.float32], rows: tuple[int, int], layout: AtlasLayout
-    ) -> _Visible | None:
-        """One strip of a region at full resolution, or nothing."""
-        assert region.pair.nodes is not None
-        j0, j1, i0, i1 = region.pair.nodes
-        nodes = (max(j0, rows[0]), min(j1, rows[1]), i0, i1)
-        box = self.grid.pixels(nodes)
-        if box[1] <= box[0] or box[3] <= box[2]:
-            return None
-        slot = layout.slot(region.source, region.level)
-        at, visible, in_image = region.pair.full_resolution(slot.alone(), nodes[:2])
-        certain = None
-        if region.certainty is not None:
-            certain = np.round(self.grid.upsample(region.certainty, nodes)).astype(np.uint8)
-        fixed = FixedMap.in_slot(at, slot)
-        return _Visible(region.source, box, fixed, visible, in_image, self.grid.upsample(weight, nodes), certain)
 
     def _seam_weights(self) -> list[npt.NDArray[np.float32]]:
         """Weights on the nodes: each source's winning area, softened over the seam width, fading at its own border."""
@@ -281,65 +417,64 @@ class ViewPlanner:
         if width_px == 0 or len(scores) < 2:
             return scores
         best = np.maximum.reduce(scores)
-        radius = max(1, round(width_px / self.grid.step / 2))
+        radius = self._seam_radius
         weights: list[npt.NDArray[np.float32]] = []
         taken = np.zeros(best.shape, bool)
         for region, score in zip(self.regions, scores, strict=True):
             label = (score == best) & (score > 0) & ~taken
             taken |= label
             # Two passes of a box make a smooth ramp.
-            soft = label.astype(np.float32)
+            soft: Any = label.astype(np.float32)
             for _ in range(2):
                 soft = cv2.blur(soft, (2 * radius + 1, 2 * radius + 1), borderType=cv2.BORDER_REPLICATE)
-            weights.append(soft * np.clip(region.border_px / width_px, 0, 1))
+            weights.append(soft * np.clip(region.border_px / np.float32(width_px), 0, 1))
         return weights
 
     def _bands(
-        self, seen: list[_Visible], winner: npt.NDArray[np.int8], shared: BoolArray, rows: tuple[int, int]
+        self,
+        weights: list[npt.NDArray[np.float32]],
+        winner: npt.NDArray[np.int8],
+        layout: AtlasLayout,
+        scratch: Scratch,
     ) -> Iterator[BlendRegion]:
-        """The blended rectangles of one strip: runs of node columns where two sources have weight."""
-        # Pixels lie between nodes: one node more on each side.
-        columns = np.logical_or.reduce(shared[max(rows[0] - 1, 0) : rows[1] + 2])
-        columns[1:] |= columns[:-1].copy()
-        columns[:-1] |= columns[1:].copy()
-        for i0, i1 in runs(columns):
-            yield from self._bands_in(self.grid.pixels((*rows, i0, i1)), seen, winner)
+        """Rectangles around the pixels that a second source adds to."""
+        from arbiview_aug.render.kernels import band_rows, cut_band, put_second, start_bands
 
-    def _bands_in(self, box: Box, seen: list[_Visible], winner: npt.NDArray[np.int8]) -> Iterator[BlendRegion]:
-        """The second sources within one rectangle of pixels."""
-        y0, y1, x0, x1 = box
-        local = [(s, common) for s in seen if (common := _overlap(box, s.box)) is not None]
-        if y1 <= y0 or x1 <= x0 or len(local) < 2:
+        if self.config.seam_width == 0 or len(weights) < 2:
             return
-        weight = np.zeros((len(local), y1 - y0, x1 - x0), np.float32)
-        for k, (s, common) in enumerate(local):
-            mine, here = _within(s.box, common), _within(box, common)
-            weight[k][here] = np.where(s.visible[mine] > 0, s.weight[mine], 0)
-        index = np.array([s.source for s, _ in local])
-        is_winner = winner[None, y0:y1, x0:x1] == index[:, None, None]
-        first = np.where(is_winner, weight, 0).max(axis=0)
-        others = np.where(is_winner, 0, weight)
-        second, second_weight = others.argmax(axis=0), others.max(axis=0)
-        share = second_weight / np.maximum(first + second_weight, 1e-30)
-        for k, (s, common) in enumerate(local):
-            adds = (second == k) & (share >= _LEAST_SHARE)
-            if not adds.any():
-                continue
-            ys, xs = np.flatnonzero(adds.any(axis=1)), np.flatnonzero(adds.any(axis=0))
-            tight = (slice(ys[0], ys[-1] + 1), slice(xs[0], xs[-1] + 1))
-            # Where this source adds nothing its positions may lie in a neighbour in the atlas: read nothing there.
-            positions = FixedMap.outside(adds.shape)
-            here = _within(box, common)
-            positions.part(*here).put(s.at.part(*_within(s.box, common)), adds[here].view(np.uint8))
-            part = np.where(adds, share, 0).astype(np.float32)[tight]
-            yield BlendRegion(y0 + int(ys[0]), x0 + int(xs[0]), s.source, positions.part(*tight).copy(), part)
+        shared = np.zeros(tuple(len(n) - 1 for n in self.nodes), np.uint8)
+        for weight in weights:
+            some = weight > 0
+            shared += some[1:, 1:] | some[1:, :-1] | some[:-1, 1:] | some[:-1, :-1]
+        if not (shared > 1).any():
+            return
+        (h, w), several = winner.shape, shared > 1
+        both = scratch.get("weights", (2, h, w), np.float32)
+        second = scratch.get("second", (h, w), np.int8)
+        xy, frac = scratch.get("second_xy", (h, w), np.int32), scratch.get("second_frac", (h, w), np.uint16)
+        start_bands(several, self.step, both, second)
+        for region, weight in zip(self.regions, weights, strict=True):
+            slot = layout.slot(region.source, region.level)
+            put_second(
+                *self._target(region), region.kernel, (region.source, slot.x, slot.y), weight, self.step,
+                region.columns, winner, both, second, xy, frac, several,
+            )  # fmt: skip
+        rows = np.empty((len(self.source), -(-h // _STRIP_PX), shared.shape[1], 2), np.int64)
+        band_rows(several, self.step, _STRIP_PX, both, second, _LEAST_SHARE, rows)
+        for source, strip in zip(*np.nonzero((rows[..., 1] > 0).any(-1)), strict=True):
+            first, last = rows[source, strip].T
+            columns = np.flatnonzero(last)
+            for run in np.split(columns, np.flatnonzero(np.diff(columns) > 1) + 1):
+                y0, y1 = int(first[run].min()), int(last[run].max())
+                x0, x1 = int(run[0]) * self.step, min((int(run[-1]) + 1) * self.step, w)
+                at = FixedMap(np.empty((y1 - y0, x1 - x0, 2), np.int16), np.empty((y1 - y0, x1 - x0), np.uint16))
+                weight = np.empty((y1 - y0, x1 - x0), np.float32)
+                cut_band(y0, x0, int(source), several, self.step, both[1], second, xy, frac, at.packed, at.frac, weight)
+                yield BlendRegion(y0, x0, int(source), at, weight)
 
     def _reports(self, winner: npt.NDArray[np.int8], won_px: Counter[int]) -> Iterator[SourceUse]:
         """What each source that wins any pixel does, largest share first."""
-        # Node values are read at the pixel nearest to each node: precise enough for a report.
-        pixel = np.round(self.rays.nodes[:, :1, 1]), np.round(self.rays.nodes[:1, :, 0])
-        y, x = (p.astype(np.int64).clip(0, n - 1) for p, n in zip(pixel, self.camera.size, strict=True))
-        on_nodes = winner[y, x]
+        on_nodes = winner[np.ix_(*self.nodes)]
         for region in sorted(self.regions, key=lambda r: -won_px[r.source]):
             if won_px[region.source] == 0:
                 continue
@@ -355,20 +490,33 @@ class ViewPlanner:
             )
 
 
-def _occluded(winner: npt.NDArray[np.int8], in_image: npt.NDArray[np.uint8] | None) -> BoolArray | None:
-    """Pixels (h, w) without a winner that lie in some source's image; None where there are none."""
-    if in_image is None:
-        return None
-    occluded = (winner < 0) & (in_image > 0)
-    return occluded if occluded.any() else None
+def halved_camera(camera: Camera, level: int) -> Camera:
+    """The camera of an image that was halved ``level`` times."""
+    h, w = level_size(camera.size, level)
+    return camera.crop(0, 0, (h << level, w << level)).resize((h, w)) if level else camera
 
 
-def _within(box: Box, part: Box) -> tuple[slice, slice]:
-    """Rows and columns of a part of a pixel box, counted in the box."""
-    return slice(part[0] - box[0], part[1] - box[0]), slice(part[2] - box[2], part[3] - box[2])
+def _derivative(uv: FloatArray, axis: int, nodes: npt.NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+    """Forward differences of u and v (ny, nx) along an axis per pixel, the last one repeated."""
+    spacing = np.maximum(np.diff(nodes), 1)
+    difference = np.diff(uv, axis=axis) / (spacing[:, None, None] if axis == 0 else spacing[None, :, None])
+    # The last nodes may coincide: their difference says nothing.
+    last = len(spacing) - 1 - (len(spacing) > 1 and nodes[-1] == nodes[-2])
+    difference = np.take(difference, np.minimum(np.arange(len(nodes)), last), axis=axis)
+    return difference[..., 0], difference[..., 1]
 
 
-def _overlap(one: Box, two: Box) -> Box | None:
-    """The common part of two pixel boxes, or nothing."""
-    y0, y1, x0, x1 = max(one[0], two[0]), min(one[1], two[1]), max(one[2], two[2]), min(one[3], two[3])
-    return (y0, y1, x0, x1) if y1 > y0 and x1 > x0 else None
+def _filled(values: FloatArray, valid: BoolArray) -> npt.NDArray[np.float32]:
+    """Values on the nodes; those that are not valid take the mean of those around them."""
+    if valid.all():
+        return values.astype(np.float32)
+    known = np.where(valid, values, 0).astype(np.float32)
+    total, count = (cv2.blur(p, (5, 5), borderType=cv2.BORDER_REPLICATE) for p in (known, valid.astype(np.float32)))
+    return np.where(valid, known, total / np.maximum(count, np.float32(1e-6)))
+
+
+def _spans(use: BoolArray) -> npt.NDArray[np.int64]:
+    """First and last (exclusive) True column (ny, 2) of each row."""
+    some: BoolArray = use.any(axis=1)
+    first, last = use.argmax(axis=1), use.shape[1] - use[:, ::-1].argmax(axis=1)
+    return np.stack([first * some, last * some], -1)

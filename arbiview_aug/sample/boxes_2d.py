@@ -15,8 +15,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.sample.batching import leading_shape
 from arbiview_aug.sample.inputs import read_frames
-from arbiview_aug.scene.boxes import BoxSurface, checked_boxes, is_over, meets, silhouettes
-from arbiview_aug.scene.static import Far
+from arbiview_aug.scene.boxes import checked_boxes, draw_boxes, is_over, meets, silhouette_sums
 
 _NEAR_M = 0.1  # near plane
 _CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))  # [8, 3]
@@ -140,10 +139,8 @@ def _of_camera(camera: Camera, boxes: FloatArray) -> ImageBoxes:
     uncut, inside = np.array(list(outlines.values())).reshape(-1, 2, 4).swapaxes(0, 1)
     uncut_px, inside_px = (np.prod(rectangles[:, 2:] - rectangles[:, :2], axis=1) for rectangles in (uncut, inside))
     boxes = boxes[rows]
-    silhouette_px = np.array([len(np.unique(pixels)) for pixels in silhouettes(camera, boxes)], np.float64)
-    fragments = BoxSurface(Far(), boxes).drawn(camera)
-    nearest = fragments.face // 6
-    if camera.mask is not None:
-        nearest = nearest[camera.mask.reshape(-1)[fragments.pixel]]
-    visible_px = np.bincount(nearest, minlength=len(boxes))
+    silhouette_px = silhouette_sums(camera, boxes, np.ones(camera.size))
+    _, face = draw_boxes(camera, boxes)
+    shown = face >= 0 if camera.mask is None else (face >= 0) & camera.mask
+    visible_px = np.bincount(face[shown] // 6, minlength=len(boxes))
     return ImageBoxes(rows, inside, 1 - inside_px / uncut_px, visible_px / np.maximum(silhouette_px, 1))

@@ -8,22 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.coarse_grid import Grid
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.cameras.rays import CELL_PX, PixelRays, pixel_rays
 from arbiview_aug.errors import SampleError
-from arbiview_aug.scene.box_raster import draw_boxes
-from arbiview_aug.scene.box_raster import silhouettes as pinhole_silhouettes
-from arbiview_aug.scene.static import Far
 from arbiview_aug.scene.surface import (
     MAX_INVERSE_DISTANCE,
-    Fragments,
     LayeredSurface,
     OcclusionMap,
     Points,
@@ -31,7 +26,6 @@ from arbiview_aug.scene.surface import (
 )
 
 _CHUNK = 1 << 15  # points tested at once, to stay in the CPU's cache
-_LENS_STEP_PX = 8  # cells of an image with a lens; rays are cast in those near a box
 
 _UNLABELLED = 0.45
 """Share of the street's uncertainty due to unlabelled objects. Fitted on synthetic streets, seeds 100 to 105."""
@@ -51,7 +45,6 @@ class BoxSurface(LayeredSurface):
         boxes: (B, 7) centre x, y, z, length, width, height (metres), yaw (radians), in the ego frame.
     """
 
-    smooth: ClassVar[bool] = True  # away from the boxes
     street: Surface
     boxes: FloatArray
     _shadows: dict[Camera, OcclusionMap] = field(default_factory=dict, repr=False)
@@ -62,27 +55,28 @@ class BoxSurface(LayeredSurface):
         return self.street
 
     # --- images -------------------------------------------------------------------------------------------------------
-    def drawn(self, camera: Camera) -> Fragments:
-        """The pixels of a camera that show boxes."""
-        return self._drawn(camera, self.boxes)
-
-    def occlusion_map(self, camera: Camera) -> OcclusionMap:
+    def occlusion_map(self, camera: Camera, rays: PixelRays) -> OcclusionMap:
         """What boxes hide from a source, by ``occludes``; kept for the next target."""
         if camera not in self._shadows:
             pixel_rad = float(1 / camera.K[0, 0])
-            index, first, face = self._drawn(camera, self._enlarged(camera.center_m, pixel_rad))
-            beyond, solid = np.zeros(camera.size, np.float32), np.full(camera.size, -1, np.int32)
-            beyond.reshape(-1)[index] = first / (1 + 2 * pixel_rad)  # a lookup at the nearest pixel
-            solid.reshape(-1)[index] = face // 6
-            self._shadows[camera] = OcclusionMap(beyond, solid)
+            q, face = draw_boxes(camera, self._enlarged(camera.center_m, pixel_rad), rays)
+            q /= np.float32(1 + 2 * pixel_rad)  # a lookup at the nearest pixel
+            self._shadows[camera] = OcclusionMap(q, face // 6)
         return self._shadows[camera]
 
-    def facing(self, origin: FloatArray, face: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int32], FloatArray]:
-        """The boxes of faces (n,), and the distances of ``origin`` in front of the faces' planes, metres."""
+    def drawn(self, camera: Camera, rays: PixelRays) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
+        """Inverse distances (h, w) of the boxes' faces along a camera's rays, 0 where there is none; the faces, or -1.
+
+        A face's number is 6 x the box's row + 2 x the axis across it + 1 for the one further along that axis.
+        """
+        return draw_boxes(camera, self.boxes, rays)
+
+    def before_faces(self, origin: FloatArray) -> FloatArray:
+        """By how many metres a point lies before the planes of all faces (6 B,)."""
         before_m = np.empty((len(self.boxes), 6))
         local, half = _in_box_frames(self.boxes, origin), self.boxes[:, 3:6] / 2
         before_m[:, 0::2], before_m[:, 1::2] = -local - half, local - half
-        return face // 6, before_m.reshape(-1)[face]
+        return before_m.reshape(-1)
 
     def _enlarged(self, origin: FloatArray, pixel_rad: float) -> FloatArray:
         """The boxes widened by half a pixel, as border pixels mix colours, and lifted, so that the road stays free."""
@@ -91,26 +85,6 @@ class BoxSurface(LayeredSurface):
         boxes[:, 2] += more_m
         boxes[:, 3:5] += 2 * more_m[:, None]
         return boxes
-
-    def _drawn(self, camera: Camera, boxes: FloatArray) -> Fragments:
-        """Rasterise boxes; with a lens, cast the rays near them."""
-        if camera.is_rectilinear:
-            return draw_boxes(camera, boxes)
-        scene = BoxSurface(self.street, boxes)
-        grid = Grid(camera.size, _LENS_STEP_PX)
-        rays, valid = camera.unproject(grid.nodes())
-        spacing = np.where(valid[:, 1:] & valid[:, :-1], np.linalg.norm(np.diff(rays, axis=1), axis=-1), 0)
-        near = np.zeros(valid.shape, bool)
-        for _, towards, angle in scene._outside(camera.center_m):
-            near |= rays @ towards >= np.cos(min(angle + 2 * float(spacing.max(initial=0.0)), np.pi))
-        cells = cv2.dilate((valid & near).astype(np.uint8), np.ones((3, 3), np.uint8))[:-1, :-1] > 0
-        ny, nx = grid.shape
-        index = np.flatnonzero(grid.cells_to_pixels(cells, (0, ny - 1, 0, nx - 1)))
-        v, u = np.divmod(index, camera.width_px)
-        directions, known = camera.unproject(np.stack([u, v], -1))
-        nearest, face = scene._boxes_ahead(camera.center_m, directions)
-        shown = known & (nearest > 0)
-        return Fragments(index[shown], nearest[shown], face[shown])
 
     # --- rays ---------------------------------------------------------------------------------------------------------
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
@@ -153,11 +127,51 @@ class BoxSurface(LayeredSurface):
         return q.reshape(directions.shape[:-1]), number.reshape(directions.shape[:-1])
 
 
-def silhouettes(camera: Camera, boxes: FloatArray) -> list[npt.NDArray[np.int64]]:
-    """For each box (B, 7) the pixels of the flattened image whose rays meet it, regardless of occlusion."""
-    if camera.is_rectilinear:
-        return pinhole_silhouettes(camera, boxes)
-    return [BoxSurface(Far(), box[None]).drawn(camera).pixel for box in boxes]
+def box_rows(camera: Camera, boxes: FloatArray) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
+    """Boxes (B, 7) as ``kernels.draw_boxes`` reads them, (B, 20), and the rows of those that a camera may see.
+
+    A box that holds the camera is its own vehicle, and is not seen.
+    """
+    c, s, o, one = np.cos(boxes[:, 6]), np.sin(boxes[:, 6]), np.zeros(len(boxes)), np.ones(len(boxes))
+    to_box = np.stack([c, s, o, -s, c, o, o, o, one], axis=-1).reshape(-1, 3, 3)
+    away, half = boxes[:, :3] - camera.center_m, boxes[:, 3:6] / 2
+    start = np.einsum("bij,bj->bi", to_box, -away)
+    distance, radius = np.linalg.norm(away, axis=1), np.linalg.norm(half, axis=1)
+    towards = away @ camera.cam2ego[:3, :3] / np.maximum(distance, 1e-9)[:, None]
+    off_axis = np.arccos(np.clip(towards[:, 2], -1, 1))
+    angle = np.arcsin(np.clip(radius / np.maximum(distance, 1e-9), 0, 1))
+    ahead = (distance <= radius) | (off_axis <= camera.half_angle_rad + angle + 0.01)
+    turn = (to_box @ camera.cam2ego[:3, :3]).reshape(-1, 9)
+    cone = np.where(distance <= radius, -9.0, np.cos(angle))
+    rows = np.concatenate([turn, start, half, (distance + radius)[:, None], towards, cone[:, None]], axis=1)
+    return rows.astype(np.float32), np.flatnonzero(ahead & (np.abs(start) > half).any(axis=1))
+
+
+def draw_boxes(
+    camera: Camera, boxes: FloatArray, rays: PixelRays | None = None
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
+    """Rasterise boxes (B, 7): inverse distances (h, w) of the nearest faces, 0 where there is none; faces, or -1.
+
+    A face's number is 6 x the box's row + 2 x the axis across it + 1 for the one further along that axis. ``rays`` are
+    the camera's, if they are known.
+    """
+    from arbiview_aug.scene.kernels import draw_boxes as draw
+
+    rays = rays or pixel_rays(camera)
+    q, face = np.zeros(camera.size, np.float32), np.full(camera.size, -1, np.int32)
+    rows, seen = box_rows(camera, boxes)
+    draw(rays.planes, rays.parameters, rows[seen], seen, rays.cones, CELL_PX, q, face)
+    return q, face
+
+
+def silhouette_sums(camera: Camera, boxes: FloatArray, weight: FloatArray) -> FloatArray:
+    """Sums (B,) of weights (h, w) over the pixels whose rays meet each box, whatever stands before it."""
+    from arbiview_aug.scene.kernels import sum_silhouettes
+
+    rays, sums = pixel_rays(camera), np.zeros(len(boxes))
+    rows, seen = box_rows(camera, boxes)
+    sum_silhouettes(rays.planes, rays.parameters, rows[seen], seen, rays.cones, CELL_PX, weight, sums)
+    return sums
 
 
 def meets(box: FloatArray, origin: FloatArray, directions: FloatArray) -> BoolArray:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -20,7 +19,6 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE, StaticSurface
 
 _STEPS = 2  # fixed-point iterations; a third one changes two real frames by at most 0.02 dB
-_TOLERANCE_SCALE = 8.0  # maps may err by 1/8 px, as distances are measured to a pixel of a view 400 px wide
 _ROW = 4096  # remap's sizes must stay below 32767
 
 
@@ -58,8 +56,6 @@ class Correction:
 class CorrectedSurface(StaticSurface):
     """A static surface ``base`` with the corrections found over it; where several apply, their weighted mean."""
 
-    smooth: ClassVar[bool] = True
-    tolerance_scale: ClassVar[float] = _TOLERANCE_SCALE
     base: StaticSurface
     corrections: tuple[Correction, ...]
 

@@ -7,22 +7,21 @@ No sensor's place is assumed: points are z-buffered and made dense anew for each
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
-from arbiview_aug.cameras.camera import Camera, Rays
+from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.cameras.rays import CELL_PX, PixelRays
 from arbiview_aug.errors import SampleError
-from arbiview_aug.scene.boxes import BoxSurface, meets, silhouettes
-from arbiview_aug.scene.panorama import CELL_RAD, Layer, Panorama, PanoramaWindow, angles, panorama
-from arbiview_aug.scene.scanned_objects import ScannedObject, scanned_objects
+from arbiview_aug.scene.boxes import BoxSurface, box_rows, meets
+from arbiview_aug.scene.panorama import CELL_RAD, SIDE_RAD, Layer, Panorama, PanoramaWindow, angles, panorama
+from arbiview_aug.scene.scanned_objects import BOX_AIR_M, RASTER_RAD, ScannedObject, scanned_objects
 from arbiview_aug.scene.surface import (
     MAX_INVERSE_DISTANCE,
     DenseSurface,
-    Fragments,
     OcclusionMap,
     Points,
     StaticSurface,
@@ -50,14 +49,12 @@ class PointCloudSurface(DenseSurface):
         objects: Whose points are among them: nothing behind these is seen through gaps between their points.
     """
 
-    smooth: ClassVar[bool] = False
     street: StaticSurface
     points: Points
     objects: tuple[ScannedObject, ...] = ()
     _panoramas: dict[bytes, list[Panorama]] = field(default_factory=dict, repr=False)
     _shadows: dict[Camera, OcclusionMap] = field(default_factory=dict, repr=False)
-    _rays: dict[Camera, _Located] = field(default_factory=dict, repr=False)
-    _seen: dict[Camera, list[_Seen]] = field(default_factory=dict, repr=False)
+    _nodes: dict[Camera, tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", self.points[~own_car(self.points)])
@@ -70,32 +67,32 @@ class PointCloudSurface(DenseSurface):
             one.fill(known)
         return np.asarray(np.clip(known, 0.0, MAX_INVERSE_DISTANCE), np.float64)
 
-    def image(self, camera: Camera) -> Layer:
-        """The points' dense surface at all pixels, 1/m (h, w).
+    def image(self, camera: Camera, rays: PixelRays) -> Layer:
+        """The points' dense surface at all pixels, 1/m (h, w)."""
+        from arbiview_aug.scene.kernels import SHOW, add_residuals
 
-        The street is interpolated between rays a panorama's cell apart: to 0.02 px for a metre of parallax.
-        """
-        rays = self._located(camera)
-        street = self.street.inverse_distance(camera.center_m, rays.directions).astype(np.float32)
-        known = rays.to_pixels(street) + rays.view.residual(rays.to_pixels(rays.row), rays.to_pixels(rays.column))
-        for one in self._objects_in(camera):
-            one.fill(known)
-        return np.clip(known, 0, np.float32(MAX_INVERSE_DISTANCE), out=known)
+        q = self.street.image(camera, rays)
+        view, row, column, step = self._located(camera, rays)
+        add_residuals(row, column, step, view.near, view.far, view.share, q)
+        self._draw_objects(camera, rays, SHOW, q)
+        return q
 
-    def occlusion_map(self, camera: Camera) -> OcclusionMap:
+    def occlusion_map(self, camera: Camera, rays: PixelRays) -> OcclusionMap:
         """What is hidden from a source, by ``occludes``; kept for the next target."""
         if camera not in self._shadows:
             none = np.broadcast_to(np.int32(-1), camera.size)
-            self._shadows[camera] = OcclusionMap(self.before_image(camera), none)
+            self._shadows[camera] = OcclusionMap(self.before_image(camera, rays), none)
         return self._shadows[camera]
 
-    def before_image(self, camera: Camera, *, widened: bool = True) -> Layer:
+    def before_image(self, camera: Camera, rays: PixelRays, *, widened: bool = True) -> Layer:
         """``occlusion_depth`` at all pixels of a camera (h, w), interpolated between rays a panorama's cell apart."""
-        rays = self._located(camera)
-        before = rays.to_pixels(rays.view.occlusion_depth(rays.row, rays.column)).copy()
-        for one in self._objects_in(camera):
-            one.hide(before, widened)
-        return np.asarray(before)
+        from arbiview_aug.scene.kernels import HIDE, HIDE_WIDE, upsample
+
+        view, row, column, step = self._located(camera, rays)
+        before = np.empty(camera.size, np.float32)
+        upsample(view.occlusion_depth(row, column), step, before)
+        self._draw_objects(camera, rays, HIDE_WIDE if widened else HIDE, before)
+        return before
 
     def occludes(
         self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
@@ -134,34 +131,56 @@ class PointCloudSurface(DenseSurface):
         met = [np.flatnonzero(meets(one.box, origin, rays)) for one in self.objects]
         return [_Seen(ray, *one.seen(origin, rays[ray])) for one, ray in zip(self.objects, met, strict=True)]
 
-    def _objects_in(self, camera: Camera) -> list[_Seen]:
-        """What a camera's pixels see of the objects; kept for the next question."""
-        if camera not in self._seen:
-            boxes = np.array([one.box for one in self.objects]).reshape(-1, 7)
-            found = []
-            for one, pixel in zip(self.objects, silhouettes(camera, boxes), strict=True):
-                v, u = np.divmod(pixel, camera.width_px)
-                directions, _ = camera.unproject(np.stack([u, v], -1))
-                found.append(_Seen(pixel, *one.seen(camera.center_m, directions)))
-            self._seen[camera] = found
-        return self._seen[camera]
+    def _draw_objects(self, camera: Camera, rays: PixelRays, mode: int, image: Layer) -> None:
+        """Draw the objects that a camera may see by their points (``kernels.draw_scanned``)."""
+        from arbiview_aug.scene.kernels import draw_scanned
 
-    def _located(self, camera: Camera) -> _Located:
-        """Rays to interpolate a camera's pixels between; kept for the next question unless they are all pixels'."""
-        if camera in self._rays:
-            return self._rays[camera]
+        if not self.objects:
+            return
+        boxes = np.array([one.box for one in self.objects])
+        rows, seen = box_rows(camera, boxes)
+        wide, _ = box_rows(camera, boxes + 2 * BOX_AIR_M * np.array([0, 0, 0, 1, 1, 1, 0]))
+        R = camera.cam2ego[:3, :3].astype(np.float32)
+        for number in seen:
+            raster = self.objects[number].raster(camera.center_m)
+            if raster is None:
+                continue
+            place = np.array([raster.azimuth_rad, raster.elevation_rad, RASTER_RAD, SIDE_RAD], np.float32)
+            pair = np.stack([rows[number], wide[number]])
+            draw_scanned(
+                rays.planes, rays.parameters, R, pair, rays.cones, CELL_PX, place, raster.nearest, raster.top_rad,
+                mode, image,
+            )  # fmt: skip
+
+    def _located(self, camera: Camera, rays: PixelRays) -> tuple[Panorama, Layer, Layer, int]:
+        """The panorama around a camera; rows and columns in it (ny + 1, nx + 1) of nodes, and how far these are apart.
+
+        Nodes lie on pixels; those behind the last one are extrapolated. Kept for the next question.
+        """
+        if camera in self._nodes:
+            return self._nodes[camera]
         step = max(1, round(CELL_RAD * float(camera.K[0, 0])))
+        found = self._nodes_apart(camera, rays, step) or self._nodes_apart(camera, rays, 1)
+        assert found is not None
+        self._nodes[camera] = found
+        return found
+
+    def _nodes_apart(self, camera: Camera, rays: PixelRays, step: int) -> tuple[Panorama, Layer, Layer, int] | None:
+        """As ``_located``; None where panorama positions cannot be interpolated between nodes."""
+        y, x = (np.arange(0, n + step, step) for n in camera.size)
+        local = rays.at(*(np.minimum(p, n - 1) for p, n in zip((y, x), camera.size, strict=True)))
+        lost = (local == 0).all(axis=0)
+        local[:, lost] = np.array([[0], [0], [1]])
+        directions = np.moveaxis(np.tensordot(camera.cam2ego[:3, :3], local.astype(np.float64), 1), 0, -1)
+        # A lens may have no rays somewhere; azimuths bend near the zenith.
+        if step > 1 and (lost.any() or float(np.abs(directions[..., 2]).max()) > _STEEP):
+            return None
+        view, row, column = self._view(camera.center_m, directions)
+        if step > 1 and view.window.is_whole:  # columns jump somewhere in a panorama that goes all around
+            return None
         if step > 1:
-            directions, valid = _spaced_rays(camera, step)
-            # A lens may have no rays next to its image; azimuths bend near the zenith.
-            if valid.all() and float(np.abs(directions[..., 2]).max()) <= _STEEP:
-                rays = _Located(camera.size, step, directions, *self._view(camera.center_m, directions))
-                if not rays.view.window.is_whole:  # columns jump somewhere in a panorama that goes all around
-                    self._rays[camera] = rays
-                    return rays
-        directions, valid = _spaced_rays(camera, 1)
-        directions = np.where(valid[..., None], directions, camera.cam2ego[:3, 2])
-        return _Located(camera.size, 1, directions, *self._view(camera.center_m, directions))
+            row, column = (_extrapolated(a, y, x, camera.size) for a in (row, column))
+        return view, row, column, step
 
     def _view(self, origin: FloatArray, directions: FloatArray) -> tuple[Panorama, Layer, Layer]:
         """The panorama around a centre that holds the rays, and their rows and columns in it."""
@@ -202,38 +221,14 @@ class _Seen(NamedTuple):
         flat[self.ray] = np.maximum(flat[self.ray], beyond)
 
 
-class _Located(NamedTuple):
-    """Rays of a camera about as far apart as a panorama's cells, and where they lie in one.
-
-    Attributes:
-        size: (h, w) of the image.
-        step: Their spacing in pixels; they start one step before the centre of the image's first block.
-        directions: (ny, nx, 3) unit rays in the ego frame; the optical axis where there is none.
-        view: The panorama.
-        row: (ny, nx) in it.
-        column: (ny, nx).
-    """
-
-    size: tuple[int, int]
-    step: int
-    directions: FloatArray
-    view: Panorama
-    row: Layer
-    column: Layer
-
-    def to_pixels(self, values: Layer) -> Any:
-        """Bilinear interpolation (ny, nx) to all pixels (h, w)."""
-        s, (h, w) = self.step, self.size
-        enlarged: Any = values
-        if s > 1:
-            enlarged = cv2.resize(values, None, fx=s, fy=s, interpolation=cv2.INTER_LINEAR)
-        return enlarged[s : s + h, s : s + w]
-
-
-def _spaced_rays(camera: Camera, step: int) -> Rays:
-    """Rays in the ego frame, from one step before the centre of the image's first block to one behind the last's."""
-    v, u = (step * np.arange(-1.0, -(-n // step) + 1) + (step - 1) / 2 for n in camera.size)
-    return camera.unproject(np.stack(np.meshgrid(u, v), -1))
+def _extrapolated(values: Layer, y: Any, x: Any, size: tuple[int, int]) -> Layer:
+    """Values at nodes (ny, nx), of which the last were read at the image's last pixel, where the nodes lie."""
+    values = values.copy()
+    for axis, nodes, n in ((0, y, size[0]), (1, x, size[1])):
+        turned = np.moveaxis(values, axis, 0)
+        if len(nodes) > 1 and n - 1 > nodes[-2]:
+            turned[-1] = turned[-2] + (turned[-1] - turned[-2]) * ((nodes[-1] - nodes[-2]) / (n - 1 - nodes[-2]))
+    return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,11 +251,11 @@ class PointCloudWithBoxes(BoxSurface):
         objects, boxes, in_box = scanned_objects(boxes, points)
         return cls(PointCloudSurface(street, points[~in_box], objects), boxes)
 
-    def drawn(self, camera: Camera) -> Fragments:
-        """The pixels of a camera that show boxes with nothing measured before them."""
-        pixel, first, face = super().drawn(camera)
-        shown = first >= self.street.before_image(camera, widened=False).reshape(-1)[pixel]
-        return Fragments(pixel[shown], first[shown], face[shown])
+    def drawn(self, camera: Camera, rays: PixelRays) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
+        """The boxes with nothing measured before them."""
+        q, face = super().drawn(camera, rays)
+        face[q < self.street.before_image(camera, rays, widened=False)] = -1
+        return q, face
 
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """The first box along a ray with nothing measured before it, else the points' surface, 1/m (...,)."""
@@ -268,12 +263,12 @@ class PointCloudWithBoxes(BoxSurface):
         shown = (first > 0) & (first >= self.street.occlusion_depth(origin, directions, widened=False))
         return np.where(shown, first, self.street.inverse_distance(origin, directions))
 
-    def occlusion_map(self, camera: Camera) -> OcclusionMap:
+    def occlusion_map(self, camera: Camera, rays: PixelRays) -> OcclusionMap:
         """What boxes hide from a source, and what was measured."""
         new = camera not in self._shadows
-        shadows = super().occlusion_map(camera)
+        shadows = super().occlusion_map(camera, rays)
         if new:
-            measured = self.street.before_image(camera)
+            measured = self.street.before_image(camera, rays)
             nearer = measured > shadows.beyond
             np.copyto(shadows.beyond, measured, where=nearer)
             np.copyto(shadows.solid, _NO_BOX, where=nearer)

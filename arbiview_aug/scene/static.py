@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
+from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rays import PixelRays
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE, StaticSurface
 
 WALL_CENTER_M = (1.0, 0.0)
@@ -17,8 +19,6 @@ WALL_CENTER_M = (1.0, 0.0)
 @dataclass(frozen=True)
 class Far(StaticSurface):
     """Everything is infinitely far away: the paper's rotation-only model (Sec. FAVS, Stage 1)."""
-
-    smooth: ClassVar[bool] = True
 
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """Zeros (...,)."""
@@ -52,9 +52,12 @@ class Ground(_RoadAndWall):
         radius_m: Radius of the upright cylinder about ``WALL_CENTER_M``.
     """
 
-    smooth: ClassVar[bool] = False
     ground_z_m: float = 0.0
     radius_m: float = 40.0
+
+    def image(self, camera: Camera, rays: PixelRays) -> npt.NDArray[np.float32]:
+        """As ``inverse_distance``, compiled."""
+        return _compiled_image(self, camera, rays, self.radius_m, self.radius_m)
 
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """The nearer of plane and cylinder, 1/m (...,)."""
@@ -77,11 +80,14 @@ class Street(_RoadAndWall):
         sharpness: k; infinity is the hard minimum with its crease.
     """
 
-    smooth: ClassVar[bool] = True
     ground_z_m: float = 0.0
     half_length_m: float = 40.0
     half_width_m: float = 20.0
     sharpness: float = 4.0
+
+    def image(self, camera: Camera, rays: PixelRays) -> npt.NDArray[np.float32]:
+        """As ``inverse_distance``, compiled."""
+        return _compiled_image(self, camera, rays, self.half_length_m, self.half_width_m)
 
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """The smooth join of plane and wall, 1/m (...,)."""
@@ -91,6 +97,22 @@ class Street(_RoadAndWall):
         ratio = farther / np.maximum(nearer, 1e-300)
         joined = nearer * (1 + ratio**self.sharpness) ** (1 / self.sharpness)
         return np.minimum(joined, MAX_INVERSE_DISTANCE)
+
+
+def _compiled_image(
+    surface: Ground | Street, camera: Camera, rays: PixelRays, half_length_m: float, half_width_m: float
+) -> npt.NDArray[np.float32]:
+    from arbiview_aug.scene.kernels import GROUND, STREET, static_image
+
+    height = camera.center_m[2] - surface.ground_z_m
+    ox, oy = (camera.center_m[:2] - WALL_CENTER_M) / (half_length_m, half_width_m)
+    per_height = 1 / height if height > 0 else 0.0
+    settings = per_height, 1 / half_length_m, 1 / half_width_m, ox, oy, ox * ox + oy * oy - 1
+    q = np.empty(camera.size, np.float32)
+    kind = STREET if isinstance(surface, Street) else GROUND
+    R = camera.cam2ego[:3, :3].astype(np.float32)
+    static_image(rays.planes, rays.parameters, R, kind, np.array(settings, np.float32), q)
+    return q
 
 
 def plane_inverse_distance(origin: FloatArray, directions: FloatArray, ground_z_m: float) -> FloatArray:

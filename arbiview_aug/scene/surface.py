@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.cameras.rays import PixelRays
 
 SurfaceName = Literal["auto", "far", "ground", "street", "objects", "lidar", "motion"]
 """Names in ``scene.SURFACES``. ``auto`` decides per pair of target and source camera."""
@@ -25,21 +26,18 @@ MAX_INVERSE_DISTANCE = 100.0
 """Upper limit, 1 cm: keeps points finite when a camera touches a surface."""
 
 _TYPICAL_OBJECT_M = 20.0
+_ROWS = 64  # of pixels, evaluated at once: they stay in the cache
 
 
 class Surface(ABC):
     """A hashable scene surface, seen from any centre.
 
     Attributes:
-        smooth: Without creases, so that maps may be interpolated from a coarse grid.
-        tolerance_scale: Factor on the interpolation tolerance, above 1 where the surface itself is less accurate.
         is_layered: Objects are rasterised in front of ``background``, see ``LayeredSurface``.
-        is_dense: Evaluated at every pixel, see ``DenseSurface``.
+        is_dense: Points or depth maps, see ``DenseSurface``.
         is_guess: Not measured; occluders also hide its points in front of them.
     """
 
-    smooth: ClassVar[bool]
-    tolerance_scale: ClassVar[float] = 1.0
     is_layered: ClassVar[bool] = False
     is_dense: ClassVar[bool] = False
     is_guess: ClassVar[bool] = False
@@ -71,17 +69,20 @@ class Surface(ABC):
             pixel_rad: Angle of a source pixel.
         """
 
+    def image(self, camera: Camera, rays: PixelRays) -> npt.NDArray[np.float32]:
+        """Inverse distances (h, w) along the rays of a camera's pixel centres, 1/m."""
+        h, w = camera.size
+        q = np.empty((h, w), np.float32)
+        for first in range(0, h, _ROWS):
+            rows = np.arange(first, min(first + _ROWS, h))
+            local = rays.at(rows, np.arange(w)).astype(np.float64)
+            directions = np.moveaxis(np.tensordot(camera.cam2ego[:3, :3], local, 1), 0, -1)
+            q[rows] = self.inverse_distance(camera.center_m, directions)
+        return q
+
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Expected error (...,) of ``inverse_distance`` in 1/m; by default that of a typical object at 20 m."""
         return np.full(inverse_distance.shape, 1 / _TYPICAL_OBJECT_M)
-
-
-class Fragments(NamedTuple):
-    """Rasterised fragments: pixels (n,) of the flattened image, ascending; inverse distances (n,), 1/m; faces (n,)."""
-
-    pixel: npt.NDArray[np.int64]
-    inverse_distance: FloatArray
-    face: npt.NDArray[np.int32]
 
 
 class OcclusionMap(NamedTuple):
@@ -106,16 +107,16 @@ class LayeredSurface(Surface):
     is_layered: ClassVar[bool] = True
 
     @abstractmethod
-    def drawn(self, camera: Camera) -> Fragments:
-        """Rasterise the objects into a camera."""
+    def drawn(self, camera: Camera, rays: PixelRays) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
+        """Rasterise the objects: inverse distances (h, w), 1/m, and faces, -1 elsewhere."""
 
     @abstractmethod
-    def occlusion_map(self, camera: Camera) -> OcclusionMap:
+    def occlusion_map(self, camera: Camera, rays: PixelRays) -> OcclusionMap:
         """The objects as occluders in a source image."""
 
     @abstractmethod
-    def facing(self, origin: FloatArray, face: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int32], FloatArray]:
-        """The objects of faces (n,), and the signed distance of a point (3,) in front of each face's plane, metres."""
+    def before_faces(self, origin: FloatArray) -> FloatArray:
+        """Signed distances (6 B,) of a point (3,) in front of the planes of all faces, metres."""
 
 
 class DenseSurface(Surface):
@@ -124,11 +125,7 @@ class DenseSurface(Surface):
     is_dense: ClassVar[bool] = True
 
     @abstractmethod
-    def image(self, camera: Camera) -> npt.NDArray[np.float32]:
-        """Inverse distances (h, w) along the rays of a camera's pixel centres, 1/m."""
-
-    @abstractmethod
-    def occlusion_map(self, camera: Camera) -> OcclusionMap:
+    def occlusion_map(self, camera: Camera, rays: PixelRays) -> OcclusionMap:
         """The surface as an occluder in a source image."""
 
 

@@ -19,7 +19,8 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.projection import ego_rays
+from arbiview_aug.cameras.projection import ego_rays, project_rays
+from arbiview_aug.cameras.rays import pixel_rays
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import ArbiviewError
 from arbiview_aug.favs.config import FavsConfig
@@ -27,6 +28,7 @@ from arbiview_aug.render.plan import RenderPlan, build_plan
 from arbiview_aug.render.rendered import Maps, RenderedFrame, Renderer, confidence_of
 from arbiview_aug.render.tone_curve import ToneCurve
 from arbiview_aug.render.view_plan import ViewPlan
+from arbiview_aug.render.view_planner import halved_camera
 from arbiview_aug.sample.neighbours import Neighbour, Warn, warn_lost
 from arbiview_aug.scene.boxes import BoxSurface
 from arbiview_aug.scene.scene import Scene
@@ -211,7 +213,11 @@ def _seen(
         length = np.maximum(np.linalg.norm(from_source, axis=1), 1e-9)
         from_source /= length[:, None]
         if len(boxes):
-            hidden = objects.occludes(source.center_m, from_source, 1 / length, float(1 / source.K[0, 0]))
+            # Half the size is enough: silhouettes are widened by half of its pixels.
+            half = halved_camera(source, 1) if min(source.size) > 1 else source
+            uv, ahead = project_rays(half, directions, q, hole.camera.center_m - source.center_m)
+            x, y = np.clip(np.rint(uv), 0, np.array(half.size[::-1]) - 1).astype(np.int64).T
+            hidden = ahead & (objects.occlusion_map(half, pixel_rays(half)).beyond[y, x] > 0)
             usable.reshape(-1)[pixel[hidden]] = False
         if neighbour.moved is not None:
             risk.reshape(-1)[pixel] = change_risks(neighbour.moved, hole.camera.center_m + offset_m)

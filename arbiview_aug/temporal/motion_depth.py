@@ -20,10 +20,10 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.projection import project_rays
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.render.pixel_projection import Layer
 from arbiview_aug.sample.neighbours import Neighbour
-from arbiview_aug.scene.box_raster import draw_boxes
+from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.depth_maps import motion_camera, points_of_depth
+from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.temporal.change import BOX_MARGIN_M
 from arbiview_aug.temporal.plane_sweep import INVALID, SweptSurface, reduced_grey, scores_opencv, scores_torch
 from arbiview_aug.temporal.pose_check import CORRECTED_PX, MAX_CORRECTIONS, MAX_ERROR_PX, PoseSamples, pose_error
@@ -174,7 +174,7 @@ def _without_objects(camera: Camera, boxes: FloatArray | None) -> Camera:
         return camera
     grown = boxes[:, :7] + np.array([0, 0, 0, 2 * BOX_MARGIN_M, 2 * BOX_MARGIN_M, 2 * BOX_MARGIN_M, 0])
     mask = np.ones(camera.size, bool) if camera.mask is None else camera.mask.copy()
-    mask.reshape(-1)[draw_boxes(camera, grown).pixel] = False
+    mask[draw_boxes(camera, grown)[1] >= 0] = False
     return replace(camera, mask=mask)
 
 

@@ -20,10 +20,10 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.projection import ego_rays
-from arbiview_aug.render.atlas import Slot
+from arbiview_aug.cameras.rays import source_pixels
 from arbiview_aug.render.harmonise import reduced
-from arbiview_aug.render.pixel_projection import Layer, pixel_rays, project_pixels
 from arbiview_aug.scene.depth_maps import halvings
+from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.scene.static import plane_inverse_distance
 
 HYPOTHESES = 96
@@ -59,6 +59,12 @@ class SweptSurface:
         """(h, w, 3) unit rays in the ego frame; the optical axis where the lens cannot be inverted."""
         rays, valid = ego_rays(self.camera, self.camera.pixel_grid())
         return np.where(valid[..., None], rays, self.camera.cam2ego[:3, 2])
+
+    @cached_property
+    def rays(self) -> Layer:
+        """(3, h, w) the same in the camera's frame."""
+        local = self.directions @ self.camera.cam2ego[:3, :3]
+        return np.ascontiguousarray(np.moveaxis(local, -1, 0), dtype=np.float32)
 
     @cached_property
     def road(self) -> Layer:
@@ -115,9 +121,12 @@ def scores_opencv(family: SweptSurface, grey: Layer, source: Camera, other: Laye
 
 def _position_lookup(family: SweptSurface, source: Camera) -> Callable[[float], npt.NDArray[np.float32]]:
     """Function from a wall to the source pixels (h, w, 2) of its surface's points."""
-    rays, slot = pixel_rays(family.camera), Slot(0, 0, 0, 0, source.size)
-    length = np.sqrt(rays[0] ** 2 + rays[1] ** 2 + rays[2] ** 2)
-    return lambda wall: project_pixels(rays, family.inverse_distance(wall) * length, family.camera, source, slot)[0]
+
+    def positions(wall: float) -> npt.NDArray[np.float32]:
+        q = family.inverse_distance(np.float32(wall))
+        return np.stack(source_pixels(family.camera, family.rays, q, source)[:2], -1)
+
+    return positions
 
 
 def _unmasked(source: Camera) -> npt.NDArray[np.uint8]:

@@ -17,7 +17,7 @@ import numpy as np
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.projection import project_rays
-from arbiview_aug.render.pixel_projection import Layer
+from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.temporal.plane_sweep import SweptSurface
 
 CORRECTED_PX = 0.15

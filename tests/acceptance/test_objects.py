@@ -29,9 +29,8 @@ from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_sou
 from arbiview_aug.datasets.synthetic.scene import BoxClass, Material, Scene, SceneBuilder
 from arbiview_aug.render.labels import render_labels
 from arbiview_aug.render.plan import build_plan
-from arbiview_aug.scene.boxes import BoxSurface, checked_boxes
+from arbiview_aug.scene.boxes import checked_boxes, draw_boxes
 from arbiview_aug.scene.scene import Scene as Geometry
-from arbiview_aug.scene.static import Street
 from tests.helpers import few_or_all
 
 pytestmark = pytest.mark.timeout(1800)
@@ -134,9 +133,7 @@ def measure(seed: int, found: dict[tuple[str, str, str], Found]) -> None:
                     true, label = truth.instances[m].numpy(), labels[m].numpy()
                     for row in np.intersect1d(np.unique(true), vehicles):
                         displaced(true == row, label == row, seen[m], into)
-                    boxes = BoxSurface(Street(), geometry.boxes[vehicles]).drawn(camera).pixel
-                    in_box = np.zeros(camera.size, bool)
-                    in_box.flat[boxes] = True
+                    in_box = draw_boxes(camera, geometry.boxes[vehicles])[1] >= 0
                     shown = np.isin(label, vehicles)
                     into.count["vehicle"] += int(np.isin(true, vehicles).sum())
                     into.count["outside box"] += int((shown & ~grown(in_box)).sum())

@@ -10,7 +10,7 @@ import torch
 
 from arbiview_aug import Camera, Rig, RigRetarget, SampleError, load_rig, project_boxes_3d
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.scene.boxes import silhouettes
+from arbiview_aug.scene.boxes import draw_boxes
 
 # 90 degrees over 801 px: focal length 400.5 px, principal point (400, 200), looking along the ego's x axis.
 FRONT = Camera.looking(
@@ -76,8 +76,7 @@ def test_the_rectangle_bounds_the_pixels(camera: Camera) -> None:
     assert len(seen.rows) >= 4
     more = []
     for index, rectangle in zip(seen.rows, seen.boxes, strict=True):
-        (pixels,) = silhouettes(camera, boxes[[index]])
-        v, u = np.divmod(pixels, camera.width_px)
+        v, u = np.nonzero(draw_boxes(camera, boxes[[index]])[1] >= 0)
         more.append(np.array([u.min(), v.min(), -u.max(), -v.max()]) - rectangle * [1, 1, -1, -1])
     print(f"{len(more)} boxes, {np.min(more):.3f} to {np.max(more):.2f} px wider than their pixels")
     assert np.min(more) >= -0.05 and np.max(more) <= 1.5

@@ -13,10 +13,10 @@ import torch
 
 from arbiview_aug import RigRetarget, SampleError, load_rig
 from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rays import pixel_rays
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.render.plan import build_plan
-from arbiview_aug.render.target_rays import TargetRays
 from arbiview_aug.scene.depth_maps import points_of_depth
 from arbiview_aug.scene.panorama import REACH_RAD
 from arbiview_aug.scene.point_cloud import PointCloudSurface, PointCloudWithBoxes, checked_points
@@ -289,10 +289,10 @@ def test_images_say_what_single_rays_say(name: str, all_around: bool) -> None:
     rays, valid = view.unproject(view.pixel_grid())
     q, before = surface.inverse_distance(EYE, rays[valid]), surface.occlusion_depth(EYE, rays[valid])
     # Rounding decides on which side of an outline a pixel lies.
-    off = np.abs(surface.image(view)[valid] - q)
+    off = np.abs(surface.image(view, pixel_rays(view))[valid] - q)
     assert np.quantile(off, 0.99) < 2e-5 and (off > 1e-3).mean() < 0.003
     # Shadows are interpolated over a panorama's cell: their outlines are half a cell wider or narrower.
-    off = np.abs(surface.occlusion_map(view).beyond[valid] - before)
+    off = np.abs(surface.occlusion_map(view, pixel_rays(view)).beyond[valid] - before)
     assert np.median(off) < 1e-5 and (off > 1e-3).mean() < 0.03
 
 
@@ -308,58 +308,3 @@ def test_coarse_grid_equals_pixel_by_pixel_evaluation() -> None:
         same = (a.source_camera == b.source_camera) & a.coverage
         assert same.mean() > 0.98 * a.coverage.mean()
         assert np.quantile(np.abs(a.at.xy[same].astype(int) - b.at.xy[same]), 0.99) <= 1
-
-
-def test_only_pixels_that_a_pair_may_read_are_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Turned cameras are exact over most of the view: points matter where neighbours see the rest."""
-    rig, scene = demo_source_rig((128, 352)), Scene(points=np.concatenate([NEAR, FAR]))
-    target = rig.turned(yaw_deg=15)
-    part = build_plan(rig, target, surface="lidar", scene=scene)
-    ask = TargetRays.ask
-    monkeypatch.setattr(TargetRays, "ask", lambda self, surface, nodes: ask(self, surface, whole(self)))
-    every = build_plan(rig, target, surface="lidar", scene=scene)
-    pixels = len(rig) * 128 * 352
-    assert 0 < part.counters["dense_pixels"] < 0.6 * pixels and every.counters["dense_pixels"] == pixels
-    for a, b in zip(part.targets, every.targets, strict=True):
-        assert (a.source_camera != b.source_camera).mean() < 1e-3
-        assert (a.at.xy != b.at.xy).mean() < 1e-3
-
-
-def whole(rays: TargetRays) -> tuple[int, int, int, int]:
-    ny, nx = rays.grid.shape
-    return 0, ny - 1, 0, nx - 1
-
-
-def test_in_a_sample() -> None:
-    rig = demo_source_rig((64, 176))
-    images = torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8)
-    sample = {"images": images, "rig": rig}
-    retarget = RigRetarget(rig.shifted(z_m=0.5), surface="lidar")
-    street = RigRetarget(rig.shifted(z_m=0.5), surface="street")(sample)
-    nothing = torch.full((3, 4), float("nan"))
-    assert torch.equal(retarget(sample | {"points": nothing})["images"], street["images"])
-    points = torch.from_numpy(NEAR).float()
-    seen = retarget(sample | {"points": points})
-    assert seen["points"] is points and not torch.equal(seen["images"], street["images"])
-    assert "lidar surface" in str(retarget.explain(sample | {"points": points}))
-    batch = {"images": images.expand(2, 6, 3, 64, 176), "rig": rig, "points": [points, points]}
-    assert torch.equal(retarget(batch)["images"][1], seen["images"])
-    with pytest.raises(SampleError, match=r"surface='lidar': expected 'points' \(P, >= 3\)"):
-        retarget(sample)
-    with pytest.raises(SampleError, match=r"points: expected shape"):
-        retarget(sample | {"points": torch.zeros(5, 2)})
-
-
-def test_depth_maps_in_a_sample() -> None:
-    rig = demo_source_rig((64, 176))
-    sample = {"images": torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8), "rig": rig}
-    retarget = RigRetarget(rig.shifted(z_m=0.5), surface="lidar")
-    depth = torch.zeros(6, 64, 176)
-    depth[0] = 9.0
-    with pytest.warns(UserWarning, match="depth_m"):
-        mapped = retarget(sample | {"depth_m": depth})
-    assert "depth_m" not in mapped  # it would be the source's
-    points = torch.from_numpy(points_of_depth(rig[0], np.full((64, 176), 9.0)))
-    assert torch.equal(mapped["images"], retarget(sample | {"points": points})["images"])
-    with pytest.raises(SampleError, match=r"depth_m: expected 6 maps"):
-        retarget(sample | {"depth_m": depth[:2]})

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.scene.boxes import meets, silhouettes
+from arbiview_aug.cameras.rays import pixel_rays
+from arbiview_aug.scene.boxes import draw_boxes, meets
 from arbiview_aug.scene.panorama import SIDE_RAD
 from arbiview_aug.scene.point_cloud import PointCloudSurface, PointCloudWithBoxes
 from arbiview_aug.scene.scanned_objects import SCANNED_POINTS, scanned_objects
@@ -122,15 +123,14 @@ def test_images_say_what_single_rays_say(name: str) -> None:
     assert len(surface.boxes) == 1 and len(surface.street.objects) == 1
     rays, valid = view.unproject(view.pixel_grid())
     rays = rays[valid]
-    for box, pixel in zip(boxes, silhouettes(view, boxes), strict=True):
-        drawn = np.zeros(view.size, bool)
-        drawn.reshape(-1)[pixel] = True
+    for box in boxes:
+        drawn = draw_boxes(view, box[None])[1] >= 0
         assert 500 < drawn.sum()
         assert (drawn[valid] != meets(box, view.center_m, rays)).mean() < 1e-4
     street = surface.street
-    off = np.abs(street.image(view)[valid] - street.inverse_distance(view.center_m, rays))
+    off = np.abs(street.image(view, pixel_rays(view))[valid] - street.inverse_distance(view.center_m, rays))
     assert np.quantile(off, 0.99) < 2e-5 and (off > 1e-3).mean() < 0.003
     for widened in (False, True):
         before = street.occlusion_depth(view.center_m, rays, widened=widened)
-        off = np.abs(street.before_image(view, widened=widened)[valid] - before)
+        off = np.abs(street.before_image(view, pixel_rays(view), widened=widened)[valid] - before)
         assert np.median(off) < 1e-5 and (off > 1e-3).mean() < 0.03

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, get_args
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -24,7 +24,6 @@ def test_names_of_the_type_are_those_of_the_table() -> None:
 class Ramp(StaticSurface):
     """A toy surface: a road that rises ahead, with nothing on it or above it."""
 
-    smooth: ClassVar[bool] = False
     ground_z_m: float
     slope: float
 

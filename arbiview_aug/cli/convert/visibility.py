@@ -10,7 +10,7 @@ import numpy as np
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.scene.box_raster import draw_boxes, silhouettes
+from arbiview_aug.scene.boxes import draw_boxes, silhouette_sums
 
 LEVELS = ("1", "2", "3", "4")
 """Tokens of nuScenes' table ``visibility``: 0 to 40, 40 to 60, 60 to 80 and 80 to 100 %."""
@@ -36,15 +36,16 @@ def visible_shares(rig: Rig, coverage: Sequence[BoolArray], boxes: FloatArray) -
     for camera, covered in zip(rig, coverage, strict=True):
         step = max(1, round(max(camera.size) / _RASTER_PX))
         wide, (top, left) = _widened(camera, step)
-        angle = _solid_angles(wide).reshape(-1)
-        total = np.maximum(total, [angle[np.unique(pixels)].sum() for pixels in silhouettes(wide, boxes)])
-        fragments = draw_boxes(wide, boxes)
-        rows, columns = np.divmod(fragments.pixel, wide.width_px)
-        rows, columns = rows - top, columns - left
+        angle = _solid_angles(wide)
+        total = np.maximum(total, silhouette_sums(wide, boxes, angle))
+        _, face = draw_boxes(wide, boxes)
+        y, x = np.nonzero(face >= 0)
+        rows, columns = y - top, x - left
         small = covered[step // 2 :: step, step // 2 :: step]
         inside = (rows >= 0) & (rows < small.shape[0]) & (columns >= 0) & (columns < small.shape[1])
         seen = np.flatnonzero(inside)[small[rows[inside], columns[inside]]]
-        shown += np.bincount(fragments.face[seen] // 6, angle[fragments.pixel[seen]], minlength=len(boxes))
+        y, x = y[seen], x[seen]
+        shown += np.bincount(face[y, x] // 6, angle[y, x], minlength=len(boxes))
     return np.minimum(np.divide(shown, total, out=np.zeros(len(boxes)), where=total > 0), 1.0)
 
 

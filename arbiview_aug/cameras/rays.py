@@ -1,0 +1,186 @@
+"""Maps of single cameras that plans read again and again: rays of lens pixels, distances to the own car."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.image_ops import halved
+from arbiview_aug.lru_cache import LRUCache
+
+Planes = npt.NDArray[np.float32]
+
+_NO_PLANES = np.zeros((3, 0, 0), np.float32)
+_NO_MASK = np.zeros((0, 0), np.uint8)
+_ROWS = 64  # unprojected at once: they stay in the cache
+CELL_PX = 8
+"""Side of the cells in which cones of rays and distances to a mask are known."""
+
+
+@dataclass(frozen=True)
+class PixelRays:
+    """Viewing rays of a camera's pixels, camera frame.
+
+    Attributes:
+        size: (h, w).
+        parameters: ``kernels.camera_parameters``.
+        planes: (3, h, w) float32 unit rays, 0 where there is none; (3, 0, 0) for a pinhole.
+    """
+
+    size: tuple[int, int]
+    parameters: Planes
+    planes: Planes
+
+    @cached_property
+    def cones(self) -> Planes:
+        """(4, ny, nx) cones around the rays of cells of ``CELL_PX``, as in ``kernels.cell_cones``."""
+        from arbiview_aug.cameras.kernels import cell_cones
+
+        cones = np.empty((4, *(-(-n // CELL_PX) for n in self.size)), np.float32)
+        cell_cones(self.planes, self.parameters, self.size, CELL_PX, cones)
+        return cones
+
+    def crop(self, top: int, left: int, size: tuple[int, int]) -> PixelRays:
+        """The rays of a window of (h, w) pixels."""
+        parameters = self.parameters.copy()
+        parameters[[2, 4]] -= left, top
+        planes = self.planes
+        if planes.size:
+            planes = np.ascontiguousarray(planes[:, top : top + size[0], left : left + size[1]])
+        return PixelRays(size, parameters, planes)
+
+    def at(self, y: npt.NDArray[np.int64], x: npt.NDArray[np.int64]) -> Planes:
+        """Rays (3, ny, nx) of the pixels in rows ``y`` and columns ``x``."""
+        if self.planes.size:
+            return np.ascontiguousarray(self.planes[:, y[:, None], x[None]])
+        fx, skew, cx, fy, cy = self.parameters[:5]
+        b = ((y.astype(np.float32) - cy) / fy)[:, None]
+        a = ((x.astype(np.float32) - cx)[None] - skew * b) / fx
+        rays = np.empty((3, len(y), len(x)), np.float32)
+        rays[2] = 1 / np.sqrt(a * a + b * b + 1)
+        rays[0], rays[1] = a * rays[2], b * rays[2]
+        return rays
+
+
+class CameraMaps:
+    """Rays and masks of cameras by their content: what is costly and does not change from frame to frame.
+
+    Args:
+        max_bytes: Memory for them.
+    """
+
+    def __init__(self, max_bytes: int = 256 * 2**20) -> None:
+        self._cache: LRUCache[Any, Any] = LRUCache(max_bytes, lambda array: array.nbytes)
+
+    def __reduce__(self) -> tuple[type[CameraMaps], tuple[int]]:
+        return CameraMaps, (self._cache.limit,)
+
+    def rays(self, camera: Camera) -> PixelRays:
+        """The rays of a camera; those of a lens are held."""
+        if camera.is_rectilinear:
+            return pixel_rays(camera)
+        key = camera.size, camera.lens, camera.distortion, camera.K.tobytes()
+        return pixel_rays(camera, self._cache.get(key, lambda: _unprojected(camera)))
+
+    def clean_pixels(self, camera: Camera, level: int) -> npt.NDArray[np.uint8]:
+        """255 (h, w) where a source halved ``level`` times shows no part of the own car; (0, 0) without a mask."""
+
+        def make(mask: Any) -> Any:
+            clean: Any = mask.view(np.uint8) * np.uint8(255)
+            return cv2.inRange(halved(clean, level), 255, 255) if level else clean  # type: ignore[call-overload]
+
+        return self._of_mask(camera, level, make)
+
+    def edge_distance(self, camera: Camera, uv: FloatArray) -> FloatArray:
+        """As the function, with the mask's distances held."""
+        return edge_distance(camera, uv, self._of_mask(camera, "distance", _distance_to_mask))
+
+    def _of_mask(self, camera: Camera, name: Any, make: Callable[[Any], Any]) -> Any:
+        if camera.mask is None:
+            return _NO_MASK
+        mask = camera.mask
+        return self._cache.get((camera.mask_key, name), lambda: _NO_MASK if mask.all() else make(mask))
+
+
+def pixel_rays(camera: Camera, planes: Planes | None = None) -> PixelRays:
+    """The rays of a camera's pixels; ``planes`` (3, h, w) if they are known."""
+    from arbiview_aug.cameras.kernels import camera_parameters
+
+    if planes is None:
+        planes = _NO_PLANES if camera.is_rectilinear else _unprojected(camera)
+    return PixelRays(camera.size, camera_parameters(camera), planes)
+
+
+def source_pixels(
+    target: Camera, rays: Planes, inverse_distance: Planes, source: Camera
+) -> tuple[Planes, Planes, Planes]:
+    """Pixels of a source for scene points on a target's rays.
+
+    Args:
+        target: The camera of the rays.
+        rays: (3, h, w) unit rays, camera frame.
+        inverse_distance: (h, w) along them, 1/m.
+        source: The other camera, in the same ego frame.
+
+    Returns:
+        u and v (h, w), ``kernels.FAR_AWAY_PX`` where there is no pixel, and the points' inverse distances from the
+        source (h, w), 1/m.
+    """
+    from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES, camera_parameters, project_image
+
+    to_source = source.cam2ego[:3, :3].T
+    A = (to_source @ target.cam2ego[:3, :3]).astype(np.float32)
+    o = (to_source @ (target.center_m - source.center_m)).astype(np.float32)
+    u, v, nearness = (np.empty(inverse_distance.shape, np.float32) for _ in range(3))
+    kind = LENS_CODES.get(source.lens, 0)
+    project_image(rays, inverse_distance, A, o, kind, camera_parameters(source), u, v, nearness)
+    if source.lens not in LENS_CODES:
+        points = np.tensordot(A, rays, 1) + o[:, None, None] * inverse_distance
+        uv, _, valid = source.project_cam(np.moveaxis(points, 0, -1).astype(np.float64))
+        u, v = (np.where(valid, uv[..., k], FAR_AWAY_PX).astype(np.float32) for k in range(2))
+    return u, v, nearness
+
+
+def edge_distance(camera: Camera, uv: FloatArray, to_mask: Any = None) -> FloatArray:
+    """Distance (px) of pixels (..., 2) to the border of what a source sees.
+
+    The outermost pixel centres are 0.5 inside it; outside the image it is negative. ``to_mask`` holds the distances of
+    cells to the mask, if they are known.
+    """
+    u, v = uv[..., 0], uv[..., 1]
+    edge = np.minimum(np.minimum(u, camera.width_px - 1 - u), np.minimum(v, camera.height_px - 1 - v)) + 0.5
+    if camera.mask is None or camera.mask.all():
+        return edge
+    distance = _distance_to_mask(camera.mask) if to_mask is None else to_mask
+    last = distance.shape[1] - 1, distance.shape[0] - 1
+    x, y = np.moveaxis(np.clip(uv / CELL_PX, 0, last).astype(np.int64), -1, 0)
+    return np.where(edge >= 0, np.minimum(edge, distance[y, x]), edge)
+
+
+def _unprojected(camera: Camera) -> Planes:
+    """Unit rays (3, h, w), 0 where there is none."""
+    h, w = camera.size
+    planes = np.empty((3, h, w), np.float32)
+    for first in range(0, h, _ROWS):
+        pixels = np.stack(np.meshgrid(np.arange(w), np.arange(first, min(first + _ROWS, h))), -1)
+        rays, valid = camera.unproject_cam(pixels.astype(np.float64))
+        planes[:, first : first + _ROWS] = np.moveaxis(np.where(valid[..., None], rays, 0), -1, 0)
+    return planes
+
+
+def _distance_to_mask(mask: Any) -> Any:
+    """Distance (px) of each cell of an image to the nearest one with a masked pixel."""
+    h, w = mask.shape
+    clean = cv2.copyMakeBorder(mask.astype(np.float32), 0, -h % CELL_PX, 0, -w % CELL_PX, cv2.BORDER_REPLICATE)
+    coarse = cv2.resize(clean, (-(-w // CELL_PX), -(-h // CELL_PX)), interpolation=cv2.INTER_AREA)
+    free = np.pad((coarse >= 1).astype(np.uint8), 1, constant_values=1)
+    distance = cv2.distanceTransform(free, cv2.DIST_L2, 3)[1:-1, 1:-1]
+    return np.minimum(distance, 1e6) * CELL_PX  # it is the largest float where nothing is masked

@@ -1,0 +1,349 @@
+"""Compiled surfaces: inverse distances of a static street, and boxes rasterised into a z-buffer, for any lens."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from arbiview_aug.cameras.kernels import rays_row
+from arbiview_aug.environment import compiled
+from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
+
+_ZERO, _ONE = np.float32(0), np.float32(1)
+_TINY = np.float32(1e-30)
+_MOST = np.float32(MAX_INVERSE_DISTANCE)
+
+_HALF = np.float32(0.5)
+_FLAT = np.float32(1e-12)
+_TURN = np.float32(2 * np.pi)
+
+GROUND, STREET = 0, 1
+SHOW, HIDE, HIDE_WIDE = 0, 1, 2
+
+
+@compiled
+def static_image(planes: Any, P: Any, R: Any, kind: int, S: Any, q: Any) -> None:
+    """Inverse distances of a static surface along a camera's rays (``static.Street``, ``static.Ground``).
+
+    Args:
+        planes: (3, h, w) rays, or (3, 0, 0) for a pinhole.
+        P: ``camera_parameters``.
+        R: (3, 3) float32 camera to ego.
+        kind: ``GROUND`` or ``STREET``.
+        S: (6,) float32: 1 / height over the road, 0 on or under it; 1 / semi-axes of the wall; the camera's centre in
+            the wall's frame, in semi-axes; c = its squared length - 1.
+        q: (h, w) float32, written.
+    """
+    h, w = q.shape
+    rx, ry, rz = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    dx, dy, road, wall = (
+        np.empty(w, np.float32),
+        np.empty(w, np.float32),
+        np.empty(w, np.float32),
+        np.empty(w, np.float32),
+    )
+    per_height, ox, oy, c = S[0], S[3], S[4], S[5]
+    for y in range(h):
+        rays_row(planes, P, y, 0, rx, ry, rz)
+        e, f, g = R[0, 0] * S[1], R[0, 1] * S[1], R[0, 2] * S[1]
+        for i in range(w):
+            dx[i] = e * rx[i] + f * ry[i] + g * rz[i]
+        e, f, g = R[1, 0] * S[2], R[1, 1] * S[2], R[1, 2] * S[2]
+        for i in range(w):
+            dy[i] = e * rx[i] + f * ry[i] + g * rz[i]
+        e, f, g = -R[2, 0] * per_height, -R[2, 1] * per_height, -R[2, 2] * per_height
+        for i in range(w):
+            road[i] = min(max(e * rx[i] + f * ry[i] + g * rz[i], _ZERO), _MOST)
+        for i in range(w):
+            a, b = dx[i] * dx[i] + dy[i] * dy[i], dx[i] * ox + dy[i] * oy
+            under = b * b - a * c
+            root = np.sqrt(max(under, _ZERO))
+            towards = a / max(root - b, _TINY)
+            if c < _ZERO:
+                value = (root + b) / -c if b > _ZERO else towards
+            else:
+                value = towards if (b < _ZERO) & (under >= _ZERO) else _ZERO
+            wall[i] = min(max(value, _ZERO), _MOST)
+        out = q[y]
+        if kind == GROUND:
+            for i in range(w):
+                out[i] = max(road[i], wall[i])
+        else:
+            for i in range(w):
+                nearer, farther = max(road[i], wall[i]), min(road[i], wall[i])
+                ratio = farther / max(nearer, _TINY)
+                ratio *= ratio
+                out[i] = min(nearer * np.sqrt(np.sqrt(_ONE + ratio * ratio)), _MOST)
+
+
+@compiled
+def draw_boxes(planes: Any, P: Any, boxes: Any, numbers: Any, cones: Any, step: int, q: Any, face: Any) -> None:
+    """Rasterise boxes into a z-buffer by the slab test, run of cells by run of cells.
+
+    Args:
+        planes: (3, h, w) rays, or (3, 0, 0) for a pinhole.
+        P: ``camera_parameters``.
+        boxes: (B, 20) float32: rotation from camera to box frame (9), the camera's centre in the box's frame (3), half
+            sizes (3), the farthest corner's distance, the direction of its middle (3), the cosine of its cone.
+        numbers: (B,) their rows among all boxes.
+        cones: ``cell_cones``.
+        step: Side of a cell, pixels.
+        q: (h, w) float32 inverse distance of the nearest face so far, 0 where there is none; updated.
+        face: (h, w) int32 6 x row + 2 x axis + 1 for the face further along the axis; updated where a box is nearer.
+    """
+    h, w = q.shape
+    _, ny, nx = cones.shape
+    work, near_box = np.empty((5, w), np.float32), np.empty(nx, np.bool_)
+    for k in range(boxes.shape[0]):
+        b = boxes[k]
+        for j in range(ny):
+            if not _cells_that_may_meet(b, cones[:, j], near_box):
+                continue
+            first, last = span(near_box)
+            x0, n = first * step, min(last * step, w) - first * step
+            rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
+            for y in range(j * step, min(j * step + step, h)):
+                rays_row(planes, P, y, x0, rx, ry, rz)
+                slabs_row(b, rx, ry, rz, enter, leave)
+                near, number = q[y, x0 : x0 + n], face[y, x0 : x0 + n]
+                for x in range(n):
+                    # The first distance below 1 cm counts as 1 cm.
+                    if leave[x] >= enter[x] and enter[x] > _ZERO and enter[x] * near[x] < _ONE:
+                        near[x] = min(_ONE / enter[x], _MOST)
+                        number[x] = 6 * numbers[k] + _entered(b, rx[x], ry[x], rz[x], enter[x])
+
+
+@compiled
+def sum_silhouettes(
+    planes: Any, P: Any, boxes: Any, numbers: Any, cones: Any, step: int, weight: Any, sums: Any
+) -> None:
+    """Add weights (h, w) of the pixels whose rays meet a box to its sum, whatever stands before it.
+
+    Args:
+        planes: As in ``draw_boxes``, as are the next five.
+        P: See there.
+        boxes: See there.
+        numbers: See there.
+        cones: See there.
+        step: See there.
+        weight: (h, w) float64.
+        sums: (all boxes,) float64, updated.
+    """
+    h, w = weight.shape
+    _, ny, nx = cones.shape
+    work, near_box = np.empty((5, w), np.float32), np.empty(nx, np.bool_)
+    for k in range(boxes.shape[0]):
+        b = boxes[k]
+        for j in range(ny):
+            if not _cells_that_may_meet(b, cones[:, j], near_box):
+                continue
+            first, last = span(near_box)
+            x0, n = first * step, min(last * step, w) - first * step
+            rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
+            for y in range(j * step, min(j * step + step, h)):
+                rays_row(planes, P, y, x0, rx, ry, rz)
+                slabs_row(b, rx, ry, rz, enter, leave)
+                for x in range(n):
+                    if leave[x] >= enter[x] and enter[x] > _ZERO:
+                        sums[numbers[k]] += weight[y, x0 + x]
+
+
+@compiled
+def _cells_that_may_meet(b: Any, cones: Any, near: Any) -> bool:
+    """Which cells (n,) of a row hold rays that may meet a box; whether any does.
+
+    First by the cone around the box, then by whether the middle's ray meets a box that is larger by what the cell's
+    rays spread up to the farthest corner.
+    """
+    cx, cy, cz, least = b[16], b[17], b[18], b[19]
+    some = 0
+    for i in range(near.shape[0]):
+        near[i] = cones[0, i] * cx + cones[1, i] * cy + cones[2, i] * cz >= least - cones[3, i]
+    for i in range(near.shape[0]):
+        if not near[i]:
+            continue
+        air = cones[3, i] * b[15]
+        low, high = np.float32(-1e30), np.float32(1e30)
+        for axis in range(3):
+            g = b[3 * axis] * cones[0, i] + b[3 * axis + 1] * cones[1, i] + b[3 * axis + 2] * cones[2, i]
+            g = g if abs(g) > _FLAT else _FLAT
+            middle, reach = -b[9 + axis] / g, (b[12 + axis] + air) / abs(g)
+            low, high = max(low, middle - reach), min(high, middle + reach)
+        near[i] = (low <= high) & (high > _ZERO)
+        some += near[i]
+    return some > 0
+
+
+@compiled
+def span(flags: Any) -> tuple[int, int]:
+    """First and last (exclusive) true entry; there is one."""
+    first, last = 0, flags.shape[0]
+    while not flags[first]:
+        first += 1
+    while not flags[last - 1]:
+        last -= 1
+    return first, last
+
+
+@compiled
+def slabs_row(b: Any, rx: Any, ry: Any, rz: Any, enter: Any, leave: Any) -> None:
+    """Distances (n,) at which rays enter and leave a box (20,); rays of length 0 miss it."""
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7], b[8]
+    sx, sy, sz, hx, hy, hz = b[9], b[10], b[11], b[12], b[13], b[14]
+    for i in range(enter.shape[0]):
+        gx, gy, gz = (
+            a0 * rx[i] + a1 * ry[i] + a2 * rz[i],
+            a3 * rx[i] + a4 * ry[i] + a5 * rz[i],
+            a6 * rx[i] + a7 * ry[i] + a8 * rz[i],
+        )
+        gx, gy, gz = (
+            gx if abs(gx) > _FLAT else _FLAT,
+            gy if abs(gy) > _FLAT else _FLAT,
+            gz if abs(gz) > _FLAT else _FLAT,
+        )
+        ix, iy, iz = _ONE / gx, _ONE / gy, _ONE / gz
+        first = max(max(-sx * ix - hx * abs(ix), -sy * iy - hy * abs(iy)), -sz * iz - hz * abs(iz))
+        last = min(min(-sx * ix + hx * abs(ix), -sy * iy + hy * abs(iy)), -sz * iz + hz * abs(iz))
+        enter[i] = first
+        leave[i] = last
+
+
+@compiled
+def _entered(b: Any, rx: float, ry: float, rz: float, enter: float) -> int:
+    """The face by which a ray enters a box: the axis whose slab it enters last."""
+    number, last = 0, np.float32(-1e30)
+    for axis in range(3):
+        g = b[3 * axis] * rx + b[3 * axis + 1] * ry + b[3 * axis + 2] * rz
+        g = g if abs(g) > _FLAT else _FLAT
+        here = -b[9 + axis] / g - b[12 + axis] / abs(g)
+        if here > last:
+            last, number = here, 2 * axis + (0 if g > _ZERO else 1)
+    return number
+
+
+@compiled
+def upsampled_row(nodes: Any, step: int, y: int, x0: int, row: Any, out: Any) -> None:
+    """Bilinear values (n,) between nodes (ny + 1, nx + 1) at pixels of row ``y`` from column ``x0`` on, a node's."""
+    j = y // step
+    t = np.float32(y - j * step) / np.float32(step)
+    for i in range(row.shape[0]):
+        row[i] = nodes[j, i] + (nodes[j + 1, i] - nodes[j, i]) * t
+    n = out.shape[0]
+    per = _ONE / np.float32(step)
+    for i in range(x0 // step, (x0 + n + step - 1) // step):
+        first, slope = row[i], (row[i + 1] - row[i]) * per
+        part = out[i * step - x0 : min(i * step + step - x0, n)]
+        for k in range(part.shape[0]):
+            part[k] = first + slope * np.float32(k)
+
+
+@compiled
+def upsample(nodes: Any, step: int, out: Any) -> None:
+    """Bilinear values (h, w) between nodes (ny + 1, nx + 1)."""
+    row = np.empty(nodes.shape[1], np.float32)
+    for y in range(out.shape[0]):
+        upsampled_row(nodes, step, y, 0, row, out[y])
+
+
+@compiled
+def add_residuals(rows: Any, columns: Any, step: int, near: Any, far: Any, share: Any, q: Any) -> None:
+    """Add a panorama's residuals (``Panorama.residual``) to inverse distances (h, w).
+
+    Args:
+        rows: (ny + 1, nx + 1) rows of the panorama at the nodes.
+        columns: (ny + 1, nx + 1) its columns.
+        step: Distance of the nodes, pixels.
+        near: (H, W) residual of the nearer side of a step.
+        far: (H, W) that of the farther one.
+        share: (H, W) share of the nearer side.
+        q: (h, w) float32, updated; clipped to what a surface may say.
+    """
+    h, w = q.shape
+    last_row, last_column = np.float32(near.shape[0] - 1), np.float32(near.shape[1] - 1)
+    line, v, u = np.empty(rows.shape[1], np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    for y in range(h):
+        upsampled_row(rows, step, y, 0, line, v)
+        upsampled_row(columns, step, y, 0, line, u)
+        for x in range(w):
+            a, b = min(max(v[x], _ZERO), last_row), min(max(u[x], _ZERO), last_column)
+            r, c = int(a), int(b)
+            s, t = a - np.float32(r), b - np.float32(c)
+            r1, c1 = min(r + 1, near.shape[0] - 1), min(c + 1, near.shape[1] - 1)
+            w00, w01, w10, w11 = (_ONE - s) * (_ONE - t), (_ONE - s) * t, s * (_ONE - t), s * t
+            nearer = w00 * share[r, c] + w01 * share[r, c1] + w10 * share[r1, c] + w11 * share[r1, c1] > _HALF
+            if nearer:
+                value = w00 * near[r, c] + w01 * near[r, c1] + w10 * near[r1, c] + w11 * near[r1, c1]
+            else:
+                value = w00 * far[r, c] + w01 * far[r, c1] + w10 * far[r1, c] + w11 * far[r1, c1]
+            q[y, x] = min(max(q[y, x] + value, _ZERO), _MOST)
+
+
+@compiled
+def draw_scanned(
+    planes: Any, P: Any, R: Any, boxes: Any, cones: Any, step: int, raster: Any, nearest: Any, top_rad: Any, mode: int,
+    image: Any,
+) -> None:  # fmt: skip
+    """Draw an object by its points into inverse distances or an occlusion map (``scanned_objects.ScannedObject``).
+
+    Args:
+        planes: (3, h, w) rays, or (3, 0, 0) for a pinhole.
+        P: ``camera_parameters``.
+        R: (3, 3) float32 camera to ego.
+        boxes: (2, 20) its box as in ``draw_boxes``, and the same with air around it.
+        cones: ``cell_cones``.
+        step: Side of a cell, pixels.
+        raster: (4,) float32 azimuth of the first column, elevation of the first row, side of a cell, how far above its
+            highest points it may hide; radians.
+        nearest: (H, W) its inverse distances.
+        top_rad: (W,) elevations of its highest points.
+        mode: ``SHOW``: where it is met in front of what ``image`` (h, w) says. ``HIDE``: what it hides. ``HIDE_WIDE``:
+            what it may hide, a little above its points too.
+        image: (h, w) float32, updated.
+    """
+    h, w = image.shape
+    _, ny, nx = cones.shape
+    rows, columns = nearest.shape
+    work, near_box = np.empty((5, w), np.float32), np.empty(nx, np.bool_)
+    for j in range(ny):
+        if not _cells_that_may_meet(boxes[0], cones[:, j], near_box):
+            continue
+        first, last = span(near_box)
+        x0, n = first * step, min(last * step, w) - first * step
+        rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
+        for y in range(j * step, min(j * step + step, h)):
+            rays_row(planes, P, y, x0, rx, ry, rz)
+            slabs_row(boxes[0], rx, ry, rz, enter, leave)
+            out = image[y, x0 : x0 + n]
+            for x in range(n):
+                if leave[x] < enter[x] or enter[x] <= _ZERO:
+                    continue
+                dx = R[0, 0] * rx[x] + R[0, 1] * ry[x] + R[0, 2] * rz[x]
+                dy = R[1, 0] * rx[x] + R[1, 1] * ry[x] + R[1, 2] * rz[x]
+                dz = R[2, 0] * rx[x] + R[2, 1] * ry[x] + R[2, 2] * rz[x]
+                azimuth = np.arctan2(dy, dx) - raster[0]
+                azimuth -= _TURN * np.rint(azimuth / _TURN)
+                elevation = np.arctan2(dz, np.sqrt(dx * dx + dy * dy))
+                column = azimuth / raster[2]
+                if column < -_HALF or column > np.float32(columns) - _HALF:
+                    continue
+                inner = min(max(column, _ZERO), np.float32(columns - 1))
+                c = min(int(inner), max(columns - 2, 0))
+                t = inner - np.float32(c)
+                top = top_rad[c] + (top_rad[min(c + 1, columns - 1)] - top_rad[c]) * t
+                if elevation > top + raster[3] or (mode != HIDE_WIDE and elevation > top):
+                    continue
+                r = min(max(int(np.rint((elevation - raster[1]) / raster[2])), 0), rows - 1)
+                own = nearest[r, int(np.rint(inner))] if elevation <= top else _ZERO
+                g = boxes[1]
+                behind = np.float32(1e30)
+                for axis in range(3):
+                    along = g[3 * axis] * rx[x] + g[3 * axis + 1] * ry[x] + g[3 * axis + 2] * rz[x]
+                    along = along if abs(along) > _FLAT else _FLAT
+                    behind = min(behind, -g[9 + axis] / along + g[12 + axis] / abs(along))
+                behind = _ONE / max(behind, _ONE / _MOST)
+                if mode == SHOW:
+                    if own > _ZERO and out[x] < behind:
+                        out[x] = own
+                elif mode == HIDE_WIDE or own > _ZERO:
+                    out[x] = max(out[x], behind)
