@@ -30,7 +30,7 @@ from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
 from arbiview_aug.scene.surface import Surface
 
 _SMALL_SIDE_PX = 64  # weights of targets with a shorter side are evaluated at every pixel
-_SLACK_PX = 1e-3  # a pixel on the very border must not drop out by a rounding of float32
+_SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
 _STRIP_PX = 128  # slanted seams make narrow rectangles
 MAGNIFIED = 0.8
 """A view is read by cubics where it has this few source pixels per pixel, or fewer, and most of it is read at its own
@@ -109,7 +109,11 @@ class ViewPlanner:
         coarse = min(camera.size) >= _SMALL_SIDE_PX
         coarse &= is_within_wall(camera.center_m) or not SURFACES[surface].has_wall
         self.step = config.grid_step_px if coarse else 1
-        self.nodes = tuple(np.minimum(np.arange(0, n + self.step, self.step), n - 1) for n in camera.size)
+        corners = tuple(np.minimum(np.arange(0, n + self.step, self.step), n - 1) for n in camera.size)
+        self.corner_rays = self.rays.at(*corners)
+        # The outermost nodes lie half a cell inside: a magnified source does not see the outermost pixels.
+        inset = self.step // 2
+        self.nodes = tuple(c.clip(inset, n - 1 - inset) for c, n in zip(corners, camera.size, strict=True))
         self.node_rays = self.rays.at(*self.nodes)
         self._geometries: dict[str, _Geometry] = {}
         self._open = np.ones(tuple(len(n) - 1 for n in self.nodes), bool)  # cells that further sources may change
@@ -231,7 +235,7 @@ class ViewPlanner:
         if kind >= 0:
             size = np.array(source.size, np.float32)
             cells_in_view(
-                self.node_rays, geometry.nearest, geometry.farthest, A, o, kind, P, size, source.cone_rad, use
+                self.corner_rays, geometry.nearest, geometry.farthest, A, o, kind, P, size, source.cone_rad, use
             )
             use &= self._open
         if not use.any():
@@ -280,8 +284,9 @@ class ViewPlanner:
         from arbiview_aug.cameras.kernels import LENS_CODES, camera_parameters
 
         (h, w), scale = level_size(source.size, level), 0.5**level
-        slack = np.array([-_SLACK_PX, -_SLACK_PX, source.width_px - 1 + _SLACK_PX, source.height_px - 1 + _SLACK_PX])
-        bounds = (slack + 0.5) * scale - 0.5
+        slack_px = _SLACK_PX + _ROUNDING * max(source.size)
+        bounds = np.array([-slack_px, -slack_px, source.width_px - 1 + slack_px, source.height_px - 1 + slack_px])
+        bounds = (bounds + 0.5) * scale - 0.5
         # Halving leaves out the last row or column of an odd size: nothing is known there.
         bounds[2:] = np.minimum(bounds[2:], (w - 0.5, h - 0.5))
         last = (w - 1, h - 1) if level else (-1, -1)
@@ -517,6 +522,5 @@ def _filled(values: FloatArray, valid: BoolArray) -> npt.NDArray[np.float32]:
 
 def _spans(use: BoolArray) -> npt.NDArray[np.int64]:
     """First and last (exclusive) True column (ny, 2) of each row."""
-    some: BoolArray = use.any(axis=1)
     first, last = use.argmax(axis=1), use.shape[1] - use[:, ::-1].argmax(axis=1)
-    return np.stack([first * some, last * some], -1)
+    return np.stack([first, np.where(use.max(axis=1), last, first)], -1)

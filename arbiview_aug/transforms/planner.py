@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.cameras.lens import BoolArray
+from arbiview_aug.cameras.rays import CameraMaps
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.favs.config import FavsConfig, PaperConfig
@@ -110,6 +111,7 @@ class FramePlanner:
         self.mixed, self.strict, self.unseen = mixed, strict, unseen
         self.plans: LRUCache[bytes, RenderPlan] = LRUCache(cache_bytes, attrgetter("nbytes"))
         self._last_plan: LRUCache[bytes, RenderPlan] = LRUCache(1)
+        self.maps = CameraMaps()
         self._pairs: LRUCache[tuple[bytes, bytes], _RigPair] = LRUCache(_MAX_RIG_PAIRS)
 
     # --- plans of frames ----------------------------------------------------------------------------------------------
@@ -189,7 +191,7 @@ class FramePlanner:
         return cache.get(pair.plan_key(scene), lambda: self._built(source, pair.target, scene, config))
 
     def _built(self, source: Rig, target: Rig, scene: Scene, config: FavsConfig) -> RenderPlan:
-        plan = build_plan(source, target, surface=self.surface, config=config, scene=scene)
+        plan = build_plan(source, target, surface=self.surface, config=config, scene=scene, maps=self.maps)
         self.warn_unreachable(target, plan.coverage)
         return plan
 
