@@ -6,7 +6,6 @@ not read from that source; where no other source sees them, they are holes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,10 +17,10 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import CELL_PX, PixelRays, pixel_rays
 from arbiview_aug.errors import SampleError
 from arbiview_aug.scene.surface import (
-    MAX_INVERSE_DISTANCE,
     LayeredSurface,
     OcclusionMap,
     Points,
+    StaticSurface,
     Surface,
 )
 
@@ -86,45 +85,12 @@ class BoxSurface(LayeredSurface):
         boxes[:, 3:5] += 2 * more_m[:, None]
         return boxes
 
-    # --- rays ---------------------------------------------------------------------------------------------------------
-    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
-        """Inverse distance to the first box along a ray, else to the street, 1/m (...,)."""
-        first = self._boxes_ahead(origin, directions)[0]
-        return np.where(first > 0, first, self.street.inverse_distance(origin, directions))
-
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Expected error (...,) in 1/m of boxes, and of the street because of unlabelled objects."""
+        assert isinstance(self.street, StaticSurface)
         on_street = inverse_distance <= self.street.inverse_distance(origin, directions)
         street = _UNLABELLED * self.street.uncertainty(origin, directions, inverse_distance)
         return np.where(on_street, street, _BOX_ERROR * inverse_distance)
-
-    def occludes(
-        self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
-    ) -> BoolArray:
-        """Whether a box occludes points (...,) on unit rays; points of a guessed street are always behind it."""
-        first = BoxSurface(self.street, self._enlarged(origin, pixel_rad))._boxes_ahead(origin, directions)[0]
-        return first > (0 if self.street.is_guess else inverse_distance * (1 + 2 * pixel_rad))
-
-    def _outside(self, origin: FloatArray) -> Iterator[tuple[int, FloatArray, float]]:
-        """Row, direction and angular radius of the boxes that do not hold the origin."""
-        holding = (np.abs(_in_box_frames(self.boxes, origin)) <= self.boxes[:, 3:6] / 2).all(axis=-1)
-        for row in np.flatnonzero(~holding).tolist():
-            box = self.boxes[row]
-            towards = box[:3] - origin
-            distance_m, radius_m = float(np.linalg.norm(towards)), float(np.linalg.norm(box[3:6])) / 2
-            angle = float(np.arcsin(radius_m / distance_m)) if distance_m > radius_m else np.pi
-            yield row, towards / max(distance_m, 1e-9), angle
-
-    def _boxes_ahead(self, origin: FloatArray, directions: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int32]]:
-        """Inverse distance (...,) to the first box face along each ray, 0 for none, and its number, -1 for none."""
-        rays = directions.reshape(-1, 3)
-        q, number = np.zeros(len(rays)), np.full(len(rays), -1, np.int32)
-        for row, towards, angle in self._outside(origin):
-            near = np.flatnonzero(rays @ towards >= np.cos(min(angle + 1e-6, np.pi)))
-            nearest, side = _first_face(self.boxes[row], origin, rays[near])
-            first = nearest > q[near]
-            q[near[first]], number[near[first]] = nearest[first], 6 * row + side[first]
-        return q.reshape(directions.shape[:-1]), number.reshape(directions.shape[:-1])
 
 
 def box_rows(camera: Camera, boxes: FloatArray) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
@@ -175,36 +141,13 @@ def silhouette_sums(camera: Camera, boxes: FloatArray, weight: FloatArray) -> Fl
 
 
 def meets(box: FloatArray, origin: FloatArray, directions: FloatArray) -> BoolArray:
-    """Whether rays (..., 3) from a point outside a box (7,) meet it."""
-    first, _ = _first_face(box, origin, directions.reshape(-1, 3))
-    return (first > 0).reshape(directions.shape[:-1])
-
-
-def _first_face(
-    box: FloatArray, origin: FloatArray, directions: FloatArray
-) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Inverse distances at which rays (n, 3) enter a box, 0 where they miss it, and the sides (slab method)."""
-    near, far, rays = _slabs(box, origin, directions)
-    axis = near.argmax(axis=-1)
-    enter, leave = near.max(axis=-1), far.min(axis=-1)
-    hit = (leave >= enter) & (enter > 0)
-    side = 2 * axis + (np.take_along_axis(rays, axis[:, None], axis=-1)[:, 0] < 0)
-    return np.where(hit, 1 / np.maximum(enter, 1 / MAX_INVERSE_DISTANCE), 0.0), side
-
-
-def beyond(box: FloatArray, origin: FloatArray, directions: FloatArray) -> FloatArray:
-    """Inverse distance (n,) at which rays (n, 3) that meet a box (7,) leave it, 1/m."""
-    _, far, _ = _slabs(box, origin, directions)
-    return np.asarray(1 / np.maximum(far.min(axis=-1), 1 / MAX_INVERSE_DISTANCE))
-
-
-def _slabs(box: FloatArray, origin: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Distances (n, 3) at which rays (n, 3) enter and leave each pair of opposite faces; the rays in the box frame."""
+    """Whether rays (..., 3) from a point outside a box (7,) meet it (slab method)."""
     rays = _in_box_frame(box, directions)
     rays = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
     start, half = _in_box_frame(box, origin - box[:3]), box[3:6] / 2
     one, two = (-half - start) / rays, (half - start) / rays
-    return np.minimum(one, two), np.maximum(one, two), rays
+    enter, leave = np.minimum(one, two).max(axis=-1), np.maximum(one, two).min(axis=-1)
+    return np.asarray((leave >= enter) & (enter > 0))
 
 
 def points_in(boxes: FloatArray, points: Points, air_m: float = 0.0) -> list[npt.NDArray[np.int64]]:

@@ -156,18 +156,13 @@ class Panorama:
     hidden_below: Layer
     measured: Layer
 
-    def residual(self, row: Layer, column: Layer) -> Layer:
-        """Inverse distance minus the static surface's (...,)."""
-        near, far, share = (_at(layer, row, column) for layer in (self.near, self.far, self.share))
-        return np.where(share > 0.5, near, far)
-
     def occlusion_depth(self, row: Layer, column: Layer) -> Layer:
         """Points of a smaller inverse distance (...,) are hidden, 1/m; 0 where nothing hides."""
-        return _at(self.hidden_below, row, column)
+        return layer_at(self.hidden_below, row, column)
 
     def is_measured(self, row: Layer, column: Layer) -> BoolArray:
         """Whether a point lies within ``SUPPORT_RAD`` (...,)."""
-        return _at(self.measured, row, column) > 0.5
+        return layer_at(self.measured, row, column) > 0.5
 
 
 def angles(directions: FloatArray) -> tuple[Layer, Layer]:
@@ -307,7 +302,7 @@ def _square(radius_rad: float) -> npt.NDArray[np.uint8]:
     return np.ones((side, side), np.uint8)
 
 
-def _at(layer: Layer, row: Layer, column: Layer) -> Layer:
+def layer_at(layer: Layer, row: Layer, column: Layer) -> Layer:
     """Bilinear values (...,) of a layer; its border beyond it."""
     n = row.size
     if n == 0:

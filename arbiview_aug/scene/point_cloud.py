@@ -7,7 +7,7 @@ No sensor's place is assumed: points are z-buffered and made dense anew for each
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,11 +16,10 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import CELL_PX, PixelRays
 from arbiview_aug.errors import SampleError
-from arbiview_aug.scene.boxes import BoxSurface, box_rows, meets
+from arbiview_aug.scene.boxes import BoxSurface, box_rows
 from arbiview_aug.scene.panorama import CELL_RAD, SIDE_RAD, Layer, Panorama, PanoramaWindow, angles, panorama
 from arbiview_aug.scene.scanned_objects import BOX_AIR_M, RASTER_RAD, ScannedObject, scanned_objects
 from arbiview_aug.scene.surface import (
-    MAX_INVERSE_DISTANCE,
     DenseSurface,
     OcclusionMap,
     Points,
@@ -59,14 +58,6 @@ class PointCloudSurface(DenseSurface):
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", self.points[~own_car(self.points)])
 
-    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
-        """The points' dense surface, 1/m (...,)."""
-        view, row, column = self._view(origin, directions)
-        known = self.street.inverse_distance(origin, directions) + view.residual(row, column)
-        for one in self._objects_on(origin, directions):
-            one.fill(known)
-        return np.asarray(np.clip(known, 0.0, MAX_INVERSE_DISTANCE), np.float64)
-
     def image(self, camera: Camera, rays: PixelRays) -> Layer:
         """The points' dense surface at all pixels, 1/m (h, w)."""
         from arbiview_aug.scene.kernels import SHOW, add_residuals
@@ -78,14 +69,22 @@ class PointCloudSurface(DenseSurface):
         return q
 
     def occlusion_map(self, camera: Camera, rays: PixelRays) -> OcclusionMap:
-        """What is hidden from a source, by ``occludes``; kept for the next target."""
+        """What is hidden from a source; kept for the next target.
+
+        Points farther by a tenth of their distance and 0.3 m than what was measured, as in the evaluation's visibility,
+        and only within measured outlines: nothing hides where the LiDAR is silent.
+        """
         if camera not in self._shadows:
             none = np.broadcast_to(np.int32(-1), camera.size)
             self._shadows[camera] = OcclusionMap(self.before_image(camera, rays), none)
         return self._shadows[camera]
 
     def before_image(self, camera: Camera, rays: PixelRays, *, widened: bool = True) -> Layer:
-        """``occlusion_depth`` at all pixels of a camera (h, w), interpolated between rays a panorama's cell apart."""
+        """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a panorama's cell apart.
+
+        With ``widened`` objects reach half a scan line's spacing above their highest points: they may, and a source
+        that shows them there must not be read for the background.
+        """
         from arbiview_aug.scene.kernels import HIDE, HIDE_WIDE, upsample
 
         view, row, column, step = self._located(camera, rays)
@@ -94,42 +93,11 @@ class PointCloudSurface(DenseSurface):
         self._draw_objects(camera, rays, HIDE_WIDE if widened else HIDE, before)
         return before
 
-    def occludes(
-        self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
-    ) -> BoolArray:
-        """Whether what was measured for certain stands between ``origin`` and scene points (...,).
-
-        What is nearer by a tenth of its distance and 0.3 m, as in the evaluation's visibility; and only within
-        measured outlines: where the LiDAR is silent nothing hides.
-        """
-        return np.asarray(inverse_distance < self.occlusion_depth(origin, directions))
-
-    def occlusion_depth(self, origin: FloatArray, directions: FloatArray, *, widened: bool = True) -> FloatArray:
-        """Inverse distances (...,) beyond which ``occludes`` says that points are hidden, 1/m.
-
-        Args:
-            origin: (3,) the rays' common start.
-            directions: (..., 3) unit rays.
-            widened: Objects reach half a scan line's spacing above their highest points: they may, and a source that
-                shows them there must not be read for what is behind. Otherwise they end with their points.
-        """
-        view, row, column = self._view(origin, directions)
-        before = view.occlusion_depth(row, column).astype(np.float64)
-        for one in self._objects_on(origin, directions):
-            one.hide(before, widened)
-        return before
-
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Small where a point is near, the street's elsewhere: 1/m (...,)."""
         view, row, column = self._view(origin, directions)
         unknown = self.street.uncertainty(origin, directions, inverse_distance)
         return np.where(view.is_measured(row, column), _MEASURED_SPREAD * inverse_distance, unknown)
-
-    def _objects_on(self, origin: FloatArray, directions: FloatArray) -> list[_Seen]:
-        """What rays (..., 3) see of the objects."""
-        rays = directions.reshape(-1, 3)
-        met = [np.flatnonzero(meets(one.box, origin, rays)) for one in self.objects]
-        return [_Seen(ray, *one.seen(origin, rays[ray])) for one, ray in zip(self.objects, met, strict=True)]
 
     def _draw_objects(self, camera: Camera, rays: PixelRays, mode: int, image: Layer) -> None:
         """Draw the objects that a camera may see by their points (``kernels.draw_scanned``)."""
@@ -198,29 +166,6 @@ class PointCloudSurface(DenseSurface):
         return view, *view.window.cells(azimuth, elevation)
 
 
-class _Seen(NamedTuple):
-    """What rays see of an object: ``ScannedObject.seen`` of the rays of these numbers (n,).
-
-    Where the points around say that a ray goes on behind the object, it is the object that it meets.
-    """
-
-    ray: npt.NDArray[np.int64]
-    own: FloatArray
-    beyond: FloatArray
-
-    def fill(self, known: FloatArray | Layer) -> None:
-        """Put the object into inverse distances."""
-        flat = known.reshape(-1)
-        behind = (self.own > 0) & (flat[self.ray] < self.beyond)
-        flat[self.ray[behind]] = self.own[behind]
-
-    def hide(self, before: FloatArray | Layer, widened: bool) -> None:
-        """Put what it hides into ``occlusion_depth``."""
-        flat = before.reshape(-1)
-        beyond = self.beyond if widened else np.where(self.own > 0, self.beyond, 0)
-        flat[self.ray] = np.maximum(flat[self.ray], beyond)
-
-
 def _extrapolated(values: Layer, y: Any, x: Any, size: tuple[int, int]) -> Layer:
     """Values at nodes (ny, nx), of which the last were read at the image's last pixel, where the nodes lie."""
     values = values.copy()
@@ -257,12 +202,6 @@ class PointCloudWithBoxes(BoxSurface):
         face[q < self.street.before_image(camera, rays, widened=False)] = -1
         return q, face
 
-    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
-        """The first box along a ray with nothing measured before it, else the points' surface, 1/m (...,)."""
-        first = self._boxes_ahead(origin, directions)[0]
-        shown = (first > 0) & (first >= self.street.occlusion_depth(origin, directions, widened=False))
-        return np.where(shown, first, self.street.inverse_distance(origin, directions))
-
     def occlusion_map(self, camera: Camera, rays: PixelRays) -> OcclusionMap:
         """What boxes hide from a source, and what was measured."""
         new = camera not in self._shadows
@@ -273,13 +212,6 @@ class PointCloudWithBoxes(BoxSurface):
             np.copyto(shadows.beyond, measured, where=nearer)
             np.copyto(shadows.solid, _NO_BOX, where=nearer)
         return shadows
-
-    def occludes(
-        self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
-    ) -> BoolArray:
-        """Whether a box, or what was measured, stands before points (...,)."""
-        by_box = super().occludes(origin, directions, inverse_distance, pixel_rad)
-        return by_box | self.street.occludes(origin, directions, inverse_distance, pixel_rad)
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Small where a point is near, the street's elsewhere: 1/m (...,)."""

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.scene.boxes import beyond, is_over, points_in
-from arbiview_aug.scene.panorama import NEAREST_M, SIDE_RAD, Layer, angles, spread, wrapped
+from arbiview_aug.scene.boxes import is_over, points_in
+from arbiview_aug.scene.panorama import NEAREST_M, Layer, angles, spread, wrapped
 from arbiview_aug.scene.surface import Points
 
 BOX_AIR_M = 0.2
@@ -43,23 +43,6 @@ class ScannedObject:
     points: FloatArray
     _rasters: dict[bytes, _Raster | None] = field(default_factory=dict, repr=False)
 
-    def seen(self, origin: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What rays (n, 3) that meet its box make of it.
-
-        Returns:
-            Its inverse distance where a ray passes below its highest points, and that beyond which it hides what is
-            behind it, half a scan line's spacing higher too; (n,) 1/m, 0 where the ray passes it.
-        """
-        if not len(directions):
-            return np.zeros(0), np.zeros(0)
-        raster = self.raster(origin)
-        if raster is None:
-            return np.zeros(len(directions)), np.zeros(len(directions))
-        met, hides = raster.seen(directions)
-        # No point of the object lies farther along a ray than where it leaves the box with air around it.
-        widened = self.box + 2 * BOX_AIR_M * np.array([0, 0, 0, 1, 1, 1, 0])
-        return met, np.where(hides, beyond(widened, origin, directions), 0.0)
-
     def raster(self, origin: FloatArray) -> _Raster | None:
         """The points as a centre (3,) sees them; None where they have no outline from there."""
         key = np.asarray(origin, np.float64).tobytes()
@@ -83,18 +66,6 @@ class _Raster:
     elevation_rad: float
     nearest: Layer
     top_rad: Layer
-
-    def seen(self, directions: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-        """Inverse distances where rays (n, 3) pass below the highest points; which pass so, or just above them."""
-        azimuth, elevation = angles(directions)
-        column = wrapped(azimuth - self.azimuth_rad) / RASTER_RAD
-        h, w = self.nearest.shape
-        # Its outline runs half a cell beyond the outermost points.
-        across = (column >= -0.5) & (column <= w - 0.5)
-        top = np.interp(column, np.arange(w), self.top_rad)
-        row = np.clip(np.round((elevation - self.elevation_rad) / RASTER_RAD), 0, h - 1).astype(np.intp)
-        own = self.nearest[row, np.clip(np.round(column), 0, w - 1).astype(np.intp)]
-        return np.where(across & (elevation <= top), own, 0.0), across & (elevation <= top + SIDE_RAD)
 
 
 def scanned_objects(

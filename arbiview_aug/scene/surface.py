@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rays import PixelRays
 
 SurfaceName = Literal["auto", "far", "ground", "street", "objects", "lidar", "motion"]
@@ -48,37 +48,8 @@ class Surface(ABC):
         return self
 
     @abstractmethod
-    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
-        """Inverse distances (...,) in 1/m, 0 <= q <= ``MAX_INVERSE_DISTANCE``.
-
-        Args:
-            origin: (3,) the rays' common start in the ego frame, metres.
-            directions: (..., 3) unit directions in the ego frame.
-        """
-
-    @abstractmethod
-    def occludes(
-        self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
-    ) -> BoolArray:
-        """Whether something lies between a source's centre and scene points.
-
-        Args:
-            origin: (3,) the source's centre in the ego frame, metres.
-            directions: (..., 3) unit directions towards the points, ego frame.
-            inverse_distance: (...,) of the points along them, 1/m.
-            pixel_rad: Angle of a source pixel.
-        """
-
     def image(self, camera: Camera, rays: PixelRays) -> npt.NDArray[np.float32]:
-        """Inverse distances (h, w) along the rays of a camera's pixel centres, 1/m."""
-        h, w = camera.size
-        q = np.empty((h, w), np.float32)
-        for first in range(0, h, _ROWS):
-            rows = np.arange(first, min(first + _ROWS, h))
-            local = rays.at(rows, np.arange(w)).astype(np.float64)
-            directions = np.moveaxis(np.tensordot(camera.cam2ego[:3, :3], local, 1), 0, -1)
-            q[rows] = self.inverse_distance(camera.center_m, directions)
-        return q
+        """Inverse distances (h, w) along a camera's pixel rays, 1/m, at most ``MAX_INVERSE_DISTANCE``."""
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Expected error (...,) of ``inverse_distance`` in 1/m; by default that of a typical object at 20 m."""
@@ -105,6 +76,13 @@ class LayeredSurface(Surface):
     """
 
     is_layered: ClassVar[bool] = True
+
+    def image(self, camera: Camera, rays: PixelRays) -> npt.NDArray[np.float32]:
+        """Inverse distances (h, w) of objects and background along the rays of a camera's pixel centres, 1/m."""
+        q = self.background.image(camera, rays)
+        objects, face = self.drawn(camera, rays)
+        np.copyto(q, objects, where=face >= 0)
+        return q
 
     @abstractmethod
     def drawn(self, camera: Camera, rays: PixelRays) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
@@ -134,7 +112,22 @@ class StaticSurface(Surface):
 
     is_guess: ClassVar[bool] = True
 
-    def occludes(
-        self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray, pixel_rad: float
-    ) -> BoolArray:
-        return np.zeros(inverse_distance.shape, bool)
+    @abstractmethod
+    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        """Inverse distances (...,) in 1/m, 0 <= q <= ``MAX_INVERSE_DISTANCE``.
+
+        Args:
+            origin: (3,) the rays' common start in the ego frame, metres.
+            directions: (..., 3) unit directions in the ego frame.
+        """
+
+    def image(self, camera: Camera, rays: PixelRays) -> npt.NDArray[np.float32]:
+        """Inverse distances (h, w) along the rays of a camera's pixel centres, 1/m."""
+        h, w = camera.size
+        q = np.empty((h, w), np.float32)
+        for first in range(0, h, _ROWS):
+            rows = np.arange(first, min(first + _ROWS, h))
+            local = rays.at(rows, np.arange(w)).astype(np.float64)
+            directions = np.moveaxis(np.tensordot(camera.cam2ego[:3, :3], local, 1), 0, -1)
+            q[rows] = self.inverse_distance(camera.center_m, directions)
+        return q

@@ -163,11 +163,12 @@ def _hole(plan: RenderPlan, index: int, surface: Surface, reach: Reach) -> Hole 
     pixel = np.flatnonzero(around)
     directions, valid = _rays(camera, pixel)
     if reach == "ground":
-        # Rays that meet the road far away are dropped first: asking the surface may be slow.
         road = plane_inverse_distance(camera.center_m, directions, plan.source.ground_z_m)
         valid &= np.hypot(directions[:, 0], directions[:, 1]) <= NEAR_M * road
     pixel, directions = pixel[valid], directions[valid]
-    q = surface.inverse_distance(camera.center_m, directions)
+    if not len(pixel):
+        return None
+    q = surface.image(camera, pixel_rays(camera)).reshape(-1)[pixel].astype(np.float64)
     if reach == "ground":
         height_m = camera.center_m[2] + directions[:, 2] / np.maximum(q, 1e-9) - plan.source.ground_z_m
         road = (q > 0) & (np.abs(height_m) < _ROAD_TOLERANCE_M)

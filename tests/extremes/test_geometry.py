@@ -21,6 +21,7 @@ from tests import helpers
 from tests.extremes import reference
 from tests.extremes.conftest import Worst
 from tests.helpers import ring, sampled
+from tests.scene.single_rays import inverse_distance
 
 MAP_TOLERANCE_PX = 1 / 32
 BOXES = np.array([[12.0, 1.0, 0.8, 4.5, 1.9, 1.6, 0.3], [-8.0, -3.0, 1.0, 4.0, 2.0, 2.0, 1.5]])
@@ -92,7 +93,7 @@ def check(plan: RenderPlan, surface: str, scene: Scene, worst: Worst) -> None:
             source = plan.source[index]
             won = view.source_camera == index
             assert ray_valid[won].all()
-            q = scene.surface(name, plan.source.ground_z_m).inverse_distance(target.center_m, directions[won])
+            q = inverse_distance(scene.surface(name, plan.source.ground_z_m), target.center_m, directions[won])
             uv, valid = project_rays(source, directions[won], q, target.center_m - source.center_m)
             ahead = (directions[won] + q[:, None] * (target.center_m - source.center_m)) @ source.cam2ego[:3, 2] > 0
             assert source.lens == "fisheye" or ahead.all(), f"{source.name} over {name}: what is read lies behind it"

@@ -24,6 +24,7 @@ from arbiview_aug.render.plan import RenderPlan, build_plan
 from arbiview_aug.scene.point_cloud import checked_points
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.surface import Surface
+from tests.scene.single_rays import inverse_distance
 
 TOLERANCE_PX = 1 / 32
 BOXES = np.array(
@@ -62,7 +63,7 @@ def errors(plan: RenderPlan, surface: str, scene: Scene, at_most: int, edges: bo
         y, x = np.unravel_index(some, camera.size)
         if edges:
             rays, _ = ego_rays(camera, camera.pixel_grid())
-            edge = near_steps(scene.surface(surface, plan.source.ground_z_m).inverse_distance(camera.center_m, rays))
+            edge = near_steps(inverse_distance(scene.surface(surface, plan.source.ground_z_m), camera.center_m, rays))
         read = FixedMap(view.at.xy[y, x][:, None], view.at.frac[y, x][:, None]).to_float()[:, 0].astype(np.float64)
         winner = view.source_camera[y, x]
         for pair in view.pairs:
@@ -70,7 +71,7 @@ def errors(plan: RenderPlan, surface: str, scene: Scene, at_most: int, edges: bo
             source, offset_m = plan.source[pair.source], camera.center_m - plan.source[pair.source].center_m
             name = "far" if np.linalg.norm(offset_m) < 1e-6 else surface
             rays, valid = ego_rays(camera, np.stack([x[won], y[won]], -1).astype(np.float64))
-            q = scene.surface(name, plan.source.ground_z_m).inverse_distance(camera.center_m, rays)
+            q = inverse_distance(scene.surface(name, plan.source.ground_z_m), camera.center_m, rays)
             uv, ahead = project_rays(source, rays, q, offset_m)
             assert valid.all() and ahead.all()
             slot = plan.layout.slot(pair.source, pair.level)

@@ -10,6 +10,7 @@ from arbiview_aug.render.confidence import certainty, confidence
 from arbiview_aug.scene.boxes import BoxSurface
 from arbiview_aug.scene.static import Far, Street
 from tests.helpers import street_sample
+from tests.scene.single_rays import inverse_distance
 
 SIZE = (96, 256)
 CAR = np.array([[10.0, 0.0, 0.75, 4.0, 2.0, 1.5, 0.0]])
@@ -51,8 +52,8 @@ def test_boxes_make_the_street_surer() -> None:
     eye, scene = np.array([0.0, 0.0, 1.5]), BoxSurface(Street(), CAR)
     rays = np.array([[8.0, 0.0, -0.5], [8.0, 4.0, -0.2]])
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    q = scene.inverse_distance(eye, rays)
-    spread, street = (s.uncertainty(eye, rays, s.inverse_distance(eye, rays)) for s in (scene, scene.street))
+    q = inverse_distance(scene, eye, rays)
+    spread, street = (s.uncertainty(eye, rays, inverse_distance(s, eye, rays)) for s in (scene, scene.street))
     assert spread[0] == pytest.approx(0.08 * q[0])
     assert 0 < spread[1] < 0.5 * street[1]
 

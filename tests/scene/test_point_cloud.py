@@ -23,6 +23,7 @@ from arbiview_aug.scene.point_cloud import PointCloudSurface, PointCloudWithBoxe
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.static import Street
 from tests import helpers
+from tests.scene.single_rays import inverse_distance, occludes, occlusion_depth
 
 EYE = np.array([2.0, 0.0, 1.5])
 PIXEL_RAD = 0.002
@@ -47,20 +48,20 @@ NEAR, FAR = wall(12.0, (-2, 2), (0.0, 2.0)), wall(32.0, (-20, 20), (-1.0, 8.0))
 
 def test_a_wall_is_where_its_points_are() -> None:
     rays, q = towards(np.array([[12.0, y, z] for y in (-1.33, 0.01, 1.47) for z in (0.6, 1.02, 1.63)]))
-    assert np.allclose(PointCloudSurface(Street(), NEAR).inverse_distance(EYE, rays), q, rtol=0.02)
+    assert np.allclose(inverse_distance(PointCloudSurface(Street(), NEAR), EYE, rays), q, rtol=0.02)
 
 
 @pytest.mark.parametrize("eye", [EYE, EYE + np.array([0.5, 0.3, 0.7]), np.array([-2.0, 0.0, 1.5])])
 def test_any_centre_sees_the_same_wall(eye: np.ndarray) -> None:
     rays, q = towards(np.array([[12.0, y, 1.02] for y in (-1.33, 0.01, 1.47)]), eye)
-    assert np.allclose(PointCloudSurface(Street(), NEAR).inverse_distance(eye, rays), q, rtol=0.02)
+    assert np.allclose(inverse_distance(PointCloudSurface(Street(), NEAR), eye, rays), q, rtol=0.02)
 
 
 def test_walls_behind_are_as_good_as_walls_ahead() -> None:
     """Azimuth wraps there."""
     mirrored = NEAR * np.array([-1.0, 1.0, 1.0])
     rays, q = towards(np.array([[-12.0, y, 1.02] for y in (-1.33, -0.01, 0.01, 1.47)]))
-    assert np.allclose(PointCloudSurface(Street(), mirrored).inverse_distance(EYE, rays), q, rtol=0.02)
+    assert np.allclose(inverse_distance(PointCloudSurface(Street(), mirrored), EYE, rays), q, rtol=0.02)
 
 
 def test_a_road_stays_a_plane_between_scan_lines() -> None:
@@ -68,7 +69,7 @@ def test_a_road_stays_a_plane_between_scan_lines() -> None:
     rings = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.zeros_like(radius)], -1).reshape(-1, 3)
     street = Street(half_length_m=500, half_width_m=500)
     rays, q = towards(np.array([[EYE[0] + d, y, 0.0] for d in (7.3, 9.7, 15.1) for y in (-1.0, 0.4)]))
-    assert np.allclose(PointCloudSurface(street, rings).inverse_distance(EYE, rays), q, rtol=2e-3)
+    assert np.allclose(inverse_distance(PointCloudSurface(street, rings), EYE, rays), q, rtol=2e-3)
 
 
 def test_outlines_do_not_melt() -> None:
@@ -76,7 +77,7 @@ def test_outlines_do_not_melt() -> None:
     surface = PointCloudSurface(Street(), np.concatenate([NEAR, FAR]))
     y = np.linspace(0.5, 3.5, 301)
     rays, q = towards(np.stack([np.full_like(y, 12.0), y, np.full_like(y, 1.5)], -1))
-    got = surface.inverse_distance(EYE, rays)
+    got = inverse_distance(surface, EYE, rays)
     on_near, on_far = np.abs(got / q - 1) < 0.02, np.abs(got / (q / 3) - 1) < 0.02
     assert (on_near ^ on_far).all()
     edge = y[on_near].max()
@@ -88,7 +89,7 @@ def test_what_shines_through_gaps_is_dropped() -> None:
     """Scan lines 1.3 degrees apart on a near wall, and points of a far one between them."""
     lines = np.concatenate([wall(12.0, (-2, 2), (z, z + 0.01)) for z in np.arange(0.0, 2.5, 0.227)])
     rays, q = towards(wall(12.0, (-1.5, 1.5), (0.4, 1.8)))
-    got = PointCloudSurface(Street(), np.concatenate([lines, FAR])).inverse_distance(EYE, rays)
+    got = inverse_distance(PointCloudSurface(Street(), np.concatenate([lines, FAR])), EYE, rays)
     assert np.allclose(got, q, rtol=0.04)
 
 
@@ -96,10 +97,10 @@ def test_silence_is_the_street() -> None:
     surface, street = PointCloudSurface(Street(), NEAR), Street()
     beyond = 2 / 10 + np.tan(REACH_RAD) + 0.1
     rays, _ = towards(EYE + np.array([[1.0, beyond, 0.2], [1.0, -beyond, -0.3], [-1.0, 0.0, -0.1]]))
-    assert np.allclose(surface.inverse_distance(EYE, rays), street.inverse_distance(EYE, rays), rtol=1e-6)
+    assert np.allclose(inverse_distance(surface, EYE, rays), inverse_distance(street, EYE, rays), rtol=1e-6)
     empty = PointCloudSurface(street, np.zeros((0, 3)))
-    assert np.allclose(empty.inverse_distance(EYE, rays), street.inverse_distance(EYE, rays), rtol=1e-6)
-    assert not empty.occludes(EYE, rays, np.zeros(3), PIXEL_RAD).any()
+    assert np.allclose(inverse_distance(empty, EYE, rays), inverse_distance(street, EYE, rays), rtol=1e-6)
+    assert not occludes(empty, EYE, rays, np.zeros(3), PIXEL_RAD).any()
 
 
 def test_measured_rays_are_more_certain() -> None:
@@ -113,17 +114,17 @@ def test_a_wall_hides_what_is_behind_it() -> None:
     rays, q = towards(np.array([[12.0, 0.3, 1.1]] * 4))
     distance = 1 / q[0]
     at = np.array([distance - 2, distance, distance + 0.5, distance + 3.0])
-    assert surface.occludes(EYE, rays, 1 / at, PIXEL_RAD).tolist() == [False, False, False, True]
-    assert surface.occludes(EYE, rays[:1], np.zeros(1), PIXEL_RAD).tolist() == [True]
+    assert occludes(surface, EYE, rays, 1 / at, PIXEL_RAD).tolist() == [False, False, False, True]
+    assert occludes(surface, EYE, rays[:1], np.zeros(1), PIXEL_RAD).tolist() == [True]
     beside, _ = towards(np.array([[12.0, 3.0, 1.1], [12.0, 0.0, 3.0]]))
-    assert surface.occludes(EYE, beside, np.zeros(2), PIXEL_RAD).tolist() == [False, False]  # silent: nothing hides
+    assert occludes(surface, EYE, beside, np.zeros(2), PIXEL_RAD).tolist() == [False, False]  # silent: nothing hides
 
 
 def test_the_own_car_is_no_obstacle() -> None:
     bonnet = np.array([[x, y, 1.0] for x in np.arange(2.5, 3.9, 0.05) for y in np.arange(-0.8, 0.8, 0.05)])
     rays, _ = towards(np.array([[12.0, 0.0, 1.0], [6.0, 0.3, 0.0]]))
-    got = PointCloudSurface(Street(), np.concatenate([bonnet, NEAR])).inverse_distance(EYE, rays)
-    assert np.allclose(got, PointCloudSurface(Street(), NEAR).inverse_distance(EYE, rays))
+    got = inverse_distance(PointCloudSurface(Street(), np.concatenate([bonnet, NEAR])), EYE, rays)
+    assert np.allclose(got, inverse_distance(PointCloudSurface(Street(), NEAR), EYE, rays))
 
 
 def test_a_box_decides_within_its_silhouette_and_its_points_not_beyond() -> None:
@@ -134,10 +135,10 @@ def test_a_box_decides_within_its_silhouette_and_its_points_not_beyond() -> None
     surface = PointCloudWithBoxes.among(Street(), np.concatenate([own, mirror, FAR]), box)
     assert len(surface.boxes) == 1
     inside, q = towards(np.array([[12.0, y, z] for y in (-1.49, 1.49) for z in (0.3, 1.99)]))
-    assert np.allclose(surface.inverse_distance(EYE, inside), q, rtol=1e-6)
+    assert np.allclose(inverse_distance(surface, EYE, inside), q, rtol=1e-6)
     outside, q = towards(np.array([[12.0, y, z] for y, z in ((-1.51, 1.5), (1.51, 1.5), (0.0, 2.01))]))
-    assert np.allclose(surface.inverse_distance(EYE, outside), q / 3, rtol=0.02)
-    assert surface.occludes(EYE, inside, np.full(4, 1 / 30), PIXEL_RAD).all()
+    assert np.allclose(inverse_distance(surface, EYE, outside), q / 3, rtol=0.02)
+    assert occludes(surface, EYE, inside, np.full(4, 1 / 30), PIXEL_RAD).all()
 
 
 # --- extremes ---------------------------------------------------------------------------------------------------------
@@ -154,30 +155,30 @@ def test_points_of_every_bad_kind() -> None:
     }
     for name, points in bad.items():
         surface = PointCloudSurface(Street(), points)
-        q = surface.inverse_distance(EYE, rays)
+        q = inverse_distance(surface, EYE, rays)
         assert np.isfinite(q).all() and (q >= 0).all() and (q <= 100).all(), name
-        assert surface.occludes(EYE, rays, q, PIXEL_RAD).shape == (40, 50)
+        assert occludes(surface, EYE, rays, q, PIXEL_RAD).shape == (40, 50)
         assert np.isfinite(surface.uncertainty(EYE, rays, q)).all(), name
-    assert surface.inverse_distance(EYE, np.zeros((0, 3))).shape == (0,)
+    assert inverse_distance(surface, EYE, np.zeros((0, 3))).shape == (0,)
 
 
 def test_duplicates_and_order_change_nothing() -> None:
     rng, rays = np.random.default_rng(0), towards(wall(12.0, (-3, 3), (0.0, 3.0), 0.02))[0]
     points = np.concatenate([NEAR, FAR])
-    once = PointCloudSurface(Street(), points).inverse_distance(EYE, rays)
+    once = inverse_distance(PointCloudSurface(Street(), points), EYE, rays)
     shuffled = rng.permutation(np.concatenate([points, points]))
-    assert np.allclose(PointCloudSurface(Street(), shuffled).inverse_distance(EYE, rays), once, atol=1e-6)
+    assert np.allclose(inverse_distance(PointCloudSurface(Street(), shuffled), EYE, rays), once, atol=1e-6)
 
 
 def test_parts_of_a_view_agree_with_the_whole() -> None:
     surface = PointCloudSurface(Street(), np.concatenate([NEAR, FAR]))
     rays = towards(wall(12.0, (-3, 3), (0.0, 3.0), 0.08))[0]
     parts = np.concatenate(
-        [PointCloudSurface(Street(), surface.points).inverse_distance(EYE, r) for r in rays[:, None]]
+        [inverse_distance(PointCloudSurface(Street(), surface.points), EYE, r) for r in rays[:, None]]
     )
     around = np.random.default_rng(0).normal(size=(500, 3))
     around /= np.linalg.norm(around, axis=-1, keepdims=True)
-    whole = surface.inverse_distance(EYE, np.concatenate([around, rays]))[500:]
+    whole = inverse_distance(surface, EYE, np.concatenate([around, rays]))[500:]
     assert np.allclose(parts, whole, rtol=0.02)
 
 
@@ -190,9 +191,9 @@ def test_only_the_nearest_point_of_a_direction_counts() -> None:
     near, behind = EYE + away, EYE + 2 * away
     asked = rays[:2000]
     for part in (asked, asked[asked[:, 0] > 0.8]):  # a narrow window too
-        once = PointCloudSurface(Street(), near).inverse_distance(EYE, part)
+        once = inverse_distance(PointCloudSurface(Street(), near), EYE, part)
         many = PointCloudSurface(Street(), rng.permutation(np.concatenate([behind, near, behind])))
-        assert np.array_equal(many.inverse_distance(EYE, part), once)
+        assert np.array_equal(inverse_distance(many, EYE, part), once)
 
 
 def test_points_are_taken_as_they_were_recorded() -> None:
@@ -201,7 +202,7 @@ def test_points_are_taken_as_they_were_recorded() -> None:
     rays = towards(wall(12.0, (-3, 3), (0.0, 3.0), 0.02))[0]
     assert checked_points(points) is not points and np.shares_memory(checked_points(points), points)
     one, two = (
-        PointCloudSurface(Street(), cloud).inverse_distance(EYE, rays) for cloud in (points, points.astype(float))
+        inverse_distance(PointCloudSurface(Street(), cloud), EYE, rays) for cloud in (points, points.astype(float))
     )
     assert np.array_equal(one, two)
 
@@ -209,7 +210,7 @@ def test_points_are_taken_as_they_were_recorded() -> None:
 def test_millions_of_points() -> None:
     points = np.random.default_rng(0).uniform((-60, -60, 0), (60, 60, 5), (2_000_000, 3))
     rays, _ = towards(wall(12.0, (-3, 3), (0.0, 3.0), 0.02))
-    assert np.isfinite(PointCloudSurface(Street(), points).inverse_distance(EYE, rays)).all()
+    assert np.isfinite(inverse_distance(PointCloudSurface(Street(), points), EYE, rays)).all()
 
 
 @pytest.mark.slow
@@ -285,9 +286,9 @@ def test_images_say_what_single_rays_say(name: str, all_around: bool) -> None:
     points = np.concatenate([NEAR, FAR, FAR * [-1, 1, 1], [[x, y, 9.0] for x in range(12) for y in range(-5, 6)]])
     surface = PointCloudSurface(Street(), points)
     if all_around:
-        surface.inverse_distance(EYE, np.array([[1.0, 0, 0], [-1.0, 0, 0], [0.0, 1.0, 0], [0.0, -1.0, 0]]))
+        inverse_distance(surface, EYE, np.array([[1.0, 0, 0], [-1.0, 0, 0], [0.0, 1.0, 0], [0.0, -1.0, 0]]))
     rays, valid = view.unproject(view.pixel_grid())
-    q, before = surface.inverse_distance(EYE, rays[valid]), surface.occlusion_depth(EYE, rays[valid])
+    q, before = inverse_distance(surface, EYE, rays[valid]), occlusion_depth(surface, EYE, rays[valid])
     # Rounding decides on which side of an outline a pixel lies.
     off = np.abs(surface.image(view, pixel_rays(view))[valid] - q)
     assert np.quantile(off, 0.99) < 2e-5 and (off > 1e-3).mean() < 0.003

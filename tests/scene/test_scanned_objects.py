@@ -12,6 +12,7 @@ from arbiview_aug.scene.panorama import SIDE_RAD
 from arbiview_aug.scene.point_cloud import PointCloudSurface, PointCloudWithBoxes
 from arbiview_aug.scene.scanned_objects import SCANNED_POINTS, scanned_objects
 from arbiview_aug.scene.static import Street
+from tests.scene.single_rays import inverse_distance, occludes, occlusion_depth
 
 EYE = np.array([2.0, 0.0, 1.5])
 PIXEL_RAD = 0.002
@@ -47,7 +48,7 @@ def test_over_the_bonnet_the_street_goes_on() -> None:
     assert len(surface.boxes) == 0
     rays, q = towards([(10.02, 0.2, 0.6), (32.0, 0.4, 1.0), (32.0, -0.9, 0.7)])
     assert meets(CAR, EYE, rays).all()  # a box would decide them all
-    assert np.allclose(surface.inverse_distance(EYE, rays), q, rtol=0.02)
+    assert np.allclose(inverse_distance(surface, EYE, rays), q, rtol=0.02)
 
 
 def test_nothing_is_read_through_the_gaps_between_scan_lines() -> None:
@@ -55,11 +56,11 @@ def test_nothing_is_read_through_the_gaps_between_scan_lines() -> None:
     points = np.concatenate([car(0.5), FAR])
     rays, _ = towards([(10.02, y, z) for y in (-0.6, 0.01, 0.7) for z in (0.5, 0.7)])
     behind = np.full(len(rays), 1 / 30)
-    assert not PointCloudSurface(Street(), points).occludes(EYE, rays, behind, PIXEL_RAD).all()
+    assert not occludes(PointCloudSurface(Street(), points), EYE, rays, behind, PIXEL_RAD).all()
     surface = PointCloudWithBoxes.among(Street(), points, CAR[None])
-    assert surface.occludes(EYE, rays, behind, PIXEL_RAD).all()
-    assert not surface.occludes(EYE, rays, np.full(len(rays), 1 / 8.1), PIXEL_RAD).any()  # its own front is not hidden
-    assert (surface.inverse_distance(EYE, rays) > 1 / 10.5).all()
+    assert occludes(surface, EYE, rays, behind, PIXEL_RAD).all()
+    assert not occludes(surface, EYE, rays, np.full(len(rays), 1 / 8.1), PIXEL_RAD).any()  # its own front is not hidden
+    assert (inverse_distance(surface, EYE, rays) > 1 / 10.5).all()
 
 
 def test_it_may_be_half_a_scan_line_higher() -> None:
@@ -68,8 +69,8 @@ def test_it_may_be_half_a_scan_line_higher() -> None:
     top = np.arctan2(1.45 - EYE[2], 11.5 - EYE[0])
     elevation = top + SIDE_RAD * np.array([0.9, 1.6])
     rays = np.stack([np.cos(elevation), np.zeros(2), np.sin(elevation)], -1)
-    assert surface.occludes(EYE, rays, np.full(2, 1 / 30), PIXEL_RAD).tolist() == [True, False]
-    assert (surface.street.occlusion_depth(EYE, rays, widened=False) < 1 / 20).all()
+    assert occludes(surface, EYE, rays, np.full(2, 1 / 30), PIXEL_RAD).tolist() == [True, False]
+    assert (occlusion_depth(surface.street, EYE, rays, widened=False) < 1 / 20).all()
 
 
 def test_few_points_leave_the_box() -> None:
@@ -86,7 +87,7 @@ def test_a_camera_within_or_at_an_object_sees_something(eye: np.ndarray) -> None
     surface = PointCloudWithBoxes.among(Street(), np.concatenate([car(), FAR]), CAR[None])
     rays = np.random.default_rng(0).normal(size=(200, 3))
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    q = surface.inverse_distance(eye, rays)
+    q = inverse_distance(surface, eye, rays)
     assert np.isfinite(q).all() and (q >= 0).all()
 
 
@@ -100,8 +101,8 @@ def test_a_bus_alongside_hides_what_is_behind_it(beside_m: float) -> None:
     assert len(surface.boxes) == 0
     eye = np.array([2.5, -1.25 - beside_m, 1.5])
     rays, q = towards([(x, -1.23, z) for x in (-3.0, 0.5, 2.6, 7.0) for z in (0.5, 1.3, 2.1, 2.8)], eye)
-    assert surface.occludes(eye, rays, np.full(len(rays), 1 / 22), PIXEL_RAD).all()
-    assert (surface.inverse_distance(eye, rays) > q / 1.6).all()  # in the bus, not on the wall
+    assert occludes(surface, eye, rays, np.full(len(rays), 1 / 22), PIXEL_RAD).all()
+    assert (inverse_distance(surface, eye, rays) > q / 1.6).all()  # in the bus, not on the wall
 
 
 VIEWS = {
@@ -128,9 +129,9 @@ def test_images_say_what_single_rays_say(name: str) -> None:
         assert 500 < drawn.sum()
         assert (drawn[valid] != meets(box, view.center_m, rays)).mean() < 1e-4
     street = surface.street
-    off = np.abs(street.image(view, pixel_rays(view))[valid] - street.inverse_distance(view.center_m, rays))
+    off = np.abs(street.image(view, pixel_rays(view))[valid] - inverse_distance(street, view.center_m, rays))
     assert np.quantile(off, 0.99) < 2e-5 and (off > 1e-3).mean() < 0.003
     for widened in (False, True):
-        before = street.occlusion_depth(view.center_m, rays, widened=widened)
+        before = occlusion_depth(street, view.center_m, rays, widened=widened)
         off = np.abs(street.before_image(view, pixel_rays(view), widened=widened)[valid] - before)
         assert np.median(off) < 1e-5 and (off > 1e-3).mean() < 0.03
