@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -66,6 +67,27 @@ def compiled(function: Any) -> Any:
         return njit(error_model="numpy", nogil=True, cache=True)(function)
     except RuntimeError:  # no locator available: neither the package's folder nor the user's can be written
         return njit(error_model="numpy", nogil=True)(function)
+
+
+@contextmanager
+def compilation_announced() -> Iterator[None]:
+    """Say once, on stderr, that functions are being compiled, where numba's cache does not hold them."""
+    from numba.core import event
+
+    class Announcement(event.Listener):  # type: ignore[misc]
+        def on_start(self, event: Any) -> None:
+            _announce_compilation()
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    with event.install_listener("numba:compile", Announcement()):
+        yield
+
+
+@cache
+def _announce_compilation() -> None:
+    print("arbiview_aug: compiling kernels, once for each installation (half a minute)", file=sys.stderr)
 
 
 @contextmanager

@@ -28,6 +28,7 @@ MOST_FOLDERS, MOST_FILES = 12, 8
 """At the top of the package."""
 
 HEAVY = (
+    "numba",
     "diffusers",
     "safetensors",
     "torchvision",

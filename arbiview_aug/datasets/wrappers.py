@@ -9,6 +9,8 @@ import torch
 from torch.utils.data import Dataset, IterableDataset
 
 from arbiview_aug.errors import DataError, SampleTypeError
+from arbiview_aug.render.plan import compile_kernels
+from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import is_number
 
 Retarget = Callable[[Any], Any]
@@ -129,4 +131,6 @@ def _checked_map_style(dataset: Any, name: str, fix: str) -> Any:
 def _checked_retarget(retarget: Any, name: str) -> Retarget:
     if not callable(retarget):
         raise SampleTypeError(f"{name}: expected a callable such as RigRetarget, got {type(retarget).__name__}")
+    if isinstance(retarget, RigRetarget):
+        compile_kernels()  # here, once, and not in every worker
     return retarget  # type: ignore[no-any-return]

@@ -9,19 +9,26 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from dataclasses import dataclass, field, fields
-from functools import partial
+from dataclasses import dataclass, field, fields, replace
+from functools import cache, partial
 from typing import Any
 
-from arbiview_aug.cameras.lens import BoolArray
+import numpy as np
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import BoolArray, LensName
 from arbiview_aug.cameras.rays import CameraMaps
 from arbiview_aug.cameras.rig import Rig, content_order
+from arbiview_aug.environment import compilation_announced
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.image_ops import Scratch
 from arbiview_aug.render.atlas import AtlasLayout
 from arbiview_aug.render.view_plan import ViewPlan
 from arbiview_aug.render.view_planner import ViewPlanner
 from arbiview_aug.scene.scene import Scene
+
+
+_LENSES: tuple[tuple[LensName, int], ...] = (("pinhole", 0), ("radtan", 4), ("fisheye", 4))  # and coefficients
 
 
 @dataclass(frozen=True)
@@ -32,7 +39,7 @@ class RenderPlan:
     target: Rig  # in the source's ego frame, on the source's road
     layout: AtlasLayout  # the sources' places in the atlas
     targets: tuple[ViewPlan, ...]  # one plan for each target camera
-    counters: dict[str, int] = field(default_factory=dict)  # pairs by surface, cells interpolated and exact, bands
+    counters: dict[str, int] = field(default_factory=dict)  # pairs by surface, cells, pixels of solids, bands
     # The maps as tensors, by device (``torch_backend.maps_on``); not pickled.
     on_devices: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
@@ -82,11 +89,37 @@ def build_plan(
     Returns:
         The plan. Targets that no source sees have zero coverage.
     """
-    config = config or FavsConfig()
-    target = target.in_frame_of(source)
+    with compilation_announced():
+        return _built(source, target.in_frame_of(source), surface, config or FavsConfig(), scene or Scene(), maps)
+
+
+@cache
+def compile_kernels() -> None:
+    """Compile what plans call, or load it from numba's cache: in the parent process, before workers are forked."""
+    views = [
+        Camera.looking(
+            name=f"{lens} {side}", azimuth_deg=20 * side, position_m=(0, 0.3 * side, 1.5), width_px=32, height_px=32,
+            horizontal_fov_deg=90, lens=lens, distortion=(0.0,) * count,
+        )
+        for lens, count in _LENSES for side in (-1, 0, 1)
+    ]  # fmt: skip
+    wall = np.stack(np.meshgrid(8.0, np.linspace(-2, 2, 20), np.linspace(0.3, 1.5, 10)), -1).reshape(-1, 3)
+    boxes = np.array([[8.5, 0, 1, 1, 4, 2, 0], [5, 3, 1, 1, 1, 2, 0]])
+    source = Rig(
+        [replace(camera, mask=np.eye(32, dtype=bool) < 1) for camera in views if not camera.name.endswith("0")]
+    )
+    target = Rig([camera for camera in views if camera.name.endswith("0")])
+    scene, config = Scene(boxes=boxes, points=wall), FavsConfig(certainty=True)
+    for surface in ("ground", "objects", "lidar"):
+        build_plan(source, target, surface=surface, config=config, scene=scene)
+
+
+def _built(
+    source: Rig, target: Rig, surface: str, config: FavsConfig, scene: Scene, maps: CameraMaps | None
+) -> RenderPlan:
     counters: Counter[str] = Counter()
     order = content_order(source.cameras)
-    scene, maps = scene or Scene(), maps or CameraMaps()
+    maps = maps or CameraMaps()
     by_name = partial(scene.surface, ground_z_m=source.ground_z_m)
     planners = [
         ViewPlanner(source, order, camera, surface, scene.best, by_name, config, counters, maps) for camera in target

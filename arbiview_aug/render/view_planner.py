@@ -23,7 +23,7 @@ from arbiview_aug.favs.stage4_fusion import distance_weight, primary_weight, qua
 from arbiview_aug.image_ops import Scratch, at_level, level_size
 from arbiview_aug.render.atlas import AtlasLayout, FixedMap
 from arbiview_aug.render.confidence import certainty
-from arbiview_aug.render.requirements import SAME_CENTER_M, covers_target_exactly
+from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.render.view_plan import BilinearFallback, BlendRegion, SourceUse, ViewPlan
 from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
@@ -116,25 +116,16 @@ class ViewPlanner:
         self.nodes = tuple(c.clip(inset, n - 1 - inset) for c, n in zip(corners, camera.size, strict=True))
         self.node_rays = self.rays.at(*self.nodes)
         self._geometries: dict[str, _Geometry] = {}
-        self._open = np.ones(tuple(len(n) - 1 for n in self.nodes), bool)  # cells that further sources may change
-        found = {}
-        for k in sorted(self._required(order), key=lambda k: self._baseline_m(k) >= SAME_CENTER_M):
-            region = self._region(k)
+        self._open = np.ones(tuple(len(n) - 1 for n in self.nodes), bool)  # cells that sources elsewhere may change
+        exact = {k: self._region(k) for k in order if self._baseline_m(k) < SAME_CENTER_M}
+        for region in exact.values():
             if region is not None:
-                found[k] = region
-                if region.baseline_m < SAME_CENTER_M:
-                    self._open &= self._around_unseen(region)
+                self._open = self._open & self._around_unseen(region)
+        found = exact | {k: self._region(k) for k in order if k not in exact}
         # In content order, so that ties never depend on the order of the source list.
-        self.regions = [found[k] for k in order if k in found]
+        self.regions = [region for k in order if (region := found[k]) is not None]
 
     # --- what a source sees -------------------------------------------------------------------------------------------
-    def _required(self, order: list[int]) -> list[int]:
-        """The sources that can win a pixel: where one serves the target alone, those at its centre."""
-        if not any(covers_target_exactly(self.source[k], self.camera, self.config) for k in order):
-            return order
-        self.counters["served_alone"] += 1
-        return [k for k in order if self._baseline_m(k) < SAME_CENTER_M]
-
     def _baseline_m(self, index: int) -> float:
         return float(np.linalg.norm(self.camera.center_m - self.source[index].center_m))
 
@@ -149,10 +140,10 @@ class ViewPlanner:
         return self.best, f"centres {baseline_m:.2f} m apart"
 
     def _around_unseen(self, region: _Region) -> BoolArray:
-        """Cells (ny, nx) that an exact source does not see whole, and those around them that seams may reach."""
+        """Cells (ny, nx) that an exact source does not certainly win, and those around them that seams may reach."""
         from arbiview_aug.render.kernels import depth_range, seen_image
 
-        seen = region.score > 0
+        seen = region.score > 1  # no weight of a source elsewhere exceeds 1
         whole = seen[1:, 1:] & seen[1:, :-1] & seen[:-1, 1:] & seen[:-1, :-1]
         if self.maps.clean_pixels(self.source[region.source], region.level).size:  # a mask may lie between nodes
             visible = np.zeros(self.camera.size, bool)
