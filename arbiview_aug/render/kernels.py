@@ -161,9 +161,9 @@ def _occlude_row(
     for i in range(n):
         pz[i] = q[i] / max(np.sqrt(px[i] * px[i] + py[i] * py[i] + pz[i] * pz[i]), _TINY)
     for i in range(n):
-        column[i] = np.rint(min(max(u[i] * scale + shift, _ZERO), np.float32(w - 1)))
+        column[i] = min(max(u[i] * scale + shift, _ZERO), np.float32(w - 1))
     for i in range(n):
-        row[i] = np.rint(min(max(v[i] * scale + shift, _ZERO), np.float32(h - 1)))
+        row[i] = min(max(v[i] * scale + shift, _ZERO), np.float32(h - 1))
     for i in range(n):
         if not seen[i]:
             continue
@@ -173,8 +173,14 @@ def _occlude_row(
             continue
         if h == 0:
             continue
-        r, c = int(row[i]), int(column[i])
+        r, c = int(np.rint(row[i])), int(np.rint(column[i]))
         hides = shadow[r, c]
+        if number < 0 and not guess and solid[r, c] < 0:  # what was measured hides smoothly, solids do not
+            r, c = int(row[i]), int(column[i])
+            s, t = row[i] - np.float32(r), column[i] - np.float32(c)
+            r1, c1 = min(r + 1, h - 1), min(c + 1, w - 1)
+            above = shadow[r, c] * (_ONE - t) + shadow[r, c1] * t
+            hides = above * (_ONE - s) + (shadow[r1, c] * (_ONE - t) + shadow[r1, c1] * t) * s
         if hides > _ZERO:
             if number >= 0:
                 seen[i] = hides <= pz[i] or solid[r, c] == number // 6
@@ -299,16 +305,7 @@ def put_second(
 ) -> None:  # fmt: skip
     """As ``put_source``, for the second-best source of pixels in cells that several have weight in.
 
-    Args:
-        planes: As in ``put_source``, as are those up to ``columns``.
-        target: See there.
-        q: See there.
-        face: See there.
-        source: See there.
-        slot: See there.
-        weight: See there.
-        step: See there.
-        columns: See there.
+    Args: as there up to ``columns``, and
         winner: (h, w) int8.
         weights: (2, h, w) float32 weight of the winner, and the largest of all others; updated.
         second: (h, w) int8 whose that is; updated.

@@ -27,7 +27,6 @@ from arbiview_aug.render.view_plan import ViewPlan
 from arbiview_aug.render.view_planner import ViewPlanner
 from arbiview_aug.scene.scene import Scene
 
-
 _LENSES: tuple[tuple[LensName, int], ...] = (("pinhole", 0), ("radtan", 4), ("fisheye", 4))  # and coefficients
 
 

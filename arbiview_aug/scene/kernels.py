@@ -120,15 +120,7 @@ def sum_silhouettes(
 ) -> None:
     """Add weights (h, w) of the pixels whose rays meet a box to its sum, whatever stands before it.
 
-    Args:
-        planes: As in ``draw_boxes``, as are the next five.
-        P: See there.
-        boxes: See there.
-        numbers: See there.
-        cones: See there.
-        step: See there.
-        weight: (h, w) float64.
-        sums: (all boxes,) float64, updated.
+    ``sums`` (all boxes,) float64 is updated; the other arguments are as in ``draw_boxes``.
     """
     h, w = weight.shape
     _, ny, nx = cones.shape
