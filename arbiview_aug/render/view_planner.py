@@ -290,8 +290,9 @@ class ViewPlanner:
         shadow, solid = nothing
         shadow_scale = 1.0
         if surface.is_layered or surface.is_dense:
-            # Half the size that is read is enough: silhouettes are widened by half of its pixels.
-            coarser = level + 1 if min(source.size) >> level >= 2 else level
+            # Points are smooth: half the size that is read is enough. Silhouettes of objects are not.
+            is_smooth = not surface.is_layered and min(source.size) >> level >= 2
+            coarser = level + 1 if is_smooth else level
             half = halved_camera(source, coarser)
             shadow, solid = surface.occlusion_map(half, self.maps.rays(half))
             shadow_scale = 0.5 ** (coarser - level)

@@ -1,7 +1,6 @@
 """How far sampling maps are from float64: every shipped rig into every other, over each surface, at several sizes.
 
-Maps are interpolated from a coarse grid wherever that is held to be exact to ``map_tolerance_px``, evaluated in float32
-over LiDAR, and rounded to 32nds of a pixel: 1/64 px for each of the two. Run with ``-s`` for the worst of each sweep.
+Every pixel is evaluated in float32, and rounded to 32nds of a pixel. Run with ``-s`` for the worst of each sweep.
 """
 
 from __future__ import annotations
