@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any, cast
 
 import cv2
@@ -118,9 +119,8 @@ class ViewPlanner:
         self._geometries: dict[str, _Geometry] = {}
         self._open = np.ones(tuple(len(n) - 1 for n in self.nodes), bool)  # cells that sources elsewhere may change
         exact = {k: self._region(k) for k in order if self._baseline_m(k) < SAME_CENTER_M}
-        for region in exact.values():
-            if region is not None:
-                self._open = self._open & self._around_unseen(region)
+        for one in filter(None, exact.values()):
+            self._open = self._open & self._around_unseen(one)
         found = exact | {k: self._region(k) for k in order if k not in exact}
         # In content order, so that ties never depend on the order of the source list.
         self.regions = [region for k in order if (region := found[k]) is not None]
@@ -145,14 +145,14 @@ class ViewPlanner:
 
         seen = region.score > 1  # no weight of a source elsewhere exceeds 1
         whole = seen[1:, 1:] & seen[1:, :-1] & seen[:-1, 1:] & seen[:-1, :-1]
-        if self.maps.clean_pixels(self.source[region.source], region.level).size:  # a mask may lie between nodes
-            visible = np.zeros(self.camera.size, bool)
-            seen_image(*self._target(region), region.kernel, visible)
-            most, least = np.empty(whole.shape, np.float32), np.empty(whole.shape, np.float32)
-            depth_range(visible.astype(np.float32), self.step, most, least)
-            whole &= least > 0
+        # Borders, masks and image circles may lie between nodes.
+        visible = np.zeros(self.camera.size, bool)
+        seen_image(*self._target(region), region.kernel, visible)
+        most, least = np.empty(whole.shape, np.float32), np.empty(whole.shape, np.float32)
+        depth_range(visible.astype(np.float32), self.step, most, least)
+        whole &= least > 0
         unseen = (~whole).astype(np.uint8)
-        side = 2 * (2 * self._seam_radius + 2) + 1
+        side = 2 * (2 * self._seam_radius + 1) + 1  # two passes of a box, and a node
         return cv2.dilate(unseen, np.ones((side, side), np.uint8)) > 0
 
     @property
@@ -458,16 +458,19 @@ class ViewPlanner:
             )  # fmt: skip
         rows = np.empty((len(self.source), -(-h // _STRIP_PX), shared.shape[1], 2), np.int64)
         band_rows(several, self.step, _STRIP_PX, both, second, _LEAST_SHARE, rows)
-        for source, strip in zip(*np.nonzero((rows[..., 1] > 0).any(-1)), strict=True):
+        # In content order: rectangles overlap, and blending rounds.
+        for source, strip in product([region.source for region in self.regions], range(rows.shape[1])):
             first, last = rows[source, strip].T
+            if not last.any():
+                continue
             columns = np.flatnonzero(last)
             for run in np.split(columns, np.flatnonzero(np.diff(columns) > 1) + 1):
                 y0, y1 = int(first[run].min()), int(last[run].max())
                 x0, x1 = int(run[0]) * self.step, min((int(run[-1]) + 1) * self.step, w)
                 at = FixedMap(np.empty((y1 - y0, x1 - x0, 2), np.int16), np.empty((y1 - y0, x1 - x0), np.uint16))
                 weight = np.empty((y1 - y0, x1 - x0), np.float32)
-                cut_band(y0, x0, int(source), several, self.step, both[1], second, xy, frac, at.packed, at.frac, weight)
-                yield BlendRegion(y0, x0, int(source), at, weight)
+                cut_band(y0, x0, source, several, self.step, both[1], second, xy, frac, at.packed, at.frac, weight)
+                yield BlendRegion(y0, x0, source, at, weight)
 
     def _reports(self, winner: npt.NDArray[np.int8], won_px: Counter[int]) -> Iterator[SourceUse]:
         """What each source that wins any pixel does, largest share first."""

@@ -63,6 +63,21 @@ def test_no_pixel_changes_where_one_source_serves_alone(
     assert same(plan, whole) and all(seen.all() for seen in plan.coverage)
 
 
+@pytest.mark.parametrize("name", ["nuscenes", "fisheye_surround"])
+@pytest.mark.parametrize("size", [(90, 160), (256, 704)])
+def test_no_pixel_changes_where_cells_are_closed(
+    name: str, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Borders and image circles that lie between nodes are seen."""
+    rig = load_rig(name).resized(size)
+    target = rig.turned(yaw_deg=3)
+    plan, every = build_plan(rig, target, config=FAST), built_without(rig, target, FAST, monkeypatch)
+    assert plan.counters["cells"] < every.counters["cells"]
+    for one, two in zip(plan.targets, every.targets, strict=True):
+        assert np.array_equal(one.source_camera, two.source_camera)
+        assert np.array_equal(one.at.xy, two.at.xy) and np.array_equal(one.at.frac, two.at.frac)
+
+
 @settings(max_examples=60)
 @given(
     yaw=st.floats(-12, 12),
