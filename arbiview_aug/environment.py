@@ -74,20 +74,26 @@ def compilation_announced() -> Iterator[None]:
     """Say once, on stderr, that functions are being compiled, where numba's cache does not hold them."""
     from numba.core import event
 
-    class Announcement(event.Listener):  # type: ignore[misc]
-        def on_start(self, event: Any) -> None:
-            _announce_compilation()
-
-        def on_end(self, event: Any) -> None:
-            pass
-
-    with event.install_listener("numba:compile", Announcement()):
+    with event.install_listener("numba:compile", _announcement()):
         yield
 
 
 @cache
-def _announce_compilation() -> None:
-    print("arbiview_aug: compiling kernels, once for each installation (half a minute)", file=sys.stderr)
+def _announcement() -> Any:
+    from numba.core import event
+
+    class Announcement(event.Listener):  # type: ignore[misc]
+        said = False
+
+        def on_start(self, event: Any) -> None:
+            if not self.said:
+                print("arbiview_aug: compiling kernels, once for each installation (half a minute)", file=sys.stderr)
+            self.said = True
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    return Announcement()
 
 
 @contextmanager

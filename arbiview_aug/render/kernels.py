@@ -245,7 +245,7 @@ def put_source(
         target: Its ``camera_parameters``.
         q: (h, w) inverse distances along its rays.
         face: (h, w) int32 faces of solids, -1 elsewhere; (0, 0) without any.
-        source: ``view_planner._Source`` as a tuple.
+        source: As ``view_planner.ViewPlanner._kernel`` makes it.
         slot: The source's index; column and row of its first pixel in the atlas.
         weight: (ny + 1, nx + 1) its weight on the nodes.
         step: Side of a cell, pixels.

@@ -237,8 +237,6 @@ class ViewPlanner:
         pixels_per_pixel = self._resolution(uv)
         edge_px = self.maps.edge_distance(source, uv)
         seen = valid & (edge_px > 0)
-        if not (seen.any() or use.any()):
-            return None
         level = self._level(pixels_per_pixel[seen], source.size) if self.config.antialias else 0
         kernel = self._kernel(source, level, surface, geometry, A, o)
         visible = np.zeros(seen.shape, bool)

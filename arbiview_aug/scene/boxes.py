@@ -16,13 +16,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import CELL_PX, PixelRays, pixel_rays
 from arbiview_aug.errors import SampleError
-from arbiview_aug.scene.surface import (
-    LayeredSurface,
-    OcclusionMap,
-    Points,
-    StaticSurface,
-    Surface,
-)
+from arbiview_aug.scene.surface import LayeredSurface, OcclusionMap, Points, StaticSurface, Surface
 
 _CHUNK = 1 << 15  # points tested at once, to stay in the CPU's cache
 
@@ -36,8 +30,6 @@ _BOX_ERROR = 0.08
 @dataclass(frozen=True, eq=False)
 class BoxSurface(LayeredSurface):
     """Boxes standing on the street.
-
-    Plans use ``drawn`` and ``occlusion_map``; ``inverse_distance`` and ``occludes`` are the reference for single rays.
 
     Attributes:
         street: The surface behind the boxes.
@@ -55,7 +47,7 @@ class BoxSurface(LayeredSurface):
 
     # --- images -------------------------------------------------------------------------------------------------------
     def occlusion_map(self, camera: Camera, rays: PixelRays) -> OcclusionMap:
-        """What boxes hide from a source, by ``occludes``; kept for the next target."""
+        """What boxes hide from a source; kept for the next target."""
         if camera not in self._shadows:
             pixel_rad = float(1 / camera.K[0, 0])
             q, face = draw_boxes(camera, self._enlarged(camera.center_m, pixel_rad), rays)

@@ -240,7 +240,7 @@ def upsample(nodes: Any, step: int, out: Any) -> None:
 
 @compiled
 def add_residuals(rows: Any, columns: Any, step: int, near: Any, far: Any, share: Any, q: Any) -> None:
-    """Add a panorama's residuals (``Panorama.residual``) to inverse distances (h, w).
+    """Add a panorama's residuals (``panorama.Panorama``) to inverse distances (h, w).
 
     Args:
         rows: (ny + 1, nx + 1) rows of the panorama at the nodes.

@@ -19,12 +19,7 @@ from arbiview_aug.errors import SampleError
 from arbiview_aug.scene.boxes import BoxSurface, box_rows
 from arbiview_aug.scene.panorama import CELL_RAD, SIDE_RAD, Layer, Panorama, PanoramaWindow, angles, panorama
 from arbiview_aug.scene.scanned_objects import BOX_AIR_M, RASTER_RAD, ScannedObject, scanned_objects
-from arbiview_aug.scene.surface import (
-    DenseSurface,
-    OcclusionMap,
-    Points,
-    StaticSurface,
-)
+from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Points, StaticSurface
 
 OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
 """(x, y) ranges in the ego frame whose returns are the own car's: a car's about the middle of its rear axle."""
@@ -181,7 +176,7 @@ class PointCloudWithBoxes(BoxSurface):
     """Labelled boxes among points made dense: a box decides within its silhouette, what was measured before it wins.
 
     An object of few points is its box; they are left out of the panoramas, where they would blur over its outline. One
-    of many is what they say (``measured``).
+    of many is what they say (``ScannedObject``).
 
     Attributes:
         street: The points' surface; ``among`` leaves out those within boxes.
