@@ -119,6 +119,13 @@ def pixel_rays(camera: Camera, planes: Planes | None = None) -> PixelRays:
     return PixelRays(camera.size, camera_parameters(camera), planes)
 
 
+def relative_pose(target: Camera, source: Camera) -> tuple[Planes, Planes]:
+    """Rotation (3, 3) from a target's frame to a source's, and the target's centre (3,) there; float32."""
+    to_source = source.cam2ego[:3, :3].T
+    A, o = to_source @ target.cam2ego[:3, :3], to_source @ (target.center_m - source.center_m)
+    return A.astype(np.float32), o.astype(np.float32)
+
+
 def source_pixels(
     target: Camera, rays: Planes, inverse_distance: Planes, source: Camera
 ) -> tuple[Planes, Planes, Planes]:
@@ -136,9 +143,7 @@ def source_pixels(
     """
     from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES, camera_parameters, project_image
 
-    to_source = source.cam2ego[:3, :3].T
-    A = (to_source @ target.cam2ego[:3, :3]).astype(np.float32)
-    o = (to_source @ (target.center_m - source.center_m)).astype(np.float32)
+    A, o = relative_pose(target, source)
     u, v, nearness = (np.empty(inverse_distance.shape, np.float32) for _ in range(3))
     kind = LENS_CODES.get(source.lens, 0)
     project_image(rays, inverse_distance, A, o, kind, camera_parameters(source), u, v, nearness)

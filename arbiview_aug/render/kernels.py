@@ -125,6 +125,7 @@ def cells_in_view(
 
 @compiled
 def _fixed(value: Any) -> Any:
+    """32nds of a pixel."""
     return np.int32(np.rint(min(max(value, -_MAP_LIMIT_PX), _MAP_LIMIT_PX) * np.float32(32)))
 
 
@@ -274,9 +275,9 @@ def put_source(
         for i in range(n):
             share[i] = share[i] if seen[i] else -_ONE - _ONE
         for i in range(n):
-            fu[i] = np.int32(np.rint(min(max(u[i], -_MAP_LIMIT_PX), _MAP_LIMIT_PX) * np.float32(32)))
+            fu[i] = _fixed(u[i])
         for i in range(n):
-            fv[i] = np.int32(np.rint(min(max(v[i], -_MAP_LIMIT_PX), _MAP_LIMIT_PX) * np.float32(32)))
+            fv[i] = _fixed(v[i])
         held, where, part, mine, image = (
             best[y, x0:x1],
             xy[y, x0:x1],

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.projection import look_apart
-from arbiview_aug.cameras.rays import CameraMaps, source_pixels
+from arbiview_aug.cameras.rays import CameraMaps, relative_pose, source_pixels
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.favs.stage4_fusion import distance_weight, primary_weight, quality_weight
@@ -218,9 +218,7 @@ class ViewPlanner:
         surface, geometry = cast(Any, self.surface_by_name(name)), self._geometry(name)
         if look_apart(self.camera, source, float(geometry.nearest.max())):
             return None
-        to_source = source.cam2ego[:3, :3].T
-        A = (to_source @ self.camera.cam2ego[:3, :3]).astype(np.float32)
-        o = (to_source @ offset_m).astype(np.float32)
+        A, o = relative_pose(self.camera, source)
         kind, P = LENS_CODES.get(source.lens, -1), camera_parameters(source)
         use = self._open.copy()
         if kind >= 0:

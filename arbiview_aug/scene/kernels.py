@@ -98,10 +98,9 @@ def draw_boxes(planes: Any, P: Any, boxes: Any, numbers: Any, cones: Any, step: 
     for k in range(boxes.shape[0]):
         b = boxes[k]
         for j in range(ny):
-            if not _cells_that_may_meet(b, cones[:, j], near_box):
+            x0, n = _columns_of_box(b, cones[:, j], near_box, step, w)
+            if n == 0:
                 continue
-            first, last = span(near_box)
-            x0, n = first * step, min(last * step, w) - first * step
             rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
             for y in range(j * step, min(j * step + step, h)):
                 rays_row(planes, P, y, x0, rx, ry, rz)
@@ -111,7 +110,7 @@ def draw_boxes(planes: Any, P: Any, boxes: Any, numbers: Any, cones: Any, step: 
                     # The first distance below 1 cm counts as 1 cm.
                     if leave[x] >= enter[x] and enter[x] > _ZERO and enter[x] * near[x] < _ONE:
                         near[x] = min(_ONE / enter[x], _MOST)
-                        number[x] = 6 * numbers[k] + _entered(b, rx[x], ry[x], rz[x], enter[x])
+                        number[x] = 6 * numbers[k] + _entered(b, rx[x], ry[x], rz[x])
 
 
 @compiled
@@ -128,10 +127,9 @@ def sum_silhouettes(
     for k in range(boxes.shape[0]):
         b = boxes[k]
         for j in range(ny):
-            if not _cells_that_may_meet(b, cones[:, j], near_box):
+            x0, n = _columns_of_box(b, cones[:, j], near_box, step, w)
+            if n == 0:
                 continue
-            first, last = span(near_box)
-            x0, n = first * step, min(last * step, w) - first * step
             rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
             for y in range(j * step, min(j * step + step, h)):
                 rays_row(planes, P, y, x0, rx, ry, rz)
@@ -142,14 +140,14 @@ def sum_silhouettes(
 
 
 @compiled
-def _cells_that_may_meet(b: Any, cones: Any, near: Any) -> bool:
-    """Which cells (n,) of a row hold rays that may meet a box; whether any does.
+def _columns_of_box(b: Any, cones: Any, near: Any, step: int, w: int) -> tuple[int, int]:
+    """First column and number of columns of the cells in a row that hold rays which may meet a box; 0 for none.
 
-    First by the cone around the box, then by whether the middle's ray meets a box that is larger by what the cell's
-    rays spread up to the farthest corner.
+    Cells (n,) are sorted out by the cone around the box, then by whether the middle's ray meets a box that is larger by
+    what the cell's rays spread up to the farthest corner.
     """
     cx, cy, cz, least = b[16], b[17], b[18], b[19]
-    some = 0
+    first, last = near.shape[0], 0
     for i in range(near.shape[0]):
         near[i] = cones[0, i] * cx + cones[1, i] * cy + cones[2, i] * cz >= least - cones[3, i]
     for i in range(near.shape[0]):
@@ -162,20 +160,9 @@ def _cells_that_may_meet(b: Any, cones: Any, near: Any) -> bool:
             g = g if abs(g) > _FLAT else _FLAT
             middle, reach = -b[9 + axis] / g, (b[12 + axis] + air) / abs(g)
             low, high = max(low, middle - reach), min(high, middle + reach)
-        near[i] = (low <= high) & (high > _ZERO)
-        some += near[i]
-    return some > 0
-
-
-@compiled
-def span(flags: Any) -> tuple[int, int]:
-    """First and last (exclusive) true entry; there is one."""
-    first, last = 0, flags.shape[0]
-    while not flags[first]:
-        first += 1
-    while not flags[last - 1]:
-        last -= 1
-    return first, last
+        if low <= high and high > _ZERO:
+            first, last = min(first, i), i + 1
+    return first * step, max(min(last * step, w) - first * step, 0)
 
 
 @compiled
@@ -202,7 +189,7 @@ def slabs_row(b: Any, rx: Any, ry: Any, rz: Any, enter: Any, leave: Any) -> None
 
 
 @compiled
-def _entered(b: Any, rx: float, ry: float, rz: float, enter: float) -> int:
+def _entered(b: Any, rx: float, ry: float, rz: float) -> int:
     """The face by which a ray enters a box: the axis whose slab it enters last."""
     number, last = 0, np.float32(-1e30)
     for axis in range(3):
@@ -298,10 +285,9 @@ def draw_scanned(
     rows, columns = nearest.shape
     work, near_box = np.empty((5, w), np.float32), np.empty(nx, np.bool_)
     for j in range(ny):
-        if not _cells_that_may_meet(boxes[0], cones[:, j], near_box):
+        x0, n = _columns_of_box(boxes[0], cones[:, j], near_box, step, w)
+        if n == 0:
             continue
-        first, last = span(near_box)
-        x0, n = first * step, min(last * step, w) - first * step
         rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
         for y in range(j * step, min(j * step + step, h)):
             rays_row(planes, P, y, x0, rx, ry, rz)
