@@ -24,7 +24,7 @@ LENS_CODES = {"pinhole": 0, "radtan": 1, "fisheye": 2}
 """Lenses that kernels know. Others are projected by their class, image by image."""
 
 _FOLD, _FIRST = 5, 6  # entries of ``camera_parameters``
-_ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
+_ZERO, _ONE, _TWO, _THREE = np.float32(0), np.float32(1), np.float32(2), np.float32(3)
 _HALF = np.float32(0.5)
 _WIDEST = np.float32(2)  # distance of opposite unit vectors
 _CONE_ROOM = np.float32(1.05)
@@ -54,9 +54,9 @@ def camera_parameters(camera: Camera, scale: float = 1.0) -> npt.NDArray[np.floa
 def pinhole_rays_row(P: Row, v: float, first: int, rx: Row, ry: Row, rz: Row) -> None:
     """Unit rays of the pixels of row ``v`` from column ``first`` on, camera frame."""
     y = (np.float32(v) - P[4]) / P[3]
-    fx, skew, cx = P[0], P[1], P[2]
+    per_fx, cx = _ONE / P[0], P[2] + P[1] * y
     for i in range(rx.shape[0]):
-        rx[i] = (np.float32(first + i) - cx - skew * y) / fx
+        rx[i] = (np.float32(first + i) - cx) * per_fx
     for i in range(rx.shape[0]):
         rz[i] = _ONE / np.sqrt(rx[i] * rx[i] + y * y + _ONE)
     for i in range(rx.shape[0]):
@@ -133,33 +133,33 @@ def project_row(x: Row, y: Row, z: Row, kind: int, P: Row, a: Row, b: Row, u: Ro
         for i in range(n):
             v[i] = fy * y[i] * a[i] + cy if a[i] > -_ONE else FAR_AWAY_PX
         return
-    for i in range(n):
-        b[i] = z[i] - _LEAST * np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
+    for i in range(n):  # the inverse depth, 0 where there is no pixel
+        in_front = z[i] * z[i] > _LEAST * _LEAST * (x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
+        a[i] = _ONE / z[i] if (z[i] > _ZERO) & in_front else _ZERO
     if kind == 0:
         for i in range(n):
-            u[i] = (fx * x[i] + skew * y[i]) / z[i] + cx if b[i] > _ZERO else FAR_AWAY_PX
+            u[i] = (fx * x[i] + skew * y[i]) * a[i] + cx if a[i] > _ZERO else FAR_AWAY_PX
         for i in range(n):
-            v[i] = fy * y[i] / z[i] + cy if b[i] > _ZERO else FAR_AWAY_PX
+            v[i] = fy * y[i] * a[i] + cy if a[i] > _ZERO else FAR_AWAY_PX
         return
     k1, k2, p1, p2 = P[6], P[7], P[8], P[9]
     k3, k4, k5, k6 = P[10], P[11], P[12], P[13]
     fold2 = P[5] * P[5]
-    for i in range(n):
-        a[i] = (x[i] * x[i] + y[i] * y[i]) / (z[i] * z[i])
     for i in range(n):  # past the fold the polynomial is not the lens
-        b[i] = b[i] if a[i] <= fold2 else -_ONE
+        r2 = (x[i] * x[i] + y[i] * y[i]) * a[i] * a[i]
+        a[i] = a[i] if r2 <= fold2 else _ZERO
     for i in range(n):
-        xn, yn, r2 = x[i] / z[i], y[i] / z[i], a[i]
-        radial = (_ONE + r2 * (k1 + r2 * (k2 + r2 * k3))) / (_ONE + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        xd = xn * radial + _TWO * p1 * xn * yn + p2 * (r2 + _TWO * xn * xn)
-        yd = yn * radial + p1 * (r2 + _TWO * yn * yn) + _TWO * p2 * xn * yn
-        u[i] = fx * xd + skew * yd + cx if b[i] > _ZERO else FAR_AWAY_PX
+        r2 = (x[i] * x[i] + y[i] * y[i]) * a[i] * a[i]
+        b[i] = (_ONE + r2 * (k1 + r2 * (k2 + r2 * k3))) / (_ONE + r2 * (k4 + r2 * (k5 + r2 * k6)))
     for i in range(n):
-        xn, yn, r2 = x[i] / z[i], y[i] / z[i], a[i]
-        radial = (_ONE + r2 * (k1 + r2 * (k2 + r2 * k3))) / (_ONE + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        v[i] = (
-            fy * (yn * radial + p1 * (r2 + _TWO * yn * yn) + _TWO * p2 * xn * yn) + cy if b[i] > _ZERO else FAR_AWAY_PX
-        )
+        xn, yn = x[i] * a[i], y[i] * a[i]
+        xd = xn * b[i] + _TWO * p1 * xn * yn + p2 * (_THREE * xn * xn + yn * yn)
+        yd = yn * b[i] + p1 * (xn * xn + _THREE * yn * yn) + _TWO * p2 * xn * yn
+        u[i] = fx * xd + skew * yd + cx if a[i] > _ZERO else FAR_AWAY_PX
+    for i in range(n):
+        xn, yn = x[i] * a[i], y[i] * a[i]
+        yd = yn * b[i] + p1 * (xn * xn + _THREE * yn * yn) + _TWO * p2 * xn * yn
+        v[i] = fy * yd + cy if a[i] > _ZERO else FAR_AWAY_PX
 
 
 @compiled
@@ -207,3 +207,25 @@ def project_image(rays: Row, q: Row, A: Row, o: Row, kind: int, P: Row, u: Row, 
         project_row(x, y, z, kind, P, a, b, u[j], v[j])
         for i in range(w):
             nearness[j, i] = q[j, i] / max(np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i]), _TINY)
+
+
+@compiled
+def edge_distance_row(u: Row, v: Row, size: Any, to_mask: Any, cell_px: int, edge_px: Row) -> None:
+    """Distances (n,) of pixels to the border of what a source sees, as ``rays.edge_distance``.
+
+    Args:
+        u: (n,) columns.
+        v: (n,) rows.
+        size: (h, w) of the source.
+        to_mask: (H, W) distance of each cell to the mask, pixels; (0, 0) without one.
+        cell_px: Side of those cells.
+        edge_px: (n,) written.
+    """
+    h, w = size
+    rows, columns = to_mask.shape
+    for i in range(u.shape[0]):
+        edge = min(min(u[i], w - 1 - u[i]), min(v[i], h - 1 - v[i])) + 0.5
+        if rows and edge >= 0:
+            row, column = min(int(v[i] / cell_px), rows - 1), min(int(u[i] / cell_px), columns - 1)
+            edge = min(edge, to_mask[max(row, 0), max(column, 0)])
+        edge_px[i] = edge

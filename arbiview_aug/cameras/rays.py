@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +20,7 @@ from arbiview_aug.lru_cache import LRUCache
 Planes = npt.NDArray[np.float32]
 
 _NO_PLANES = np.zeros((3, 0, 0), np.float32)
-_NO_MASK = np.zeros((0, 0), np.uint8)
+_NO_MASK, _NO_DISTANCE = np.zeros((0, 0), np.uint8), np.zeros((0, 0), np.float32)
 _ROWS = 64  # unprojected at once: they stay in the cache
 CELL_PX = 8
 """Side of the cells in which cones of rays and distances to a mask are known."""
@@ -48,8 +49,24 @@ class PixelRays:
         cell_cones(self.planes, self.parameters, self.size, CELL_PX, cones)
         return cones
 
+    @cached_property
+    def cone(self) -> FloatArray:
+        """(4,) middle of a cone around all rays, camera frame, and its half angle, radians."""
+        rays, spread = self.cones[:3].reshape(3, -1).astype(np.float64), self.cones[3].ravel()
+        middle = rays.sum(axis=1)
+        middle /= max(float(np.linalg.norm(middle)), 1e-9)
+        off_axis = np.arccos(np.clip(middle @ rays, -1, 1)) + 2 * np.arcsin(np.minimum(spread / 2, 1))
+        return np.array([*middle, off_axis.max()])
+
+    @property
+    def nbytes(self) -> int:
+        """Memory in bytes, with the cones."""
+        return self.planes.nbytes + 16 * math.prod(-(-n // CELL_PX) for n in self.size)
+
     def crop(self, top: int, left: int, size: tuple[int, int]) -> PixelRays:
         """The rays of a window of (h, w) pixels."""
+        if size == self.size:
+            return self
         parameters = self.parameters.copy()
         parameters[[2, 4]] -= left, top
         planes = self.planes
@@ -78,17 +95,15 @@ class CameraMaps:
     """
 
     def __init__(self, max_bytes: int = 256 * 2**20) -> None:
-        self._cache: LRUCache[Any, Any] = LRUCache(max_bytes, lambda array: array.nbytes)
+        self._cache: LRUCache[Any, Any] = LRUCache(max_bytes, lambda item: item.nbytes)
 
     def __reduce__(self) -> tuple[type[CameraMaps], tuple[int]]:
         return CameraMaps, (self._cache.limit,)
 
     def rays(self, camera: Camera) -> PixelRays:
-        """The rays of a camera; those of a lens are held."""
-        if camera.is_rectilinear:
-            return pixel_rays(camera)
+        """The rays of a camera."""
         key = camera.size, camera.lens, camera.distortion, camera.K.tobytes()
-        return pixel_rays(camera, self._cache.get(key, lambda: _unprojected(camera)))
+        return self._cache.get(key, lambda: pixel_rays(camera))
 
     def clean_pixels(self, camera: Camera, level: int) -> npt.NDArray[np.uint8]:
         """255 (h, w) where a source halved ``level`` times shows no part of the own car; (0, 0) without a mask."""
@@ -97,25 +112,24 @@ class CameraMaps:
             clean: Any = mask.view(np.uint8) * np.uint8(255)
             return cv2.inRange(halved(clean, level), 255, 255) if level else clean  # type: ignore[call-overload]
 
-        return self._of_mask(camera, level, make)
+        return self._of_mask(camera, level, make, _NO_MASK)
 
-    def edge_distance(self, camera: Camera, uv: FloatArray) -> FloatArray:
-        """As the function, with the mask's distances held."""
-        return edge_distance(camera, uv, self._of_mask(camera, "distance", _distance_to_mask))
+    def to_mask(self, camera: Camera) -> Planes:
+        """Distance (px) of each cell of ``CELL_PX`` to a source's mask; (0, 0) without one."""
+        return self._of_mask(camera, "distance", _distance_to_mask, _NO_DISTANCE)
 
-    def _of_mask(self, camera: Camera, name: Any, make: Callable[[Any], Any]) -> Any:
+    def _of_mask(self, camera: Camera, name: Any, make: Callable[[Any], Any], none: Any) -> Any:
         if camera.mask is None:
-            return _NO_MASK
+            return none
         mask = camera.mask
-        return self._cache.get((camera.mask_key, name), lambda: _NO_MASK if mask.all() else make(mask))
+        return self._cache.get((camera.mask_key, name), lambda: none if mask.all() else make(mask))
 
 
-def pixel_rays(camera: Camera, planes: Planes | None = None) -> PixelRays:
-    """The rays of a camera's pixels; ``planes`` (3, h, w) if they are known."""
+def pixel_rays(camera: Camera) -> PixelRays:
+    """The rays of a camera's pixels."""
     from arbiview_aug.cameras.kernels import camera_parameters
 
-    if planes is None:
-        planes = _NO_PLANES if camera.is_rectilinear else _unprojected(camera)
+    planes = _NO_PLANES if camera.is_rectilinear else _unprojected(camera)
     return PixelRays(camera.size, camera_parameters(camera), planes)
 
 
@@ -154,20 +168,19 @@ def source_pixels(
     return u, v, nearness
 
 
-def edge_distance(camera: Camera, uv: FloatArray, to_mask: Any = None) -> FloatArray:
+def edge_distance(camera: Camera, uv: FloatArray) -> FloatArray:
     """Distance (px) of pixels (..., 2) to the border of what a source sees.
 
-    The outermost pixel centres are 0.5 inside it; outside the image it is negative. ``to_mask`` holds the distances of
-    cells to the mask, if they are known.
+    The outermost pixel centres are 0.5 inside it; outside the image it is negative.
     """
-    u, v = uv[..., 0], uv[..., 1]
-    edge = np.minimum(np.minimum(u, camera.width_px - 1 - u), np.minimum(v, camera.height_px - 1 - v)) + 0.5
-    if camera.mask is None or camera.mask.all():
-        return edge
-    distance = _distance_to_mask(camera.mask) if to_mask is None else to_mask
-    last = distance.shape[1] - 1, distance.shape[0] - 1
-    x, y = np.moveaxis(np.clip(uv / CELL_PX, 0, last).astype(np.int64), -1, 0)
-    return np.where(edge >= 0, np.minimum(edge, distance[y, x]), edge)
+    from arbiview_aug.cameras.kernels import edge_distance_row
+
+    u, v = (np.ascontiguousarray(uv[..., k], np.float32).ravel() for k in range(2))
+    is_masked = camera.mask is not None and not camera.mask.all()
+    to_mask = _distance_to_mask(camera.mask) if is_masked else _NO_DISTANCE
+    distance = np.empty(u.shape)
+    edge_distance_row(u, v, camera.size, to_mask, CELL_PX, distance)
+    return distance.reshape(uv.shape[:-1])
 
 
 def _unprojected(camera: Camera) -> Planes:
@@ -188,4 +201,6 @@ def _distance_to_mask(mask: Any) -> Any:
     coarse = cv2.resize(clean, (-(-w // CELL_PX), -(-h // CELL_PX)), interpolation=cv2.INTER_AREA)
     free = np.pad((coarse >= 1).astype(np.uint8), 1, constant_values=1)
     distance = cv2.distanceTransform(free, cv2.DIST_L2, 3)[1:-1, 1:-1]
-    return np.minimum(distance, 1e6) * CELL_PX  # it is the largest float where nothing is masked
+    return np.minimum(distance, np.float32(1e6)) * np.float32(
+        CELL_PX
+    )  # it is the largest float where nothing is masked

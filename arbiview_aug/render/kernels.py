@@ -9,19 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.cameras.kernels import project_row, rays_row, turn_row
+from arbiview_aug.cameras.kernels import edge_distance_row, project_row, rays_row, turn_row
 from arbiview_aug.environment import compiled
 from arbiview_aug.render.atlas import OUTSIDE
 from arbiview_aug.scene.kernels import upsampled_row
 
 _ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
-_TINY = np.float32(1e-30)
+_TINY, _MOST = np.float32(1e-30), np.float32(1e30)
 _LEAST_INCIDENCE = np.float32(0.05)
 """Sine of the flattest angle at which a source may look along a face: that of the road 30 m from a car's cameras."""
 
 _BORDER_PX = np.float32(1.0)  # maps bulge between the corners of a cell
 _OUTSIDE = np.int32((OUTSIDE << 16) | (OUTSIDE & 0xFFFF))  # both coordinates of a packed position
-_WORK_ROWS = 10  # of scratch memory in ``_evaluate_row``
+_WORK_ROWS = 11  # of scratch memory in ``_evaluate_row``
 _MAP_LIMIT_PX = np.float32(32000)
 
 
@@ -64,63 +64,98 @@ def cells_in_view(
         use: (ny, nx) bool, written.
     """
     ny, nx = use.shape
-    h, w = size[0], size[1]
-    x, y, z, u, v, a, b = (
-        np.empty(8, np.float32),
-        np.empty(8, np.float32),
-        np.empty(8, np.float32),
-        np.empty(8, np.float32),
-        np.empty(8, np.float32),
-        np.empty(8, np.float32),
-        np.empty(8, np.float32),
-    )
-    rx, ry, rz, q = (np.empty(8, np.float32), np.empty(8, np.float32), np.empty(8, np.float32), np.empty(8, np.float32))
+    right, bottom = size[1] - _ONE + _BORDER_PX, size[0] - _ONE + _BORDER_PX
+    work, common = np.empty((12, nx), np.float32), np.empty(nx, np.int32)
+    x, y, z, u, v, a, b = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
+    first_x, first_y, first_z, forward, together = work[7], work[8], work[9], work[10], work[11]
     for j in range(ny):
-        for i in range(nx):
-            for c in range(8):
-                jj, ii = j + (c >> 1 & 1), i + (c & 1)
-                rx[c], ry[c], rz[c] = rays[0, jj, ii], rays[1, jj, ii], rays[2, jj, ii]
-                q[c] = nearest[j, i] if c < 4 else farthest[j, i]
-            turn_row(rx, ry, rz, q, A, o, x, y, z)
-            common = 31
+        common[:] = 31
+        forward[:] = -_ONE
+        together[:] = _ONE
+        for c in range(8):
+            jj, ii = j + (c >> 1 & 1), c & 1
+            q = nearest[j] if c < 4 else farthest[j]
+            corner = slice(ii, ii + nx)
+            turn_row(rays[0, jj, corner], rays[1, jj, corner], rays[2, jj, corner], q, A, o, x, y, z)
             if kind == 0:
-                for c in range(8):
-                    px, py = P[0] * x[c] + P[1] * y[c] + P[2] * z[c], P[3] * y[c] + P[4] * z[c]
-                    code = 0
-                    if px < -_BORDER_PX * z[c]:
-                        code |= 1
-                    if px > (w - _ONE + _BORDER_PX) * z[c]:
-                        code |= 2
-                    if py < -_BORDER_PX * z[c]:
-                        code |= 4
-                    if py > (h - _ONE + _BORDER_PX) * z[c]:
-                        code |= 8
-                    if z[c] < _ZERO:
-                        code |= 16
-                    common &= code
-                use[j, i] = common == 0
+                for i in range(nx):
+                    px, py = P[0] * x[i] + P[1] * y[i] + P[2] * z[i], P[3] * y[i] + P[4] * z[i]
+                    code = np.int32(1) if px < -_BORDER_PX * z[i] else np.int32(0)
+                    code |= np.int32(2) if px > right * z[i] else np.int32(0)
+                    code |= np.int32(4) if py < -_BORDER_PX * z[i] else np.int32(0)
+                    code |= np.int32(8) if py > bottom * z[i] else np.int32(0)
+                    code |= np.int32(16) if z[i] < _ZERO else np.int32(0)
+                    common[i] &= code
                 continue
             project_row(x, y, z, kind, P, a, b, u, v)
-            least, widest = 9.0, 0.0
-            for c in range(8):
-                length = np.sqrt(x[c] * x[c] + y[c] * y[c] + z[c] * z[c])
-                off_axis = np.arccos(min(max(z[c] / max(length, _TINY), -_ONE), _ONE))
-                first = np.sqrt(x[0] * x[0] + y[0] * y[0] + z[0] * z[0])
-                along = (x[0] * x[c] + y[0] * y[c] + z[0] * z[c]) / max(length * first, _TINY)
-                least = min(least, off_axis)
-                widest = max(widest, np.arccos(min(max(along, -_ONE), _ONE)))
-                code = 0
-                if abs(u[c]) < np.float32(9e4):
-                    if u[c] < -_BORDER_PX:
-                        code |= 1
-                    if u[c] > w - _ONE + _BORDER_PX:
-                        code |= 2
-                    if v[c] < -_BORDER_PX:
-                        code |= 4
-                    if v[c] > h - _ONE + _BORDER_PX:
-                        code |= 8
-                common &= code
-            use[j, i] = common == 0 and least <= cone_rad + widest
+            for i in range(nx):
+                code = np.int32(1) if u[i] < -_BORDER_PX else np.int32(0)
+                code |= np.int32(2) if u[i] > right else np.int32(0)
+                code |= np.int32(4) if v[i] < -_BORDER_PX else np.int32(0)
+                code |= np.int32(8) if v[i] > bottom else np.int32(0)
+                common[i] &= code if abs(u[i]) < np.float32(9e4) else np.int32(0)
+            for i in range(nx):
+                a[i] = max(np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i]), _TINY)
+            for i in range(nx):
+                forward[i] = max(forward[i], z[i] / a[i])
+            if c == 0:
+                first_x[:], first_y[:], first_z[:] = x / a, y / a, z / a
+            for i in range(nx):
+                together[i] = min(together[i], (first_x[i] * x[i] + first_y[i] * y[i] + first_z[i] * z[i]) / a[i])
+        for i in range(nx):
+            use[j, i] = common[i] == 0
+            if kind != 0 and use[j, i]:
+                use[j, i] = np.arccos(min(forward[i], _ONE)) <= cone_rad + np.arccos(max(together[i], -_ONE))
+
+
+@compiled
+def measure_nodes(
+    u: Any, v: Any, y: Any, x: Any, size: Any, to_mask: Any, cell_px: int, directions: Any, offset_m: Any,
+    uncertainty: Any, resolution: Any, edge_px: Any, parallax_rad: Any,
+) -> None:  # fmt: skip
+    """What weights depend on, at the nodes of a target.
+
+    Args:
+        u: (ny, nx) float32 columns in the source.
+        v: (ny, nx) its rows.
+        y: (ny,) the nodes' rows in the target.
+        x: (nx,) their columns.
+        size: (h, w) of the source.
+        to_mask: (H, W) distance of each cell of the source to its mask, pixels; (0, 0) without one.
+        cell_px: Side of those cells.
+        directions: (3, ny, nx) the nodes' rays, ego frame.
+        offset_m: (3,) the target's centre minus the source's.
+        uncertainty: (ny, nx) expected error of the inverse distance, 1/m.
+        resolution: (ny, nx) float64, written: source pixels per target pixel along the worse axis, which is the smaller
+            singular value of the Jacobian.
+        edge_px: (ny, nx) float64, written: ``rays.edge_distance``.
+        parallax_rad: (ny, nx) float64, written: displacement that unknown depth may cause, offset across the ray times
+            uncertainty.
+    """
+    ny, nx = u.shape
+    # The last nodes may coincide: their difference says nothing.
+    last_y = max(ny - 2 - (ny > 2 and y[ny - 1] == y[ny - 2]), 0)
+    last_x = max(nx - 2 - (nx > 2 and x[nx - 1] == x[nx - 2]), 0)
+    length2 = offset_m[0] ** 2 + offset_m[1] ** 2 + offset_m[2] ** 2
+    for j in range(ny):
+        jj = min(j, last_y)
+        per_y = 1.0 / max(y[jj + 1] - y[jj], 1)
+        for i in range(nx):
+            ii = min(i, last_x)
+            per_x = 1.0 / max(x[ii + 1] - x[ii], 1)
+            a, c = (u[j, ii + 1] - u[j, ii]) * per_x, (v[j, ii + 1] - v[j, ii]) * per_x
+            b, d = (u[jj + 1, i] - u[jj, i]) * per_y, (v[jj + 1, i] - v[jj, i]) * per_y
+            half_sum, determinant = (a * a + b * b + c * c + d * d) / 2, a * d - b * c
+            root = np.sqrt(max(half_sum * half_sum - determinant * determinant, 0.0))
+            resolution[j, i] = np.sqrt(max(half_sum - root, 0.0))
+        edge_distance_row(u[j], v[j], size, to_mask, cell_px, edge_px[j])
+        for i in range(nx):
+            along = (
+                directions[0, j, i] * offset_m[0]
+                + directions[1, j, i] * offset_m[1]
+                + directions[2, j, i] * offset_m[2]
+            )
+            parallax_rad[j, i] = np.sqrt(max(length2 - along * along, 0.0)) * uncertainty[j, i]
 
 
 @compiled
@@ -131,23 +166,23 @@ def _fixed(value: Any) -> Any:
 
 @compiled
 def _occlude_row(
-    q: Any, face: Any, y: int, x0: int, px: Any, py: Any, pz: Any, u: Any, v: Any, column: Any, row: Any, scale: float,
-    before_m: Any, shadow: Any, solid: Any, guess: bool, seen: Any,
+    q: Any, face: Any, px: Any, py: Any, pz: Any, u: Any, v: Any, column: Any, row: Any, hides: Any, place: Any,
+    scale: float, before_m: Any, shadow: Any, solid: Any, guess: bool, seen: Any,
 ) -> None:  # fmt: skip
     """Clear ``seen`` (n,) where something hides a point from a source, or its face is turned away from it.
 
     Args:
         q: (n,) inverse distances along the target's rays.
-        face: (h, w) of solids, -1 for the background; (0, 0) without any.
-        y: The row.
-        x0: Its first pixel.
-        px: (n,) points in the source's frame, times q; as are ``py`` and ``pz``.
+        face: (n,) of solids, -1 for the background; (0,) without any.
+        px: (n,) points in the source's frame, times q; as are ``py`` and ``pz``, which is overwritten.
         py: See there.
         pz: See there.
         u: (n,) positions in the source as it is read; as is ``v``.
         v: See there.
-        column: (n,) float32 scratch; as is ``row``.
+        column: (n,) float32 scratch; as are ``row``, ``hides`` and ``place``, which is int32.
         row: See there.
+        hides: See there.
+        place: See there.
         scale: Size of the shadow image by that of the source as it is read.
         before_m: (F,) by how many metres the source lies before each face's plane.
         shadow: (h, w) what has a smaller inverse distance is hidden, 0 for nothing.
@@ -158,35 +193,43 @@ def _occlude_row(
     n = q.shape[0]
     h, w = shadow.shape
     shift = (scale - _ONE) * _HALF
-    # The distance from the source, inverted.
+    # The distance from the source, inverted: what must not be exceeded by what hides.
     for i in range(n):
         pz[i] = q[i] / max(np.sqrt(px[i] * px[i] + py[i] * py[i] + pz[i] * pz[i]), _TINY)
+    if h == 0:
+        hides[:] = _ZERO
+    else:
+        for i in range(n):
+            column[i] = min(max(u[i] * scale + shift, _ZERO), np.float32(w - 1))
+        for i in range(n):
+            row[i] = min(max(v[i] * scale + shift, _ZERO), np.float32(h - 1))
+        for i in range(n):
+            place[i] = np.int32(np.rint(row[i])) * np.int32(w) + np.int32(np.rint(column[i]))
+        beyond = shadow.reshape(h * w)
+        for i in range(n):
+            hides[i] = beyond[place[i]]
+    number_at = solid.reshape(h * w)
+    if face.shape[0] == 0 and guess:
+        pz[:] = _ZERO
+    elif face.shape[0]:
+        for i in range(n):
+            number = face[i]
+            if number < 0:
+                pz[i] = _ZERO if guess else pz[i]
+            elif before_m[number] <= _ZERO or before_m[number] * pz[i] < _LEAST_INCIDENCE:
+                pz[i] = -_ONE
+            elif h and number_at[place[i]] == number // 6:
+                pz[i] = _MOST
+    if h and not guess:  # what was measured hides smoothly, solids do not
+        for i in range(n):
+            if number_at[place[i]] < 0 and (face.shape[0] == 0 or face[i] < 0):
+                r, c = int(row[i]), int(column[i])
+                s, t = row[i] - np.float32(r), column[i] - np.float32(c)
+                r1, c1 = min(r + 1, h - 1), min(c + 1, w - 1)
+                above = shadow[r, c] * (_ONE - t) + shadow[r, c1] * t
+                hides[i] = above * (_ONE - s) + (shadow[r1, c] * (_ONE - t) + shadow[r1, c1] * t) * s
     for i in range(n):
-        column[i] = min(max(u[i] * scale + shift, _ZERO), np.float32(w - 1))
-    for i in range(n):
-        row[i] = min(max(v[i] * scale + shift, _ZERO), np.float32(h - 1))
-    for i in range(n):
-        if not seen[i]:
-            continue
-        number = face[y, x0 + i] if face.shape[0] else -1
-        if number >= 0 and (before_m[number] <= _ZERO or before_m[number] * pz[i] < _LEAST_INCIDENCE):
-            seen[i] = 0
-            continue
-        if h == 0:
-            continue
-        r, c = int(np.rint(row[i])), int(np.rint(column[i]))
-        hides = shadow[r, c]
-        if number < 0 and not guess and solid[r, c] < 0:  # what was measured hides smoothly, solids do not
-            r, c = int(row[i]), int(column[i])
-            s, t = row[i] - np.float32(r), column[i] - np.float32(c)
-            r1, c1 = min(r + 1, h - 1), min(c + 1, w - 1)
-            above = shadow[r, c] * (_ONE - t) + shadow[r, c1] * t
-            hides = above * (_ONE - s) + (shadow[r1, c] * (_ONE - t) + shadow[r1, c1] * t) * s
-        if hides > _ZERO:
-            if number >= 0:
-                seen[i] = hides <= pz[i] or solid[r, c] == number // 6
-            else:
-                seen[i] = not guess and hides <= pz[i]
+        seen[i] = seen[i] & (hides[i] <= pz[i])
 
 
 @compiled
@@ -213,9 +256,11 @@ def _evaluate_row(
     for i in range(n):
         seen[i] = inside[i]
     if shadow.shape[0] or face.shape[0]:
+        faces = face[y, x0 : x0 + n] if face.shape[0] else face[:, 0]
         _occlude_row(
-            q[y, x0 : x0 + n], face, y, x0, px, py, pz, u, v, rx, ry, bounds[6], before_m, shadow, solid, guess, seen
-        )
+            q[y, x0 : x0 + n], faces, px, py, pz, u, v, rx, ry, rz, work[10].view(np.int32), bounds[6], before_m,
+            shadow, solid, guess, seen,
+        )  # fmt: skip
     # The outer half pixel of a full image lies outside the halved one: its border pixel is read.
     right, bottom = bounds[4], bounds[5]
     if right >= _ZERO:

@@ -1,4 +1,4 @@
-"""How one target view is rendered: which sources see it, over which surface, who wins each pixel, blended seams."""
+"""How one target view is rendered: which sources see it, over which surface, and who wins each pixel."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from typing import Any, cast
 
 import cv2
@@ -17,7 +16,7 @@ import numpy.typing as npt
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.projection import look_apart
-from arbiview_aug.cameras.rays import CameraMaps, relative_pose, source_pixels
+from arbiview_aug.cameras.rays import CELL_PX, CameraMaps, relative_pose, source_pixels
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.favs.stage4_fusion import distance_weight, primary_weight, quality_weight
@@ -25,22 +24,20 @@ from arbiview_aug.image_ops import Scratch, at_level, level_size
 from arbiview_aug.render.atlas import AtlasLayout, FixedMap
 from arbiview_aug.render.confidence import certainty
 from arbiview_aug.render.requirements import SAME_CENTER_M
-from arbiview_aug.render.view_plan import BilinearFallback, BlendRegion, SourceUse, ViewPlan
+from arbiview_aug.render.seams import blend_regions, seam_weights
+from arbiview_aug.render.view_plan import BilinearFallback, SourceUse, ViewPlan
 from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
 from arbiview_aug.scene.surface import Surface
 
 _SMALL_SIDE_PX = 64  # weights of targets with a shorter side are evaluated at every pixel
 _SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
-_STRIP_PX = 128  # slanted seams make narrow rectangles
 MAGNIFIED = 0.8
 """A view is read by cubics where it has this few source pixels per pixel, or fewer, and most of it is read at its own
 centre: it is sharper for it, and a cubic costs 2.6 to 4.7 times as much. On synthetic streets, dB over bilinear by
 source pixels per pixel: 0.57 +0.6, 0.73 +0.7 (there a detector recovers 91 instead of 77 % of the gap), 0.94 +0.5, 1.06
 +0.1, 1.3 -0.2. Real frames turned by up to 35 degrees, 0.8 to 1, gain nothing: -0.04 dB on DDAD. Nor do other centres,
 where the surface is what errs: 0.7 m higher -0.1 dB, and the detector 75 instead of 77 %."""
-
-_LEAST_SHARE = 1 / 256  # a source that adds less than this to a pixel cannot change a grey level
 
 
 @dataclass(frozen=True)
@@ -84,7 +81,7 @@ class _Region:
 
 
 class ViewPlanner:
-    """Builds one target's plan in two steps: what each source sees, then who wins and where seams are blended.
+    """Builds one target's plan in two steps: what each source sees, then who wins and where ``seams`` are blended.
 
     Positions, visibility and winners are evaluated at every pixel (``kernels``). Weights are smooth: they are known on
     nodes ``config.grid_step_px`` apart, which lie on pixel centres, and interpolated between.
@@ -179,7 +176,8 @@ class ViewPlanner:
             min(n * self.step, limit) for n, limit in zip((y0, y1, x0, x1), np.repeat(q.shape, 2), strict=True)
         )
         window = y0, x0, (y1 - y0, x1 - x0)
-        camera, rays = self.camera.crop(*window), self.rays.crop(*window)
+        is_whole = window[2] == q.shape
+        camera, rays = self.camera if is_whole else self.camera.crop(*window), self.rays.crop(*window)
         here = slice(y0, y1), slice(x0, x1)
         q[here] = surface.background.image(camera, rays)
         self.counters["dense_pixels"] += q[here].size if surface.background.is_dense else 0
@@ -207,7 +205,7 @@ class ViewPlanner:
 
     def _region(self, index: int) -> _Region | None:
         from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES, camera_parameters
-        from arbiview_aug.render.kernels import cells_in_view, seen_image
+        from arbiview_aug.render.kernels import cells_in_view, measure_nodes, seen_image
 
         source = self.source[index]
         offset_m = self.camera.center_m - source.center_m
@@ -231,11 +229,17 @@ class ViewPlanner:
             return None
         u, v, _ = source_pixels(self.camera, self.node_rays, geometry.behind, source)
         valid = np.abs(u) < 0.9 * FAR_AWAY_PX
-        uv = np.stack([u, v], -1).astype(np.float64)
-        pixels_per_pixel = self._resolution(uv)
-        edge_px = self.maps.edge_distance(source, uv)
+        resolution, edge_px, parallax_rad = np.empty((3, *u.shape))
+        measure_nodes(
+            u, v, *self.nodes, source.size, self.maps.to_mask(source), CELL_PX, np.moveaxis(self._directions, -1, 0),
+            offset_m, geometry.uncertainty, resolution, edge_px, parallax_rad,
+        )  # fmt: skip
+        if min(self.camera.size) < 2:
+            resolution[:] = 1
+        parallax = focal_px * parallax_rad
         seen = valid & (edge_px > 0)
-        level = self._level(pixels_per_pixel[seen], source.size) if self.config.antialias else 0
+        most = np.sort(resolution[seen][::4])
+        level = self._level(most, source.size) if self.config.antialias else 0
         kernel = self._kernel(source, level, surface, geometry, A, o)
         visible = np.zeros(seen.shape, bool)
         at_nodes = np.ix_(*self.nodes)
@@ -243,13 +247,12 @@ class ViewPlanner:
         given = kernel[-1][:, self.nodes[0][:, None], self.nodes[1][None]] if kind < 0 else kernel[-1]
         seen_image(self.node_rays, self.rays.parameters, geometry.q[at_nodes], face, (*kernel[:-1], given), visible)
         self.counters[f"pairs_{name}"] += 1
-        parallax = self._expected_parallax(offset_m, focal_px, geometry)
         score = (
             distance_weight(edge_px, min(source.size) / 2, self.config.distance_gamma)
-            * quality_weight(parallax, pixels_per_pixel)
+            * quality_weight(parallax, resolution)
             * primary_weight(baseline_m < SAME_CENTER_M, self.config.primary_bonus)
         )
-        certain = 255 * certainty(parallax / focal_px, pixels_per_pixel) if self.config.certainty else None
+        certain = 255 * certainty(parallax_rad, resolution) if self.config.certainty else None
         return _Region(
             source=index,
             level=level,
@@ -261,8 +264,8 @@ class ViewPlanner:
             kernel=kernel,
             score=np.where(visible & (edge_px > 0), score, 0).astype(np.float32),
             parallax=parallax.astype(np.float32),
-            border_px=(edge_px / np.maximum(pixels_per_pixel, 1e-3)).astype(np.float32),
-            fineness=float(np.median(pixels_per_pixel[seen])) / 2**level if seen.any() else 1.0,
+            border_px=(edge_px / np.maximum(resolution, 1e-3)).astype(np.float32),
+            fineness=float(most[len(most) // 2]) / 2**level if len(most) else 1.0,
             certainty=None if certain is None else _filled(certain, valid),
         )
 
@@ -309,27 +312,13 @@ class ViewPlanner:
             given,
         )
 
-    def _resolution(self, uv: FloatArray) -> FloatArray:
-        """Source pixels per target pixel along the worse axis: the smaller singular value of the Jacobian."""
-        if min(self.camera.size) < 2:
-            return np.ones(uv.shape[:2])
-        (a, c), (b, d) = (_derivative(uv, axis, self.nodes[axis]) for axis in (1, 0))
-        half_sum, determinant = (a * a + b * b + c * c + d * d) / 2, a * d - b * c
-        return np.sqrt(np.maximum(half_sum - np.sqrt(np.maximum(half_sum**2 - determinant**2, 0)), 0))
-
-    def _expected_parallax(self, offset_m: FloatArray, focal_px: float, geometry: _Geometry) -> FloatArray:
-        """Displacement (target px) that unknown depth around a surface may cause: offset across the ray x spread."""
-        along_m = self._directions @ offset_m
-        across_m = np.sqrt(np.maximum(offset_m @ offset_m - along_m**2, 0))
-        return focal_px * across_m * geometry.uncertainty
-
     @staticmethod
     def _level(resolution: FloatArray, size: tuple[int, int]) -> int:
-        """Halvings: the largest power of two not above the minification, of most of what is seen."""
+        """Halvings: the largest power of two not above the minification (n,), ascending, of most of what is seen."""
         if resolution.size == 0:
             return 0
         # 2 % of tolerance: a target of exactly half size must read the halved source.
-        level = int(max(0, math.floor(math.log2(max(1.02 * float(np.quantile(resolution[::4], 0.2)), 1e-6)))))
+        level = int(max(0, math.floor(math.log2(max(1.02 * resolution[len(resolution) // 5], 1e-6)))))
         while level and min(level_size(size, level)) < 2:
             level -= 1
         return level
@@ -345,17 +334,18 @@ class ViewPlanner:
         in_image = np.zeros((h, w), np.uint8)
         best = scratch.get("best", (h, w), np.float32)
         best.fill(-1)  # a source that sees a pixel beats none, even with a weight of 0
-        weights = self._seam_weights()
+        scores, borders = [region.score for region in self.regions], [region.border_px for region in self.regions]
+        weights = seam_weights(scores, borders, self._seam_radius, self.config.seam_width * self.camera.width_px)
+        contributions = []
         for region, weight in zip(self.regions, weights, strict=True):
             slot = layout.slot(region.source, region.level)
             self.counters["cells"] += int((region.columns[:, 1] - region.columns[:, 0]).sum())
-            put_source(
-                *self._target(region), region.kernel, (region.source, slot.x, slot.y), weight, self.step,
-                region.columns, best, winner, fixed.packed, fixed.frac, in_image,
-            )  # fmt: skip
-        count = np.bincount(winner.reshape(-1).view(np.uint8), minlength=256)
+            place = region.source, slot.x, slot.y
+            contributions.append((*self._target(region), region.kernel, place, weight, self.step, region.columns))
+            put_source(*contributions[-1], best, winner, fixed.packed, fixed.frac, in_image)
+        count: Any = cv2.calcHist([winner.view(np.uint8)], [0], None, [256], [0, 256]).ravel()
         won_px = Counter({region.source: int(count[region.source]) for region in self.regions})
-        bands = tuple(self._bands(weights, winner, layout, scratch))
+        bands = tuple(blend_regions(contributions, winner, scratch)) if self.config.seam_width else ()
         certain = None
         if self.config.certainty:
             certain = np.zeros((h, w), np.uint8)
@@ -403,71 +393,6 @@ class ViewPlanner:
         there = FixedMap(fixed.xy[y, x][None], fixed.frac[y, x][None])
         return BilinearFallback(y.astype(np.int64) * winner.shape[1] + x, there)
 
-    def _seam_weights(self) -> list[npt.NDArray[np.float32]]:
-        """Weights on the nodes: each source's winning area, softened over the seam width, fading at its own border."""
-        scores = [region.score for region in self.regions]
-        width_px = self.config.seam_width * self.camera.width_px
-        if width_px == 0 or len(scores) < 2:
-            return scores
-        best = np.maximum.reduce(scores)
-        radius = self._seam_radius
-        weights: list[npt.NDArray[np.float32]] = []
-        taken = np.zeros(best.shape, bool)
-        for region, score in zip(self.regions, scores, strict=True):
-            label = (score == best) & (score > 0) & ~taken
-            taken |= label
-            # Two passes of a box make a smooth ramp.
-            soft: Any = label.astype(np.float32)
-            for _ in range(2):
-                soft = cv2.blur(soft, (2 * radius + 1, 2 * radius + 1), borderType=cv2.BORDER_REPLICATE)
-            weights.append(soft * np.clip(region.border_px / np.float32(width_px), 0, 1))
-        return weights
-
-    def _bands(
-        self,
-        weights: list[npt.NDArray[np.float32]],
-        winner: npt.NDArray[np.int8],
-        layout: AtlasLayout,
-        scratch: Scratch,
-    ) -> Iterator[BlendRegion]:
-        """Rectangles around the pixels that a second source adds to."""
-        from arbiview_aug.render.kernels import band_rows, cut_band, put_second, start_bands
-
-        if self.config.seam_width == 0 or len(weights) < 2:
-            return
-        shared = np.zeros(tuple(len(n) - 1 for n in self.nodes), np.uint8)
-        for weight in weights:
-            some = weight > 0
-            shared += some[1:, 1:] | some[1:, :-1] | some[:-1, 1:] | some[:-1, :-1]
-        if not (shared > 1).any():
-            return
-        (h, w), several = winner.shape, shared > 1
-        both = scratch.get("weights", (2, h, w), np.float32)
-        second = scratch.get("second", (h, w), np.int8)
-        xy, frac = scratch.get("second_xy", (h, w), np.int32), scratch.get("second_frac", (h, w), np.uint16)
-        start_bands(several, self.step, both, second)
-        for region, weight in zip(self.regions, weights, strict=True):
-            slot = layout.slot(region.source, region.level)
-            put_second(
-                *self._target(region), region.kernel, (region.source, slot.x, slot.y), weight, self.step,
-                region.columns, winner, both, second, xy, frac, several,
-            )  # fmt: skip
-        rows = np.empty((len(self.source), -(-h // _STRIP_PX), shared.shape[1], 2), np.int64)
-        band_rows(several, self.step, _STRIP_PX, both, second, _LEAST_SHARE, rows)
-        # In content order: rectangles overlap, and blending rounds.
-        for source, strip in product([region.source for region in self.regions], range(rows.shape[1])):
-            first, last = rows[source, strip].T
-            if not last.any():
-                continue
-            columns = np.flatnonzero(last)
-            for run in np.split(columns, np.flatnonzero(np.diff(columns) > 1) + 1):
-                y0, y1 = int(first[run].min()), int(last[run].max())
-                x0, x1 = int(run[0]) * self.step, min((int(run[-1]) + 1) * self.step, w)
-                at = FixedMap(np.empty((y1 - y0, x1 - x0, 2), np.int16), np.empty((y1 - y0, x1 - x0), np.uint16))
-                weight = np.empty((y1 - y0, x1 - x0), np.float32)
-                cut_band(y0, x0, source, several, self.step, both[1], second, xy, frac, at.packed, at.frac, weight)
-                yield BlendRegion(y0, x0, source, at, weight)
-
     def _reports(self, winner: npt.NDArray[np.int8], won_px: Counter[int]) -> Iterator[SourceUse]:
         """What each source that wins any pixel does, largest share first."""
         on_nodes = winner[np.ix_(*self.nodes)]
@@ -490,16 +415,6 @@ def halved_camera(camera: Camera, level: int) -> Camera:
     """The camera of an image that was halved ``level`` times."""
     h, w = level_size(camera.size, level)
     return camera.crop(0, 0, (h << level, w << level)).resize((h, w)) if level else camera
-
-
-def _derivative(uv: FloatArray, axis: int, nodes: npt.NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
-    """Forward differences of u and v (ny, nx) along an axis per pixel, the last one repeated."""
-    spacing = np.maximum(np.diff(nodes), 1)
-    difference = np.diff(uv, axis=axis) / (spacing[:, None, None] if axis == 0 else spacing[None, :, None])
-    # The last nodes may coincide: their difference says nothing.
-    last = len(spacing) - 1 - (len(spacing) > 1 and nodes[-1] == nodes[-2])
-    difference = np.take(difference, np.minimum(np.arange(len(nodes)), last), axis=axis)
-    return difference[..., 0], difference[..., 1]
 
 
 def _filled(values: FloatArray, valid: BoolArray) -> npt.NDArray[np.float32]:

@@ -50,9 +50,8 @@ class BoxSurface(LayeredSurface):
         """What boxes hide from a source; kept for the next target."""
         if camera not in self._shadows:
             pixel_rad = float(1 / camera.K[0, 0])
-            q, face = draw_boxes(camera, self._enlarged(camera.center_m, pixel_rad), rays)
-            q /= np.float32(1 + 2 * pixel_rad)  # a lookup at the nearest pixel
-            self._shadows[camera] = OcclusionMap(q, face // 6)
+            boxes, scale = self._enlarged(camera.center_m, pixel_rad), 1 / (1 + 2 * pixel_rad)  # a lookup's error
+            self._shadows[camera] = OcclusionMap(*draw_boxes(camera, boxes, rays, scale=scale, faces=False))
         return self._shadows[camera]
 
     def drawn(self, camera: Camera, rays: PixelRays) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
@@ -85,41 +84,39 @@ class BoxSurface(LayeredSurface):
         return np.where(on_street, street, _BOX_ERROR * inverse_distance)
 
 
-def box_rows(camera: Camera, boxes: FloatArray) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
-    """Boxes (B, 7) as ``kernels.draw_boxes`` reads them, (B, 20), and the rows of those that a camera may see.
+def box_rows(
+    camera: Camera, boxes: FloatArray, rays: PixelRays
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
+    """The boxes of (B, 7) that a camera may see as ``kernels.draw_boxes`` reads them, (n, 20), and their rows (n,)."""
+    from arbiview_aug.scene.kernels import box_rows as describe
 
-    A box that holds the camera is its own vehicle, and is not seen.
-    """
-    c, s, o, one = np.cos(boxes[:, 6]), np.sin(boxes[:, 6]), np.zeros(len(boxes)), np.ones(len(boxes))
-    to_box = np.stack([c, s, o, -s, c, o, o, o, one], axis=-1).reshape(-1, 3, 3)
-    away, half = boxes[:, :3] - camera.center_m, boxes[:, 3:6] / 2
-    start = np.einsum("bij,bj->bi", to_box, -away)
-    distance, radius = np.linalg.norm(away, axis=1), np.linalg.norm(half, axis=1)
-    towards = away @ camera.cam2ego[:3, :3] / np.maximum(distance, 1e-9)[:, None]
-    off_axis = np.arccos(np.clip(towards[:, 2], -1, 1))
-    angle = np.arcsin(np.clip(radius / np.maximum(distance, 1e-9), 0, 1))
-    ahead = (distance <= radius) | (off_axis <= camera.half_angle_rad + angle + 0.01)
-    turn = (to_box @ camera.cam2ego[:3, :3]).reshape(-1, 9)
-    cone = np.where(distance <= radius, -9.0, np.cos(angle))
-    rows = np.concatenate([turn, start, half, (distance + radius)[:, None], towards, cone[:, None]], axis=1)
-    return rows.astype(np.float32), np.flatnonzero(ahead & (np.abs(start) > half).any(axis=1))
+    rows, numbers = np.empty((len(boxes), 20), np.float32), np.empty(len(boxes), np.int64)
+    pose = np.ascontiguousarray(camera.cam2ego[:3, :3]), np.ascontiguousarray(camera.center_m)
+    count = describe(np.ascontiguousarray(boxes), pose[1], pose[0], rays.cone, rows, numbers)
+    return rows[:count], numbers[:count]
 
 
 def draw_boxes(
-    camera: Camera, boxes: FloatArray, rays: PixelRays | None = None
+    camera: Camera, boxes: FloatArray, rays: PixelRays | None = None, *, scale: float = 1.0, faces: bool = True
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
-    """Rasterise boxes (B, 7): inverse distances (h, w) of the nearest faces, 0 where there is none; faces, or -1.
+    """Rasterise boxes (B, 7).
 
-    A face's number is 6 x the box's row + 2 x the axis across it + 1 for the one further along that axis. ``rays`` are
-    the camera's, if they are known.
+    Args:
+        camera: The camera.
+        boxes: (B, 7).
+        rays: The camera's rays, if they are known.
+        scale: Factor of the inverse distances.
+        faces: Number the faces: 6 x the box's row + 2 x the axis across it + 1 for the one further along that axis.
+
+    Returns:
+        (h, w) inverse distances of the nearest faces, 0 where there is none; (h, w) the boxes' rows or faces, or -1.
     """
     from arbiview_aug.scene.kernels import draw_boxes as draw
 
     rays = rays or pixel_rays(camera)
-    q, face = np.zeros(camera.size, np.float32), np.full(camera.size, -1, np.int32)
-    rows, seen = box_rows(camera, boxes)
-    draw(rays.planes, rays.parameters, rows[seen], seen, rays.cones, CELL_PX, q, face)
-    return q, face
+    q, number = np.zeros(camera.size, np.float32), np.full(camera.size, -1, np.int32)
+    draw(rays.planes, rays.parameters, *box_rows(camera, boxes, rays), rays.cones, CELL_PX, scale, faces, q, number)
+    return q, number
 
 
 def silhouette_sums(camera: Camera, boxes: FloatArray, weight: FloatArray) -> FloatArray:
@@ -127,8 +124,9 @@ def silhouette_sums(camera: Camera, boxes: FloatArray, weight: FloatArray) -> Fl
     from arbiview_aug.scene.kernels import sum_silhouettes
 
     rays, sums = pixel_rays(camera), np.zeros(len(boxes))
-    rows, seen = box_rows(camera, boxes)
-    sum_silhouettes(rays.planes, rays.parameters, rows[seen], seen, rays.cones, CELL_PX, weight, sums)
+    sum_silhouettes(
+        rays.planes, rays.parameters, *box_rows(camera, boxes, rays), rays.cones, CELL_PX, weight, sums
+    )  # fmt: skip
     return sums
 
 

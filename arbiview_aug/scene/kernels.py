@@ -78,7 +78,51 @@ def static_image(planes: Any, P: Any, R: Any, kind: int, S: Any, q: Any) -> None
 
 
 @compiled
-def draw_boxes(planes: Any, P: Any, boxes: Any, numbers: Any, cones: Any, step: int, q: Any, face: Any) -> None:
+def box_rows(boxes: Any, center: Any, R: Any, axis: Any, rows: Any, numbers: Any) -> int:
+    """Describe the boxes (B, 7) that a camera may see, as ``draw_boxes`` reads them; return how many there are.
+
+    A box that holds the camera is its own vehicle, and is not seen.
+
+    Args:
+        boxes: (B, 7) float64 centre, length, width, height, yaw, ego frame.
+        center: (3,) the camera's.
+        R: (3, 3) float64 camera to ego.
+        axis: (4,) middle of a cone around the camera's rays, camera frame, and its half angle.
+        rows: (B, 20) float32, written.
+        numbers: (B,) int64, written: the rows among all boxes.
+    """
+    count = 0
+    away, start, half = np.empty(3), np.empty(3), np.empty(3)
+    for k in range(boxes.shape[0]):
+        c, s = np.cos(boxes[k, 6]), np.sin(boxes[k, 6])
+        for i in range(3):
+            away[i], half[i] = boxes[k, i] - center[i], boxes[k, 3 + i] / 2
+        start[0], start[1], start[2] = -(c * away[0] + s * away[1]), s * away[0] - c * away[1], -away[2]
+        if abs(start[0]) <= half[0] and abs(start[1]) <= half[1] and abs(start[2]) <= half[2]:
+            continue
+        distance = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2)
+        radius = np.sqrt(half[0] ** 2 + half[1] ** 2 + half[2] ** 2)
+        row, off_axis = rows[count], 0.0
+        for i in range(3):
+            row[16 + i] = (away[0] * R[0, i] + away[1] * R[1, i] + away[2] * R[2, i]) / distance
+            off_axis += row[16 + i] * axis[i]
+        angle = np.arcsin(min(radius / distance, 1.0))
+        if distance > radius and np.arccos(min(max(off_axis, -1.0), 1.0)) > axis[3] + angle + 0.01:
+            continue
+        for i in range(3):
+            row[i], row[3 + i], row[6 + i] = c * R[0, i] + s * R[1, i], c * R[1, i] - s * R[0, i], R[2, i]
+            row[9 + i], row[12 + i] = start[i], half[i]
+        row[15] = distance + radius
+        row[19] = np.cos(angle) if distance > radius else -9.0
+        numbers[count] = k
+        count += 1
+    return count
+
+
+@compiled
+def draw_boxes(
+    planes: Any, P: Any, boxes: Any, numbers: Any, cones: Any, step: int, scale: float, faces: bool, q: Any, number: Any
+) -> None:
     """Rasterise boxes into a z-buffer by the slab test, run of cells by run of cells.
 
     Args:
@@ -89,28 +133,47 @@ def draw_boxes(planes: Any, P: Any, boxes: Any, numbers: Any, cones: Any, step: 
         numbers: (B,) their rows among all boxes.
         cones: ``cell_cones``.
         step: Side of a cell, pixels.
+        scale: Factor of the inverse distances.
+        faces: Number the boxes' faces, else the boxes.
         q: (h, w) float32 inverse distance of the nearest face so far, 0 where there is none; updated.
-        face: (h, w) int32 6 x row + 2 x axis + 1 for the face further along the axis; updated where a box is nearer.
+        number: (h, w) int32 row of the nearest box; with ``faces`` 6 x row + 2 x axis + 1 for the face further along
+            the axis; updated.
     """
     h, w = q.shape
     _, ny, nx = cones.shape
-    work, near_box = np.empty((5, w), np.float32), np.empty(nx, np.bool_)
+    work, near_box = np.empty((8, w), np.float32), np.empty(nx, np.bool_)
+    factor = np.float32(scale)
     for k in range(boxes.shape[0]):
-        b = boxes[k]
+        b, me = boxes[k], np.int32(numbers[k])
+        sx, sy, sz, hx, hy, hz = b[9], b[10], b[11], b[12], b[13], b[14]
         for j in range(ny):
             x0, n = _columns_of_box(b, cones[:, j], near_box, step, w)
             if n == 0:
                 continue
-            rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
+            rx, ry, rz, ix = work[0, :n], work[1, :n], work[2, :n], work[3, :n]
+            iy, iz, enter, leave = work[4, :n], work[5, :n], work[6, :n], work[7, :n]
             for y in range(j * step, min(j * step + step, h)):
                 rays_row(planes, P, y, x0, rx, ry, rz)
-                slabs_row(b, rx, ry, rz, enter, leave)
-                near, number = q[y, x0 : x0 + n], face[y, x0 : x0 + n]
+                slabs_row(b, rx, ry, rz, ix, iy, iz, enter, leave)
+                near, which = q[y, x0 : x0 + n], number[y, x0 : x0 + n]
+                for x in range(n):  # the first distance below 1 cm counts as 1 cm
+                    met = (leave[x] >= enter[x]) & (enter[x] > _ZERO)
+                    leave[x] = min(_ONE / enter[x], _MOST) * factor if met else _ZERO
+                if faces:
+                    for x in range(n):  # the axis whose slab it enters last
+                        first, second = -sx * ix[x] - hx * abs(ix[x]), -sy * iy[x] - hy * abs(iy[x])
+                        third = -sz * iz[x] - hz * abs(iz[x])
+                        face = np.int32(0) if ix[x] > _ZERO else np.int32(1)
+                        other = np.int32(2) if iy[x] > _ZERO else np.int32(3)
+                        face = other if second > first else face
+                        other = np.int32(4) if iz[x] > _ZERO else np.int32(5)
+                        face = other if third > max(first, second) else face
+                        which[x] = np.int32(6) * me + face if leave[x] > near[x] else which[x]
+                else:
+                    for x in range(n):
+                        which[x] = me if leave[x] > near[x] else which[x]
                 for x in range(n):
-                    # The first distance below 1 cm counts as 1 cm.
-                    if leave[x] >= enter[x] and enter[x] > _ZERO and enter[x] * near[x] < _ONE:
-                        near[x] = min(_ONE / enter[x], _MOST)
-                        number[x] = 6 * numbers[k] + _entered(b, rx[x], ry[x], rz[x])
+                    near[x] = max(near[x], leave[x])
 
 
 @compiled
@@ -123,17 +186,17 @@ def sum_silhouettes(
     """
     h, w = weight.shape
     _, ny, nx = cones.shape
-    work, near_box = np.empty((5, w), np.float32), np.empty(nx, np.bool_)
+    work, near_box = np.empty((8, w), np.float32), np.empty(nx, np.bool_)
     for k in range(boxes.shape[0]):
         b = boxes[k]
         for j in range(ny):
             x0, n = _columns_of_box(b, cones[:, j], near_box, step, w)
             if n == 0:
                 continue
-            rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
+            rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[6, :n], work[7, :n]
             for y in range(j * step, min(j * step + step, h)):
                 rays_row(planes, P, y, x0, rx, ry, rz)
-                slabs_row(b, rx, ry, rz, enter, leave)
+                slabs_row(b, rx, ry, rz, work[3, :n], work[4, :n], work[5, :n], enter, leave)
                 for x in range(n):
                     if leave[x] >= enter[x] and enter[x] > _ZERO:
                         sums[numbers[k]] += weight[y, x0 + x]
@@ -166,39 +229,28 @@ def _columns_of_box(b: Any, cones: Any, near: Any, step: int, w: int) -> tuple[i
 
 
 @compiled
-def slabs_row(b: Any, rx: Any, ry: Any, rz: Any, enter: Any, leave: Any) -> None:
-    """Distances (n,) at which rays enter and leave a box (20,); rays of length 0 miss it."""
-    a0, a1, a2, a3, a4, a5, a6, a7, a8 = b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7], b[8]
+def slabs_row(b: Any, rx: Any, ry: Any, rz: Any, ix: Any, iy: Any, iz: Any, enter: Any, leave: Any) -> None:
+    """Distances (n,) at which rays enter and leave a box (20,); rays of length 0 miss it.
+
+    ``ix``, ``iy`` and ``iz`` (n,) become the inverse of their directions in the box's frame.
+    """
     sx, sy, sz, hx, hy, hz = b[9], b[10], b[11], b[12], b[13], b[14]
+    _invert_row(b[0], b[1], b[2], rx, ry, rz, ix)
+    _invert_row(b[3], b[4], b[5], rx, ry, rz, iy)
+    _invert_row(b[6], b[7], b[8], rx, ry, rz, iz)
     for i in range(enter.shape[0]):
-        gx, gy, gz = (
-            a0 * rx[i] + a1 * ry[i] + a2 * rz[i],
-            a3 * rx[i] + a4 * ry[i] + a5 * rz[i],
-            a6 * rx[i] + a7 * ry[i] + a8 * rz[i],
-        )
-        gx, gy, gz = (
-            gx if abs(gx) > _FLAT else _FLAT,
-            gy if abs(gy) > _FLAT else _FLAT,
-            gz if abs(gz) > _FLAT else _FLAT,
-        )
-        ix, iy, iz = _ONE / gx, _ONE / gy, _ONE / gz
-        first = max(max(-sx * ix - hx * abs(ix), -sy * iy - hy * abs(iy)), -sz * iz - hz * abs(iz))
-        last = min(min(-sx * ix + hx * abs(ix), -sy * iy + hy * abs(iy)), -sz * iz + hz * abs(iz))
-        enter[i] = first
-        leave[i] = last
+        first = max(-sx * ix[i] - hx * abs(ix[i]), -sy * iy[i] - hy * abs(iy[i]))
+        enter[i] = max(first, -sz * iz[i] - hz * abs(iz[i]))
+    for i in range(leave.shape[0]):
+        last = min(-sx * ix[i] + hx * abs(ix[i]), -sy * iy[i] + hy * abs(iy[i]))
+        leave[i] = min(last, -sz * iz[i] + hz * abs(iz[i]))
 
 
 @compiled
-def _entered(b: Any, rx: float, ry: float, rz: float) -> int:
-    """The face by which a ray enters a box: the axis whose slab it enters last."""
-    number, last = 0, np.float32(-1e30)
-    for axis in range(3):
-        g = b[3 * axis] * rx + b[3 * axis + 1] * ry + b[3 * axis + 2] * rz
-        g = g if abs(g) > _FLAT else _FLAT
-        here = -b[9 + axis] / g - b[12 + axis] / abs(g)
-        if here > last:
-            last, number = here, 2 * axis + (0 if g > _ZERO else 1)
-    return number
+def _invert_row(a: float, b: float, c: float, rx: Any, ry: Any, rz: Any, inverse: Any) -> None:
+    for i in range(inverse.shape[0]):
+        g = a * rx[i] + b * ry[i] + c * rz[i]
+        inverse[i] = _ONE / (g if abs(g) > _FLAT else _FLAT)
 
 
 @compiled
@@ -283,15 +335,15 @@ def draw_scanned(
     h, w = image.shape
     _, ny, nx = cones.shape
     rows, columns = nearest.shape
-    work, near_box = np.empty((5, w), np.float32), np.empty(nx, np.bool_)
+    work, near_box = np.empty((8, w), np.float32), np.empty(nx, np.bool_)
     for j in range(ny):
         x0, n = _columns_of_box(boxes[0], cones[:, j], near_box, step, w)
         if n == 0:
             continue
-        rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
+        rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[6, :n], work[7, :n]
         for y in range(j * step, min(j * step + step, h)):
             rays_row(planes, P, y, x0, rx, ry, rz)
-            slabs_row(boxes[0], rx, ry, rz, enter, leave)
+            slabs_row(boxes[0], rx, ry, rz, work[3, :n], work[4, :n], work[5, :n], enter, leave)
             out = image[y, x0 : x0 + n]
             for x in range(n):
                 if leave[x] < enter[x] or enter[x] <= _ZERO:

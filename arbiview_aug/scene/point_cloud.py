@@ -101,15 +101,15 @@ class PointCloudSurface(DenseSurface):
         if not self.objects:
             return
         boxes = np.array([one.box for one in self.objects])
-        rows, seen = box_rows(camera, boxes)
-        wide, _ = box_rows(camera, boxes + 2 * BOX_AIR_M * np.array([0, 0, 0, 1, 1, 1, 0]))
+        rows, seen = box_rows(camera, boxes, rays)
+        wide = rows.copy()
+        wide[:, 12:15] += BOX_AIR_M
         R = camera.cam2ego[:3, :3].astype(np.float32)
-        for number in seen:
+        for number, pair in zip(seen, np.stack([rows, wide], 1), strict=True):
             raster = self.objects[number].raster(camera.center_m)
             if raster is None:
                 continue
             place = np.array([raster.azimuth_rad, raster.elevation_rad, RASTER_RAD, SIDE_RAD], np.float32)
-            pair = np.stack([rows[number], wide[number]])
             draw_scanned(
                 rays.planes, rays.parameters, R, pair, rays.cones, CELL_PX, place, raster.nearest, raster.top_rad,
                 mode, image,
