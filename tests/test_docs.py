@@ -64,7 +64,7 @@ TINY = {
     "bench generator": ["--size", "32x56", "--steps", "1", "--frames", "1", "--repeats", "1"],
     "bench neighbours": ["--size", "32x88", "--repeats", "1", "--counts", "0", "1", "--surface", "street"],
     "bench speed --device cuda": ["--device", "cpu", "--repeats", "1"],
-    "bench speed": ["--repeats", "1"],
+    "bench speed": ["--repeats", "1", "--size", "32x88"],
     "convert --data FOLDER --target argoverse2 --output converted --size 256x704": [
         *("--size", "24x40", "--reduce", "4", "--workers", "1", "--surface", "street", "--report", "0")
     ],

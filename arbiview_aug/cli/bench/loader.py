@@ -84,7 +84,8 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     rig: Rig = data.sample(0, arguments.reduce)["rig"]
     for surface in arguments.surface:
         retarget = RigRetarget(target, surface=surface)
-        retarget.prepare(rig)  # workers share static plans
+        if SURFACES[surface].needs is None:
+            retarget.prepare(rig)  # workers share static plans
         datasets[f"retargeted, {surface}"] = RetargetedDataset(plain, retarget)
     return {
         "clock": "on the wall",

@@ -1,88 +1,101 @@
-"""``python -m arbiview_aug bench speed``: rendering time relative to bare ``cv2.remap`` calls.
+"""``python -m arbiview_aug bench speed``: whole ``RigRetarget`` calls relative to bare ``cv2.remap`` calls.
 
-The floor is six linear ``cv2.remap`` calls from interleaved uint8 RGB images into preallocated outputs, with float32
-maps that read a source of the output's own size at
+The floor of a target rig is one linear ``cv2.remap`` for each view, from interleaved uint8 RGB images into preallocated
+outputs, with float32 maps that read a source of the view's own size at
 
     x' = 0.97 x + 0.02 y + 3        y' = 0.95 y + 0.01 x + 5
 
-A time is the median over the rounds; a ratio is the median of candidate / floor within a round.
+A time is the median over the rounds; a ratio is the median of call / floor within a round.
 
-``frame`` executes the cached plan; ``interleaved`` images lie channels-last in one block, as this package's readers
-give them. ``whole call`` is ``RigRetarget`` with black holes; ``filled``: with filled holes, the default. ``plan``
-builds the plan of a new calibration; its ratio is to the frame. ``harmonised`` is the frame with known gains.
+The targets are Waymo's five cameras without and with their lenses, four fisheye cameras, and the source's own, turned
+or lowered. *Held*: the calibration comes back, and with it the plan; every other call plans anew. Images are decoded
+at half size where they are then still larger than the views. They lie channels-last in one block, as this package's
+readers give them; contiguous ones are planes, torch's usual layout.
 """
 
 from __future__ import annotations
 
 import os
 import statistics
+import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from itertools import count, cycle
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.cli.arguments import add_data, device_named
+from arbiview_aug.cli.arguments import add_data, device_named, size
+from arbiview_aug.cli.bench.data import Recorded, recorded
 from arbiview_aug.cli.bench.device import YAW_DEG, device_table, measure_device
+from arbiview_aug.cli.bench.neighbours import lowered
 from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
 from arbiview_aug.cli.bench.timing import machine_line, quartiles, show, timed_rounds
-from arbiview_aug.datasets import open_data, reduced_rig
-from arbiview_aug.datasets.registry import data_name
+from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.evaluate.targets import without_masks
-from arbiview_aug.generator.fillers import Holes
-from arbiview_aug.image_ops import Scratch
-from arbiview_aug.render.opencv_backend import render_opencv
-from arbiview_aug.render.plan import build_plan
-from arbiview_aug.render.tone_curve import ToneCurve
+from arbiview_aug.render.plan import compile_kernels
+from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
-REPEATS = 15
-_SMALL_ROUNDS = 3
-"""Factor of rounds for small frames, whose times are noisier."""
-_NEW_CALIBRATION_M = 0.01
+REPEATS = 9
+FULL_SIZE = (900, 1600)
+BOXES = (10, 30, 75, 150)
+BOUNDS: Mapping[tuple[int, int], Mapping[str, float]] = {
+    SIZE: {
+        **{"street, held": 1.2, "street": 3.5, "LiDAR": 8.0, "LiDAR, 75 boxes": 11.0},
+        **{f"{n} boxes": 5.0 for n in BOXES},
+        **{f"street, held, {fit}, contiguous": 2.0 for fit in ("stretch", "crop")},
+        **{f"{known}, two neighbours": 20.0 for known in ("street", "75 boxes")},
+    },
+    FULL_SIZE: {
+        **{"street": 2.5, "LiDAR": 3.5, "LiDAR, 75 boxes": 4.0},
+        **{f"{n} boxes": 3.0 for n in BOXES},
+    },
+}
+"""Largest ratios of calls by the size of the views, from nuScenes' images."""
+
+_ENOUGH_MS = 1500.0
+_TRAVEL_M = 1.2  # between neighbouring frames
+_STEP_M, _STEPS = 1e-4, 200
 _GAINS = (0.8, 1.1, 0.9, 1.25, 1.05, 0.95)
 """Gains of the sources, as far apart as on a real frame."""
 
-
-class _Candidate(NamedTuple):
-    """Function to time; ``of``: the candidate that its ratio is relative to, by default itself; ``bound``: of it."""
-
-    name: str
-    run: Callable[[], Any]
-    of: str = ""
-    bound: float | None = None
+Sample = Mapping[str, Any]
+Calls = dict[str, Callable[[], Any]]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print the table, write the JSON."""
     parser = benchmark_parser(
         "speed",
-        "Milliseconds on one thread, and ratios to six bare cv2.remap calls of the same output pixels.",
+        "Milliseconds of RigRetarget on one thread, and ratios to bare cv2.remap calls of the same views.",
         repeats=REPEATS,
         output="output/speed.json",
         example="--device cuda",
     )
-    add_data(parser, "nuscenes-one below ARBIVIEW_DATA where that is, else random smooth images for nuScenes' rig")
+    add_data(parser, "nuscenes-one below ARBIVIEW_DATA where that is, else a synthetic street")
+    sizes = [SIZE, FULL_SIZE]
+    parser.add_argument("--size", type=size, nargs="+", default=sizes, metavar="HxW", help="of views (default: both)")
     parser.add_argument(
         "--device",
         metavar="NAME",
         help="render batches by torch on cpu, cuda, cuda:1, ...: milliseconds, and the share of copy bandwidth",
     )
     arguments = parser.parse_args(argv)
-    data = arguments.data or default_data()
-    if arguments.device is None:
-        report = measure(data, arguments.repeats)
-        text = table(report)
-    else:
-        device = device_named(arguments.device)
-        name, rig, images, _ = _inputs(data, None)
-        report = measure_device(rig, list(images), name, device, arguments.repeats)
-        text = device_table(report)
+    with recorded(arguments.data or default_data(), size=FULL_SIZE) as data:
+        if arguments.device is None:
+            report = measure(data, arguments.repeats, arguments.size)
+            text = table(report)
+        else:
+            device, sample = device_named(arguments.device), _sample(data, 1)
+            report = measure_device(sample["rig"], list(sample["images"]), data.name, device, arguments.repeats)
+            text = device_table(report)
     show(text, report, Path(arguments.output))
     return 0
 
@@ -95,72 +108,125 @@ def default_data() -> Path | None:
 
 
 @benchmark
-def measure(
-    data: str | Path | None = None,
-    repeats: int = REPEATS,
-    *,
-    full_size: tuple[int, int] | None = None,
-    small_size: tuple[int, int] = SIZE,
-) -> dict[str, Any]:
-    """Time all candidates on a frame folder, or on random smooth images (of ``full_size``) on nuScenes' rig."""
-    name, rig, images, halves = _inputs(data, full_size)
-    rounds = {"full size": repeats, "small": repeats * _SMALL_ROUNDS}
-    rows = _run(_full_size(rig, images), rounds["full size"], "full size")
-    rows += _run(_small_size(rig, images, halves, small_size), rounds["small"], "small")
+def measure(data: Recorded, repeats: int, sizes: Sequence[tuple[int, int]]) -> dict[str, Any]:
+    """Time the calls on the first frame, for views of each size (h, w)."""
+    start = time.process_time()
+    compile_kernels()
+    ready_s = time.process_time() - start
+    waymo, fisheye = without_masks(load_rig("waymo")), without_masks(load_rig("fisheye_surround"))
+    targets = {"pinhole": waymo.undistorted(), "radtan": waymo, "fisheye": fisheye}
+    full, half = _sample(data, 1), _sample(data, 2)
+    rows = []
+    for h, w in sizes:
+        is_small = 2 * h <= full["rig"][0].height_px and 2 * w <= full["rig"][0].width_px
+        sample = half if is_small else full
+        calls = {name: (len(rig), _calls(sample, rig.resized((h, w)))) for name, rig in targets.items()}
+        if is_small:
+            calls["radtan, from full size"] = len(waymo), _calls_from_full_size(full, waymo, (h, w))
+            calls["own"] = len(full["rig"]), _calls_of_own(sample, (h, w))
+        for name, (views, runs) in calls.items():
+            floor = f"floor: cv2.remap of {views} views"
+            runs = {floor: remap_floor(sample["images"][:views], (h, w)), **runs}
+            times = timed_rounds(runs, repeats, f"{w}x{h} {name}", enough_ms=_ENOUGH_MS)
+            for call, taken in times.items():
+                ratio = statistics.median(a / b for a, b in zip(taken, times[floor], strict=False))
+                bound = BOUNDS.get((h, w), {}).get(call)
+                row = {"size": [h, w], "target": name, "name": call, **quartiles(taken)._asdict()}
+                rows.append(row | {"ratio": ratio, "bound": bound})
     return {
-        "floor": "six cv2.remap, linear, float32 maps, x' = 0.97 x + 0.02 y + 3, y' = 0.95 y + 0.01 x + 5",
+        "floor": "cv2.remap, linear, float32 maps, x' = 0.97 x + 0.02 y + 3, y' = 0.95 y + 0.01 x + 5",
         "clock": "CPU time of the process, milliseconds",
-        "data": name,
-        "sources": [list(size) for size in rig.sizes],
-        "rounds": rounds,
+        "data": data.name,
+        "sources": [list(of_camera) for of_camera in full["rig"].sizes],
+        "rounds": repeats,
+        "ready_s": ready_s,
         "measures": rows,
     }
 
 
 COLUMNS = (
-    ("ms", "{median_ms:.2f}"),
-    ("quartiles", "{q1_ms:.2f} to {q3_ms:.2f}"),
-    ("ratio", "{ratio:.2f}"),
+    ("ms", "{median_ms:.1f}"),
+    ("quartiles", "{q1_ms:.1f} to {q3_ms:.1f}"),
+    ("x floor", "{ratio:.2f}"),
     ("bound", "{bound:g}"),
 )
 
 
 def table(report: Mapping[str, Any]) -> str:
     """Machine and Markdown table of a report."""
-    return f"{machine_line(report)}\n\n{metric_table(report['measures'], COLUMNS, ('name', 'of'))}"
+    head = f"{report['data']}; {machine_line(report)}; kernels ready after {report['ready_s']:.1f} s"
+    rows = [row | {"views": "{1}x{0}".format(*row["size"])} for row in report["measures"]]
+    return f"{head}\n\n{metric_table(rows, COLUMNS, ('views', 'target', 'name'))}"
 
 
-# --- candidates -------------------------------------------------------------------------------------------------------
-def _full_size(rig: Rig, images: torch.Tensor) -> list[_Candidate]:
-    target = rig.turned(yaw_deg=YAW_DEG)
-    label = "{1}x{0}".format(*rig.sizes[0])
-    floor, frame = f"{label} floor", f"{label} frame, interleaved"
-    return [
-        _Candidate(floor, remap_floor(images, rig.sizes[0])),
-        _Candidate(frame, _frame(rig, target, images), floor, 1.5),
-        _Candidate(f"{label} frame, planar", _frame(rig, target, images.contiguous()), floor, 1.5),
-        _Candidate(f"{label} frame, harmonised", _frame(rig, target, images, _GAINS), frame),
-        _Candidate(f"{label} whole call", _call(rig, target, images, "black"), floor),
-        _Candidate(f"{label} whole call, filled", _call(rig, target, images, "fill"), floor),
-        _Candidate(f"{label} plan", _plan(rig, target), frame, 1.5),
-    ]
+# --- calls ------------------------------------------------------------------------------------------------------------
+def _calls(sample: Sample, target: Rig) -> Calls:
+    points = {"points": sample["points"]}
+    return {
+        "street, held": _held(sample, target),
+        "street, held, contiguous": _held(_contiguous(sample), target),
+        "street": _anew(sample, target, "street", {}),
+        **{f"{n} boxes": _anew(sample, target, "objects", {"boxes_3d": boxes_around(n)}) for n in BOXES},
+        "LiDAR": _anew(sample, target, "lidar", points),
+        "LiDAR, 75 boxes": _anew(sample, target, "lidar", points | {"boxes_3d": boxes_around(75)}),
+    }
 
 
-def _small_size(rig: Rig, images: torch.Tensor, halves: torch.Tensor, size: tuple[int, int]) -> list[_Candidate]:
-    target, half_rig = rig.turned(yaw_deg=YAW_DEG).resized(size), reduced_rig(rig, 2)
-    label = "{1}x{0}".format(*size)
-    floor, full, half = f"{label} floor", f"{label} frame, from full size", f"{label} frame, from half size"
-    return [
-        _Candidate(floor, remap_floor(images, size)),
-        _Candidate(full, _frame(rig, target, images), floor, 2.2),
-        _Candidate(f"{full}, harmonised", _frame(rig, target, images, _GAINS), full),
-        _Candidate(half, _frame(half_rig, target, halves), floor, 1.6),
-        _Candidate(f"{half}, harmonised", _frame(half_rig, target, halves, _GAINS), half),
-        _Candidate(f"{label} whole call, from half size", _call(half_rig, target, halves, "black"), floor),
-        _Candidate(f"{label} whole call, filled", _call(half_rig, target, halves, "fill"), floor),
-        _Candidate(f"{label} plan, from full size", _plan(rig, target), full, 1.5),
-        _Candidate(f"{label} plan, from half size", _plan(half_rig, target), half, 1.5),
-    ]
+def _calls_from_full_size(sample: Sample, target: Rig, views: tuple[int, int]) -> Calls:
+    runs: Calls = {}
+    for fit in ("stretch", "crop"):
+        to = target.resized(views, fit)
+        runs[f"street, held, {fit}"] = _held(sample, to)
+        runs[f"street, held, {fit}, contiguous"] = _held(_contiguous(sample), to)
+    return runs
+
+
+def _calls_of_own(sample: Sample, views: tuple[int, int]) -> Calls:
+    """Turned cameras, which have holes, and lowered ones, which neighbouring frames fill."""
+    rig = sample["rig"]
+    turned, low = rig.turned(yaw_deg=YAW_DEG).resized(views), lowered(rig, views)
+    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    poses[1:, 0, 3] = torch.tensor([-_TRAVEL_M, _TRAVEL_M])
+    frame, *neighbours = ({**sample, "ego2world": pose} for pose in poses)
+    boxes = {"boxes_3d": boxes_around(75)}
+    with_boxes = frame | {"neighbours": [neighbour | boxes for neighbour in neighbours]}
+    return {
+        "street, held, turned, holes black": _held(sample, turned, holes="black"),
+        "street, held, turned": _held(sample, turned),
+        "street, held, turned, harmonised": _held(sample, turned, harmonise=_GAINS[: len(rig)]),
+        "street, two neighbours": _anew(frame | {"neighbours": neighbours}, low, "street", {}),
+        "75 boxes, two neighbours": _anew(with_boxes, low, "objects", boxes),
+    }
+
+
+def _held(sample: Sample, target: Rig, **settings: Any) -> Callable[[], Any]:
+    return partial(RigRetarget(target, surface="street", **settings), sample)
+
+
+def _anew(sample: Sample, target: Rig, surface: SurfaceName, geometry: Sample) -> Callable[[], Any]:
+    """Call with the geometry, or the rig where there is none, always a little elsewhere, so that no plan comes back."""
+    retarget, ways_m = RigRetarget(target, surface=surface, cache_bytes=0), count(_STEP_M, _STEP_M)
+    rigs = cycle([sample["rig"].shifted(x_m=k * _STEP_M) for k in range(0 if geometry else _STEPS)])
+
+    def run() -> None:
+        way_m = next(ways_m)
+        moved = {key: value + way_m * (torch.arange(value.shape[1]) == 2) for key, value in geometry.items()}
+        retarget({**sample, **(moved or {"rig": next(rigs)})})
+
+    return run
+
+
+def _contiguous(sample: Sample) -> Sample:
+    return {**sample, "images": sample["images"].contiguous()}
+
+
+def boxes_around(number: int) -> torch.Tensor:
+    """(number, 7) random boxes from pedestrians to vans, 5 to 70 m from the vehicle, in all directions."""
+    rng = np.random.default_rng(0)
+    away_m, azimuth = rng.uniform(5, 70, number), rng.uniform(-np.pi, np.pi, number)
+    lwh = [rng.uniform(low, high, number) for low, high in ((0.6, 6), (0.6, 2.2), (1.4, 2.5))]
+    x, y, yaw = away_m * np.cos(azimuth), away_m * np.sin(azimuth), rng.uniform(-np.pi, np.pi, number)
+    return torch.from_numpy(np.stack([x, y, lwh[2] / 2, *lwh, yaw], 1).astype(np.float32))
 
 
 def remap_floor(images: torch.Tensor, size: tuple[int, int]) -> Callable[[], None]:
@@ -178,53 +244,9 @@ def remap_floor(images: torch.Tensor, size: tuple[int, int]) -> Callable[[], Non
     return run
 
 
-def _frame(source: Rig, target: Rig, images: torch.Tensor, gains: Sequence[float] = ()) -> Callable[[], Any]:
-    plan, scratch, views = build_plan(source, target), Scratch(), list(images)
-    curves = [ToneCurve(gains[k % len(gains)]) for k in range(len(source))] if gains else None
-    return lambda: render_opencv(plan, views, scratch, curves)
-
-
-def _call(source: Rig, target: Rig, images: torch.Tensor, holes: Holes) -> Callable[[], Any]:
-    retarget = RigRetarget(target, source_rig=source, holes=holes)
-    retarget.prepare()
-    return lambda: retarget({"images": images})
-
-
-def _plan(source: Rig, target: Rig) -> Callable[[], Any]:
-    """Plan a new calibration in each call."""
-    calls = iter(range(1, 1 << 30))
-
-    def run() -> None:
-        x_m = _NEW_CALIBRATION_M * next(calls)
-        build_plan(source.shifted(x_m=x_m), target.shifted(x_m=x_m))
-
-    return run
-
-
-def _run(candidates: Sequence[_Candidate], rounds: int, label: str) -> list[dict[str, Any]]:
-    times = timed_rounds({name: run for name, run, *_ in candidates}, rounds, label)
-    rows = []
-    for name, _, of, bound in candidates:
-        ratio = float(statistics.median(times[name] / times[of or name]))
-        rows.append({"name": name, "of": of, **quartiles(times[name])._asdict(), "ratio": ratio, "bound": bound})
-    return rows
-
-
-def _inputs(data: str | Path | None, full_size: tuple[int, int] | None) -> tuple[str, Rig, torch.Tensor, torch.Tensor]:
-    """Name, rig, images (N, 3, H, W) uint8 in one channels-last block, and the same at half size."""
-    if data is None:
-        rig = load_rig("nuscenes") if full_size is None else load_rig("nuscenes").resized(full_size)
-        half_size = reduced_rig(rig, 2).sizes[0]
-        images, halves = (_smooth_images(len(rig), size) for size in (rig.sizes[0], half_size))
-        return "random smooth images", rig, images, halves
-    sample, half = open_data(data)[0], open_data(data, reduce=2)[0]
-    if not isinstance(sample["images"], torch.Tensor):
-        raise DataError(f"--data {data}: expected images of one size, got several")
-    return data_name(data), without_masks(sample["rig"]), sample["images"], half["images"]
-
-
-def _smooth_images(count: int, size: tuple[int, int]) -> torch.Tensor:
-    rng = np.random.default_rng(0)
-    coarse = rng.integers(0, 256, (count, 24, 40, 3), np.uint8)
-    block = np.stack([cv2.resize(image, size[::-1], interpolation=cv2.INTER_CUBIC) for image in coarse])
-    return torch.from_numpy(block).permute(0, 3, 1, 2)
+def _sample(data: Recorded, reduce: Reduce) -> dict[str, Any]:
+    """Images (N, 3, h, w) of the first frame, its rig without masks, and its points."""
+    sample = data.sample(0, reduce)
+    if not isinstance(sample["images"], torch.Tensor) or "points" not in sample:
+        raise DataError(f"--data {data.root}: expected images of one size, and LiDAR points")
+    return {"images": sample["images"], "rig": without_masks(sample["rig"]), "points": sample["points"]}
