@@ -12,7 +12,7 @@ An atlas holds the source images that a plan reads, below and beside each other,
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -121,52 +121,53 @@ class AtlasLayout:
 
     Attributes:
         slots: One for each (source, level) in use.
-        size: (h, w) of the atlas.
-        is_stack: All sources at full size below each other: an (N, H, W, 3) block of images *is* the atlas.
     """
 
     slots: tuple[Slot, ...]
-    size: tuple[int, int]
-    is_stack: bool
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(h, w) of the atlas."""
+        corners = [(slot.y + slot.size[0], slot.x + slot.size[1]) for slot in self.slots]
+        return max((1, *(y for y, _ in corners))), max((1, *(x for _, x in corners)))
+
+    @property
+    def is_stack(self) -> bool:
+        """Whether all are sources at full size in their order: an (N, H, W, 3) block of images *is* the atlas."""
+        return all(slot.level == slot.x == 0 and slot.y == slot.source * slot.size[0] for slot in self.slots)
 
     @classmethod
     def for_sources(cls, sizes: Sequence[tuple[int, int]], used: Sequence[tuple[int, int]]) -> AtlasLayout:
         """Lay out the used (source, level) pairs: below each other, in further columns where rows run out.
 
+        Sources of one size take the rows that they have in a block of images: they may turn out to be all that is read.
+
         Raises:
             CalibrationError: There are no more columns: 29 images of 7680x4320 px, read at their full size.
         """
-        used = sorted(set(used))
-        is_stack = (
-            len(set(sizes)) == 1
-            and len(used) > 0
-            and all(level == 0 for _, level in used)
-            and len(sizes) * sizes[0][0] <= _MAX_ROWS
-        )
-        if is_stack:
-            h, w = sizes[0]
-            stacked = tuple(Slot(s, 0, s * h, 0, (h, w)) for s, _ in used)
-            return cls(stacked, (h * len(sizes), w), True)
-        slots, y, x, column_width, rows = [], 0, 0, 0, 0
-        for source, level in used:
+        used = sorted(set(used), key=lambda pair: (pair[1] > 0, pair))
+        (h, w), slots, y, x, column_width = sizes[0], list[Slot](), 0, 0, 0
+        if len(set(sizes)) == 1 and len(sizes) * h <= _MAX_ROWS and any(level == 0 for _, level in used):
+            slots = [Slot(source, 0, source * h, 0, (h, w)) for source, level in used if level == 0]
+            y, column_width = len(sizes) * h, w
+        for source, level in used[len(slots) :]:
             h, w = level_size(sizes[source], level)
             if y and y + h > _MAX_ROWS:
                 x, y, column_width = x + column_width, 0, 0
             slots.append(Slot(source, level, y, x, (h, w)))
             y, column_width = y + h, max(column_width, w)
-            rows = max(rows, y)
-        columns = x + column_width
-        if columns > MAX_SIZE_PX:
+        layout = cls(tuple(slots))
+        if layout.size[1] > MAX_SIZE_PX:
             raise CalibrationError(
                 f"rig: expected source images that fit {_MAX_ROWS} rows and {MAX_SIZE_PX} columns together, got "
                 f"{len(slots)} to read at once, up to {max(h for h, _ in sizes)}x{max(w for _, w in sizes)}; resize "
                 "them, and their cameras by Rig.resized"
             )
-        return cls(tuple(slots), (max(rows, 1), max(columns, 1)), False)
+        return layout
 
     def without_others(self, read: Collection[tuple[int, int]]) -> AtlasLayout:
         """The same places for the (source, level) pairs that are read: images that win no pixel are not copied."""
-        return replace(self, slots=tuple(slot for slot in self.slots if (slot.source, slot.level) in read))
+        return AtlasLayout(tuple(slot for slot in self.slots if (slot.source, slot.level) in read))
 
     def slot(self, source: int, level: int) -> Slot:
         """The place of one source at one level."""
