@@ -11,19 +11,26 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
+from torch.utils.data import DataLoader, Dataset
 
 from arbiview_aug import RetargetedDataset, RigRetarget
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.bench.loader import PLAIN, Repeated, loader_rates
+from arbiview_aug.cli.bench.timing import memory_mib
+from arbiview_aug.datasets.synthetic import demo_target_rig
+from tests.helpers import street_sample
 
 EXPECTED = 1.7
 QUIET = 1.9  # two processes that only count do this much more than one where nobody else is working
 QUIET_LOAD = 1.0  # before the measurement, over a minute
 FRAMES = 48
 EPOCHS = 3
+SOAKED, WARM_UP = 2000, 200  # frames
+MOST_GROWTH_MIB = 8.0
 COUNTING = """
 import time
 end, n = time.perf_counter() + 1.0, 0
@@ -107,3 +114,35 @@ def test_two_workers_against_one(
     if (os.cpu_count() or 1) < 2 or given < QUIET or load > QUIET_LOAD:
         pytest.skip(f"the machine is busy, so the bound says nothing: {report}")
     report_bound("frames/s, two workers over one", scaling, at_least=EXPECTED)
+
+
+class Drifting(Dataset[dict[str, Any]]):
+    """A frame whose calibration, points and boxes are a little elsewhere each time, so that each needs its own plan."""
+
+    def __init__(self, sample: dict[str, Any], length: int) -> None:
+        self.sample, self.length = sample, length
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        away_m = 1e-4 * index
+        moved = {key: self.sample[key] + away_m for key in ("points", "boxes_3d")}
+        return self.sample | moved | {"rig": self.sample["rig"].shifted(x_m=away_m)}
+
+
+@pytest.mark.release
+def test_soak(report_bound: Callable[..., None]) -> None:
+    """2,000 frames in two workers with a new plan each, over LiDAR and boxes: the workers' memory stays."""
+    sample = street_sample()
+    retarget = RigRetarget(demo_target_rig((64, 176)), surface="lidar")
+    loader = DataLoader(RetargetedDataset(Drifting(sample, SOAKED), retarget), batch_size=None, num_workers=2)
+    before = set(multiprocessing.active_children())
+    used_mib: list[list[float]] = []
+    for k, _ in enumerate(loader):
+        if k in (WARM_UP, SOAKED // 2, SOAKED - 20):  # workers that have no more to do end
+            workers = sorted(child.pid for child in set(multiprocessing.active_children()) - before if child.pid)
+            used_mib.append([memory_mib("status", "RssAnon", pid) for pid in workers])
+    print(f"MiB of both workers after {WARM_UP}, {SOAKED // 2} and {SOAKED} frames: {used_mib}")
+    growth = max(last - first for first, last in zip(used_mib[0], used_mib[-1], strict=True))
+    report_bound("MiB by which a worker grows", growth, at_most=MOST_GROWTH_MIB)
