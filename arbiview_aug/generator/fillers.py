@@ -66,8 +66,8 @@ def mean_colour(views: Sequence[torch.Tensor], coverage: Sequence[torch.Tensor])
     total, count = np.zeros(3), 0
     for view, seen in zip(views, coverage, strict=True):
         step = _cell_px(seen.shape)
-        sampled = seen[::step, ::step]
-        total += view.detach()[:, ::step, ::step][:, sampled].double().sum(1).cpu().numpy()
+        sampled = seen[::step, ::step].cpu().numpy()  # numpy is five times faster here
+        total += (view.detach()[:, ::step, ::step].cpu().double().numpy() * sampled).sum((1, 2))
         count += int(sampled.sum())
     if count == 0:
         return np.full(3, 255 * GREY, np.float32)
@@ -89,9 +89,10 @@ def _filled(
     if how == "fill":
         box = _in_cells(box[0], cell, len(hole)), _in_cells(box[1], cell, hole.shape[1])
         planes = view[:, box[0], box[1]].detach().cpu()
-        inside = covered[box] if occluded is None else covered[box] | occluded[box].view(np.uint8)
+        known = covered[box]
+        inside = known if occluded is None else known | occluded[box].view(np.uint8)
         arrays = list((planes if planes.dtype == torch.uint8 else planes.float()).numpy())
-        small = _continued(arrays, covered[box], inside, colour, cell, min(hole.shape))
+        small = _continued(arrays, known, inside, colour, cell, min(hole.shape))
     h, w = hole[box].shape
     filled_planes = [cv2.resize(plane, (w, h), interpolation=cv2.INTER_LINEAR) for plane in cv2.split(small)]
     if view.dtype == torch.uint8 and view.device.type == "cpu":
@@ -127,8 +128,9 @@ def _continued(
     known = share >= _MIN_COVERAGE
     # Telea's method also marches from the mean colour: both meet half-way.
     reach = round(2 * REACH * side_px / cell_px)
-    inside_share: Any = cv2.resize(inside * np.uint8(255), size, interpolation=cv2.INTER_AREA)
-    far = cv2.dilate(inside_share, np.ones((2 * reach + 1,) * 2, np.uint8)) == 0
+    if inside is not covered:
+        share = cv2.resize(inside * np.uint8(255), size, interpolation=cv2.INTER_AREA)
+    far = cv2.dilate(share, np.ones((2 * reach + 1,) * 2, np.uint8)) == 0
     small[far] = np.round(colour)
     known |= far
     if not known.any():

@@ -10,7 +10,7 @@ A time is the median over the rounds; a ratio is the median of call / floor with
 The targets are Waymo's five cameras without and with their lenses, four fisheye cameras, and the source's own, turned
 or lowered. *Held*: the calibration comes back, and with it the plan; every other call plans anew. Images are decoded
 at half size where they are then still larger than the views. They lie channels-last in one block, as this package's
-readers give them; contiguous ones are planes, torch's usual layout.
+readers give them; contiguous ones are planes, torch's usual layout. Holes stay black unless they are *filled*.
 """
 
 from __future__ import annotations
@@ -39,6 +39,8 @@ from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.evaluate.targets import without_masks
+from arbiview_aug.generator.fillers import Holes
+from arbiview_aug.render.harmonise import Harmonise
 from arbiview_aug.render.plan import compile_kernels
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
@@ -165,6 +167,7 @@ def _calls(sample: Sample, target: Rig) -> Calls:
     return {
         "street, held": _held(sample, target),
         "street, held, contiguous": _held(_contiguous(sample), target),
+        "street, held, filled": _held(sample, target, holes="fill"),
         "street": _anew(sample, target, "street", {}),
         **{f"{n} boxes": _anew(sample, target, "objects", {"boxes_3d": boxes_around(n)}) for n in BOXES},
         "LiDAR": _anew(sample, target, "lidar", points),
@@ -191,21 +194,21 @@ def _calls_of_own(sample: Sample, views: tuple[int, int]) -> Calls:
     boxes = {"boxes_3d": boxes_around(75)}
     with_boxes = frame | {"neighbours": [neighbour | boxes for neighbour in neighbours]}
     return {
-        "street, held, turned, holes black": _held(sample, turned, holes="black"),
         "street, held, turned": _held(sample, turned),
+        "street, held, turned, filled": _held(sample, turned, holes="fill"),
         "street, held, turned, harmonised": _held(sample, turned, harmonise=_GAINS[: len(rig)]),
         "street, two neighbours": _anew(frame | {"neighbours": neighbours}, low, "street", {}),
         "75 boxes, two neighbours": _anew(with_boxes, low, "objects", boxes),
     }
 
 
-def _held(sample: Sample, target: Rig, **settings: Any) -> Callable[[], Any]:
-    return partial(RigRetarget(target, surface="street", **settings), sample)
+def _held(sample: Sample, target: Rig, holes: Holes = "black", harmonise: Harmonise = None) -> Callable[[], Any]:
+    return partial(RigRetarget(target, surface="street", holes=holes, harmonise=harmonise), sample)
 
 
 def _anew(sample: Sample, target: Rig, surface: SurfaceName, geometry: Sample) -> Callable[[], Any]:
     """Call with the geometry, or the rig where there is none, always a little elsewhere, so that no plan comes back."""
-    retarget, ways_m = RigRetarget(target, surface=surface, cache_bytes=0), count(_STEP_M, _STEP_M)
+    retarget, ways_m = RigRetarget(target, surface=surface, holes="black", cache_bytes=0), count(_STEP_M, _STEP_M)
     rigs = cycle([sample["rig"].shifted(x_m=k * _STEP_M) for k in range(0 if geometry else _STEPS)])
 
     def run() -> None:
