@@ -72,9 +72,13 @@ def rays_row(planes: Row, P: Row, y: int, x0: int, rx: Row, ry: Row, rz: Row) ->
         pinhole_rays_row(P, y, x0, rx, ry, rz)
     else:
         n = rx.shape[0]
-        rx[:] = planes[0, y, x0 : x0 + n]
-        ry[:] = planes[1, y, x0 : x0 + n]
-        rz[:] = planes[2, y, x0 : x0 + n]
+        a, b, c = planes[0, y, x0 : x0 + n], planes[1, y, x0 : x0 + n], planes[2, y, x0 : x0 + n]
+        for i in range(n):  # rx[:] = a takes three times as long
+            rx[i] = a[i]
+        for i in range(n):
+            ry[i] = b[i]
+        for i in range(n):
+            rz[i] = c[i]
 
 
 @compiled
@@ -163,23 +167,28 @@ def project_row(x: Row, y: Row, z: Row, kind: int, P: Row, a: Row, b: Row, u: Ro
 
 
 @compiled
+def angle_row(r: Row, z: Row, out: Row) -> None:
+    """atan2(r, z) (n,) in [0, pi] for r >= 0, by the octant that r and |z| lie in."""
+    for i in range(r.shape[0]):
+        far = abs(z[i])
+        low, high = min(r[i], far), max(max(r[i], far), _TINY)
+        turned = low > _TAN_22_5 * high
+        s = (low - high if turned else low) / (low + high if turned else high)
+        s2 = s * s
+        angle = s + s * s2 * (_A3 + s2 * (_A2 + s2 * (_A1 + s2 * _A0)))
+        angle = angle + _QUARTER_PI if turned else angle
+        angle = _HALF_PI - angle if r[i] > far else angle
+        out[i] = _PI - angle if z[i] < _ZERO else angle
+
+
+@compiled
 def _fisheye_row(x: Row, y: Row, z: Row, P: Row, scale: Row, r: Row) -> None:
     """theta_d / r (n,) of a Kannala-Brandt lens, -2 past its fold and on the axis behind the camera."""
     k1, k2, k3, k4, fold = P[6], P[7], P[8], P[9], P[5]
     n = x.shape[0]
     for i in range(n):
         r[i] = np.sqrt(x[i] * x[i] + y[i] * y[i])
-    for i in range(n):  # atan2(r, z) by the octant that r and |z| lie in
-        far = abs(z[i])
-        low, high = min(r[i], far), max(max(r[i], far), _TINY)
-        t = low / high
-        turned = t > _TAN_22_5
-        s = (t - _ONE) / (t + _ONE) if turned else t
-        s2 = s * s
-        angle = s + s * s2 * (_A3 + s2 * (_A2 + s2 * (_A1 + s2 * _A0)))
-        angle = angle + _QUARTER_PI if turned else angle
-        angle = _HALF_PI - angle if r[i] > far else angle
-        scale[i] = _PI - angle if z[i] < _ZERO else angle
+    angle_row(r, z, scale)
     for i in range(n):
         theta = scale[i]
         t2 = theta * theta

@@ -289,9 +289,8 @@ class ViewPlanner:
         shadow, solid = nothing
         shadow_scale = 1.0
         if surface.is_layered or surface.is_dense:
-            # Points are smooth: half the size that is read is enough. Silhouettes of objects are not.
-            is_smooth = not surface.is_layered and min(source.size) >> level >= 2
-            coarser = level + 1 if is_smooth else level
+            # Points are known by cells: a pixel for each is enough. Silhouettes of objects are sharper.
+            coarser = level if surface.is_layered else max(level, surface.occlusion_level(source))
             half = halved_camera(source, coarser)
             shadow, solid = surface.occlusion_map(half, self.maps.rays(half))
             shadow_scale = 0.5 ** (coarser - level)

@@ -278,42 +278,9 @@ def upsample(nodes: Any, step: int, out: Any) -> None:
 
 
 @compiled
-def add_residuals(rows: Any, columns: Any, step: int, near: Any, far: Any, share: Any, q: Any) -> None:
-    """Add a panorama's residuals (``panorama.Panorama``) to inverse distances (h, w).
-
-    Args:
-        rows: (ny + 1, nx + 1) rows of the panorama at the nodes.
-        columns: (ny + 1, nx + 1) its columns.
-        step: Distance of the nodes, pixels.
-        near: (H, W) residual of the nearer side of a step.
-        far: (H, W) that of the farther one.
-        share: (H, W) share of the nearer side.
-        q: (h, w) float32, updated; clipped to what a surface may say.
-    """
-    h, w = q.shape
-    last_row, last_column = np.float32(near.shape[0] - 1), np.float32(near.shape[1] - 1)
-    line, v, u = np.empty(rows.shape[1], np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
-    for y in range(h):
-        upsampled_row(rows, step, y, 0, line, v)
-        upsampled_row(columns, step, y, 0, line, u)
-        for x in range(w):
-            a, b = min(max(v[x], _ZERO), last_row), min(max(u[x], _ZERO), last_column)
-            r, c = int(a), int(b)
-            s, t = a - np.float32(r), b - np.float32(c)
-            r1, c1 = min(r + 1, near.shape[0] - 1), min(c + 1, near.shape[1] - 1)
-            w00, w01, w10, w11 = (_ONE - s) * (_ONE - t), (_ONE - s) * t, s * (_ONE - t), s * t
-            nearer = w00 * share[r, c] + w01 * share[r, c1] + w10 * share[r1, c] + w11 * share[r1, c1] > _HALF
-            if nearer:
-                value = w00 * near[r, c] + w01 * near[r, c1] + w10 * near[r1, c] + w11 * near[r1, c1]
-            else:
-                value = w00 * far[r, c] + w01 * far[r, c1] + w10 * far[r1, c] + w11 * far[r1, c1]
-            q[y, x] = min(max(q[y, x] + value, _ZERO), _MOST)
-
-
-@compiled
 def draw_scanned(
     planes: Any, P: Any, R: Any, boxes: Any, cones: Any, step: int, raster: Any, nearest: Any, top_rad: Any, mode: int,
-    image: Any,
+    image: Any, solid: Any,
 ) -> None:  # fmt: skip
     """Draw an object by its points into inverse distances or an occlusion map (``scanned_objects.ScannedObject``).
 
@@ -331,6 +298,7 @@ def draw_scanned(
         mode: ``SHOW``: where it is met in front of what ``image`` (h, w) says. ``HIDE``: what it hides. ``HIDE_WIDE``:
             what it may hide, a little above its points too.
         image: (h, w) float32, updated.
+        solid: (h, w) int32, -1 where the image is raised; (0, 0) with ``SHOW``.
     """
     h, w = image.shape
     _, ny, nx = cones.shape
@@ -375,5 +343,6 @@ def draw_scanned(
                 if mode == SHOW:
                     if own > _ZERO and out[x] < behind:
                         out[x] = own
-                elif mode == HIDE_WIDE or own > _ZERO:
-                    out[x] = max(out[x], behind)
+                elif (mode == HIDE_WIDE or own > _ZERO) and behind > out[x]:
+                    out[x] = behind
+                    solid[y, x0 + x] = -1

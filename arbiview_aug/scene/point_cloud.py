@@ -6,8 +6,9 @@ No sensor's place is assumed: points are z-buffered and made dense anew for each
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +18,7 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import CELL_PX, PixelRays
 from arbiview_aug.errors import SampleError
 from arbiview_aug.scene.boxes import BoxSurface, box_rows
-from arbiview_aug.scene.panorama import CELL_RAD, SIDE_RAD, Layer, Panorama, PanoramaWindow, angles, panorama
+from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, SIDE_RAD, Layer, PanoramaWindow, angles
 from arbiview_aug.scene.scanned_objects import BOX_AIR_M, RASTER_RAD, ScannedObject, scanned_objects
 from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Points, StaticSurface
 
@@ -25,12 +26,79 @@ OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
 """(x, y) ranges in the ego frame whose returns are the own car's: a car's about the middle of its rear axle."""
 
 _STEEP = 0.9
-"""Sine of the elevation up to which azimuths are interpolated over 0.2 degrees: 64 degrees."""
+"""Sine of the elevation up to which azimuths are interpolated: 64 degrees."""
 
-_NO_BOX = -2  # in shadows: a point's, no box's
+_NODES_RAD = 4 * CELL_RAD
+"""Distance of nodes between which positions in a panorama are interpolated, to 1/50 of a cell."""
+
+_NO_SOLID = np.zeros((0, 0), np.int32)
 
 _MEASURED_SPREAD = 0.05
 """Spread of a measured inverse distance, as a share of it: half of STEP, below which densification follows a slope."""
+
+
+@dataclass(frozen=True, eq=False)
+class Panorama:
+    """What the points say within a window of one centre's view; residuals in 1/m, all (rows, columns).
+
+    Attributes:
+        window: Which part of the sphere.
+        origin: (3,) the centre.
+        base: The static surface under the residuals.
+        near: Residual of the nearer side of a step, or of everything where there is none.
+        far: That of the farther side.
+        share: How much of the neighbourhood belongs to the nearer side.
+        measured: 1 where a point lies within ``SUPPORT_RAD``, else 0.
+    """
+
+    window: PanoramaWindow
+    origin: FloatArray
+    base: StaticSurface
+    near: Layer
+    far: Layer
+    share: Layer
+    measured: Layer
+
+    @cached_property
+    def hidden_below(self) -> Layer:
+        """Points of a smaller inverse distance are hidden by what certainly stands there; 0 where nothing was
+        measured."""
+        from arbiview_aug.scene.completion import hidden_depths
+
+        h, w = self.near.shape
+        rows, columns = (np.arange(0, n + BASE_STEP, BASE_STEP) * np.float32(CELL_RAD) for n in (h, w))
+        azimuth, elevation = self.window.place[0] + columns, (self.window.place[2] + rows)[:, None]
+        level, up = np.cos(elevation), np.broadcast_to(np.sin(elevation), (len(rows), len(columns)))
+        rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up])
+        out = np.empty((h, w), np.float32)
+        hidden_depths(self.near, self.far, self.share, self.measured, self.base.along(self.origin, rays), out)
+        return out
+
+    def cells(self, rays: Layer, R: FloatArray) -> tuple[Layer, Layer]:
+        """Rows and columns (h, w) of rays (3, h, w) that ``R`` turns to the ego frame; beyond the end they exceed the
+        shape."""
+        from arbiview_aug.scene.completion import cells_of
+
+        rows, columns = np.empty(rays.shape[1:], np.float32), np.empty(rays.shape[1:], np.float32)
+        cells_of(rays, R.astype(np.float32), self.window.place, rows, columns)
+        return rows, columns
+
+
+def panorama(window: PanoramaWindow, origin: FloatArray, points: Points, base: StaticSurface) -> Panorama:
+    """The points (P, 3) as seen from ``origin`` (3,), made dense over a static surface.
+
+    Nearest point first in each cell, none within ``NEAREST_M``; points that shine through gaps of what is nearer are
+    dropped; each cell takes the residual of its nearest point; residuals are averaged, on both sides of a step apart.
+    """
+    from arbiview_aug.scene.completion import complete, drop_hidden, nearest_points
+
+    q, number = np.zeros(window.shape, np.float32), np.empty(window.shape, np.int32)
+    nearest_points(points, origin, window.bounds, window.place, q, number)
+    cells, rays = drop_hidden(q, number, points, origin)
+    own = q.reshape(-1)[cells]
+    view = Panorama(window, origin, base, *(np.empty(window.shape, np.float32) for _ in range(4)))
+    complete(cells, own, own - base.along(origin, rays)[0], view.near, view.far, view.share, view.measured)
+    return view
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +123,13 @@ class PointCloudSurface(DenseSurface):
 
     def image(self, camera: Camera, rays: PixelRays) -> Layer:
         """The points' dense surface at all pixels, 1/m (h, w)."""
-        from arbiview_aug.scene.kernels import SHOW, add_residuals
+        from arbiview_aug.scene.completion import add_residuals
+        from arbiview_aug.scene.kernels import SHOW
 
         q = self.street.image(camera, rays)
-        view, row, column, step = self._located(camera, rays)
-        add_residuals(row, column, step, view.near, view.far, view.share, q)
-        self._draw_objects(camera, rays, SHOW, q)
+        view, *cells = self._located(camera, rays)
+        add_residuals(*cells, view.near, view.far, view.share, q)
+        self._draw_objects(camera, rays, SHOW, q, _NO_SOLID)
         return q
 
     def occlusion_map(self, camera: Camera, rays: PixelRays) -> OcclusionMap:
@@ -70,31 +139,46 @@ class PointCloudSurface(DenseSurface):
         and only within measured outlines: nothing hides where the LiDAR is silent.
         """
         if camera not in self._shadows:
-            none = np.broadcast_to(np.int32(-1), camera.size)
-            self._shadows[camera] = OcclusionMap(self.before_image(camera, rays), none)
+            shadows = OcclusionMap(np.zeros(camera.size, np.float32), np.full(camera.size, -1, np.int32))
+            self.hide(camera, rays, shadows.beyond, shadows.solid)
+            self._shadows[camera] = shadows
         return self._shadows[camera]
 
-    def before_image(self, camera: Camera, rays: PixelRays, *, widened: bool = True) -> Layer:
-        """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a panorama's cell apart.
+    def occlusion_level(self, camera: Camera) -> int:
+        """Halvings up to which a pixel is not wider than a cell."""
+        level = int(math.log2(max(CELL_RAD * float(camera.K[0, 0]), 1)))
+        return 0 if min(camera.size) >> level < 2 else level
 
-        With ``widened`` objects reach half a scan line's spacing above their highest points: they may, and a source
-        that shows them there must not be read for the background.
+    def hide(
+        self, camera: Camera, rays: PixelRays, beyond: Layer, solid: npt.NDArray[np.int32], *, widened: bool = True
+    ) -> None:
+        """Raise inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart.
+
+        ``solid`` (h, w) becomes -1 there. With ``widened`` objects reach half a scan line's spacing above their highest
+        points: they may, and a source that shows them there must not be read for the background.
         """
-        from arbiview_aug.scene.kernels import HIDE, HIDE_WIDE, upsample
+        from arbiview_aug.scene.completion import raise_depths
+        from arbiview_aug.scene.kernels import HIDE, HIDE_WIDE
 
-        view, row, column, step = self._located(camera, rays)
-        before = np.empty(camera.size, np.float32)
-        upsample(view.occlusion_depth(row, column), step, before)
-        self._draw_objects(camera, rays, HIDE_WIDE if widened else HIDE, before)
-        return before
+        view, *cells = self._located(camera, rays)
+        apart = max(1, round(CELL_RAD * float(rays.parameters[0])))
+        raise_depths(*cells, view.hidden_below, apart, beyond, solid)
+        self._draw_objects(camera, rays, HIDE_WIDE if widened else HIDE, beyond, solid)
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Small where a point is near, the street's elsewhere: 1/m (...,)."""
-        view, row, column = self._view(origin, directions)
-        unknown = self.street.uncertainty(origin, directions, inverse_distance)
-        return np.where(view.is_measured(row, column), _MEASURED_SPREAD * inverse_distance, unknown)
+        from arbiview_aug.scene.completion import read_layer
 
-    def _draw_objects(self, camera: Camera, rays: PixelRays, mode: int, image: Layer) -> None:
+        rays = np.moveaxis(directions.reshape(1, -1, 3), -1, 0).astype(np.float32, order="C")
+        view = self.view(origin, directions)
+        near = np.empty(rays.shape[2], np.float32)
+        read_layer(*(cells[0] for cells in view.cells(rays, np.eye(3))), view.measured, near)
+        unknown = self.street.uncertainty(origin, directions, inverse_distance)
+        return np.where(near.reshape(unknown.shape) > 0.5, _MEASURED_SPREAD * inverse_distance, unknown)
+
+    def _draw_objects(
+        self, camera: Camera, rays: PixelRays, mode: int, image: Layer, solid: npt.NDArray[np.int32]
+    ) -> None:
         """Draw the objects that a camera may see by their points (``kernels.draw_scanned``)."""
         from arbiview_aug.scene.kernels import draw_scanned
 
@@ -112,63 +196,40 @@ class PointCloudSurface(DenseSurface):
             place = np.array([raster.azimuth_rad, raster.elevation_rad, RASTER_RAD, SIDE_RAD], np.float32)
             draw_scanned(
                 rays.planes, rays.parameters, R, pair, rays.cones, CELL_PX, place, raster.nearest, raster.top_rad,
-                mode, image,
+                mode, image, solid,
             )  # fmt: skip
 
     def _located(self, camera: Camera, rays: PixelRays) -> tuple[Panorama, Layer, Layer, int]:
         """The panorama around a camera; rows and columns in it (ny + 1, nx + 1) of nodes, and how far these are apart.
 
-        Nodes lie on pixels; those behind the last one are extrapolated. Kept for the next question.
+        Kept for the next question.
         """
-        if camera in self._nodes:
-            return self._nodes[camera]
-        step = max(1, round(CELL_RAD * float(camera.K[0, 0])))
-        found = self._nodes_apart(camera, rays, step) or self._nodes_apart(camera, rays, 1)
-        assert found is not None
-        self._nodes[camera] = found
+        if camera not in self._nodes:
+            step, R = max(1, int(_NODES_RAD * float(rays.parameters[0]))), camera.cam2ego[:3, :3]
+            local, directions = _nodes(rays, step, R)
+            view = self.view(camera.center_m, directions)
+            # A lens may have no rays somewhere; azimuths bend near the zenith, and jump in a panorama all around.
+            steep = len(directions) == 0 or float(np.abs(directions[:, 2]).max()) > _STEEP
+            if step > 1 and (steep or view.window.is_whole or len(directions) < local[0].size):
+                step, (local, _) = 1, _nodes(rays, 1, R)
+            self._nodes[camera] = view, *view.cells(local, R), step
+        return self._nodes[camera]
+
+    def view(self, origin: FloatArray, directions: FloatArray) -> Panorama:
+        """The panorama around a centre that holds rays (..., 3)."""
+        asked = PanoramaWindow.around(*angles(directions if directions.size else np.array([[1.0, 0.0, 0.0]])))
+        held = self._panoramas.setdefault(np.asarray(origin, np.float64).tobytes(), [])
+        found = next((p for p in held if p.window.holds(asked)), None)
+        if found is None:
+            found = panorama(asked.widened(), np.asarray(origin, np.float64), self.points, self.street)
+            held.append(found)
         return found
 
-    def _nodes_apart(self, camera: Camera, rays: PixelRays, step: int) -> tuple[Panorama, Layer, Layer, int] | None:
-        """As ``_located``; None where panorama positions cannot be interpolated between nodes."""
-        y, x = (np.arange(0, n + step, step) for n in camera.size)
-        local = rays.at(*(np.minimum(p, n - 1) for p, n in zip((y, x), camera.size, strict=True)))
-        lost = (local == 0).all(axis=0)
-        local[:, lost] = np.array([[0], [0], [1]])
-        directions = np.moveaxis(np.tensordot(camera.cam2ego[:3, :3], local.astype(np.float64), 1), 0, -1)
-        # A lens may have no rays somewhere; azimuths bend near the zenith.
-        if step > 1 and (lost.any() or float(np.abs(directions[..., 2]).max()) > _STEEP):
-            return None
-        view, row, column = self._view(camera.center_m, directions)
-        if step > 1 and view.window.is_whole:  # columns jump somewhere in a panorama that goes all around
-            return None
-        if step > 1:
-            row, column = (_extrapolated(a, y, x, camera.size) for a in (row, column))
-        return view, row, column, step
 
-    def _view(self, origin: FloatArray, directions: FloatArray) -> tuple[Panorama, Layer, Layer]:
-        """The panorama around a centre that holds the rays, and their rows and columns in it."""
-        azimuth, elevation = angles(directions)
-        asked = (
-            PanoramaWindow.around(azimuth, elevation)
-            if directions.size
-            else PanoramaWindow(0.0, CELL_RAD, 0.0, CELL_RAD)
-        )
-        held = self._panoramas.setdefault(np.asarray(origin, np.float64).tobytes(), [])
-        view = next((p for p in held if p.window.holds(asked)), None)
-        if view is None:
-            view = panorama(asked.widened(), origin, self.points, self.street)
-            held.append(view)
-        return view, *view.window.cells(azimuth, elevation)
-
-
-def _extrapolated(values: Layer, y: Any, x: Any, size: tuple[int, int]) -> Layer:
-    """Values at nodes (ny, nx), of which the last were read at the image's last pixel, where the nodes lie."""
-    values = values.copy()
-    for axis, nodes, n in ((0, y, size[0]), (1, x, size[1])):
-        turned = np.moveaxis(values, axis, 0)
-        if len(nodes) > 1 and n - 1 > nodes[-2]:
-            turned[-1] = turned[-2] + (turned[-1] - turned[-2]) * ((nodes[-1] - nodes[-2]) / (n - 1 - nodes[-2]))
-    return values
+def _nodes(rays: PixelRays, step: int, R: FloatArray) -> tuple[Layer, FloatArray]:
+    """Rays (3, ny + 1, nx + 1) of nodes, the last ones on the last pixels; those there are (n, 3), in the ego frame."""
+    local = rays.at(*(np.minimum(np.arange(0, n + step, step), n - 1) for n in rays.size))
+    return local, local[:, local.any(axis=0)].T @ R.T
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +255,7 @@ class PointCloudWithBoxes(BoxSurface):
     def drawn(self, camera: Camera, rays: PixelRays) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
         """The boxes with nothing measured before them."""
         q, face = super().drawn(camera, rays)
-        face[q < self.street.before_image(camera, rays, widened=False)] = -1
+        self.street.hide(camera, rays, q, face, widened=False)
         return q, face
 
     def occlusion_map(self, camera: Camera, rays: PixelRays) -> OcclusionMap:
@@ -202,10 +263,7 @@ class PointCloudWithBoxes(BoxSurface):
         new = camera not in self._shadows
         shadows = super().occlusion_map(camera, rays)
         if new:
-            measured = self.street.before_image(camera, rays)
-            nearer = measured > shadows.beyond
-            np.copyto(shadows.beyond, measured, where=nearer)
-            np.copyto(shadows.solid, _NO_BOX, where=nearer)
+            self.street.hide(camera, rays, shadows.beyond, shadows.solid)
         return shadows
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:

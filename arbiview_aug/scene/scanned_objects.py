@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.scene.boxes import is_over, points_in
-from arbiview_aug.scene.panorama import NEAREST_M, Layer, angles, spread, wrapped
+from arbiview_aug.scene.panorama import NEAREST_M, Layer, angles, wrapped
 from arbiview_aug.scene.surface import Points
 
 BOX_AIR_M = 0.2
@@ -94,6 +94,8 @@ def scanned_objects(
 
 def _raster(box: FloatArray, points: FloatArray, origin: FloatArray) -> _Raster | None:
     """None where the centre is over the object or in it, or all but touches its points: it has no outline there."""
+    from arbiview_aug.scene.completion import fill_raster
+
     if is_over(box, origin, BOX_AIR_M):
         return None
     away = points - origin
@@ -113,5 +115,5 @@ def _raster(box: FloatArray, points: FloatArray, origin: FloatArray) -> _Raster 
     np.maximum.at(top, column, elevation)
     there = np.flatnonzero(np.isfinite(top))
     top = np.interp(np.arange(len(top)), there, top[there])
-    _, (nearest,) = spread(nearest > 0, nearest)
+    fill_raster(nearest)
     return _Raster(middle + left, low, nearest, top.astype(np.float32))

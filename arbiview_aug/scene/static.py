@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +34,34 @@ _FREE, _DENSITY = 0.1, 1.33
 class _RoadAndWall(StaticSurface):
     """A street without objects."""
 
+    ground_z_m: float
+
+    @property
+    @abstractmethod
+    def semi_axes_m(self) -> tuple[float, float]:
+        """Of the wall, along the road and across it."""
+
+    def image(self, camera: Camera, rays: PixelRays) -> npt.NDArray[np.float32]:
+        """As ``inverse_distance``, compiled."""
+        return self._compiled(camera.center_m, camera.cam2ego[:3, :3], rays.planes, rays.parameters, camera.size)
+
+    def along(self, origin: FloatArray, rays: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """As ``inverse_distance``, compiled."""
+        return self._compiled(origin, np.eye(3), rays, np.zeros(14, np.float32), rays.shape[1:])
+
+    def _compiled(
+        self, origin: FloatArray, R: FloatArray, planes: Any, parameters: Any, size: tuple[int, ...]
+    ) -> npt.NDArray[np.float32]:
+        from arbiview_aug.scene.kernels import GROUND, STREET, static_image
+
+        height, axes = origin[2] - self.ground_z_m, self.semi_axes_m
+        ox, oy = (origin[:2] - WALL_CENTER_M) / axes
+        settings = 1 / height if height > 0 else 0.0, 1 / axes[0], 1 / axes[1], ox, oy, ox * ox + oy * oy - 1
+        q = np.empty(size, np.float32)
+        kind = STREET if isinstance(self, Street) else GROUND
+        static_image(planes, parameters, R.astype(np.float32), kind, np.array(settings, np.float32), q)
+        return q
+
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Mean error (...,) in 1/m caused by unknown objects, within a quarter on most of six synthetic streets.
 
@@ -55,9 +85,10 @@ class Ground(_RoadAndWall):
     ground_z_m: float = 0.0
     radius_m: float = 40.0
 
-    def image(self, camera: Camera, rays: PixelRays) -> npt.NDArray[np.float32]:
-        """As ``inverse_distance``, compiled."""
-        return _compiled_image(self, camera, rays, self.radius_m, self.radius_m)
+    @property
+    def semi_axes_m(self) -> tuple[float, float]:
+        """Radii of the cylinder."""
+        return self.radius_m, self.radius_m
 
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """The nearer of plane and cylinder, 1/m (...,)."""
@@ -85,9 +116,10 @@ class Street(_RoadAndWall):
     half_width_m: float = 20.0
     sharpness: float = 4.0
 
-    def image(self, camera: Camera, rays: PixelRays) -> npt.NDArray[np.float32]:
-        """As ``inverse_distance``, compiled."""
-        return _compiled_image(self, camera, rays, self.half_length_m, self.half_width_m)
+    @property
+    def semi_axes_m(self) -> tuple[float, float]:
+        """Those of the wall."""
+        return self.half_length_m, self.half_width_m
 
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """The smooth join of plane and wall, 1/m (...,)."""
@@ -97,22 +129,6 @@ class Street(_RoadAndWall):
         ratio = farther / np.maximum(nearer, 1e-300)
         joined = nearer * (1 + ratio**self.sharpness) ** (1 / self.sharpness)
         return np.minimum(joined, MAX_INVERSE_DISTANCE)
-
-
-def _compiled_image(
-    surface: Ground | Street, camera: Camera, rays: PixelRays, half_length_m: float, half_width_m: float
-) -> npt.NDArray[np.float32]:
-    from arbiview_aug.scene.kernels import GROUND, STREET, static_image
-
-    height = camera.center_m[2] - surface.ground_z_m
-    ox, oy = (camera.center_m[:2] - WALL_CENTER_M) / (half_length_m, half_width_m)
-    per_height = 1 / height if height > 0 else 0.0
-    settings = per_height, 1 / half_length_m, 1 / half_width_m, ox, oy, ox * ox + oy * oy - 1
-    q = np.empty(camera.size, np.float32)
-    kind = STREET if isinstance(surface, Street) else GROUND
-    R = camera.cam2ego[:3, :3].astype(np.float32)
-    static_image(rays.planes, rays.parameters, R, kind, np.array(settings, np.float32), q)
-    return q
 
 
 def plane_inverse_distance(origin: FloatArray, directions: FloatArray, ground_z_m: float) -> FloatArray:

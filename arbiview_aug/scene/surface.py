@@ -106,6 +106,10 @@ class DenseSurface(Surface):
     def occlusion_map(self, camera: Camera, rays: PixelRays) -> OcclusionMap:
         """The surface as an occluder in a source image."""
 
+    @abstractmethod
+    def occlusion_level(self, camera: Camera) -> int:
+        """Halvings of a source image at which its occlusion map loses nothing."""
+
 
 class StaticSurface(Surface):
     """A surface without objects, which occludes nothing."""
@@ -120,6 +124,10 @@ class StaticSurface(Surface):
             origin: (3,) the rays' common start in the ego frame, metres.
             directions: (..., 3) unit directions in the ego frame.
         """
+
+    def along(self, origin: FloatArray, rays: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Inverse distances (h, w) along unit rays (3, h, w) in the ego frame, 1/m."""
+        return self.inverse_distance(origin, np.moveaxis(rays.astype(np.float64), 0, -1)).astype(np.float32)
 
     def image(self, camera: Camera, rays: PixelRays) -> npt.NDArray[np.float32]:
         """Inverse distances (h, w) along the rays of a camera's pixel centres, 1/m."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from arbiview_aug.scene.boxes import BoxSurface, meets
-from arbiview_aug.scene.panorama import SIDE_RAD, angles, layer_at, wrapped
-from arbiview_aug.scene.point_cloud import PointCloudSurface, PointCloudWithBoxes
+from arbiview_aug.scene.panorama import CELL_RAD, SIDE_RAD, angles, wrapped
+from arbiview_aug.scene.point_cloud import Panorama, PointCloudSurface, PointCloudWithBoxes
 from arbiview_aug.scene.scanned_objects import BOX_AIR_M, RASTER_RAD, ScannedObject
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE, StaticSurface, Surface
 
@@ -22,8 +22,8 @@ def inverse_distance(surface: Surface, origin: np.ndarray, directions: np.ndarra
             shown &= first >= occlusion_depth(surface.street, origin, directions, widened=False)
         return np.where(shown, first, inverse_distance(surface.street, origin, directions))
     assert isinstance(surface, PointCloudSurface)
-    view, row, column = surface._view(origin, directions)
-    near, far, share = (layer_at(layer, row, column) for layer in (view.near, view.far, view.share))
+    view = surface.view(origin, directions)
+    near, far, share = (layer_at(view, layer, directions) for layer in (view.near, view.far, view.share))
     q = surface.street.inverse_distance(origin, directions) + np.where(share > 0.5, near, far)
     flat = q.reshape(-1)
     for met, own, behind in _objects_on(surface, origin, directions):
@@ -49,12 +49,27 @@ def occlusion_depth(
     surface: PointCloudSurface, origin: np.ndarray, directions: np.ndarray, widened: bool = True
 ) -> np.ndarray:
     """Inverse distances (...,) beyond which points hide what is behind them."""
-    view, row, column = surface._view(origin, directions)
-    depth = view.occlusion_depth(row, column).astype(np.float64)
+    view = surface.view(origin, directions)
+    depth = layer_at(view, view.hidden_below, directions)
     flat = depth.reshape(-1)
     for met, own, behind in _objects_on(surface, origin, directions):
         flat[met] = np.maximum(flat[met], behind if widened else np.where(own > 0, behind, 0))
     return depth
+
+
+def layer_at(view: Panorama, layer: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Bilinear values (...,) of a panorama's layer along unit rays (..., 3); its border beyond it."""
+    first, lead, low = view.window.place.astype(np.float64)
+    azimuth, elevation = (
+        np.arctan2(directions[..., 1], directions[..., 0]),
+        np.arcsin(np.clip(directions[..., 2], -1, 1)),
+    )
+    column = lead + ((azimuth - first) / CELL_RAD - lead) % (2 * np.pi / CELL_RAD)
+    at = [np.clip(a, 0, n - 1) for a, n in zip(((elevation - low) / CELL_RAD, column), layer.shape, strict=True)]
+    (r, c), (s, t) = (a.astype(int) for a in at), (a % 1 for a in at)
+    r1, c1 = (np.minimum(a + 1, n - 1) for a, n in zip((r, c), layer.shape, strict=True))
+    above, below = layer[r, c] * (1 - t) + layer[r, c1] * t, layer[r1, c] * (1 - t) + layer[r1, c1] * t
+    return np.asarray(above * (1 - s) + below * s)
 
 
 def boxes_ahead(boxes: np.ndarray, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,472 @@
+"""Compiled completion of points around a centre: z-buffer, nearest values, both sides of a step, hidden depths."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from arbiview_aug.cameras.kernels import angle_row
+from arbiview_aug.environment import compiled
+from arbiview_aug.scene.kernels import upsampled_row
+from arbiview_aug.scene.panorama import (
+    BASE_STEP,
+    CELL_RAD,
+    NEAREST_M,
+    REACH_RAD,
+    SEE_THROUGH_RAD,
+    SHRINK_RAD,
+    SIDE_RAD,
+    SMOOTH_RAD,
+    STEP,
+    STEP_PER_M,
+    SUPPORT_RAD,
+)
+from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
+
+_ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
+_MOST = np.float32(MAX_INVERSE_DISTANCE)
+_HALF_PI = np.float32(np.pi / 2)
+_CHUNK = 1024  # points worked on at once
+_PER_RAD = np.float32(1 / CELL_RAD)
+_TURN = np.float32(round(2 * np.pi / CELL_RAD))
+
+# A cell's nearest seed in one int32, so that the nearer of two is their minimum: distance in 1/1024 cell (from bit 14),
+# row (from bit 7) and column of the seed as seen from the cell, plus 64. Distances are those of Borgefors' 5 x 5 mask.
+_UNIT, _ROW, _MIDDLE = 1 << 14, 1 << 7, 64
+_NO_SEED = np.int32(64 * 1024 * _UNIT)
+_SIDE, _CORNER, _KNIGHT = 1024 * _UNIT, 1434 * _UNIT, 2250 * _UNIT
+_REACH = np.float32(REACH_RAD / CELL_RAD)
+_SUPPORT = np.float32(SUPPORT_RAD / CELL_RAD)
+
+_FAR, _ASIDE = round(SEE_THROUGH_RAD / CELL_RAD), round(SIDE_RAD / CELL_RAD)
+_RADIUS = max(1, round(SMOOTH_RAD / 2 / CELL_RAD))
+_SHRINK = max(1, round(SHRINK_RAD / CELL_RAD))
+_STEP, _STEP_PER_M, _SOME = np.float32(STEP), np.float32(STEP_PER_M), np.float32(1e-3)
+
+
+@compiled
+def cells_row(x: Any, y: Any, z: Any, place: Any, level: Any, row: Any, column: Any) -> None:
+    """Rows and columns (n,) in a panorama (``PanoramaWindow.place``) of ego-frame vectors; ``level`` is scratch."""
+    first, lead, low = place[0], place[1], place[2]
+    n = x.shape[0]
+    for i in range(n):
+        level[i] = abs(y[i])
+    angle_row(level, x, column)
+    for i in range(n):
+        azimuth = (column[i] if y[i] >= _ZERO else -column[i]) - first
+        column[i] = azimuth * _PER_RAD - lead
+    for i in range(n):
+        column[i] += lead - np.floor(column[i] / _TURN) * _TURN
+    for i in range(n):
+        level[i] = np.sqrt(x[i] * x[i] + y[i] * y[i])
+    angle_row(level, z, row)
+    for i in range(n):
+        row[i] = (_HALF_PI - row[i] - low) * _PER_RAD
+
+
+@compiled
+def nearest_points(points: Any, origin: Any, bounds: Any, place: Any, q: Any, number: Any) -> None:
+    """Z-buffer the points (P, 3) around ``origin``: their largest inverse distance in each cell, and whose it is.
+
+    Args:
+        points: Ego frame, metres.
+        origin: (3,) float64.
+        bounds: ``PanoramaWindow.bounds``.
+        place: ``PanoramaWindow.place``.
+        q: (h, w) float32, 0; written where there is a point.
+        number: (h, w) int32; written where there is a point, of equally near ones the last.
+    """
+    h, w = q.shape
+    low, high, cosine, sine, least = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
+    work, index = np.empty((7, _CHUNK), np.float32), np.empty(_CHUNK, np.int64)
+    for start in range(0, points.shape[0], _CHUNK):
+        n = 0
+        for i in range(start, min(start + _CHUNK, points.shape[0])):
+            x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+            level2 = x * x + y * y
+            length = np.sqrt(level2 + z * z)
+            if length < NEAREST_M or z < low * length or z > high * length:
+                continue
+            if x * cosine + y * sine < least * np.sqrt(level2):
+                continue
+            work[0, n], work[1, n], work[2, n], work[3, n] = x / length, y / length, z / length, 1 / length
+            index[n] = i
+            n += 1
+        cells_row(work[0, :n], work[1, :n], work[2, :n], place, work[4, :n], work[5, :n], work[6, :n])
+        for i in range(n):
+            row, column = int(np.rint(work[5, i])), int(np.rint(work[6, i])) % int(_TURN)
+            if row < 0 or row >= h:
+                continue
+            while column < w:  # the halo of a whole turn holds some points twice
+                if work[3, i] >= q[row, column]:
+                    q[row, column], number[row, column] = work[3, i], index[i]
+                column += int(_TURN)
+
+
+@compiled
+def drop_hidden(q: Any, number: Any, points: Any, origin: Any) -> tuple[Any, Any]:
+    """Drop points that shine through gaps of what is nearer on both sides of them (``SEE_THROUGH_RAD``).
+
+    ``q`` and ``number`` are those of ``nearest_points``. Returns the flat indices (n,) of cells that keep their point,
+    and its ray (3, 1, n) in the ego frame, float32.
+    """
+    h, w = q.shape
+    across, down = q.copy(), q.copy()
+    _window_max(across, 2 * _ASIDE + 1, _FAR)
+    _window_max(down, _FAR, 2 * _ASIDE + 1)
+    cells, n = np.empty(h * w, np.int64), 0
+    for y in range(h):
+        inside = _FAR <= y < h - _FAR
+        for x in range(w):
+            if q[y, x] <= _ZERO:
+                continue
+            if inside and _FAR <= x < w - _FAR:
+                one = min(across[y - _ASIDE, x - _FAR], across[y - _ASIDE, x + 1])
+                two = min(down[y - _FAR, x - _ASIDE], down[y + 1, x - _ASIDE])
+                if q[y, x] < _hidden_below(max(one, two)):
+                    continue
+            cells[n] = y * w + x
+            n += 1
+    rays = np.empty((3, 1, n), np.float32)
+    for i in range(n):
+        y, x = cells[i] // w, cells[i] % w
+        for axis in range(3):
+            rays[axis, 0, i] = (points[number[y, x], axis] - origin[axis]) * q[y, x]
+    return cells[:n].copy(), rays
+
+
+@compiled
+def complete(cells: Any, own: Any, residuals: Any, near: Any, far: Any, share: Any, measured: Any) -> None:
+    """Give every cell the residual of the nearest point, averaged on a step's nearer and on its farther side.
+
+    Args:
+        cells: (n,) flat indices of cells that have a point.
+        own: (n,) their inverse distances.
+        residuals: (n,) what they add to the static surface.
+        near: (h, w) float32, written as are the further ones: see ``Panorama``.
+        far: See there.
+        share: See there.
+        measured: See there.
+    """
+    h, w = near.shape
+    code = np.full((h + 4, w + 4), _NO_SEED, np.int32)
+    r, q = np.empty((h, w), np.float32), np.empty((h, w), np.float32)
+    for i in range(cells.shape[0]):
+        y, x = cells[i] // w, cells[i] % w
+        code[y + 2, x + 2] = _MIDDLE * _ROW + _MIDDLE
+        r[y, x], q[y, x] = residuals[i], own[i]
+    spread(code)
+    away = np.empty(w, np.float32)
+    for y in range(h):
+        for x in range(w):
+            away[x] = np.float32(code[y + 2, x + 2] >> 14) * np.float32(1 / 1024)
+        for x in range(w):
+            measured[y, x] = _ONE if away[x] <= _SUPPORT else _ZERO
+        for x in range(w):
+            if away[x] >= _REACH:
+                r[y, x] = q[y, x] = _ZERO
+            else:
+                fade = min(_TWO - _TWO * away[x] / _REACH, _ONE)
+                from_y, from_x = seed(code[y + 2, x + 2])
+                r[y, x], q[y, x] = r[y + from_y, x + from_x] * fade, q[y + from_y, x + from_x]
+    _average_sides(r, q, near, far, share)
+
+
+@compiled
+def spread(code: Any) -> None:
+    """Find every cell's nearest seed; codes (h + 4, w + 4) int32 are those of ``_NO_SEED``, two around the cells."""
+    h, w = code.shape
+    for s in (1, -1):
+        beside, above = np.int32(_SIDE - s), -s * _ROW
+        c0, c1, c2 = np.int32(_SIDE + above), np.int32(_CORNER + above - 1), np.int32(_CORNER + above + 1)
+        c3, c4 = np.int32(_KNIGHT + above - 2), np.int32(_KNIGHT + above + 2)
+        c5, c6 = np.int32(_KNIGHT + 2 * above - 1), np.int32(_KNIGHT + 2 * above + 1)
+        for k in range(2, h - 2):
+            y = k if s == 1 else h - 1 - k
+            row, one, two = code[y, 2 : w - 2], code[y - s], code[y - 2 * s]
+            one0, one1, one3, one4 = one[: w - 4], one[1 : w - 3], one[3 : w - 1], one[4:w]
+            one2, two1, two3 = one[2 : w - 2], two[1 : w - 3], two[3 : w - 1]
+            for x in range(w - 4):
+                a = min(min(np.int32(one2[x] + c0), np.int32(one1[x] + c1)), np.int32(one3[x] + c2))
+                b = min(np.int32(one0[x] + c3), np.int32(one4[x] + c4))
+                c = min(np.int32(two1[x] + c5), np.int32(two3[x] + c6))
+                row[x] = min(min(row[x], a), min(b, c))
+            last = _NO_SEED
+            for i in range(w - 4):
+                x = i if s == 1 else w - 5 - i
+                last = min(row[x], np.int32(last + beside))
+                row[x] = last
+
+
+@compiled
+def seed(code: int) -> tuple[int, int]:
+    """Rows and columns from a cell to its nearest seed."""
+    return ((code >> 7) & 127) - _MIDDLE, (code & 127) - _MIDDLE
+
+
+@compiled
+def _average_sides(r: Any, q: Any, near: Any, far: Any, share: Any) -> None:
+    """Average residuals over ``SMOOTH_RAD`` on both sides of steps; sides are told apart over twice that window.
+
+    All that is averaged about a step then knows of it. Near the border, which only filters read, nothing is averaged.
+    """
+    h, w = r.shape
+    side, edge = 2 * _RADIUS, 3 * _RADIUS
+    size, n, m = side + 1, w - 2 * side, w - 2 * edge  # of a window, and of the rows where they fit
+    for y in range(h):
+        for x in range(w):
+            if min(y, h - 1 - y) < edge or min(x, w - 1 - x) < edge:
+                near[y, x], far[y, x], share[y, x] = r[y, x], r[y, x], _ONE
+    high, low = r.copy(), -r
+    _window_max(high, size, size)  # of the window whose first row and column it is
+    _window_max(low, size, size)
+    wide, nearer, of_near = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+    sums, total = np.zeros((3, size, m), np.float32), np.zeros((3, m), np.float32)
+    per, flat = np.float32(1 / (size * size)), np.empty(m, np.float32)
+    for y in range(side, h - side):
+        above, below, here = high[y - side], high[y], r[y, side : w - side]
+        h0, h1, h2, h3 = above[:n], above[side : side + n], below[:n], below[side : side + n]
+        above, below = low[y - side], low[y]
+        l0, l1, l2, l3 = above[:n], above[side : side + n], below[:n], below[side : side + n]
+        for x in range(n):
+            wide[x] = max(max(h0[x], h1[x]), max(h2[x], h3[x])) - max(max(l0[x], l1[x]), max(l2[x], l3[x]))
+        for x in range(n):
+            nearer[x] = _ONE if _TWO * here[x] > wide[x] else _ZERO
+        for x in range(n):
+            of_near[x] = here[x] * nearer[x]
+        for k in range(3):
+            _slide(nearer if k == 0 else here if k == 1 else of_near, sums[k, y % size], total[k])
+        if y < 2 * side:
+            continue
+        y0 = y - _RADIUS
+        own, q0, r0, share0 = total[0], q[y0, edge : w - edge], r[y0, edge : w - edge], share[y0, edge : w - edge]
+        for x in range(m):
+            share0[x] = own[x] * per
+        h0, l0 = high[y0 - _RADIUS, side : side + m], low[y0 - _RADIUS, side : side + m]
+        for x in range(m):  # the mean where nothing steps
+            flat[x] = total[1, x] * per if h0[x] + l0[x] <= _STEP * q0[x] + _STEP_PER_M else np.nan
+        out, part = near[y0, edge : w - edge], total[2]
+        for x in range(m):
+            one = part[x] * per / max(share0[x], _SOME) if share0[x] > _SOME else r0[x]
+            out[x] = flat[x] if flat[x] == flat[x] else one
+        out, part, every = far[y0, edge : w - edge], total[2], total[1]
+        for x in range(m):
+            rest = _ONE - share0[x]
+            one = (every[x] - part[x]) * per / max(rest, _SOME) if rest > _SOME else r0[x]
+            out[x] = flat[x] if flat[x] == flat[x] else one
+
+
+@compiled
+def _slide(row: Any, oldest: Any, total: Any) -> None:
+    """Replace the oldest row of windows' sums (m,) by those of a new row, and update their total over rows."""
+    m = total.shape[0]
+    for x in range(m):
+        total[x] -= oldest[x]
+    for x in range(m):
+        oldest[x] = row[x]
+    for k in range(1, row.shape[0] - m + 1):
+        part = row[k : k + m]
+        for x in range(m):
+            oldest[x] += part[x]
+    for x in range(m):
+        total[x] += oldest[x]
+
+
+@compiled
+def _window_max(a: Any, rows: int, columns: int) -> None:
+    """Replace each cell of ``a`` (h, w) by the largest of the window whose first row and column it is."""
+    h, w = a.shape
+    line = np.empty(w, np.float32)
+    for y in range(h):
+        row = a[y]
+        size = 1
+        while size < columns:
+            step = min(size, columns - size)
+            for x in range(w):  # line[:] = row takes three times as long
+                line[x] = row[x]
+            other = line[step:]
+            for x in range(w - step):
+                row[x] = max(line[x], other[x])
+            size += step
+    size = 1
+    while size < rows:
+        step = min(size, rows - size)
+        for y in range(h - step):
+            row, other = a[y], a[y + step]
+            for x in range(w):
+                line[x] = row[x]
+            for x in range(w):  # in place, nothing vectorises
+                row[x] = max(line[x], other[x])
+        size += step
+
+
+@compiled
+def _hidden_below(known: Any) -> Any:
+    """The evaluation protocol's tolerance, in inverse distance: nearer by a tenth of the distance and 0.3 m."""
+    known = max(known, _ZERO)
+    return known / (np.float32(1.1) + np.float32(0.3) * known)
+
+
+@compiled
+def hidden_depths(near: Any, far: Any, share: Any, measured: Any, base: Any, out: Any) -> None:
+    """Inverse distances (h, w) below which points are hidden; 0 where nothing was measured.
+
+    ``base`` (ny + 1, nx + 1) is the static surface, on every ``BASE_STEP``-th cell; the others are a panorama's.
+    """
+    h, w = near.shape
+    side = 2 * _SHRINK
+    silent, line = _ONE - measured, np.empty(base.shape[1], np.float32)
+    _window_max(silent, side + 1, side + 1)
+    static, known = np.empty(w, np.float32), np.empty(w, np.float32)
+    for y in range(h):
+        upsampled_row(base, BASE_STEP, y, 0, line, static)
+        one, two, part = near[y], far[y], share[y]
+        for x in range(w):
+            known[x] = static[x] + (one[x] if part[x] > _HALF else two[x])
+        row, inner, hidden = out[y], known[_SHRINK:], silent[min(max(y - _SHRINK, 0), h - 1 - side)]
+        for x in range(w):
+            row[x] = _ZERO
+        row = row[_SHRINK:]
+        for x in range(w - side):  # closes gaps between scan lines, but not outwards
+            row[x] = _hidden_below(inner[x]) if hidden[x] == _ZERO else _ZERO
+
+
+@compiled
+def cells_of(rays: Any, R: Any, place: Any, rows: Any, columns: Any) -> None:
+    """Rows and columns (ny, nx) in a panorama (``PanoramaWindow.place``) of rays (3, ny, nx) turned by ``R``."""
+    work = np.empty((4, rays.shape[2]), np.float32)
+    for y in range(rays.shape[1]):
+        a, b, c = rays[0, y], rays[1, y], rays[2, y]
+        for k in range(3):
+            out, r0, r1, r2 = work[k], R[k, 0], R[k, 1], R[k, 2]
+            for x in range(a.shape[0]):
+                out[x] = r0 * a[x] + r1 * b[x] + r2 * c[x]
+        cells_row(work[0], work[1], work[2], place, work[3], rows[y], columns[y])
+
+
+@compiled
+def read_layer(rows: Any, columns: Any, layer: Any, out: Any) -> None:
+    """Bilinear values (n,) of a panorama's layer at rows and columns (n,); its border beyond it."""
+    h, w = layer.shape
+    last_row, last_column = np.float32(h - 1), np.float32(w - 1)
+    for x in range(out.shape[0]):
+        a, b = min(max(rows[x], _ZERO), last_row), min(max(columns[x], _ZERO), last_column)
+        r, c = int(a), int(b)
+        s, t = a - np.float32(r), b - np.float32(c)
+        r1, c1 = min(r + 1, h - 1), min(c + 1, w - 1)
+        above = layer[r, c] + (layer[r, c1] - layer[r, c]) * t
+        out[x] = above + (layer[r1, c] + (layer[r1, c1] - layer[r1, c]) * t - above) * s
+
+
+@compiled
+def _between(nodes: Any, step: int, out: Any) -> None:
+    """Values (n,) between nodes ``step`` apart; the last ones lie on the last pixel."""
+    n = out.shape[0]
+    if step == 1:
+        for i in range(n):
+            out[i] = nodes[i]
+        return
+    for i in range(nodes.shape[0] - 1):
+        first, last = i * step, min(i * step + step, n - 1)
+        value, slope = nodes[i], (nodes[i + 1] - nodes[i]) / np.float32(max(last - first, 1))
+        part = out[first : min(first + step, n)]
+        for k in range(part.shape[0]):
+            part[k] = value + slope * np.float32(k)
+
+
+@compiled
+def _between_rows(nodes: Any, step: int, y: int, h: int, around: Any, out: Any) -> None:
+    """Values (w,) in row ``y`` of h between nodes (ny + 1, nx + 1).
+
+    ``around`` (2, w + 1) holds the rows of nodes before and after it, and in its last column which they are.
+    """
+    j, w = y // step, out.shape[0]
+    if around[0, w] != j:
+        _between(nodes[j], step, around[0, :w])
+        _between(nodes[j + 1], step, around[1, :w])
+        around[0, w] = j
+    t = np.float32(y - j * step) / np.float32(max(min(step, h - 1 - j * step), 1))
+    above, below = around[0], around[1]
+    for x in range(w):
+        out[x] = above[x] + (below[x] - above[x]) * t
+
+
+@compiled
+def add_residuals(rows: Any, columns: Any, step: int, near: Any, far: Any, share: Any, q: Any) -> None:
+    """Add a panorama's residuals to inverse distances (h, w), clipped to what a surface may say.
+
+    Args:
+        rows: (ny + 1, nx + 1) rows of the panorama at nodes.
+        columns: (ny + 1, nx + 1) its columns.
+        step: Distance of the nodes, pixels; the last ones lie on the last pixel.
+        near: (H, W) residual of the nearer side of a step.
+        far: (H, W) that of the farther one.
+        share: (H, W) share of the nearer side.
+        q: (h, w) float32, updated.
+    """
+    h, w = q.shape
+    last_row, last_column = np.float32(near.shape[0] - 1), np.float32(near.shape[1] - 1)
+    around, v, u = np.full((2, 2, w + 1), -1, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    for y in range(h):
+        _between_rows(rows, step, y, h, around[0], v)
+        _between_rows(columns, step, y, h, around[1], u)
+        for x in range(w):
+            a, b = min(max(v[x], _ZERO), last_row), min(max(u[x], _ZERO), last_column)
+            r, c = int(a), int(b)
+            s, t = a - np.float32(r), b - np.float32(c)
+            r1, c1 = min(r + 1, near.shape[0] - 1), min(c + 1, near.shape[1] - 1)
+            w00, w01, w10, w11 = (_ONE - s) * (_ONE - t), (_ONE - s) * t, s * (_ONE - t), s * t
+            nearer = w00 * share[r, c] + w01 * share[r, c1] + w10 * share[r1, c] + w11 * share[r1, c1] > _HALF
+            if nearer:
+                value = w00 * near[r, c] + w01 * near[r, c1] + w10 * near[r1, c] + w11 * near[r1, c1]
+            else:
+                value = w00 * far[r, c] + w01 * far[r, c1] + w10 * far[r1, c] + w11 * far[r1, c1]
+            q[y, x] = min(max(q[y, x] + value, _ZERO), _MOST)
+
+
+@compiled
+def raise_depths(rows: Any, columns: Any, step: int, layer: Any, apart: int, q: Any, solid: Any) -> None:
+    """Raise inverse distances (h, w) to those of a panorama's layer, read every ``apart`` pixels; ``solid`` becomes -1.
+
+    Rows, columns and step are as in ``add_residuals``.
+    """
+    h, w = q.shape
+    around, v, u = np.full((3, 2, w + 1), -1, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    nodes = np.empty((-(-h // apart) + 1, -(-w // apart) + 1), np.float32)
+    for j in range(nodes.shape[0]):
+        y = min(j * apart, h - 1)
+        _between_rows(rows, step, y, h, around[0], v)
+        _between_rows(columns, step, y, h, around[1], u)
+        for i in range(nodes.shape[1]):
+            x = min(i * apart, w - 1)
+            v[i], u[i] = v[x], u[x]
+        read_layer(v[: nodes.shape[1]], u[: nodes.shape[1]], layer, nodes[j])
+    values, whose = np.empty((2, w), np.float32), np.empty(w, np.int32)
+    for y in range(h):
+        _between_rows(nodes, apart, y, h, around[2], values[0])
+        value, top, old, number = values[0], values[1], q[y], solid[y]
+        for x in range(w):
+            top[x] = max(value[x], old[x])
+        for x in range(w):
+            whose[x] = -1 if value[x] > old[x] else number[x]
+        for x in range(w):
+            old[x] = top[x]
+        for x in range(w):
+            number[x] = whose[x]
+
+
+@compiled
+def fill_raster(nearest: Any) -> None:
+    """Give cells (h, w) of 0 the value of the nearest other one."""
+    h, w = nearest.shape
+    code = np.full((h + 4, w + 4), _NO_SEED, np.int32)
+    for y in range(h):
+        for x in range(w):
+            if nearest[y, x] > _ZERO:
+                code[y + 2, x + 2] = _MIDDLE * _ROW + _MIDDLE
+    spread(code)
+    for y in range(h):
+        for x in range(w):
+            from_y, from_x = seed(code[y + 2, x + 2])
+            nearest[y, x] = nearest[y + from_y, x + from_x]
