@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     add_target(parser)
     parser.add_argument("--workers", type=seed, nargs="+", default=[0, 1, 2], metavar="N", help="workers")
-    parser.add_argument("--surface", nargs="+", choices=tuple(SURFACES), default=["auto"], help="scene geometry")
+    parser.add_argument("--surface", nargs="+", choices=tuple(SURFACES), default=["street", "auto"], help="geometry")
     parser.add_argument("--frames", type=count, default=48, metavar="N", help="frames in an epoch")
     parser.add_argument("--epochs", type=count, default=3, metavar="N", help="epochs to measure")
     arguments = parser.parse_args(argv)
@@ -103,6 +103,7 @@ COLUMNS = (
     ("workers", "{workers}"),
     ("frames/s", "{frames_per_s:.1f}"),
     ("best", "{best_per_s:.1f}"),
+    ("of reading", "{of_reading:.2f}"),
     ("CPU ms", "{cpu_ms:.1f}"),
     ("unique MiB", "{unique_mib:.0f}"),
 )
@@ -120,8 +121,8 @@ def loader_rates(datasets: Mapping[str, Dataset[Any]], workers: Sequence[int], e
     """Measure all data sets with all numbers of workers, epoch by epoch in turn; one thread in this process.
 
     Returns:
-        Rows; ``ms`` has quartiles, ``cpu_ms`` is of all workers, ``unique_mib`` the mean private memory of a worker.
-        The last two are None where unknown.
+        Rows; ``of_reading`` is the rate by that of ``PLAIN`` in the same rounds, ``ms`` has quartiles, ``cpu_ms`` is of
+        all workers, ``unique_mib`` the mean private memory of a worker. The last two are None where unknown.
     """
     with one_thread():
         loaders = {
@@ -141,7 +142,7 @@ def loader_rates(datasets: Mapping[str, Dataset[Any]], workers: Sequence[int], e
                 start_s = _cpu_s(pids[key])
                 times[key].append(_epoch_s(loader))
                 used_s[key] += _cpu_s(pids[key]) - start_s
-        return [_rate(key, datasets[key[0]], times[key], used_s[key], pids[key]) for key in loaders]
+        return [_rate(key, len(loaders[key]), times, used_s[key], pids[key]) for key in loaders]
 
 
 def _epoch_s(loader: DataLoader[Any]) -> float:
@@ -151,15 +152,18 @@ def _epoch_s(loader: DataLoader[Any]) -> float:
     return time.perf_counter() - start
 
 
-def _rate(key: tuple[str, int], dataset: Any, epochs_s: list[float], used_s: float, pids: list[int]) -> dict[str, Any]:
-    (name, workers), frames = key, len(dataset)
-    ms = quartiles(1e3 * np.array(epochs_s) / frames)
+def _rate(
+    key: tuple[str, int], frames: int, times: Mapping[Any, list[float]], used_s: float, pids: list[int]
+) -> dict[str, Any]:
+    (name, workers), epochs_s = key, np.array(times[key])
+    ms, plain_s = quartiles(1e3 * epochs_s / frames), times.get((PLAIN, workers), times[key])
     row = {"name": name, "workers": workers, "frames_per_s": 1e3 / ms.median_ms, "best_per_s": frames / min(epochs_s)}
     try:
         unique = [memory_mib("smaps_rollup", "Private_(?:Clean|Dirty)", pid) for pid in pids] if workers else []
     except OSError:
         unique = []
     return row | {
+        "of_reading": float(np.median(plain_s / epochs_s)),
         "ms": ms._asdict(),
         "cpu_ms": 1e3 * used_s / frames / len(epochs_s) if used_s else None,
         "unique_mib": float(np.mean(unique)) if unique else None,

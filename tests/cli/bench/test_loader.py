@@ -71,6 +71,7 @@ def test_rates(samples: ModuleType) -> None:
     for rate in rates:
         assert 0 < rate["frames_per_s"] <= rate["best_per_s"]
         assert rate["ms"]["q1_ms"] <= rate["ms"]["median_ms"] <= rate["ms"]["q3_ms"]
+        assert (rate["of_reading"] == 1) == (rate["name"] == PLAIN)
         assert (rate["unique_mib"] is None) == (rate["workers"] == 0)
         if rate["unique_mib"] is not None:
             assert 0 < rate["unique_mib"] < 2000
@@ -129,6 +130,17 @@ class Drifting(Dataset[dict[str, Any]]):
         away_m = 1e-4 * index
         moved = {key: self.sample[key] + away_m for key in ("points", "boxes_3d")}
         return self.sample | moved | {"rig": self.sample["rig"].shifted(x_m=away_m)}
+
+
+@pytest.mark.release
+def test_rates_against_reading(nuscenes_root: Path, tmp_path: Path, report_bound: Callable[..., None]) -> None:
+    """Two workers, a plan a frame over LiDAR and boxes; and the street, whose plan is held."""
+    path = tmp_path / "loader.json"
+    arguments = ["--data", f"nuscenes:{nuscenes_root}", "--workers", "2", "--surface", "street", "lidar"]
+    assert main(["bench", "loader", *arguments, "--output", str(path)]) == 0
+    _, street, lidar = json.loads(path.read_text())["rates"]
+    report_bound("rate over the street by that of reading", street["of_reading"], at_least=0.85)
+    report_bound("rate over LiDAR and boxes by that of reading", lidar["of_reading"], at_least=0.30)
 
 
 @pytest.mark.release
