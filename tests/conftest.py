@@ -3,9 +3,12 @@
 import importlib.util
 import math
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -14,9 +17,25 @@ from hypothesis import settings
 settings.register_profile("reproducible", derandomize=True, deadline=None)
 settings.load_profile("reproducible")
 
+COMPILER = pytest.StashKey[subprocess.Popen]()
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--bounds", action="store_true", help="fail where a measured time misses its bound")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes(config: pytest.Config) -> None:
+    """Compile the kernels once, while the processes of ``-n`` collect: each would compile them for itself."""
+    command = "from arbiview_aug.render.plan import compile_kernels; compile_kernels()"
+    config.stash[COMPILER] = subprocess.Popen([sys.executable, "-c", command], cwd=config.rootpath)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_node_collection_finished(node: Any) -> None:
+    """Begin with the first test when the kernels are compiled."""
+    if node.config.stash[COMPILER].wait():
+        pytest.exit("the kernels do not compile", returncode=1)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
