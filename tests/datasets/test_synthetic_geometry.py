@@ -64,7 +64,7 @@ def test_vectorised_cast_equals_a_naive_loop():
         rays = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], 1)
         local = scene_from(scene, origin)
         tensor = torch.from_numpy(rays.astype(np.float32))
-        t, hit = cast(local, tensor, find_candidates(local, tensor))
+        t, hit = cast(local, torch.from_numpy(origin[None]).float(), tensor, find_candidates(local, tensor))
         differing = 0
         for n in range(8):
             for r in range(12):

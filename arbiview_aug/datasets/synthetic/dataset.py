@@ -172,7 +172,8 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         with self._renderer.run():
             rays = torch.as_tensor(street).transpose(1, 2).contiguous()
             local = scene_from(scene, origin)
-            distance, hit = cast(local, rays, find_candidates(local, rays))
+            start = torch.as_tensor(origin[None].astype(np.float32))
+            distance, hit = cast(local, start, rays, find_candidates(local, rays))
         t, row = distance.cpu().numpy().ravel().astype(np.float64), hit.cpu().numpy().ravel()
         rng = np.random.default_rng(np.random.SeedSequence([self.seed, index, 1]))
         noise, gain = rng.normal(0, LIDAR_NOISE_M, len(t)), rng.uniform(0.8, 1.2, len(t))

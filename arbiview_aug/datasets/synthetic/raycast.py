@@ -1,4 +1,4 @@
-"""Ray casting from one point: culling by packet, then closed-form intersections.
+"""Ray casting from a few points: culling by packet, then closed-form intersections.
 
 Rays come in packets of similar directions (a tile of pixels, some LiDAR columns). Each packet is bounded by a pyramid
 that selects its candidate primitives, which are intersected from near to far. Distances are along unit directions.
@@ -39,7 +39,6 @@ class LocalScene(NamedTuple):
     to_unit: Tensor  # [P, 3, 3] to the unit sphere or cylinder
     origin: Tensor  # [P, 3] the ray origin there
     round_z: Tensor  # [P] 1 for ellipsoids, 0 for cylinders
-    height_m: float  # the origin's height over the road plane
 
 
 def scene_from(scene: Scene, origin: np.ndarray) -> LocalScene:
@@ -64,7 +63,6 @@ def scene_from(scene: Scene, origin: np.ndarray) -> LocalScene:
         to_unit=put(to_unit[order]),
         origin=put((rotated / scene.half)[order]),
         round_z=put(scene.kind[order] != CYLINDER),
-        height_m=float(origin[2]),
     )
 
 
@@ -126,21 +124,20 @@ def _inside(sides: Tensor, corners: Tensor) -> Tensor:
     return (dots.view(n, 4, p, 8).amax(3) >= 0).all(1)
 
 
-def cast(local: LocalScene, rays: Tensor, candidates: Candidates) -> tuple[Tensor, Tensor]:
-    """Find the first hits of packets of unit rays (n, 3, R).
+def cast(local: LocalScene, start: Tensor, rays: Tensor, candidates: Candidates) -> tuple[Tensor, Tensor]:
+    """Find the first hits of packets of unit rays (n, 3, R) from ``start`` (n or 1, 3), in the street frame.
+
+    ``local`` may be several scenes, one after the other, each relative to the origin of other packets.
 
     Returns:
         (n, R) distance, infinite for the sky; (n, R) int64 row in the scene, ``GROUND_ID`` or ``SKY_ID``.
     """
-    t, hit = _ground(local, rays)
+    t, hit = _ground(start[:, 2:], rays)
     order = torch.sort(candidates.rank, stable=True).indices
     packets, primitives = candidates.packet[order], candidates.primitive[order]
     rounds = torch.bincount(candidates.rank).tolist()
-    start = 0
-    for count in rounds:
-        packet, primitive = packets[start : start + count], primitives[start : start + count]
-        start += count
-        in_front = local.distance[primitive] < t.amax(1)[packet]
+    for packet, primitive in zip(packets.split(rounds), primitives.split(rounds), strict=True):
+        in_front = local.distance[primitive] < t.index_select(0, packet).amax(1)
         for boxes, meet in ((True, _meet_box), (False, _meet_quadric)):
             chosen = (in_front & (local.is_box[primitive] == boxes)).nonzero()[:, 0]
             for part in chosen.split(_PAIRS_PER_STEP):
@@ -153,11 +150,9 @@ def cast(local: LocalScene, rays: Tensor, candidates: Candidates) -> tuple[Tenso
     return t, hit
 
 
-def _ground(local: LocalScene, rays: Tensor) -> tuple[Tensor, Tensor]:
+def _ground(height_m: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
     down = -rays[:, 2]
-    t = torch.where(down > 1e-7, local.height_m / down.clamp_min(1e-7), torch.inf)
-    if local.height_m <= 0:
-        t = torch.full_like(t, torch.inf)
+    t = torch.where((down > 1e-7) & (height_m > 0), height_m * down.clamp_min(1e-7).reciprocal(), torch.inf)
     return t, torch.where(torch.isfinite(t), GROUND_ID, SKY_ID)
 
 

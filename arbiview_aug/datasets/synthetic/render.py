@@ -58,7 +58,7 @@ class CameraRays(NamedTuple):
     down: Tensor  # [n, 3, 256]
     pitch: Tensor  # [n, 256] angle between neighbouring pixels, radians
     valid: Tensor  # [n, 256] whether the lens sees anything there
-    axis: Tensor  # [3] optical axis
+    axis: Tensor  # [n, 3] optical axis
 
 
 def camera_rays(camera: Camera) -> CameraRays:
@@ -75,8 +75,10 @@ def camera_rays(camera: Camera) -> CameraRays:
         dtype = bool if array.dtype == bool else np.float32
         return _to_tiles(torch.as_tensor(np.ascontiguousarray(array, dtype=dtype)))
 
-    axis = torch.as_tensor(camera.cam2ego[:3, 2].astype(np.float32))
-    return CameraRays(put(rays), put(right), put(down), put(pitch)[:, 0], put(valid)[:, 0], axis)
+    directions, axis = put(rays), torch.as_tensor(camera.cam2ego[:3, 2].astype(np.float32))
+    return CameraRays(
+        directions, put(right), put(down), put(pitch)[:, 0], put(valid)[:, 0], axis.expand(len(directions), 3)
+    )
 
 
 def _differences(rays: np.ndarray, valid: np.ndarray, axis: int) -> np.ndarray:
@@ -156,42 +158,46 @@ class Renderer:
         if self._tables is None or self._tables.scene is not scene:
             self._tables = SceneTables.build(scene)
         tables = self._tables
-        casts = [self._cast(scene, camera, ground_z_m) for camera in cameras]
-        hits = _joined([c.hits for c in casts])
+        first = self._cast(scene, cameras, ground_z_m)
+        hits = first.hits
         face = faces(tables, hits.point, hits.primitive)
-        sizes = [len(c.hits.t) for c in casts]
-        colors = list(shade(tables, hits, face).split(sizes))
+        color = shade(tables, hits, face)
         if self.supersampling > 1:
             key = torch.where(hits.primitive >= 0, hits.primitive * 8 + face, hits.primitive)
-            fine = [self._cast_outlines(c, k, scene) for c, k in zip(casts, key.split(sizes), strict=True)]
-            hits = _joined([f[1] for f in fine])
-            color = shade(tables, hits, faces(tables, hits.point, hits.primitive))
-            samples = color.view(-1, self.supersampling**2, 3).unbind(1)
-            means = reduce(torch.add, samples) / len(samples)  # a fixed order of summation
-            for color, (chosen, _), mean in zip(colors, fine, means.split([len(f[0]) for f in fine]), strict=True):
-                color[chosen] = mean
-        return [self._view(scene, c, color) for c, color in zip(casts, colors, strict=True)]
+            chosen, hits = self._cast_outlines(first, key, scene)
+            fine = shade(tables, hits, faces(tables, hits.point, hits.primitive))
+            samples = fine.view(-1, self.supersampling**2, 3).unbind(1)
+            color[chosen] = reduce(torch.add, samples) / len(samples)  # a fixed order of summation
+        return self._views(scene, first, color)
 
-    def _cast(self, scene: Scene, camera: Camera, ground_z_m: float) -> _Cast:
-        """First pass: one ray through every pixel's centre."""
-        rays = self._rays.get(camera.content_key, partial(camera_rays, camera))
-        pose = scene.ego2street
-        origin = pose[:3, :3] @ (camera.center_m - (0, 0, ground_z_m)) + pose[:3, 3]
-        start = torch.as_tensor(origin.astype(np.float32))
-        directions = _to_street(rays.directions, scene)
-        local = scene_from(scene, origin)
-        candidates = find_candidates(local, directions)
-        t, hit = cast(local, directions, candidates)
-        t = torch.where(rays.valid, t, torch.inf)
-        hit = torch.where(rays.valid, hit, SKY_ID)
+    def _cast(self, scene: Scene, cameras: list[Camera], ground_z_m: float) -> _Cast:
+        """First pass: one ray through every pixel's centre. All cameras are cast together, in longer operations."""
+        of_cameras = [self._rays.get(camera.content_key, partial(camera_rays, camera)) for camera in cameras]
+        tiles = [len(rays.directions) for rays in of_cameras]
+        rays = CameraRays(*map(torch.cat, zip(*of_cameras, strict=True)))
+        directions, pose = _to_street(rays.directions, scene), scene.ego2street
+        origins = [pose[:3, :3] @ (camera.center_m - (0, 0, ground_z_m)) + pose[:3, 3] for camera in cameras]
+        start = torch.as_tensor(np.repeat(origins, tiles, axis=0).astype(np.float32))
+        scenes = [scene_from(scene, origin) for origin in origins]
+        found, first_tile = [], 0
+        for k, (local, packets) in enumerate(zip(scenes, directions.split(tiles), strict=True)):
+            packet, primitive, rank = find_candidates(local, packets)
+            found.append((packet + first_tile, primitive + k * len(local.order), rank))
+            first_tile += tiles[k]
+        local = LocalScene(*map(torch.cat, zip(*scenes, strict=True)))
+        candidates = Candidates(*map(torch.cat, zip(*found, strict=True)))
+        t, hit = cast(local, start, directions, candidates)
+        t, hit = torch.where(rays.valid, t, torch.inf), torch.where(rays.valid, hit, SKY_ID)
         flat = directions.transpose(1, 2).reshape(-1, 3)
-        hits = _hits(start, flat, t.reshape(-1), hit.reshape(-1), rays.pitch.reshape(-1))
-        return _Cast(camera, rays, start, local, candidates, t, hit, hits)
+        starts = start.repeat_interleave(TILE_PX**2, 0)
+        hits = _hits(starts, flat, t.reshape(-1), hit.reshape(-1), rays.pitch.reshape(-1))
+        return _Cast(cameras, tiles, rays, start, local, candidates, t, hit, hits)
 
     def _cast_outlines(self, first: _Cast, key: Tensor, scene: Scene) -> tuple[Tensor, Hits]:
         """Second pass: rows (m,) of the supersampled pixels, and their (m * s * s) hits."""
         rays, candidates, s = first.rays, first.candidates, self.supersampling
-        outline = _to_tiles(_outlines(_from_tiles(key.view_as(first.hit), first.camera.size)))[:, 0]
+        of_cameras = zip(first.cameras, key.view_as(first.hit).split(first.tiles), strict=True)
+        outline = torch.cat([_to_tiles(_outlines(_from_tiles(k, camera.size)))[:, 0] for camera, k in of_cameras])
         distance = first.local.distance[candidates.primitive].clamp_min(0.1)
         pixel = rays.pitch.amax(1)[candidates.packet] * distance
         busy = torch.zeros(len(outline), dtype=torch.bool)
@@ -212,16 +218,17 @@ class Renderer:
         packed = sub[first_pixel[owner]][:, None, :1].expand(-1, _PACKET_PX, s * s, -1).clone()
         packed[packet, place] = sub
         packed = _to_street(packed.view(len(owner), _PACKET_PX * s * s, 3).transpose(1, 2), scene)
-        t, hit = cast(first.local, packed, _for_packets(candidates, owner, len(outline)))
+        t, hit = cast(first.local, first.start[owner], packed, _for_packets(candidates, owner, len(outline)))
         t, hit = (a.view(len(owner), _PACKET_PX, s * s)[packet, place].reshape(-1) for a in (t, hit))
         direction = packed.transpose(1, 2).reshape(len(owner), _PACKET_PX, s * s, 3)[packet, place].reshape(-1, 3)
         pitch = (rays.pitch[tile, slot] / s).repeat_interleave(s * s)
-        return tile * outline.shape[1] + slot, _hits(first.start, direction, t, hit, pitch)
+        start = first.start[tile].repeat_interleave(s * s, 0)
+        return tile * outline.shape[1] + slot, _hits(start, direction, t, hit, pitch)
 
-    def _view(self, scene: Scene, first: _Cast, color: Tensor) -> CameraView:
-        size, hit, rays = first.camera.size, first.hit, first.rays
-        axis = rays.directions[:, 0] * rays.axis[0] + rays.directions[:, 1] * rays.axis[1]
-        depth = first.t * (axis + rays.directions[:, 2] * rays.axis[2])
+    def _views(self, scene: Scene, first: _Cast, color: Tensor) -> list[CameraView]:
+        hit, rays = first.hit, first.rays
+        axis = rays.directions[:, 0] * rays.axis[:, :1] + rays.directions[:, 1] * rays.axis[:, 1:2]
+        depth = first.t * (axis + rays.directions[:, 2] * rays.axis[:, 2:])
         depth = torch.where(torch.isfinite(first.t), depth, torch.inf)
         row = hit.clamp_min(0)
         classes = torch.as_tensor(scene.cls)[row]
@@ -230,25 +237,26 @@ class Renderer:
         classes = torch.where(rays.valid, classes, int(SceneClass.VOID))
         instances = torch.where(hit >= 0, torch.as_tensor(scene.instance)[row], -1)
         image = (color.view(*hit.shape, 3) * 255 + 0.5).to(torch.uint8) * rays.valid[..., None]
-        maps = [_from_tiles(a, size) for a in (depth, classes.to(torch.uint8), instances.to(torch.int16))]
-        return CameraView(*(a.contiguous().cpu() for a in (_from_tiles(image, size).permute(2, 0, 1), *maps)))
+        maps = image, depth, classes.to(torch.uint8), instances.to(torch.int16)
+        views = []
+        for camera, *parts in zip(first.cameras, *(a.split(first.tiles) for a in maps), strict=True):
+            image, *rest = (_from_tiles(a, camera.size) for a in parts)
+            views.append(CameraView(*(a.contiguous().cpu() for a in (image.permute(2, 0, 1), *rest))))
+        return views
 
 
 class _Cast(NamedTuple):
-    """A camera's first pass; ``t`` and ``hit`` are tiles (n, 256)."""
+    """The first pass of all cameras, one after the other; ``t`` and ``hit`` are tiles (n, 256)."""
 
-    camera: Camera
+    cameras: list[Camera]
+    tiles: list[int]  # number of each camera's
     rays: CameraRays
-    start: Tensor  # [3] the camera's centre, street frame
+    start: Tensor  # [n, 3] the camera's centre, street frame
     local: LocalScene
     candidates: Candidates
     t: Tensor
     hit: Tensor
     hits: Hits  # flat
-
-
-def _joined(hits: list[Hits]) -> Hits:
-    return Hits(*(torch.cat(parts) for parts in zip(*hits, strict=True)))
 
 
 def _to_street(rays: Tensor, scene: Scene) -> Tensor:
