@@ -72,12 +72,13 @@ def test_filled_holes_are_nearer_to_the_truth_than_black_ones() -> None:
     from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 
     drive = SyntheticDrive(demo_source_rig((64, 176)), num_frames=1)
-    target = raised(drive[0])
+    sample = drive[0]
+    target = raised(sample)
     truth = drive.render(0, target).images
     assert isinstance(truth, torch.Tensor)
     errors = {}
     for how in SETTINGS:
-        out = RigRetarget(target, surface="objects", holes=how)(drive[0])  # type: ignore[arg-type]
+        out = RigRetarget(target, surface="objects", holes=how)(sample)  # type: ignore[arg-type]
         hole = ~out["coverage"][:, None].expand_as(truth)
         errors[how] = float((out["images"].float() - truth.float())[hole].square().mean())
     assert errors["fill"] < 0.6 * errors["mean"] < 0.6 * errors["black"]

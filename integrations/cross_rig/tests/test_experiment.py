@@ -107,6 +107,7 @@ def test_true_pixels_replace_what_was_rendered(done):
     np.testing.assert_array_equal(holes.images[~seen], oracle.images[~seen])
 
 
+@pytest.mark.slow
 def test_variants_without_a_mask_lift_every_pixel(done):
     """Black holes: the pixels of the masked variant. Filled holes: what was seen is the same bit for bit."""
     more = replace(done, settings=replace(TINY, changes=("up70",), variants=("auto", "auto_black", "auto_fill")))

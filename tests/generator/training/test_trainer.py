@@ -18,7 +18,7 @@ from arbiview_aug.errors import OutputError, TrainingError
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.checkpoint import read_checkpoint
 from arbiview_aug.generator.denoiser import REGRESSION
-from arbiview_aug.generator.training import checkpointing
+from arbiview_aug.generator.training import checkpointing, trainer
 from arbiview_aug.generator.training.config import LossConfig, tiny
 from arbiview_aug.generator.training.data import one_thread_worker
 from arbiview_aug.generator.training.losses import Perceptual
@@ -26,6 +26,12 @@ from arbiview_aug.generator.training.pseudo_views import collate
 from arbiview_aug.generator.training.trainer import Trainer, learning_rate
 from tests.generator.training.small import config, frames
 from tests.generator.training.test_losses import features
+
+
+@pytest.fixture(autouse=True)
+def deviation_of_few_items(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The deviation is measured on 4 items rather than 32: most tests need none that is exact."""
+    monkeypatch.setattr(trainer, "_DEVIATION_ITEMS", 4)
 
 
 def run(folder: Path, **changes: Any) -> Trainer:
@@ -276,8 +282,9 @@ def test_the_perceptual_term_comes_every_nth_step(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_the_condition_lacks_is_measured_and_shipped(tmp_path: Path) -> None:
+def test_what_the_condition_lacks_is_measured_and_shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It sets the scale of a residual generator's diffusion: the same for the same data; it is saved."""
+    monkeypatch.setattr(trainer, "_DEVIATION_ITEMS", 32)
     one, two = (run(tmp_path / name, steps=1) for name in ("one", "two"))
     inside, outside = one.generator.denoiser.deviation.tolist()
     assert torch.equal(one.generator.denoiser.deviation, two.generator.denoiser.deviation)
@@ -287,8 +294,9 @@ def test_what_the_condition_lacks_is_measured_and_shipped(tmp_path: Path) -> Non
     assert torch.equal(kept, one.generator.denoiser.deviation)
 
 
-def test_an_untrained_network_errs_by_one_unit_at_all_times(tmp_path: Path) -> None:
+def test_an_untrained_network_errs_by_one_unit_at_all_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In its unit the error of the linear guess does not depend on t: no time starves."""
+    monkeypatch.setattr(trainer, "_DEVIATION_ITEMS", 32)
     made = run(tmp_path, batch=8, loss=LossConfig(perceptual=0.0, known=1.0))
     batch = collate([made.items[k] for k in range(8)])
     truth, condition = batch.truth * 2 - 1, batch.condition * 2 - 1
