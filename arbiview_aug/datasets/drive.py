@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -57,9 +58,13 @@ class Recording(Dataset[dict[str, Any]]):
             )
         return self[self._index[token]]
 
+
+class WritableRecording(Recording, ABC):
+    """Base class of readers that ``convert`` has a writer for."""
+
+    @abstractmethod
     def files(self, index: int) -> list[Path]:
-        """All files that a sample is read from; only readers with a writer need it."""
-        raise NotImplementedError
+        """All files that a sample is read from."""
 
 
 @dataclass(frozen=True, kw_only=True)

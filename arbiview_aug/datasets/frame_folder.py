@@ -23,8 +23,8 @@ from arbiview_aug.datasets.drive import (
     Drive,
     LazyFrame,
     Neighbours,
-    Recording,
     Unreadable,
+    WritableRecording,
     camera_fields,
     check_neighbours,
     parts_of_clock,
@@ -73,7 +73,7 @@ class _Frame:
         return self.file(name, what)
 
 
-class FrameFolder(Recording):
+class FrameFolder(WritableRecording):
     """A folder that is a frame (it has ``calib.json``), or a folder of such folders, in the order of their names.
 
     ``docs/formats.md`` describes ``calib.json``, the points (a float .npy of shape (P, >=3), x y z first, in the ego

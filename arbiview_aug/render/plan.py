@@ -11,12 +11,12 @@ import hashlib
 from collections import Counter
 from dataclasses import dataclass, field, fields, replace
 from functools import cache, partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.lens import BoolArray, LensName
+from arbiview_aug.cameras.lens import LENSES, BoolArray, LensName
 from arbiview_aug.cameras.rays import CameraMaps
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.environment import compilation_announced
@@ -26,8 +26,6 @@ from arbiview_aug.render.atlas import AtlasLayout
 from arbiview_aug.render.view_plan import ViewPlan
 from arbiview_aug.render.view_planner import ViewPlanner
 from arbiview_aug.scene.scene import Scene
-
-_LENSES: tuple[tuple[LensName, int], ...] = (("pinhole", 0), ("radtan", 4), ("fisheye", 4))  # and coefficients
 
 
 @dataclass(frozen=True)
@@ -97,10 +95,10 @@ def compile_kernels() -> None:
     """Compile what plans call, or load it from numba's cache: in the parent process, before workers are forked."""
     views = [
         Camera.looking(
-            name=f"{lens} {side}", azimuth_deg=20 * side, position_m=(0, 0.3 * side, 1.5), width_px=32, height_px=32,
-            horizontal_fov_deg=90, lens=lens, distortion=(0.0,) * count,
+            name=f"{name} {side}", azimuth_deg=20 * side, position_m=(0, 0.3 * side, 1.5), width_px=32, height_px=32,
+            horizontal_fov_deg=90, lens=cast(LensName, name), distortion=(0.0,) * lens.coefficient_counts[0],
         )
-        for lens, count in _LENSES for side in (-1, 0, 1)
+        for name, lens in LENSES.items() for side in (-1, 0, 1)
     ]  # fmt: skip
     wall = np.stack(np.meshgrid(8.0, np.linspace(-2, 2, 20), np.linspace(0.3, 1.5, 10)), -1).reshape(-1, 3)
     boxes = np.array([[8.5, 0, 1, 1, 4, 2, 0], [5, 3, 1, 1, 1, 2, 0]])

@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from integrations.cross_rig.training import Schedule
 from integrations.cross_rig.variant import Variant
-from integrations.cross_rig.variants import VARIANTS, named_variants
-from integrations.cross_rig.worlds import CHANGES, Size, named_changes
+from integrations.cross_rig.variants import VARIANTS
+from integrations.cross_rig.worlds import CHANGES, Size
+
+T = TypeVar("T")
+
+
+def named_rows(kind: str, names: Sequence[str], table: Mapping[str, T]) -> list[T]:
+    """Rows of a table by name, in the order of the table.
+
+    Raises:
+        ValueError: An unknown name.
+    """
+    unknown = [name for name in names if name not in table]
+    if unknown:
+        raise ValueError(f"{kind}: expected some of {', '.join(table)}, got {', '.join(unknown)}")
+    return [row for name, row in table.items() if name in names]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,8 +52,8 @@ class Settings:
     schedule: Schedule = field(default_factory=lambda: Schedule(steps=900))
 
     def __post_init__(self) -> None:
-        named_variants(self.variants)
-        named_changes(self.changes)
+        named_rows("variants", self.variants, VARIANTS)
+        named_rows("changes", self.changes, CHANGES)
         for name in ("train_frames", "val_frames", "test_frames"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected a whole number above 0, got {getattr(self, name)}")
@@ -67,7 +83,7 @@ def jobs(settings: Settings) -> list[Job]:
     """All trainings; a whole seed before the next, so that an interrupted run has every variant."""
     found = []
     for seed in settings.seeds:
-        variants = named_variants(settings.variants)
+        variants = named_rows("variants", settings.variants, VARIANTS)
         found += [Job(variant=variant, change=None, seed=seed) for variant in variants if variant.kind == "raw"]
         for change in settings.changes:
             found += [Job(variant=variant, change=change, seed=seed) for variant in variants if variant.kind != "raw"]

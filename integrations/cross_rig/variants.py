@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from integrations.cross_rig.variant import Geometry, Variant
 
 _ALL: tuple[Geometry, ...] = ("points", "boxes_3d")
@@ -92,15 +90,3 @@ VARIANTS: dict[str, Variant] = {
     )
 }
 """By name, in the order of tables."""
-
-
-def named_variants(names: Sequence[str]) -> list[Variant]:
-    """Variants by name, in the order of ``VARIANTS``.
-
-    Raises:
-        ValueError: An unknown name.
-    """
-    unknown = [name for name in names if name not in VARIANTS]
-    if unknown:
-        raise ValueError(f"variants: expected some of {', '.join(VARIANTS)}, got {', '.join(unknown)}")
-    return [variant for variant in VARIANTS.values() if variant.name in names]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -94,15 +94,3 @@ CHANGES: dict[str, Change] = {
     )
 }
 """By name. ``waymo``: Waymo's azimuths and height at A's field of view, so that it stays a change of the layout."""
-
-
-def named_changes(names: Sequence[str]) -> list[Change]:
-    """Changes by name.
-
-    Raises:
-        ValueError: An unknown name.
-    """
-    unknown = [name for name in names if name not in CHANGES]
-    if unknown:
-        raise ValueError(f"changes: expected some of {', '.join(CHANGES)}, got {', '.join(unknown)}")
-    return [CHANGES[name] for name in names]

@@ -18,7 +18,7 @@ from arbiview_aug.cli.convert.manifest import Manifest, Record
 from arbiview_aug.cli.convert.settings import Settings
 from arbiview_aug.cli.convert.views import encode_views, rig_of
 from arbiview_aug.cli.convert.writer import Converted, Writer
-from arbiview_aug.datasets.drive import Recording
+from arbiview_aug.datasets.drive import Recording, WritableRecording
 from arbiview_aug.datasets.motion_depth import WithMotionDepth
 from arbiview_aug.datasets.registry import find_reader
 from arbiview_aug.environment import repeatable_opencv
@@ -52,12 +52,12 @@ class Jobs(Dataset[Done]):
     """Samples of a shard, by their ``indices``, each converted on access; DataError if the reader names no writer."""
 
     def __init__(self, settings: Settings, data: Recording, indices: Sequence[int], on_error: OnError) -> None:
+        _, reader = find_reader(settings.root, settings.kind)
+        if reader.writer is None or not isinstance(data, WritableRecording):
+            raise DataError(f"--data {settings.root}: expected a kind that can be written, got a {reader.description}")
         self.settings, self.data, self.indices, self.on_error = settings, data, indices, on_error
         depth = settings.motion_depth
         self.samples = data if depth is None else WithMotionDepth(data, depth)
-        _, reader = find_reader(settings.root, settings.kind)
-        if reader.writer is None:
-            raise DataError(f"--data {settings.root}: expected a kind that can be written, got a {reader.description}")
         module, _, name = reader.writer.partition(":")
         self.format: Writer = getattr(import_module(module), name)(settings, data)
         self.manifest = Manifest(settings.output)

@@ -20,8 +20,8 @@ from arbiview_aug.datasets.drive import (
     Drive,
     LazyFrame,
     Neighbours,
-    Recording,
     Unreadable,
+    WritableRecording,
     camera_fields,
     check_neighbours,
 )
@@ -44,7 +44,7 @@ def table_folders(root: Path) -> list[str]:
     return sorted(found, key=lambda name: (name not in ("v1.0-mini", "v1.0-trainval"), name))
 
 
-class NuScenesDataset(Recording):
+class NuScenesDataset(WritableRecording):
     """The keyframes of a nuScenes v1.0 data set, in the order of its ``sample`` table.
 
     A sample is a dict, everything in the ego frame at the LiDAR's time: ``images`` (N, 3, h, w) uint8 RGB; ``rig``;

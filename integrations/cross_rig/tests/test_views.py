@@ -9,9 +9,10 @@ import torch
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from integrations.cross_rig.augmentation import SCALE, scaled_and_cropped
 from integrations.cross_rig.frames import NEIGHBOURS, Source, _VariantFrames
-from integrations.cross_rig.variants import VARIANTS, named_variants
+from integrations.cross_rig.settings import Settings
+from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.views import ViewMaker
-from integrations.cross_rig.worlds import CHANGES, STREET_SEEDS, named_changes, source_rig
+from integrations.cross_rig.worlds import CHANGES, STREET_SEEDS, source_rig
 
 SIZE = (24, 64)
 
@@ -115,6 +116,6 @@ def test_streets_are_disjoint_and_rigs_stand_on_one_road():
 
 def test_unknown_names_are_refused():
     with pytest.raises(ValueError, match=r"variants: expected some of raw, .*, got nothing"):
-        named_variants(["nothing"])
+        Settings(variants=("nothing",))
     with pytest.raises(ValueError, match=r"changes: expected some of fov50, .*, got up7"):
-        named_changes(["up7"])
+        Settings(changes=("up7",))
