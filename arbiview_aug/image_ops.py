@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import threading
+import weakref
 from typing import Any
 
 import cv2
@@ -90,6 +92,9 @@ def nearest_resized(label: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     return label[..., y[:, None], x]
 
 
+_PAGES = 1 << 16  # smaller arrays come from memory that the process has
+
+
 class Scratch:
     """Image buffers reused from call to call, one set per thread: allocating them costs more than filling them."""
 
@@ -106,3 +111,52 @@ class Scratch:
 
     def __reduce__(self) -> tuple[type[Scratch], tuple[()]]:
         return Scratch, ()
+
+
+class Memory:
+    """Memory for arrays, used again when nothing refers to them any more: page faults cost more than filling it.
+
+    Args:
+        limit: Bytes that are kept for the next array of the same size; 0 keeps none.
+    """
+
+    def __init__(self, limit: int = 512 * 2**20) -> None:
+        self.limit, self._kept, self._lock = limit, 0, threading.Lock()
+        self._free: dict[int, list[np.ndarray]] = {}
+
+    def empty(self, shape: tuple[int, ...], dtype: npt.DTypeLike) -> Any:
+        """An array of arbitrary content."""
+        size = math.prod(shape) * np.dtype(dtype).itemsize
+        if not self.limit or size < _PAGES:
+            return np.empty(shape, dtype)
+        with self._lock:
+            free = self._free.get(size)
+            block = free.pop() if free else None
+            self._kept -= size if block is not None else 0
+        if block is None:
+            block = np.empty(size, np.uint8)
+        # Views of it refer to this array, not to the block.
+        array = np.frombuffer(block.data, dtype)
+        weakref.finalize(array, self._take_back, block).atexit = False
+        return array.reshape(shape)
+
+    def full(self, shape: tuple[int, ...], value: float, dtype: npt.DTypeLike) -> Any:
+        """An array of one value."""
+        array = self.empty(shape, dtype)
+        array.fill(value)
+        return array
+
+    def _take_back(self, block: np.ndarray) -> None:
+        with self._lock:
+            if self._kept + block.nbytes > self.limit:  # other sizes are asked for now
+                self._free.clear()
+                self._kept = 0
+            self._free.setdefault(block.nbytes, []).append(block)
+            self._kept += block.nbytes
+
+    def __reduce__(self) -> tuple[type[Memory], tuple[int]]:
+        return Memory, (self.limit,)
+
+
+FRESH = Memory(0)
+"""Memory that keeps nothing."""

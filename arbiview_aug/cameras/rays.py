@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.image_ops import halved
+from arbiview_aug.image_ops import Memory, halved
 from arbiview_aug.lru_cache import LRUCache
 
 Planes = npt.NDArray[np.float32]
@@ -92,10 +92,14 @@ class CameraMaps:
 
     Args:
         max_bytes: Memory for them.
+
+    Attributes:
+        memory: Memory of what does change.
     """
 
     def __init__(self, max_bytes: int = 256 * 2**20) -> None:
         self._cache: LRUCache[Any, Any] = LRUCache(max_bytes, lambda item: item.nbytes)
+        self.memory = Memory()
 
     def __reduce__(self) -> tuple[type[CameraMaps], tuple[int]]:
         return CameraMaps, (self._cache.limit,)

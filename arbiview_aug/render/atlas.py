@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.errors import CalibrationError
-from arbiview_aug.image_ops import at_level, level_size
+from arbiview_aug.image_ops import FRESH, Memory, at_level, level_size
 
 OUTSIDE = -16
 """Whole-pixel coordinate of a map entry that reads nothing: far enough that no bilinear tap touches the atlas."""
@@ -53,9 +53,9 @@ class FixedMap:
         return fixed
 
     @classmethod
-    def outside(cls, size: tuple[int, int]) -> FixedMap:
+    def outside(cls, size: tuple[int, int], memory: Memory = FRESH) -> FixedMap:
         """A map (h, w) that reads nothing."""
-        return cls(np.full((*size, 2), OUTSIDE, np.int16), np.zeros(size, np.uint16))
+        return cls(memory.full((*size, 2), OUTSIDE, np.int16), memory.full(size, 0, np.uint16))
 
     def put(self, part: FixedMap, where: npt.NDArray[np.uint8]) -> None:
         """Take another map's positions where ``where`` (h, w) is not 0."""

@@ -21,7 +21,6 @@ from arbiview_aug.cameras.rays import CameraMaps
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.environment import compilation_announced
 from arbiview_aug.favs.config import FavsConfig
-from arbiview_aug.image_ops import Scratch
 from arbiview_aug.render.atlas import AtlasLayout
 from arbiview_aug.render.view_plan import ViewPlan
 from arbiview_aug.render.view_planner import ViewPlanner
@@ -123,8 +122,7 @@ def _built(
     ]
     used = [(region.source, region.level) for planner in planners for region in planner.regions]
     layout = AtlasLayout.for_sources(source.sizes, used)
-    scratch = Scratch()
-    targets = tuple(planner.finish(layout, scratch) for planner in planners)
+    targets = tuple(planner.finish(layout) for planner in planners)
     read = {
         (region.source, region.level)
         for planner, target in zip(planners, targets, strict=True)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from arbiview_aug.image_ops import Scratch
+from arbiview_aug.image_ops import Memory
 from arbiview_aug.render.atlas import FixedMap
 from arbiview_aug.render.view_plan import BlendRegion
 
@@ -49,14 +49,14 @@ def seam_weights(scores: Sequence[Nodes], border_px: Sequence[Nodes], radius: in
 
 
 def blend_regions(
-    contributions: Sequence[tuple[Any, ...]], winner: npt.NDArray[np.int8], scratch: Scratch
+    contributions: Sequence[tuple[Any, ...]], winner: npt.NDArray[np.int8], memory: Memory
 ) -> Iterator[BlendRegion]:
     """Rectangles around the pixels that a second source adds to.
 
     Args:
         contributions: The first nine arguments of ``kernels.put_source`` for each source, in content order.
         winner: (h, w) index of the winning source.
-        scratch: Image buffers.
+        memory: Memory of images.
     """
     from arbiview_aug.render.kernels import band_rows, cut_band, put_second, start_bands
 
@@ -71,9 +71,8 @@ def blend_regions(
     if not several.any():
         return
     h, w = winner.shape
-    both = scratch.get("weights", (2, h, w), np.float32)
-    second = scratch.get("second", (h, w), np.int8)
-    xy, frac = scratch.get("second_xy", (h, w), np.int32), scratch.get("second_frac", (h, w), np.uint16)
+    both, second = memory.empty((2, h, w), np.float32), memory.empty((h, w), np.int8)
+    xy, frac = memory.empty((h, w), np.int32), memory.empty((h, w), np.uint16)
     start_bands(several, step, both, second)
     for contribution in contributions:
         put_second(*contribution, winner, both, second, xy, frac, several)

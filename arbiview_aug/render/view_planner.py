@@ -20,7 +20,7 @@ from arbiview_aug.cameras.rays import CELL_PX, CameraMaps, relative_pose, source
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.favs.stage4_fusion import distance_weight, primary_weight, quality_weight
-from arbiview_aug.image_ops import Scratch, at_level, level_size
+from arbiview_aug.image_ops import at_level, level_size
 from arbiview_aug.render.atlas import AtlasLayout, FixedMap
 from arbiview_aug.render.confidence import certainty
 from arbiview_aug.render.requirements import SAME_CENTER_M
@@ -168,37 +168,36 @@ class ViewPlanner:
             return self._geometries[name]
         from arbiview_aug.render.kernels import depth_range
 
-        surface, center = cast(Any, self.surface_by_name(name)), self.camera.center_m
-        q = np.zeros(self.camera.size, np.float32)
+        surface, center, memory = cast(Any, self.surface_by_name(name)), self.camera.center_m, self.maps.memory
+        size = np.repeat(self.camera.size, 2)
         rows, columns = (np.flatnonzero(self._open.any(axis)) for axis in (1, 0))
-        y0, y1, x0, x1 = (int(n) for n in (rows[0], rows[-1] + 1, columns[0], columns[-1] + 1))
-        y0, y1, x0, x1 = (
-            min(n * self.step, limit) for n, limit in zip((y0, y1, x0, x1), np.repeat(q.shape, 2), strict=True)
-        )
+        cells = np.array([rows[0], rows[-1] + 1, columns[0], columns[-1] + 1])
+        y0, y1, x0, x1 = np.minimum(cells * self.step, size).tolist()
         window = y0, x0, (y1 - y0, x1 - x0)
-        is_whole = window[2] == q.shape
+        is_whole = window[2] == self.camera.size
         camera, rays = self.camera if is_whole else self.camera.crop(*window), self.rays.crop(*window)
-        here = slice(y0, y1), slice(x0, x1)
-        q[here] = surface.background.image(camera, rays)
-        self.counters["dense_pixels"] += q[here].size if surface.background.is_dense else 0
+
+        def widened(image: Any, outside: float) -> Any:
+            if is_whole:
+                return image
+            wide = memory.full(self.camera.size, outside, image.dtype)
+            wide[y0:y1, x0:x1] = image
+            return wide
+
+        q = widened(surface.background.image(camera, rays, memory), 0)
+        self.counters["dense_pixels"] += (y1 - y0) * (x1 - x0) if surface.background.is_dense else 0
         at_nodes = np.ix_(*self.nodes)
         behind = q[at_nodes]
         face = np.zeros((0, 0), np.int32)
-        on_nodes = behind.astype(np.float64)
-        if surface.background.is_guess:
-            on_nodes = surface.background.inverse_distance(center, self._directions)
         if surface.is_layered:
-            solid, face = np.zeros_like(q), np.full(q.shape, -1, np.int32)
-            solid[here], face[here] = surface.drawn(camera, rays)
+            solid, face = (widened(*one) for one in zip(surface.drawn(camera, rays, memory), (0, -1), strict=True))
             shown = face >= 0
             np.copyto(q, solid, where=shown)
-            self.counters["solid_pixels"] += int(np.count_nonzero(shown))
-            on_nodes = np.where(shown[at_nodes], solid[at_nodes], on_nodes)
-            if not shown.any():
-                face = np.zeros((0, 0), np.int32)
-        uncertainty = surface.uncertainty(center, self._directions, on_nodes)
-        cells = tuple(len(n) - 1 for n in self.nodes)
-        nearest, farthest = np.empty(cells, np.float32), np.empty(cells, np.float32)
+            solid_px = int(np.count_nonzero(shown))
+            self.counters["solid_pixels"] += solid_px
+            face = face if solid_px else np.zeros((0, 0), np.int32)
+        uncertainty = surface.uncertainty(center, self._directions, q[at_nodes])
+        nearest, farthest = np.empty((2, *self._open.shape), np.float32)
         depth_range(q, self.step, nearest, farthest)
         self._geometries[name] = _Geometry(q, face, behind, nearest, farthest, uncertainty)
         return self._geometries[name]
@@ -292,7 +291,7 @@ class ViewPlanner:
             # Points are known by cells: a pixel for each is enough. Silhouettes of objects are sharper.
             coarser = level if surface.is_layered else max(level, surface.occlusion_level(source))
             half = halved_camera(source, coarser)
-            shadow, solid = surface.occlusion_map(half, self.maps.rays(half))
+            shadow, solid = surface.occlusion_map(half, self.maps.rays(half), self.maps.memory)
             shadow_scale = 0.5 ** (coarser - level)
         before_m = np.zeros(0, np.float32)
         if surface.is_layered:
@@ -323,16 +322,14 @@ class ViewPlanner:
         return level
 
     # --- who wins -----------------------------------------------------------------------------------------------------
-    def finish(self, layout: AtlasLayout, scratch: Scratch) -> ViewPlan:
+    def finish(self, layout: AtlasLayout) -> ViewPlan:
         """Winners, maps into the atlas, and blended bands."""
         from arbiview_aug.render.kernels import put_source, upsample_where
 
-        h, w = self.camera.size
-        fixed = FixedMap.outside((h, w))
-        winner = np.full((h, w), -1, np.int8)
-        in_image = np.zeros((h, w), np.uint8)
-        best = scratch.get("best", (h, w), np.float32)
-        best.fill(-1)  # a source that sees a pixel beats none, even with a weight of 0
+        size, memory = self.camera.size, self.maps.memory
+        fixed = FixedMap.outside(size, memory)
+        winner, in_image = memory.full(size, -1, np.int8), memory.full(size, 0, np.uint8)
+        best = memory.full(size, -1, np.float32)  # a source that sees a pixel beats none, even with a weight of 0
         scores, borders = [region.score for region in self.regions], [region.border_px for region in self.regions]
         weights = seam_weights(scores, borders, self._seam_radius, self.config.seam_width * self.camera.width_px)
         contributions = []
@@ -344,10 +341,10 @@ class ViewPlanner:
             put_source(*contributions[-1], best, winner, fixed.packed, fixed.frac, in_image)
         count: Any = cv2.calcHist([winner.view(np.uint8)], [0], None, [256], [0, 256]).ravel()
         won_px = Counter({region.source: int(count[region.source]) for region in self.regions})
-        bands = tuple(blend_regions(contributions, winner, scratch)) if self.config.seam_width else ()
+        bands = tuple(blend_regions(contributions, winner, memory)) if self.config.seam_width else ()
         certain = None
         if self.config.certainty:
-            certain = np.zeros((h, w), np.uint8)
+            certain = memory.full(size, 0, np.uint8)
             for region in self.regions:
                 upsample_where(region.certainty, self.step, winner, region.source, certain)
         interpolation = self._interpolation(won_px)

@@ -16,6 +16,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import CELL_PX, PixelRays, pixel_rays
 from arbiview_aug.errors import SampleError
+from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene.surface import LayeredSurface, OcclusionMap, Points, StaticSurface, Surface
 
 _CHUNK = 1 << 15  # points tested at once, to stay in the CPU's cache
@@ -25,6 +26,9 @@ _UNLABELLED = 0.45
 
 _BOX_ERROR = 0.08
 """Mean relative error of a box face's inverse distance. Fitted on synthetic streets, seeds 100 to 105."""
+
+
+_ROUNDING = 1e-4  # of float32 images against float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,20 +50,22 @@ class BoxSurface(LayeredSurface):
         return self.street
 
     # --- images -------------------------------------------------------------------------------------------------------
-    def occlusion_map(self, camera: Camera, rays: PixelRays) -> OcclusionMap:
+    def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
         """What boxes hide from a source; kept for the next target."""
         if camera not in self._shadows:
             pixel_rad = float(1 / camera.K[0, 0])
             boxes, scale = self._enlarged(camera.center_m, pixel_rad), 1 / (1 + 2 * pixel_rad)  # a lookup's error
-            self._shadows[camera] = OcclusionMap(*draw_boxes(camera, boxes, rays, scale=scale, faces=False))
+            self._shadows[camera] = OcclusionMap(*draw_boxes(camera, boxes, rays, memory, scale=scale, faces=False))
         return self._shadows[camera]
 
-    def drawn(self, camera: Camera, rays: PixelRays) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
+    def drawn(
+        self, camera: Camera, rays: PixelRays, memory: Memory = FRESH
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
         """Inverse distances (h, w) of the boxes' faces along a camera's rays, 0 where there is none; the faces, or -1.
 
         A face's number is 6 x the box's row + 2 x the axis across it + 1 for the one further along that axis.
         """
-        return draw_boxes(camera, self.boxes, rays)
+        return draw_boxes(camera, self.boxes, rays, memory)
 
     def before_faces(self, origin: FloatArray) -> FloatArray:
         """By how many metres a point lies before the planes of all faces (6 B,)."""
@@ -79,7 +85,7 @@ class BoxSurface(LayeredSurface):
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Expected error (...,) in 1/m of boxes, and of the street because of unlabelled objects."""
         assert isinstance(self.street, StaticSurface)
-        on_street = inverse_distance <= self.street.inverse_distance(origin, directions)
+        on_street = inverse_distance <= (1 + _ROUNDING) * self.street.inverse_distance(origin, directions)
         street = _UNLABELLED * self.street.uncertainty(origin, directions, inverse_distance)
         return np.where(on_street, street, _BOX_ERROR * inverse_distance)
 
@@ -97,7 +103,13 @@ def box_rows(
 
 
 def draw_boxes(
-    camera: Camera, boxes: FloatArray, rays: PixelRays | None = None, *, scale: float = 1.0, faces: bool = True
+    camera: Camera,
+    boxes: FloatArray,
+    rays: PixelRays | None = None,
+    memory: Memory = FRESH,
+    *,
+    scale: float = 1.0,
+    faces: bool = True,
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
     """Rasterise boxes (B, 7).
 
@@ -105,6 +117,7 @@ def draw_boxes(
         camera: The camera.
         boxes: (B, 7).
         rays: The camera's rays, if they are known.
+        memory: Memory of the images.
         scale: Factor of the inverse distances.
         faces: Number the faces: 6 x the box's row + 2 x the axis across it + 1 for the one further along that axis.
 
@@ -114,7 +127,7 @@ def draw_boxes(
     from arbiview_aug.scene.kernels import draw_boxes as draw
 
     rays = rays or pixel_rays(camera)
-    q, number = np.zeros(camera.size, np.float32), np.full(camera.size, -1, np.int32)
+    q, number = memory.full(camera.size, 0, np.float32), memory.full(camera.size, -1, np.int32)
     draw(rays.planes, rays.parameters, *box_rows(camera, boxes, rays), rays.cones, CELL_PX, scale, faces, q, number)
     return q, number
 

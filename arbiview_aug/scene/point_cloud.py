@@ -17,6 +17,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import CELL_PX, PixelRays
 from arbiview_aug.errors import SampleError
+from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene.boxes import BoxSurface, box_rows
 from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, SIDE_RAD, Layer, PanoramaWindow, angles
 from arbiview_aug.scene.scanned_objects import BOX_AIR_M, RASTER_RAD, ScannedObject, scanned_objects
@@ -121,25 +122,25 @@ class PointCloudSurface(DenseSurface):
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", self.points[~own_car(self.points)])
 
-    def image(self, camera: Camera, rays: PixelRays) -> Layer:
+    def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> Layer:
         """The points' dense surface at all pixels, 1/m (h, w)."""
         from arbiview_aug.scene.completion import add_residuals
         from arbiview_aug.scene.kernels import SHOW
 
-        q = self.street.image(camera, rays)
+        q = self.street.image(camera, rays, memory)
         view, *cells = self._located(camera, rays)
         add_residuals(*cells, view.near, view.far, view.share, q)
         self._draw_objects(camera, rays, SHOW, q, _NO_SOLID)
         return q
 
-    def occlusion_map(self, camera: Camera, rays: PixelRays) -> OcclusionMap:
+    def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
         """What is hidden from a source; kept for the next target.
 
         Points farther by a tenth of their distance and 0.3 m than what was measured, as in the evaluation's visibility,
         and only within measured outlines: nothing hides where the LiDAR is silent.
         """
         if camera not in self._shadows:
-            shadows = OcclusionMap(np.zeros(camera.size, np.float32), np.full(camera.size, -1, np.int32))
+            shadows = OcclusionMap(memory.full(camera.size, 0, np.float32), memory.full(camera.size, -1, np.int32))
             self.hide(camera, rays, shadows.beyond, shadows.solid)
             self._shadows[camera] = shadows
         return self._shadows[camera]
@@ -252,16 +253,18 @@ class PointCloudWithBoxes(BoxSurface):
         objects, boxes, in_box = scanned_objects(boxes, points)
         return cls(PointCloudSurface(street, points[~in_box], objects), boxes)
 
-    def drawn(self, camera: Camera, rays: PixelRays) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
+    def drawn(
+        self, camera: Camera, rays: PixelRays, memory: Memory = FRESH
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
         """The boxes with nothing measured before them."""
-        q, face = super().drawn(camera, rays)
+        q, face = super().drawn(camera, rays, memory)
         self.street.hide(camera, rays, q, face, widened=False)
         return q, face
 
-    def occlusion_map(self, camera: Camera, rays: PixelRays) -> OcclusionMap:
+    def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
         """What boxes hide from a source, and what was measured."""
         new = camera not in self._shadows
-        shadows = super().occlusion_map(camera, rays)
+        shadows = super().occlusion_map(camera, rays, memory)
         if new:
             self.street.hide(camera, rays, shadows.beyond, shadows.solid)
         return shadows

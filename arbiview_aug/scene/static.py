@@ -12,6 +12,7 @@ import numpy.typing as npt
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rays import PixelRays
+from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE, StaticSurface
 
 WALL_CENTER_M = (1.0, 0.0)
@@ -41,26 +42,26 @@ class _RoadAndWall(StaticSurface):
     def semi_axes_m(self) -> tuple[float, float]:
         """Of the wall, along the road and across it."""
 
-    def image(self, camera: Camera, rays: PixelRays) -> npt.NDArray[np.float32]:
+    def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> npt.NDArray[np.float32]:
         """As ``inverse_distance``, compiled."""
-        return self._compiled(camera.center_m, camera.cam2ego[:3, :3], rays.planes, rays.parameters, camera.size)
+        q: npt.NDArray[np.float32] = memory.empty(camera.size, np.float32)
+        self._draw(camera.center_m, camera.cam2ego[:3, :3], rays.planes, rays.parameters, q)
+        return q
 
     def along(self, origin: FloatArray, rays: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """As ``inverse_distance``, compiled."""
-        return self._compiled(origin, np.eye(3), rays, np.zeros(14, np.float32), rays.shape[1:])
+        q = np.empty(rays.shape[1:], np.float32)
+        self._draw(origin, np.eye(3), rays, np.zeros(14, np.float32), q)
+        return q
 
-    def _compiled(
-        self, origin: FloatArray, R: FloatArray, planes: Any, parameters: Any, size: tuple[int, ...]
-    ) -> npt.NDArray[np.float32]:
+    def _draw(self, origin: FloatArray, R: FloatArray, planes: Any, parameters: Any, q: Any) -> None:
         from arbiview_aug.scene.kernels import GROUND, STREET, static_image
 
         height, axes = origin[2] - self.ground_z_m, self.semi_axes_m
         ox, oy = (origin[:2] - WALL_CENTER_M) / axes
         settings = 1 / height if height > 0 else 0.0, 1 / axes[0], 1 / axes[1], ox, oy, ox * ox + oy * oy - 1
-        q = np.empty(size, np.float32)
         kind = STREET if isinstance(self, Street) else GROUND
         static_image(planes, parameters, R.astype(np.float32), kind, np.array(settings, np.float32), q)
-        return q
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Mean error (...,) in 1/m caused by unknown objects, within a quarter on most of six synthetic streets.

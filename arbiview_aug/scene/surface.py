@@ -15,6 +15,7 @@ import numpy.typing as npt
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rays import PixelRays
+from arbiview_aug.image_ops import FRESH, Memory
 
 SurfaceName = Literal["auto", "far", "ground", "street", "objects", "lidar", "motion"]
 """Names in ``scene.SURFACES``. ``auto`` decides per pair of target and source camera."""
@@ -48,7 +49,7 @@ class Surface(ABC):
         return self
 
     @abstractmethod
-    def image(self, camera: Camera, rays: PixelRays) -> npt.NDArray[np.float32]:
+    def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> npt.NDArray[np.float32]:
         """Inverse distances (h, w) along a camera's pixel rays, 1/m, at most ``MAX_INVERSE_DISTANCE``."""
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
@@ -77,19 +78,21 @@ class LayeredSurface(Surface):
 
     is_layered: ClassVar[bool] = True
 
-    def image(self, camera: Camera, rays: PixelRays) -> npt.NDArray[np.float32]:
+    def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> npt.NDArray[np.float32]:
         """Inverse distances (h, w) of objects and background along the rays of a camera's pixel centres, 1/m."""
-        q = self.background.image(camera, rays)
-        objects, face = self.drawn(camera, rays)
+        q = self.background.image(camera, rays, memory)
+        objects, face = self.drawn(camera, rays, memory)
         np.copyto(q, objects, where=face >= 0)
         return q
 
     @abstractmethod
-    def drawn(self, camera: Camera, rays: PixelRays) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
+    def drawn(
+        self, camera: Camera, rays: PixelRays, memory: Memory = FRESH
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
         """Rasterise the objects: inverse distances (h, w), 1/m, and faces, -1 elsewhere."""
 
     @abstractmethod
-    def occlusion_map(self, camera: Camera, rays: PixelRays) -> OcclusionMap:
+    def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
         """The objects as occluders in a source image."""
 
     @abstractmethod
@@ -103,7 +106,7 @@ class DenseSurface(Surface):
     is_dense: ClassVar[bool] = True
 
     @abstractmethod
-    def occlusion_map(self, camera: Camera, rays: PixelRays) -> OcclusionMap:
+    def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
         """The surface as an occluder in a source image."""
 
     @abstractmethod
@@ -129,10 +132,10 @@ class StaticSurface(Surface):
         """Inverse distances (h, w) along unit rays (3, h, w) in the ego frame, 1/m."""
         return self.inverse_distance(origin, np.moveaxis(rays.astype(np.float64), 0, -1)).astype(np.float32)
 
-    def image(self, camera: Camera, rays: PixelRays) -> npt.NDArray[np.float32]:
+    def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> npt.NDArray[np.float32]:
         """Inverse distances (h, w) along the rays of a camera's pixel centres, 1/m."""
         h, w = camera.size
-        q = np.empty((h, w), np.float32)
+        q = memory.empty((h, w), np.float32)
         for first in range(0, h, _ROWS):
             rows = np.arange(first, min(first + _ROWS, h))
             local = rays.at(rows, np.arange(w)).astype(np.float64)
