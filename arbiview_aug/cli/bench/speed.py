@@ -52,7 +52,7 @@ BOUNDS: Mapping[tuple[int, int], Mapping[str, float]] = {
     SIZE: {
         **{"street, held": 1.2, "street": 3.5, "LiDAR": 8.0, "LiDAR, 75 boxes": 11.0},
         **{f"{n} boxes": 5.0 for n in BOXES},
-        **{f"street, held, {fit}, contiguous": 2.0 for fit in ("stretch", "crop")},
+        **{f"street, held, {fit}, contiguous": 2.0 for fit in ("squashed", "cropped")},
         **{f"{known}, two neighbours": 20.0 for known in ("street", "75 boxes")},
     },
     FULL_SIZE: {
@@ -124,26 +124,19 @@ def measure(data: Recorded, repeats: int, sizes: Sequence[tuple[int, int]]) -> d
         sample = half if is_small else full
         calls = {name: (len(rig), _calls(sample, rig.resized((h, w)))) for name, rig in targets.items()}
         if is_small:
-            calls["radtan, from full size"] = len(waymo), _calls_from_full_size(full, waymo, (h, w))
-            calls["own"] = len(full["rig"]), _calls_of_own(sample, (h, w))
+            squashed, cropped = waymo.resized((h, w)), waymo.resized((h, w), "crop")
+            runs = _both_layouts("street, held, squashed", full, squashed)
+            runs |= _both_layouts("street, held, cropped", full, cropped)
+            calls |= {"radtan, from full size": (len(waymo), runs), "own": (len(full["rig"]), _own(sample, (h, w)))}
         for name, (views, runs) in calls.items():
             floor = f"floor: cv2.remap of {views} views"
             runs = {floor: remap_floor(sample["images"][:views], (h, w)), **runs}
             times = timed_rounds(runs, repeats, f"{w}x{h} {name}", enough_ms=_ENOUGH_MS)
             for call, taken in times.items():
                 ratio = statistics.median(a / b for a, b in zip(taken, times[floor], strict=False))
-                bound = BOUNDS.get((h, w), {}).get(call)
                 row = {"size": [h, w], "target": name, "name": call, **quartiles(taken)._asdict()}
-                rows.append(row | {"ratio": ratio, "bound": bound})
-    return {
-        "floor": "cv2.remap, linear, float32 maps, x' = 0.97 x + 0.02 y + 3, y' = 0.95 y + 0.01 x + 5",
-        "clock": "CPU time of the process, milliseconds",
-        "data": data.name,
-        "sources": [list(of_camera) for of_camera in full["rig"].sizes],
-        "rounds": repeats,
-        "ready_s": ready_s,
-        "measures": rows,
-    }
+                rows.append(row | {"ratio": ratio, "bound": BOUNDS.get((h, w), {}).get(call)})
+    return {"data": data.name, "rounds": repeats, "ready_s": ready_s, "measures": rows}
 
 
 COLUMNS = (
@@ -165,8 +158,7 @@ def table(report: Mapping[str, Any]) -> str:
 def _calls(sample: Sample, target: Rig) -> Calls:
     points = {"points": sample["points"]}
     return {
-        "street, held": _held(sample, target),
-        "street, held, contiguous": _held(_contiguous(sample), target),
+        **_both_layouts("street, held", sample, target),
         "street, held, filled": _held(sample, target, holes="fill"),
         "street": _anew(sample, target, "street", {}),
         **{f"{n} boxes": _anew(sample, target, "objects", {"boxes_3d": boxes_around(n)}) for n in BOXES},
@@ -175,16 +167,7 @@ def _calls(sample: Sample, target: Rig) -> Calls:
     }
 
 
-def _calls_from_full_size(sample: Sample, target: Rig, views: tuple[int, int]) -> Calls:
-    runs: Calls = {}
-    for fit in ("stretch", "crop"):
-        to = target.resized(views, fit)
-        runs[f"street, held, {fit}"] = _held(sample, to)
-        runs[f"street, held, {fit}, contiguous"] = _held(_contiguous(sample), to)
-    return runs
-
-
-def _calls_of_own(sample: Sample, views: tuple[int, int]) -> Calls:
+def _own(sample: Sample, views: tuple[int, int]) -> Calls:
     """Turned cameras, which have holes, and lowered ones, which neighbouring frames fill."""
     rig = sample["rig"]
     turned, low = rig.turned(yaw_deg=YAW_DEG).resized(views), lowered(rig, views)
@@ -202,6 +185,11 @@ def _calls_of_own(sample: Sample, views: tuple[int, int]) -> Calls:
     }
 
 
+def _both_layouts(name: str, sample: Sample, target: Rig) -> Calls:
+    contiguous = {**sample, "images": sample["images"].contiguous()}
+    return {name: _held(sample, target), f"{name}, contiguous": _held(contiguous, target)}
+
+
 def _held(sample: Sample, target: Rig, holes: Holes = "black", harmonise: Harmonise = None) -> Callable[[], Any]:
     return partial(RigRetarget(target, surface="street", holes=holes, harmonise=harmonise), sample)
 
@@ -217,10 +205,6 @@ def _anew(sample: Sample, target: Rig, surface: SurfaceName, geometry: Sample) -
         retarget({**sample, **(moved or {"rig": next(rigs)})})
 
     return run
-
-
-def _contiguous(sample: Sample) -> Sample:
-    return {**sample, "images": sample["images"].contiguous()}
 
 
 def boxes_around(number: int) -> torch.Tensor:

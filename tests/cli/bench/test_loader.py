@@ -144,6 +144,7 @@ def test_rates_against_reading(nuscenes_root: Path, tmp_path: Path, report_bound
 
 
 @pytest.mark.release
+@pytest.mark.timeout(3600)
 def test_soak(report_bound: Callable[..., None]) -> None:
     """2,000 frames in two workers with a new plan each, over LiDAR and boxes: the workers' memory stays."""
     sample = street_sample()
