@@ -19,8 +19,6 @@ from arbiview_aug.errors import SampleError
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene.surface import LayeredSurface, OcclusionMap, Points, StaticSurface, Surface
 
-_CHUNK = 1 << 15  # points tested at once, to stay in the CPU's cache
-
 _UNLABELLED = 0.45
 """Share of the street's uncertainty due to unlabelled objects. Fitted on synthetic streets, seeds 100 to 105."""
 
@@ -155,16 +153,12 @@ def meets(box: FloatArray, origin: FloatArray, directions: FloatArray) -> BoolAr
 
 def points_in(boxes: FloatArray, points: Points, air_m: float = 0.0) -> list[npt.NDArray[np.int64]]:
     """For each box (B, 7) the indices of the points (P, 3) in it, widened by ``air_m`` on all sides."""
-    found: list[list[npt.NDArray[np.int64]]] = [[np.zeros(0, np.int64)] for _ in boxes]
-    reach_m = np.hypot(boxes[:, 3], boxes[:, 4]) / 2 + 2 * air_m
-    for first in range(0, len(points), _CHUNK):
-        chunk = points[first : first + _CHUNK]
-        x, y = chunk[:, :2].T.astype(np.float64, order="C")
-        for box, reach, numbers in zip(boxes, reach_m.tolist(), found, strict=True):
-            near = np.flatnonzero((np.abs(x - box[0]) <= reach) & (np.abs(y - box[1]) <= reach))
-            inside = np.abs(_in_box_frame(box, chunk[near] - box[:3])) <= box[3:6] / 2 + air_m
-            numbers.append(first + near[inside.all(axis=1)])
-    return [np.concatenate(numbers) for numbers in found]
+    from arbiview_aug.scene.kernels import points_in as pairs_of
+
+    box, point = pairs_of(np.ascontiguousarray(boxes), np.ascontiguousarray(points), air_m)
+    point = point[np.argsort(box, kind="stable")]
+    ends = np.cumsum(np.bincount(box, minlength=len(boxes)))
+    return [point[end - count : end] for end, count in zip(ends, np.diff(ends, prepend=0), strict=True)]
 
 
 def is_over(box: FloatArray, point: FloatArray, air_m: float = 0.0) -> bool:

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.cameras.kernels import angle_row
+from arbiview_aug.cameras.kernels import angle_row, rays_row
 from arbiview_aug.environment import compiled
-from arbiview_aug.scene.kernels import upsampled_row
+from arbiview_aug.scene.kernels import columns_of_box, slabs_row, upsampled_row
 from arbiview_aug.scene.panorama import (
     BASE_STEP,
     CELL_RAD,
@@ -27,14 +27,14 @@ from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _MOST = np.float32(MAX_INVERSE_DISTANCE)
 _HALF_PI = np.float32(np.pi / 2)
+SHOW, HIDE, HIDE_WIDE = 0, 1, 2
 _CHUNK = 1024  # points worked on at once
-_PER_RAD = np.float32(1 / CELL_RAD)
-_TURN = np.float32(round(2 * np.pi / CELL_RAD))
 
 # A cell's nearest seed in one int32, so that the nearer of two is their minimum: distance in 1/1024 cell (from bit 14),
 # row (from bit 7) and column of the seed as seen from the cell, plus 64. Distances are those of Borgefors' 5 x 5 mask.
 _UNIT, _ROW, _MIDDLE = 1 << 14, 1 << 7, 64
 _NO_SEED = np.int32(64 * 1024 * _UNIT)
+_OWN = np.int32(64 * 128 + 64)
 _SIDE, _CORNER, _KNIGHT = 1024 * _UNIT, 1434 * _UNIT, 2250 * _UNIT
 _REACH = np.float32(REACH_RAD / CELL_RAD)
 _SUPPORT = np.float32(SUPPORT_RAD / CELL_RAD)
@@ -48,21 +48,21 @@ _STEP, _STEP_PER_M, _SOME = np.float32(STEP), np.float32(STEP_PER_M), np.float32
 @compiled
 def cells_row(x: Any, y: Any, z: Any, place: Any, level: Any, row: Any, column: Any) -> None:
     """Rows and columns (n,) in a panorama (``PanoramaWindow.place``) of ego-frame vectors; ``level`` is scratch."""
-    first, lead, low = place[0], place[1], place[2]
+    first, lead, low, per_rad, turn = place[0], place[1], place[2], place[3], place[4]
     n = x.shape[0]
     for i in range(n):
         level[i] = abs(y[i])
     angle_row(level, x, column)
     for i in range(n):
         azimuth = (column[i] if y[i] >= _ZERO else -column[i]) - first
-        column[i] = azimuth * _PER_RAD - lead
+        column[i] = azimuth * per_rad - lead
     for i in range(n):
-        column[i] += lead - np.floor(column[i] / _TURN) * _TURN
+        column[i] += lead - np.floor(column[i] / turn) * turn
     for i in range(n):
         level[i] = np.sqrt(x[i] * x[i] + y[i] * y[i])
     angle_row(level, z, row)
     for i in range(n):
-        row[i] = (_HALF_PI - row[i] - low) * _PER_RAD
+        row[i] = (_HALF_PI - row[i] - low) * per_rad
 
 
 @compiled
@@ -77,7 +77,7 @@ def nearest_points(points: Any, origin: Any, bounds: Any, place: Any, q: Any, nu
         q: (h, w) float32, 0; written where there is a point.
         number: (h, w) int32; written where there is a point, of equally near ones the last.
     """
-    h, w = q.shape
+    (h, w), turn = q.shape, int(place[4])
     low, high, cosine, sine, least = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
     work, index = np.empty((7, _CHUNK), np.float32), np.empty(_CHUNK, np.int64)
     for start in range(0, points.shape[0], _CHUNK):
@@ -95,13 +95,13 @@ def nearest_points(points: Any, origin: Any, bounds: Any, place: Any, q: Any, nu
             n += 1
         cells_row(work[0, :n], work[1, :n], work[2, :n], place, work[4, :n], work[5, :n], work[6, :n])
         for i in range(n):
-            row, column = int(np.rint(work[5, i])), int(np.rint(work[6, i])) % int(_TURN)
+            row, column = int(np.rint(work[5, i])), int(np.rint(work[6, i])) % turn
             if row < 0 or row >= h:
                 continue
             while column < w:  # the halo of a whole turn holds some points twice
                 if work[3, i] >= q[row, column]:
                     q[row, column], number[row, column] = work[3, i], index[i]
-                column += int(_TURN)
+                column += turn
 
 
 @compiled
@@ -154,7 +154,7 @@ def complete(cells: Any, own: Any, residuals: Any, near: Any, far: Any, share: A
     r, q = np.empty((h, w), np.float32), np.empty((h, w), np.float32)
     for i in range(cells.shape[0]):
         y, x = cells[i] // w, cells[i] % w
-        code[y + 2, x + 2] = _MIDDLE * _ROW + _MIDDLE
+        code[y + 2, x + 2] = _OWN
         r[y, x], q[y, x] = residuals[i], own[i]
     spread(code)
     away = np.empty(w, np.float32)
@@ -337,11 +337,7 @@ def cells_of(rays: Any, R: Any, place: Any, rows: Any, columns: Any) -> None:
     """Rows and columns (ny, nx) in a panorama (``PanoramaWindow.place``) of rays (3, ny, nx) turned by ``R``."""
     work = np.empty((4, rays.shape[2]), np.float32)
     for y in range(rays.shape[1]):
-        a, b, c = rays[0, y], rays[1, y], rays[2, y]
-        for k in range(3):
-            out, r0, r1, r2 = work[k], R[k, 0], R[k, 1], R[k, 2]
-            for x in range(a.shape[0]):
-                out[x] = r0 * a[x] + r1 * b[x] + r2 * c[x]
+        _turned_row(R, rays[0, y], rays[1, y], rays[2, y], work[0], work[1], work[2])
         cells_row(work[0], work[1], work[2], place, work[3], rows[y], columns[y])
 
 
@@ -457,16 +453,109 @@ def raise_depths(rows: Any, columns: Any, step: int, layer: Any, apart: int, q: 
 
 
 @compiled
-def fill_raster(nearest: Any) -> None:
-    """Give cells (h, w) of 0 the value of the nearest other one."""
-    h, w = nearest.shape
-    code = np.full((h + 4, w + 4), _NO_SEED, np.int32)
-    for y in range(h):
-        for x in range(w):
-            if nearest[y, x] > _ZERO:
-                code[y + 2, x + 2] = _MIDDLE * _ROW + _MIDDLE
+def scan(points: Any, origin: Any, azimuth: float, per_rad: float) -> tuple[Any, Any, Any]:
+    """Rasterise the points (n, 3) of an object about an azimuth as a centre sees them (``scanned_objects.Raster``)."""
+    work, turn = np.empty((7, points.shape[0]), np.float32), np.float32(2 * np.pi * per_rad)
+    place, n = np.array([azimuth, -turn / 2, 0.0, per_rad, turn], np.float32), 0
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+        length = np.sqrt(x * x + y * y + z * z)
+        if length >= NEAREST_M:
+            work[0, n], work[1, n], work[2, n], work[3, n] = x / length, y / length, z / length, 1 / length
+            n += 1
+    if n == 0:
+        return place, np.zeros((0, 0), np.float32), np.zeros(0, np.float32)
+    row, column = work[5, :n], work[6, :n]
+    cells_row(work[0, :n], work[1, :n], work[2, :n], place, work[4, :n], row, column)
+    low, left = row.min(), column.min()
+    place[0], place[2] = place[0] + left / per_rad, low / per_rad
+    h, w = int(np.rint(row.max() - low)) + 1, int(np.rint(column.max() - left)) + 1
+    nearest, code = np.zeros((h, w), np.float32), np.full((h + 4, w + 4), _NO_SEED, np.int32)
+    top = np.full(w, -1, np.float32)
+    for i in range(n):
+        r, c = int(np.rint(row[i] - low)), int(np.rint(column[i] - left))
+        nearest[r, c], code[r + 2, c + 2] = max(nearest[r, c], work[3, i]), _OWN
+        top[c] = max(top[c], row[i] - low)
     spread(code)
-    for y in range(h):
-        for x in range(w):
-            from_y, from_x = seed(code[y + 2, x + 2])
-            nearest[y, x] = nearest[y + from_y, x + from_x]
+    for r in range(h):
+        for c in range(w):
+            from_r, from_c = seed(code[r + 2, c + 2])
+            nearest[r, c] = nearest[r + from_r, c + from_c]
+    last = 0  # the first and the last column have points
+    for c in range(w):
+        if top[c] >= _ZERO:
+            for k in range(last + 1, c):
+                top[k] = top[last] + (top[c] - top[last]) * np.float32((k - last) / (c - last))
+            last = c
+    return place, nearest, top
+
+
+@compiled
+def draw_scanned(
+    planes: Any, P: Any, R: Any, box: Any, cones: Any, step: int, raster: Any, air: Any, mode: int, image: Any,
+    solid: Any,
+) -> None:  # fmt: skip
+    """Draw an object by its points into inverse distances or an occlusion map (``scanned_objects.ScannedObject``).
+
+    Args:
+        planes: (3, h, w) rays, or (3, 0, 0) for a pinhole.
+        P: ``camera_parameters``.
+        R: (3, 3) float32 camera to ego.
+        box: (20,) as in ``draw_boxes``.
+        cones: ``cell_cones``.
+        step: Side of a cell, pixels.
+        raster: What ``scan`` returns.
+        air: (2,) float32: how far outside its box its points may lie, metres; how far above its highest points it may
+            hide, cells of the raster.
+        mode: ``SHOW``: where it is met in front of what ``image`` (h, w) says. ``HIDE``: what it hides. ``HIDE_WIDE``:
+            what it may hide, a little above its points too.
+        image: (h, w) float32, updated.
+        solid: (h, w) int32, -1 where the image is raised; (0, 0) with ``SHOW``.
+    """
+    h, w = image.shape
+    _, ny, nx = cones.shape
+    place, nearest, top = raster
+    rows, columns = nearest.shape
+    last = np.float32(columns) - _HALF
+    work, near_box = np.empty((11, w), np.float32), np.empty(nx, np.bool_)
+    sx, sy, sz, hx, hy, hz = box[9], box[10], box[11], box[12] + air[0], box[13] + air[0], box[14] + air[0]
+    above = air[1] if mode == HIDE_WIDE else _ZERO
+    for j in range(ny):
+        x0, n = columns_of_box(box, cones[:, j], near_box, step, w)
+        if n == 0:
+            continue
+        rx, ry, rz, ix, iy, iz = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n], work[5, :n]
+        enter, leave, behind, row, column = work[6, :n], work[7, :n], work[8, :n], work[9, :n], work[10, :n]
+        for y in range(j * step, min(j * step + step, h)):
+            rays_row(planes, P, y, x0, rx, ry, rz)
+            slabs_row(box, rx, ry, rz, ix, iy, iz, enter, leave)
+            for x in range(n):  # it leaves the air around the box
+                far = min(-sx * ix[x] + hx * abs(ix[x]), -sy * iy[x] + hy * abs(iy[x]))
+                behind[x] = _ONE / max(min(far, -sz * iz[x] + hz * abs(iz[x])), _ONE / _MOST)
+            _turned_row(R, rx, ry, rz, ix, iy, iz)
+            cells_row(ix, iy, iz, place, rx, row, column)
+            out = image[y, x0 : x0 + n]
+            for x in range(n):
+                if leave[x] < enter[x] or enter[x] <= _ZERO or column[x] < -_HALF or column[x] > last:
+                    continue
+                inner = min(max(column[x], _ZERO), last - _HALF)
+                c = int(inner)
+                highest = top[c] + (top[min(c + 1, columns - 1)] - top[c]) * (inner - np.float32(c))
+                if row[x] > highest + above:
+                    continue
+                r = min(max(int(np.rint(row[x])), 0), rows - 1)
+                own = nearest[r, int(np.rint(inner))] if row[x] <= highest else _ZERO
+                if mode == SHOW:
+                    if own > _ZERO and out[x] < behind[x]:
+                        out[x] = own
+                elif (mode == HIDE_WIDE or own > _ZERO) and behind[x] > out[x]:
+                    out[x], solid[y, x0 + x] = behind[x], -1
+
+
+@compiled
+def _turned_row(R: Any, x: Any, y: Any, z: Any, u: Any, v: Any, w: Any) -> None:
+    """Vectors (n,) turned by ``R`` (3, 3)."""
+    for k, out in enumerate((u, v, w)):
+        a, b, c = R[k, 0], R[k, 1], R[k, 2]
+        for i in range(out.shape[0]):
+            out[i] = a * x[i] + b * y[i] + c * z[i]

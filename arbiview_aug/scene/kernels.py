@@ -16,10 +16,8 @@ _MOST = np.float32(MAX_INVERSE_DISTANCE)
 
 _HALF = np.float32(0.5)
 _FLAT = np.float32(1e-12)
-_TURN = np.float32(2 * np.pi)
 
 GROUND, STREET = 0, 1
-SHOW, HIDE, HIDE_WIDE = 0, 1, 2
 
 
 @compiled
@@ -147,7 +145,7 @@ def draw_boxes(
         b, me = boxes[k], np.int32(numbers[k])
         sx, sy, sz, hx, hy, hz = b[9], b[10], b[11], b[12], b[13], b[14]
         for j in range(ny):
-            x0, n = _columns_of_box(b, cones[:, j], near_box, step, w)
+            x0, n = columns_of_box(b, cones[:, j], near_box, step, w)
             if n == 0:
                 continue
             rx, ry, rz, ix = work[0, :n], work[1, :n], work[2, :n], work[3, :n]
@@ -190,7 +188,7 @@ def sum_silhouettes(
     for k in range(boxes.shape[0]):
         b = boxes[k]
         for j in range(ny):
-            x0, n = _columns_of_box(b, cones[:, j], near_box, step, w)
+            x0, n = columns_of_box(b, cones[:, j], near_box, step, w)
             if n == 0:
                 continue
             rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[6, :n], work[7, :n]
@@ -203,7 +201,7 @@ def sum_silhouettes(
 
 
 @compiled
-def _columns_of_box(b: Any, cones: Any, near: Any, step: int, w: int) -> tuple[int, int]:
+def columns_of_box(b: Any, cones: Any, near: Any, step: int, w: int) -> tuple[int, int]:
     """First column and number of columns of the cells in a row that hold rays which may meet a box; 0 for none.
 
     Cells (n,) are sorted out by the cone around the box, then by whether the middle's ray meets a box that is larger by
@@ -270,79 +268,26 @@ def upsampled_row(nodes: Any, step: int, y: int, x0: int, row: Any, out: Any) ->
 
 
 @compiled
-def upsample(nodes: Any, step: int, out: Any) -> None:
-    """Bilinear values (h, w) between nodes (ny + 1, nx + 1)."""
-    row = np.empty(nodes.shape[1], np.float32)
-    for y in range(out.shape[0]):
-        upsampled_row(nodes, step, y, 0, row, out[y])
-
-
-@compiled
-def draw_scanned(
-    planes: Any, P: Any, R: Any, boxes: Any, cones: Any, step: int, raster: Any, nearest: Any, top_rad: Any, mode: int,
-    image: Any, solid: Any,
-) -> None:  # fmt: skip
-    """Draw an object by its points into inverse distances or an occlusion map (``scanned_objects.ScannedObject``).
-
-    Args:
-        planes: (3, h, w) rays, or (3, 0, 0) for a pinhole.
-        P: ``camera_parameters``.
-        R: (3, 3) float32 camera to ego.
-        boxes: (2, 20) its box as in ``draw_boxes``, and the same with air around it.
-        cones: ``cell_cones``.
-        step: Side of a cell, pixels.
-        raster: (4,) float32 azimuth of the first column, elevation of the first row, side of a cell, how far above its
-            highest points it may hide; radians.
-        nearest: (H, W) its inverse distances.
-        top_rad: (W,) elevations of its highest points.
-        mode: ``SHOW``: where it is met in front of what ``image`` (h, w) says. ``HIDE``: what it hides. ``HIDE_WIDE``:
-            what it may hide, a little above its points too.
-        image: (h, w) float32, updated.
-        solid: (h, w) int32, -1 where the image is raised; (0, 0) with ``SHOW``.
-    """
-    h, w = image.shape
-    _, ny, nx = cones.shape
-    rows, columns = nearest.shape
-    work, near_box = np.empty((8, w), np.float32), np.empty(nx, np.bool_)
-    for j in range(ny):
-        x0, n = _columns_of_box(boxes[0], cones[:, j], near_box, step, w)
-        if n == 0:
+def points_in(boxes: Any, points: Any, air: float) -> Any:
+    """Pairs (2, n) of a box (B, 7) and a point (P, 3) in it, widened by ``air`` on all sides, in the points' order."""
+    center, reach = boxes[:, :2].T.copy(), np.empty(boxes.shape[0])
+    for k in range(boxes.shape[0]):
+        reach[k] = np.hypot(boxes[k, 3], boxes[k, 4]) / 2 + 2 * air
+    found, n = np.empty((2, 1024), np.int64), 0
+    for i in range(points.shape[0]):
+        px, py, hits = points[i, 0], points[i, 1], 0
+        for k in range(reach.shape[0]):
+            hits |= (abs(px - center[0, k]) <= reach[k]) & (abs(py - center[1, k]) <= reach[k])
+        if not hits:
             continue
-        rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[6, :n], work[7, :n]
-        for y in range(j * step, min(j * step + step, h)):
-            rays_row(planes, P, y, x0, rx, ry, rz)
-            slabs_row(boxes[0], rx, ry, rz, work[3, :n], work[4, :n], work[5, :n], enter, leave)
-            out = image[y, x0 : x0 + n]
-            for x in range(n):
-                if leave[x] < enter[x] or enter[x] <= _ZERO:
-                    continue
-                dx = R[0, 0] * rx[x] + R[0, 1] * ry[x] + R[0, 2] * rz[x]
-                dy = R[1, 0] * rx[x] + R[1, 1] * ry[x] + R[1, 2] * rz[x]
-                dz = R[2, 0] * rx[x] + R[2, 1] * ry[x] + R[2, 2] * rz[x]
-                azimuth = np.arctan2(dy, dx) - raster[0]
-                azimuth -= _TURN * np.rint(azimuth / _TURN)
-                elevation = np.arctan2(dz, np.sqrt(dx * dx + dy * dy))
-                column = azimuth / raster[2]
-                if column < -_HALF or column > np.float32(columns) - _HALF:
-                    continue
-                inner = min(max(column, _ZERO), np.float32(columns - 1))
-                c = min(int(inner), max(columns - 2, 0))
-                t = inner - np.float32(c)
-                top = top_rad[c] + (top_rad[min(c + 1, columns - 1)] - top_rad[c]) * t
-                if elevation > top + raster[3] or (mode != HIDE_WIDE and elevation > top):
-                    continue
-                r = min(max(int(np.rint((elevation - raster[1]) / raster[2])), 0), rows - 1)
-                own = nearest[r, int(np.rint(inner))] if elevation <= top else _ZERO
-                g = boxes[1]
-                behind = np.float32(1e30)
-                for axis in range(3):
-                    along = g[3 * axis] * rx[x] + g[3 * axis + 1] * ry[x] + g[3 * axis + 2] * rz[x]
-                    along = along if abs(along) > _FLAT else _FLAT
-                    behind = min(behind, -g[9 + axis] / along + g[12 + axis] / abs(along))
-                behind = _ONE / max(behind, _ONE / _MOST)
-                if mode == SHOW:
-                    if own > _ZERO and out[x] < behind:
-                        out[x] = own
-                elif (mode == HIDE_WIDE or own > _ZERO) and behind > out[x]:
-                    out[x] = behind
-                    solid[y, x0 + x] = -1
+        for k in range(reach.shape[0]):
+            x, y, z = px - center[0, k], py - center[1, k], points[i, 2] - boxes[k, 2]
+            if abs(x) > reach[k] or abs(y) > reach[k] or abs(z) > boxes[k, 5] / 2 + air:
+                continue
+            c, s = np.cos(boxes[k, 6]), np.sin(boxes[k, 6])
+            if abs(c * x + s * y) <= boxes[k, 3] / 2 + air and abs(c * y - s * x) <= boxes[k, 4] / 2 + air:
+                if n == found.shape[1]:
+                    found = np.concatenate((found, np.empty_like(found)), axis=1)
+                found[0, n], found[1, n] = k, i
+                n += 1
+    return found[:, :n]

@@ -109,10 +109,11 @@ class PanoramaWindow:
 
     @property
     def place(self) -> Layer:
-        """(3,) azimuth of column 0, the column at which the turn ends and begins, elevation of row 0."""
+        """(5,) azimuth of column 0, the column where a turn ends, elevation of row 0, cells per radian and per turn."""
         # In a whole turn the halo at the start lacks what lies before it; that at the end has both.
         lead = _HALO_RAD / CELL_RAD if self.is_whole else 0.0
-        return np.array([self.start_rad - _HALO_RAD, lead, self.low_rad - _HALO_RAD], np.float32)
+        first, low = self.start_rad - _HALO_RAD, self.low_rad - _HALO_RAD
+        return np.array([first, lead, low, 1 / CELL_RAD, round(2 * math.pi / CELL_RAD)], np.float32)
 
     @property
     def bounds(self) -> FloatArray:

@@ -34,6 +34,8 @@ _NODES_RAD = 4 * CELL_RAD
 
 _NO_SOLID = np.zeros((0, 0), np.int32)
 
+_AIR = np.array([BOX_AIR_M, SIDE_RAD / RASTER_RAD], np.float32)
+
 _MEASURED_SPREAD = 0.05
 """Spread of a measured inverse distance, as a share of it: half of STEP, below which densification follows a slope."""
 
@@ -124,8 +126,7 @@ class PointCloudSurface(DenseSurface):
 
     def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> Layer:
         """The points' dense surface at all pixels, 1/m (h, w)."""
-        from arbiview_aug.scene.completion import add_residuals
-        from arbiview_aug.scene.kernels import SHOW
+        from arbiview_aug.scene.completion import SHOW, add_residuals
 
         q = self.street.image(camera, rays, memory)
         view, *cells = self._located(camera, rays)
@@ -158,8 +159,7 @@ class PointCloudSurface(DenseSurface):
         ``solid`` (h, w) becomes -1 there. With ``widened`` objects reach half a scan line's spacing above their highest
         points: they may, and a source that shows them there must not be read for the background.
         """
-        from arbiview_aug.scene.completion import raise_depths
-        from arbiview_aug.scene.kernels import HIDE, HIDE_WIDE
+        from arbiview_aug.scene.completion import HIDE, HIDE_WIDE, raise_depths
 
         view, *cells = self._located(camera, rays)
         apart = max(1, round(CELL_RAD * float(rays.parameters[0])))
@@ -180,25 +180,19 @@ class PointCloudSurface(DenseSurface):
     def _draw_objects(
         self, camera: Camera, rays: PixelRays, mode: int, image: Layer, solid: npt.NDArray[np.int32]
     ) -> None:
-        """Draw the objects that a camera may see by their points (``kernels.draw_scanned``)."""
-        from arbiview_aug.scene.kernels import draw_scanned
+        """Draw the objects that a camera may see by their points (``completion.draw_scanned``)."""
+        from arbiview_aug.scene.completion import draw_scanned
 
         if not self.objects:
             return
-        boxes = np.array([one.box for one in self.objects])
-        rows, seen = box_rows(camera, boxes, rays)
-        wide = rows.copy()
-        wide[:, 12:15] += BOX_AIR_M
-        R = camera.cam2ego[:3, :3].astype(np.float32)
-        for number, pair in zip(seen, np.stack([rows, wide], 1), strict=True):
-            raster = self.objects[number].raster(camera.center_m)
-            if raster is None:
-                continue
-            place = np.array([raster.azimuth_rad, raster.elevation_rad, RASTER_RAD, SIDE_RAD], np.float32)
-            draw_scanned(
-                rays.planes, rays.parameters, R, pair, rays.cones, CELL_PX, place, raster.nearest, raster.top_rad,
-                mode, image, solid,
-            )  # fmt: skip
+        boxes, numbers = box_rows(camera, np.array([one.box for one in self.objects]), rays)
+        center, R = np.ascontiguousarray(camera.center_m), camera.cam2ego[:3, :3].astype(np.float32)
+        for box, number in zip(boxes, numbers, strict=True):
+            raster = self.objects[number].raster(center)
+            if raster.nearest.size:
+                draw_scanned(
+                    rays.planes, rays.parameters, R, box, rays.cones, CELL_PX, raster, _AIR, mode, image, solid
+                )  # fmt: skip
 
     def _located(self, camera: Camera, rays: PixelRays) -> tuple[Panorama, Layer, Layer, int]:
         """The panorama around a camera; rows and columns in it (ny + 1, nx + 1) of nodes, and how far these are apart.

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.scene.boxes import is_over, points_in
-from arbiview_aug.scene.panorama import NEAREST_M, Layer, angles, wrapped
+from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.scene.surface import Points
 
 BOX_AIR_M = 0.2
@@ -41,31 +42,36 @@ class ScannedObject:
 
     box: FloatArray
     points: FloatArray
-    _rasters: dict[bytes, _Raster | None] = field(default_factory=dict, repr=False)
+    _rasters: dict[bytes, Raster] = field(default_factory=dict, repr=False)
 
-    def raster(self, origin: FloatArray) -> _Raster | None:
-        """The points as a centre (3,) sees them; None where they have no outline from there."""
-        key = np.asarray(origin, np.float64).tobytes()
+    def raster(self, origin: FloatArray) -> Raster:
+        """The points as a centre (3,) sees them; none where they have no outline from there.
+
+        That is where it is over the object or in it, or all but touches its points. Elsewhere they are less than half a
+        turn about the azimuth of the box's middle: its footprint is convex, and the centre beside it.
+        """
+        from arbiview_aug.scene.completion import scan
+
+        key = origin.tobytes()
         if key not in self._rasters:
-            self._rasters[key] = _raster(self.box, self.points, np.asarray(origin, np.float64))
+            x, y = self.box[:2] - origin[:2]
+            points = self.points[:0] if is_over(self.box, origin, BOX_AIR_M) else self.points
+            self._rasters[key] = Raster(*scan(points, origin, math.atan2(y, x), 1 / RASTER_RAD))
         return self._rasters[key]
 
 
-@dataclass(frozen=True, eq=False)
-class _Raster:
+class Raster(NamedTuple):
     """An object's points as one centre sees them.
 
     Attributes:
-        azimuth_rad: Of the first column.
-        elevation_rad: Of the first row.
+        place: As ``PanoramaWindow.place``.
         nearest: (rows, columns) inverse distances, those between points from the nearest cell.
-        top_rad: (columns,) elevation of the highest points.
+        top: (columns,) rows of the highest points.
     """
 
-    azimuth_rad: float
-    elevation_rad: float
+    place: Layer
     nearest: Layer
-    top_rad: Layer
+    top: Layer
 
 
 def scanned_objects(
@@ -90,30 +96,3 @@ def scanned_objects(
         else:
             in_box[number] = True
     return tuple(objects), boxes[is_box], in_box
-
-
-def _raster(box: FloatArray, points: FloatArray, origin: FloatArray) -> _Raster | None:
-    """None where the centre is over the object or in it, or all but touches its points: it has no outline there."""
-    from arbiview_aug.scene.completion import fill_raster
-
-    if is_over(box, origin, BOX_AIR_M):
-        return None
-    away = points - origin
-    length = np.linalg.norm(away, axis=1)
-    away, length = away[length >= NEAREST_M], length[length >= NEAREST_M]
-    if not len(away):
-        return None
-    azimuth, elevation = angles(away / length[:, None])
-    # Less than half a turn, about the azimuth of its middle: the footprint is convex, and the centre beside it.
-    middle = math.atan2(box[1] - origin[1], box[0] - origin[0])
-    offset = wrapped(azimuth - middle)
-    left, low = float(offset.min()), float(elevation.min())
-    column, row = (np.round(a / RASTER_RAD).astype(np.intp) for a in (offset - left, elevation - low))
-    nearest = np.zeros((int(row.max()) + 1, int(column.max()) + 1), np.float32)
-    np.maximum.at(nearest, (row, column), 1 / length)
-    top = np.full(nearest.shape[1], -np.inf)
-    np.maximum.at(top, column, elevation)
-    there = np.flatnonzero(np.isfinite(top))
-    top = np.interp(np.arange(len(top)), there, top[there])
-    fill_raster(nearest)
-    return _Raster(middle + left, low, nearest, top.astype(np.float32))

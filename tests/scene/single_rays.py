@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from arbiview_aug.scene.boxes import BoxSurface, meets
-from arbiview_aug.scene.panorama import CELL_RAD, SIDE_RAD, angles, wrapped
+from arbiview_aug.scene.panorama import CELL_RAD, SIDE_RAD
 from arbiview_aug.scene.point_cloud import Panorama, PointCloudSurface, PointCloudWithBoxes
 from arbiview_aug.scene.scanned_objects import BOX_AIR_M, RASTER_RAD, ScannedObject
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE, StaticSurface, Surface
@@ -59,7 +59,7 @@ def occlusion_depth(
 
 def layer_at(view: Panorama, layer: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Bilinear values (...,) of a panorama's layer along unit rays (..., 3); its border beyond it."""
-    first, lead, low = view.window.place.astype(np.float64)
+    first, lead, low = view.window.place[:3].astype(np.float64)
     azimuth, elevation = (
         np.arctan2(directions[..., 1], directions[..., 0]),
         np.arcsin(np.clip(directions[..., 2], -1, 1)),
@@ -110,18 +110,19 @@ def _objects_on(
 
 
 def _scanned(one: ScannedObject, origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    raster = one.raster(origin)
-    if raster is None or not len(rays):
+    place, nearest, top = one.raster(np.asarray(origin, np.float64))
+    if not nearest.size or not len(rays):
         return np.zeros(len(rays)), np.zeros(len(rays))
-    azimuth, elevation = angles(rays)
-    column = wrapped(azimuth - raster.azimuth_rad) / RASTER_RAD
-    h, w = raster.nearest.shape
+    azimuth, elevation = np.arctan2(rays[:, 1], rays[:, 0]), np.arcsin(np.clip(rays[:, 2], -1, 1))
+    column = ((azimuth - place[0] + np.pi) % (2 * np.pi) - np.pi) / RASTER_RAD
+    height = (elevation - place[2]) / RASTER_RAD
+    h, w = nearest.shape
     # Its outline runs half a cell beyond the outermost points.
     across = (column >= -0.5) & (column <= w - 0.5)
-    top = np.interp(column, np.arange(w), raster.top_rad)
-    row = np.clip(np.round((elevation - raster.elevation_rad) / RASTER_RAD), 0, h - 1).astype(np.intp)
-    own = raster.nearest[row, np.clip(np.round(column), 0, w - 1).astype(np.intp)]
+    highest = np.interp(column, np.arange(w), top)
+    row = np.clip(np.round(height), 0, h - 1).astype(np.intp)
+    own = nearest[row, np.clip(np.round(column), 0, w - 1).astype(np.intp)]
     wide = one.box + 2 * BOX_AIR_M * np.array([0, 0, 0, 1, 1, 1, 0])
     behind = 1 / np.maximum(_through(wide, origin, rays)[1], 1 / MAX_INVERSE_DISTANCE)
-    hides = across & (elevation <= top + SIDE_RAD)
-    return np.where(across & (elevation <= top), own, 0.0), np.where(hides, behind, 0.0)
+    hides = across & (height <= highest + SIDE_RAD / RASTER_RAD)
+    return np.where(across & (height <= highest), own, 0.0), np.where(hides, behind, 0.0)
