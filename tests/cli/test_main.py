@@ -137,18 +137,20 @@ def test_an_interrupt_is_one_line_and_130(
 @pytest.mark.parametrize(
     ("code", "expected"),
     [
-        (
+        pytest.param(
             "from arbiview_aug import __main__ as m; from arbiview_aug.cli import demo; demo.open_frames = wait\n"
             "sys.exit(m.main(['demo', '--output', sys.argv[1]]))",
             "python -m arbiview_aug demo: interrupted\n",
+            id="demo",
         ),
-        (
+        pytest.param(
             "from arbiview_aug import train as m; from arbiview_aug.generator.training import command\n"
             "command.open_frames = wait; sys.exit(m.main(['--output', sys.argv[1]]))",
             "python -m arbiview_aug.train: interrupted; run it again to go on\n",
+            id="train",
+            marks=pytest.mark.slow,
         ),
     ],
-    ids=["demo", "train"],
 )
 def test_a_real_interrupt(code: str, expected: str, tmp_path: Path) -> None:
     wait = "import sys, threading; wait = lambda *_, **__: (print('ready', flush=True), threading.Event().wait())\n"

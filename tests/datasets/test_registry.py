@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +17,19 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import DataError
 
 
+@cache
+def street() -> dict[str, Any]:
+    return SyntheticDrive(demo_source_rig((48, 132)), num_frames=1, lidar=False)[0]
+
+
 class Toy(Recording):
     """One synthetic street in a folder that holds the file ``toy.txt``."""
 
     def __init__(self, root: Path) -> None:
         self.root, self.tokens, self.load_points = root, ["street"], True
-        self._drive = SyntheticDrive(demo_source_rig((48, 132)), num_frames=1, lidar=False)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        return {**self._drive[index], "token": self.tokens[index]}
+        return {**street(), "token": self.tokens[index]}
 
 
 @pytest.fixture
