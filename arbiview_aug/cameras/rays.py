@@ -11,9 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.image_ops import Memory, halved
 from arbiview_aug.lru_cache import LRUCache
 
@@ -109,18 +110,22 @@ class CameraMaps:
         key = camera.size, camera.lens, camera.distortion, camera.K.tobytes()
         return self._cache.get(key, lambda: pixel_rays(camera))
 
+    def copy_on(self, device: torch.device, key: Any, make: Callable[[], Any]) -> torch.Tensor:
+        """What ``make`` gives for a content key, on a device; held."""
+        return self._cache.get((key, device), lambda: torch.from_numpy(make()).to(device))
+
+    def rays_on(self, camera: Camera, device: torch.device) -> torch.Tensor:
+        """The unit rays (3, h, w) of a lens on a device; held."""
+        key = camera.size, camera.lens, camera.distortion, camera.K.tobytes()
+        return self.copy_on(device, key, lambda: self.rays(camera).planes)
+
     def clean_pixels(self, camera: Camera, level: int) -> npt.NDArray[np.uint8]:
         """255 (h, w) where a source halved ``level`` times shows no part of the own car; (0, 0) without a mask."""
-
-        def make(mask: Any) -> Any:
-            clean: Any = mask.view(np.uint8) * np.uint8(255)
-            return cv2.inRange(halved(clean, level), 255, 255) if level else clean  # type: ignore[call-overload]
-
-        return self._of_mask(camera, level, make, _NO_MASK)
+        return self._of_mask(camera, level, lambda mask: clean_pixels(mask, level), _NO_MASK)
 
     def to_mask(self, camera: Camera) -> Planes:
         """Distance (px) of each cell of ``CELL_PX`` to a source's mask; (0, 0) without one."""
-        return self._of_mask(camera, "distance", _distance_to_mask, _NO_DISTANCE)
+        return self._of_mask(camera, "distance", distance_to_mask, _NO_DISTANCE)
 
     def _of_mask(self, camera: Camera, name: Any, make: Callable[[Any], Any], none: Any) -> Any:
         if camera.mask is None:
@@ -135,6 +140,12 @@ def pixel_rays(camera: Camera) -> PixelRays:
 
     planes = _NO_PLANES if camera.is_rectilinear else _unprojected(camera)
     return PixelRays(camera.size, camera_parameters(camera), planes)
+
+
+def clean_pixels(mask: BoolArray, level: int) -> Any:
+    """255 (h, w) where a mask halved ``level`` times shows no part of the own car."""
+    clean: Any = mask.view(np.uint8) * np.uint8(255)
+    return cv2.inRange(halved(clean, level), 255, 255) if level else clean  # type: ignore[call-overload]
 
 
 def relative_pose(target: Camera, source: Camera) -> tuple[Planes, Planes]:
@@ -181,7 +192,7 @@ def edge_distance(camera: Camera, uv: FloatArray) -> FloatArray:
 
     u, v = (np.ascontiguousarray(uv[..., k], np.float32).ravel() for k in range(2))
     is_masked = camera.mask is not None and not camera.mask.all()
-    to_mask = _distance_to_mask(camera.mask) if is_masked else _NO_DISTANCE
+    to_mask = distance_to_mask(camera.mask) if is_masked else _NO_DISTANCE
     distance = np.empty(u.shape)
     edge_distance_row(u, v, camera.size, to_mask, CELL_PX, distance)
     return distance.reshape(uv.shape[:-1])
@@ -198,13 +209,12 @@ def _unprojected(camera: Camera) -> Planes:
     return planes
 
 
-def _distance_to_mask(mask: Any) -> Any:
+def distance_to_mask(mask: Any) -> Any:
     """Distance (px) of each cell of an image to the nearest one with a masked pixel."""
     h, w = mask.shape
     clean = cv2.copyMakeBorder(mask.astype(np.float32), 0, -h % CELL_PX, 0, -w % CELL_PX, cv2.BORDER_REPLICATE)
     coarse = cv2.resize(clean, (-(-w // CELL_PX), -(-h // CELL_PX)), interpolation=cv2.INTER_AREA)
     free = np.pad((coarse >= 1).astype(np.uint8), 1, constant_values=1)
     distance = cv2.distanceTransform(free, cv2.DIST_L2, 3)[1:-1, 1:-1]
-    return np.minimum(distance, np.float32(1e6)) * np.float32(
-        CELL_PX
-    )  # it is the largest float where nothing is masked
+    # It is the largest float where nothing is masked.
+    return np.minimum(distance, np.float32(1e6)) * np.float32(CELL_PX)

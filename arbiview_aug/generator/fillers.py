@@ -41,7 +41,7 @@ def fill_frame(rendered: RenderedFrame, how: Holes) -> RenderedFrame:
 def fill_holes(
     views: Sequence[torch.Tensor],
     coverage: Sequence[torch.Tensor],
-    occluded: Sequence[BoolArray | None],
+    occluded: Sequence[BoolArray | torch.Tensor | None],
     how: Holes,
 ) -> list[torch.Tensor]:
     """Fill uncovered pixels; covered ones are unchanged and keep their gradients.
@@ -76,7 +76,11 @@ def mean_colour(views: Sequence[torch.Tensor], coverage: Sequence[torch.Tensor])
 
 
 def _filled(
-    view: torch.Tensor, seen: torch.Tensor, occluded: BoolArray | None, colour: npt.NDArray[np.float32], how: Holes
+    view: torch.Tensor,
+    seen: torch.Tensor,
+    occluded: BoolArray | torch.Tensor | None,
+    colour: npt.NDArray[np.float32],
+    how: Holes,
 ) -> torch.Tensor:
     covered: Any = seen.cpu().numpy().view(np.uint8)
     hole: Any = covered ^ 1
@@ -90,7 +94,7 @@ def _filled(
         box = _in_cells(box[0], cell, len(hole)), _in_cells(box[1], cell, hole.shape[1])
         planes = view[:, box[0], box[1]].detach().cpu()
         known = covered[box]
-        inside = known if occluded is None else known | occluded[box].view(np.uint8)
+        inside = known if occluded is None else known | torch.as_tensor(occluded)[box].cpu().numpy()
         arrays = list((planes if planes.dtype == torch.uint8 else planes.float()).numpy())
         small = _continued(arrays, known, inside, colour, cell, min(hole.shape))
     h, w = hole[box].shape

@@ -49,7 +49,7 @@ def certainty(parallax_rad: FloatArray, pixels_per_pixel: FloatArray) -> FloatAr
 
 
 def confidence(
-    view: torch.Tensor, certain: npt.NDArray[np.uint8], covered: torch.Tensor, seam: torch.Tensor
+    view: torch.Tensor, certain: npt.NDArray[np.uint8] | torch.Tensor, covered: torch.Tensor, seam: torch.Tensor
 ) -> torch.Tensor:
     """Confidence (..., h, w) float32 in [0, 1] of a rendered view: 0 where uncovered, 1 where the source is exact.
 
@@ -62,7 +62,7 @@ def confidence(
     levels = 1.0 if view.dtype == torch.uint8 else 255.0
     with torch.no_grad():
         # In place: three times as fast.
-        doubt = torch.from_numpy(certain).to(view.device).float().div_(-255).add_(1)
+        doubt = torch.as_tensor(certain).to(view.device).float().div_(-255).add_(1)
         error = _contrast(view.detach(), levels, covered).add_(_LEAST_CONTRAST).mul_(doubt).add_(seam, alpha=levels)
         return error.mul_(-_ERROR_PER_CONTRAST / EXPECTED_ERROR_LEVELS).exp_().mul_(covered)
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
-import numpy as np
 import torch
 
+from arbiview_aug.render.atlas import Slot
 from arbiview_aug.render.plan import RenderPlan
+from arbiview_aug.render.torch_backend import positions
 
 
 def render_labels(plan: RenderPlan, labels: Sequence[torch.Tensor], fill: float) -> list[torch.Tensor]:
@@ -18,18 +19,27 @@ def render_labels(plan: RenderPlan, labels: Sequence[torch.Tensor], fill: float)
         labels: N maps (..., H, W) of any type and device.
         fill: Value of uncovered pixels.
     """
-    rendered = []
-    for target in plan.targets:
-        positions = target.at.to_float()
-        out = labels[0].new_full((*labels[0].shape[:-2], *target.source_camera.shape), fill)
-        for pair in target.pairs:
-            slot = plan.layout.slot(pair.source, pair.level)
-            won = target.source_camera == pair.source
-            uv = slot.to_source(positions[won])
-            label = labels[pair.source]
-            h, w = label.shape[-2:]
-            pixel = np.floor(uv + 0.5).astype(np.int64).clip(0, (w - 1, h - 1))
-            x, y = (torch.from_numpy(np.ascontiguousarray(pixel[:, k])).to(label.device) for k in (0, 1))
-            out[..., torch.from_numpy(won).to(label.device)] = label[..., y, x]
+    rendered, device = [], labels[0].device
+    for at, winner, slots in _views(plan, device):
+        out = labels[0].new_full((*labels[0].shape[:-2], *winner.shape), fill)
+        for slot in slots:
+            won, label = winner == slot.source, labels[slot.source]
+            x, y = (
+                ((at[..., k][won] - first + 0.5) * 2**slot.level).floor().long().clamp(0, n - 1)
+                for k, (first, n) in enumerate(zip((slot.x, slot.y), label.shape[:-3:-1], strict=True))
+            )
+            out[..., won] = label[..., y, x]
         rendered.append(out)
     return rendered
+
+
+def _views(plan: RenderPlan, device: torch.device) -> Iterator[tuple[torch.Tensor, torch.Tensor, Sequence[Slot]]]:
+    """Atlas positions (h, w, 2) and winning sources (h, w) of each view, and where its sources lie."""
+    if device in plan.on_devices:
+        for maps in plan.on_devices[device]:
+            yield positions(maps.grid, plan.layout.size), maps.source, maps.slots
+        return
+    for target in plan.targets:
+        slots = [plan.layout.slot(pair.source, pair.level) for pair in target.pairs]
+        at, winner = (torch.from_numpy(a).to(device) for a in (target.at.to_float(), target.source_camera))
+        yield at, winner, slots

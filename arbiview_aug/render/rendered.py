@@ -22,7 +22,7 @@ from arbiview_aug.render.labels import render_labels
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.tone_curve import ToneCurve
-from arbiview_aug.render.torch_backend import maps_on, render_torch
+from arbiview_aug.render.torch_backend import render_torch
 from arbiview_aug.sample.batching import barred, covered, framed, stacked
 from arbiview_aug.sample.inputs import Frame
 
@@ -64,8 +64,8 @@ class RenderedFrame:
     source_frame: Maps | None = None
     confidence: Maps | None = None
     generated: Maps | None = None
-    occluded: Sequence[BoolArray | None] = ()
-    certainty: Sequence[npt.NDArray[np.uint8]] = ()
+    occluded: Sequence[BoolArray | torch.Tensor | None] = ()
+    certainty: Sequence[npt.NDArray[np.uint8] | torch.Tensor] = ()
     seams: Sequence[torch.Tensor] = ()
     labels: LabelRenderer | None = None
 
@@ -167,17 +167,19 @@ class Renderer:
 def _rendered(
     plan: RenderPlan, images: list[torch.Tensor], seams: Sequence[torch.Tensor], outputs: Collection[str]
 ) -> RenderedFrame:
-    device = images[0].device
-    if device.type == "cpu":
-        winners = [torch.from_numpy(view.source_camera) for view in plan.targets]
+    views: Any = plan.on_devices.get(images[0].device)
+    if views is not None:
+        winners = [view.source for view in views]
     else:
-        winners = [view.source for view in maps_on(plan, device)]
-    occluded = [view.occluded for view in plan.targets]
+        views = plan.targets
+        winners = [torch.from_numpy(view.source_camera) for view in views]
+    occluded = [view.occluded for view in views]
     rendered = _from_winners(images, plan.target, winners, occluded, partial(render_labels, plan), outputs)
     if "confidence" not in outputs:
         return rendered
-    certainty = [view.certainty for view in plan.targets if view.certainty is not None]
-    rendered = replace(rendered, certainty=certainty, seams=seams)
+    rendered = replace(
+        rendered, certainty=[view.certainty for view in views if view.certainty is not None], seams=seams
+    )
     return replace(rendered, confidence=confidence_of(rendered))
 
 
@@ -185,7 +187,7 @@ def _from_winners(
     images: list[torch.Tensor],
     rig: Rig,
     winners: Sequence[torch.Tensor],
-    occluded: Sequence[BoolArray | None],
+    occluded: Sequence[BoolArray | torch.Tensor | None],
     labels: Callable[[Sequence[torch.Tensor], float], list[torch.Tensor]],
     outputs: Collection[str],
 ) -> RenderedFrame:

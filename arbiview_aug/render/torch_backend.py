@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from arbiview_aug.render.atlas import AtlasLayout
+from arbiview_aug.render.atlas import AtlasLayout, Slot
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.tone_curve import ToneCurve
 from arbiview_aug.render.view_plan import ViewPlan
@@ -41,11 +41,17 @@ class ViewMaps:
     source: torch.Tensor  # (h, w) int8 index of the winning source, -1 where none sees
     blend: Blend | None
     edge: tuple[torch.Tensor, torch.Tensor] | None  # the view's ``BilinearFallback``: (n,) int64 and (1, n, 2) float32
+    interpolation: str  # as in ``ViewPlan``, like the next two
+    certainty: torch.Tensor | None  # (h, w) uint8
+    occluded: torch.Tensor | None  # (h, w) bool
+    slots: tuple[Slot, ...]  # where its sources lie in the atlas
+    covered: float  # share of its pixels that some source sees
 
     @property
     def nbytes(self) -> int:
         """Memory in bytes."""
-        tensors = [self.grid, self.source, *(self.edge or ())]
+        further = [part for part in (self.certainty, self.occluded) if part is not None]
+        tensors = [self.grid, self.source, *(self.edge or ()), *further]
         if self.blend is not None:
             tensors += [self.blend.pixel, self.blend.grid, self.blend.weight, self.blend.source]
         return sum(tensor.nbytes for tensor in tensors)
@@ -56,17 +62,32 @@ def maps_on(plan: RenderPlan, device: torch.device) -> Sequence[ViewMaps]:
     if device not in plan.on_devices:
         # Inference tensors could not take part in a later backward pass.
         with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
-            plan.on_devices[device] = tuple(_view_maps(target, plan.layout.size, device) for target in plan.targets)
+            plan.on_devices[device] = tuple(_view_maps(plan, target, device) for target in plan.targets)
     return plan.on_devices[device]
 
 
-def _view_maps(target: ViewPlan, atlas_size: tuple[int, int], device: torch.device) -> ViewMaps:
-    grid = _grid(target.at.to_float(), atlas_size, device)
-    source, blend = torch.from_numpy(target.source_camera).to(device), _blend(target, atlas_size, device)
-    if target.edge is None:
-        return ViewMaps(grid, source, blend, None)
-    at_edge = _grid(target.edge.at.to_float(), atlas_size, device)
-    return ViewMaps(grid, source, blend, (torch.from_numpy(target.edge.pixel).to(device), at_edge))
+def _view_maps(plan: RenderPlan, target: ViewPlan, device: torch.device) -> ViewMaps:
+    atlas_size = plan.layout.size
+    source, certainty, occluded, pixel = (
+        None if array is None else torch.from_numpy(array).to(device)
+        for array in (target.source_camera, target.certainty, target.occluded, target.edge and target.edge.pixel)
+    )
+    assert source is not None
+    edge = None
+    if target.edge is not None and pixel is not None:
+        edge = pixel, _grid(target.edge.at.to_float(), atlas_size, device)
+    grid, blend = _grid(target.at.to_float(), atlas_size, device), _blend(target, atlas_size, device)
+    slots = tuple(plan.layout.slot(pair.source, pair.level) for pair in target.pairs)
+    return ViewMaps(
+        grid, source, blend, edge, target.interpolation, certainty, occluded, slots, float(target.coverage.mean())
+    )
+
+
+def positions(grid: torch.Tensor, atlas_size: tuple[int, int]) -> torch.Tensor:
+    """Atlas positions (..., 2) of a ``grid_sample`` grid, in whole 32nds of a pixel."""
+    h, w = atlas_size
+    scale = torch.tensor([max(w - 1, 1), max(h - 1, 1)], dtype=torch.float64, device=grid.device)
+    return ((grid.double() + 1) * (16 * scale)).round().div(32).float()
 
 
 def _blend(target: ViewPlan, atlas_size: tuple[int, int], device: torch.device) -> Blend | None:
@@ -141,8 +162,8 @@ def render_torch(
     atlas = _fill_atlas(plan.layout, images)
     tones = _Tones.of(curves, len(images), device, top) if curves is not None and any(curves) else None
     views = []
-    for target, maps in zip(plan.targets, maps_on(plan, device), strict=True):
-        view = _sample(atlas, maps.grid, target.interpolation)
+    for maps in maps_on(plan, device):
+        view = _sample(atlas, maps.grid, maps.interpolation)
         if maps.edge is not None:
             pixel, grid = maps.edge
             at_edge = _sample(atlas, grid, "linear")[:, :, 0]
@@ -151,7 +172,9 @@ def render_torch(
             view = tones.applied(view, maps.source.long())
         change = view.new_zeros(view.shape[0], *view.shape[2:])
         if maps.blend is not None:
-            view = _blended(view, atlas, maps.blend, target.seam_interpolation, tones, change)
+            # Never by cubics: a mean of two sources is no sharper for it.
+            how = "linear" if maps.interpolation == "cubic" else maps.interpolation
+            view = _blended(view, atlas, maps.blend, how, tones, change)
         if seams is not None:
             seams.append(change)
         views.append(view.round().clamp(0, 255).to(dtype) if dtype == torch.uint8 else view.to(dtype))

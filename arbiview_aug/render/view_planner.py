@@ -30,7 +30,7 @@ from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
 from arbiview_aug.scene.surface import Surface
 
-_SMALL_SIDE_PX = 64  # weights of targets with a shorter side are evaluated at every pixel
+SMALL_SIDE_PX = 64  # weights of targets with a shorter side are evaluated at every pixel
 _SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
 MAGNIFIED = 0.8
 """A view is read by cubics where it has this few source pixels per pixel, or fewer, and most of it is read at its own
@@ -104,7 +104,7 @@ class ViewPlanner:
         self.counters, self.maps = counters, maps
         self.rays = maps.rays(camera)
         # From outside, the far wall is a narrow strip with edges, which cells could step over.
-        coarse = min(camera.size) >= _SMALL_SIDE_PX
+        coarse = min(camera.size) >= SMALL_SIDE_PX
         coarse &= is_within_wall(camera.center_m) or not SURFACES[surface].has_wall
         self.step = config.grid_step_px if coarse else 1
         corners = tuple(np.minimum(np.arange(0, n + self.step, self.step), n - 1) for n in camera.size)
@@ -238,7 +238,7 @@ class ViewPlanner:
         parallax = focal_px * parallax_rad
         seen = valid & (edge_px > 0)
         most = np.sort(resolution[seen][::4])
-        level = self._level(most, source.size) if self.config.antialias else 0
+        level = halvings(most[len(most) // 5], source.size) if self.config.antialias and len(most) else 0
         kernel = self._kernel(source, level, surface, geometry, A, o)
         visible = np.zeros(seen.shape, bool)
         at_nodes = np.ix_(*self.nodes)
@@ -272,13 +272,6 @@ class ViewPlanner:
         """The source as ``kernels.put_source`` reads it, halved ``level`` times."""
         from arbiview_aug.cameras.kernels import LENS_CODES, camera_parameters
 
-        (h, w), scale = level_size(source.size, level), 0.5**level
-        slack_px = _SLACK_PX + _ROUNDING * max(source.size)
-        bounds = np.array([-slack_px, -slack_px, source.width_px - 1 + slack_px, source.height_px - 1 + slack_px])
-        bounds = (bounds + 0.5) * scale - 0.5
-        # Halving leaves out the last row or column of an odd size: nothing is known there.
-        bounds[2:] = np.minimum(bounds[2:], (w - 0.5, h - 0.5))
-        last = (w - 1, h - 1) if level else (-1, -1)
         kind = LENS_CODES.get(source.lens, -1)
         given = np.zeros((2, 0, 0), np.float32)
         if kind < 0:
@@ -300,8 +293,8 @@ class ViewPlanner:
             A,
             o,
             kind,
-            camera_parameters(source, scale),
-            np.array([*bounds, *last, shadow_scale], np.float32),
+            camera_parameters(source, 0.5**level),
+            np.array([*source_bounds(source, level), shadow_scale], np.float32),
             self.maps.clean_pixels(source, level),
             before_m,
             shadow,
@@ -309,17 +302,6 @@ class ViewPlanner:
             bool(surface.background.is_guess),
             given,
         )
-
-    @staticmethod
-    def _level(resolution: FloatArray, size: tuple[int, int]) -> int:
-        """Halvings: the largest power of two not above the minification (n,), ascending, of most of what is seen."""
-        if resolution.size == 0:
-            return 0
-        # 2 % of tolerance: a target of exactly half size must read the halved source.
-        level = int(max(0, math.floor(math.log2(max(1.02 * resolution[len(resolution) // 5], 1e-6)))))
-        while level and min(level_size(size, level)) < 2:
-            level -= 1
-        return level
 
     # --- who wins -----------------------------------------------------------------------------------------------------
     def finish(self, layout: AtlasLayout) -> ViewPlan:
@@ -405,6 +387,26 @@ class ViewPlanner:
                 share=won_px[region.source] / winner.size,
                 level=region.level,
             )
+
+
+def halvings(resolution: float, size: tuple[int, int]) -> int:
+    """How many times an image of (h, w) that is minified by ``resolution`` is halved: at least 2 pixels remain."""
+    # 2 % of tolerance: a target of exactly half size must read the halved source.
+    level = int(max(0, math.floor(math.log2(max(1.02 * resolution, 1e-6)))))
+    while level and min(level_size(size, level)) < 2:
+        level -= 1
+    return level
+
+
+def source_bounds(source: Camera, level: int) -> npt.NDArray[np.float64]:
+    """(6,) least and largest columns and rows of what a source halved ``level`` times shows; its last ones, or -1."""
+    (h, w), scale = level_size(source.size, level), 0.5**level
+    slack_px = _SLACK_PX + _ROUNDING * max(source.size)
+    bounds = np.array([-slack_px, -slack_px, source.width_px - 1 + slack_px, source.height_px - 1 + slack_px])
+    bounds = (bounds + 0.5) * scale - 0.5
+    # Halving leaves out the last row or column of an odd size: nothing is known there.
+    bounds[2:] = np.minimum(bounds[2:], (w - 0.5, h - 0.5))
+    return np.array([*bounds, *((w - 1, h - 1) if level else (-1, -1))])
 
 
 def halved_camera(camera: Camera, level: int) -> Camera:

@@ -87,6 +87,7 @@ class SurfaceRow:
         reads: The geometry that it uses: ``boxes``, ``points``, ``motion``, or any other key of the sample.
         needs: The geometry that it cannot be made without.
         overlap_depth: Whether depth from overlap may correct it.
+        on_device: Whether plans over it can be made on a device (``render.torch_planner``).
         has_wall: Whether it ends in the far wall, which has edges when seen from outside.
     """
 
@@ -94,6 +95,7 @@ class SurfaceRow:
     reads: tuple[str, ...] = ()
     needs: str | None = None
     overlap_depth: bool = False
+    on_device: bool = False
     has_wall: bool = True
 
     @cached_property
@@ -123,10 +125,10 @@ def _point_cloud(points: Points | None, scene: Scene, ground_z_m: float) -> Surf
 
 SURFACES: dict[str, SurfaceRow] = {
     "auto": SurfaceRow(lambda scene, z_m: scene.surface(scene.best, z_m), ("boxes", "points"), overlap_depth=True),
-    "far": SurfaceRow(lambda scene, z_m: Far(), has_wall=False),
-    "ground": SurfaceRow(lambda scene, z_m: Ground(ground_z_m=z_m)),
-    "street": SurfaceRow(_street, overlap_depth=True),
-    "objects": SurfaceRow(_boxes, ("boxes",), "boxes", overlap_depth=True),
+    "far": SurfaceRow(lambda scene, z_m: Far(), on_device=True, has_wall=False),
+    "ground": SurfaceRow(lambda scene, z_m: Ground(ground_z_m=z_m), on_device=True),
+    "street": SurfaceRow(_street, overlap_depth=True, on_device=True),
+    "objects": SurfaceRow(_boxes, ("boxes",), "boxes", overlap_depth=True, on_device=True),
     "lidar": SurfaceRow(lambda scene, z_m: _point_cloud(scene.points, scene, z_m), ("boxes", "points"), "points"),
     "motion": SurfaceRow(lambda scene, z_m: _point_cloud(scene.motion, scene, z_m), ("boxes", "motion"), "motion"),
 }

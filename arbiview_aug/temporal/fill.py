@@ -261,7 +261,10 @@ def fill_from_neighbours(
             neighbours.append((fill, renderer.views(fill.plan, sources, curves, images)))
     if not neighbours:
         return rendered
-    views, certainty = list(rendered.images), [of_view.copy() for of_view in rendered.certainty]  # a plan owns those
+    views, certainty = (
+        list(rendered.images),
+        [torch.as_tensor(of_view).clone() for of_view in rendered.certainty],
+    )  # a plan owns those
     for k, hole in enumerate(fills.holes):
         view, place = views[hole.target], (slice(None), *hole.box)
         free, seam = (torch.from_numpy(mask).to(view.device) for mask in (hole.free, hole.seam))
@@ -276,8 +279,7 @@ def fill_from_neighbours(
             _write(rendered.source_camera, hole, taken, torch.from_numpy(target.source_camera))
             _write(rendered.source_frame, hole, taken, torch.tensor(fill.neighbour.number + 1, dtype=torch.int8))
             if certainty and target.certainty is not None:
-                taken_here = taken.cpu().numpy()
-                certainty[hole.target][hole.box][taken_here] = target.certainty[taken_here]
+                _write(certainty, hole, taken, torch.from_numpy(target.certainty))
     rendered = replace(rendered, images=views, certainty=certainty)
     return rendered if rendered.confidence is None else replace(rendered, confidence=confidence_of(rendered))
 

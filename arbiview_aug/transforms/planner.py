@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
+import torch
 
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rays import CameraMaps
@@ -23,7 +24,7 @@ from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.render.requirements import harm_remedies, needs_geometry, static_harm
 from arbiview_aug.render.tone_curve import ToneCurve
 from arbiview_aug.sample.detections import OfCameras, detections_of_frames
-from arbiview_aug.sample.inputs import MOTION_KEY, Frame, names_of_frames, read_scenes
+from arbiview_aug.sample.inputs import MOTION_KEY, Frame, names_of_frames, read_scenes, scenes_on_device
 from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames
 from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.surface import SurfaceName
@@ -110,15 +111,29 @@ class FramePlanner:
         self.refinement, self.reach, self.warn = refinement, reach, warn
         self.mixed, self.strict, self.unseen = mixed, strict, unseen
         self.plans: LRUCache[bytes, RenderPlan] = LRUCache(cache_bytes, attrgetter("nbytes"))
+        self.device_plans: LRUCache[Any, RenderPlan] = LRUCache(cache_bytes, attrgetter("nbytes"))
         self._last_plan: LRUCache[bytes, RenderPlan] = LRUCache(1)
         self.maps = CameraMaps()
         self._pairs: LRUCache[tuple[bytes, bytes], _RigPair] = LRUCache(_MAX_RIG_PAIRS)
 
     # --- plans of frames ----------------------------------------------------------------------------------------------
     def plan(
-        self, sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...], target: Rig
+        self,
+        sample: Mapping[str, Any],
+        frames: Sequence[Frame],
+        lead: tuple[int, ...],
+        target: Rig,
+        *,
+        explained: bool = False,
     ) -> list[FramePlan]:
-        """Plan each frame of a sample.
+        """Plan each frame of a sample: on its images' device, where everything that decides lies there.
+
+        Args:
+            sample: The sample.
+            frames: Its frames.
+            lead: Leading dimensions of its images.
+            target: The target rig.
+            explained: Plan on the CPU, as explanations are written there.
 
         Raises:
             SampleError: The sample lacks what the settings need, or it is impossible.
@@ -133,8 +148,11 @@ class FramePlanner:
         fills_holes = self.reach is not None and isinstance(given, list | tuple) and len(given) > 0
         is_needed = any(pair.needs_geometry for pair in pairs)
         scenes: Sequence[Scene] = ()
+        on_device = not explained and given is None and self._plans_on(frames[0].images[0].device)
         if is_needed or self.surface != "auto" or fills_holes:  # objects decide what neighbours may fill
-            scenes = read_scenes(sample, frames, lead, self.surface)
+            scenes = (on_device and scenes_on_device(sample, frames, lead, self.surface)) or ()
+            if not all(SURFACES[self._surface(scene)].on_device for scene in scenes) or not scenes:
+                scenes = read_scenes(sample, frames, lead, self.surface)
         scenes = scenes or [pair.road for pair in pairs]
         names = self._names(sample, len(frames), lead)
         uses_motion = "motion" in SURFACES[self.surface].reads
@@ -147,8 +165,10 @@ class FramePlanner:
         neighbouring: list[list[Neighbour]] = [[] for _ in frames]
         if given is not None and (estimates_motion or self.reach is not None):
             neighbouring = neighbours_of_frames(sample, frames, lead, self.warn)
+        made = self._made_on_device(pairs, frames, scenes) if on_device else {}
         plans = []
-        for frame, pair, scene, name, neighbours in zip(frames, pairs, scenes, names, neighbouring, strict=True):
+        frames_in_turn = enumerate(zip(frames, pairs, scenes, names, neighbouring, strict=True))
+        for number, (frame, pair, scene, name, neighbours) in frames_in_turn:
             depth = motion = fills = None
             if pair.needs_geometry and self.config.overlap_depth:
                 depth = self._depth(frame, scene, name)
@@ -158,8 +178,8 @@ class FramePlanner:
                 scene = replace(scene, corrections=depth.corrections)
             if uses_motion and scene.motion is None:
                 scene = replace(scene, motion=np.zeros((0, 3)) if motion is None else motion.points(frame.rig))
-            plan = self._plan_of_pair(pair, frame.rig, scene, self.config)
-            surface = scene.best if self.surface == "auto" else self.surface
+            plan = made.get(number) or self._plan_of_pair(pair, frame.rig, scene, self.config)
+            surface = self._surface(scene)
             if neighbours and self.reach is not None:
                 fills = plan_fills(plan, neighbours, scene, surface, self.config, self.reach)
             curves = self.harmoniser.curves(frame.rig, frame.images) if self.harmoniser.is_on else None
@@ -190,6 +210,41 @@ class FramePlanner:
         cache = self.plans if self.refinement is not None and scene.best == "street" else self._last_plan
         return cache.get(pair.plan_key(scene), lambda: self._built(source, pair.target, scene, config))
 
+    def _surface(self, scene: Scene) -> SurfaceName:
+        """The surface that a scene is rendered over."""
+        return scene.best if self.surface == "auto" else self.surface
+
+    def _plans_on(self, device: torch.device) -> bool:
+        """Whether plans for images on a device are made there by tensor code; those for the CPU's are compiled."""
+        return device.type != "cpu" and isinstance(self.config, FavsConfig) and not self.config.overlap_depth
+
+    def _made_on_device(
+        self, pairs: Sequence[_RigPair], frames: Sequence[Frame], scenes: Sequence[Scene]
+    ) -> dict[int, RenderPlan]:
+        """Plans by the frames' numbers, on their images' device; those that are not cached are made in one batch."""
+        from arbiview_aug.render.torch_planner import Request, build_plans
+
+        assert isinstance(self.config, FavsConfig)
+        device = frames[0].images[0].device
+        keys: dict[int, Any] = {}
+        requests: dict[Any, Request] = {}
+        for number, (pair, frame, scene) in enumerate(zip(pairs, frames, scenes, strict=True)):
+            is_road = scene.is_empty or not pair.needs_geometry
+            scene = pair.road if is_road else scene
+            if not SURFACES[self._surface(scene)].on_device:
+                continue
+            keys[number] = key = (pair.road_key, device) if is_road else number
+            if key not in self.device_plans:
+                requests.setdefault(key, Request(frame.rig, pair.target, scene))
+        made = build_plans(list(requests.values()), self.surface, self.config, device, self.maps)
+        found = dict(zip(requests, made, strict=True))
+        for request, plan in zip(requests.values(), made, strict=True):
+            self.warn_unreachable(request.target, [view.covered for view in plan.on_devices[device]])
+        for key in keys.values():
+            if isinstance(key, tuple):
+                found[key] = self.device_plans.get(key, partial(found.__getitem__, key))
+        return {number: found[key] for number, key in keys.items()}
+
     def _built(self, source: Rig, target: Rig, scene: Scene, config: FavsConfig) -> RenderPlan:
         plan = build_plan(source, target, surface=self.surface, config=config, scene=scene, maps=self.maps)
         self.warn_unreachable(target, plan.coverage)
@@ -211,7 +266,7 @@ class FramePlanner:
 
     def _depth(self, frame: Frame, scene: Scene, name: object) -> OverlapDepth | None:
         """Depth from overlap; None over surfaces that it does not correct."""
-        row = SURFACES[scene.best if self.surface == "auto" else self.surface]
+        row = SURFACES[self._surface(scene)]
         if not row.overlap_depth:
             return None
         boxes = scene.boxes if "boxes" in row.reads else None
@@ -234,11 +289,11 @@ class FramePlanner:
         return depth
 
     # --- warnings -----------------------------------------------------------------------------------------------------
-    def warn_unreachable(self, target: Rig, coverages: Sequence[BoolArray]) -> None:
-        """Warn once of target cameras that the sources hardly cover, by the (h, w) coverage of each."""
+    def warn_unreachable(self, target: Rig, coverages: Sequence[BoolArray | float]) -> None:
+        """Warn once of target cameras that the sources hardly cover, by the coverage (h, w) or share of each."""
         if "unreachable" in self.warn.topics:  # the means below take milliseconds
             return
-        shares = [float(coverage.mean()) for coverage in coverages]
+        shares = [float(np.mean(coverage)) for coverage in coverages]
         poor = [f"{c.name} {share:.0%}" for c, share in zip(target, shares, strict=True) if share < _UNREACHABLE]
         if poor:
             self.warn(

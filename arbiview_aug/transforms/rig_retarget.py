@@ -411,7 +411,7 @@ class RigRetarget(torch.nn.Module):
         """
         frames, lead = read_frames(sample, self.source_rig), leading_shape(sample["images"])
         target, _, _ = self._make_params(sample, frames[:1], None)
-        plan = self.planner.plan(sample, frames, lead, target)[0]
+        plan = self.planner.plan(sample, frames, lead, target, explained=True)[0]
         if plan.plan is None:
             return PaperExplanation(self._published(plan, frames[0]))
         gains = self.harmonisation(sample) if self.planner.harmoniser.is_on else None
