@@ -203,12 +203,26 @@ def _occlude_row(
             column[i] = min(max(u[i] * scale + shift, _ZERO), np.float32(w - 1))
         for i in range(n):
             row[i] = min(max(v[i] * scale + shift, _ZERO), np.float32(h - 1))
-        for i in range(n):
-            place[i] = np.int32(np.rint(row[i])) * np.int32(w) + np.int32(np.rint(column[i]))
         beyond = shadow.reshape(h * w)
-        for i in range(n):
-            hides[i] = beyond[place[i]]
+        if not guess and min(h, w) > 1:  # what was measured hides smoothly
+            top, left, wide = np.int32(h - 2), np.int32(w - 2), np.int32(w)
+            for i in range(n):
+                r, c = min(np.int32(row[i]), top), min(np.int32(column[i]), left)
+                k, s, t = r * wide + c, row[i] - np.float32(r), column[i] - np.float32(c)
+                above = beyond[k] * (_ONE - t) + beyond[k + 1] * t
+                below = beyond[k + w] * (_ONE - t) + beyond[k + w + 1] * t
+                hides[i] = above * (_ONE - s) + below * s
+        if guess or min(h, w) == 1 or before_m.shape[0]:
+            for i in range(n):
+                place[i] = np.int32(np.rint(row[i])) * np.int32(w) + np.int32(np.rint(column[i]))
+        if guess or min(h, w) == 1:
+            for i in range(n):
+                hides[i] = beyond[place[i]]
     number_at = solid.reshape(h * w)
+    if h and not guess and before_m.shape[0]:  # silhouettes of solids do not
+        for i in range(n):
+            if number_at[place[i]] >= 0 or (face.shape[0] and face[i] >= 0):
+                hides[i] = beyond[place[i]]
     if face.shape[0] == 0 and guess:
         pz[:] = _ZERO
     elif face.shape[0]:
@@ -220,14 +234,6 @@ def _occlude_row(
                 pz[i] = -_ONE
             elif h and number_at[place[i]] == number // 6:
                 pz[i] = _MOST
-    if h and not guess:  # what was measured hides smoothly, solids do not
-        for i in range(n):
-            if number_at[place[i]] < 0 and (face.shape[0] == 0 or face[i] < 0):
-                r, c = int(row[i]), int(column[i])
-                s, t = row[i] - np.float32(r), column[i] - np.float32(c)
-                r1, c1 = min(r + 1, h - 1), min(c + 1, w - 1)
-                above = shadow[r, c] * (_ONE - t) + shadow[r, c1] * t
-                hides[i] = above * (_ONE - s) + (shadow[r1, c] * (_ONE - t) + shadow[r1, c1] * t) * s
     for i in range(n):
         seen[i] = seen[i] & (hides[i] <= pz[i])
 
