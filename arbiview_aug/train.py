@@ -1,4 +1,4 @@
-"""``python -m arbiview_aug.train``: train a generator, ablate its parts, or score it on held-out streets."""
+"""``python -m arbiview_aug.train``: train a generator, or score it on held-out streets."""
 
 from __future__ import annotations
 

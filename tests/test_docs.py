@@ -19,8 +19,7 @@ import arbiview_aug
 from arbiview_aug import RigRetarget
 from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import shipped_rigs
-from arbiview_aug.cli.bench import generator, neighbours, trade
-from arbiview_aug.cli.bench.ablation import NOTES, ROWS, STEPS, markdown
+from arbiview_aug.cli.bench import neighbours, trade
 from arbiview_aug.datasets import registry
 from arbiview_aug.evaluate import paper_study
 from arbiview_aug.evaluate.frames import ScoredFrame
@@ -32,6 +31,8 @@ from arbiview_aug.render.requirements import HELPFUL_DATA
 from arbiview_aug.scene.surface import SurfaceName
 from tests.generator.training.small import frames as drawn_frames
 from tests.generator.training.test_command import SMALLER
+from tests.studies import generator
+from tests.studies.ablation import NOTES, ROWS, STEPS, markdown
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted((ROOT / "docs").glob("*.md"))
@@ -61,7 +62,6 @@ TINY = {
         *["--surface", "street", "--size", "32x88", "--reduce", "4", "--workers", "0", "1"],
         *["--frames", "2", "--epochs", "1"],
     ],
-    "bench generator": ["--size", "32x56", "--steps", "1", "--frames", "1", "--repeats", "1"],
     "bench neighbours": ["--size", "32x88", "--repeats", "1", "--counts", "0", "1", "--surface", "street"],
     "bench speed --device cuda": ["--device", "cpu", "--repeats", "1"],
     "bench speed": ["--repeats", "1", "--size", "32x88"],
@@ -69,7 +69,6 @@ TINY = {
         *("--size", "24x40", "--reduce", "4", "--workers", "1", "--surface", "street", "--report", "0")
     ],
     "depth --data FOLDER": ["--output", "depth"],
-    "bench ablation --data FOLDER": ["--reduce", "4", "--only", "street, not far"],
     "train --output output/tiny": ["--quiet", *SMALLER],
 }
 """Every command of the README and the pages, and options that make it quick."""
@@ -209,7 +208,7 @@ def test_the_commands_run(
 
 # --- tables -----------------------------------------------------------------------------------------------------------
 def test_the_ablation_is_the_commands() -> None:
-    """``bench ablation --data nuscenes-one ddad-one``: headings and steps, all that frames without boxes can tell."""
+    """Headings and steps of ``tests.studies.ablation``: all that frames without boxes can tell."""
     move = {"psnr_db": 1.0, "gain_db": 1.0, "gain_db_per_ms": 1.0}
     figures = {"turned": move, "raised": move, "ms": 1.0, "added_ms": {"median_ms": 1.0}}
     steps = {name: figures for name, step in STEPS.items() if ROWS[step.row].fits(ScoredFrame({}))}

@@ -71,9 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         text = _figure(arguments, folder)
     else:
         text = _evaluate(arguments, folder, notes)
-    if not arguments.json:
-        for note in notes:
-            print(f"note: {note}\n")
+    for note in notes:
+        print(f"note: {note}\n")
     print(text)
     return 0
 
@@ -101,7 +100,6 @@ def _parser() -> argparse.ArgumentParser:
     add_frames(parser, None, "number of frames (default: 1; --paper: 3 synthetic ones)")
     add_reduce(parser)
     add_output(parser)
-    parser.add_argument("--json", action="store_true", help="print the JSON instead of the tables")
     what = parser.add_mutually_exclusive_group()
     what.add_argument(
         "--paper",
@@ -198,11 +196,10 @@ def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> 
     names = [method.name for method in methods]
     tables = evaluation_tables(done, names)
     title = f"{arguments.data or f'Synthetic streets, seed {arguments.seed}'}: {count_of} frame{'s' * (count_of > 1)}"
-    settings = {key: value for key, value in vars(arguments).items() if key not in ("json", *_FIXED)}
+    settings = {key: value for key, value in vars(arguments).items() if key not in _FIXED}
     report = {"arguments": settings, "scored_on_other_points": done.first.held_out}
     report |= {"means": tables[0][1], "agreement": tables[1][1], "views": done.views, "pairs": done.pairs}
-    text = json.dumps(report, indent=1)
-    (folder / "evaluate.json").write_text(text + "\n")
+    (folder / "evaluate.json").write_text(json.dumps(report, indent=1) + "\n")
     sample = done.first.sample
     for (target, method), views in done.pictures.items():
         rig = done.targets[target]
@@ -210,8 +207,6 @@ def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> 
         file = re.sub(r"[^\w+-]+", "-", f"{target}-{method}") + ".png"
         save_picture(folder / file, frame_sheet(sample["rig"], as_arrays(sample["images"]), rig, views, truth))
     (folder / "report.html").write_text(html_report(title, done, names, tables, notes), encoding="utf-8")
-    if arguments.json:
-        return text
     printed = "\n\n".join(text_table(*table) for table in tables)
     return f"{title}\n\n{printed}\n\nreport: {folder / 'report.html'}\nnumbers: {folder / 'evaluate.json'}"
 
@@ -219,10 +214,8 @@ def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> 
 def _paper(arguments: argparse.Namespace, folder: Path) -> str:
     with named_steps([]) as tick:  # warnings of targets half outside the view are expected
         study = measure_paper(arguments.data, frames=arguments.frames, size=arguments.size, tick=tick)
-    text, table = json.dumps(study.as_dict(), indent=1), paper_report(study)
-    (folder / "paper.json").write_text(text + "\n")
-    (folder / "paper.md").write_text(table + "\n")
-    return text if arguments.json else f"{table}\n\nnumbers: {folder / 'paper.json'}\nthis text: {folder / 'paper.md'}"
+    (folder / "paper.json").write_text(json.dumps(study.as_dict(), indent=1) + "\n")
+    return f"{paper_report(study)}\n\nnumbers: {folder / 'paper.json'}"
 
 
 def _figure(arguments: argparse.Namespace, folder: Path) -> str:

@@ -31,9 +31,6 @@ OURS: tuple[Quality, ...] = ("draft", "fast", "accurate")
 INPAINTED, GENERATED = "fast, inpainted", "generator"
 """Rows of ``fast`` with holes filled by Telea's inpainting, and by the shipped weights."""
 
-WEIGHTS = ("distance", "gradient", "quality", "primary")
-"""Weights of the paper's stage 4."""
-
 _CACHED_TRANSFORMS = 8  # the targets of a set; full-size plans take 50 MB each
 
 
@@ -71,7 +68,6 @@ def retargeting(
     *,
     path: RenderPath = "favs",
     harmonise: Harmonise = None,
-    transforms: int = _CACHED_TRANSFORMS,
     **settings: Any,
 ) -> Method:
     """Wrap ``RigRetarget`` as a method, with its arguments; holes stay black with ``path="favs"``.
@@ -82,7 +78,6 @@ def retargeting(
         name: Name in tables; by default made of quality, surface and path.
         path: Filling of holes; a source camera alone is never completed.
         harmonise: Exposure gains.
-        transforms: Number of target rigs whose transforms are cached.
         settings: Further arguments.
     """
     completes, steps = path != "favs", settings.get("steps")
@@ -90,7 +85,7 @@ def retargeting(
         settings["generator"] = Generator.shipped()  # once, not for each target
     settings |= {"path": path, "harmonise": harmonise, "holes": "fill" if completes else "black", "cache_bytes": 0}
 
-    @lru_cache(transforms)
+    @lru_cache(_CACHED_TRANSFORMS)
     def transform(target: Rig) -> RigRetarget:
         return RigRetarget(target, quality=quality, surface=surface, **settings)
 
@@ -177,14 +172,14 @@ def paper_stages() -> dict[str, PaperConfig]:
         "paper without stage 2, matching": replace(full, use_feature_matching=False),
         "paper without stage 3, objects": replace(full, use_object_alignment=False),
         "paper without stages 2 and 3": replace(full, use_feature_matching=False, use_object_alignment=False),
-        "paper without stage 4, weights": without_weights(full, *WEIGHTS),
+        "paper without stage 4, weights": replace(
+            full,
+            use_distance_weight=False,
+            use_gradient_weight=False,
+            use_quality_weight=False,
+            use_primary_weight=False,
+        ),
     }
-
-
-def without_weights(config: PaperConfig, *weights: str) -> PaperConfig:
-    """Switch off some of the ``WEIGHTS``."""
-    off: dict[str, Any] = {f"use_{weight}_weight": False for weight in weights}
-    return replace(config, **off)
 
 
 def study_methods() -> list[Method]:

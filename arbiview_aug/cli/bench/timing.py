@@ -138,18 +138,16 @@ def machine_line(report: Mapping[str, Any]) -> str:
     return f"{facts['cpu']}, one thread of {facts['cores']} cores, {load}; {named}"
 
 
-def show(table: str, report: Mapping[str, Any], path: Path, *, as_json: bool = False) -> None:
-    """Print a report's table, or its JSON alone, and write the JSON.
+def show(table: str, report: Mapping[str, Any], path: Path) -> None:
+    """Print a report's table, and write its JSON.
 
     Raises:
         DataError: It cannot be written.
     """
-    text = json.dumps(report, indent=1)
-    print(text if as_json else table)  # first, so that an unwritable file does not lose the figures
+    print(table)  # first, so that an unwritable file does not lose the figures
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text + "\n")
+        path.write_text(json.dumps(report, indent=1) + "\n")
     except OSError as error:
         raise DataError(f"--output {path}: expected a file that can be written to, got {error.strerror}") from None
-    if not as_json:
-        print(f"report: {path}")
+    print(f"report: {path}")

@@ -1,7 +1,7 @@
 """``python -m arbiview_aug bench [trade]``: speed against accuracy of all settings, on the user's data or synthetic.
 
-Sweeps quality, surface, decoded size, execution and cached depth from overlap; marks the Pareto front, draws a plot,
-and recommends a setting for ``--budget-ms`` or ``--min-psnr``, measured again. Static surfaces are not recommended
+Sweeps quality, surface, decoded size, execution and cached depth from overlap; marks the Pareto front, and
+recommends a setting for ``--budget-ms`` or ``--min-psnr``, measured again. Static surfaces are not recommended
 where cameras move (``requirements.static_harm``): PSNR does not show what a detector learns from them.
 
 Times are CPU time of a ``RigRetarget`` call on one thread, with the plan where every frame needs its own. Accuracy is
@@ -25,7 +25,6 @@ from tqdm import tqdm
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import add_target, count, writable_folder
 from arbiview_aug.cli.bench.data import REDUCES, SOURCES_OVER_VIEWS, Recorded, as_of_another_frame, recorded
-from arbiview_aug.cli.bench.plot import save_plot
 from arbiview_aug.cli.bench.speed import remap_floor
 from arbiview_aug.cli.bench.study import (
     LEAST_GAIN_DB,
@@ -132,16 +131,13 @@ def settings(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure, print the tables, write the JSON and the plot; return 1 if no harmless setting keeps the limit."""
+    """Measure, print the tables, write the JSON; return 1 if no harmless setting keeps the limit."""
     arguments = _parser().parse_args(argv)
     folder = writable_folder(Path(arguments.output), arguments.output)
     h, w = (SOURCES_OVER_VIEWS * side for side in arguments.size)
     with recorded(arguments.data, frames=arguments.frames, size=(h, w)) as data:
         report = measure(data, arguments)
-    steps = report["steps"]
-    save_plot(report["settings"], steps, f"{report['data']}: {report['target']}", folder / "trade.png")
-    text = f"{table(report)}\n\nplot: {folder / 'trade.png'}"
-    show(text, report, folder / "trade.json", as_json=arguments.json)
+    show(table(report), report, folder / "trade.json")
     return 0 if report["advice"] is None or report["advice"]["setting"] else 1
 
 
@@ -167,7 +163,6 @@ def _parser() -> argparse.ArgumentParser:
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument("--budget-ms", type=float, metavar="MS", help="recommend the most accurate within it")
     limit.add_argument("--min-psnr", type=float, metavar="DB", help="recommend the fastest that reaches it")
-    parser.add_argument("--json", action="store_true", help="print the JSON instead of the tables")
     return parser
 
 

@@ -1,4 +1,4 @@
-"""Run ``python -m arbiview_aug.train``: open the data, load weights, then train, ablate or evaluate."""
+"""Run ``python -m arbiview_aug.train``: open the data, load weights, then train or evaluate."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from arbiview_aug.cli.arguments import writable_folder
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.training.ablation import ablate
 from arbiview_aug.generator.training.autoencoder import train_autoencoder
 from arbiview_aug.generator.training.checkpointing import saved_config
 from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden
@@ -24,7 +23,7 @@ from arbiview_aug.generator.training.held_out import held_out_scores, report
 from arbiview_aug.generator.training.losses import Perceptual, load_perceptual
 from arbiview_aug.generator.training.trainer import Trainer
 
-COMMANDS = ("train", "ablate", "evaluate")
+COMMANDS = ("train", "evaluate")
 
 _TIMEOUT = timedelta(hours=3)
 """Timeout of the other processes, while one trains the autoencoder or scores."""
@@ -69,17 +68,10 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
         "show": show,
         "say": say,
     }
-
-    def make(config: TrainConfig) -> Generator:
-        generator = fresh(config, arguments.weights).to(device)
-        with processes.main_process_first():  # the others load the autoencoder that it saved
-            train_autoencoder(config, frames, generator, output, **options)
-        return generator
-
-    generator = make(config)
-    if arguments.command == "ablate":
-        ablate(config, frames, make, output, views=arguments.views, **options)
-    elif arguments.stage == "autoencoder":
+    generator = fresh(config, arguments.weights).to(device)
+    with processes.main_process_first():  # the others load the autoencoder that it saved
+        train_autoencoder(config, frames, generator, output, **options)
+    if arguments.stage == "autoencoder":
         say(f"the autoencoder is in {output / 'autoencoder'}")
     else:
         Trainer(config, frames, generator, output, **options).train()

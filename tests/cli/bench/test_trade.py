@@ -1,4 +1,4 @@
-"""``python -m arbiview_aug bench``: the sweep, its plot and its recommendation."""
+"""``python -m arbiview_aug bench``: the sweep and its recommendation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -38,8 +37,6 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     only = ["--quality", "draft", "fast", "--surface", "far", "street", "objects", "--reduce", "1", "2"]
     tiny = ["--size", "{}x{}".format(*SIZE), "--repeats", "2", "--budget-ms", "1000", "--output", str(folder)]
     assert main(["bench", *only, *tiny]) == 0
-    picture = cv2.imread(str(folder / "trade.png"))
-    assert picture.shape[0] > 400 and picture.std() > 10
     return json.loads((folder / "trade.json").read_text())
 
 

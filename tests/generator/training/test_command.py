@@ -12,6 +12,7 @@ from arbiview_aug.generator import Generator
 from arbiview_aug.generator.training import command
 from arbiview_aug.train import main
 from tests.generator.training.small import frames
+from tests.studies import training
 
 SMALLER = [
     f"--set={setting}"
@@ -53,14 +54,15 @@ def test_both_entries_have_the_same_help(capsys: pytest.CaptureFixture[str]) -> 
 
 
 @pytest.mark.slow
-def test_train_evaluate_ablate_on_streets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_train_and_evaluate_on_streets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     common = ["--config", "tiny", "--output", str(tmp_path), "--quiet", *SMALLER]
     assert main(common) == 0
     assert main(["evaluate", *common, "--views", "1"]) == 0
     out = capsys.readouterr().out
     assert "held-out views; Telea" in out and "one_step" in out and "mean" in out
-    assert main(["ablate", *common, "--views", "1"]) == 0
-    assert {"as written", "without attention"} < set(json.loads((tmp_path / "ablation.json").read_text()))
+    study = ["--config", "tiny", "--output", str(tmp_path / "study"), "--quiet", *SMALLER]
+    assert training.main([*study, "--views", "1"]) == 0
+    assert set(training.VARIANTS) == set(json.loads((tmp_path / "study" / "ablation.json").read_text()))
     assert "wrong rig" in capsys.readouterr().out
 
 

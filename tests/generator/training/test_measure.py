@@ -15,7 +15,6 @@ from arbiview_aug.errors import GeneratorError, TrainingError
 from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import shown_condition
-from arbiview_aug.generator.training.ablation import correct_correspondences, seen_scores, text_of, wrong_rig
 from arbiview_aug.generator.training.data import open_frames
 from arbiview_aug.generator.training.held_out import gains, held_out_scores
 from arbiview_aug.generator.training.measure import bootstrap, hole_psnr, picture, sampled
@@ -24,6 +23,8 @@ from arbiview_aug.generator.training.step import without_attention
 from tests.generator.small import ring, stirred
 from tests.generator.training.small import config, frames
 from tests.generator.training.test_pseudo_views import HOLE
+from tests.studies import training
+from tests.studies.training import correct_correspondences, seen_scores, text_of, wrong_rig
 
 
 @pytest.fixture(scope="module")
@@ -125,13 +126,8 @@ def test_the_table_names_every_variant() -> None:
 
 
 def test_an_ablation_that_is_stopped_scores_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from arbiview_aug.generator.training import ablation
-
-    monkeypatch.setattr(ablation.Trainer, "train", lambda self: False)
-    settings = config()
-    made = ablation.ablate(
-        settings, frames(), lambda variant: Generator.from_config(variant.generator), tmp_path, show=False, say=print
-    )
+    monkeypatch.setattr(training.Trainer, "train", lambda self: False)
+    made = training.ablate(config(), frames(), tmp_path, show=False)
     assert made == {} and not (tmp_path / "ablation.json").exists()
 
 

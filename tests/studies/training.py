@@ -1,9 +1,13 @@
-"""Ablation study: train variants of the settings and score each on held-out streets."""
+"""``python -m tests.studies.training``: train variants of the settings and score each on held-out streets.
+
+Options are those of ``python -m arbiview_aug.train``.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +18,15 @@ from arbiview_aug.generator import Generator
 from arbiview_aug.generator.correspondence import Correspondence
 from arbiview_aug.generator.denoiser import REGRESSION, Rows
 from arbiview_aug.generator.geometry import FrameGeometry
-from arbiview_aug.generator.training.config import PseudoViewConfig, TrainConfig, overridden
-from arbiview_aug.generator.training.data import Frames
+from arbiview_aug.generator.training.command import fresh
+from arbiview_aug.generator.training.config import CONFIGS, PseudoViewConfig, TrainConfig, overridden
+from arbiview_aug.generator.training.data import Frames, open_frames
 from arbiview_aug.generator.training.held_out import gains, held_out_scores
-from arbiview_aug.generator.training.losses import Perceptual
 from arbiview_aug.generator.training.measure import mean_hole_psnr, sampled
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
 from arbiview_aug.generator.training.step import without_attention
 from arbiview_aug.generator.training.trainer import Trainer
+from arbiview_aug.train import parser
 
 _AS_WRITTEN = (
     "pseudo_views.transplanted=0",
@@ -80,21 +85,10 @@ def seen_batch(frames: Frames, indices: Sequence[int], config: TrainConfig, mask
     return collate([items[k] for k in range(SEEN_ITEMS)])
 
 
-def ablate(
-    config: TrainConfig,
-    frames: Frames,
-    make: Callable[[TrainConfig], Generator],
-    output: Path,
-    *,
-    views: int = 64,
-    perceptual: Perceptual | None = None,
-    show: bool = True,
-    say: Callable[[str], None] = print,
-) -> dict[str, dict[str, Any]]:
+def ablate(config: TrainConfig, frames: Frames, output: Path, *, views: int = 64, show: bool = True) -> dict[str, Any]:
     """Train and score each variant on synthetic streets, and write ``ablation.json``; a stopped study resumes.
 
-    ``make`` returns an untrained generator for a variant's settings, the same each time. Each variant gets a folder in
-    ``output`` and is scored on ``views`` held-out views. The other arguments are those of ``Trainer``.
+    Each variant gets a folder in ``output`` and is scored on ``views`` held-out views.
     """
     split = frames.split(config.seed)
     indices = (split.held_out or split.validation or split.training)[:views]
@@ -102,12 +96,9 @@ def ablate(
     for variant, settings in VARIANTS.items():
         changed = overridden(config, settings)
         folder = output / variant.replace(" ", "_").replace("+", "with")
-        trainer = Trainer(changed, frames, make(changed), folder, perceptual=perceptual, show=show, say=say)
+        trainer = Trainer(changed, frames, fresh(changed, None), folder, show=show)
         if not trainer.train():
             return table  # stopped by a signal
-        if not trainer.is_main:
-            trainer.accelerator.wait_for_everyone()
-            continue
         generator = Generator.from_pretrained(folder / "generator").to(trainer.device)
         batch = seen_batch(frames, indices, changed, trainer.items.masks).to(trainer.device)
         scores = held_out_scores(generator, frames, indices, steps=config.generator.steps, mean_of=0, show=show)
@@ -116,11 +107,8 @@ def ablate(
             "seen by a source": seen_scores(generator, batch),
             "top-1": correct_correspondences(generator, batch),
         }
-        output.mkdir(parents=True, exist_ok=True)
         (output / "ablation.json").write_text(json.dumps(table, indent=1) + "\n")
-        say(f"{variant}: {json.dumps(table[variant])}")
-        trainer.accelerator.wait_for_everyone()
-    say(text_of(table))
+    print(text_of(table))
     return table
 
 
@@ -132,3 +120,16 @@ def text_of(table: dict[str, dict[str, Any]]) -> str:
         cells += [f"{psnr:.2f}" for psnr in row["seen by a source"].values()]
         rows.append([variant, *cells, f"{row['top-1']:.0%}"])
     return markdown_table(("dB in the holes", "one step", "sample", "seen", "without", "wrong rig", "top-1"), rows)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Train, score and print the table."""
+    arguments = parser().parse_args(argv)
+    config = overridden(CONFIGS[arguments.config](), arguments.set)
+    frames = open_frames(arguments.data, config.generator.image_size, scenes=config.scenes, seed=config.seed)
+    ablate(config, frames, Path(arguments.output), views=arguments.views, show=not arguments.quiet)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

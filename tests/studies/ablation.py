@@ -1,4 +1,4 @@
-"""``python -m arbiview_aug bench ablation``: gain of each stage and setting, in dB and in milliseconds.
+"""``python -m tests.studies.ablation``: gain of each stage and setting, in dB and in milliseconds.
 
 All rows render the paper's six configurations and the rig raised by 0.6 m. A step is the difference of two rows. Its
 milliseconds are the median over the targets of their differences, CPU time without plans, unless its plan belongs to
@@ -8,7 +8,9 @@ one frame.
 from __future__ import annotations
 
 import statistics
+import sys
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,8 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.arguments import add_data
-from arbiview_aug.cli.bench.study import benchmark, benchmark_parser, study
+from arbiview_aug.cli.arguments import add_data, command_parser
+from arbiview_aug.cli.bench.data import REDUCES
+from arbiview_aug.cli.bench.study import benchmark, study
 from arbiview_aug.cli.bench.timing import machine_line, quartiles, show
 from arbiview_aug.datasets import open_data, reduced_rig
 from arbiview_aug.datasets.image_io import Reduce
@@ -26,7 +29,7 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.agreement import source_overlap, summary
 from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
-from arbiview_aug.evaluate.methods import WEIGHTS, Method, paper_stages, retargeting, without_weights
+from arbiview_aug.evaluate.methods import Method, paper_stages, retargeting
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import UP_M, paper_targets, shifted_target
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality
@@ -34,7 +37,16 @@ from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.scene.surface import SurfaceName
 
 SYNTHETIC = "synthetic street"
+WEIGHTS = ("distance", "gradient", "quality", "primary")
+"""Weights of the paper's stage 4."""
+
 _STAGES_1_AND_4 = paper_stages()["paper without stages 2 and 3"]
+
+
+def without_weights(config: PaperConfig, *weights: str) -> PaperConfig:
+    """Switch off some of the ``WEIGHTS``."""
+    off: dict[str, Any] = {f"use_{weight}_weight": False for weight in weights}
+    return replace(config, **off)
 
 
 class Row(NamedTuple):
@@ -50,7 +62,7 @@ class Row(NamedTuple):
         """Create the method, with empty caches."""
         refinement = RefinementCache() if self.cached else None
         given = self.quality, self.surface, name
-        return retargeting(*given, harmonise=self.harmonise, refinement=refinement, transforms=1)
+        return retargeting(*given, harmonise=self.harmonise, refinement=refinement)
 
     def fits(self, frame: ScoredFrame) -> bool:
         """Whether a frame has boxes or the truth, where the row needs them (LiDAR points cannot score antialiasing)."""
@@ -115,17 +127,17 @@ NOTES = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print the table, write the JSON."""
-    parser = benchmark_parser(
-        "ablation",
+    parser = command_parser(
+        "",
         "Each stage and setting on and off: accuracy, milliseconds on one thread, and what a ms buys.",
-        reduce=True,
-        output="output/ablation.json",
-        example="--data FOLDER",
+        "--data FOLDER",
+        program="python -m tests.studies.ablation",
     )
     add_data(parser, "a synthetic street", nargs="+", default=[])
+    parser.add_argument("--reduce", type=int, choices=REDUCES, default=2, help="decode the images at 1/N")
+    parser.add_argument("--output", default="output/ablation.json", metavar="FILE", help="file to write to")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the synthetic street")
     parser.add_argument("--only", metavar="TEXT", default="", help="steps whose names contain it")
-    parser.add_argument("--json", action="store_true", help="print JSON instead of the table")
     arguments = parser.parse_args(argv)
     steps = [name for name in STEPS if arguments.only in name]
     if not steps:
@@ -134,7 +146,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("argument --data: expected folders of different names")
     report = measure(arguments.data, steps, reduce=arguments.reduce, seed=arguments.seed)
     table = f"{markdown(report)}\n\n{machine_line(report)}"
-    show(table, report, Path(arguments.output), as_json=arguments.json)
+    show(table, report, Path(arguments.output))
     return 0
 
 
@@ -234,3 +246,7 @@ def _signed(value: float, digits: int) -> str:
 def _overlap(frame: ScoredFrame, harmonised: bool) -> dict[str, float]:
     """Agreement of neighbours on the frame as recorded."""
     return summary("overlap", source_overlap(frame.sample, retargeting("fast", "street", harmonise=harmonised)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

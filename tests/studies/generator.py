@@ -1,8 +1,9 @@
-"""``python -m arbiview_aug bench generator``: cost and accuracy of filled holes on synthetic streets."""
+"""``python -m tests.studies.generator``: cost and accuracy of filled holes on synthetic streets."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -12,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.arguments import count, device_named, writable_folder
-from arbiview_aug.cli.bench.study import benchmark, benchmark_parser, study
+from arbiview_aug.cli.arguments import add_output, command_parser, count, device_named, size, writable_folder
+from arbiview_aug.cli.bench.study import benchmark, study
 from arbiview_aug.cli.bench.timing import clock_of, machine_line, quartiles, show
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.frames import make_frame
@@ -33,14 +34,15 @@ YAW_DEG, FOCAL = 20.0, 0.7
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print the table, write the JSON."""
-    parser = benchmark_parser(
-        "generator",
+    parser = command_parser(
+        "",
         "Holes left black, inpainted, generated: milliseconds a frame, and PSNR against the true views.",
-        view_size=SIZE,
-        repeats=3,
-        output="output",
-        example="--steps 1 4",
+        "--steps 1 4",
+        program="python -m tests.studies.generator",
     )
+    parser.add_argument("--size", type=size, default=SIZE, metavar="HxW", help="of every view")
+    parser.add_argument("--repeats", type=count, default=3, metavar="N", help="rounds of timing")
+    add_output(parser)
     parser.add_argument("--generator", metavar="DIR", help="a trained one (default: the package's own)")
     parser.add_argument("--steps", nargs="+", type=count, default=STEPS, metavar="N", help="(default: 1 4 10 50)")
     parser.add_argument("--frames", type=count, default=2, metavar="N", help="number of streets")
@@ -124,3 +126,7 @@ def table(report: Mapping[str, Any]) -> str:
         f"{report['device']}; {machine_line(report)}. {report['clock']}. {NOTES}"
     )
     return f"{title}\n\n{metric_table([{'name': name, **row} for name, row in rows.items()], COLUMNS)}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
