@@ -40,10 +40,13 @@ def render_opencv(
         M views (3, h, w) of the images' type, black where no source sees; slices of one (M, 3, h, w) block where all
         targets have one size.
     """
+    from arbiview_aug.render.kernels import read_ahead
+
     scratch = scratch or Scratch()
     dtype = images[0].dtype
     work = torch.uint8 if dtype == torch.uint8 else torch.float32
     atlas = _fill_atlas(plan.layout, [image.detach().to(work) for image in images], scratch)
+    rows_of_bytes = atlas.view(np.uint8).reshape(len(atlas), -1)
     views = _empty_views(plan, work)
     sizes = {target.source_camera.shape for target in plan.targets}
     buffers = {size: scratch.get(f"view {size}", (*size, 3), atlas.dtype) for size in sizes}
@@ -59,6 +62,7 @@ def render_opencv(
         for y in range(0, h, STRIP_ROWS):
             rows = slice(y, y + STRIP_ROWS)
             strip = buffer[rows]
+            read_ahead(rows_of_bytes, 3 * atlas.itemsize, target.at.packed[rows], target.source_camera[rows])
             _remap(atlas, target.at.xy[rows], target.at.frac[rows], target.interpolation, dst=strip)
             if target.edge is not None:
                 _put_edge(target.edge.rows(y, y + STRIP_ROWS, w), atlas, strip)

@@ -92,6 +92,8 @@ def build_plan(
 @cache
 def compile_kernels() -> None:
     """Compile what plans call, or load it from numba's cache: in the parent process, before workers are forked."""
+    from arbiview_aug.render.kernels import read_ahead
+
     views = [
         Camera.looking(
             name=f"{name} {side}", azimuth_deg=20 * side, position_m=(0, 0.3 * side, 1.5), width_px=32, height_px=32,
@@ -107,7 +109,8 @@ def compile_kernels() -> None:
     target = Rig([camera for camera in views if camera.name.endswith("0")])
     scene, config = Scene(boxes=boxes, points=wall), FavsConfig(certainty=True)
     for surface in ("ground", "objects", "lidar"):
-        build_plan(source, target, surface=surface, config=config, scene=scene)
+        plan = build_plan(source, target, surface=surface, config=config, scene=scene)
+    read_ahead(np.zeros((1, 3), np.uint8), 3, plan.targets[0].at.packed, plan.targets[0].source_camera)
 
 
 def _built(

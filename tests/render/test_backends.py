@@ -15,6 +15,7 @@ from arbiview_aug.favs.config import FavsConfig, favs_config
 from arbiview_aug.favs.stage1_geometry import h_geom
 from arbiview_aug.image_ops import Scratch
 from arbiview_aug.render.atlas import AtlasLayout, FixedMap
+from arbiview_aug.render.kernels import read_ahead
 from arbiview_aug.render.labels import render_labels
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import RenderPlan, build_plan
@@ -113,12 +114,20 @@ def test_memory_layouts_and_dtypes_give_the_same_views() -> None:
         block = torch.stack(images).contiguous(memory_format=torch.channels_last)  # one block: used without a copy
         planar = [image.contiguous() for image in images]
         for given in (block, planar, list(block)):
-            assert differences(expected, render_opencv(plan, list(given), scratch)).max() <= 1
+            assert differences(expected, render_opencv(plan, list(given), scratch)).max() == 0
         floats = render_opencv(plan, [image.float() / 255 for image in planar])
         assert differences(expected, [(v * 255).round() for v in floats]).max() <= 1
         half = render_opencv(plan, [(image.float() / 255).half() for image in planar])
         assert half[0].dtype == torch.float16
         assert differences(expected, [(v.float() * 255).round() for v in half]).max() <= 1
+
+
+def test_reading_ahead_leaves_out_what_lies_outside_the_atlas() -> None:
+    atlas = np.zeros((40, 60), np.uint8)
+    xy = np.random.default_rng(0).integers(-40, 80, (32, 200, 2)).astype(np.int16)
+    for places in (xy, xy[::-1].copy(), np.full_like(xy, 32000), np.full_like(xy, -16)):
+        for winner in (np.zeros((32, 200), np.int8), np.full((32, 200), 127, np.int8), np.full((32, 200), -1, np.int8)):
+            assert read_ahead(atlas, 3, FixedMap(places, xy[..., 0]).packed, winner) == 0
 
 
 def test_slices_of_one_numpy_array_render_like_any_images() -> None:
