@@ -265,10 +265,10 @@ def _slide(row: Any, oldest: Any, total: Any) -> None:
         total[x] -= oldest[x]
     for x in range(m):
         oldest[x] = row[x]
-    for k in range(1, row.shape[0] - m + 1):
-        part = row[k : k + m]
+    for k in range(1, row.shape[0] - m, 2):  # their number is odd
+        one, two = row[k : k + m], row[k + 1 : k + 1 + m]
         for x in range(m):
-            oldest[x] += part[x]
+            oldest[x] += one[x] + two[x]
     for x in range(m):
         total[x] += oldest[x]
 
@@ -342,17 +342,36 @@ def cells_of(rays: Any, R: Any, place: Any, rows: Any, columns: Any) -> None:
 
 
 @compiled
+def _blocks_row(rows: Any, columns: Any, h: int, w: int, first: Any, down: Any, right: Any) -> None:
+    """Flat index (n,) of the first of the 2 x 2 cells around each position in (h, w), and what it is off that one."""
+    last_row, last_column = np.float32(h - 2), np.float32(w - 2)
+    for x in range(first.shape[0]):
+        r, c = np.int32(min(max(rows[x], _ZERO), last_row)), np.int32(min(max(columns[x], _ZERO), last_column))
+        first[x] = r * np.int32(w) + c
+    for x in range(first.shape[0]):
+        a = min(max(rows[x], _ZERO), last_row + _ONE)
+        down[x] = a - np.floor(min(a, last_row))
+    for x in range(first.shape[0]):
+        a = min(max(columns[x], _ZERO), last_column + _ONE)
+        right[x] = a - np.floor(min(a, last_column))
+
+
+@compiled
+def _mixed(layer: Any, i: int, w: int, s: float, t: float) -> float:
+    """Bilinear value in the 2 x 2 cells from flat index ``i`` on, in rows of ``w``."""
+    j, k, m = np.uint32(i + 1), np.uint32(i + w), np.uint32(i + w + 1)
+    above = layer[i] + (layer[j] - layer[i]) * t
+    return above + (layer[k] + (layer[m] - layer[k]) * t - above) * s
+
+
+@compiled
 def read_layer(rows: Any, columns: Any, layer: Any, out: Any) -> None:
     """Bilinear values (n,) of a panorama's layer at rows and columns (n,); its border beyond it."""
-    h, w = layer.shape
-    last_row, last_column = np.float32(h - 1), np.float32(w - 1)
-    for x in range(out.shape[0]):
-        a, b = min(max(rows[x], _ZERO), last_row), min(max(columns[x], _ZERO), last_column)
-        r, c = int(a), int(b)
-        s, t = a - np.float32(r), b - np.float32(c)
-        r1, c1 = min(r + 1, h - 1), min(c + 1, w - 1)
-        above = layer[r, c] + (layer[r, c1] - layer[r, c]) * t
-        out[x] = above + (layer[r1, c] + (layer[r1, c1] - layer[r1, c]) * t - above) * s
+    (h, w), n, flat = layer.shape, out.shape[0], layer.reshape(layer.size)
+    first, down, right = np.empty(n, np.uint32), np.empty(n, np.float32), np.empty(n, np.float32)
+    _blocks_row(rows, columns, h, w, first, down, right)
+    for x in range(n):
+        out[x] = _mixed(flat, first[x], w, down[x], right[x])
 
 
 @compiled
@@ -402,23 +421,22 @@ def add_residuals(rows: Any, columns: Any, step: int, near: Any, far: Any, share
         q: (h, w) float32, updated.
     """
     h, w = q.shape
-    last_row, last_column = np.float32(near.shape[0] - 1), np.float32(near.shape[1] - 1)
-    around, v, u = np.full((2, 2, w + 1), -1, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    (rows_of_all, all_columns), n = near.shape, near.size
+    nears, fars, shares = near.reshape(n), far.reshape(n), share.reshape(n)
+    around, first, work = np.full((2, 2, w + 1), -1, np.float32), np.empty(w, np.uint32), np.empty((4, w), np.float32)
+    v, u, down, right = work[0], work[1], work[2], work[3]
     for y in range(h):
         _between_rows(rows, step, y, h, around[0], v)
         _between_rows(columns, step, y, h, around[1], u)
+        _blocks_row(v, u, rows_of_all, all_columns, first, down, right)
+        out = q[y]
         for x in range(w):
-            a, b = min(max(v[x], _ZERO), last_row), min(max(u[x], _ZERO), last_column)
-            r, c = int(a), int(b)
-            s, t = a - np.float32(r), b - np.float32(c)
-            r1, c1 = min(r + 1, near.shape[0] - 1), min(c + 1, near.shape[1] - 1)
-            w00, w01, w10, w11 = (_ONE - s) * (_ONE - t), (_ONE - s) * t, s * (_ONE - t), s * t
-            nearer = w00 * share[r, c] + w01 * share[r, c1] + w10 * share[r1, c] + w11 * share[r1, c1] > _HALF
-            if nearer:
-                value = w00 * near[r, c] + w01 * near[r, c1] + w10 * near[r1, c] + w11 * near[r1, c1]
+            i, s, t = first[x], down[x], right[x]
+            if _mixed(shares, i, all_columns, s, t) > _HALF:
+                value = _mixed(nears, i, all_columns, s, t)
             else:
-                value = w00 * far[r, c] + w01 * far[r, c1] + w10 * far[r1, c] + w11 * far[r1, c1]
-            q[y, x] = min(max(q[y, x] + value, _ZERO), _MOST)
+                value = _mixed(fars, i, all_columns, s, t)
+            out[x] = min(max(out[x] + value, _ZERO), _MOST)
 
 
 @compiled
@@ -438,18 +456,19 @@ def raise_depths(rows: Any, columns: Any, step: int, layer: Any, apart: int, q: 
             x = min(i * apart, w - 1)
             v[i], u[i] = v[x], u[x]
         read_layer(v[: nodes.shape[1]], u[: nodes.shape[1]], layer, nodes[j])
-    values, whose = np.empty((2, w), np.float32), np.empty(w, np.int32)
+    values = np.empty((2, w), np.float32)
     for y in range(h):
         _between_rows(nodes, apart, y, h, around[2], values[0])
         value, top, old, number = values[0], values[1], q[y], solid[y]
         for x in range(w):
             top[x] = max(value[x], old[x])
+        taken = 0
         for x in range(w):
-            whose[x] = -1 if value[x] > old[x] else number[x]
+            taken |= np.int32(value[x] > old[x]) & (number[x] + np.int32(1))
+        for x in range(w if taken else 0):
+            number[x] = -1 if value[x] > old[x] else number[x]
         for x in range(w):
             old[x] = top[x]
-        for x in range(w):
-            number[x] = whose[x]
 
 
 @compiled
