@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, cast
 
 import cv2
@@ -409,6 +409,7 @@ def source_bounds(source: Camera, level: int) -> npt.NDArray[np.float64]:
     return np.array([*bounds, *((w - 1, h - 1) if level else (-1, -1))])
 
 
+@lru_cache(32)  # all targets ask for the same ones
 def halved_camera(camera: Camera, level: int) -> Camera:
     """The camera of an image that was halved ``level`` times."""
     h, w = level_size(camera.size, level)

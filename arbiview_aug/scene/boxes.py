@@ -53,17 +53,23 @@ class BoxSurface(LayeredSurface):
         if camera not in self._shadows:
             pixel_rad = float(1 / camera.K[0, 0])
             boxes, scale = self._enlarged(camera.center_m, pixel_rad), 1 / (1 + 2 * pixel_rad)  # a lookup's error
-            self._shadows[camera] = OcclusionMap(*draw_boxes(camera, boxes, rays, memory, scale=scale, faces=False))
+            onto = self._hidden(camera, rays, memory, widened=True)
+            drawn = draw_boxes(camera, boxes, rays, memory, scale=scale, faces=False, onto=onto)
+            self._shadows[camera] = OcclusionMap(*drawn)
         return self._shadows[camera]
 
     def drawn(
         self, camera: Camera, rays: PixelRays, memory: Memory = FRESH
     ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
-        """Inverse distances (h, w) of the boxes' faces along a camera's rays, 0 where there is none; the faces, or -1.
+        """Inverse distances (h, w) of the boxes' faces along a camera's rays where nothing hides them; faces, or -1.
 
         A face's number is 6 x the box's row + 2 x the axis across it + 1 for the one further along that axis.
         """
-        return draw_boxes(camera, self.boxes, rays, memory)
+        return draw_boxes(camera, self.boxes, rays, memory, onto=self._hidden(camera, rays, memory, widened=False))
+
+    def _hidden(self, camera: Camera, rays: PixelRays, memory: Memory, *, widened: bool) -> npt.NDArray[np.float32]:
+        """Inverse distances (h, w) beyond which something else hides, 0 where nothing does."""
+        return np.asarray(memory.full(camera.size, 0, np.float32))
 
     def before_faces(self, origin: FloatArray) -> FloatArray:
         """By how many metres a point lies before the planes of all faces (6 B,)."""
@@ -108,6 +114,7 @@ def draw_boxes(
     *,
     scale: float = 1.0,
     faces: bool = True,
+    onto: npt.NDArray[np.float32] | None = None,
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
     """Rasterise boxes (B, 7).
 
@@ -118,14 +125,16 @@ def draw_boxes(
         memory: Memory of the images.
         scale: Factor of the inverse distances.
         faces: Number the faces: 6 x the box's row + 2 x the axis across it + 1 for the one further along that axis.
+        onto: (h, w) inverse distances that stand there, drawn over by what is nearer; 0 by default.
 
     Returns:
-        (h, w) inverse distances of the nearest faces, 0 where there is none; (h, w) the boxes' rows or faces, or -1.
+        (h, w) inverse distances of the nearest faces, or of what stands there; (h, w) the boxes' rows or faces, or -1.
     """
     from arbiview_aug.scene.kernels import draw_boxes as draw
 
     rays = rays or pixel_rays(camera)
-    q, number = memory.full(camera.size, 0, np.float32), memory.full(camera.size, -1, np.int32)
+    q = memory.full(camera.size, 0, np.float32) if onto is None else onto
+    number = memory.full(camera.size, -1, np.int32)
     draw(rays.planes, rays.parameters, *box_rows(camera, boxes, rays), rays.cones, CELL_PX, scale, faces, q, number)
     return q, number
 

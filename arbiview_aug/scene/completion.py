@@ -440,12 +440,9 @@ def add_residuals(rows: Any, columns: Any, step: int, near: Any, far: Any, share
 
 
 @compiled
-def raise_depths(rows: Any, columns: Any, step: int, layer: Any, apart: int, q: Any, solid: Any) -> None:
-    """Raise inverse distances (h, w) to those of a panorama's layer, read every ``apart`` pixels; ``solid`` becomes -1.
-
-    Rows, columns and step are as in ``add_residuals``.
-    """
-    h, w = q.shape
+def interpolate_layer(rows: Any, columns: Any, step: int, layer: Any, apart: int, out: Any) -> None:
+    """Values (h, w) between those of a panorama's layer every ``apart`` pixels; the rest is as in ``add_residuals``."""
+    h, w = out.shape
     around, v, u = np.full((3, 2, w + 1), -1, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
     nodes = np.empty((-(-h // apart) + 1, -(-w // apart) + 1), np.float32)
     for j in range(nodes.shape[0]):
@@ -456,19 +453,8 @@ def raise_depths(rows: Any, columns: Any, step: int, layer: Any, apart: int, q: 
             x = min(i * apart, w - 1)
             v[i], u[i] = v[x], u[x]
         read_layer(v[: nodes.shape[1]], u[: nodes.shape[1]], layer, nodes[j])
-    values = np.empty((2, w), np.float32)
     for y in range(h):
-        _between_rows(nodes, apart, y, h, around[2], values[0])
-        value, top, old, number = values[0], values[1], q[y], solid[y]
-        for x in range(w):
-            top[x] = max(value[x], old[x])
-        taken = 0
-        for x in range(w):
-            taken |= np.int32(value[x] > old[x]) & (number[x] + np.int32(1))
-        for x in range(w if taken else 0):
-            number[x] = -1 if value[x] > old[x] else number[x]
-        for x in range(w):
-            old[x] = top[x]
+        _between_rows(nodes, apart, y, h, around[2], out[y])
 
 
 @compiled
@@ -511,8 +497,7 @@ def scan(points: Any, origin: Any, azimuth: float, per_rad: float) -> tuple[Any,
 
 @compiled
 def draw_scanned(
-    planes: Any, P: Any, R: Any, box: Any, cones: Any, step: int, raster: Any, air: Any, mode: int, image: Any,
-    solid: Any,
+    planes: Any, P: Any, R: Any, box: Any, cones: Any, step: int, raster: Any, air: Any, mode: int, image: Any
 ) -> None:  # fmt: skip
     """Draw an object by its points into inverse distances or an occlusion map (``scanned_objects.ScannedObject``).
 
@@ -529,7 +514,6 @@ def draw_scanned(
         mode: ``SHOW``: where it is met in front of what ``image`` (h, w) says. ``HIDE``: what it hides. ``HIDE_WIDE``:
             what it may hide, a little above its points too.
         image: (h, w) float32, updated.
-        solid: (h, w) int32, -1 where the image is raised; (0, 0) with ``SHOW``.
     """
     h, w = image.shape
     _, ny, nx = cones.shape
@@ -568,7 +552,7 @@ def draw_scanned(
                     if own > _ZERO and out[x] < behind[x]:
                         out[x] = own
                 elif (mode == HIDE_WIDE or own > _ZERO) and behind[x] > out[x]:
-                    out[x], solid[y, x0 + x] = behind[x], -1
+                    out[x] = behind[x]
 
 
 @compiled

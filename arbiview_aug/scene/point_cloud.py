@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
@@ -31,8 +30,6 @@ _STEEP = 0.9
 
 _NODES_RAD = 4 * CELL_RAD
 """Distance of nodes between which positions in a panorama are interpolated, to 1/50 of a cell."""
-
-_NO_SOLID = np.zeros((0, 0), np.int32)
 
 _AIR = np.array([BOX_AIR_M, SIDE_RAD / RASTER_RAD], np.float32)
 
@@ -95,11 +92,12 @@ def panorama(window: PanoramaWindow, origin: FloatArray, points: Points, base: S
     """
     from arbiview_aug.scene.completion import complete, drop_hidden, nearest_points
 
-    q, number = np.zeros(window.shape, np.float32), np.empty(window.shape, np.int32)
+    shape = window.shape
+    q, number = np.zeros(shape, np.float32), np.empty(shape, np.int32)
     nearest_points(points, origin, window.bounds, window.place, q, number)
     cells, rays = drop_hidden(q, number, points, origin)
     own = q.reshape(-1)[cells]
-    view = Panorama(window, origin, base, *(np.empty(window.shape, np.float32) for _ in range(4)))
+    view = Panorama(window, origin, base, *np.empty((4, *shape), np.float32))
     complete(cells, own, own - base.along(origin, rays)[0], view.near, view.far, view.share, view.measured)
     return view
 
@@ -131,7 +129,7 @@ class PointCloudSurface(DenseSurface):
         q = self.street.image(camera, rays, memory)
         view, *cells = self._located(camera, rays)
         add_residuals(*cells, view.near, view.far, view.share, q)
-        self._draw_objects(camera, rays, SHOW, q, _NO_SOLID)
+        self._draw_objects(camera, rays, SHOW, q)
         return q
 
     def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
@@ -141,9 +139,8 @@ class PointCloudSurface(DenseSurface):
         and only within measured outlines: nothing hides where the LiDAR is silent.
         """
         if camera not in self._shadows:
-            shadows = OcclusionMap(memory.full(camera.size, 0, np.float32), memory.full(camera.size, -1, np.int32))
-            self.hide(camera, rays, shadows.beyond, shadows.solid)
-            self._shadows[camera] = shadows
+            solid = memory.full(camera.size, -1, np.int32)
+            self._shadows[camera] = OcclusionMap(self.hidden(camera, rays, memory), solid)
         return self._shadows[camera]
 
     def occlusion_level(self, camera: Camera) -> int:
@@ -151,20 +148,20 @@ class PointCloudSurface(DenseSurface):
         level = int(math.log2(max(CELL_RAD * float(camera.K[0, 0]), 1)))
         return 0 if min(camera.size) >> level < 2 else level
 
-    def hide(
-        self, camera: Camera, rays: PixelRays, beyond: Layer, solid: npt.NDArray[np.int32], *, widened: bool = True
-    ) -> None:
-        """Raise inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart.
+    def hidden(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH, *, widened: bool = True) -> Layer:
+        """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart.
 
-        ``solid`` (h, w) becomes -1 there. With ``widened`` objects reach half a scan line's spacing above their highest
-        points: they may, and a source that shows them there must not be read for the background.
+        With ``widened`` objects reach half a scan line's spacing above their highest points: they may, and a source
+        that shows them there must not be read for the background.
         """
-        from arbiview_aug.scene.completion import HIDE, HIDE_WIDE, raise_depths
+        from arbiview_aug.scene.completion import HIDE, HIDE_WIDE, interpolate_layer
 
         view, *cells = self._located(camera, rays)
         apart = max(1, round(CELL_RAD * float(rays.parameters[0])))
-        raise_depths(*cells, view.hidden_below, apart, beyond, solid)
-        self._draw_objects(camera, rays, HIDE_WIDE if widened else HIDE, beyond, solid)
+        hidden = memory.empty(camera.size, np.float32)
+        interpolate_layer(*cells, view.hidden_below, apart, hidden)
+        self._draw_objects(camera, rays, HIDE_WIDE if widened else HIDE, hidden)
+        return np.asarray(hidden)
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Small where a point is near, the street's elsewhere: 1/m (...,)."""
@@ -177,9 +174,7 @@ class PointCloudSurface(DenseSurface):
         unknown = self.street.uncertainty(origin, directions, inverse_distance)
         return np.where(near.reshape(unknown.shape) > 0.5, _MEASURED_SPREAD * inverse_distance, unknown)
 
-    def _draw_objects(
-        self, camera: Camera, rays: PixelRays, mode: int, image: Layer, solid: npt.NDArray[np.int32]
-    ) -> None:
+    def _draw_objects(self, camera: Camera, rays: PixelRays, mode: int, image: Layer) -> None:
         """Draw the objects that a camera may see by their points (``completion.draw_scanned``)."""
         from arbiview_aug.scene.completion import draw_scanned
 
@@ -190,9 +185,7 @@ class PointCloudSurface(DenseSurface):
         for box, number in zip(boxes, numbers, strict=True):
             raster = self.objects[number].raster(center)
             if raster.nearest.size:
-                draw_scanned(
-                    rays.planes, rays.parameters, R, box, rays.cones, CELL_PX, raster, _AIR, mode, image, solid
-                )  # fmt: skip
+                draw_scanned(rays.planes, rays.parameters, R, box, rays.cones, CELL_PX, raster, _AIR, mode, image)
 
     def _located(self, camera: Camera, rays: PixelRays) -> tuple[Panorama, Layer, Layer, int]:
         """The panorama around a camera; rows and columns in it (ny + 1, nx + 1) of nodes, and how far these are apart.
@@ -247,21 +240,8 @@ class PointCloudWithBoxes(BoxSurface):
         objects, boxes, in_box = scanned_objects(boxes, points)
         return cls(PointCloudSurface(street, points[~in_box], objects), boxes)
 
-    def drawn(
-        self, camera: Camera, rays: PixelRays, memory: Memory = FRESH
-    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
-        """The boxes with nothing measured before them."""
-        q, face = super().drawn(camera, rays, memory)
-        self.street.hide(camera, rays, q, face, widened=False)
-        return q, face
-
-    def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
-        """What boxes hide from a source, and what was measured."""
-        new = camera not in self._shadows
-        shadows = super().occlusion_map(camera, rays, memory)
-        if new:
-            self.street.hide(camera, rays, shadows.beyond, shadows.solid)
-        return shadows
+    def _hidden(self, camera: Camera, rays: PixelRays, memory: Memory, *, widened: bool) -> Layer:
+        return self.street.hidden(camera, rays, memory, widened=widened)
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Small where a point is near, the street's elsewhere: 1/m (...,)."""

@@ -133,8 +133,6 @@ def test_images_say_what_single_rays_say(name: str) -> None:
     assert np.quantile(off, 0.99) < 2e-5 and (off > 1e-3).mean() < 0.003
     for widened in (False, True):
         before = occlusion_depth(street, view.center_m, rays, widened=widened)
-        drawn, solid = np.zeros(view.size, np.float32), np.zeros(view.size, np.int32)
-        street.hide(view, pixel_rays(view), drawn, solid, widened=widened)
-        assert np.array_equal(solid < 0, drawn > 0)
+        drawn = street.hidden(view, pixel_rays(view), widened=widened)
         off = np.abs(drawn[valid] - before)
         assert np.median(off) < 1e-5 and (off > 1e-3).mean() < 0.03
