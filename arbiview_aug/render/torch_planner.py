@@ -38,8 +38,10 @@ from arbiview_aug.render.view_planner import (
     source_bounds,
 )
 from arbiview_aug.scene.boxes import _BOX_ERROR, _UNLABELLED
+from arbiview_aug.scene.point_cloud import _MEASURED_SPREAD, occlusion_level
 from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
+from arbiview_aug.scene.torch_points import PanoramaViews, upsampled
 from arbiview_aug.scene.torch_surface import (
     Poses,
     before_faces,
@@ -79,6 +81,8 @@ def build_plans(
         groups: dict[Any, list[tuple[int, int]]] = {}
         for f, request in enumerate(requests):
             name = request.scene.best if surface == "auto" else surface
+            if name == "lidar" and not len(request.scene.points):  # type: ignore[arg-type]
+                name = "street" if request.scene.boxes is None else "objects"
             for m, camera in enumerate(request.target):
                 coarse = min(camera.size) >= SMALL_SIDE_PX
                 coarse &= is_within_wall(camera.center_m) or not SURFACES[surface].has_wall
@@ -130,6 +134,13 @@ class _Bank:
         y, x = (torch.minimum(p.clamp(min=0).long(), n[:, k] - 1) for p, n in ((y, self._h), (x, self._w)))
         return self._flat[self._first[:, k] + y * self._w[:, k] + x]
 
+    def between(self, y: torch.Tensor, x: torch.Tensor, k: int | slice) -> torch.Tensor:
+        """Bilinear values (..., h, w) of the sources ``k``; their border beyond it."""
+        y, x = (torch.minimum(p.clamp(min=0), n[:, k] - 1.0) for p, n in ((y, self._h), (x, self._w)))
+        s, t = y - y.floor(), x - x.floor()
+        above, below = (self.at(r, x, k) * (1 - t) + self.at(r, x + 1, k) * t for r in (y, y + 1))
+        return above * (1 - s) + below * s
+
 
 class _ViewBatch:
     """Views of one size over one surface: as ``ViewPlanner``, V at once. Node values are float64."""
@@ -175,6 +186,16 @@ class _ViewBatch:
         assert self.boxes is not None
         return torch.stack([self.boxes[f] for f in frames])
 
+    def _points_of(self, frames: Sequence[int]) -> torch.Tensor:
+        """Points (C, P, 3) float64 of frames, padded by NaN."""
+        given = {f: torch.as_tensor(self.requests[f].scene.points)[:, :3] for f in self.frames}
+        most = max(map(len, given.values()))
+        rows = {
+            f: _pad(p.to(self.device, torch.float64), (0, 0, 0, most - len(p)), value=math.nan)
+            for f, p in given.items()
+        }
+        return torch.stack([rows[f] for f in frames])
+
     def _find_surface(self) -> None:
         """Inverse distances at all pixels, faces of solids, and the expected error on the nodes."""
         self.face: torch.Tensor | None = None
@@ -187,12 +208,18 @@ class _ViewBatch:
         ego = torch.stack(turned(self.rays, self.poses.R.float()), 1)
         self.q = self.behind = static_image(self.name != "ground", ego, centers_m, ground_z_m)
         on_street = self._on_nodes(self.behind)
+        if self.name == "lidar":
+            of_views = PanoramaViews(self.cameras, self.maps, self._points_of(self.frames), ground_z_m)
+            self.q = self.behind = of_views.image(ego, self.q)
         if self.boxes is not None:
             solid, self.face = draw_boxes(self.rays, self.poses, self._boxes_of(self.frames))
             self.q = torch.where(self.face >= 0, solid, self.behind)
         on_nodes = self._on_nodes(self.q)
         self.uncertainty = static_uncertainty(self.directions, on_nodes.double(), centers_m)
-        if self.boxes is not None:
+        if self.name == "lidar":
+            (near,) = of_views.read((of_views.measured,), self._on_nodes(ego))
+            self.uncertainty = torch.where(near > 0.5, _MEASURED_SPREAD * on_nodes, self.uncertainty)
+        elif self.boxes is not None:
             self.uncertainty = torch.where(on_nodes <= on_street, _UNLABELLED * self.uncertainty, _BOX_ERROR * on_nodes)
 
     # --- what sources see ---------------------------------------------------------------------------------------------
@@ -330,34 +357,47 @@ class _ViewBatch:
         """Masks and occlusion maps of the sources at their levels."""
         full = torch.tensor(255, dtype=torch.uint8)
         self.clean = self._bank(lambda row, k: self._of_mask(row, k, "clean", clean_pixels), full)
-        if self.boxes is None:
+        self.is_solid = self.boxes is not None or self.name == "lidar"
+        if not self.is_solid:
             return
+        scale = np.ones(self.numbers.shape)
         sizes: dict[tuple[int, int], dict[Any, Camera]] = {}
         for row, k in zip(*np.nonzero(self.is_near), strict=True):
-            half = halved_camera(self.pairs[row][k], int(self.levels[row, k]))
+            source, level = self.pairs[row][k], int(self.levels[row, k])
+            coarser = level if self.boxes is not None else max(level, occlusion_level(source))
+            scale[row, k] = 0.5 ** (coarser - level)
+            half = halved_camera(source, coarser)
             sizes.setdefault(half.size, {})[self._key(row, k)] = half
-        drawn: dict[Any, tuple[torch.Tensor, torch.Tensor]] = {}
+        self.scale = on_device(scale, self.device, torch.float32)[..., None, None]
+        drawn: dict[Any, Any] = {}
         for of_size in sizes.values():
-            cameras = list(of_size.values())
-            rays, poses = pixel_rays(cameras, self.maps, self.device), Poses.of(cameras, self.device)
-            pixel_rad = on_device(np.array([1 / camera.K[0, 0] for camera in cameras]), self.device)
-            maps = occluding_boxes(rays, poses, self._boxes_of([key[0] for key in of_size]), pixel_rad)
-            drawn.update(zip(of_size, zip(*maps, strict=True), strict=True))
+            drawn.update(zip(of_size, self._drawn([key[0] for key in of_size], list(of_size.values())), strict=True))
         none = None, None
         self.shadow = self._bank(lambda row, k: drawn.get(self._key(row, k), none)[0], torch.tensor(0.0))
-        self.solid = self._bank(
-            lambda row, k: drawn.get(self._key(row, k), none)[1], torch.tensor(-1, dtype=torch.int32)
-        )
-        centers_m = self.poses.center_m[:, None] - on_device(self.offset_m, self.device)
-        self.before_m = before_faces(self._boxes_of(self.frames)[:, None], centers_m)
+        self.solid = self._bank(lambda row, k: drawn.get(self._key(row, k), none)[1], torch.tensor(-1).int())
+        if self.boxes is not None:
+            centers_m = self.poses.center_m[:, None] - on_device(self.offset_m, self.device)
+            self.before_m = before_faces(self._boxes_of(self.frames)[:, None], centers_m)
+
+    def _drawn(self, frames: Sequence[int], cameras: Sequence[Camera]) -> Iterator[tuple[Any, Any]]:
+        """What hides from cameras of one size, inverse distances (h, w), and the boxes' rows; None for none."""
+        rays, poses = pixel_rays(cameras, self.maps, self.device), Poses.of(cameras, self.device)
+        if self.boxes is not None:
+            pixel_rad = on_device(np.array([1 / camera.K[0, 0] for camera in cameras]), self.device)
+            yield from zip(*occluding_boxes(rays, poses, self._boxes_of(frames), pixel_rad), strict=True)
+            return
+        ground_z_m = np.array([self.requests[f].source.ground_z_m for f in frames])
+        views = PanoramaViews(cameras, self.maps, self._points_of(frames), ground_z_m)
+        ego = torch.stack(turned(rays, poses.R.float()), 1)
+        yield from ((beyond, None) for beyond in views.read((views.hidden_below(),), ego)[0])
 
     def _evaluate(self, rays: torch.Tensor, q: torch.Tensor, face: torch.Tensor | None, k: int | slice) -> Any:
         """As ``kernels._evaluate_row``: columns and rows in sources ``k`` in 32nds, int32, inside, and seen."""
         u, v, nearness = self._points(rays, q, k)
         low_u, low_v, high_u, high_v, right, bottom = self.bounds[:, k].unbind(-3)
         seen = inside = (u >= low_u) & (u <= high_u) & (v >= low_v) & (v <= high_v)
-        if face is not None:
-            seen = inside & ~self._hidden(u, v, nearness, torch.where(self.near[:, k] > 0, face, -1), k)
+        if self.is_solid:
+            seen = inside & ~self._hidden(u, v, nearness, face, k)
         # The outer half pixel of a full image lies outside the halved one: its border pixel is read.
         limit = float(_MAP_LIMIT_PX)
         fu, fv = (
@@ -369,12 +409,17 @@ class _ViewBatch:
                 seen = seen & (self.clean.at((fv + more_v) >> 5, (fu + more_u) >> 5, k) > 0)
         return fu, fv, inside, seen
 
-    def _hidden(self, u: Any, v: Any, nearness: torch.Tensor, face: torch.Tensor, k: int | slice) -> torch.Tensor:
-        """Whether boxes hide points from sources, or their face is turned away: ``kernels._occlude_row``."""
+    def _hidden(
+        self, u: torch.Tensor, v: torch.Tensor, nearness: torch.Tensor, face: torch.Tensor | None, k: int | slice
+    ) -> torch.Tensor:
+        """Whether something hides points from sources, or their face is turned away: ``kernels._occlude_row``."""
+        u, v = (p * self.scale[:, k] + (self.scale[:, k] - 1) * 0.5 for p in (u, v))
+        if face is None:
+            return self.shadow.between(v, u, k) > nearness
+        face = torch.where(self.near[:, k] > 0, face, -1)
         before_m = self.before_m[:, k].gather(-1, face.clamp(min=0).long().flatten(-2)).view(face.shape)
         away = (before_m <= 0) | (before_m * nearness < float(_LEAST_INCIDENCE))
-        u, v = u.round(), v.round()
-        hides, by = self.shadow.at(v, u, k), self.solid.at(v, u, k)
+        hides, by = self.shadow.at(v.round(), u.round(), k), self.solid.at(v.round(), u.round(), k)
         hidden = (hides > 0) & ((face < 0) | (hides > nearness) & (by != torch.div(face, 6, rounding_mode="floor")))
         return hidden | (face >= 0) & away
 
@@ -393,7 +438,7 @@ class _ViewBatch:
         certainty = torch.zeros_like(best, dtype=torch.uint8) if config.certainty else None
         for k in range(K):
             fu, fv, inside, seen = self._evaluate(self.rays, self.q, self.face, k)
-            weight = torch.where(seen, self._upsampled(weights[:, k]), -2.0)
+            weight = torch.where(seen, upsampled(weights[:, k], self.step, self.size), -2.0)
             here, better = torch.stack([fu, fv], 1), weight > best
             if K > 1 and config.seam_width:
                 also = ~better & (weight > share)
@@ -403,7 +448,9 @@ class _ViewBatch:
             winner, at = torch.where(better, self.number[:, k], winner), torch.where(better[:, None], here, at)
             best, in_image = torch.maximum(best, weight), in_image | inside
             if certain is not None and certainty is not None:
-                certainty = torch.where(better, self._upsampled(certain[:, k]).round().to(torch.uint8), certainty)
+                certainty = torch.where(
+                    better, upsampled(certain[:, k], self.step, self.size).round().to(torch.uint8), certainty
+                )
         share = share / (best + share).clamp(min=TINY)
         share = torch.where((share >= _LEAST_SHARE) & (second >= 0), share, 0.0)
         second = torch.where(share > 0, second, -1)
@@ -498,13 +545,6 @@ class _ViewBatch:
         for _ in range(2):
             soft = _blurred(soft, max(1, round(width_px / self.step / 2)))
         return soft * ((self.edge_px / self.resolution.clamp(min=1e-3)).float() / width_px).clamp(0, 1)
-
-    def _upsampled(self, nodes: torch.Tensor) -> torch.Tensor:
-        """Bilinear values (V, h, w) between nodes (V, ny + 1, nx + 1)."""
-        y, x = (torch.arange(n, device=self.device) for n in self.size)
-        (j, t), (i, k) = ((p // self.step, (p % self.step).float()) for p in (y, x))
-        rows = nodes[:, j] + (nodes[:, j + 1] - nodes[:, j]) * (t / self.step)[:, None]
-        return rows[:, :, i] + (rows.diff() / self.step)[:, :, i] * k
 
     def _interpolation(self, row: int) -> str:
         """As ``ViewPlanner._interpolation``."""

@@ -145,8 +145,7 @@ class PointCloudSurface(DenseSurface):
 
     def occlusion_level(self, camera: Camera) -> int:
         """Halvings up to which a pixel is not wider than a cell."""
-        level = int(math.log2(max(CELL_RAD * float(camera.K[0, 0]), 1)))
-        return 0 if min(camera.size) >> level < 2 else level
+        return occlusion_level(camera)
 
     def hidden(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH, *, widened: bool = True) -> Layer:
         """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart.
@@ -246,6 +245,12 @@ class PointCloudWithBoxes(BoxSurface):
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Small where a point is near, the street's elsewhere: 1/m (...,)."""
         return self.street.uncertainty(origin, directions, inverse_distance)
+
+
+def occlusion_level(camera: Camera) -> int:
+    """Halvings of a camera's image up to which a pixel is not wider than a cell of points."""
+    level = int(math.log2(max(CELL_RAD * float(camera.K[0, 0]), 1)))
+    return 0 if min(camera.size) >> level < 2 else level
 
 
 def own_car(points: Points) -> BoolArray:

@@ -129,7 +129,9 @@ SURFACES: dict[str, SurfaceRow] = {
     "ground": SurfaceRow(lambda scene, z_m: Ground(ground_z_m=z_m), on_device=True),
     "street": SurfaceRow(_street, overlap_depth=True, on_device=True),
     "objects": SurfaceRow(_boxes, ("boxes",), "boxes", overlap_depth=True, on_device=True),
-    "lidar": SurfaceRow(lambda scene, z_m: _point_cloud(scene.points, scene, z_m), ("boxes", "points"), "points"),
+    "lidar": SurfaceRow(
+        lambda scene, z_m: _point_cloud(scene.points, scene, z_m), ("boxes", "points"), "points", on_device=True
+    ),
     "motion": SurfaceRow(lambda scene, z_m: _point_cloud(scene.motion, scene, z_m), ("boxes", "motion"), "motion"),
 }
 """All surfaces by name. A new one is a class in this folder and a row here."""

@@ -91,6 +91,25 @@ def _count(blend: Any) -> int:
     return 0 if blend is None else len(blend.pixel)
 
 
+def measured() -> Scene:
+    """A scan of 32 lines from 1.8 m over a road, with pillars on it and a wall on both sides."""
+    elevation, azimuth = np.meshgrid(np.radians(np.linspace(-25, 8, 32)), np.radians(np.arange(0, 360, 0.4)))
+    rays = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1)
+    level = np.hypot(rays[..., 0], rays[..., 1])
+    road = np.where(rays[..., 2] < 0, -1.8 / np.minimum(rays[..., 2], -1e-9), np.inf)
+    distance = np.minimum(road, 15 / np.maximum(np.abs(rays[..., 1]), 1e-9))
+    for x, y, radius in ((8, 2, 0.6), (-7, -3, 1.0), (12, -4, 0.3), (3, -9, 1.5), (-2, 7, 0.8)):
+        along, off = (rays[..., 0] * x + rays[..., 1] * y) / level, np.abs(rays[..., 0] * y - rays[..., 1] * x) / level
+        hit = np.where((off < radius) & (along > 0), (along - np.sqrt(np.maximum(radius**2 - off**2, 0))) / level, 1e9)
+        distance = np.minimum(distance, np.where(hit * rays[..., 2] < 1.0, hit, np.inf))
+    points = (rays * distance[..., None] + (0, 0, 1.8))[distance < 60]
+    return Scene(points=points.astype(np.float32))
+
+
+def front(rig: Rig) -> Rig:
+    return rig.with_cameras(list(rig)[:2])
+
+
 CASES: dict[str, tuple[Rig, Rig, str, Scene]] = {
     "pinholes to lenses": (nuscenes(), load_rig("waymo").resized((96, 264)), "street", Scene()),
     "turned in place, magnified and masked": (
@@ -106,6 +125,9 @@ CASES: dict[str, tuple[Rig, Rig, str, Scene]] = {
     "radtan, boxes": (radtan(), nuscenes().shifted(z_m=0.4), "objects", boxes()),
     "boxes": (masked(nuscenes()), nuscenes().shifted(z_m=0.6), "objects", boxes()),
     "fisheyes, boxes": (fisheye(), nuscenes().shifted(z_m=0.6), "auto", boxes()),
+    "points": (front(masked(nuscenes())), front(nuscenes().shifted(z_m=0.6)).resized(0.6), "lidar", measured()),
+    "fisheye, points": (Rig([fisheye()[0]]), Rig([nuscenes()[0].shifted(z_m=0.4)]), "auto", measured()),
+    "no points": (nuscenes(), nuscenes().shifted(z_m=0.6), "lidar", Scene(points=np.zeros((0, 3)))),
     "no boxes": (nuscenes(), nuscenes().shifted(z_m=0.6), "objects", Scene(boxes=np.zeros((0, 7)))),
 }
 

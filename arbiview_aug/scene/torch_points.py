@@ -1,0 +1,212 @@
+"""Points made dense as tensors: ``scene.completion`` for batches of centres on any device."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rays import CameraMaps
+from arbiview_aug.cameras.torch_rays import on_device
+from arbiview_aug.scene.completion import _ASIDE, _FAR, _RADIUS, _REACH, _SHRINK, _SOME, _SUPPORT
+from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, NEAREST_M, STEP, STEP_PER_M, PanoramaWindow, angles
+from arbiview_aug.scene.point_cloud import _NODES_RAD, OWN_CAR_M, _nodes
+from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
+from arbiview_aug.scene.torch_surface import static_image
+
+_JUMPS = (32, 16, 8, 4, 2, 1, 2, 1)  # of the search for nearest seeds: up to 63 cells
+_NO_SEED = 64 * 1024 << 14
+_OWN = 64 * 128 + 64
+_max, _mean, _pad = torch.nn.functional.max_pool2d, torch.nn.functional.avg_pool2d, torch.nn.functional.pad
+
+
+class PanoramaViews:
+    """What points say around C cameras' centres, as ``point_cloud.Panorama``; layers are (C, H, W).
+
+    Args:
+        cameras: They decide what is seen of the sphere.
+        maps: Rays of cameras.
+        points: (C, P, 3) float64 ego frame; rows that are not finite are none.
+        ground_z_m: (C,) height of the road.
+    """
+
+    def __init__(
+        self, cameras: Sequence[Camera], maps: CameraMaps, points: torch.Tensor, ground_z_m: np.ndarray
+    ) -> None:
+        device = points.device
+        windows = [window_of(camera, maps) for camera in cameras]
+        self._shapes = on_device(np.array([window.shape for window in windows]), device)
+        self._size = tuple(max(sides) for sides in zip(*(window.shape for window in windows), strict=True))
+        self._place = on_device(np.stack([window.place for window in windows]), device)[:, :, None, None]
+        bounds = on_device(np.stack([window.bounds for window in windows]), device)
+        self._centers_m, self._ground_z_m = np.stack([camera.center_m for camera in cameras]), ground_z_m
+        q, residual = self._nearest_points(points, bounds)
+        q = torch.where(self._is_hidden(q), 0.0, q)
+        self._complete(q, residual)
+
+    def cells(self, rays: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Rows and columns (C, h, w) of ego-frame rays (C, 3, h, w)."""
+        first, lead, low, per_rad, turn = self._place.unbind(1)
+        x, y, z = rays.unbind(1)
+        column = (torch.atan2(y, x) - first) * per_rad - lead
+        column = column + (lead - torch.floor(column / turn) * turn)
+        return (math.pi / 2 - torch.atan2(torch.sqrt(x * x + y * y), z) - low) * per_rad, column
+
+    def read(self, layers: Sequence[torch.Tensor], rays: torch.Tensor) -> list[torch.Tensor]:
+        """Bilinear values (C, h, w) of layers along ego-frame rays (C, 3, h, w)."""
+        h, w = (n[:, None, None] - 1 for n in self._shapes.unbind(1))
+        row, column = (torch.minimum(p.clamp(min=0), n.float()) for p, n in zip(self.cells(rays), (h, w), strict=True))
+        r, c = row.long(), column.long()
+        s, t = row - r, column - c
+        r1, c1 = torch.minimum(r + 1, h), torch.minimum(c + 1, w)
+        number = torch.arange(len(h), device=rays.device)[:, None, None] * self._size[0]
+        corners = [
+            ((number + y) * self._size[1] + x, weight)
+            for y, x, weight in ((r, c, (1 - s) * (1 - t)), (r, c1, (1 - s) * t), (r1, c, s * (1 - t)), (r1, c1, s * t))
+        ]
+        flat = [layer.reshape(-1) for layer in layers]
+        return [sum((weight * layer[at] for at, weight in corners), torch.zeros_like(s)) for layer in flat]
+
+    def image(self, rays: torch.Tensor, street: torch.Tensor) -> torch.Tensor:
+        """The points' dense surface (C, h, w) over the street's, along ego-frame rays (C, 3, h, w)."""
+        share, near, far = self.read((self.share, self.near, self.far), rays)
+        return (street + torch.where(share > 0.5, near, far)).clamp(0, MAX_INVERSE_DISTANCE)
+
+    def hidden_below(self) -> torch.Tensor:
+        """As ``Panorama.hidden_below``."""
+        h, w = (torch.arange(0, n + BASE_STEP, BASE_STEP, device=self.near.device) * CELL_RAD for n in self._size)
+        first, _, low, _, _ = self._place.unbind(1)
+        azimuth, elevation = first + w, low + h[:, None]
+        level, up = elevation.cos(), elevation.sin().expand(-1, -1, len(w))
+        rays = torch.stack([level * azimuth.cos(), level * azimuth.sin(), up], 1)
+        static = upsampled(static_image(True, rays, self._centers_m, self._ground_z_m), BASE_STEP, self._size)
+        known = static + torch.where(self.share > 0.5, self.near, self.far)
+        silent = _max(_pad(1 - self.measured, [_SHRINK] * 4, value=1.0), 2 * _SHRINK + 1, stride=1)
+        return torch.where(silent == 0, _hidden(known), 0.0)
+
+    def _nearest_points(self, points: torch.Tensor, bounds: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Inverse distances and residuals (C, H, W) of the nearest point in each cell, 0 where there is none."""
+        (H, W), (count, most, _) = self._size, points.shape
+        away = points - on_device(self._centers_m, points.device)[:, None]
+        x, y, z = away.unbind(-1)
+        level2 = x * x + y * y
+        distance = torch.sqrt(level2 + z * z)
+        low, high, cosine, sine, least = bounds[:, :, None].unbind(1)
+        kept = (distance >= NEAREST_M) & (z >= low * distance) & (z <= high * distance)
+        kept &= x * cosine + y * sine >= least * torch.sqrt(level2)
+        (x0, x1), (y0, y1) = OWN_CAR_M
+        px, py, _ = points.unbind(-1)
+        kept &= ~((px > x0) & (px < x1) & (py > y0) & (py < y1))
+        rays = torch.where(kept[..., None], away / distance[..., None], 0.0).float().movedim(-1, 1)[:, :, None]
+        q = torch.where(kept, 1 / distance, 0.0).float()
+        row, column = (p[:, 0].round().long() for p in self.cells(rays))
+        turn, (h, w) = self._place[:, 4, 0].long(), self._shapes[:, :, None].unbind(1)
+        column = column % turn
+        number = torch.arange(most, device=points.device)
+        key = torch.zeros(count * H * W, dtype=torch.int64, device=points.device)
+        first = torch.arange(count, device=points.device)[:, None] * (H * W)
+        for shift in (0, 1):  # the halo of a whole turn holds some points twice
+            x = column + shift * turn
+            held = kept & (row >= 0) & (row < h) & (x < w)
+            at = torch.where(held, first + row * W + x, 0)
+            packed = torch.where(held, (q.view(torch.int32).long() << 32) | number, 0)
+            key.scatter_reduce_(0, at.flatten(), packed.flatten(), "amax")
+        residual = q - static_image(True, rays, self._centers_m, self._ground_z_m)[:, 0]
+        key = key.view(count, H, W)
+        nearest = (key >> 32).int().view(torch.float32)
+        own = residual.gather(1, (key & 0xFFFFFFFF).flatten(1)).view_as(nearest)
+        return nearest, torch.where(nearest > 0, own, 0.0)
+
+    def _inner(self, edge: int) -> torch.Tensor:
+        """Cells (C, H, W) that lie ``edge`` or more within their own window."""
+        y, x = (torch.arange(n, device=self._shapes.device) for n in self._size)
+        h, w = self._shapes[:, :, None, None].unbind(1)
+        return (y[:, None] >= edge) & (y[:, None] < h - edge) & (x >= edge) & (x < w - edge)
+
+    def _is_hidden(self, q: torch.Tensor) -> torch.Tensor:
+        """Points that shine through gaps of what is nearer on both sides of them."""
+        H, W = self._size
+        padded = _pad(q, (_FAR,) * 4)
+        across = _max(padded, (2 * _ASIDE + 1, _FAR), stride=1)[:, _FAR - _ASIDE :]
+        down = _max(padded, (_FAR, 2 * _ASIDE + 1), stride=1)[:, :, _FAR - _ASIDE :]
+        one = torch.minimum(across[:, :H, :W], across[:, :H, _FAR + 1 : _FAR + 1 + W])
+        two = torch.minimum(down[:, :H, :W], down[:, _FAR + 1 : _FAR + 1 + H, :W])
+        return (q < _hidden(torch.maximum(one, two))) & self._inner(_FAR)
+
+    def _complete(self, q: torch.Tensor, residual: torch.Tensor) -> None:
+        """Give every cell the residual of the nearest point, averaged on both sides of a step."""
+        code = spread(torch.where(q > 0, _OWN, _NO_SEED).int())
+        away = (code >> 14).float() / 1024
+        self.measured = (away <= float(_SUPPORT)).float()
+        H, W = self._size
+        y, x = (torch.arange(n, device=q.device) for n in self._size)
+        row = (y[:, None] + ((code >> 7) & 127) - 64).clamp(0, H - 1)
+        column = (x + (code & 127) - 64).clamp(0, W - 1)
+        seed = (row * W + column).flatten(1).long()
+        reached = away < float(_REACH)
+        r, q = (torch.where(reached, p.flatten(1).gather(1, seed).view_as(p), 0.0) for p in (residual, q))
+        r = r * (2 - 2 * away / float(_REACH)).clamp(max=1)
+        some = float(_SOME)
+        high, low = _around(r, 2 * _RADIUS, _max), -_around(-r, 2 * _RADIUS, _max)
+        nearer = (2 * r > high + low).float()
+        share, every, part = (_around(p, _RADIUS, _mean) for p in (nearer, r, r * nearer))
+        high, low = _around(r, _RADIUS, _max), -_around(-r, _RADIUS, _max)
+        flat, inner = high - low <= STEP * q + STEP_PER_M, self._inner(3 * _RADIUS)
+        near = torch.where(share > some, part / share.clamp(min=some), r)
+        far = torch.where(1 - share > some, (every - part) / (1 - share).clamp(min=some), r)
+        near, far = torch.where(flat, every, near), torch.where(flat, every, far)
+        self.near, self.far = torch.where(inner, near, r), torch.where(inner, far, r)
+        self.share = torch.where(inner, share, 1.0)
+
+
+def window_of(camera: Camera, maps: CameraMaps) -> PanoramaWindow:
+    """The part of the sphere that is made dense for a camera."""
+    rays = maps.rays(camera)
+    step = max(1, int(_NODES_RAD * float(rays.parameters[0])))
+    _, directions = _nodes(rays, step, camera.cam2ego[:3, :3])
+    return PanoramaWindow.around(*angles(directions if directions.size else np.array([[1.0, 0.0, 0.0]]))).widened()
+
+
+def upsampled(nodes: torch.Tensor, step: int, size: Sequence[int]) -> torch.Tensor:
+    """Bilinear values (V, h, w) between nodes (V, ny + 1, nx + 1) ``step`` apart."""
+    y, x = (torch.arange(n, device=nodes.device) for n in size)
+    (j, t), (i, k) = ((p // step, (p % step).float()) for p in (y, x))
+    rows = nodes[:, j] + (nodes[:, j + 1] - nodes[:, j]) * (t / step)[:, None]
+    return rows[:, :, i] + (rows.diff() / step)[:, :, i] * k
+
+
+def spread(code: torch.Tensor) -> torch.Tensor:
+    """Every cell's nearest seed by jump flooding; codes (C, H, W) int32 are those of ``completion.spread``."""
+    H, W = code.shape[1:]
+    for jump in _JUMPS:
+        padded, best = _pad(code, (jump,) * 4, value=_NO_SEED), code
+        for dy in (-jump, 0, jump):
+            for dx in (-jump, 0, jump):
+                if dy == dx == 0:
+                    continue
+                there = padded[:, jump + dy : jump + dy + H, jump + dx : jump + dx + W]
+                y, x = ((there >> 7) & 127) - 64 + dy, (there & 127) - 64 + dx
+                long, short = torch.maximum(y.abs(), x.abs()), torch.minimum(y.abs(), x.abs())
+                away = torch.where(
+                    long >= 2 * short, (long - 2 * short) * 1024 + short * 2250,
+                    (2 * short - long) * 1434 + (long - short) * 2250,
+                )  # fmt: skip
+                new = (away << 14) + ((y + 64) << 7) + x + 64
+                best = torch.minimum(best, torch.where((there < _NO_SEED) & (long < 63), new, _NO_SEED))
+        code = best
+    return code
+
+
+def _hidden(known: torch.Tensor) -> torch.Tensor:
+    """As ``completion._hidden_below``."""
+    known = known.clamp(min=0)
+    return known / (1.1 + 0.3 * known)
+
+
+def _around(image: torch.Tensor, radius: int, pool: Any) -> torch.Tensor:
+    """Pooled (C, H, W) over squares about each cell."""
+    return pool(_pad(image, [radius] * 4, mode="replicate"), 2 * radius + 1, stride=1)
