@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -36,39 +35,13 @@ class FixedMap:
     frac: npt.NDArray[np.uint16]
 
     @classmethod
-    def from_float(cls, uv: npt.NDArray[np.float32]) -> FixedMap:
-        """Round a float map (h, w, 2) to 32nds of a pixel."""
-        return cls(*cv2.convertMaps(uv, None, cv2.CV_16SC2))  # type: ignore[call-overload]
-
-    @classmethod
-    def in_slot(cls, uv: npt.NDArray[np.float32], slot: Slot) -> FixedMap:
-        """A float map (h, w, 2) in the image of a slot, as positions in the atlas.
-
-        Rounded first: float32 has 1/512 px left in an atlas's last rows, whole pixels are added exactly.
-        """
-        fixed = cls.from_float(uv)
-        for axis, first in enumerate((slot.x, slot.y)):
-            if first:
-                fixed.xy[..., axis] += np.int16(first)
-        return fixed
-
-    @classmethod
     def outside(cls, size: tuple[int, int], memory: Memory = FRESH) -> FixedMap:
         """A map (h, w) that reads nothing."""
         return cls(memory.full((*size, 2), OUTSIDE, np.int16), memory.full(size, 0, np.uint16))
 
-    def put(self, part: FixedMap, where: npt.NDArray[np.uint8]) -> None:
-        """Take another map's positions where ``where`` (h, w) is not 0."""
-        cv2.copyTo(part.xy, where, self.xy)
-        cv2.copyTo(part.frac, where, self.frac)
-
     def part(self, rows: slice, columns: slice) -> FixedMap:
         """A rectangle of it, the same memory."""
         return FixedMap(self.xy[rows, columns], self.frac[rows, columns])
-
-    def copy(self) -> FixedMap:
-        """The same map in memory of its own."""
-        return FixedMap(self.xy.copy(), self.frac.copy())
 
     def rounded(self) -> FixedMap:
         """The same map at the nearest whole pixels."""
@@ -109,10 +82,6 @@ class Slot:
     def to_source(self, at: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
         """The inverse of ``from_source``."""
         return (at - (self.x, self.y) + 0.5) * 2**self.level - 0.5
-
-    def alone(self) -> Slot:
-        """The same image in an atlas of its own: what it sees must not depend on the images above it."""
-        return Slot(self.source, self.level, 0, 0, self.size)
 
 
 @dataclass(frozen=True)
