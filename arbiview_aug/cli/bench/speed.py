@@ -45,7 +45,7 @@ from arbiview_aug.render.plan import compile_kernels
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
-REPEATS = 9
+REPEATS = 5
 FULL_SIZE = (900, 1600)
 BOXES = (10, 30, 75, 150)
 BOUNDS: Mapping[tuple[int, int], Mapping[str, float]] = {
