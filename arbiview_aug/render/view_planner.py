@@ -26,6 +26,7 @@ from arbiview_aug.render.confidence import certainty
 from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.render.seams import blend_regions, seam_weights
 from arbiview_aug.render.view_plan import BilinearFallback, SourceUse, ViewPlan
+from arbiview_aug.scene.point_cloud import occlusion_level
 from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
 from arbiview_aug.scene.surface import Surface
@@ -282,7 +283,7 @@ class ViewPlanner:
         shadow_scale = 1.0
         if surface.is_layered or surface.is_dense:
             # Points are known by cells: a pixel for each is enough. Silhouettes of objects are sharper.
-            coarser = level if surface.is_layered else max(level, surface.occlusion_level(source))
+            coarser = level if surface.is_layered else max(level, occlusion_level(source))
             half = halved_camera(source, coarser)
             shadow, solid = surface.occlusion_map(half, self.maps.rays(half), self.maps.memory)
             shadow_scale = 0.5 ** (coarser - level)

@@ -8,20 +8,9 @@ import numpy as np
 
 from arbiview_aug.cameras.kernels import angle_row, rays_row
 from arbiview_aug.environment import compiled
+from arbiview_aug.scene import panorama
 from arbiview_aug.scene.kernels import columns_of_box, slabs_row, upsampled_row
-from arbiview_aug.scene.panorama import (
-    BASE_STEP,
-    CELL_RAD,
-    NEAREST_M,
-    REACH_RAD,
-    SEE_THROUGH_RAD,
-    SHRINK_RAD,
-    SIDE_RAD,
-    SMOOTH_RAD,
-    STEP,
-    STEP_PER_M,
-    SUPPORT_RAD,
-)
+from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, NEAREST_M
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
@@ -32,22 +21,17 @@ _CHUNK = 1024  # points worked on at once
 
 # A cell's nearest seed in one int32, so that the nearer of two is their minimum: distance in 1/1024 cell (from bit 14),
 # row (from bit 7) and column of the seed as seen from the cell, plus 64. Distances are those of Borgefors' 5 x 5 mask.
-_UNIT, _ROW, _MIDDLE = 1 << 14, 1 << 7, 64
-_NO_SEED = np.int32(64 * 1024 * _UNIT)
-_OWN = np.int32(64 * 128 + 64)
-_SIDE, _CORNER, _KNIGHT = 1024 * _UNIT, 1434 * _UNIT, 2250 * _UNIT
-_REACH = np.float32(REACH_RAD / CELL_RAD)
-_SUPPORT = np.float32(SUPPORT_RAD / CELL_RAD)
-
-_FAR, _ASIDE = round(SEE_THROUGH_RAD / CELL_RAD), round(SIDE_RAD / CELL_RAD)
-_RADIUS = max(1, round(SMOOTH_RAD / 2 / CELL_RAD))
-_SHRINK = max(1, round(SHRINK_RAD / CELL_RAD))
-_STEP, _STEP_PER_M, _SOME = np.float32(STEP), np.float32(STEP_PER_M), np.float32(1e-3)
+_ROW, _OWN, _NO_SEED = 1 << 7, np.int32(64 * 128 + 64), np.int32(1 << 30)
+_SIDE, _CORNER, _KNIGHT = 1024 << 14, 1434 << 14, 2250 << 14
+_REACH, _SUPPORT = np.float32(panorama.REACH_RAD / CELL_RAD), np.float32(panorama.SUPPORT_RAD / CELL_RAD)
+_FAR, _ASIDE = round(panorama.SEE_THROUGH_RAD / CELL_RAD), round(panorama.SIDE_RAD / CELL_RAD)
+_RADIUS, _SHRINK = round(panorama.SMOOTH_RAD / 2 / CELL_RAD), round(panorama.SHRINK_RAD / CELL_RAD)
+_STEP, _STEP_PER_M, _SOME = np.float32(panorama.STEP), np.float32(panorama.STEP_PER_M), np.float32(1e-3)
 
 
 @compiled
 def cells_row(x: Any, y: Any, z: Any, place: Any, level: Any, row: Any, column: Any) -> None:
-    """Rows and columns (n,) in a panorama (``PanoramaWindow.place``) of ego-frame vectors; ``level`` is scratch."""
+    """Rows and columns (n,) in a panorama (``Window.place``) of ego-frame vectors; ``level`` is scratch."""
     first, lead, low, per_rad, turn = place[0], place[1], place[2], place[3], place[4]
     n = x.shape[0]
     for i in range(n):
@@ -67,15 +51,10 @@ def cells_row(x: Any, y: Any, z: Any, place: Any, level: Any, row: Any, column: 
 
 @compiled
 def nearest_points(points: Any, origin: Any, bounds: Any, place: Any, q: Any, number: Any) -> None:
-    """Z-buffer the points (P, 3) around ``origin``: their largest inverse distance in each cell, and whose it is.
+    """Z-buffer the points (P, 3) around ``origin`` in a window (``Window.bounds``, ``Window.place``).
 
-    Args:
-        points: Ego frame, metres.
-        origin: (3,) float64.
-        bounds: ``PanoramaWindow.bounds``.
-        place: ``PanoramaWindow.place``.
-        q: (h, w) float32, 0; written where there is a point.
-        number: (h, w) int32; written where there is a point, of equally near ones the last.
+    ``q`` (h, w), 0 before, becomes the largest inverse distance of points in a cell, ``number`` (h, w) int32 whose it
+    is, of equally near ones the last's.
     """
     (h, w), turn = q.shape, int(place[4])
     low, high, cosine, sine, least = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
@@ -86,19 +65,15 @@ def nearest_points(points: Any, origin: Any, bounds: Any, place: Any, q: Any, nu
             x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
             level2 = x * x + y * y
             length = np.sqrt(level2 + z * z)
-            if length < NEAREST_M or z < low * length or z > high * length:
-                continue
-            if x * cosine + y * sine < least * np.sqrt(level2):
-                continue
-            work[0, n], work[1, n], work[2, n], work[3, n] = x / length, y / length, z / length, 1 / length
-            index[n] = i
-            n += 1
+            if length >= NEAREST_M and low * length <= z <= high * length:
+                if x * cosine + y * sine >= least * np.sqrt(level2):
+                    work[0, n], work[1, n], work[2, n], work[3, n] = x / length, y / length, z / length, 1 / length
+                    index[n] = i
+                    n += 1
         cells_row(work[0, :n], work[1, :n], work[2, :n], place, work[4, :n], work[5, :n], work[6, :n])
         for i in range(n):
             row, column = int(np.rint(work[5, i])), int(np.rint(work[6, i])) % turn
-            if row < 0 or row >= h:
-                continue
-            while column < w:  # the halo of a whole turn holds some points twice
+            while 0 <= row < h and column < w:  # the halo of a whole turn holds some points twice
                 if work[3, i] >= q[row, column]:
                     q[row, column], number[row, column] = work[3, i], index[i]
                 column += turn
@@ -137,19 +112,13 @@ def drop_hidden(q: Any, number: Any, points: Any, origin: Any) -> tuple[Any, Any
 
 
 @compiled
-def complete(cells: Any, own: Any, residuals: Any, near: Any, far: Any, share: Any, measured: Any) -> None:
+def complete(cells: Any, own: Any, residuals: Any, layers: Any) -> None:
     """Give every cell the residual of the nearest point, averaged on a step's nearer and on its farther side.
 
-    Args:
-        cells: (n,) flat indices of cells that have a point.
-        own: (n,) their inverse distances.
-        residuals: (n,) what they add to the static surface.
-        near: (h, w) float32, written as are the further ones: see ``Panorama``.
-        far: See there.
-        share: See there.
-        measured: See there.
+    ``layers`` (4, h, w) becomes those of ``Panorama``; the points' flat cells, inverse distances, residuals are (n,).
     """
-    h, w = near.shape
+    measured = layers[3]
+    h, w = measured.shape
     code = np.full((h + 4, w + 4), _NO_SEED, np.int32)
     r, q = np.empty((h, w), np.float32), np.empty((h, w), np.float32)
     for i in range(cells.shape[0]):
@@ -170,7 +139,7 @@ def complete(cells: Any, own: Any, residuals: Any, near: Any, far: Any, share: A
                 fade = min(_TWO - _TWO * away[x] / _REACH, _ONE)
                 from_y, from_x = seed(code[y + 2, x + 2])
                 r[y, x], q[y, x] = r[y + from_y, x + from_x] * fade, q[y + from_y, x + from_x]
-    _average_sides(r, q, near, far, share)
+    _average_sides(r, q, layers[0], layers[1], layers[2])
 
 
 @compiled
@@ -202,7 +171,7 @@ def spread(code: Any) -> None:
 @compiled
 def seed(code: int) -> tuple[int, int]:
     """Rows and columns from a cell to its nearest seed."""
-    return ((code >> 7) & 127) - _MIDDLE, (code & 127) - _MIDDLE
+    return ((code >> 7) & 127) - 64, (code & 127) - 64
 
 
 @compiled
@@ -309,12 +278,13 @@ def _hidden_below(known: Any) -> Any:
 
 
 @compiled
-def hidden_depths(near: Any, far: Any, share: Any, measured: Any, base: Any, out: Any) -> None:
-    """Inverse distances (h, w) below which points are hidden; 0 where nothing was measured.
+def hidden_depths(layers: Any, base: Any, out: Any) -> None:
+    """Inverse distances (h, w) below which points are hidden by a panorama's layers; 0 where nothing was measured.
 
-    ``base`` (ny + 1, nx + 1) is the static surface, on every ``BASE_STEP``-th cell; the others are a panorama's.
+    ``base`` (ny + 1, nx + 1) is the static surface, on every ``BASE_STEP``-th cell.
     """
-    h, w = near.shape
+    h, w = out.shape
+    near, far, share, measured = layers[0], layers[1], layers[2], layers[3]
     side = 2 * _SHRINK
     silent, line = _ONE - measured, np.empty(base.shape[1], np.float32)
     _window_max(silent, side + 1, side + 1)
@@ -334,7 +304,7 @@ def hidden_depths(near: Any, far: Any, share: Any, measured: Any, base: Any, out
 
 @compiled
 def cells_of(rays: Any, R: Any, place: Any, rows: Any, columns: Any) -> None:
-    """Rows and columns (ny, nx) in a panorama (``PanoramaWindow.place``) of rays (3, ny, nx) turned by ``R``."""
+    """Rows and columns (ny, nx) in a panorama (``Window.place``) of rays (3, ny, nx) turned by ``R``."""
     work = np.empty((4, rays.shape[2]), np.float32)
     for y in range(rays.shape[1]):
         _turned_row(R, rays[0, y], rays[1, y], rays[2, y], work[0], work[1], work[2])
@@ -408,34 +378,33 @@ def _between_rows(nodes: Any, step: int, y: int, h: int, around: Any, out: Any) 
 
 
 @compiled
-def add_residuals(rows: Any, columns: Any, step: int, near: Any, far: Any, share: Any, q: Any) -> None:
+def add_residuals(rows: Any, columns: Any, step: int, layers: Any, q: Any) -> None:
     """Add a panorama's residuals to inverse distances (h, w), clipped to what a surface may say.
 
     Args:
         rows: (ny + 1, nx + 1) rows of the panorama at nodes.
         columns: (ny + 1, nx + 1) its columns.
         step: Distance of the nodes, pixels; the last ones lie on the last pixel.
-        near: (H, W) residual of the nearer side of a step.
-        far: (H, W) that of the farther one.
-        share: (H, W) share of the nearer side.
+        layers: ``Panorama.layers``.
         q: (h, w) float32, updated.
     """
     h, w = q.shape
-    (rows_of_all, all_columns), n = near.shape, near.size
-    nears, fars, shares = near.reshape(n), far.reshape(n), share.reshape(n)
+    _, height, width = layers.shape
+    flat = layers.reshape(4, height * width)
+    near, far, share = flat[0], flat[1], flat[2]
     around, first, work = np.full((2, 2, w + 1), -1, np.float32), np.empty(w, np.uint32), np.empty((4, w), np.float32)
     v, u, down, right = work[0], work[1], work[2], work[3]
     for y in range(h):
         _between_rows(rows, step, y, h, around[0], v)
         _between_rows(columns, step, y, h, around[1], u)
-        _blocks_row(v, u, rows_of_all, all_columns, first, down, right)
+        _blocks_row(v, u, height, width, first, down, right)
         out = q[y]
         for x in range(w):
             i, s, t = first[x], down[x], right[x]
-            if _mixed(shares, i, all_columns, s, t) > _HALF:
-                value = _mixed(nears, i, all_columns, s, t)
+            if _mixed(share, i, width, s, t) > _HALF:
+                value = _mixed(near, i, width, s, t)
             else:
-                value = _mixed(fars, i, all_columns, s, t)
+                value = _mixed(far, i, width, s, t)
             out[x] = min(max(out[x] + value, _ZERO), _MOST)
 
 

@@ -9,12 +9,9 @@ share is one half. Interpolating the two layers and the share apart keeps outlin
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-
-from arbiview_aug.cameras.lens import FloatArray
 
 Layer = npt.NDArray[np.float32]
 
@@ -55,87 +52,7 @@ NEAREST_M = 0.5
 """Nearer to a centre than this nothing of the scene stands: such points are the vehicle's, or the camera itself."""
 
 BASE_STEP = 4  # cells, 0.8 degrees: a static surface is smooth
-_ROOM_RAD = math.radians(1.0)  # panoramas are this much wider than what is asked first: later questions fit in
-_HALO_RAD = math.radians(4.0)  # points around a window that its filters need
+HALO = round(math.radians(4.0) / CELL_RAD)
+"""Cells around a window that its filters need."""
 
-
-@dataclass(frozen=True)
-class PanoramaWindow:
-    """A part of the sphere: azimuths from ``start_rad`` over ``width_rad``, elevations from ``low_rad`` up."""
-
-    start_rad: float
-    width_rad: float
-    low_rad: float
-    height_rad: float
-
-    @classmethod
-    def around(cls, azimuth: Layer, elevation: Layer) -> PanoramaWindow:
-        """The smallest window that holds rays (...,)."""
-        middle = float(azimuth.reshape(-1)[0])
-        offset = wrapped(azimuth - middle)
-        if float(offset.max() - offset.min()) > math.pi:  # they may lie around the back of the first one
-            middle = math.atan2(float(np.sin(azimuth).mean()), float(np.cos(azimuth).mean()))
-            offset = wrapped(azimuth - middle)
-        low, first = float(elevation.min()), float(offset.min())
-        return cls(middle + first, float(offset.max()) - first, low, float(elevation.max()) - low)
-
-    def widened(self) -> PanoramaWindow:
-        """With room for later questions; all around where little is missing from it."""
-        # Starts on a common raster: a centre's panoramas agree where they overlap.
-        low = max(_floored(self.low_rad - _ROOM_RAD), -math.pi / 2)
-        height = min(self.low_rad + self.height_rad + _ROOM_RAD, math.pi / 2) - low
-        if self.width_rad > 2 * math.pi - 4 * _ROOM_RAD:
-            return PanoramaWindow(-math.pi, 2 * math.pi, low, height)
-        start = _floored(self.start_rad - _ROOM_RAD)
-        return PanoramaWindow(start, self.start_rad + self.width_rad + _ROOM_RAD - start, low, height)
-
-    def holds(self, other: PanoramaWindow) -> bool:
-        """Whether another window lies within this one."""
-        ahead = (other.start_rad - self.start_rad + 1e-9) % (2 * math.pi)
-        sideways = self.is_whole or ahead + other.width_rad <= self.width_rad + 2e-9
-        above = other.low_rad >= self.low_rad - 1e-9
-        return sideways and above and other.low_rad + other.height_rad <= self.low_rad + self.height_rad + 1e-9
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether it goes all around."""
-        return self.width_rad >= 2 * math.pi - 1e-9
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns, with the halo."""
-        h, w = (math.ceil((side + 2 * _HALO_RAD) / CELL_RAD) + 1 for side in (self.height_rad, self.width_rad))
-        return h, w
-
-    @property
-    def place(self) -> Layer:
-        """(5,) azimuth of column 0, the column where a turn ends, elevation of row 0, cells per radian and per turn."""
-        # In a whole turn the halo at the start lacks what lies before it; that at the end has both.
-        lead = _HALO_RAD / CELL_RAD if self.is_whole else 0.0
-        first, low = self.start_rad - _HALO_RAD, self.low_rad - _HALO_RAD
-        return np.array([first, lead, low, 1 / CELL_RAD, round(2 * math.pi / CELL_RAD)], np.float32)
-
-    @property
-    def bounds(self) -> FloatArray:
-        """(5,) sines of the lowest and highest elevation, cosine and sine of the middle azimuth, cosine of half the
-        width: two cells beyond the halo."""
-        slack = _HALO_RAD + 2 * CELL_RAD
-        middle, half = self.start_rad + self.width_rad / 2, min(self.width_rad / 2 + slack, math.pi)
-        low, high = max(self.low_rad - slack, -math.pi / 2), min(self.low_rad + self.height_rad + slack, math.pi / 2)
-        return np.array([math.sin(low), math.sin(high), math.cos(middle), math.sin(middle), math.cos(half)])
-
-
-def angles(directions: FloatArray) -> tuple[Layer, Layer]:
-    """Azimuth and elevation (...,) of unit rays (..., 3), radians; float32 is precise to 1/10000 of a cell."""
-    x, y, z = (directions[..., k].astype(np.float32) for k in range(3))
-    return np.arctan2(y, x), np.arcsin(np.clip(z, -1, 1))
-
-
-def _floored(angle_rad: float) -> float:
-    return math.floor(angle_rad / CELL_RAD) * CELL_RAD
-
-
-def wrapped(angle: Layer) -> Layer:
-    """Differences of two azimuths, in [-pi, pi]."""
-    turn = np.float32(2 * math.pi)
-    return np.where(angle > math.pi, angle - turn, np.where(angle < -math.pi, angle + turn, angle))
+TURN = round(2 * math.pi / CELL_RAD)

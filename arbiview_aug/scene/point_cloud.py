@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from arbiview_aug.cameras.rays import CELL_PX, PixelRays
 from arbiview_aug.errors import SampleError
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene.boxes import BoxSurface, box_rows
-from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, SIDE_RAD, Layer, PanoramaWindow, angles
+from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, HALO, SIDE_RAD, TURN, Layer
 from arbiview_aug.scene.scanned_objects import BOX_AIR_M, RASTER_RAD, ScannedObject, scanned_objects
 from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Points, StaticSurface
 
@@ -31,75 +32,114 @@ _STEEP = 0.9
 _NODES_RAD = 4 * CELL_RAD
 """Distance of nodes between which positions in a panorama are interpolated, to 1/50 of a cell."""
 
+_ROOM = 5  # cells by which panoramas are wider than what is asked first: later questions fit in
+
 _AIR = np.array([BOX_AIR_M, SIDE_RAD / RASTER_RAD], np.float32)
 
 _MEASURED_SPREAD = 0.05
 """Spread of a measured inverse distance, as a share of it: half of STEP, below which densification follows a slope."""
 
 
-@dataclass(frozen=True, eq=False)
+class Window(NamedTuple):
+    """A part of the sphere, in cells: row 0 begins at the horizon, column 0 straight ahead."""
+
+    row: int
+    column: int
+    rows: int
+    columns: int
+
+    @classmethod
+    def around(cls, directions: FloatArray, room: int = 0) -> Window:
+        """The smallest window that holds unit rays (n, 3), with room around it; all around where little is missing."""
+        if not len(directions):
+            return cls(0, 0, 1, 1)
+        x, y, z = directions.T
+        middle = math.atan2(y.sum(), x.sum())
+        azimuth = (np.arctan2(y, x) - middle + math.pi) % (2 * math.pi) - math.pi + middle
+        elevation = np.arcsin(np.clip(z, -1, 1))
+        row, column = (math.floor(a.min() / CELL_RAD) - room for a in (elevation, azimuth))
+        rows, columns = (
+            math.ceil(a.max() / CELL_RAD) + room - first for a, first in ((elevation, row), (azimuth, column))
+        )
+        row, top = max(row, -TURN // 4), min(row + rows, TURN // 4)
+        return cls(row, column, top - row, columns) if columns <= TURN - 2 * _ROOM else cls(row, 0, top - row, TURN)
+
+    def holds(self, other: Window) -> bool:
+        """Whether another window lies within this one."""
+        beside = self.columns >= TURN or (other.column - self.column) % TURN + other.columns <= self.columns
+        return beside and self.row <= other.row and other.row + other.rows <= self.row + self.rows
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns, with the halo."""
+        return self.rows + 2 * HALO + 1, self.columns + 2 * HALO + 1
+
+    @property
+    def place(self) -> Layer:
+        """(5,) azimuth of column 0, the column where a turn ends, elevation of row 0, cells per radian and per turn.
+
+        Rows and columns are counted from the halo. That of a whole turn lacks at its start what lies before it; that at
+        its end has both.
+        """
+        lead = HALO if self.columns >= TURN else 0
+        return np.array(
+            [(self.column - HALO) * CELL_RAD, lead, (self.row - HALO) * CELL_RAD, 1 / CELL_RAD, TURN], np.float32
+        )
+
+    @property
+    def bounds(self) -> FloatArray:
+        """(5,) sines of the lowest and highest elevation, cosine and sine of the middle azimuth, cosine of half the
+        width: two cells beyond the halo."""
+        low, high = np.clip([self.row - HALO - 2, self.row + self.rows + HALO + 2], -TURN // 4, TURN // 4) * CELL_RAD
+        middle, half = self.column + self.columns / 2, min(self.columns / 2 + HALO + 2, TURN / 2)
+        cosine, sine = math.cos(middle * CELL_RAD), math.sin(middle * CELL_RAD)
+        return np.array([math.sin(low), math.sin(high), cosine, sine, math.cos(half * CELL_RAD)])
+
+
 class Panorama:
-    """What the points say within a window of one centre's view; residuals in 1/m, all (rows, columns).
-
-    Attributes:
-        window: Which part of the sphere.
-        origin: (3,) the centre.
-        base: The static surface under the residuals.
-        near: Residual of the nearer side of a step, or of everything where there is none.
-        far: That of the farther side.
-        share: How much of the neighbourhood belongs to the nearer side.
-        measured: 1 where a point lies within ``SUPPORT_RAD``, else 0.
-    """
-
-    window: PanoramaWindow
-    origin: FloatArray
-    base: StaticSurface
-    near: Layer
-    far: Layer
-    share: Layer
-    measured: Layer
-
-    @cached_property
-    def hidden_below(self) -> Layer:
-        """Points of a smaller inverse distance are hidden by what certainly stands there; 0 where nothing was
-        measured."""
-        from arbiview_aug.scene.completion import hidden_depths
-
-        h, w = self.near.shape
-        rows, columns = (np.arange(0, n + BASE_STEP, BASE_STEP) * np.float32(CELL_RAD) for n in (h, w))
-        azimuth, elevation = self.window.place[0] + columns, (self.window.place[2] + rows)[:, None]
-        level, up = np.cos(elevation), np.broadcast_to(np.sin(elevation), (len(rows), len(columns)))
-        rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up])
-        out = np.empty((h, w), np.float32)
-        hidden_depths(self.near, self.far, self.share, self.measured, self.base.along(self.origin, rays), out)
-        return out
-
-    def cells(self, rays: Layer, R: FloatArray) -> tuple[Layer, Layer]:
-        """Rows and columns (h, w) of rays (3, h, w) that ``R`` turns to the ego frame; beyond the end they exceed the
-        shape."""
-        from arbiview_aug.scene.completion import cells_of
-
-        rows, columns = np.empty(rays.shape[1:], np.float32), np.empty(rays.shape[1:], np.float32)
-        cells_of(rays, R.astype(np.float32), self.window.place, rows, columns)
-        return rows, columns
-
-
-def panorama(window: PanoramaWindow, origin: FloatArray, points: Points, base: StaticSurface) -> Panorama:
-    """The points (P, 3) as seen from ``origin`` (3,), made dense over a static surface.
+    """What the points (P, 3) say within a window of the view from ``origin`` (3,), made dense over a static surface.
 
     Nearest point first in each cell, none within ``NEAREST_M``; points that shine through gaps of what is nearer are
     dropped; each cell takes the residual of its nearest point; residuals are averaged, on both sides of a step apart.
-    """
-    from arbiview_aug.scene.completion import complete, drop_hidden, nearest_points
 
-    shape = window.shape
-    q, number = np.zeros(shape, np.float32), np.empty(shape, np.int32)
-    nearest_points(points, origin, window.bounds, window.place, q, number)
-    cells, rays = drop_hidden(q, number, points, origin)
-    own = q.reshape(-1)[cells]
-    view = Panorama(window, origin, base, *np.empty((4, *shape), np.float32))
-    complete(cells, own, own - base.along(origin, rays)[0], view.near, view.far, view.share, view.measured)
-    return view
+    Attributes:
+        layers: (4, rows, columns) residual of the nearer side of a step, or of everything where there is none, 1/m;
+            that of the farther side; the nearer side's share of the neighbourhood; 1 where a point lies within
+            ``SUPPORT_RAD``, else 0.
+    """
+
+    def __init__(self, window: Window, origin: FloatArray, points: Points, street: StaticSurface) -> None:
+        from arbiview_aug.scene.completion import complete, drop_hidden, nearest_points
+
+        self.window, self._origin, self._street, self._place = window, origin, street, window.place
+        shape = window.shape
+        q, number = np.zeros(shape, np.float32), np.empty(shape, np.int32)
+        nearest_points(points, origin, window.bounds, self._place, q, number)
+        cells, rays = drop_hidden(q, number, points, origin)
+        own = q.reshape(-1)[cells]
+        self.layers = np.empty((4, *shape), np.float32)
+        complete(cells, own, own - street.along(origin, rays)[0], self.layers)
+
+    @cached_property
+    def hidden_below(self) -> Layer:
+        """Points of a smaller inverse distance are hidden by what certainly stands there; 0 where it is silent."""
+        from arbiview_aug.scene.completion import hidden_depths
+
+        rows, columns = (np.arange(0, n + BASE_STEP, BASE_STEP) * np.float32(CELL_RAD) for n in self.layers.shape[1:])
+        azimuth, elevation = self._place[0] + columns, (self._place[2] + rows)[:, None]
+        level, up = np.cos(elevation), np.broadcast_to(np.sin(elevation), (len(rows), len(columns)))
+        rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up])
+        hidden = np.empty(self.layers.shape[1:], np.float32)
+        hidden_depths(self.layers, self._street.along(self._origin, rays), hidden)
+        return hidden
+
+    def cells(self, rays: Layer, R: FloatArray) -> tuple[Layer, Layer]:
+        """Rows and columns (h, w) of rays (3, h, w) that ``R`` turns to the ego frame."""
+        from arbiview_aug.scene.completion import cells_of
+
+        rows, columns = np.empty((2, *rays.shape[1:]), np.float32)
+        cells_of(rays, R.astype(np.float32), self._place, rows, columns)
+        return rows, columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +168,7 @@ class PointCloudSurface(DenseSurface):
 
         q = self.street.image(camera, rays, memory)
         view, *cells = self._located(camera, rays)
-        add_residuals(*cells, view.near, view.far, view.share, q)
+        add_residuals(*cells, view.layers, q)
         self._draw_objects(camera, rays, SHOW, q)
         return q
 
@@ -142,10 +182,6 @@ class PointCloudSurface(DenseSurface):
             solid = memory.full(camera.size, -1, np.int32)
             self._shadows[camera] = OcclusionMap(self.hidden(camera, rays, memory), solid)
         return self._shadows[camera]
-
-    def occlusion_level(self, camera: Camera) -> int:
-        """Halvings up to which a pixel is not wider than a cell."""
-        return occlusion_level(camera)
 
     def hidden(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH, *, widened: bool = True) -> Layer:
         """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart.
@@ -169,7 +205,7 @@ class PointCloudSurface(DenseSurface):
         rays = np.moveaxis(directions.reshape(1, -1, 3), -1, 0).astype(np.float32, order="C")
         view = self.view(origin, directions)
         near = np.empty(rays.shape[2], np.float32)
-        read_layer(*(cells[0] for cells in view.cells(rays, np.eye(3))), view.measured, near)
+        read_layer(*(cells[0] for cells in view.cells(rays, np.eye(3))), view.layers[3], near)
         unknown = self.street.uncertainty(origin, directions, inverse_distance)
         return np.where(near.reshape(unknown.shape) > 0.5, _MEASURED_SPREAD * inverse_distance, unknown)
 
@@ -197,18 +233,18 @@ class PointCloudSurface(DenseSurface):
             view = self.view(camera.center_m, directions)
             # A lens may have no rays somewhere; azimuths bend near the zenith, and jump in a panorama all around.
             steep = len(directions) == 0 or float(np.abs(directions[:, 2]).max()) > _STEEP
-            if step > 1 and (steep or view.window.is_whole or len(directions) < local[0].size):
+            if step > 1 and (steep or view.window.columns >= TURN or len(directions) < local[0].size):
                 step, (local, _) = 1, _nodes(rays, 1, R)
             self._nodes[camera] = view, *view.cells(local, R), step
         return self._nodes[camera]
 
     def view(self, origin: FloatArray, directions: FloatArray) -> Panorama:
         """The panorama around a centre that holds rays (..., 3)."""
-        asked = PanoramaWindow.around(*angles(directions if directions.size else np.array([[1.0, 0.0, 0.0]])))
-        held = self._panoramas.setdefault(np.asarray(origin, np.float64).tobytes(), [])
+        directions = directions.reshape(-1, 3)
+        asked, held = Window.around(directions), self._panoramas.setdefault(origin.tobytes(), [])
         found = next((p for p in held if p.window.holds(asked)), None)
         if found is None:
-            found = panorama(asked.widened(), np.asarray(origin, np.float64), self.points, self.street)
+            found = Panorama(Window.around(directions, _ROOM), origin, self.points, self.street)
             held.append(found)
         return found
 

@@ -64,7 +64,7 @@ class Raster(NamedTuple):
     """An object's points as one centre sees them.
 
     Attributes:
-        place: As ``PanoramaWindow.place``.
+        place: As ``point_cloud.Window.place``.
         nearest: (rows, columns) inverse distances, those between points from the nearest cell.
         top: (columns,) rows of the highest points.
     """

@@ -109,10 +109,6 @@ class DenseSurface(Surface):
     def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
         """The surface as an occluder in a source image."""
 
-    @abstractmethod
-    def occlusion_level(self, camera: Camera) -> int:
-        """Halvings of a source image at which its occlusion map loses nothing."""
-
 
 class StaticSurface(Surface):
     """A surface without objects, which occludes nothing."""

@@ -13,8 +13,8 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import CameraMaps
 from arbiview_aug.cameras.torch_rays import on_device
 from arbiview_aug.scene.completion import _ASIDE, _FAR, _RADIUS, _REACH, _SHRINK, _SOME, _SUPPORT
-from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, NEAREST_M, STEP, STEP_PER_M, PanoramaWindow, angles
-from arbiview_aug.scene.point_cloud import _NODES_RAD, OWN_CAR_M, _nodes
+from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, NEAREST_M, STEP, STEP_PER_M
+from arbiview_aug.scene.point_cloud import _NODES_RAD, _ROOM, OWN_CAR_M, Window, _nodes
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 from arbiview_aug.scene.torch_surface import static_image
 
@@ -163,12 +163,12 @@ class PanoramaViews:
         self.share = torch.where(inner, share, 1.0)
 
 
-def window_of(camera: Camera, maps: CameraMaps) -> PanoramaWindow:
+def window_of(camera: Camera, maps: CameraMaps) -> Window:
     """The part of the sphere that is made dense for a camera."""
     rays = maps.rays(camera)
     step = max(1, int(_NODES_RAD * float(rays.parameters[0])))
     _, directions = _nodes(rays, step, camera.cam2ego[:3, :3])
-    return PanoramaWindow.around(*angles(directions if directions.size else np.array([[1.0, 0.0, 0.0]]))).widened()
+    return Window.around(directions, _ROOM)
 
 
 def upsampled(nodes: torch.Tensor, step: int, size: Sequence[int]) -> torch.Tensor:

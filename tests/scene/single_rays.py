@@ -22,8 +22,8 @@ def inverse_distance(surface: Surface, origin: np.ndarray, directions: np.ndarra
             shown &= first >= occlusion_depth(surface.street, origin, directions, widened=False)
         return np.where(shown, first, inverse_distance(surface.street, origin, directions))
     assert isinstance(surface, PointCloudSurface)
-    view = surface.view(origin, directions)
-    near, far, share = (layer_at(view, layer, directions) for layer in (view.near, view.far, view.share))
+    view = surface.view(np.asarray(origin, np.float64), directions)
+    near, far, share = (layer_at(view, layer, directions) for layer in view.layers[:3])
     q = surface.street.inverse_distance(origin, directions) + np.where(share > 0.5, near, far)
     flat = q.reshape(-1)
     for met, own, behind in _objects_on(surface, origin, directions):
@@ -49,7 +49,7 @@ def occlusion_depth(
     surface: PointCloudSurface, origin: np.ndarray, directions: np.ndarray, widened: bool = True
 ) -> np.ndarray:
     """Inverse distances (...,) beyond which points hide what is behind them."""
-    view = surface.view(origin, directions)
+    view = surface.view(np.asarray(origin, np.float64), directions)
     depth = layer_at(view, view.hidden_below, directions)
     flat = depth.reshape(-1)
     for met, own, behind in _objects_on(surface, origin, directions):
