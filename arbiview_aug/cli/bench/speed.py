@@ -37,7 +37,7 @@ from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
 from arbiview_aug.cli.bench.timing import machine_line, quartiles, show, timed_rounds
 from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.report.tables import metric_table
+from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.generator.fillers import Holes
 from arbiview_aug.render.harmonise import Harmonise
@@ -52,7 +52,7 @@ BOUNDS: Mapping[tuple[int, int], Mapping[str, float]] = {
     SIZE: {
         **{"street, held": 1.2, "street": 3.5, "LiDAR": 8.0, "LiDAR, 75 boxes": 11.0},
         **{f"{n} boxes": 5.0 for n in BOXES},
-        **{f"street, held, {fit}, contiguous": 2.0 for fit in ("squashed", "cropped")},
+        **{f"street, held, {fit} from full size, contiguous": 2.0 for fit in ("squashed", "cropped")},
         **{f"{known}, two neighbours": 20.0 for known in ("street", "75 boxes")},
     },
     FULL_SIZE: {
@@ -62,6 +62,7 @@ BOUNDS: Mapping[tuple[int, int], Mapping[str, float]] = {
 }
 """Largest ratios of calls by the size of the views, from nuScenes' images."""
 
+_FLOOR = "bare cv2.remap"
 _ENOUGH_MS = 1500.0
 _TRAVEL_M = 1.2  # between neighbouring frames
 _STEP_M, _STEPS = 1e-4, 200
@@ -124,34 +125,30 @@ def measure(data: Recorded, repeats: int, sizes: Sequence[tuple[int, int]]) -> d
         sample = half if is_small else full
         calls = {name: (len(rig), _calls(sample, rig.resized((h, w)))) for name, rig in targets.items()}
         if is_small:
-            squashed, cropped = waymo.resized((h, w)), waymo.resized((h, w), "crop")
-            runs = _both_layouts("street, held, squashed", full, squashed)
-            runs |= _both_layouts("street, held, cropped", full, cropped)
-            calls |= {"radtan, from full size": (len(waymo), runs), "own": (len(full["rig"]), _own(sample, (h, w)))}
+            for name, to in (("squashed", waymo.resized((h, w))), ("cropped", waymo.resized((h, w), "crop"))):
+                calls["radtan"][1].update(_both_layouts(f"street, held, {name} from full size", full, to))
+            calls["own"] = len(full["rig"]), _own(sample, (h, w))
         for name, (views, runs) in calls.items():
-            floor = f"floor: cv2.remap of {views} views"
-            runs = {floor: remap_floor(sample["images"][:views], (h, w)), **runs}
+            runs = {_FLOOR: remap_floor(sample["images"][:views], (h, w)), **runs}
             times = timed_rounds(runs, repeats, f"{w}x{h} {name}", enough_ms=_ENOUGH_MS)
             for call, taken in times.items():
-                ratio = statistics.median(a / b for a, b in zip(taken, times[floor], strict=False))
+                ratio = statistics.median(a / b for a, b in zip(taken, times[_FLOOR], strict=False))
                 row = {"size": [h, w], "target": name, "name": call, **quartiles(taken)._asdict()}
                 rows.append(row | {"ratio": ratio, "bound": BOUNDS.get((h, w), {}).get(call)})
     return {"data": data.name, "rounds": repeats, "ready_s": ready_s, "measures": rows}
 
 
-COLUMNS = (
-    ("ms", "{median_ms:.1f}"),
-    ("quartiles", "{q1_ms:.1f} to {q3_ms:.1f}"),
-    ("x floor", "{ratio:.2f}"),
-    ("bound", "{bound:g}"),
-)
-
-
 def table(report: Mapping[str, Any]) -> str:
-    """Machine and Markdown table of a report."""
-    head = f"{report['data']}; {machine_line(report)}; kernels ready after {report['ready_s']:.1f} s"
-    rows = [row | {"views": "{1}x{0}".format(*row["size"])} for row in report["measures"]]
-    return f"{head}\n\n{metric_table(rows, COLUMNS, ('views', 'target', 'name'))}"
+    """Machine, and a Markdown table for each size of views: milliseconds, and in parentheses the ratio to the floor."""
+    parts = [f"{report['data']}; {machine_line(report)}; kernels ready after {report['ready_s']:.1f} s"]
+    for h, w in dict.fromkeys(tuple(m["size"]) for m in report["measures"]):
+        measures = [m for m in report["measures"] if m["size"] == [h, w]]
+        targets, names = (list(dict.fromkeys(m[key] for m in measures)) for key in ("target", "name"))
+        cells = {(m["name"], m["target"]): f"{m['median_ms']:.1f} ({m['ratio']:.2f})" for m in measures}
+        bounds = {m["name"]: cell(m, "{bound:g}") for m in measures}
+        rows = [[name, bounds[name], *(cells.get((name, target), "") for target in targets)] for name in names]
+        parts.append(markdown_table([f"{w}x{h}", "bound", *targets], rows))
+    return "\n\n".join(parts)
 
 
 # --- calls ------------------------------------------------------------------------------------------------------------
