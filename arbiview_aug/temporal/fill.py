@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from functools import cached_property
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -19,21 +20,20 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.projection import ego_rays, project_rays
-from arbiview_aug.cameras.rays import pixel_rays
+from arbiview_aug.cameras.rays import CameraMaps, PixelRays
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import ArbiviewError
 from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.render.plan import RenderPlan, build_plan
 from arbiview_aug.render.rendered import Maps, RenderedFrame, Renderer, confidence_of
 from arbiview_aug.render.tone_curve import ToneCurve
 from arbiview_aug.render.view_plan import ViewPlan
-from arbiview_aug.render.view_planner import halved_camera
 from arbiview_aug.sample.neighbours import Neighbour, Warn, warn_lost
 from arbiview_aug.scene.boxes import BoxSurface
 from arbiview_aug.scene.scene import Scene
-from arbiview_aug.scene.static import Street, plane_inverse_distance
-from arbiview_aug.scene.surface import Surface
+from arbiview_aug.scene.static import Far, Street
+from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Surface
 from arbiview_aug.temporal.change import BOX_MARGIN_M, ChangeRisk, change_risks
 from arbiview_aug.temporal.merge import Candidate, merged
 
@@ -49,27 +49,40 @@ _ROAD_TOLERANCE_M = 0.15
 _SEAM_WIDTH = 0.02
 """Colour-matching margin around a hole, as a fraction of the view's width."""
 
+_CELL_PX = 8
+"""Side of the cells in which blur and risks are known."""
 
-class Hole(NamedTuple):
+
+@dataclass(frozen=True, eq=False)
+class Hole:
     """Rectangle of a target view around the pixels to fill.
 
     Attributes:
         target: Index of the target camera.
         box: Its rows and columns in the view.
         camera: The target camera, cropped to the rectangle.
+        rays: Of its pixels.
         free: (h, w) bool, uncovered pixels that may be filled.
         seam: (h, w) bool, covered pixels next to them, on the same kind of surface.
-        inverse_distance: (h, w) along the rays of both, 1/m.
+        inverse_distance: (h, w) float32 along the rays, 1/m.
         margin_px: Width of the seam.
     """
 
     target: int
     box: tuple[slice, slice]
     camera: Camera
+    rays: PixelRays
     free: BoolArray
     seam: BoolArray
-    inverse_distance: FloatArray
+    inverse_distance: npt.NDArray[np.float32]
     margin_px: int
+
+    @cached_property
+    def nodes(self) -> tuple[FloatArray, FloatArray]:
+        """Ego-frame rays (ny + 1, nx + 1, 3) and inverse distances at the corners of cells."""
+        y, x = (np.minimum(np.arange(0, n + _CELL_PX, _CELL_PX), n - 1) for n in self.camera.size)
+        directions = np.moveaxis(np.tensordot(self.camera.cam2ego[:3, :3], self.rays.at(y, x), 1), 0, -1)
+        return directions, np.maximum(self.inverse_distance[np.ix_(y, x)].astype(np.float64), 1e-6)
 
 
 class Fill(NamedTuple):
@@ -78,16 +91,12 @@ class Fill(NamedTuple):
     Attributes:
         neighbour: The frame.
         plan: Render plan from its rig to the cameras of the holes.
-        usable: For each hole (h, w) bool, the free and seam pixels that it shows.
-        blur: For each hole (h, w) uint8, how much coarser it shows them, in half octaves; 0 for as sharp as the target.
-        risk: For each hole (h, w) uint8 ``ChangeRisk``.
+        shown: What it shows of each hole; no images yet.
     """
 
     neighbour: Neighbour
     plan: RenderPlan
-    usable: list[BoolArray]
-    blur: list[npt.NDArray[np.uint8]]
-    risk: list[npt.NDArray[np.uint8]]
+    shown: list[Candidate]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,28 +110,84 @@ class Fills:
         """For each target camera, the share of its pixels that neighbours show and the current frame does not."""
         shares = [0.0] * len(plan.targets)
         for k, hole in enumerate(self.holes):
-            seen = np.logical_or.reduce([fill.usable[k] for fill in self.fills])
+            seen = np.logical_or.reduce([fill.shown[k].shows for fill in self.fills])
             shares[hole.target] = float((hole.free & seen).sum() / plan.targets[hole.target].source_camera.size)
         return shares
 
     def lines(self, plan: RenderPlan) -> list[str]:
         """One line for each neighbour: the share of pixels that neither the current frame nor a nearer one shows."""
         pixels = sum(target.source_camera.size for target in plan.targets)
-        missing = [hole.free.copy() for hole in self.holes]
+        missing = [hole.free for hole in self.holes]
         lines = []
         for fill in self.fills:
-            added = 0
-            for free, seen in zip(missing, fill.usable, strict=True):
-                added += int((free & seen).sum())
-                free &= ~seen
+            new = [free & one.shows for free, one in zip(missing, fill.shown, strict=True)]
+            missing = [free & ~of_hole for free, of_hole in zip(missing, new, strict=True)]
+            added = sum(map(np.count_nonzero, new))
             where = f"{fill.neighbour.travel_m:.1f} m of travel"
             lines.append(f"neighbour {fill.neighbour.name}, {where}: {added / pixels:.1%} of all pixels")
         return lines
 
 
 # --- planning ---------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class _HoleSurface(DenseSurface):
+    """Known distances of the holes' pixels, hidden from a neighbour by labelled objects and by what was measured.
+
+    Plans take it for a scene, whose only surface it is.
+
+    Attributes:
+        holes: The holes.
+        full: The frame's surface.
+        objects: Labelled objects of both frames.
+    """
+
+    holes: Sequence[Hole]
+    full: Surface
+    objects: BoxSurface | None
+    best: ClassVar[str] = "street"
+
+    def surface(self, name: str, ground_z_m: float) -> Surface:
+        """It; at a camera's own centre no distance matters."""
+        return Far() if name == "far" else self
+
+    @property
+    def is_dense(self) -> bool:  # type: ignore[override]
+        """Whether anything hides them."""
+        return self.objects is not None or self.full.background.is_dense
+
+    def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> npt.NDArray[np.float32]:
+        """Those of the hole with this camera's name, of which it may be a window."""
+        hole = next(hole for hole in self.holes if hole.camera.name == camera.name)
+        left, top = np.rint(hole.camera.K[:2, 2] - camera.K[:2, 2]).astype(int)
+        return hole.inverse_distance[top : top + camera.height_px, left : left + camera.width_px]
+
+    def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
+        """Labelled objects hide everything; what was measured hides what lies behind."""
+        before, full = memory.full(camera.size, 0, np.float32), self.full.background
+        if isinstance(full, DenseSurface):
+            before = full.occlusion_map(camera, rays, memory).beyond
+        if self.objects is not None:
+            before = np.where(self.objects.occlusion_map(camera, rays, memory).beyond > 0, np.float32(np.inf), before)
+        return OcclusionMap(before, np.zeros(before.shape, np.int32))
+
+    def occlusion_level(self, camera: Camera) -> int:
+        """That of what was measured, or half the size: silhouettes are widened by half of its pixels."""
+        full = self.full.background
+        return full.occlusion_level(camera) if isinstance(full, DenseSurface) else int(min(camera.size) > 1)
+
+    def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
+        """The full surface's."""
+        return self.full.uncertainty(origin, directions, inverse_distance)
+
+
 def plan_fills(
-    plan: RenderPlan, neighbours: Sequence[Neighbour], scene: Scene, surface: str, config: FavsConfig, reach: Reach
+    plan: RenderPlan,
+    neighbours: Sequence[Neighbour],
+    scene: Scene,
+    surface: str,
+    config: FavsConfig,
+    reach: Reach,
+    maps: CameraMaps,
 ) -> Fills | None:
     """Find the holes of a frame and the neighbours that show them; None if none does.
 
@@ -133,11 +198,10 @@ def plan_fills(
         surface: Name of the surface that the current frame is rendered over.
         config: Its settings.
         reach: Area that may be filled.
+        maps: Rays and masks of cameras.
     """
-    if not neighbours or all(target.coverage.all() for target in plan.targets):
-        return None
     full = scene.surface(surface, plan.source.ground_z_m)
-    holes = [hole for k in range(len(plan.targets)) if (hole := _hole(plan, k, full, reach)) is not None]
+    holes = [hole for k in range(len(plan.targets)) if (hole := _hole(plan, k, full, reach, maps)) is not None]
     if not holes:
         return None
     # A neighbour's cameras are not blended: one of them may see a moved object.
@@ -145,91 +209,68 @@ def plan_fills(
     rig = Rig([hole.camera for hole in holes], ground_z_m=plan.source.ground_z_m)
     fills = []
     for neighbour in neighbours:
-        views = build_plan(neighbour.rig, rig, surface=surface, config=config, scene=scene)
-        seen = [_seen(hole, view, neighbour) for hole, view in zip(holes, views.targets, strict=True)]
-        if any((hole.free & usable).any() for hole, (usable, *_) in zip(holes, seen, strict=True)):
-            usable, blur, risk = (list(maps) for maps in zip(*seen, strict=True))
-            fills.append(Fill(neighbour, views, usable, blur, risk))
+        boxes = neighbour.labelled + np.array([0, 0, 0, 2 * BOX_MARGIN_M, 2 * BOX_MARGIN_M, 0, 0])
+        of_holes: Any = _HoleSurface(holes, full, BoxSurface(Street(), boxes) if len(boxes) else None)
+        views = build_plan(neighbour.rig, rig, surface=surface, config=config, scene=of_holes, maps=maps)
+        shown = [_shown(hole, view, neighbour) for hole, view in zip(holes, views.targets, strict=True)]
+        if any((hole.free & one.shows).any() for hole, one in zip(holes, shown, strict=True)):
+            fills.append(Fill(neighbour, views, shown))
     return Fills(holes, fills) if fills else None
 
 
-def _hole(plan: RenderPlan, index: int, surface: Surface, reach: Reach) -> Hole | None:
+def _hole(plan: RenderPlan, index: int, surface: Surface, reach: Reach, maps: CameraMaps) -> Hole | None:
     camera, covered = plan.target[index], plan.targets[index].coverage
     empty = ~covered if camera.mask is None else ~covered & camera.mask
-    if not empty.any():
+    height_m = camera.center_m[2] - plan.source.ground_z_m
+    if not empty.any() or (reach == "ground" and height_m <= 0):
         return None
-    margin_px = max(2, round(_SEAM_WIDTH * camera.width_px))
-    around: Any = cv2.dilate(empty.view(np.uint8), np.ones((2 * margin_px + 1,) * 2, np.uint8))
-    pixel = np.flatnonzero(around)
-    directions, valid = _rays(camera, pixel)
-    if reach == "ground":
-        road = plane_inverse_distance(camera.center_m, directions, plan.source.ground_z_m)
-        valid &= np.hypot(directions[:, 0], directions[:, 1]) <= NEAR_M * road
-    pixel, directions = pixel[valid], directions[valid]
-    if not len(pixel):
-        return None
-    q = surface.image(camera, pixel_rays(camera)).reshape(-1)[pixel].astype(np.float64)
-    if reach == "ground":
-        height_m = camera.center_m[2] + directions[:, 2] / np.maximum(q, 1e-9) - plan.source.ground_z_m
-        road = (q > 0) & (np.abs(height_m) < _ROAD_TOLERANCE_M)
-        pixel, q = pixel[road], q[road]
-    inverse_distance, allowed = np.zeros(camera.size), np.zeros(camera.size, bool)
-    inverse_distance.reshape(-1)[pixel], allowed.reshape(-1)[pixel] = q, True
-    free = allowed & empty
+    rays = maps.rays(camera)
+    local = rays.at(*map(np.arange, camera.size))
+    up = np.tensordot(camera.cam2ego[2, :3].astype(np.float32), local, 1)
+    allowed = np.asarray(up < -1 / np.hypot(1, NEAR_M / height_m) if reach == "ground" else local.any(axis=0))
+    free = empty & allowed
     if not free.any():
         return None
+    margin_px = max(2, round(_SEAM_WIDTH * camera.width_px))
     rows, columns = (_with_margin(np.asarray(free.any(axis=1 - axis)), margin_px) for axis in (0, 1))
-    box = rows, columns
-    cropped = camera.crop(rows.start, columns.start, (rows.stop - rows.start, columns.stop - columns.start))
-    return Hole(index, box, cropped, free[box], (allowed & covered)[box], inverse_distance[box], margin_px)
+    box, size = (rows, columns), (rows.stop - rows.start, columns.stop - columns.start)
+    camera, rays = camera.crop(rows.start, columns.start, size), rays.crop(rows.start, columns.start, size)
+    q, allowed = surface.image(camera, rays), allowed[box]
+    if reach == "ground":
+        allowed &= (q > 0) & (np.abs(height_m + up[box] / np.maximum(q, np.float32(1e-9))) < _ROAD_TOLERANCE_M)
+    free = free[box] & allowed
+    if not free.any():
+        return None
+    around = cv2.dilate(empty[box].view(np.uint8), np.ones((2 * margin_px + 1,) * 2, np.uint8)) > 0
+    return Hole(index, box, camera, rays, free, around & allowed & covered[box], q, margin_px)
 
 
 def _with_margin(flags: BoolArray, margin: int) -> slice:
     """From the first to the last True, with a margin."""
-    indices = np.flatnonzero(flags)
-    return slice(max(int(indices[0]) - margin, 0), min(int(indices[-1]) + 1 + margin, len(flags)))
+    first, last = np.flatnonzero(flags)[[0, -1]].tolist()
+    return slice(max(first - margin, 0), min(last + 1 + margin, len(flags)))
 
 
-def _rays(camera: Camera, pixel: npt.NDArray[np.int64]) -> tuple[FloatArray, BoolArray]:
-    """Unit rays (n, 3) in the ego frame of pixels (n,) of the flattened view, and their validity."""
-    v, u = np.divmod(pixel, camera.width_px)
-    return ego_rays(camera, np.stack([u, v], -1).astype(np.float64))
+def _shown(hole: Hole, view: ViewPlan, neighbour: Neighbour) -> Candidate:
+    from arbiview_aug.render.kernels import upsample_where
 
-
-def _seen(
-    hole: Hole, view: ViewPlan, neighbour: Neighbour
-) -> tuple[BoolArray, npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """``usable``, ``blur`` and ``risk`` of ``Fill`` for one hole."""
     usable = view.coverage & (hole.free | hole.seam)
     blur, risk = np.zeros(usable.shape, np.uint8), np.full(usable.shape, ChangeRisk.UNLABELLED, np.uint8)
-    boxes = neighbour.labelled + np.array([0, 0, 0, 2 * BOX_MARGIN_M, 2 * BOX_MARGIN_M, 0, 0])
-    objects = BoxSurface(Street(ground_z_m=neighbour.rig.ground_z_m), boxes)
+    directions, q = hole.nodes
     for pair in view.pairs:
-        pixel = np.flatnonzero(usable & (view.source_camera == pair.source))
-        directions, _ = _rays(hole.camera, pixel)
         source = neighbour.rig[pair.source]
-        q = np.maximum(hole.inverse_distance.reshape(-1)[pixel], 1e-6)
-        offset_m = directions / q[:, None]
-        from_source = (hole.camera.center_m - source.center_m) + offset_m
-        length = np.maximum(np.linalg.norm(from_source, axis=1), 1e-9)
-        from_source /= length[:, None]
-        if len(boxes):
-            # Half the size is enough: silhouettes are widened by half of its pixels.
-            half = halved_camera(source, 1) if min(source.size) > 1 else source
-            uv, ahead = project_rays(half, directions, q, hole.camera.center_m - source.center_m)
-            x, y = np.clip(np.rint(uv), 0, np.array(half.size[::-1]) - 1).astype(np.int64).T
-            hidden = ahead & (objects.occlusion_map(half, pixel_rays(half)).beyond[y, x] > 0)
-            usable.reshape(-1)[pixel[hidden]] = False
-        if neighbour.moved is not None:
-            risk.reshape(-1)[pixel] = change_risks(neighbour.moved, hole.camera.center_m + offset_m)
         # Pixels per metre along the road, which is the coarser axis: proportional to sin(incidence) / distance.
-        own, other = (
-            camera.K[0, 0] * np.abs(ray[:, 2]) * inverse_m
-            for camera, ray, inverse_m in ((hole.camera, directions, q), (source, from_source, 1 / length))
-        )
-        octaves = np.log2(np.maximum(own, 1e-9) / np.maximum(other, 1e-9))
-        blur.reshape(-1)[pixel] = np.clip(np.round(2 * octaves), 0, 255).astype(np.uint8)
-    return usable, blur, risk
+        from_source = (hole.camera.center_m - source.center_m) * q[..., None] + directions
+        relative = np.maximum((from_source**2).sum(axis=-1), 1e-9)
+        other, own = (np.maximum(np.abs(rays[..., 2]), 1e-9) for rays in (from_source, directions))
+        halves = np.clip(2 * np.log2(hole.camera.K[0, 0] * own * relative / (source.K[0, 0] * other)), 0, 255)
+        upsample_where(halves.astype(np.float32), _CELL_PX, view.source_camera, pair.source, blur)
+    if neighbour.moved is not None:
+        points = hole.camera.center_m + directions / q[..., None]
+        corners = change_risks(neighbour.moved, points.reshape(-1, 3)).reshape(q.shape)
+        cells = np.maximum.reduce([corners[:-1, :-1], corners[1:, :-1], corners[:-1, 1:], corners[1:, 1:]])
+        risk = cells.repeat(_CELL_PX, axis=0).repeat(_CELL_PX, axis=1)[: usable.shape[0], : usable.shape[1]]
+    return Candidate(usable, blur, risk, neighbour.is_later)
 
 
 # --- filling ----------------------------------------------------------------------------------------------------------
@@ -261,26 +302,21 @@ def fill_from_neighbours(
             neighbours.append((fill, renderer.views(fill.plan, sources, curves, images)))
     if not neighbours:
         return rendered
-    views, certainty = (
-        list(rendered.images),
-        [torch.as_tensor(of_view).clone() for of_view in rendered.certainty],
-    )  # a plan owns those
+    views, certain = list(rendered.images), [torch.as_tensor(one).clone() for one in rendered.certainty]  # a plan's
     for k, hole in enumerate(fills.holes):
         view, place = views[hole.target], (slice(None), *hole.box)
-        free, seam = (torch.from_numpy(mask).to(view.device) for mask in (hole.free, hole.seam))
-        candidates = [_candidate(fill, k, of_holes[k], view.device) for fill, of_holes in neighbours]
-        pixels, chosen = merged(view[place], free, seam, candidates, hole.margin_px)
+        candidates = [fill.shown[k]._replace(image=of_holes[k]) for fill, of_holes in neighbours]
+        pixels, chosen = merged(view[place], hole.free, hole.seam, candidates, hole.margin_px)
         if view.requires_grad or view.device.type != "cpu":
             views[hole.target] = view.clone()
         views[hole.target][place] = pixels
         for n, (fill, _) in enumerate(neighbours):
             taken, target = chosen == n, fill.plan.targets[k]
-            _write(rendered.coverage, hole, taken, torch.tensor(True))
-            _write(rendered.source_camera, hole, taken, torch.from_numpy(target.source_camera))
-            _write(rendered.source_frame, hole, taken, torch.tensor(fill.neighbour.number + 1, dtype=torch.int8))
-            if certainty and target.certainty is not None:
-                _write(certainty, hole, taken, torch.from_numpy(target.certainty))
-    rendered = replace(rendered, images=views, certainty=certainty)
+            _write(rendered.coverage, hole, taken, np.True_)
+            _write(rendered.source_camera, hole, taken, target.source_camera)
+            _write(rendered.source_frame, hole, taken, np.int8(fill.neighbour.number + 1))
+            _write(certain if target.certainty is not None else None, hole, taken, target.certainty)
+    rendered = replace(rendered, images=views, certainty=certain)
     return rendered if rendered.confidence is None else replace(rendered, confidence=confidence_of(rendered))
 
 
@@ -293,14 +329,9 @@ def neighbour_images(neighbour: Neighbour, like: Sequence[torch.Tensor], warn: W
         return None
 
 
-def _candidate(fill: Fill, k: int, image: torch.Tensor, device: torch.device) -> Candidate:
-    usable, blur, risk = (torch.from_numpy(maps[k]).to(device) for maps in (fill.usable, fill.blur, fill.risk))
-    return Candidate(image, usable, blur, risk, fill.neighbour.is_later)
-
-
-def _write(maps: Maps | None, hole: Hole, where: torch.Tensor, value: torch.Tensor) -> None:
+def _write(maps: Maps | None, hole: Hole, where: BoolArray, value: Any) -> None:
     """Write a value, or those of a map (h, w), into a hole of a view's map."""
     if maps is not None:
         place = maps[hole.target][hole.box]
-        where = where.to(place.device)
-        place[where] = value.to(place.device).expand(where.shape)[where]
+        values = torch.from_numpy(np.broadcast_to(value, where.shape).copy()).to(place)
+        place.copy_(torch.where(torch.from_numpy(where).to(place.device), values, place))

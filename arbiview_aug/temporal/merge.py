@@ -9,12 +9,15 @@ of at most two contradicts; and the current frame shows no newly arrived object 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from itertools import combinations
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import torch
 
+from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.temporal.change import ChangeRisk
 
 _AGREEMENT_LEVELS = 16.0
@@ -45,215 +48,190 @@ _MEAN_WEIGHT = 0.02
 """Weight of the seam's mean offset beside the local one; far from the seam it stands alone."""
 
 
+Levels = npt.NDArray[np.float32]
+"""An image (3, h, w) in grey levels."""
+
+
 class Candidate(NamedTuple):
-    """One neighbour's view of a hole; ``blur`` and ``risk`` as in ``arbiview_aug.temporal.fill.Fill``.
+    """What one neighbour shows of a hole.
 
     Attributes:
-        image: (3, h, w) of the view's type.
-        shows: (h, w) bool.
-        blur: (h, w) uint8.
+        shows: (h, w) bool, the free and seam pixels that it shows.
+        blur: (h, w) uint8, how much coarser it shows them, in half octaves; 0 for as sharp as the target.
         risk: (h, w) uint8 ``ChangeRisk``.
         later: Whether it was recorded after the current frame.
+        image: (3, h, w) of the view's type, once it is rendered.
     """
 
-    image: torch.Tensor
-    shows: torch.Tensor
-    blur: torch.Tensor
-    risk: torch.Tensor
+    shows: BoolArray
+    blur: npt.NDArray[np.uint8]
+    risk: npt.NDArray[np.uint8]
     later: bool
+    image: torch.Tensor = torch.empty(0)
 
 
 def merged(
-    view: torch.Tensor, free: torch.Tensor, seam: torch.Tensor, candidates: Sequence[Candidate], margin_px: int
-) -> tuple[torch.Tensor, torch.Tensor]:
+    view: torch.Tensor, free: BoolArray, seam: BoolArray, candidates: Sequence[Candidate], margin_px: int
+) -> tuple[torch.Tensor, npt.NDArray[np.int16]]:
     """Fill the free pixels of a view by the sharpest accepted candidate, at the view's exposure.
 
     Args:
-        view: (3, h, w) uint8, or float in [0, 1].
+        view: (3, h, w) uint8, or float in [0, 1]; gradients reach the pixels that it keeps.
         free: (h, w) bool, True where the view may be filled.
         seam: (h, w) bool, True where view and candidates should agree.
         candidates: The nearest first.
         margin_px: Width of the seam.
 
     Returns:
-        (3, h, w) filled view, and (h, w) int64 index of the candidate taken, -1 for none.
+        (3, h, w) filled view, and (h, w) int16 index of the candidate taken, -1 for none.
     """
     levels = 1.0 if view.dtype == torch.uint8 else 255.0
-    current = levels * view.float()
-    toned = _toned(current, free, seam, candidates, levels, margin_px)
-    shown = torch.stack([one.shows for one in candidates]) & free
-    accepted = shown & _accepted(current, toned, shown, seam, candidates)
-    blur = torch.stack([one.blur for one in candidates]).int()
-    # The order breaks ties, as argmin may return any of equal values.
-    order = torch.arange(len(candidates), device=view.device)[:, None, None]
-    rank = torch.where(accepted, blur * len(candidates) + order, 256 * len(candidates))
-    chosen = torch.where(accepted.any(0), rank.argmin(0), -1)
-    out = current
-    for k, image in enumerate(toned):
-        out = torch.where(chosen == k, image, out)
-    if view.dtype == torch.uint8:
-        return torch.round(out).clamp(0, 255).to(torch.uint8), chosen
-    return torch.where(chosen >= 0, (out / levels).clamp(0, 1).to(view.dtype), view), chosen
+    current, images = _levels(view, levels), [_levels(one.image, levels) for one in candidates]
+    _tone(current, images, free, seam, candidates, margin_px)
+    shown = np.stack([one.shows & free for one in candidates])
+    accepted = shown & _accepted(current, images, shown, seam, candidates)
+    # The order breaks ties.
+    rank, chosen = np.full(free.shape, 256 * len(candidates), np.uint16), np.full(free.shape, -1, np.int16)
+    for k, one in enumerate(candidates):
+        own = one.blur * np.uint16(len(candidates)) + np.uint16(k)
+        better = accepted[k] & (own < rank)
+        np.copyto(rank, own, where=better)
+        np.copyto(chosen, np.int16(k), where=better)
+        np.copyto(current, images[k], where=better)
+    filled = np.clip(np.rint(current) if levels == 1 else current / np.float32(levels), 0, 255 / levels)
+    where = torch.from_numpy(chosen >= 0).to(view.device)
+    return torch.where(where, torch.from_numpy(filled).to(view), view), chosen
+
+
+def _levels(image: torch.Tensor, levels: float) -> Levels:
+    grey = image.detach().cpu().to(torch.float32, memory_format=torch.contiguous_format, copy=True)
+    return np.asarray(grey.mul_(levels).numpy())
 
 
 # --- votes ------------------------------------------------------------------------------------------------------------
 def _accepted(
-    current: torch.Tensor,
-    toned: Sequence[torch.Tensor],
-    shown: torch.Tensor,
-    seam: torch.Tensor,
-    candidates: Sequence[Candidate],
-) -> torch.Tensor:
+    current: Levels, toned: Sequence[Levels], shown: BoolArray, seam: BoolArray, candidates: Sequence[Candidate]
+) -> BoolArray:
     """(n, h, w) whether each candidate shows what stands there now."""
-    votes, others = _votes(toned, shown), shown.sum(0) - 1
-    risk = torch.stack([one.risk for one in candidates])
-    accepted = 2 * votes >= others
-    if not bool((risk != ChangeRisk.NONE).any()):
-        return accepted
+    votes, nearest = np.zeros(shown.shape, np.uint8), np.full((2, *seam.shape), -1, np.int16)
+    for k, one in enumerate(candidates):
+        side = nearest[int(one.later)]
+        np.copyto(side, np.int16(k), where=shown[k] & (side < 0))
+    static = shown.copy()  # as far as the nearest frames before and after the current one agree
+    for pair in combinations(range(len(candidates)), 2):
+        both = shown[pair[0]] & shown[pair[1]]
+        agree = _agreeing(toned[pair[0]], toned[pair[1]], both, _AGREEMENT_LEVELS)
+        for i, j in (pair, pair[::-1]):
+            votes[i] += agree
+            static[i] &= ~both | agree | (nearest[int(candidates[j].later)] != j)
+    others = shown.sum(axis=0, dtype=np.uint8) - np.uint8(1)
+    risk, few = np.stack([one.risk for one in candidates]), len(candidates) <= _FEW_CANDIDATES
     unanimous = votes == others
-    few = len(candidates) <= _FEW_CANDIDATES
-    accepted &= (risk < ChangeRisk.SHADED) | unanimous
+    accepted = unanimous | ((risk < ChangeRisk.SHADED) & (2 * votes >= others))
     accepted &= (risk < ChangeRisk.BESIDE) | (votes >= (0 if few else 1))
     unlabelled = risk == ChangeRisk.UNLABELLED
-    if bool(unlabelled.any()):
-        one_sided = unanimous & (votes >= (0 if few else 2))
-        static = _static(toned, shown, [one.later for one in candidates], one_sided)
+    if unlabelled.any():
+        on_both_sides = (nearest[0] >= 0) & (nearest[1] >= 0)
+        static = (static & on_both_sides) | (unanimous & (votes >= (0 if few else 2)) & ~on_both_sides)
         if len(candidates) > 1:  # a single candidate may itself show the moving object
             static &= ~_arrived(current, toned, seam, candidates)
-        accepted = torch.where(unlabelled, static, accepted)
-    return accepted
+        accepted = (static & unlabelled) | (accepted & ~unlabelled)
+    return np.asarray(accepted)
 
 
-def _votes(toned: Sequence[torch.Tensor], shown: torch.Tensor) -> torch.Tensor:
-    """(n, h, w) number of other candidates that agree with each."""
-    votes = torch.zeros(shown.shape, dtype=torch.int16, device=shown.device)
-    for i in range(len(toned)):
-        for j in range(i):
-            both = shown[i] & shown[j]
-            agree = both & (_difference(toned[i], toned[j], both) < _AGREEMENT_LEVELS)
-            votes[i] += agree
-            votes[j] += agree
-    return votes
-
-
-def _static(
-    toned: Sequence[torch.Tensor], shown: torch.Tensor, later: Sequence[bool], one_sided: torch.Tensor
-) -> torch.Tensor:
-    """(n, h, w) whether the nearest frames before and after the current one agree with each candidate.
-
-    ``one_sided`` (n, h, w) is the answer where all frames lie on one side.
-    """
-    both_sides, agree = torch.ones_like(shown[0]), torch.ones_like(shown)
-    for side in (False, True):
-        nearest, known = torch.zeros_like(toned[0]), torch.zeros_like(shown[0])
-        for image, there, is_later in zip(toned, shown, later, strict=True):
-            if is_later == side:
-                nearest, known = torch.where(there & ~known, image, nearest), known | there
-        both_sides &= known
-        for k, image in enumerate(toned):
-            both = shown[k] & known
-            agree[k] &= both & (_difference(image, nearest, both) < _AGREEMENT_LEVELS)
-    return torch.where(both_sides, agree, one_sided)
-
-
-def _arrived(
-    current: torch.Tensor, toned: Sequence[torch.Tensor], seam: torch.Tensor, candidates: Sequence[Candidate]
-) -> torch.Tensor:
+def _arrived(current: Levels, toned: Sequence[Levels], seam: BoolArray, candidates: Sequence[Candidate]) -> BoolArray:
     """(h, w) where a hole continues what the current frame alone shows on the seam."""
-    known, agree = torch.zeros_like(seam), torch.zeros_like(seam)
+    known, agree = np.zeros_like(seam), np.zeros_like(seam)
     for image, one in zip(toned, candidates, strict=True):
         both = seam & one.shows
         known |= both
-        agree |= both & (_difference(image, current, both) < _CONTRADICTION_LEVELS)
-    if not bool((known & ~agree).any()):
-        return torch.zeros_like(seam)
-    arrived = _distance_px(known & ~agree) < _CONTRADICTION_REACH * _distance_px(agree)
-    return torch.from_numpy(arrived).to(seam.device)
+        agree |= _agreeing(image, current, both, _CONTRADICTION_LEVELS)
+    contradicts = known & ~agree
+    if not contradicts.any():
+        return contradicts
+    away, near = (
+        np.asarray(cv2.distanceTransform((~places).view(np.uint8), cv2.DIST_L2, 5)) for places in (contradicts, agree)
+    )
+    return np.asarray(away / _CONTRADICTION_REACH < near)
 
 
-def _distance_px(places: torch.Tensor) -> np.ndarray:
-    """(h, w) float32 distance to the nearest True pixel; beyond the image's size where there is none."""
-    empty = (~places).cpu().numpy().view(np.uint8)
-    if empty.all():
-        return np.full(empty.shape, float(sum(empty.shape)), np.float32)
-    return np.asarray(cv2.distanceTransform(empty, cv2.DIST_L2, 5))
-
-
-def _difference(one: torch.Tensor, two: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
-    """(h, w) mean difference of two images (3, h, w) over the valid pixels of a window, in grey levels."""
-    difference = (one - two).detach().abs().mean(0)
-    total, count = (_box(part[None], 2) for part in (difference * where, where.float()))
-    return (total / count.clamp(min=1e-6))[0]
+def _agreeing(one: Levels, two: Levels, where: BoolArray, limit: float) -> BoolArray:
+    """(h, w) where two images differ by less than a limit: means over the channels and a window's valid pixels."""
+    apart = np.asarray(cv2.absdiff(one.reshape(-1, one.shape[2]), two.reshape(-1, one.shape[2]))).reshape(one.shape)
+    valid = where.astype(np.float32)
+    total, count = (
+        np.asarray(cv2.boxFilter(part, -1, (5, 5), normalize=False, borderType=cv2.BORDER_CONSTANT))
+        for part in ((apart[0] + apart[1] + apart[2]) * valid, valid)
+    )
+    return np.asarray(where & (total < 3 * limit * count))
 
 
 # --- exposure ---------------------------------------------------------------------------------------------------------
-def _toned(
-    current: torch.Tensor,
-    free: torch.Tensor,
-    seam: torch.Tensor,
+def _tone(
+    view: Levels,
+    images: list[Levels],
+    free: BoolArray,
+    seam: BoolArray,
     candidates: Sequence[Candidate],
-    levels: float,
     margin_px: int,
-) -> list[torch.Tensor]:
-    """Bring the candidates (3, h, w) to the view's exposure, in grey levels.
+) -> None:
+    """Bring the candidates to the view's exposure, in place.
 
     Candidates with too little of the seam are matched to those with enough.
     """
-    toned = [levels * one.image.float() for one in candidates]
-    reference, known = current, seam
     unmatched = []
     for k, one in enumerate(candidates):
-        exposure = _exposure(current, toned[k], seam & one.shows, _SEAM_INLIERS)
-        if exposure is None:
+        agreement = _expose(images[k], view, seam & one.shows, _SEAM_INLIERS)
+        if agreement is None:
             unmatched.append(k)
-            continue
-        gain, inliers = exposure
-        toned[k] = gain * (toned[k] + _DARK_LEVELS) - _DARK_LEVELS
-        toned[k] = toned[k] + _offset(current - toned[k], inliers, margin_px)
-        new = free & one.shows & ~known
-        reference, known = torch.where(new, toned[k], reference), known | new
-    for k in unmatched:
+        else:
+            images[k] += _offset(*agreement, seam.shape, max(1, margin_px // 2))
+    if not unmatched:
+        return
+    reference, known = view.copy(), seam.copy()
+    for k in sorted(range(len(candidates)), key=unmatched.__contains__):
         shows = free & candidates[k].shows
-        exposure = _exposure(reference, toned[k], shows & known, _OVERLAP_INLIERS)
-        if exposure is not None:
-            toned[k] = exposure[0] * (toned[k] + _DARK_LEVELS) - _DARK_LEVELS
-            reference, known = torch.where(shows & ~known, toned[k], reference), known | shows
-    return toned
+        if k in unmatched and _expose(images[k], reference, shows & known, _OVERLAP_INLIERS) is None:
+            continue
+        np.copyto(reference, images[k], where=shows & ~known)
+        known |= shows
 
 
-def _exposure(
-    reference: torch.Tensor, image: torch.Tensor, where: torch.Tensor, min_inliers: float
-) -> tuple[torch.Tensor, torch.Tensor] | None:
-    """Gain (3, 1, 1) from an image to a reference and (h, w) where they then agree; None if implausible."""
-    count = int(where.sum())
-    if count < _MIN_SEAM_PX:
+def _expose(
+    image: Levels, reference: Levels, where: BoolArray, min_inliers: float
+) -> tuple[npt.NDArray[np.int64], Levels] | None:
+    """Give an image the gain of a reference, in place; None if it is implausible.
+
+    Returns:
+        Pixels (n,) that then agree, and what they lack (3, n).
+    """
+    pixel = np.flatnonzero(where)
+    if len(pixel) < _MIN_SEAM_PX:
         return None
-    pairs = [part.detach()[:, where] + _DARK_LEVELS for part in (reference, image)]
-    # Sorting gives the lower median; CUDA's own median is not deterministic.
-    logs = torch.log(pairs[0] / pairs[1]).sort(1).values[:, (count - 1) // 2]
-    if float(logs.mean().abs()) > _MAX_LOG_GAIN or float(logs.max() - logs.min()) > _MAX_LOG_TINT:
+    ours, theirs = (part.reshape(3, -1).take(pixel, 1) + np.float32(_DARK_LEVELS) for part in (reference, image))
+    middle = (len(pixel) - 1) // 2
+    gain = np.partition(ours / theirs, middle, axis=1)[:, middle, None]
+    logs = np.log(gain)
+    if abs(logs.mean()) > _MAX_LOG_GAIN or np.ptp(logs) > _MAX_LOG_TINT:
         return None
-    gain = logs.exp()[:, None, None]
-    error = (reference - gain * (image + _DARK_LEVELS) + _DARK_LEVELS).detach().abs().amax(0)
-    inliers = where & (error < _AGREEMENT_LEVELS)
-    return (gain, inliers) if int(inliers.sum()) >= min_inliers * count else None
+    error = ours - gain * theirs
+    agree = np.flatnonzero((np.abs(error) < _AGREEMENT_LEVELS).all(axis=0))
+    if len(agree) < min_inliers * len(pixel):
+        return None
+    image *= gain[:, :, None]
+    image += np.float32(_DARK_LEVELS) * (gain[:, :, None] - 1)
+    return pixel[agree], error.take(agree, 1)
 
 
-def _offset(difference: torch.Tensor, inliers: torch.Tensor, margin: int) -> torch.Tensor:
-    """(3, h, w) smooth offset of a candidate: the local difference near the seam, its mean farther away."""
-    known = torch.cat([difference * inliers, inliers[None].to(difference)])
-    mean = known[:3].sum((1, 2), keepdim=True) / known[3:].sum().clamp(min=1)
-    cell, (h, w) = max(1, margin // 2), inliers.shape
-    cells = torch.nn.functional.avg_pool2d(known[None], cell, ceil_mode=True)[0]
-    around = _box(_box(cells, 2), 2)
-    coarse = (around[:3] + _MEAN_WEIGHT * mean) / (around[3:] + _MEAN_WEIGHT)
-    size = [cell * n for n in coarse.shape[1:]]
-    fine = torch.nn.functional.interpolate(coarse[None], size=size, mode="bilinear", align_corners=False)
-    return fine[0, :, :h, :w]
-
-
-def _box(image: torch.Tensor, radius: int) -> torch.Tensor:
-    """Means (C, h, w) over squares; zeros around the image."""
-    side = 2 * radius + 1
-    across = torch.nn.functional.avg_pool2d(image[None], (1, side), 1, (0, radius))
-    return torch.nn.functional.avg_pool2d(across, (side, 1), 1, (radius, 0))[0]
+def _offset(pixel: npt.NDArray[np.int64], error: Levels, size: tuple[int, ...], cell: int) -> Levels:
+    """(3, h, w) smooth offset of a candidate: the local error near the seam, its mean farther away."""
+    h, w = (-(-n // cell) for n in size)
+    y, x = np.divmod(pixel, size[1])
+    place = y // cell * w + x // cell
+    sums = [np.bincount(place, part, h * w) for part in (*error, np.ones(len(pixel)))]
+    around: Any = np.stack(sums, axis=-1).reshape(h, w, 4) / cell**2
+    for _ in range(2):
+        around = cv2.blur(around, (5, 5), borderType=cv2.BORDER_CONSTANT)
+    coarse = (around[..., :3] + _MEAN_WEIGHT * error.mean(axis=1)) / (around[..., 3:] + _MEAN_WEIGHT)
+    fine = [cv2.resize(part, (w * cell, h * cell)) for part in np.moveaxis(coarse, -1, 0).astype(np.float32, order="C")]
+    return np.stack(fine)[:, : size[0], : size[1]]

@@ -181,7 +181,7 @@ class FramePlanner:
             plan = made.get(number) or self._plan_of_pair(pair, frame.rig, scene, self.config)
             surface = self._surface(scene)
             if neighbours and self.reach is not None:
-                fills = plan_fills(plan, neighbours, scene, surface, self.config, self.reach)
+                fills = plan_fills(plan, neighbours, scene, surface, self.config, self.reach, self.maps)
             curves = self.harmoniser.curves(frame.rig, frame.images) if self.harmoniser.is_on else None
             harm = pair.harm if SURFACES[surface].is_static else None
             plans.append(FramePlan(frame.rig, pair.target, plan, {}, depth, motion, fills, curves, harm))

@@ -97,7 +97,7 @@ def test_gradients_reach_the_current_images(sample: dict[str, Any]) -> None:
 def test_explain_lists_each_neighbour(sample: dict[str, Any], alone: dict[str, Any], filled: dict[str, Any]) -> None:
     explanation = RigRetarget(low()).explain(sample)
     shares = [entry["filled"] for entry in explanation.as_dict()]
-    gained = (filled["coverage"] & ~alone["coverage"]).float().mean((1, 2)).tolist()
+    gained = (filled["coverage"] & ~alone["coverage"]).double().mean((1, 2)).tolist()
     assert all(up_to >= share for up_to, share in zip(shares, gained, strict=True)) and sum(shares) < 1.3 * sum(gained)
     assert str(explanation).count("m of travel: ") == 4 and "more by other frames of the drive" in str(explanation)
     assert "filled" not in RigRetarget(low(), neighbours=None).explain(sample).as_dict()[0]
@@ -127,12 +127,10 @@ def test_all_fills_more_than_the_ground(sample: dict[str, Any], filled: dict[str
 
 # --- the merge --------------------------------------------------------------------------------------------------------
 H, W = 24, 40
-FREE = torch.zeros(H, W, dtype=torch.bool)
-FREE[8:] = True
-SEAM = torch.zeros(H, W, dtype=torch.bool)
-SEAM[4:8] = True
+FREE, SEAM = np.zeros((H, W), bool), np.zeros((H, W), bool)
+FREE[8:] = SEAM[4:8] = True
 ROAD = torch.full((3, H, W), 90, dtype=torch.uint8)
-HOLE = torch.where(FREE, 0, ROAD)
+HOLE = torch.where(torch.from_numpy(FREE), 0, ROAD)
 
 
 def candidate(
@@ -140,11 +138,11 @@ def candidate(
     blur: int = 0,
     risk: ChangeRisk = ChangeRisk.UNLABELLED,
     later: bool = False,
-    shows: torch.Tensor | None = None,
+    shows: np.ndarray | None = None,
 ) -> Candidate:
-    whole = torch.ones(H, W, dtype=torch.bool) if shows is None else shows
+    whole = np.ones((H, W), bool) if shows is None else shows
     image = torch.full((3, H, W), level, dtype=torch.uint8)
-    return Candidate(image, whole, *(torch.full((H, W), n, dtype=torch.uint8) for n in (blur, risk)), later)
+    return Candidate(whole, *(np.full((H, W), n, np.uint8) for n in (blur, risk)), later, image)
 
 
 def test_exposure_follows_the_seam() -> None:
@@ -181,7 +179,7 @@ def test_with_labels_the_majority_decides() -> None:
 
 
 def test_a_single_candidate_is_accepted_unless_something_moved_beside_it() -> None:
-    nothing = torch.zeros(H, W, dtype=torch.bool)
+    nothing = np.zeros((H, W), bool)
     for risk in ChangeRisk:
         several = [candidate(90, risk=risk), candidate(90, shows=nothing), candidate(90, shows=nothing)]
         for of in (several, several[:2]):
@@ -190,7 +188,7 @@ def test_a_single_candidate_is_accepted_unless_something_moved_beside_it() -> No
 
 
 def test_without_labels_two_of_one_side_are_not_enough() -> None:
-    nothing = candidate(90, shows=torch.zeros(H, W, dtype=torch.bool))
+    nothing = candidate(90, shows=np.zeros((H, W), bool))
     for several in ([passing(200), passing(200), nothing], [passing(200), passing(200), passing(200)]):
         _, chosen = merged(HOLE, FREE, SEAM, several, 2)
         assert (chosen[16:] == (0 if several[2] is not nothing else -1)).all()
@@ -225,7 +223,7 @@ def test_an_implausible_exposure_is_rejected() -> None:
 
 def test_a_neighbour_without_a_seam_takes_the_exposure_of_others() -> None:
     """A camera twice as bright sees the far half of the hole alone, and overlaps another one."""
-    near, far = torch.ones(H, W, dtype=torch.bool), torch.zeros(H, W, dtype=torch.bool)
+    near, far = np.ones((H, W), bool), np.zeros((H, W), bool)
     near[18:], far[10:] = False, True
     several = [candidate(90, risk=ChangeRisk.NONE, shows=near), candidate(180, risk=ChangeRisk.NONE, shows=far)]
     pixels, chosen = merged(HOLE, FREE, SEAM, several, 2)

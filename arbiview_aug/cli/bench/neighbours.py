@@ -23,11 +23,12 @@ from arbiview_aug.cli.bench.data import as_of_another_frame, recorded
 from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
 from arbiview_aug.cli.bench.timing import machine_line, peak_mib, quartiles, show, timed_rounds
 from arbiview_aug.datasets import Neighbours, open_data
-from arbiview_aug.errors import DataError, SampleError
+from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.temporal.fill import fill_from_neighbours
+from arbiview_aug.transforms.planner import FramePlan
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 COUNTS = (0, 1, 2, 8)
@@ -158,7 +159,7 @@ def _costs(
         runs[f"{n} read"] = partial(_read, data, index, n)
         runs[f"{n} plan"] = partial(_plan, retarget, frames, target)
         runs[f"{n} fill"] = _fill(retarget, frame, target)
-        runs[f"{n} frame"] = partial(_frame, retarget, frames)
+        runs[f"{n} frame"] = partial(lambda of, to: of(next(to)), retarget, frames)
     times = timed_rounds(runs, repeats, surface, enough_ms=_ENOUGH_MS)
     for row in rows:
         own = {part: times[f"{row['neighbours']} {part}"] for part in ("read", "plan", "fill", "frame")}
@@ -168,30 +169,20 @@ def _costs(
 
 
 def _read(data: Any, index: int, number: int) -> None:
-    sample = data[index]
-    for neighbour in nearest(sample)[:number]:
+    for neighbour in nearest(data[index])[:number]:
         neighbour["images"]
 
 
-def _plan(retarget: RigRetarget, frames: Iterator[Mapping[str, Any]], target: Rig) -> None:
+def _plan(retarget: RigRetarget, frames: Iterator[Mapping[str, Any]], target: Rig) -> FramePlan:
     sample = next(frames)
-    retarget.planner.plan(sample, read_frames(sample, None), (), target)
+    return retarget.planner.plan(sample, read_frames(sample, None), (), target)[0]
 
 
 def _fill(retarget: RigRetarget, sample: Mapping[str, Any], target: Rig) -> Callable[[], Any]:
-    frames = read_frames(sample, None)
-    (plan,) = retarget.planner.plan(sample, frames, (), target)
+    frames, plan = read_frames(sample, None), _plan(retarget, iter([sample]), target)
     assert plan.plan is not None
     (rendered,) = retarget.renderer.render([plan.plan], frames, [plan.curves])
-
-    def warn(topic: str, message: str) -> None:
-        raise SampleError(f"{topic}: {message}")
-
-    return partial(fill_from_neighbours, rendered, plan.fills, frames[0].images, plan.curves, retarget.renderer, warn)
-
-
-def _frame(retarget: RigRetarget, frames: Iterator[Mapping[str, Any]]) -> None:
-    retarget(next(frames))
+    return partial(fill_from_neighbours, rendered, plan.fills, frames[0].images, plan.curves, retarget.renderer, print)
 
 
 COLUMNS = (
