@@ -20,6 +20,7 @@ from arbiview_aug import RigRetarget
 from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import shipped_rigs
 from arbiview_aug.cli.bench import neighbours, trade
+from arbiview_aug.cli.bench.ablation import NOTES, ROWS, STEPS, markdown
 from arbiview_aug.datasets import registry
 from arbiview_aug.evaluate import paper_study
 from arbiview_aug.evaluate.frames import ScoredFrame
@@ -32,7 +33,6 @@ from arbiview_aug.scene.surface import SurfaceName
 from tests.generator.training.small import frames as drawn_frames
 from tests.generator.training.test_command import SMALLER
 from tests.studies import generator
-from tests.studies.ablation import NOTES, ROWS, STEPS, markdown
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted((ROOT / "docs").glob("*.md"))
@@ -69,6 +69,7 @@ TINY = {
         *("--size", "24x40", "--reduce", "4", "--workers", "1", "--surface", "street", "--report", "0")
     ],
     "depth --data FOLDER": ["--output", "depth"],
+    "bench ablation --data FOLDER": ["--reduce", "4", "--only", "street, not far"],
     "train --output output/tiny": ["--quiet", *SMALLER],
 }
 """Every command of the README and the pages, and options that make it quick."""
@@ -208,7 +209,7 @@ def test_the_commands_run(
 
 # --- tables -----------------------------------------------------------------------------------------------------------
 def test_the_ablation_is_the_commands() -> None:
-    """Headings and steps of ``tests.studies.ablation``: all that frames without boxes can tell."""
+    """``bench ablation --data nuscenes-one ddad-one``: headings and steps, all that frames without boxes can tell."""
     move = {"psnr_db": 1.0, "gain_db": 1.0, "gain_db_per_ms": 1.0}
     figures = {"turned": move, "raised": move, "ms": 1.0, "added_ms": {"median_ms": 1.0}}
     steps = {name: figures for name, step in STEPS.items() if ROWS[step.row].fits(ScoredFrame({}))}

@@ -9,6 +9,7 @@ from importlib import import_module
 BENCHMARKS = {
     "trade": "speed against accuracy of all settings, and which to use (the default)",
     "speed": "milliseconds against bare cv2.remap calls; --device: batches by torch against a copy",
+    "ablation": "each stage and setting on and off: dB and milliseconds",
     "loader": "frames per second of a DataLoader, memory per worker",
     "neighbours": "what other frames of the drive cost, and what they fill",
 }

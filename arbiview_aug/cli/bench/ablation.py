@@ -1,4 +1,4 @@
-"""``python -m tests.studies.ablation``: gain of each stage and setting, in dB and in milliseconds.
+"""``python -m arbiview_aug bench ablation``: gain of each stage and setting, in dB and in milliseconds.
 
 All rows render the paper's six configurations and the rig raised by 0.6 m. A step is the difference of two rows. Its
 milliseconds are the median over the targets of their differences, CPU time without plans, unless its plan belongs to
@@ -8,7 +8,6 @@ one frame.
 from __future__ import annotations
 
 import statistics
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -18,9 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.arguments import add_data, command_parser
-from arbiview_aug.cli.bench.data import REDUCES
-from arbiview_aug.cli.bench.study import benchmark, study
+from arbiview_aug.cli.arguments import add_data
+from arbiview_aug.cli.bench.study import benchmark, benchmark_parser, study
 from arbiview_aug.cli.bench.timing import machine_line, quartiles, show
 from arbiview_aug.datasets import open_data, reduced_rig
 from arbiview_aug.datasets.image_io import Reduce
@@ -127,15 +125,14 @@ NOTES = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print the table, write the JSON."""
-    parser = command_parser(
-        "",
+    parser = benchmark_parser(
+        "ablation",
         "Each stage and setting on and off: accuracy, milliseconds on one thread, and what a ms buys.",
-        "--data FOLDER",
-        program="python -m tests.studies.ablation",
+        reduce=True,
+        output="output/ablation.json",
+        example="--data FOLDER",
     )
     add_data(parser, "a synthetic street", nargs="+", default=[])
-    parser.add_argument("--reduce", type=int, choices=REDUCES, default=2, help="decode the images at 1/N")
-    parser.add_argument("--output", default="output/ablation.json", metavar="FILE", help="file to write to")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the synthetic street")
     parser.add_argument("--only", metavar="TEXT", default="", help="steps whose names contain it")
     arguments = parser.parse_args(argv)
@@ -246,7 +243,3 @@ def _signed(value: float, digits: int) -> str:
 def _overlap(frame: ScoredFrame, harmonised: bool) -> dict[str, float]:
     """Agreement of neighbours on the frame as recorded."""
     return summary("overlap", source_overlap(frame.sample, retargeting("fast", "street", harmonise=harmonised)))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
