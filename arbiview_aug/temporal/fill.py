@@ -170,11 +170,6 @@ class _HoleSurface(DenseSurface):
             before = np.where(self.objects.occlusion_map(camera, rays, memory).beyond > 0, np.float32(np.inf), before)
         return OcclusionMap(before, np.zeros(before.shape, np.int32))
 
-    def occlusion_level(self, camera: Camera) -> int:
-        """That of what was measured, or half the size: silhouettes are widened by half of its pixels."""
-        full = self.full.background
-        return full.occlusion_level(camera) if isinstance(full, DenseSurface) else int(min(camera.size) > 1)
-
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """The full surface's."""
         return self.full.uncertainty(origin, directions, inverse_distance)
