@@ -42,6 +42,7 @@ from arbiview_aug.scene.point_cloud import _MEASURED_SPREAD, occlusion_level
 from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
 from arbiview_aug.scene.torch_points import PanoramaViews, upsampled
+from arbiview_aug.scene.torch_scans import ScannedViews, scanned
 from arbiview_aug.scene.torch_surface import (
     Poses,
     before_faces,
@@ -82,13 +83,16 @@ def build_plans(
         for f, request in enumerate(requests):
             name = request.scene.best if surface == "auto" else surface
             if name == "lidar" and not len(request.scene.points):  # type: ignore[arg-type]
-                name = "street" if request.scene.boxes is None else "objects"
+                name = "objects" if has_boxes(request.scene) else "street"
+            with_boxes = name == "lidar" and has_boxes(request.scene)
             for m, camera in enumerate(request.target):
                 coarse = min(camera.size) >= SMALL_SIDE_PX
                 coarse &= is_within_wall(camera.center_m) or not SURFACES[surface].has_wall
-                groups.setdefault((camera.size, config.grid_step_px if coarse else 1, name), []).append((f, m))
+                groups.setdefault((camera.size, config.grid_step_px if coarse else 1, name, with_boxes), []).append(
+                    (f, m)
+                )
         batches = []
-        for (size, step, name), views in groups.items():
+        for (size, step, name, _), views in groups.items():
             count = max(1, _MOST_PIXELS // math.prod(size))
             for first in range(0, len(views), count):
                 some = views[first : first + count]
@@ -107,6 +111,11 @@ def build_plans(
             plans.append(RenderPlan(request.source, request.target, layout, ()))
             plans[-1].on_devices[device] = tuple(found[f, m] for m in range(len(request.target)))
         return plans
+
+
+def has_boxes(scene: Scene) -> bool:
+    """Whether a scene has labelled boxes."""
+    return scene.boxes is not None and len(scene.boxes) > 0
 
 
 class _Bank:
@@ -167,7 +176,12 @@ class _ViewBatch:
         self._y, self._x = (on_device(n, device) for n in self.nodes)
         self.rays, self.poses = pixel_rays(self.cameras, maps, device), Poses.of(self.cameras, device)
         self.directions = torch.stack(turned(self._on_nodes(self.rays).double(), self.poses.R), 1)
-        self.boxes = self._boxes() if name == "objects" else None
+        scenes = {f: requests[f].scene for f in self.frames}
+        self.has_points = name == "lidar"
+        layered = name == "objects" or (self.has_points and has_boxes(scenes[self.frames[0]]))
+        self.boxes = self._boxes(scenes) if layered else None
+        if self.has_points:
+            self._split_points(scenes)
         self._find_surface()
         self._find_sources()
 
@@ -176,25 +190,38 @@ class _ViewBatch:
         return image[..., self._y[:, None], self._x]
 
     # --- the surface --------------------------------------------------------------------------------------------------
-    def _boxes(self) -> dict[int, torch.Tensor]:
+    def _boxes(self, scenes: dict[int, Scene]) -> dict[int, torch.Tensor]:
         """(B, 7) float64 boxes of each frame, padded by zeros to one number; one row at least."""
-        given = {f: torch.as_tensor(self.requests[f].scene.boxes)[:, :7] for f in self.frames}
+        given = {f: torch.as_tensor(scene.boxes)[:, :7] for f, scene in scenes.items()}
         most = max(1, *map(len, given.values()))
         return {f: _pad(b.to(self.device, torch.float64), (0, 0, 0, most - len(b))) for f, b in given.items()}
+
+    def _split_points(self, scenes: dict[int, Scene]) -> None:
+        """Points of all frames, padded by NaN, and which are a box's."""
+        given = {f: torch.as_tensor(scene.points)[:, :3].to(self.device, torch.float64) for f, scene in scenes.items()}
+        most = max(map(len, given.values()))
+        self.points = {f: _pad(p, (0, 0, 0, most - len(p)), value=math.nan) for f, p in given.items()}
+        self.all_points, self.labels, self.own = self.points, self.boxes, {}
+        if self.boxes is None:
+            return
+        split = {f: scanned(boxes, self.points[f]) for f, boxes in self.boxes.items()}
+        self.own, self.points = {f: part[1] for f, part in split.items()}, {f: part[2] for f, part in split.items()}
+        self.boxes = {f: torch.where(split[f][0][:, None], 0.0, boxes) for f, boxes in self.boxes.items()}
+
+    def _point_views(self, frames: Sequence[int], cameras: Sequence[Camera], rays: Any, ego: Any, poses: Poses) -> Any:
+        """What the points say around cameras of frames, and the objects that show their shape there."""
+        ground_z_m = np.array([self.requests[f].source.ground_z_m for f in frames])
+        views = PanoramaViews(cameras, self.maps, torch.stack([self.points[f] for f in frames]), ground_z_m)
+        if self.labels is None:
+            return views, None
+        order = list(self.own)
+        frame = on_device([order.index(f) for f in frames], self.device)
+        own, points = (torch.stack(list(part.values())) for part in (self.own, self.all_points))
+        return views, ScannedViews(rays, ego, poses, torch.stack([self.labels[f] for f in frames]), own, points, frame)
 
     def _boxes_of(self, frames: Sequence[int]) -> torch.Tensor:
         assert self.boxes is not None
         return torch.stack([self.boxes[f] for f in frames])
-
-    def _points_of(self, frames: Sequence[int]) -> torch.Tensor:
-        """Points (C, P, 3) float64 of frames, padded by NaN."""
-        given = {f: torch.as_tensor(self.requests[f].scene.points)[:, :3] for f in self.frames}
-        most = max(map(len, given.values()))
-        rows = {
-            f: _pad(p.to(self.device, torch.float64), (0, 0, 0, most - len(p)), value=math.nan)
-            for f, p in given.items()
-        }
-        return torch.stack([rows[f] for f in frames])
 
     def _find_surface(self) -> None:
         """Inverse distances at all pixels, faces of solids, and the expected error on the nodes."""
@@ -208,16 +235,20 @@ class _ViewBatch:
         ego = torch.stack(turned(self.rays, self.poses.R.float()), 1)
         self.q = self.behind = static_image(self.name != "ground", ego, centers_m, ground_z_m)
         on_street = self._on_nodes(self.behind)
-        if self.name == "lidar":
-            of_views = PanoramaViews(self.cameras, self.maps, self._points_of(self.frames), ground_z_m)
-            self.q = self.behind = of_views.image(ego, self.q)
+        if self.has_points:
+            views, scans = self._point_views(self.frames, self.cameras, self.rays, ego, self.poses)
+            self.q = self.behind = views.image(ego, self.q)
+            if scans is not None:
+                self.q = self.behind = scans.show(self.q)
         if self.boxes is not None:
             solid, self.face = draw_boxes(self.rays, self.poses, self._boxes_of(self.frames))
+            if self.has_points:
+                self.face = torch.where(solid < torch.maximum(views.hidden(ego), scans.hide(False)), -1, self.face)
             self.q = torch.where(self.face >= 0, solid, self.behind)
         on_nodes = self._on_nodes(self.q)
         self.uncertainty = static_uncertainty(self.directions, on_nodes.double(), centers_m)
-        if self.name == "lidar":
-            (near,) = of_views.read((of_views.measured,), self._on_nodes(ego))
+        if self.has_points:
+            (near,) = views.read((views.measured,), self._on_nodes(ego))
             self.uncertainty = torch.where(near > 0.5, _MEASURED_SPREAD * on_nodes, self.uncertainty)
         elif self.boxes is not None:
             self.uncertainty = torch.where(on_nodes <= on_street, _UNLABELLED * self.uncertainty, _BOX_ERROR * on_nodes)
@@ -357,7 +388,7 @@ class _ViewBatch:
         """Masks and occlusion maps of the sources at their levels."""
         full = torch.tensor(255, dtype=torch.uint8)
         self.clean = self._bank(lambda row, k: self._of_mask(row, k, "clean", clean_pixels), full)
-        self.is_solid = self.boxes is not None or self.name == "lidar"
+        self.is_solid = self.boxes is not None or self.has_points
         if not self.is_solid:
             return
         scale = np.ones(self.numbers.shape)
@@ -382,14 +413,19 @@ class _ViewBatch:
     def _drawn(self, frames: Sequence[int], cameras: Sequence[Camera]) -> Iterator[tuple[Any, Any]]:
         """What hides from cameras of one size, inverse distances (h, w), and the boxes' rows; None for none."""
         rays, poses = pixel_rays(cameras, self.maps, self.device), Poses.of(cameras, self.device)
+        beyond = number = None
+        if self.has_points:
+            ego = torch.stack(turned(rays, poses.R.float()), 1)
+            views, scans = self._point_views(frames, cameras, rays, ego, poses)
+            beyond = views.hidden(ego)
+            beyond = beyond if scans is None else torch.maximum(beyond, scans.hide(True))
         if self.boxes is not None:
             pixel_rad = on_device(np.array([1 / camera.K[0, 0] for camera in cameras]), self.device)
-            yield from zip(*occluding_boxes(rays, poses, self._boxes_of(frames), pixel_rad), strict=True)
-            return
-        ground_z_m = np.array([self.requests[f].source.ground_z_m for f in frames])
-        views = PanoramaViews(cameras, self.maps, self._points_of(frames), ground_z_m)
-        ego = torch.stack(turned(rays, poses.R.float()), 1)
-        yield from ((beyond, None) for beyond in views.read((views.hidden_below(),), ego)[0])
+            q, number = occluding_boxes(rays, poses, self._boxes_of(frames), pixel_rad)
+            number = number if beyond is None else torch.where(q > beyond, number, -1)
+            beyond = q if beyond is None else torch.maximum(q, beyond)
+        assert beyond is not None
+        yield from zip(beyond, [None] * len(frames) if number is None else number, strict=True)
 
     def _evaluate(self, rays: torch.Tensor, q: torch.Tensor, face: torch.Tensor | None, k: int | slice) -> Any:
         """As ``kernels._evaluate_row``: columns and rows in sources ``k`` in 32nds, int32, inside, and seen."""
@@ -420,8 +456,11 @@ class _ViewBatch:
         before_m = self.before_m[:, k].gather(-1, face.clamp(min=0).long().flatten(-2)).view(face.shape)
         away = (before_m <= 0) | (before_m * nearness < float(_LEAST_INCIDENCE))
         hides, by = self.shadow.at(v.round(), u.round(), k), self.solid.at(v.round(), u.round(), k)
-        hidden = (hides > 0) & ((face < 0) | (hides > nearness) & (by != torch.div(face, 6, rounding_mode="floor")))
-        return hidden | (face >= 0) & away
+        hidden = (hides > nearness) & (by != torch.div(face, 6, rounding_mode="floor")) | away
+        behind = hides > (nearness if self.has_points else 0)
+        if self.has_points:  # what was measured hides smoothly, solids do not
+            behind = torch.where(by < 0, self.shadow.between(v, u, k) > nearness, behind)
+        return torch.where(face < 0, behind, hidden)
 
     # --- who wins -----------------------------------------------------------------------------------------------------
     def find_winners(self) -> None:

@@ -18,9 +18,9 @@ from arbiview_aug.scene.point_cloud import _NODES_RAD, _ROOM, OWN_CAR_M, Window,
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 from arbiview_aug.scene.torch_surface import static_image
 
-_JUMPS = (32, 16, 8, 4, 2, 1, 2, 1)  # of the search for nearest seeds: up to 63 cells
-_NO_SEED = 64 * 1024 << 14
-_OWN = 64 * 128 + 64
+JUMPS = (32, 16, 8, 4, 2, 1, 2, 1)  # of the search for nearest seeds: up to 63 cells
+NO_SEED = 64 * 1024 << 14
+OWN = 64 * 128 + 64
 _max, _mean, _pad = torch.nn.functional.max_pool2d, torch.nn.functional.avg_pool2d, torch.nn.functional.pad
 
 
@@ -43,6 +43,7 @@ class PanoramaViews:
         self._size = tuple(max(sides) for sides in zip(*(window.shape for window in windows), strict=True))
         self._place = on_device(np.stack([window.place for window in windows]), device)[:, :, None, None]
         bounds = on_device(np.stack([window.bounds for window in windows]), device)
+        self._apart = np.array([max(1, round(CELL_RAD * float(camera.K[0, 0]))) for camera in cameras])
         self._centers_m, self._ground_z_m = np.stack([camera.center_m for camera in cameras]), ground_z_m
         q, residual = self._nearest_points(points, bounds)
         q = torch.where(self._is_hidden(q), 0.0, q)
@@ -76,7 +77,18 @@ class PanoramaViews:
         share, near, far = self.read((self.share, self.near, self.far), rays)
         return (street + torch.where(share > 0.5, near, far)).clamp(0, MAX_INVERSE_DISTANCE)
 
-    def hidden_below(self) -> torch.Tensor:
+    def hidden(self, rays: torch.Tensor) -> torch.Tensor:
+        """As ``PointCloudSurface.hidden`` without objects, along ego-frame rays (C, 3, h, w)."""
+        below, found, (h, w) = self._hidden_below(), torch.empty(0), rays.shape[2:]
+        for apart in np.unique(self._apart):
+            y, x = (torch.arange(0, n + apart, apart, device=rays.device).clamp(max=n - 1) for n in (h, w))
+            (nodes,) = self.read((below,), rays[:, :, y[:, None], x])
+            image = upsampled(nodes, int(apart), (h, w), ends=True)
+            own = on_device(self._apart == apart, rays.device)[:, None, None]
+            found = torch.where(own, image, found) if len(found) else image
+        return found
+
+    def _hidden_below(self) -> torch.Tensor:
         """As ``Panorama.hidden_below``."""
         h, w = (torch.arange(0, n + BASE_STEP, BASE_STEP, device=self.near.device) * CELL_RAD for n in self._size)
         first, _, low, _, _ = self._place.unbind(1)
@@ -139,13 +151,13 @@ class PanoramaViews:
 
     def _complete(self, q: torch.Tensor, residual: torch.Tensor) -> None:
         """Give every cell the residual of the nearest point, averaged on both sides of a step."""
-        code = spread(torch.where(q > 0, _OWN, _NO_SEED).int())
+        code = spread(torch.where(q > 0, OWN, NO_SEED).int())
         away = (code >> 14).float() / 1024
         self.measured = (away <= float(_SUPPORT)).float()
         H, W = self._size
         y, x = (torch.arange(n, device=q.device) for n in self._size)
-        row = (y[:, None] + ((code >> 7) & 127) - 64).clamp(0, H - 1)
-        column = (x + (code & 127) - 64).clamp(0, W - 1)
+        dy, dx = seed_of(code)
+        row, column = (y[:, None] + dy).clamp(0, H - 1), (x + dx).clamp(0, W - 1)
         seed = (row * W + column).flatten(1).long()
         reached = away < float(_REACH)
         r, q = (torch.where(reached, p.flatten(1).gather(1, seed).view_as(p), 0.0) for p in (residual, q))
@@ -171,34 +183,45 @@ def window_of(camera: Camera, maps: CameraMaps) -> Window:
     return Window.around(directions, _ROOM)
 
 
-def upsampled(nodes: torch.Tensor, step: int, size: Sequence[int]) -> torch.Tensor:
-    """Bilinear values (V, h, w) between nodes (V, ny + 1, nx + 1) ``step`` apart."""
-    y, x = (torch.arange(n, device=nodes.device) for n in size)
-    (j, t), (i, k) = ((p // step, (p % step).float()) for p in (y, x))
-    rows = nodes[:, j] + (nodes[:, j + 1] - nodes[:, j]) * (t / step)[:, None]
-    return rows[:, :, i] + (rows.diff() / step)[:, :, i] * k
+def upsampled(nodes: torch.Tensor, step: int, size: Sequence[int], ends: bool = False) -> torch.Tensor:
+    """Values (V, h, w) between nodes (V, ny + 1, nx + 1) ``step`` apart; with ``ends`` the last on the last pixel."""
+    (j, t), (i, k) = (
+        (p // step, (p % step) / ((n - 1 - p // step * step).clamp(1, step) if ends else step))
+        for n in size
+        for p in [torch.arange(n, device=nodes.device)]
+    )
+    rows = nodes[:, j] + (nodes[:, j + 1] - nodes[:, j]) * t[:, None]
+    return rows[:, :, i] + rows.diff()[:, :, i] * k
 
 
 def spread(code: torch.Tensor) -> torch.Tensor:
     """Every cell's nearest seed by jump flooding; codes (C, H, W) int32 are those of ``completion.spread``."""
     H, W = code.shape[1:]
-    for jump in _JUMPS:
-        padded, best = _pad(code, (jump,) * 4, value=_NO_SEED), code
+    for jump in JUMPS:
+        padded, best = _pad(code, (jump,) * 4, value=NO_SEED), code
         for dy in (-jump, 0, jump):
             for dx in (-jump, 0, jump):
                 if dy == dx == 0:
                     continue
                 there = padded[:, jump + dy : jump + dy + H, jump + dx : jump + dx + W]
-                y, x = ((there >> 7) & 127) - 64 + dy, (there & 127) - 64 + dx
-                long, short = torch.maximum(y.abs(), x.abs()), torch.minimum(y.abs(), x.abs())
-                away = torch.where(
-                    long >= 2 * short, (long - 2 * short) * 1024 + short * 2250,
-                    (2 * short - long) * 1434 + (long - short) * 2250,
-                )  # fmt: skip
-                new = (away << 14) + ((y + 64) << 7) + x + 64
-                best = torch.minimum(best, torch.where((there < _NO_SEED) & (long < 63), new, _NO_SEED))
+                best = torch.minimum(best, moved_seed(there, dy, dx))
         code = best
     return code
+
+
+def seed_of(code: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rows and columns from cells to their nearest seeds."""
+    return ((code >> 7) & 127) - 64, (code & 127) - 64
+
+
+def moved_seed(code: torch.Tensor, dy: int, dx: int) -> torch.Tensor:
+    """Codes of cells that are ``dy`` rows and ``dx`` columns away, as seen from here."""
+    y, x = seed_of(code)
+    y, x = y + dy, x + dx
+    long, short = torch.maximum(y.abs(), x.abs()), torch.minimum(y.abs(), x.abs())
+    straight, slanted = (long - 2 * short) * 1024 + short * 2250, (2 * short - long) * 1434 + (long - short) * 2250
+    moved = (torch.where(long >= 2 * short, straight, slanted) << 14) + ((y + 64) << 7) + x + 64
+    return torch.where((code < NO_SEED) & (long < 63), moved, NO_SEED)
 
 
 def _hidden(known: torch.Tensor) -> torch.Tensor:

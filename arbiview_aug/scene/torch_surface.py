@@ -110,7 +110,7 @@ def draw_boxes(rays: torch.Tensor, poses: Poses, boxes: torch.Tensor) -> tuple[t
         Inverse distances (C, h, w) of the nearest faces, 0 where there is none; int32 faces, or -1.
     """
     shape, (rows, seen) = rays[:, 0].shape, box_rows(poses, boxes)
-    camera, box, pixel = _pixels_of_boxes(rays, rows, seen)
+    camera, box, pixel = pixels_of_boxes(rays, rows, seen)
     planes = rays.transpose(0, 1).flatten(1)
     enter, leave = slabs(rows[camera, box][:, None], planes[:, pixel])
     cell, number = ((leave >= enter) & (enter > 0)).nonzero(as_tuple=True)
@@ -123,7 +123,7 @@ def draw_boxes(rays: torch.Tensor, poses: Poses, boxes: torch.Tensor) -> tuple[t
     return (buffer >> 32).int().view(torch.float32).view(shape), face.view(shape)
 
 
-def _pixels_of_boxes(
+def pixels_of_boxes(
     rays: torch.Tensor, rows: torch.Tensor, seen: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Pairs of a cell and a box that it may see: camera (n,), box (n,), and the cell's pixels (n, p) among all."""

@@ -151,7 +151,7 @@ class FramePlanner:
         on_device = not explained and given is None and self._plans_on(frames[0].images[0].device)
         if is_needed or self.surface != "auto" or fills_holes:  # objects decide what neighbours may fill
             scenes = (on_device and scenes_on_device(sample, frames, lead, self.surface)) or ()
-            if not all(map(self._is_planned_on_device, scenes)) or not scenes:
+            if not all(SURFACES[self._surface(scene)].on_device for scene in scenes) or not scenes:
                 scenes = read_scenes(sample, frames, lead, self.surface)
         scenes = scenes or [pair.road for pair in pairs]
         names = self._names(sample, len(frames), lead)
@@ -218,10 +218,6 @@ class FramePlanner:
         """Whether plans for images on a device are made there by tensor code; those for the CPU's are compiled."""
         return device.type != "cpu" and isinstance(self.config, FavsConfig) and not self.config.overlap_depth
 
-    def _is_planned_on_device(self, scene: Scene) -> bool:
-        row = SURFACES[self._surface(scene)]
-        return row.on_device and not ("points" in row.reads and scene.boxes is not None and len(scene.boxes))
-
     def _made_on_device(
         self, pairs: Sequence[_RigPair], frames: Sequence[Frame], scenes: Sequence[Scene]
     ) -> dict[int, RenderPlan]:
@@ -235,7 +231,7 @@ class FramePlanner:
         for number, (pair, frame, scene) in enumerate(zip(pairs, frames, scenes, strict=True)):
             is_road = scene.is_empty or not pair.needs_geometry
             scene = pair.road if is_road else scene
-            if not self._is_planned_on_device(scene):
+            if not SURFACES[self._surface(scene)].on_device:
                 continue
             keys[number] = key = (pair.road_key, device) if is_road else number
             if key not in self.device_plans:
