@@ -20,6 +20,8 @@ from arbiview_aug import Camera, Rig
 from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.lidar import ColouredPoints, equalised, sparse_metrics
 from arbiview_aug.evaluate.metrics import mean_of
+from arbiview_aug.image_ops import at_level
+from arbiview_aug.render.atlas import Slot
 
 
 def camera(
@@ -134,6 +136,17 @@ class Standing(SyntheticDrive):
     def scene(self, index: int) -> Scene:
         scene = super().scene(index)
         return replace(scene, velocities=np.zeros_like(scene.velocities))
+
+
+# --- the atlas --------------------------------------------------------------------------------------------------------
+def in_atlas(slot: Slot, uv: Any) -> Any:
+    """Atlas positions of source pixels (..., 2)."""
+    return at_level(uv, slot.level) + np.array([slot.x, slot.y])
+
+
+def in_source(slot: Slot, at: Any) -> Any:
+    """Source pixels (..., 2) of atlas positions."""
+    return (at - (slot.x, slot.y) + 0.5) * 2**slot.level - 0.5
 
 
 # --- the evaluation protocol ------------------------------------------------------------------------------------------

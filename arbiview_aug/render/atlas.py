@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.errors import CalibrationError
-from arbiview_aug.image_ops import FRESH, Memory, at_level, level_size
+from arbiview_aug.image_ops import FRESH, Memory, level_size
 
 OUTSIDE = -16
 """Whole-pixel coordinate of a map entry that reads nothing: far enough that no bilinear tap touches the atlas."""
@@ -73,15 +73,6 @@ class Slot:
     y: int
     x: int
     size: tuple[int, int]
-
-    def from_source(self, uv: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-        """Atlas positions of source pixels (..., 2)."""
-        half = at_level(uv, self.level)
-        return half + np.array([self.x, self.y]) if self.x or self.y else half
-
-    def to_source(self, at: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-        """The inverse of ``from_source``."""
-        return (at - (self.x, self.y) + 0.5) * 2**self.level - 0.5
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from arbiview_aug.render.plan import RenderPlan, build_plan
 from arbiview_aug.scene.point_cloud import checked_points
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.surface import Surface
+from tests.helpers import in_atlas
 from tests.scene.single_rays import inverse_distance
 
 TOLERANCE_PX = 1 / 32
@@ -74,7 +75,7 @@ def errors(plan: RenderPlan, surface: str, scene: Scene, at_most: int, edges: bo
             uv, ahead = project_rays(source, rays, q, offset_m)
             assert valid.all() and ahead.all()
             slot = plan.layout.slot(pair.source, pair.level)
-            expected = slot.from_source(uv)
+            expected = in_atlas(slot, uv)
             if slot.level:  # a halved image's outer half pixel is read at its border
                 h, w = slot.size
                 expected = np.clip(expected, (slot.x, slot.y), (slot.x + w - 1, slot.y + h - 1))

@@ -20,7 +20,7 @@ from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.static import WALL_CENTER_M
 from tests.extremes import drawn, reference
 from tests.extremes.conftest import Worst
-from tests.helpers import examples
+from tests.helpers import examples, in_source
 
 BOXES = np.array([[12.03, 1.0, 0.807, 4.5, 1.9, 1.613, 0.3], [-8.0, -3.0, 1.01, 4.0, 2.0, 2.02, 1.5]])
 MAP_TOLERANCE_PX = 1 / 32
@@ -191,7 +191,7 @@ def test_rigs_moved_together_with_the_world_render_the_same(
                 continue  # it won a few such pixels in one of the two
             won = same & (one.source_camera == report.source)
             slots = [p.layout.slot(report.source, report.level) for p in (plan, again)]
-            first, second = (s.to_source(v.at.to_float()[won]) for s, v in zip(slots, (one, two), strict=True))
+            first, second = (in_source(s, v.at.to_float()[won]) for s, v in zip(slots, (one, two), strict=True))
             difference_px = np.abs(first - second).max(initial=0) / 2**report.level
             worst("px, between a scene and the same scene moved", difference_px)
             assert difference_px <= MAP_TOLERANCE_PX  # one step of a fixed-point map

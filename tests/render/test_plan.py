@@ -14,7 +14,7 @@ from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.plan import RenderPlan, build_plan, plan_key
 from arbiview_aug.scene.scene import Scene
-from tests.helpers import sampled
+from tests.helpers import in_atlas, in_source, sampled
 
 MAP_TOLERANCE_PX = 1 / 32
 
@@ -68,7 +68,7 @@ def test_maps_and_coverage_agree_with_the_float64_reference(case: str, surface: 
             slot = next(x for x in plan.layout.slots if x.source == s and x.level == level_of(view, s))
             # In pixels of the image that is read; a halved image's outer half pixel is clamped to its border.
             h, w = slot.size
-            expected = slot.from_source(uv)
+            expected = in_atlas(slot, uv)
             if slot.level:
                 expected = np.clip(expected, (slot.x, slot.y), (slot.x + w - 1, slot.y + h - 1))
             error = np.abs(positions - expected)[won]
@@ -151,7 +151,7 @@ def test_masked_source_pixels_never_contribute() -> None:
             if pair.source != 0:
                 continue
             slot = plan.layout.slot(0, pair.level)
-            uv = slot.to_source(view.at.to_float()[view.source_camera == 0])
+            uv = in_source(slot, view.at.to_float()[view.source_camera == 0])
             for across in (np.floor, np.ceil):
                 for down in (np.floor, np.ceil):  # the taps that have any weight
                     assert mask[down(uv[:, 1]).astype(int), across(uv[:, 0]).astype(int)].all()

@@ -111,9 +111,10 @@ def as_of_another_frame(sample: Mapping[str, Any]) -> dict[str, Any]:
     shifted: Any = images.clone() if isinstance(images, torch.Tensor) else [image.clone() for image in images]
     for to, image in zip(shifted, images, strict=True):
         to[..., 1:] = image[..., :-1]
-    found = {**sample, "images": shifted}
-    for key in ("points", "boxes_3d"):
-        if key in sample:
-            found[key] = sample[key].clone()
-            found[key][:, 2] += 1e-3
-    return found
+    return lifted({**sample, "images": shifted}, 1e-3)
+
+
+def lifted(sample: Mapping[str, Any], up_m: float) -> dict[str, Any]:
+    """Move points and boxes, so that no plan of other heights fits."""
+    known = [key for key in ("points", "boxes_3d") if key in sample]
+    return {**sample, **{key: sample[key] + up_m * (torch.arange(sample[key].shape[-1]) == 2) for key in known}}

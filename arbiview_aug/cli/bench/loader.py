@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import add_target, count, seed
-from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, recorded
+from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, lifted, recorded
 from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
 from arbiview_aug.cli.bench.timing import machine_line, memory_mib, quartiles, show
 from arbiview_aug.datasets import RetargetedDataset, open_data
@@ -43,12 +43,7 @@ class Repeated(Dataset[Any]):
 
     def __getitem__(self, index: int) -> Any:
         lap, index = divmod(index, len(self.dataset))
-        sample = dict(self.dataset[index])
-        for key in ("points", "boxes_3d"):
-            if lap and key in sample:
-                sample[key] = sample[key].clone()
-                sample[key][:, 2] += lap * _APART_M
-        return sample
+        return lifted(self.dataset[index], lap * _APART_M)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

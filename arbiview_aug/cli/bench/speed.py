@@ -30,7 +30,7 @@ import torch
 
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.arguments import add_data, device_named, size
-from arbiview_aug.cli.bench.data import Recorded, recorded
+from arbiview_aug.cli.bench.data import Recorded, lifted, recorded
 from arbiview_aug.cli.bench.device import YAW_DEG, device_table, measure_device
 from arbiview_aug.cli.bench.neighbours import lowered
 from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
@@ -45,7 +45,6 @@ from arbiview_aug.render.plan import compile_kernels
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
-REPEATS = 5
 FULL_SIZE = (900, 1600)
 BOXES = (10, 30, 75, 150)
 BOUNDS: Mapping[tuple[int, int], Mapping[str, float]] = {
@@ -78,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = benchmark_parser(
         "speed",
         "Milliseconds of RigRetarget on one thread, and ratios to bare cv2.remap calls of the same views.",
-        repeats=REPEATS,
+        repeats=5,
         output="output/speed.json",
         example="--device cuda",
     )
@@ -153,14 +152,13 @@ def table(report: Mapping[str, Any]) -> str:
 
 # --- calls ------------------------------------------------------------------------------------------------------------
 def _calls(sample: Sample, target: Rig) -> Calls:
-    points = {"points": sample["points"]}
     return {
         **_both_layouts("street, held", sample, target),
         "street, held, filled": _held(sample, target, holes="fill"),
-        "street": _anew(sample, target, "street", {}),
-        **{f"{n} boxes": _anew(sample, target, "objects", {"boxes_3d": boxes_around(n)}) for n in BOXES},
-        "LiDAR": _anew(sample, target, "lidar", points),
-        "LiDAR, 75 boxes": _anew(sample, target, "lidar", points | {"boxes_3d": boxes_around(75)}),
+        "street": _anew(sample, target, "street"),
+        **{f"{n} boxes": _anew({**sample, "boxes_3d": boxes_around(n)}, target, "objects") for n in BOXES},
+        "LiDAR": _anew(sample, target, "lidar"),
+        "LiDAR, 75 boxes": _anew({**sample, "boxes_3d": boxes_around(75)}, target, "lidar"),
     }
 
 
@@ -172,13 +170,13 @@ def _own(sample: Sample, views: tuple[int, int]) -> Calls:
     poses[1:, 0, 3] = torch.tensor([-_TRAVEL_M, _TRAVEL_M])
     frame, *neighbours = ({**sample, "ego2world": pose} for pose in poses)
     boxes = {"boxes_3d": boxes_around(75)}
-    with_boxes = frame | {"neighbours": [neighbour | boxes for neighbour in neighbours]}
+    with_boxes = frame | boxes | {"neighbours": [neighbour | boxes for neighbour in neighbours]}
     return {
         "street, held, turned": _held(sample, turned),
         "street, held, turned, filled": _held(sample, turned, holes="fill"),
         "street, held, turned, harmonised": _held(sample, turned, harmonise=_GAINS[: len(rig)]),
-        "street, two neighbours": _anew(frame | {"neighbours": neighbours}, low, "street", {}),
-        "75 boxes, two neighbours": _anew(with_boxes, low, "objects", boxes),
+        "street, two neighbours": _anew(frame | {"neighbours": neighbours}, low, "street"),
+        "75 boxes, two neighbours": _anew(with_boxes, low, "objects"),
     }
 
 
@@ -191,17 +189,11 @@ def _held(sample: Sample, target: Rig, holes: Holes = "black", harmonise: Harmon
     return partial(RigRetarget(target, surface="street", holes=holes, harmonise=harmonise), sample)
 
 
-def _anew(sample: Sample, target: Rig, surface: SurfaceName, geometry: Sample) -> Callable[[], Any]:
-    """Call with the geometry, or the rig where there is none, always a little elsewhere, so that no plan comes back."""
+def _anew(sample: Sample, target: Rig, surface: SurfaceName) -> Callable[[], Any]:
+    """Call with the geometry, over the street the rig, always a little elsewhere, so that no plan comes back."""
     retarget, ways_m = RigRetarget(target, surface=surface, holes="black", cache_bytes=0), count(_STEP_M, _STEP_M)
-    rigs = cycle([sample["rig"].shifted(x_m=k * _STEP_M) for k in range(0 if geometry else _STEPS)])
-
-    def run() -> None:
-        way_m = next(ways_m)
-        moved = {key: value + way_m * (torch.arange(value.shape[1]) == 2) for key, value in geometry.items()}
-        retarget({**sample, **(moved or {"rig": next(rigs)})})
-
-    return run
+    rigs = cycle([sample["rig"].shifted(x_m=k * _STEP_M) for k in range(_STEPS if surface == "street" else 1)])
+    return lambda: retarget(lifted({**sample, "rig": next(rigs)}, next(ways_m)))
 
 
 def boxes_around(number: int) -> torch.Tensor:
