@@ -105,10 +105,10 @@ class CameraMaps:
     def __reduce__(self) -> tuple[type[CameraMaps], tuple[int]]:
         return CameraMaps, (self._cache.limit,)
 
-    def rays(self, camera: Camera) -> PixelRays:
-        """The rays of a camera."""
+    def rays(self, camera: Camera, known: PixelRays | None = None) -> PixelRays:
+        """The rays of a camera; ``known`` are taken for it from now on."""
         key = camera.size, camera.lens, camera.distortion, camera.K.tobytes()
-        return self._cache.get(key, lambda: pixel_rays(camera))
+        return self._cache.get(key, lambda: known or pixel_rays(camera))
 
     def copy_on(self, device: torch.device, key: Any, make: Callable[[], Any]) -> torch.Tensor:
         """What ``make`` gives for a content key, on a device; held."""

@@ -229,7 +229,8 @@ def _hole(plan: RenderPlan, index: int, surface: Surface, reach: Reach, maps: Ca
     margin_px = max(2, round(_SEAM_WIDTH * camera.width_px))
     rows, columns = (_with_margin(np.asarray(free.any(axis=1 - axis)), margin_px) for axis in (0, 1))
     box, size = (rows, columns), (rows.stop - rows.start, columns.stop - columns.start)
-    camera, rays = camera.crop(rows.start, columns.start, size), rays.crop(rows.start, columns.start, size)
+    camera = camera.crop(rows.start, columns.start, size)
+    rays = maps.rays(camera, rays.crop(rows.start, columns.start, size))
     q, allowed = surface.image(camera, rays), allowed[box]
     if reach == "ground":
         allowed &= (q > 0) & (np.abs(height_m + up[box] / np.maximum(q, np.float32(1e-9))) < _ROAD_TOLERANCE_M)
