@@ -492,9 +492,15 @@ def draw_scanned(
     work, near_box = np.empty((11, w), np.float32), np.empty(nx, np.bool_)
     sx, sy, sz, hx, hy, hz = box[9], box[10], box[11], box[12] + air[0], box[13] + air[0], box[14] + air[0]
     above = air[1] if mode == HIDE_WIDE else _ZERO
+    most = np.sin(min(place[2] + (top.max() + above) / place[3], _HALF_PI)) + np.float32(1e-4)
+    lowest = R[2, 0] * cones[0] + R[2, 1] * cones[1] + R[2, 2] * cones[2] - cones[3]
     for j in range(ny):
         x0, n = columns_of_box(box, cones[:, j], near_box, step, w)
-        if n == 0:
+        while n > 0 and lowest[j, x0 // step] > most:  # cells over its highest points
+            x0, n = x0 + step, n - step
+        while n > 0 and lowest[j, (x0 + n - 1) // step] > most:
+            n = (x0 + n - 1) // step * step - x0
+        if n <= 0:
             continue
         rx, ry, rz, ix, iy, iz = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n], work[5, :n]
         enter, leave, behind, row, column = work[6, :n], work[7, :n], work[8, :n], work[9, :n], work[10, :n]
