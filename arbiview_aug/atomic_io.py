@@ -186,10 +186,8 @@ def link_whole(source: Path, path: Path, owner: str = "") -> None:
 def remove_parts(root: Path, owned: Callable[[str], bool]) -> None:
     """Remove files that killed processes left half-written below a folder.
 
-    Args:
-        root: The folder.
-        owned: Whether this process alone writes an owner's files. Other files are removed if their process ran on this
-            machine and has ended.
+    ``owned`` tells whether this process alone writes an owner's files. Other files are removed if their process ran on
+    this machine and has ended.
     """
     for folder, _, names in os.walk(root):
         for name in names:

@@ -15,11 +15,7 @@ class LRUCache(Generic[K, V]):
     """Thread-safe LRU cache bounded by total value size, with counts of ``hits`` and ``misses``.
 
     The last value always stays. Threads that miss the same key at once each make the value and all get the first one.
-    Pickles as empty.
-
-    Args:
-        limit: Maximum total size.
-        size: Size of one value, picklable; None counts values.
+    Pickles as empty. ``size`` of one value is picklable; None counts values.
     """
 
     def __init__(self, limit: int, size: Callable[[V], int] | None = None) -> None:

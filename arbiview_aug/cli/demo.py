@@ -6,12 +6,10 @@ import argparse
 import statistics
 import time
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import cv2
 
-from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.cli.arguments import (
     add_data,
     add_frames,
@@ -20,16 +18,15 @@ from arbiview_aug.cli.arguments import (
     add_target,
     command_parser,
     count,
-    named_steps,
+    gathered_warnings,
     writable_folder,
 )
-from arbiview_aug.cli.evaluate import open_frames, scored_frames, target_rigs
+from arbiview_aug.cli.evaluate import frames_text, measured, open_frames
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.methods import Method, Sample, retargeting, views_of
 from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.evaluate.report.sheet import frame_sheet
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
-from arbiview_aug.evaluate.run import evaluate
 from arbiview_aug.favs.config import Quality
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
@@ -53,25 +50,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     writable_folder(path.parent, arguments.output)
     if arguments.size is None and arguments.data is None:
         arguments.size = _SYNTHETIC_SIZE
-    chosen = None if arguments.target is None else load_rig(arguments.target)
     data = open_frames(arguments, [arguments.surface], lidar=False)
-    count_of = min(arguments.frames, len(data))
     methods = _compared(arguments.quality, arguments.surface, arguments.path)
-    frames = scored_frames(data, count_of, any(method.reads_points for method in methods))
     notes: list[str] = []
-    with named_steps(notes) as tick:
-        targets = partial(target_rigs, arguments, chosen)
-        done = evaluate(frames, targets, methods, lambda name, steps: tick(name, steps * count_of), agreement=False)
+    done = measured(arguments, data, methods, notes, agreement=False)
+    with gathered_warnings(notes):
         (target,), sample = done.targets.values(), data[0]
         retarget = RigRetarget(target, quality=arguments.quality, surface=arguments.surface, path=arguments.path)
         times_ms = [_call_ms(retarget, sample) for _ in range(1 + _TIMED_CALLS)]
         views, explained = views_of(retarget(sample)), retarget.explain(sample)
-    for note in notes:
+    for note in dict.fromkeys(notes):
         print(f"note: {note}\n")
     source = sample["rig"]
     print(f"{source!r}\n\n{target!r}\n\n{explained}\n")
     table, _ = evaluation_tables(done, [method.name for method in methods])
-    print(text_table(f"{table[0]} ({len(target)} cameras, {count_of} frame{'s' * (count_of > 1)})", *table[1:]))
+    print(text_table(f"{table[0]} ({len(target)} cameras, {frames_text(arguments, data)})", *table[1:]))
     frame_ms = statistics.median(times_ms[1:])
     planned = f"a new plan, for another calibration or other boxes, takes {max(times_ms[0] - frame_ms, 0):.0f} ms more."
     if arguments.quality == "paper":

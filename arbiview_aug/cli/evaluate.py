@@ -42,7 +42,7 @@ from arbiview_aug.evaluate.report.html import html_report
 from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.evaluate.report.sheet import frame_sheet
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
-from arbiview_aug.evaluate.run import evaluate
+from arbiview_aug.evaluate.run import Evaluation, evaluate
 from arbiview_aug.evaluate.targets import named_targets, without_masks
 from arbiview_aug.generator import Generator
 from arbiview_aug.scene.scene import SURFACES
@@ -179,23 +179,36 @@ def _methods(arguments: argparse.Namespace) -> list[Method]:
     return methods
 
 
+def frames_text(arguments: argparse.Namespace, data: Any) -> str:
+    """Number of evaluated frames, for titles."""
+    count_of = min(arguments.frames or 1, len(data))
+    return f"{count_of} frame{'s' * (count_of > 1)}"
+
+
+def measured(
+    arguments: argparse.Namespace, data: Any, methods: Sequence[Method], notes: list[str], *, agreement: bool = True
+) -> Evaluation:
+    """Evaluate methods on the first frames, behind a progress bar; warnings go to ``notes``."""
+    chosen = None if arguments.target is None else load_rig(arguments.target)
+    count_of = min(arguments.frames or 1, len(data))
+    frames = scored_frames(data, count_of, any(method.reads_points for method in methods))
+    targets = partial(target_rigs, arguments, chosen)
+    with named_steps(notes) as tick:
+        return evaluate(frames, targets, methods, lambda name, steps: tick(name, steps * count_of), agreement=agreement)
+
+
 # --- the three modes --------------------------------------------------------------------------------------------------
 def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> str:
     methods = _methods(arguments)
-    chosen = None if arguments.target is None else load_rig(arguments.target)
     data = open_frames(arguments, arguments.surface)
-    count_of = min(arguments.frames or 1, len(data))
-    frames = scored_frames(data, count_of, any(method.reads_points for method in methods))
-    with named_steps(notes) as tick:
-        targets = partial(target_rigs, arguments, chosen)
-        done = evaluate(frames, targets, methods, lambda name, steps: tick(name, steps * count_of))
+    done = measured(arguments, data, methods, notes)
     if not done.views:
         raise DataError("; ".join(done.declined.values()))
     assert done.first is not None
     notes.extend(f"{name}: {why}" for name, why in done.declined.items())
     names = [method.name for method in methods]
     tables = evaluation_tables(done, names)
-    title = f"{arguments.data or f'Synthetic streets, seed {arguments.seed}'}: {count_of} frame{'s' * (count_of > 1)}"
+    title = f"{arguments.data or f'Synthetic streets, seed {arguments.seed}'}: {frames_text(arguments, data)}"
     settings = {key: value for key, value in vars(arguments).items() if key not in _FIXED}
     report = {"arguments": settings, "scored_on_other_points": done.first.held_out}
     report |= {"means": tables[0][1], "agreement": tables[1][1], "views": done.views, "pairs": done.pairs}

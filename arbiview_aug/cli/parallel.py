@@ -20,14 +20,10 @@ Result = TypeVar("Result")
 def results(
     jobs: Dataset[Result], workers: int, label: str, note: Callable[[Result], str] | None = None
 ) -> Iterator[Result]:
-    """Yield each job's result, in order.
+    """Yield the items of ``jobs``, each of which does some work, in order; ``note`` is the text beside the bar.
 
-    Args:
-        jobs: Map-style data set whose items do the work; picklable for more than one worker.
-        workers: Number of one-thread processes, started by a fork server so that no thread or CUDA context is forked.
-            1 works in this process, on its own threads.
-        label: Title of the progress bar.
-        note: Text beside the bar after each result.
+    Several workers are one-thread processes, started by a fork server so that no thread or CUDA context is forked; the
+    jobs are pickled. 1 works in this process, on its own threads.
     """
     context = None
     if workers > 1:

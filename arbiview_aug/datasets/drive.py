@@ -118,11 +118,9 @@ def check_neighbours(value: Any) -> None:
 
 
 class Drive:
-    """Distance travelled by a vehicle, frame by frame.
+    """Distance travelled by a vehicle, from its positions (F, 3) in the world, in recording order.
 
-    Args:
-        positions_m: (F, 3) vehicle positions in the world, in recording order.
-        parts: (F,) non-decreasing numbers of uninterrupted parts; neighbours share their part.
+    ``parts`` (F,) are non-decreasing numbers of uninterrupted parts; neighbours share their part.
     """
 
     def __init__(self, positions_m: FloatArray, parts: npt.NDArray[np.int64]) -> None:

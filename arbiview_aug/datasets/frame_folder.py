@@ -30,7 +30,8 @@ from arbiview_aug.datasets.drive import (
     parts_of_clock,
 )
 from arbiview_aug.datasets.image_io import Reduce, check_reduce, decode_images, reduced_rig
-from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, WarnOnce
+from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, WarnOnce
+from arbiview_aug.scene.boxes import checked_boxes
 
 CALIBRATION_FILE = "calib.json"
 SEQUENCE_FILE = "sequence.json"
@@ -336,20 +337,15 @@ def checked_points(array: Any, where: str) -> torch.Tensor:
 
 
 def _boxes(rows: Any, where: str) -> torch.Tensor:
-    expected = "rows of x y z length width height yaw (at least 7 finite numbers, sizes above 0)"
     try:
         with np.errstate(over="ignore"):  # infinite in float32, and refused below
             array = np.array(rows, dtype=np.float64).astype(np.float32)
+        checked_boxes(array)
+    except SampleError as error:
+        raise DataError(f"{where}: {error}") from None
     except (TypeError, ValueError, OverflowError) as error:
-        raise DataError(f"{where}: boxes_3d: expected {expected}, got {error}") from None
-    if array.size == 0:
-        array = array.reshape(0, 7)
-    if array.ndim != 2 or array.shape[1] < 7:
-        raise DataError(f"{where}: boxes_3d: expected {expected}, got shape {array.shape}")
-    bad = np.flatnonzero(~np.isfinite(array[:, :7]).all(axis=1) | (array[:, 3:6] <= 0).any(axis=1))
-    if len(bad):
-        raise DataError(f"{where}: boxes_3d: expected {expected}, got row {bad[0]}: {array[bad[0]].tolist()}")
-    return torch.from_numpy(array)
+        raise DataError(f"{where}: boxes_3d: expected rows of at least 7 numbers, got {error}") from None
+    return torch.from_numpy(array if array.size else array.reshape(0, 7))
 
 
 def _pose(value: Any, where: str) -> torch.Tensor:

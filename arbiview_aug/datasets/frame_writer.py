@@ -15,12 +15,7 @@ from arbiview_aug.datasets.image_io import encoded_image
 
 
 def write_frame(folder: Path, sample: Mapping[str, Any]) -> None:
-    """Write a sample's images as JPEGs, its calibration, and its points, boxes and pose if it has them.
-
-    Args:
-        folder: The frame's folder, created if missing.
-        sample: Has ``images``, one uint8 (3, h, w) per camera of ``rig``; the rig's masks are not written.
-    """
+    """Write a sample's uint8 images as JPEGs, its rig without masks, and its points, boxes and pose if it has them."""
     rig: Rig = sample["rig"]
     folder.mkdir(parents=True, exist_ok=True)
     calib = rig.to_dict()

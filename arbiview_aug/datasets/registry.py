@@ -15,19 +15,12 @@ from arbiview_aug.errors import DataError
 
 @dataclass(frozen=True)
 class Reader:
-    """One kind of data set.
+    """One kind of data set."""
 
-    Attributes:
-        description: Such a folder, for messages and help texts.
-        recognises: Whether a folder is of this kind.
-        open: Opens a folder, given the keywords ``version``, ``reduce`` and ``neighbours`` of ``open_data``.
-        writer: Subclass of ``cli.convert.writer.Writer`` as ``module:Class``; None if ``convert`` cannot write it.
-    """
-
-    description: str
-    recognises: Callable[[Path], bool]
-    open: Callable[..., Recording]
-    writer: str | None = None
+    description: str  # such a folder, for messages and help texts
+    recognises: Callable[[Path], bool]  # whether a folder is of this kind
+    open: Callable[..., Recording]  # opens a folder, given the other keywords of ``open_data``
+    writer: str | None = None  # subclass of ``Writer`` as ``module:Class``; None if ``convert`` has none
 
 
 READERS = {

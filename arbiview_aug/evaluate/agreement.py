@@ -40,16 +40,10 @@ class OverlapScore(NamedTuple):
 
 
 def overlap_psnr(one: npt.NDArray[Any], two: npt.NDArray[Any], both: BoolArray, *, fitted: bool = True) -> float | None:
-    """PSNR in dB between two renderings of one view on the odd tiles.
+    """PSNR in dB between two renderings (h, w, 3), 0-255, of one view on the odd tiles, where ``both`` (h, w) see it.
 
-    Args:
-        one: (h, w, 3) on the scale 0-255.
-        two: The other.
-        both: (h, w) bool, where both sources see the view.
-        fitted: Whether to map ``one`` to ``two`` first, by a gain and an offset per channel fitted on the even tiles.
-
-    Returns:
-        The PSNR, or None with fewer than ``MIN_PIXELS`` pixels to fit or to test.
+    ``fitted`` maps one to the other first, by a gain and an offset per channel fitted on the even tiles. None with
+    fewer than ``MIN_PIXELS`` pixels to fit or to test.
     """
     odd = odd_tiles(both.shape, TILE_PX)
     fit, test = both & ~odd, both & odd
@@ -67,22 +61,14 @@ def overlap_psnr(one: npt.NDArray[Any], two: npt.NDArray[Any], both: BoolArray, 
 
 
 def overlap_scores(
-    rig: Rig,
-    render: Callable[[Camera, int], tuple[Image, BoolArray]],
-    *,
-    size: tuple[int, int] = VIEW_SIZE,
-    pairs: list[tuple[int, int]] | None = None,
+    rig: Rig, render: Callable[[Camera, int], tuple[Image, BoolArray]], size: tuple[int, int] = VIEW_SIZE
 ) -> list[OverlapScore]:
-    """Overlap metrics of pairs of cameras.
+    """Overlap metrics of adjacent cameras, by views (h, w) half-way between them.
 
-    Args:
-        rig: The source rig.
-        render: Maps a view and a source's index to the view from that source alone: image and coverage.
-        size: (h, w) of the views.
-        pairs: Pairs of camera indices; by default ``adjacent_pairs``.
+    ``render`` maps a view and a source's index to the view from that source alone: image and coverage.
     """
     scores = []
-    for a, b in adjacent_pairs(rig) if pairs is None else pairs:
+    for a, b in adjacent_pairs(rig):
         view = half_way_view(rig[a], rig[b], size)
         (one, sees_one), (two, sees_two) = render(view, a), render(view, b)
         both = sees_one & sees_two
@@ -103,7 +89,7 @@ def source_overlap(
             alone = method.alone(sample, k, rig.with_cameras([view]))
         return alone.image, alone.coverage
 
-    return overlap_scores(rig, from_one, size=size)
+    return overlap_scores(rig, from_one, size)
 
 
 def target_consistency(
@@ -122,7 +108,7 @@ def target_consistency(
         (image,) = as_arrays(render_opencv(plan, as_tensors([views[k].image])))
         return image, plan.coverage[0]
 
-    return overlap_scores(rig, from_one, size=size)
+    return overlap_scores(rig, from_one, size)
 
 
 def summary(prefix: str, pairs: Sequence[OverlapScore]) -> dict[str, float]:

@@ -42,19 +42,12 @@ class LidarReference(NamedTuple):
 
 @dataclass(frozen=True)
 class ScoredFrame:
-    """A sample for methods, and its references.
+    """A sample for methods, and its references."""
 
-    Attributes:
-        sample: ``rig``, ``images`` and other keys that methods may use.
-        lidar: References by exposure; empty without points.
-        held_out: Whether ``sample`` has points, and others score.
-        truth: Renders the true views of a rig; None on real frames.
-    """
-
-    sample: dict[str, Any]
-    lidar: Mapping[Exposure, LidarReference] = field(default_factory=dict)
-    held_out: bool = False
-    truth: Callable[[Rig], RenderedViews] | None = None
+    sample: dict[str, Any]  # ``rig``, ``images`` and other keys that methods may use
+    lidar: Mapping[Exposure, LidarReference] = field(default_factory=dict)  # by exposure; empty without points
+    held_out: bool = False  # whether ``sample`` has points, and others score
+    truth: Callable[[Rig], RenderedViews] | None = None  # renders the true views of a rig; None on real frames
 
     @property
     def scored_sample(self) -> dict[str, Any]:
@@ -71,11 +64,8 @@ def make_frame(
 ) -> ScoredFrame:
     """Split a sample into the part that methods get and the references.
 
-    Args:
-        sample: With ``rig`` and ``images``, and maybe ``points`` in the ego frame.
-        truth: Renders the true views of a rig; the last ones are cached.
-        exposures: Exposures to score points at; none if points do not score.
-        hand_over_points: Whether methods get points: those of the sectors that do not score.
+    ``truth`` renders the true views of a rig; the last ones are cached. Without ``exposures`` points do not score. With
+    ``hand_over_points`` methods get the points of the sectors that do not score.
     """
     truth = None if truth is None else lru_cache(_CACHED_TRUTHS)(truth)
     given = {key: value for key, value in sample.items() if key != "points"}
@@ -98,13 +88,7 @@ def make_frame(
 def scores(
     frame: ScoredFrame, render: Render, target: Rig, exposures: Sequence[Exposure] = EXPOSURES
 ) -> tuple[list[RenderedView], list[dict[str, float]]]:
-    """Render a frame and score each view.
-
-    Args:
-        frame: The frame.
-        render: The method.
-        target: The rig to render, in its own ego frame.
-        exposures: Exposures to score at, of those that the frame has.
+    """Render a frame for a rig in its own ego frame, and score each view at the exposures that the frame has.
 
     Returns:
         The views at the first exposure, and one row of metrics each: ``seen``, the share of covered pixels;

@@ -17,19 +17,12 @@ Image = npt.NDArray[np.uint8] | npt.NDArray[np.floating[Any]]
 
 
 class RenderedView(NamedTuple):
-    """A rendered view.
+    """A rendered view."""
 
-    Attributes:
-        image: (h, w, 3), black where nothing covers it.
-        coverage: (h, w) bool, where some source saw it.
-        confidence: (h, w) in [0, 1], if the renderer gives it.
-        generated: (h, w) bool, inpainted or generated pixels, if any.
-    """
-
-    image: Image
-    coverage: BoolArray
-    confidence: npt.NDArray[np.float32] | None = None
-    generated: BoolArray | None = None
+    image: Image  # (h, w, 3), black where nothing covers it
+    coverage: BoolArray  # (h, w) bool, where some source saw it
+    confidence: npt.NDArray[np.float32] | None = None  # (h, w) in [0, 1], if the renderer gives it
+    generated: BoolArray | None = None  # (h, w) bool, inpainted or generated pixels, if any
 
     @property
     def shown(self) -> BoolArray:

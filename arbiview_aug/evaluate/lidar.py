@@ -47,17 +47,11 @@ class VisiblePoints(NamedTuple):
 
 @dataclass(frozen=True)
 class ColouredPoints:
-    """LiDAR points with colours of the source cameras.
+    """LiDAR points with colours of the source cameras."""
 
-    Attributes:
-        points: (n, 3) in the ego frame.
-        colours: (n, 3) RGB, 0-255.
-        on_ground: (n,) bool, within 0.3 m of the rig's road plane.
-    """
-
-    points: FloatArray
-    colours: FloatArray
-    on_ground: BoolArray
+    points: FloatArray  # (n, 3) in the ego frame
+    colours: FloatArray  # (n, 3) RGB, 0-255
+    on_ground: BoolArray  # (n,) bool, within 0.3 m of the rig's road plane
 
     def __len__(self) -> int:
         return len(self.points)
@@ -164,13 +158,9 @@ def lidar_split(points: FloatArray) -> tuple[BoolArray, BoolArray]:
 def sparse_metrics(
     image: Image, camera: Camera, points: ColouredPoints, *, coverage: BoolArray | None = None
 ) -> dict[str, float] | None:
-    """Compare a rendered target with the coloured points that fall into it.
+    """Compare a target's image with the coloured points that fall into it.
 
-    Args:
-        image: The target's image, black (or filled) where nothing covers it.
-        camera: The target camera.
-        points: From ``coloured_points``.
-        coverage: (h, w) bool, where some source saw the target; by default, pixels that are not black.
+    ``coverage`` (h, w) bool is where some source saw the target; by default, pixels that are not black.
 
     Returns:
         ``psnr_db, mae, rmse`` over all points, the paper's figures; the same with the prefixes ``covered_``,

@@ -72,13 +72,7 @@ def retargeting(
 ) -> Method:
     """Wrap ``RigRetarget`` as a method, with its arguments; holes stay black with ``path="favs"``.
 
-    Args:
-        quality: Preset or configuration.
-        surface: Scene geometry.
-        name: Name in tables; by default made of quality, surface and path.
-        path: Filling of holes; a source camera alone is never completed.
-        harmonise: Exposure gains.
-        settings: Further arguments.
+    The name is by default made of quality, surface and path. A source camera alone is never completed.
     """
     completes, steps = path != "favs", settings.get("steps")
     if path == "diffusion" and settings.get("generator") is None:

@@ -80,10 +80,9 @@ def measure_paper(
     methods: Sequence[Method] | None = None,
     tick: Callable[[str, int], None] = lambda _, __: None,
 ) -> Study:
-    """Measure all rows.
+    """Measure all rows on a folder of real frames; by default on ``REAL_FRAMES`` below ARBIVIEW_DATA and on streets.
 
     Args:
-        data: A folder of real frames; by default ``REAL_FRAMES`` below ARBIVIEW_DATA, and synthetic streets.
         frames: Frames per data set; by default 1 of real ones and ``SYNTHETIC_FRAMES``.
         size: (h, w) of the synthetic images.
         methods: By default ``study_methods``.

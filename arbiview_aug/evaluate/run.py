@@ -60,12 +60,8 @@ def evaluate(
 ) -> Evaluation:
     """Run every method on every named frame and target.
 
-    Args:
-        frames: Names and frames.
-        targets: Maps a source rig to the rigs to render, by name.
-        methods: The methods.
-        tick: Called before each step with its name and the frame's number of steps.
-        agreement: Whether to measure the agreement of neighbours.
+    ``targets`` maps a source rig to the rigs to render, by name. ``tick`` is called before each step with its name and
+    the frame's number of steps. ``agreement`` measures that of neighbours too.
     """
     done = Evaluation()
     for name, frame in frames:

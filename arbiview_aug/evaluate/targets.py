@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -45,16 +44,6 @@ def paper_target(rig: Rig, share: float) -> Rig:
     return without_masks(rig.with_cameras(cameras))
 
 
-def paper_targets(rig: Rig) -> list[Rig]:
-    """The paper's six configurations."""
-    return [paper_target(rig, share) for share in PAPER_SHARES]
-
-
-def yawed_targets(rig: Rig, yaws_deg: Sequence[float] = YAWS_DEG) -> list[Rig]:
-    """All cameras turned about their own centres."""
-    return [without_masks(rig.turned(yaw_deg=yaw)) for yaw in yaws_deg]
-
-
 def shifted_target(rig: Rig, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0, *, yaw_deg: float = 0.0) -> Rig:
     """All cameras moved along the ego's axes, and turned."""
     return without_masks(rig.shifted(x_m, y_m, z_m).turned(yaw_deg=yaw_deg))
@@ -81,9 +70,9 @@ def vehicle_targets(rig: Rig) -> dict[str, Rig]:
 def named_targets(kind: str, rig: Rig) -> dict[str, Rig]:
     """Targets of a set, by name: ``paper`` (six), ``yaw`` (``YAWS_DEG``), ``vehicles`` or ``truck``."""
     if kind == "paper":
-        return {f"paper {share:+g}": target for share, target in zip(PAPER_SHARES, paper_targets(rig), strict=True)}
+        return {f"paper {share:+g}": paper_target(rig, share) for share in PAPER_SHARES}
     if kind == "yaw":
-        return {f"yaw {yaw:+g}": target for yaw, target in zip(YAWS_DEG, yawed_targets(rig), strict=True)}
+        return {f"yaw {yaw:+g}": without_masks(rig.turned(yaw_deg=yaw)) for yaw in YAWS_DEG}
     if kind == "vehicles":
         return vehicle_targets(rig)
     return {"truck": shifted_target(rig, z_m=TRUCK_UP_M)}

@@ -33,40 +33,24 @@ SAME_CENTER_M = 1e-6
 
 @dataclass(frozen=True)
 class SourceReport:
-    """How one source served one target view.
+    """How one source served one target view."""
 
-    Attributes:
-        source: Index of the source camera in the source rig.
-        primary: Whether it is the primary camera.
-        H_final: (3, 3) source pixels to target pixels, det 1.
-        features: Result of stage 2.
-        objects: Result of stage 3.
-        share: Share of the target's pixels in which its weight is the largest.
-    """
-
-    source: int
-    primary: bool
-    H_final: FloatArray
-    features: FeatureReport
-    objects: AlignmentReport
-    share: float
+    source: int  # index of the source camera in the source rig
+    primary: bool  # whether it is the primary camera
+    H_final: FloatArray  # (3, 3) source pixels to target pixels, det 1
+    features: FeatureReport  # result of stage 2
+    objects: AlignmentReport  # result of stage 3
+    share: float  # share of the target's pixels in which its weight is the largest
 
 
 @dataclass(frozen=True)
 class PaperView:
-    """One target view.
+    """One target view."""
 
-    Attributes:
-        image: (3, h, w) in the type of the source images, black where no source sees.
-        source_camera: (h, w) int8 index of the source with the largest weight, -1 where there is none.
-        reports: One for each source that the target shows.
-        occluded: (h, w) bool, uncovered pixels inside some source's image, which its own car hides; None for none.
-    """
-
-    image: torch.Tensor
-    source_camera: npt.NDArray[np.int8]
-    reports: tuple[SourceReport, ...]
-    occluded: BoolArray | None = None
+    image: torch.Tensor  # (3, h, w) in the type of the source images, black where no source sees
+    source_camera: npt.NDArray[np.int8]  # (h, w) index of the source with the largest weight, -1 for none
+    reports: tuple[SourceReport, ...]  # one for each source that the target shows
+    occluded: BoolArray | None = None  # (h, w) uncovered pixels that some source's own car hides; None for none
 
     @property
     def coverage(self) -> BoolArray:
@@ -76,17 +60,11 @@ class PaperView:
 
 @dataclass(frozen=True)
 class PaperRendering:
-    """A frame rendered by the published stages.
+    """A frame rendered by the published stages."""
 
-    Attributes:
-        source: The source rig.
-        target: The target rig in the source's ego frame.
-        targets: One view for each target camera.
-    """
-
-    source: Rig
-    target: Rig
-    targets: tuple[PaperView, ...]
+    source: Rig  # the source rig
+    target: Rig  # the target rig in the source's ego frame
+    targets: tuple[PaperView, ...]  # one view for each target camera
 
     @property
     def coverage(self) -> list[BoolArray]:
@@ -143,10 +121,7 @@ def check_settings(surface: str, execution: str) -> None:
 def primary_camera(sources: Sequence[Camera], target: Camera, candidates: Sequence[int]) -> int:
     """Choose the primary camera: the nearest optical axis, among sources at the target's centre if there are any.
 
-    Args:
-        sources: The source cameras.
-        target: The target camera.
-        candidates: Indices of the sources that the target shows; the first one wins ties.
+    ``candidates`` are indices of the sources that the target shows; the first one wins ties.
     """
     poses, pose = {k: sources[k].cam2ego for k in candidates}, target.cam2ego
     exact = [k for k in candidates if np.linalg.norm(poses[k][:3, 3] - pose[:3, 3]) < SAME_CENTER_M]
@@ -216,15 +191,9 @@ def _render_view(
 
 
 def paper_labels(rendering: PaperRendering, labels: Sequence[torch.Tensor], fill: float) -> list[torch.Tensor]:
-    """Render label maps by the nearest label of the source with the largest weight.
+    """Render N label maps (..., H, W) of any type as M maps (..., h, w); uncovered pixels are ``fill``.
 
-    Args:
-        rendering: The rendering of the same frame.
-        labels: N maps (..., H, W) of any type.
-        fill: Value of uncovered pixels.
-
-    Returns:
-        M maps (..., h, w).
+    Each pixel takes the nearest label of the source with the largest weight.
     """
     rendered = []
     for view in rendering.targets:

@@ -51,13 +51,7 @@ def h_planar(source: Camera, target: Camera, normal: FloatArray, distance_m: flo
     """Compute the (3, 3) homography of a scene plane, H_planar = K2 (R − t nᵀ / d) K1⁻¹.
 
     R = R2 R1⁻¹ and t, the source's centre in the target's frame, take source to target: X2 = R X1 + t. The minus sign
-    means the plane n·X1 = −d.
-
-    Args:
-        source: Camera 1.
-        target: Camera 2.
-        normal: (3,) unit normal in the source camera's frame, from the plane towards the source.
-        distance_m: Distance d > 0 of the source's centre from the plane.
+    means the plane n·X1 = −d: ``normal`` (3,) points from it towards the source, at ``distance_m`` > 0.
 
     Raises:
         CalibrationError: A camera is not a pinhole camera, or the distance is not positive.
@@ -75,12 +69,7 @@ def check_homography(H: FloatArray, size: tuple[int, int], max_area_ratio: float
 
     The corners must stay in front (one sign of the third coordinate), form a convex quadrilateral of the same
     orientation, and enclose between 1 / ``max_area_ratio`` and ``max_area_ratio`` times the image's area. H and −H are
-    the same homography, so the sign is taken from the image centre.
-
-    Args:
-        H: (3, 3).
-        size: (h, w) of the source image.
-        max_area_ratio: Largest enlargement or reduction of area.
+    the same homography, so the sign is taken from the image centre. ``size`` is (h, w) of the source image.
     """
     if H.shape != (3, 3) or not np.isfinite(H).all():
         return False

@@ -62,27 +62,16 @@ NO_MATCHES = Matches(np.zeros((0, 2)), np.zeros((0, 2)))
 
 @dataclass(frozen=True)
 class FeatureReport:
-    """Result of stage 2 for one source.
+    """Result of stage 2 for one source."""
 
-    Attributes:
-        H_base: (3, 3) homography for stage 3, det 1.
-        case: The case of the paper's H_base.
-        alpha: α, the share of H_geometric: 0 for ``feature``, 1 for ``geometric``.
-        good_matches: Number of matches that passed the ratio test.
-        inliers: Number of them that agree with M, 0 without one.
-        consistency_px: Largest corner motion between the two homographies; None without a valid H_feature.
-        reason: Explanation of the case.
-        matches: Matches for stage 3 to cluster: the inliers of M, else all good ones.
-    """
-
-    H_base: FloatArray
-    case: Case
-    alpha: float
-    good_matches: int
-    inliers: int
-    consistency_px: float | None
-    reason: str
-    matches: Matches
+    H_base: FloatArray  # (3, 3) homography for stage 3, det 1
+    case: Case  # the case of the paper's H_base
+    alpha: float  # α, the share of H_geometric: 0 for ``feature``, 1 for ``geometric``
+    good_matches: int  # number of matches that passed the ratio test
+    inliers: int  # number of them that agree with M, 0 without one
+    consistency_px: float | None  # largest corner motion between the two homographies; None without a valid H_feature
+    reason: str  # explanation of the case
+    matches: Matches  # matches for stage 3 to cluster: the inliers of M, else all good ones
 
     @property
     def quality(self) -> float:
@@ -102,10 +91,7 @@ def normalised(H: FloatArray) -> FloatArray:
 def consistency(H_geometric: FloatArray, H_feature: FloatArray, corners: FloatArray) -> float:
     """consistency(H_geometric, H_feature): the largest motion of a corner between the two, in pixels.
 
-    Args:
-        H_geometric: (3, 3).
-        H_feature: (3, 3).
-        corners: (n, 2) *target* pixels around the source's warp; the source's own corners may project to infinity.
+    ``corners`` (n, 2) are *target* pixels around the source's warp: the source's own may project to infinity.
     """
     M = normalised(H_feature) @ np.linalg.inv(normalised(H_geometric))
     moved = np.concatenate([corners, np.ones((len(corners), 1))], 1) @ M.T
@@ -144,14 +130,8 @@ def match_features(
 ) -> Matches:
     """Match SIFT features by FLANN and Lowe's ratio test, good_matches = {m : d1 / d2 < ratio}.
 
-    SIFT repeats bit for bit within ``environment.repeatable_opencv`` only.
-
-    Args:
-        warped: (h, w) the source's warp.
-        reference: (h, w) the reference.
-        usable: (h, w) bool, False where keypoints are ignored, as at a warp's black border.
-        ratio: 0.75 in the paper.
-        max_features: Number of the strongest keypoints to keep.
+    SIFT repeats bit for bit within ``environment.repeatable_opencv`` only. Keypoints count where ``usable`` (h, w), not
+    at a warp's black border.
     """
     sift = cv2.SIFT_create(nfeatures=max_features)  # type: ignore[attr-defined]
     inside = usable.astype(np.uint8) * 255
@@ -193,11 +173,7 @@ def estimate_homography(matches: Matches, ransac_px: float) -> tuple[FloatArray,
 def is_valid(H: FloatArray, visible: Region, scale: float, max_area_ratio: float) -> bool:
     """Apply check_homography to the visible part of a source: its other corners may lie behind the target.
 
-    Args:
-        H: (3, 3).
-        visible: Bounding box of the part that the target shows, source pixels.
-        scale: Source focal length over target focal length, so that a smaller target is no distortion.
-        max_area_ratio: The bound.
+    ``scale`` is source focal length over target focal length, so that a smaller target is no distortion.
     """
     shift = np.array([[1.0, 0.0, visible.x0], [0.0, 1.0, visible.y0], [0.0, 0.0, 1.0]])
     size = visible.y1 - visible.y0 + 1, visible.x1 - visible.x0 + 1
@@ -215,14 +191,8 @@ def optimise_transformation(
 ) -> FeatureReport:
     """Run stage 2 for one source: match its warp to the reference and update the base transformation.
 
-    Args:
-        H_geometric: (3, 3) from stage 1.
-        warped: (h, w) the source's warp by it.
-        reference: (h, w) the primary camera's warp.
-        coverages: (h, w) bool of the two warps.
-        visible: Bounding box of the part of the source that the target shows, source pixels.
-        focal_ratio: Source focal length over target focal length.
-        config: Settings.
+    ``visible`` bounds the part of the source that the target shows, in source pixels; ``focal_ratio`` is its focal
+    length over the target's.
     """
     scale = warped.shape[1] / REFERENCE_WIDTH_PX
     if not is_valid(H_geometric, visible, focal_ratio, config.max_area_ratio):

@@ -26,38 +26,23 @@ from arbiview_aug.favs.stage2_features import REFERENCE_WIDTH_PX, Matches
 
 @dataclass(frozen=True)
 class Detection:
-    """Detector's box in a source image, from which objects take their type.
+    """Detector's box in a source image, from which objects take their type."""
 
-    Attributes:
-        box: (x0, y0, x1, y1) in source pixels.
-        type: Class name, weighted by ``PaperConfig.type_weights``.
-    """
-
-    box: tuple[float, float, float, float]
-    type: str
+    box: tuple[float, float, float, float]  # (x0, y0, x1, y1) in source pixels
+    type: str  # class name, weighted by ``PaperConfig.type_weights``
 
 
 @dataclass(frozen=True)
 class SceneObject:
-    """object_j = {center_j, bbox_j, confidence_j, type_j}.
+    """object_j = {center_j, bbox_j, confidence_j, type_j}."""
 
-    Attributes:
-        center_source: c1_j, (2,) centroid in source pixels.
-        center_target: c2_j, (2,) centroid in the reference, target pixels.
-        bbox: (x0, y0, x1, y1) around its points in the reference.
-        confidence: In (0, 1], 1 where all points have the same offset.
-        type: ``ground``, ``upright``, ``far``, or a detector's class.
-        density_factor: In (0, 1).
-        points: n_j.
-    """
-
-    center_source: FloatArray
-    center_target: FloatArray
-    bbox: tuple[float, float, float, float]
-    confidence: float
-    type: str
-    density_factor: float
-    points: int
+    center_source: FloatArray  # c1_j, (2,) centroid in source pixels
+    center_target: FloatArray  # c2_j, (2,) centroid in the reference, target pixels
+    bbox: tuple[float, float, float, float]  # (x0, y0, x1, y1) around its points in the reference
+    confidence: float  # in (0, 1], 1 where all points have the same offset
+    type: str  # ``ground``, ``upright``, ``far``, or a detector's class
+    density_factor: float  # in (0, 1)
+    points: int  # n_j
 
     def weight(self, config: PaperConfig) -> float:
         """w_j = confidence_j × type_weight_j × density_factor_j."""
@@ -66,30 +51,19 @@ class SceneObject:
 
 @dataclass(frozen=True)
 class AlignmentReport:
-    """Result of stage 3 for one source.
+    """Result of stage 3 for one source."""
 
-    Attributes:
-        H_aligned: (3, 3) T(β ΔT) · H_base.
-        shift_px: (2,) ΔT, zero where it was declined.
-        objects: The objects found.
-        reason: Explanation of the shift.
-    """
-
-    H_aligned: FloatArray
-    shift_px: FloatArray
-    objects: tuple[SceneObject, ...]
-    reason: str
+    H_aligned: FloatArray  # (3, 3) T(β ΔT) · H_base
+    shift_px: FloatArray  # (2,) ΔT, zero where it was declined
+    objects: tuple[SceneObject, ...]  # the objects found
+    reason: str  # explanation of the shift
 
 
 # --- equations --------------------------------------------------------------------------------------------------------
 def mean_offset(c1: FloatArray, c2: FloatArray, weights: FloatArray, H_base: FloatArray) -> FloatArray:
     """ΔT = argmin Σ w_j ‖c2_j − (H_base c1_j + ΔT)‖², which is the weighted mean of c2_j − H_base c1_j.
 
-    Args:
-        c1: (m, 2) object centres in the source.
-        c2: (m, 2) in the target.
-        weights: (m,) >= 0, not all 0.
-        H_base: (3, 3) source to target.
+    c1 and c2 (m, 2) are object centres in source and target; weights (m,) >= 0 are not all 0.
     """
     return weights @ (c2 - apply(H_base, c1)) / weights.sum()
 
@@ -157,16 +131,10 @@ def find_objects(
     config: PaperConfig,
     detections: Sequence[Detection] = (),
 ) -> list[SceneObject]:
-    """Cluster one source's matches into objects.
+    """Cluster one source's matches, for which it was warped by ``H_geometric``, into objects.
 
-    Args:
-        matches: From stage 2.
-        H_geometric: (3, 3) by which the source was warped for matching.
-        H_base: (3, 3) from stage 2.
-        target: The target camera.
-        ground_z_m: Height of the road in its ego frame.
-        config: Settings.
-        detections: Boxes in the source image; the smallest one around an object's centre gives its type.
+    The road lies at ``ground_z_m`` in the target's ego frame. The smallest detection around an object's centre gives
+    its type.
     """
     scale = target.width_px / REFERENCE_WIDTH_PX
     radius_px = config.cluster_radius_px * scale

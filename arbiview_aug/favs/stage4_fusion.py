@@ -29,19 +29,12 @@ _UNMASKED = 1 - 1e-6  # share of unmasked taps that counts as all: bilinear weig
 
 
 class Warp(NamedTuple):
-    """A source image as the target sees it.
+    """A source image as the target sees it."""
 
-    Attributes:
-        image: (h, w, 3) in 0..255, black outside the coverage.
-        coverage: (h, w) bool, True where the source sees the scene.
-        in_image: (h, w) bool, the coverage with the pixels that the source's mask hides.
-        uv: (h, w, 2) float32 source pixels.
-    """
-
-    image: Float32Image
-    coverage: BoolArray
-    in_image: BoolArray
-    uv: npt.NDArray[np.float32]
+    image: Float32Image  # (h, w, 3) in 0..255, black outside the coverage
+    coverage: BoolArray  # (h, w) bool, True where the source sees the scene
+    in_image: BoolArray  # (h, w) bool, the coverage with the pixels that the source's mask hides
+    uv: npt.NDArray[np.float32]  # (h, w, 2) float32 source pixels
 
 
 # --- warping ----------------------------------------------------------------------------------------------------------
@@ -49,12 +42,7 @@ def warp_perspective(image: Float32Image, H: FloatArray, size: tuple[int, int], 
     """I_warped = warp_perspective(I_source, H), bilinear.
 
     Unlike ``cv2.warpPerspective``, this rejects points behind the camera and never reads masked pixels or the border.
-
-    Args:
-        image: (H, W, 3), 0 where masked.
-        H: (3, 3) source pixels to target pixels, positive third coordinates in front.
-        size: (h, w) of the target.
-        mask: (H, W) bool, False on the own car's body.
+    The image (H, W, 3) is 0 where its mask (H, W) is False, on the own car's body.
     """
     uv, in_image = source_pixels(H, image.shape[:2], size)
     coverage = in_image
@@ -70,12 +58,7 @@ def warp_perspective(image: Float32Image, H: FloatArray, size: tuple[int, int], 
 def source_pixels(
     H: FloatArray, source_size: tuple[int, ...], size: tuple[int, int]
 ) -> tuple[npt.NDArray[np.float32], BoolArray]:
-    """Map each target pixel to the source by H⁻¹.
-
-    Args:
-        H: (3, 3) source pixels to target pixels, positive third coordinates in front.
-        source_size: (H, W) of the source.
-        size: (h, w) of the target.
+    """Map each target pixel to the source by H⁻¹; H gives positive third coordinates in front.
 
     Returns:
         (h, w, 2) float32 source pixels; (h, w) bool, True in front of the source and between its outermost pixels.
@@ -111,9 +94,8 @@ def gradient_weight(gradient_magnitude: FloatArray, sigma: float) -> FloatArray:
 def quality_weight(parallax_px: FloatArray, resolution: FloatArray) -> FloatArray:
     """w_quality in (0, 1] from calibration alone, for render plans; ``fusion_weight`` has that of matched images.
 
-    Args:
-        parallax_px: (...,) displacement in target pixels that unknown depth may cause, >= 0.
-        resolution: (...,) source pixels per target pixel along the worse axis.
+    ``parallax_px`` is the displacement in target pixels that unknown depth may cause, ``resolution`` source pixels per
+    target pixel along the worse axis.
     """
     return np.clip(resolution, 0.05, 1.0) / (1.0 + parallax_px)
 
@@ -126,14 +108,9 @@ def primary_weight(is_primary: bool, bonus: float) -> float:
 def fusion_weight(
     image: Float32Image, coverage: BoolArray, quality: float, primary: bool, config: PaperConfig
 ) -> npt.NDArray[np.float32]:
-    """w = w_distance · w_gradient · w_quality · w_primary, (h, w), 0 outside the coverage.
+    """w = w_distance · w_gradient · w_quality · w_primary, (h, w), 0 outside the coverage, of a warped source.
 
-    Args:
-        image: (h, w, 3) warped source, 0..255.
-        coverage: (h, w) bool.
-        quality: Matching quality in [0, 1]; unused for the primary camera, to which the others are matched.
-        primary: Whether the source is the primary camera.
-        config: Settings.
+    ``quality`` in [0, 1] is that of matching, unused for the primary camera, to which the others are matched.
     """
     weight = coverage.astype(np.float64)
     if config.use_distance_weight and not coverage.all():  # without a border there is no distance to it
@@ -153,11 +130,7 @@ def fusion_weight(
 
 # --- the weighted average ---------------------------------------------------------------------------------------------
 def fuse(images: FloatArray, weights: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """I_target = Σ w⁽ⁱ⁾ I_warped⁽ⁱ⁾ / Σ w⁽ⁱ⁾.
-
-    Args:
-        images: (S, h, w, 3) warped sources.
-        weights: (S, h, w) >= 0.
+    """I_target = Σ w⁽ⁱ⁾ I_warped⁽ⁱ⁾ / Σ w⁽ⁱ⁾ of warped sources (S, h, w, 3) and weights (S, h, w) >= 0.
 
     Returns:
         (h, w, 3) fused image, 0 where all weights are zero; (h, w) bool, True where any is positive.
@@ -175,12 +148,6 @@ def adaptive_fusion(
     warps: Sequence[Warp], qualities: Sequence[float], primary: int, config: PaperConfig
 ) -> tuple[Float32Image, npt.NDArray[np.int64]]:
     """Weight and fuse the warped sources of one target view.
-
-    Args:
-        warps: S warped sources.
-        qualities: Matching quality of each in [0, 1].
-        primary: Index of the primary camera's warp.
-        config: Settings.
 
     Returns:
         (h, w, 3) fused image; (h, w) index of the source with the largest weight, -1 where there is none.

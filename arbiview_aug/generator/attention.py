@@ -37,22 +37,12 @@ class PositionalEncoding(nn.Module):
     resolve. Equal maps let a shift of Δp rotate each (sin, cos) pair, see ``rotate_queries``.
     """
 
-    def __init__(self, width: int = HEAD_WIDTH) -> None:
-        super().__init__()
-        self.width = width
-
-    def maps(self, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
-        """W1 and W2, (width / 2, 2) float32: half of the rows for x, half for y."""
-        frequency = math.pi * 2.0 ** torch.linspace(-4, 0, self.width // 4, device=device)
-        none = torch.zeros_like(frequency)
-        W = torch.cat([torch.stack([frequency, none], 1), torch.stack([none, frequency], 1)])
-        return W, W
-
     def forward(self, delta: torch.Tensor) -> torch.Tensor:
-        """(..., width) of Δp (..., 2), in float32: a matrix product would be bfloat16 or TF32 on a GPU."""
-        delta = delta.float()[..., None, :]
-        W1, W2 = self.maps(delta.device)
-        return torch.cat([torch.sin((delta * W1).sum(-1)), torch.cos((delta * W2).sum(-1))], -1)
+        """(..., 32) of Δp (..., 2), in float32: a matrix product would be bfloat16 or TF32 on a GPU."""
+        frequency = math.pi * 2.0 ** torch.linspace(-4, 0, HEAD_WIDTH // 4, device=delta.device)
+        W = torch.block_diag(frequency[:, None], frequency[:, None])  # half of the rows for x, half for y
+        angle = (delta.float()[..., None, :] * W).sum(-1)
+        return torch.cat([torch.sin(angle), torch.cos(angle)], -1)
 
     def rotate_queries(self, queries: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
         """Queries (..., heads, width) rotated by ``offset`` (..., 2) tokens: rotated(q, b)·PE(a) = q·PE(a − b).
@@ -82,11 +72,8 @@ class GEGLU(nn.Module):
 class CrossViewAttention(nn.Module):
     """One block: cross-view attention, then a feed-forward, both residual with zero-initialised outputs.
 
-    About 16 width² parameters. Keys and values of each view are projected once (``keys_values``) and then gathered.
-
-    Args:
-        width: Channels of the features; a multiple of 32, the width of a head.
-        levels: Depth levels L.
+    About 16 width² parameters; the width is a multiple of 32, that of a head. Keys and values of each view are
+    projected once (``keys_values``) and then gathered.
     """
 
     def __init__(self, width: int, levels: int) -> None:
@@ -115,17 +102,11 @@ class CrossViewAttention(nn.Module):
     def forward(
         self, tokens: torch.Tensor, keys: torch.Tensor, values: torch.Tensor, at: TokenWindow, with_rows: bool = False
     ) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Let the query views read the key views.
-
-        Args:
-            tokens: (B, Q, T, width) features of the query views.
-            keys: (B, V, T, width) by ``keys_values``; ``values`` likewise.
-            values: See ``keys``.
-            at: The windows of this token grid.
-            with_rows: Also return L_geo's rows.
+        """Let the query views, features (B, Q, T, width), read keys and values (B, V, T, width) by ``keys_values``.
 
         Returns:
-            Features (B, Q, T, width), and M_ij^pred (E, 9): each Attention^(l) over its taps, mean over the heads.
+            Features (B, Q, T, width); with ``with_rows`` also M_ij^pred (E, 9) of L_geo: each Attention^(l) over its
+            taps, mean over the heads.
         """
         logits = self._logits(self.to_q(self.norm(tokens)), keys, at)
         share = torch.softmax(logits.float(), -1) * self._weights(logits[..., TAPS // 2], at)[..., None]

@@ -32,16 +32,10 @@ class Completion:
 
 
 def complete_frame(rendered: RenderedFrame, frame: Frame, name: str, how: Completion) -> RenderedFrame:
-    """Fill the pixels of a rendered frame that no camera saw, or saw with too little confidence.
+    """Fill the pixels of a rendered ``frame`` that no camera saw, or saw with too little confidence.
 
     Filled pixels are no longer covered: ``coverage`` False, ``confidence`` 0, ``source_camera`` and ``source_frame``
-    -1. Gradients of the others stay.
-
-    Args:
-        rendered: The views.
-        frame: The frame they were rendered from.
-        name: Name of the frame, for the noise.
-        how: Settings.
+    -1. Gradients of the others stay. ``name`` decides the noise.
     """
     # Noise by camera number: cameras have no names in a batch.
     cameras = [replace(camera, name=str(k)) for k, camera in enumerate(rendered.rig)]
@@ -102,12 +96,8 @@ def complete_batch(
     The pixels are those of ``RigRetarget(path="diffusion")``.
 
     Args:
-        generator: The model; None inpaints.
+        generator: The model; None inpaints. The settings are those of ``RigRetarget``.
         batch: From ``RigRetarget(..., outputs=("sources", "confidence"))``, one sample or a batch of them.
-        steps: As in ``RigRetarget``, like all settings.
-        guidance: See ``steps``.
-        min_confidence: See ``steps``.
-        seed: See ``steps``.
 
     Returns:
         A new dict without ``sources``, with ``generated``.
@@ -146,10 +136,8 @@ def complete_batch(
 class CompletedLoader:
     """Loader that completes the batches of another one in this process, on the generator's device.
 
-    Args:
-        loader: Yields batches from ``RigRetarget(..., outputs=("sources", "confidence"))``.
-        generator: The model.
-        settings: Keyword arguments of ``complete_batch``.
+    ``loader`` yields batches from ``RigRetarget(..., outputs=("sources", "confidence"))``. The other arguments are
+    those of ``complete_batch``.
     """
 
     def __init__(

@@ -54,21 +54,13 @@ class Completed(NamedTuple):
 
 
 class Conditions(NamedTuple):
-    """Inputs of the generator for N targets and S sources of B frames, at its image size.
+    """Inputs of the generator for N targets and S sources of B frames, at its image size."""
 
-    Attributes:
-        prefilled: (B, N, 3, H, W) in [0, 1], FAVS at the targets with holes inpainted.
-        known: (B, N, H, W) bool, or shares in [0, 1].
-        confidence: (B, N, H, W) in [0, 1].
-        sources: (B, S, 3, H, W) in [0, 1].
-        seen: (B, S, H, W) valid pixels of the sources, bool, or 0 and 1.
-    """
-
-    prefilled: torch.Tensor
-    known: torch.Tensor
-    confidence: torch.Tensor
-    sources: torch.Tensor
-    seen: torch.Tensor
+    prefilled: torch.Tensor  # (B, N, 3, H, W) in [0, 1], FAVS at the targets with holes inpainted
+    known: torch.Tensor  # (B, N, H, W) bool, or shares in [0, 1]
+    confidence: torch.Tensor  # (B, N, H, W) in [0, 1]
+    sources: torch.Tensor  # (B, S, 3, H, W) in [0, 1]
+    seen: torch.Tensor  # (B, S, H, W) valid pixels of the sources, bool, or 0 and 1
 
     def encoded(
         self, config: GeneratorConfig, autoencoder: Autoencoder, geometry: FrameGeometry

@@ -33,21 +33,13 @@ _OCTAVES = 4
 
 
 class Views(NamedTuple):
-    """The conditions of the views of B frames, N views each, on the latent grid.
+    """The conditions of the views of B frames, N views each, on the latent grid."""
 
-    Attributes:
-        latent: (B, N, C, h, w) FAVS at a target's pose, pre-filled; a source's image.
-        mask: (B, N, 1, h, w) known share of each latent pixel, in [0, 1].
-        confidence: (B, N, 1, h, w) in [0, 1].
-        rays: (B, N, 6, h, w) Plücker rays, see ``plucker_rays``.
-        pose: (B, N, 16) see ``pose_vector``.
-    """
-
-    latent: torch.Tensor
-    mask: torch.Tensor
-    confidence: torch.Tensor
-    rays: torch.Tensor
-    pose: torch.Tensor
+    latent: torch.Tensor  # (B, N, C, h, w) FAVS at a target's pose, pre-filled; a source's image
+    mask: torch.Tensor  # (B, N, 1, h, w) known share of each latent pixel, in [0, 1]
+    confidence: torch.Tensor  # (B, N, 1, h, w) in [0, 1]
+    rays: torch.Tensor  # (B, N, 6, h, w) Plücker rays, see ``plucker_rays``
+    pose: torch.Tensor  # (B, N, 16) see ``pose_vector``
 
     def dropped(self, drop: torch.Tensor) -> Views:
         """Zero the conditions of the frames ``drop`` (B,) bool, for classifier-free guidance."""
@@ -116,12 +108,7 @@ def pooled(maps: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
 
 # --- the pose token ---------------------------------------------------------------------------------------------------
 class PoseContext(nn.Module):
-    """The U-Net's cross-attention context: the empty prompt's embedding and one pose token.
-
-    Args:
-        width: Cross-attention width of the U-Net.
-        prompt_tokens: Tokens of the empty prompt: 77 for Stable Diffusion, 0 without text.
-    """
+    """The U-Net's cross-attention context: the empty prompt's embedding (77 or 0 tokens) and one pose token."""
 
     empty_prompt: torch.Tensor
 

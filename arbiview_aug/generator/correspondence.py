@@ -35,17 +35,11 @@ LEVELS = ("infinity", "road", "facing")
 
 
 class Correspondence(NamedTuple):
-    """Positions of the tokens of Q query views in the views that they may read, on one token grid.
+    """Positions of the tokens of Q query views in the views that they may read, on one token grid."""
 
-    Attributes:
-        neighbour: (B, Q, J) int64, the key view of each of J slots; 0 in unused slots.
-        centre: (B, Q, J, L, h, w, 2) float32, p_j^(l) as (x, y) in tokens; 0 where not valid.
-        valid: (B, Q, J, L, h, w) bool, M_j^(l).
-    """
-
-    neighbour: torch.Tensor
-    centre: torch.Tensor
-    valid: torch.Tensor
+    neighbour: torch.Tensor  # (B, Q, J) int64, the key view of each of J slots; 0 in unused slots
+    centre: torch.Tensor  # (B, Q, J, L, h, w, 2) float32, p_j^(l) as (x, y) in tokens; 0 where not valid
+    valid: torch.Tensor  # (B, Q, J, L, h, w) bool, M_j^(l)
 
     def to(self, device: torch.device | str) -> Correspondence:
         """Copy to a device."""
@@ -78,13 +72,9 @@ def ray_map(query: Camera, key: Camera, plane: FloatArray) -> FloatArray:
 
 
 def correspond(query: Camera, rays: Rays, key: Camera, planes: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Map the tokens of one view to another over planes.
+    """Map the tokens (h, w) of view i, ``query``, with their rays in its own frame, to view j, ``key``, over planes.
 
-    Args:
-        query: View i.
-        rays: Of its tokens (h, w), in its own frame: ``unproject_cam`` at the size of the grid.
-        key: View j, at the size of the grid.
-        planes: (L, 3) n_l / d_l in ``query``'s frame; the first is infinity.
+    The planes (L, 3) n_l / d_l lie in the query's frame; the first is infinity. The key has the size of the grid.
 
     Returns:
         p_j^(l) (L, h, w, 2), 0 where not valid, and M_j^(l) (L, h, w).
@@ -122,13 +112,8 @@ def correspondences(
     pair whose centres coincide has one level, infinity, which is then exact; the others have all of ``LEVELS``. J is
     the largest number of neighbours, at least 1: attention is never skipped, which would hang distributed training.
 
-    Args:
-        queries: Q cameras, in one ego frame.
-        keys: V cameras that may be read.
-        own: For each query its own index among the keys: no view reads itself.
-        sizes: (h, w) of the token grids, the finest first.
-        ground_z_m: Height of the road in the ego frame.
-        facing_m: Distance of the facing plane.
+    ``own`` is each query's index among the keys: no view reads itself. ``sizes`` (h, w) of the token grids, the finest
+    first. All cameras and the road lie in one ego frame.
     """
     small = [[camera.resize(size) for size in sizes] for camera in keys]
     found = []
@@ -198,22 +183,14 @@ class TokenWindow(NamedTuple):
     """The 3 x 3 integer taps that attention reads around each valid p_j^(l), on one grid of T = h w tokens.
 
     A rig's views overlap by a fifth to a third, so the E valid places (a token, a neighbour, a level) are listed.
-
-    Attributes:
-        valid: (B, Q, J, L, T) bool, with E entries that are true.
-        place: (E,) int64 their indices in the flattened ``valid``.
-        token: (E,) int64 the query's token among all B Q T.
-        tap: (E, 9) int64 the keys' tokens among all B V T, in view j even where masked.
-        inside: (E, 9) bool, the taps inside view j.
-        fraction: (E, 2) float32 H p_i from its nearest tap.
     """
 
-    valid: torch.Tensor
-    place: torch.Tensor
-    token: torch.Tensor
-    tap: torch.Tensor
-    inside: torch.Tensor
-    fraction: torch.Tensor
+    valid: torch.Tensor  # (B, Q, J, L, T) bool, with E entries that are true
+    place: torch.Tensor  # (E,) int64 their indices in the flattened ``valid``
+    token: torch.Tensor  # (E,) int64 the query's token among all B Q T
+    tap: torch.Tensor  # (E, 9) int64 the keys' tokens among all B V T, in view j even where masked
+    inside: torch.Tensor  # (E, 9) bool, the taps inside view j
+    fraction: torch.Tensor  # (E, 2) float32 H p_i from its nearest tap
 
     @property
     def read(self) -> torch.Tensor:

@@ -35,17 +35,11 @@ Sources = list[KeysValues]
 
 
 class Rows(NamedTuple):
-    """Attention maps of one block for L_geo, over the 3 x 3 taps of the E valid (token, pair, level).
+    """Attention maps of one block for L_geo, over the 3 x 3 taps of the E valid (token, pair, level)."""
 
-    Attributes:
-        predicted: (E, 9) M_ij^pred.
-        target: (E, 9) M_ij^target, bilinear weights at H p_i.
-        pair: (E,) int64 index of the pair (i, j) of a row.
-    """
-
-    predicted: torch.Tensor
-    target: torch.Tensor
-    pair: torch.Tensor
+    predicted: torch.Tensor  # (E, 9) M_ij^pred
+    target: torch.Tensor  # (E, 9) M_ij^target, bilinear weights at H p_i
+    pair: torch.Tensor  # (E,) int64 index of the pair (i, j) of a row
 
 
 class Denoiser(nn.Module):
@@ -105,12 +99,7 @@ class Denoiser(nn.Module):
         return [parameter for part in parts for parameter in part.parameters()]
 
     def read_sources(self, sources: Views, windows: Sequence[TokenWindow]) -> Sources:
-        """Run the source branches, which read sources only.
-
-        Args:
-            sources: Conditions of S views; their latents are clean.
-            windows: Of the sources in the sources, one for each token grid, the finest first.
-        """
+        """Run the source branches, which read sources only; ``windows``: one for each token grid, the finest first."""
         t = torch.zeros(len(sources.latent), dtype=torch.long, device=sources.latent.device)
         outputs: Sources = []
         clean = sources.latent if self.signal is None else torch.zeros_like(sources.latent)  # their residual is 0

@@ -130,21 +130,15 @@ class Generator(GeneratorNetworks):
         """
         return cls.from_pretrained(_SHIPPED)
 
-    def save_pretrained(self, folder: str | Path, *, dtype: torch.dtype | None = None) -> None:
-        """Write the generator to a folder of its own, atomically.
-
-        Args:
-            folder: Created if needed.
-            dtype: Of the stored weights, by default their own; float16 halves the file and is loaded as float32.
+    def save_pretrained(self, folder: str | Path) -> None:
+        """Write the generator to a folder of its own, atomically; in float16 (``half()``) the file is half as large.
 
         Raises:
             OutputError: The disk is full, or the folder cannot be written.
         """
-        tensors = self.state_dict()
-        if dtype is not None:
-            tensors = {name: t.to(dtype) if t.is_floating_point() else t for name, t in tensors.items()}
         scaled = replace(self.config.autoencoder, scale=self.autoencoder.scale)
-        write_checkpoint(Path(folder), {"generator": asdict(replace(self.config, autoencoder=scaled))}, tensors)
+        config = {"generator": asdict(replace(self.config, autoencoder=scaled))}
+        write_checkpoint(Path(folder), config, self.state_dict())
 
     # --- use ----------------------------------------------------------------------------------------------------------
     complete_views = complete

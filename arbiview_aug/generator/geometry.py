@@ -21,23 +21,14 @@ from arbiview_aug.generator.correspondence import (
 
 
 class FrameGeometry(NamedTuple):
-    """The N target and S source cameras of B frames. If both are read, sources are numbered before targets.
+    """The N target and S source cameras of B frames. If both are read, sources are numbered before targets."""
 
-    Attributes:
-        target_rays: (B, N, 6, h, w), see ``conditioning.plucker_rays``.
-        target_pose: (B, N, 16), see ``conditioning.pose_vector``.
-        source_rays: (B, S, 6, h, w).
-        source_pose: (B, S, 16).
-        target_reads: Correspondences of the targets in sources and targets, one per token grid, the finest first.
-        source_reads: Correspondences of the sources in the other sources.
-    """
-
-    target_rays: torch.Tensor
-    target_pose: torch.Tensor
-    source_rays: torch.Tensor
-    source_pose: torch.Tensor
-    target_reads: list[Correspondence]
-    source_reads: list[Correspondence]
+    target_rays: torch.Tensor  # (B, N, 6, h, w), see ``conditioning.plucker_rays``
+    target_pose: torch.Tensor  # (B, N, 16), see ``conditioning.pose_vector``
+    source_rays: torch.Tensor  # (B, S, 6, h, w)
+    source_pose: torch.Tensor  # (B, S, 16)
+    target_reads: list[Correspondence]  # of the targets in sources and targets, one per token grid, the finest first
+    source_reads: list[Correspondence]  # of the sources in the other sources
 
     def to(self, device: torch.device | str) -> FrameGeometry:
         """Copy to a device."""
@@ -49,13 +40,7 @@ class FrameGeometry(NamedTuple):
         return FrameGeometry._make([*self[:4], *([change(grid) for grid in reads] for reads in self[4:])])
 
     def target_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> Views:
-        """The targets' conditions.
-
-        Args:
-            latent: (B, N, C, h, w) of FAVS at their poses, pre-filled.
-            mask: (B, N, H, W) coverage of FAVS, at any resolution.
-            confidence: (B, N, H, W) in [0, 1].
-        """
+        """The targets' conditions: latents (B, N, C, h, w), coverage and confidence (B, N, H, W) at any resolution."""
         return _views(latent, mask, confidence, self.target_rays, self.target_pose)
 
     def source_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> Views:
@@ -76,14 +61,7 @@ class FrameGeometry(NamedTuple):
 def frame_geometry(
     targets: Sequence[Camera], sources: Sequence[Camera], ground_z_m: float, config: GeneratorConfig
 ) -> FrameGeometry:
-    """The geometry of one frame (B = 1).
-
-    Args:
-        targets: N cameras of any sizes, in one ego frame with the sources.
-        sources: S cameras.
-        ground_z_m: Height of the road in that frame.
-        config: Settings: the latents' size, the U-Net's levels, the depth levels.
-    """
+    """The geometry of one frame (B = 1), whose N targets, S sources and road lie in one ego frame."""
     size = config.latent_size
     grids = token_sizes(size, len(config.unet.widths))
     target_rays, target_pose = camera_conditions(targets, [reference_camera(t, sources) for t in targets], size)

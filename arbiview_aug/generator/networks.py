@@ -11,16 +11,7 @@ from arbiview_aug.generator.denoiser import Denoiser
 
 
 class GeneratorNetworks(nn.Module):
-    """Denoiser and autoencoder of one configuration (Sec. CVC-SSL).
-
-    Args:
-        config: Settings.
-        denoiser: The U-Net with its cross-view blocks.
-        autoencoder: Between images and latents.
-
-    Attributes:
-        calls: Number of denoiser calls so far, over steps and guidance.
-    """
+    """Denoiser and autoencoder of one configuration (Sec. CVC-SSL); ``calls`` counts those of the denoiser."""
 
     def __init__(self, config: GeneratorConfig, denoiser: Denoiser, autoencoder: Autoencoder) -> None:
         super().__init__()

@@ -22,9 +22,7 @@ Predict = Callable[[torch.Tensor, int], torch.Tensor]
 def noise_schedule(*, prediction: str, zero_snr: bool) -> Any:
     """Stable Diffusion's schedule (scaled linear, β from 0.00085 to 0.012, 1000 steps).
 
-    Args:
-        prediction: ``epsilon`` or ``v_prediction``.
-        zero_snr: Rescale it to zero terminal SNR (Lin et al. 2023); only with ``v_prediction``.
+    ``zero_snr`` rescales it to zero terminal SNR (Lin et al. 2023); only with ``v_prediction``.
     """
     return optional_package("diffusers", "generator").DPMSolverMultistepScheduler(
         num_train_timesteps=TIMESTEPS,
@@ -82,13 +80,9 @@ def sample(
 
 
 def guided(conditional: torch.Tensor, unconditional: torch.Tensor, guidance: float, rescale: float) -> torch.Tensor:
-    """Classifier-free guidance u + g (c − u), rescaled to the deviation of c (Lin et al. 2023, Sec. 3.4).
+    """Classifier-free guidance u + g (c − u) of (B, N, C, h, w), rescaled to the deviation of c by φ = ``rescale``.
 
-    Args:
-        conditional: (B, N, C, h, w) with conditions.
-        unconditional: Likewise without.
-        guidance: g; 1 is no guidance.
-        rescale: φ in [0, 1]: 0.7 keeps strong guidance from overexposing.
+    Lin et al. 2023, Sec. 3.4: φ = 0.7 keeps strong guidance from overexposing.
     """
     mixed = unconditional + guidance * (conditional - unconditional)
     each = (2, 3, 4)

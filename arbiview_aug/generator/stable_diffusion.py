@@ -28,13 +28,10 @@ PLAIN_UNET = {
 
 
 def load_part(kind: str, where: str | Path, subfolder: str, expected: Mapping[str, Any]) -> Any:
-    """Load a diffusers model and refuse missing or extra weights, of which diffusers itself only warns.
+    """Load a diffusers model (class ``kind``) and refuse missing or extra weights, of which diffusers only warns.
 
-    Args:
-        kind: The diffusers class.
-        where: Folder or hub id in diffusers' layout; from a hub id, safetensors are downloaded.
-        subfolder: ``unet`` or ``vae``.
-        expected: Entries that its configuration must have.
+    ``where`` is a folder or hub id in diffusers' layout; from a hub id, safetensors are downloaded. ``expected`` are
+    entries that its configuration must have.
 
     Raises:
         GeneratorError: No such folder, another architecture, or weights that are missing, extra or of another shape.

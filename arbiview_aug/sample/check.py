@@ -41,11 +41,7 @@ def check_other_keys(
 ) -> list[str]:
     """The keys that hold label maps; refuse others that may be bound to the source's pixels.
 
-    Args:
-        sample: The sample dict.
-        sizes: The (h, w) of its images.
-        label_keys: Named by the user as label maps.
-        pass_keys: Named by the user as independent of pixels.
+    ``sizes`` are (h, w) of the images; ``label_keys`` and ``pass_keys`` are the user's.
 
     Raises:
         SampleError: A tensor of the images' height and width, or a torchvision tv_tensor, under another key.
@@ -94,14 +90,10 @@ def warn_of_misnamed(
     named: Sequence[str],
     warn: Callable[[str, str], None],
 ) -> None:
-    """Warn of keys that are probably misnamed and would not be read.
+    """Warn, by topic and message, of keys that are probably misnamed and would not be read.
 
-    Args:
-        sample: The sample dict.
-        calibrated: A rig stands for ``lens``, ``distortion`` and ``ground_z_m``.
-        static: No ego-frame key is used.
-        named: Keys that the user named on purpose.
-        warn: Called with a topic and a message.
+    Where ``calibrated``, a rig stands for ``lens``, ``distortion`` and ``ground_z_m``; where ``static``, no ego-frame
+    key is used. ``named`` keys are named on purpose.
     """
     lenses = () if calibrated else ("distortion", "lens", "ground_z_m")
     geometry = () if static else (*EGO_KEYS, "depth_m")

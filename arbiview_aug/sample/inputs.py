@@ -86,14 +86,7 @@ def read_frames(sample: Any, source_rig: Rig | None) -> list[Frame]:
 
 
 def read_scenes(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...], surface: str) -> list[Scene]:
-    """Read the scene geometry that a surface uses for each frame, in the source's ego frame; [] without any.
-
-    Args:
-        sample: The sample dict.
-        frames: Its checked frames.
-        lead: Leading dimensions of its images.
-        surface: A name in ``SURFACES``.
-    """
+    """Read the scene geometry that a surface uses for each frame, in the source's ego frame; [] without any."""
     row = SURFACES[surface]
     found: dict[str, list[Points]] = {}
     for name in row.reads:

@@ -46,11 +46,7 @@ class SampleWriter:
     ) -> dict[str, Any]:
         """Write the output sample of a sample, its frames and its leading dimensions; the input is not changed.
 
-        Args:
-            rendered: The rendered frames.
-            labels: The sample's keys that hold label maps.
-            target: The target rig in its own ego frame.
-            params: ``retarget_params``.
+        ``labels`` are the sample's keys that hold label maps; ``target`` is in its own ego frame.
         """
         out = self._passed_on(sample, labels)
         out["images"] = rewrapped(gathered([stacked(frame.images) for frame in rendered], lead), sample["images"])

@@ -12,10 +12,8 @@ from arbiview_aug.evaluate.targets import (
     VEHICLES,
     named_targets,
     paper_target,
-    paper_targets,
     shifted_target,
     spacing_deg,
-    yawed_targets,
 )
 
 
@@ -27,7 +25,7 @@ def turned_by(source: Rig, target: Rig) -> dict[str, float]:
 def test_the_papers_yaws() -> None:
     """The paper states 11/14, 22/28, 27.5/35 and 13.75/17.5 degrees: sides and front / back."""
     rig = load_rig("nuscenes")
-    yaws = [turned_by(rig, target) for target in paper_targets(rig)]
+    yaws = [turned_by(rig, target) for target in named_targets("paper", rig).values()]
     assert [(y["CAM_FRONT"], y["CAM_BACK"]) for y in yaws] == [
         (11.0, 14.0),
         (-11.0, -14.0),
@@ -53,7 +51,7 @@ def test_spacing_of_other_rigs() -> None:
 
 def test_yaw_and_shift() -> None:
     rig = load_rig("waymo")
-    left, right = yawed_targets(rig, [22.0, -22.0])
+    left, right = (shifted_target(rig, yaw_deg=yaw) for yaw in (22.0, -22.0))
     assert set(turned_by(rig, left).values()) == {22.0} and set(turned_by(rig, right).values()) == {-22.0}
     np.testing.assert_array_equal(left.cam2ego[:, :3, 3], rig.cam2ego[:, :3, 3])
     moved = shifted_target(rig, 0.5, 0.3, 0.7, yaw_deg=11.0)
@@ -66,7 +64,7 @@ def test_targets_carry_no_masks() -> None:
         name="a", azimuth_deg=0, width_px=8, height_px=8, horizontal_fov_deg=50.0, mask=np.zeros((8, 8), bool)
     )
     rig = Rig([camera], ground_z_m=0.1, name="masked")
-    for target in (paper_target(rig, 0.2), *yawed_targets(rig, [5.0]), shifted_target(rig, z_m=1.0)):
+    for target in (paper_target(rig, 0.2), shifted_target(rig, yaw_deg=5.0), shifted_target(rig, z_m=1.0)):
         assert target[0].mask is None and target.name == "masked"
 
 

@@ -274,7 +274,7 @@ def test_real_frame(nuscenes_root) -> None:
     from arbiview_aug.datasets import FrameFolder
     from arbiview_aug.evaluate.images import as_arrays, as_tensors
     from arbiview_aug.evaluate.lidar import coloured_points
-    from arbiview_aug.evaluate.targets import yawed_targets
+    from arbiview_aug.evaluate.targets import named_targets
     from tests.helpers import score_targets
 
     sample = FrameFolder(nuscenes_root)[0]
@@ -290,7 +290,7 @@ def test_real_frame(nuscenes_root) -> None:
         rendered.append(render_paper(rig, target, as_tensors(images)))
         return as_arrays([view.image for view in rendered[-1].targets])
 
-    psnr = score_targets(render, points, yawed_targets(rig))["psnr_db"]
+    psnr = score_targets(render, points, [*named_targets("yaw", rig).values()])["psnr_db"]
     print(f"nuscenes-one, yaw, raw: {psnr:.2f} dB")
     assert abs(psnr - 22.5) < 1.5
     for rendering in rendered:

@@ -29,7 +29,7 @@ from arbiview_aug.evaluate.agreement import source_overlap, summary
 from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
 from arbiview_aug.evaluate.methods import Method, paper_stages, retargeting
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
-from arbiview_aug.evaluate.targets import UP_M, paper_targets, shifted_target
+from arbiview_aug.evaluate.targets import UP_M, named_targets, shifted_target
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.scene.surface import SurfaceName
@@ -200,7 +200,7 @@ def _frames(data: Sequence[str], reduce: Reduce, seed: int, size: tuple[int, int
 def _rows(data: str, frame: ScoredFrame, names: set[str]) -> dict[str, dict[str, Any]]:
     """Mean metrics of each row by move (``turned``, ``raised``), and its times on each target."""
     rig: Rig = frame.sample["rig"]
-    targets = {"turned": paper_targets(rig), "raised": [shifted_target(rig, z_m=UP_M)]}
+    targets = {"turned": [*named_targets("paper", rig).values()], "raised": [shifted_target(rig, z_m=UP_M)]}
     found: dict[str, dict[str, Any]] = {}
     for reduce in sorted({ROWS[name].reduce for name in names}):
         methods = [row.method(name) for name, row in ROWS.items() if name in names and row.reduce == reduce]

@@ -24,12 +24,8 @@ def visible_shares(rig: Rig, coverage: Sequence[BoolArray], boxes: FloatArray) -
     """(B,) share of each box that the cameras show.
 
     The solid angle of covered pixels that no nearer box occludes, summed over the cameras, over that of the box's whole
-    silhouette in the camera that would show most of it if its image were twice as wide and high.
-
-    Args:
-        rig: Pinhole cameras in the boxes' frame.
-        coverage: (h, w) bool for each camera.
-        boxes: (B, >=7) centre, length, width, height (m), yaw (radians).
+    silhouette in the camera that would show most of it if its image were twice as wide and high. The pinhole cameras,
+    each with its coverage (h, w), and the boxes (B, >= 7) lie in one frame.
     """
     boxes = np.asarray(boxes, np.float64)[:, :7]
     shown, total = np.zeros(len(boxes)), np.zeros(len(boxes))

@@ -14,21 +14,13 @@ from arbiview_aug.cli.convert.settings import Settings
 
 @dataclass(frozen=True)
 class Converted:
-    """A converted sample.
+    """A converted sample."""
 
-    Attributes:
-        index: Number of the sample in the source.
-        sample: The sample as read.
-        out: The retargeted sample.
-        rig: Its cameras.
-        views: For each camera the names of its files, by what follows their stem.
-    """
-
-    index: int
-    sample: Mapping[str, Any]
-    out: Mapping[str, Any]
-    rig: Rig
-    views: Sequence[Mapping[str, str]]
+    index: int  # number of the sample in the source
+    sample: Mapping[str, Any]  # the sample as read
+    out: Mapping[str, Any]  # the retargeted sample
+    rig: Rig  # its cameras
+    views: Sequence[Mapping[str, str]]  # for each camera the names of its files, by what follows their stem
 
 
 class Writer(ABC):

@@ -21,39 +21,22 @@ SingleArray = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Annotations:
-    """All B boxes of S samples, grouped by sample: those of sample k are rows first[k] to first[k + 1].
+    """All B boxes of S samples, grouped by sample: those of sample k are rows first[k] to first[k + 1]."""
 
-    Attributes:
-        first: (S + 1,) first row of each sample, and the end.
-        tokens: (B,) tokens of the annotations.
-        categories: Names of the categories.
-        category: (B,) index into ``categories``.
-        centers_m: (B, 3) world frame.
-        sizes_m: (B, 3) length, width, height.
-        headings: (B, 3) unit vectors along the lengths, world frame.
-        velocities_mps: (B, 3) world frame, NaN where unknown.
-        sample: (B,) index of the sample.
-        later: (B,) the same object's next annotation, -1 for none.
-        earlier: (B,) its previous annotation, -1 for none.
-        times_s: (S,) times of the samples.
-        scenes: (S,) numbers of their scenes.
-        order: (S,) samples sorted by scene and time.
-    """
-
-    first: npt.NDArray[np.int64]
-    tokens: npt.NDArray[np.bytes_]
-    categories: list[str]
-    category: IntArray
-    centers_m: FloatArray
-    sizes_m: SingleArray
-    headings: SingleArray
-    velocities_mps: SingleArray
-    sample: IntArray
-    later: IntArray
-    earlier: IntArray
-    times_s: FloatArray
-    scenes: npt.NDArray[np.int64]
-    order: npt.NDArray[np.int64]
+    first: npt.NDArray[np.int64]  # (S + 1,) first row of each sample, and the end
+    tokens: npt.NDArray[np.bytes_]  # (B,) tokens of the annotations
+    categories: list[str]  # names of the categories
+    category: IntArray  # (B,) index into ``categories``
+    centers_m: FloatArray  # (B, 3) world frame
+    sizes_m: SingleArray  # (B, 3) length, width, height
+    headings: SingleArray  # (B, 3) unit vectors along the lengths, world frame
+    velocities_mps: SingleArray  # (B, 3) world frame, NaN where unknown
+    sample: IntArray  # (B,) index of the sample
+    later: IntArray  # (B,) the same object's next annotation, -1 for none
+    earlier: IntArray  # (B,) its previous annotation, -1 for none
+    times_s: FloatArray  # (S,) times of the samples
+    scenes: npt.NDArray[np.int64]  # (S,) numbers of their scenes
+    order: npt.NDArray[np.int64]  # (S,) samples sorted by scene and time
 
     def rows(self, sample: int) -> npt.NDArray[np.int64]:
         """The boxes (n,) of a keyframe."""

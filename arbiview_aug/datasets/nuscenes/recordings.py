@@ -57,31 +57,18 @@ _ROW = np.dtype(
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """Recordings of all sensors, sorted by channel, scene and time.
+    """Recordings of all sensors, sorted by channel, scene and time."""
 
-    Attributes:
-        channels: The cameras, whose first one times a drive's frames, and last the LiDAR.
-        sensor2ego: (C, 4, 4) by calibrated sensor.
-        K: (C, 3, 3), the identity for the LiDAR.
-        rows: (R,) records of ``_ROW``.
-        first: (channels * scenes + 1,) first row of each channel in each scene, and the end.
-        keyframes: (S, channels) row of each sample's recording.
-        poses: (E, 7) ego poses: x y z and quaternion w x y z, world frame.
-        file_names: File names before and after the time; None after a name without the time.
-        tokens: (F,) tokens of the first channel's rows; empty without sweeps.
-        parts: (F,) numbers of the uninterrupted drives of these rows; empty without sweeps.
-    """
-
-    channels: list[str]
-    sensor2ego: FloatArray
-    K: FloatArray
-    rows: npt.NDArray[Any]
-    first: IntArray
-    keyframes: IntArray
-    poses: FloatArray
-    file_names: list[tuple[str, str | None]]
-    tokens: npt.NDArray[np.bytes_]
-    parts: IntArray
+    channels: list[str]  # the cameras, whose first one times a drive's frames, and last the LiDAR
+    sensor2ego: FloatArray  # (C, 4, 4) by calibrated sensor
+    K: FloatArray  # (C, 3, 3), the identity for the LiDAR
+    rows: npt.NDArray[Any]  # (R,) records of ``_ROW``
+    first: IntArray  # (channels * scenes + 1,) first row of each channel in each scene, and the end
+    keyframes: IntArray  # (S, channels) row of each sample's recording
+    poses: FloatArray  # (E, 7) ego poses: x y z and quaternion w x y z, world frame
+    file_names: list[tuple[str, str | None]]  # file names before and after the time; None after a name without the time
+    tokens: npt.NDArray[np.bytes_]  # (F,) tokens of the first channel's rows; empty without sweeps
+    parts: IntArray  # (F,) numbers of the uninterrupted drives of these rows; empty without sweeps
 
     def file(self, row: int) -> str:
         """Name of a recording's file, relative to the root."""

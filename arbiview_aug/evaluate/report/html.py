@@ -27,17 +27,10 @@ _JPEG_QUALITY = 85
 def html_report(
     title: str, done: Evaluation, methods: Sequence[str], tables: Sequence[Table], notes: Sequence[str] = ()
 ) -> str:
-    """Build the page.
+    """Build the page: title, notes as paragraphs, tables, and the first frame's views.
 
-    For each target rig it shows one picture per camera, with a slider between two layers (source, methods, holes,
-    confidence, truth), and both rigs from above.
-
-    Args:
-        title: Heading.
-        done: The measurements; the first frame's views are shown.
-        methods: Names in the order of the layers.
-        tables: Arguments of ``tables.text_table``.
-        notes: Paragraphs below the heading.
+    For each target rig it shows one picture per camera, with a slider between two layers (source, methods in their
+    order, holes, confidence, truth), and both rigs from above.
     """
     parts = [f"<h1>{escape(title)}</h1>", *(f"<p>{escape(note)}</p>" for note in notes)]
     parts += [_table(*table) for table in tables]

@@ -95,13 +95,7 @@ def text_table(title: str, rows: Mapping[str, Mapping[str, float]], columns: Col
 
 
 def metric_table(rows: Sequence[Mapping[str, Any]], columns: Columns, names: Sequence[str] = ("name",)) -> str:
-    """Markdown table of rows; a missing field is a dash.
-
-    Args:
-        rows: Fields by name.
-        columns: Headings and formats.
-        names: Fields of the first columns, which have no headings.
-    """
+    """Markdown table of rows; a missing field is a dash. ``names``: fields of the first columns, without headings."""
     cells = [[*(str(row[name]) for name in names), *(cell(row, form) for _, form in columns)] for row in rows]
     return markdown_table([*("" for _ in names), *(heading for heading, _ in columns)], cells, left=len(names))
 

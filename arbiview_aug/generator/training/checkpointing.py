@@ -25,12 +25,7 @@ STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 class Average:
-    """Exponential moving average of a module's trained parameters.
-
-    Args:
-        module: Its parameters that require gradients are averaged.
-        decay: Of the average; (1 + step) / (10 + step) while that is smaller.
-    """
+    """Moving average of a module's parameters that require gradients; decay (1 + step) / (10 + step) if smaller."""
 
     def __init__(self, module: nn.Module, decay: float) -> None:
         self.decay = decay

@@ -33,17 +33,11 @@ CACHE_BYTES = 4 * 2**30
 
 
 class TrainingFrame(NamedTuple):
-    """The images of one moment.
+    """The images of one moment."""
 
-    Attributes:
-        images: N tensors (3, h, w) uint8, at the training size.
-        rig: Their N cameras at that size, with masks of their own car.
-        token: Its name.
-    """
-
-    images: list[torch.Tensor]
-    rig: Rig
-    token: str
+    images: list[torch.Tensor]  # N tensors (3, h, w) uint8, at the training size
+    rig: Rig  # their N cameras at that size, with masks of their own car
+    token: str  # its name
 
 
 class Split(NamedTuple):
@@ -55,13 +49,7 @@ class Split(NamedTuple):
 
 
 class Frames:
-    """Frames of a data set at the training size, cached in memory.
-
-    Args:
-        dataset: A map-style data set of this package.
-        size: (h, w).
-        scenes: Name of the scene of each frame.
-    """
+    """Frames of a map-style data set at the training size (h, w), cached in memory; ``scenes`` names each one's."""
 
     def __init__(self, dataset: Dataset[dict[str, Any]], size: tuple[int, int], scenes: Sequence[str]) -> None:
         self.dataset, self.size, self.scenes = dataset, size, list(scenes)
@@ -148,14 +136,9 @@ def _unchanged(value: Any) -> Any:
 def open_frames(
     data: str, size: tuple[int, int], *, scenes: int, seed: int = 0, device: torch.device | str = "cpu"
 ) -> Frames:
-    """Open the frames that ``--data`` names.
+    """Open the frames (h, w) that ``--data`` names: ``KIND:PATH``, or a number of synthetic ``scenes``.
 
-    Args:
-        data: ``synthetic``, or ``KIND:PATH`` as in ``open_data``.
-        size: (h, w) of the images.
-        scenes: Number of synthetic streets.
-        seed: Seed of the streets.
-        device: Device on which streets are rendered; workers cannot render on a GPU.
+    Streets are rendered on ``device``; workers cannot render on a GPU.
 
     Raises:
         TrainingError: An unknown kind of data.

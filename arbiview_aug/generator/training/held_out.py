@@ -47,12 +47,9 @@ def held_out_scores(
 
     Args:
         generator: The model.
-        frames: Synthetic streets, whose true pixels are known.
-        indices: Indices of held-out frames.
+        frames: Synthetic streets, whose true pixels are known, and the ``indices`` of held-out ones.
         seeds: Seeds of targets and noise.
-        steps: Denoising steps of the samples.
-        mean_of: Number of samples in the mean; 0 leaves it out.
-        show: Show a progress bar.
+        steps: Denoising steps of the samples, of which ``mean_of`` make the mean; 0 leaves it out.
 
     Returns:
         Values of ``telea``, ``one_step`` (if trained), ``sample``, ``mean``; and ``sample_energy``, the gradient energy
@@ -103,9 +100,7 @@ def _target(frame: TrainingFrame, rng: torch.Generator) -> tuple[Camera, Rendere
 def gains(scores: Mapping[str, Sequence[float]], seeds: int = 1) -> dict[str, Interval]:
     """Paired gain in dB of each method over Telea, with 95 % bootstrap intervals over streets.
 
-    Args:
-        scores: From ``held_out_scores``.
-        seeds: Views of each street, which are resampled together.
+    The ``seeds`` views of a street are resampled together.
     """
     methods = [name for name in scores if name not in ("telea", "sample_energy")]
     gain = {name: np.subtract(scores[name], scores["telea"]).reshape(seeds, -1).mean(0) for name in methods}

@@ -84,11 +84,7 @@ def geometric_loss(rows: Sequence[Rows], mode: GeoMode) -> torch.Tensor:
 
 
 class Perceptual(nn.Module):
-    """L_perceptual = Σ_l λ_l ‖φ_l(pred) − φ_l(target)‖₂ with VGG16, each norm divided by √(number of features).
-
-    Args:
-        features: ``torchvision.models.vgg16().features`` with weights.
-    """
+    """L_perceptual = Σ_l λ_l ‖φ_l(pred) − φ_l(target)‖₂ with VGG16, each norm divided by √(number of features)."""
 
     mean: torch.Tensor
     std: torch.Tensor

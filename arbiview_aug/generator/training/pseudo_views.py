@@ -42,31 +42,18 @@ _FAVS = FavsConfig(certainty=True)
 
 
 class Batch(NamedTuple):
-    """B items, each with N = 1 target view and S = 2 source branches; images in [0, 1], float32.
+    """B items, each with N = 1 target view and S = 2 source branches; images in [0, 1], float32."""
 
-    Attributes:
-        truth: (B, N, 3, H, W) the real view.
-        valid: (B, N, H, W) bool, its valid pixels.
-        favs: (B, N, 3, H, W) FAVS of the pair at the target pose, black in holes.
-        condition: (B, N, 3, H, W) the same, with holes inpainted.
-        known: (B, N, H, W) bool, coverage of ``favs``.
-        confidence: (B, N, H, W) in [0, 1].
-        sources: (B, S, 3, H, W).
-        seen: (B, S, H, W) bool, valid pixels of the sources.
-        geometry: Of their cameras.
-        tokens: Names of the items.
-    """
-
-    truth: torch.Tensor
-    valid: torch.Tensor
-    favs: torch.Tensor
-    condition: torch.Tensor
-    known: torch.Tensor
-    confidence: torch.Tensor
-    sources: torch.Tensor
-    seen: torch.Tensor
-    geometry: FrameGeometry
-    tokens: tuple[str, ...]
+    truth: torch.Tensor  # (B, N, 3, H, W) the real view
+    valid: torch.Tensor  # (B, N, H, W) bool, its valid pixels
+    favs: torch.Tensor  # (B, N, 3, H, W) FAVS of the pair at the target pose, black in holes
+    condition: torch.Tensor  # (B, N, 3, H, W) the same, with holes inpainted
+    known: torch.Tensor  # (B, N, H, W) bool, coverage of ``favs``
+    confidence: torch.Tensor  # (B, N, H, W) in [0, 1]
+    sources: torch.Tensor  # (B, S, 3, H, W)
+    seen: torch.Tensor  # (B, S, H, W) bool, valid pixels of the sources
+    geometry: FrameGeometry  # of their cameras
+    tokens: tuple[str, ...]  # names of the items
 
     def to(self, device: torch.device | str) -> Batch:
         """Copy to a device."""

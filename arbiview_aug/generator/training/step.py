@@ -18,19 +18,12 @@ from arbiview_aug.generator.training.pseudo_views import Batch
 
 
 class Draws(NamedTuple):
-    """Random draws of a step, on the batch's device.
+    """Random draws of a step, on the batch's device."""
 
-    Attributes:
-        t: (B,) int64 times; ``REGRESSION`` for the items that train the one-step head.
-        eps: (B, N, C, h, w) standard normal.
-        drop: (B,) bool, items without conditions.
-        rng: For the crop of the perceptual loss.
-    """
-
-    t: torch.Tensor
-    eps: torch.Tensor
-    drop: torch.Tensor
-    rng: torch.Generator
+    t: torch.Tensor  # (B,) int64 times; ``REGRESSION`` for the items that train the one-step head
+    eps: torch.Tensor  # (B, N, C, h, w) standard normal
+    drop: torch.Tensor  # (B,) bool, items without conditions
+    rng: torch.Generator  # for the crop of the perceptual loss
 
 
 def without_attention(geometry: FrameGeometry) -> FrameGeometry:

@@ -43,9 +43,7 @@ class Trainer:
     from), ``logs/`` (TensorBoard) and ``validation/`` (PNG).
 
     Args:
-        config: Settings.
-        frames: The data.
-        generator: Trained in place; its autoencoder is frozen.
+        generator: Trained in place on the ``frames``; its autoencoder is frozen.
         output: Folder; the run resumes from a state that it holds.
         perceptual: None switches L_perceptual off.
         show: Show a progress bar.
