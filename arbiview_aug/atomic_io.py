@@ -108,9 +108,7 @@ def whole_file(path: Path, owner: str = "") -> Iterator[BinaryIO]:
     """Open a binary file that replaces ``path`` when the block ends, and is removed if the block fails.
 
     ``owner``, letters or digits, is part of the temporary file's name, for ``remove_parts``. The folder is created.
-
-    Raises:
-        OutputError: It cannot be written: a full disk, no permission.
+    OutputError if it cannot be written: a full disk, no permission.
     """
     with writing(path):
         part = _part(path, owner)
@@ -127,8 +125,7 @@ def whole_file(path: Path, owner: str = "") -> Iterator[BinaryIO]:
 def write_whole(files: Mapping[Path, bytes], owner: str = "") -> None:
     """Write files atomically, given their contents by path; ``owner`` is that of ``whole_file``.
 
-    Raises:
-        OutputError: One cannot be written; others may have been.
+    OutputError if one cannot be written; others may have been.
     """
     parts = {}
     try:

@@ -42,8 +42,7 @@ def warn_about_cv2_wheels() -> None:
 def optional_package(name: str, extra: str | None = None) -> Any:
     """Import an optional package, which an ``extra`` of this package installs if given.
 
-    Raises:
-        ImportError: It is not installed; the message gives the command that installs it.
+    ImportError with the command that installs it.
     """
     try:
         return import_module(name)

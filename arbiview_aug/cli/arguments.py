@@ -21,8 +21,7 @@ from arbiview_aug.favs.config import Quality
 from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.transforms.settings import RenderPath
 
-REAL_TARGET = "waymo"
-"""Default target rig of real frames."""
+REAL_TARGET = "waymo"  # default target rig of real frames
 
 
 class _HelpFormatter(argparse.HelpFormatter):
@@ -128,11 +127,7 @@ def _integer(text: str, least: int, expected: str) -> int:
 
 
 def device_named(name: str | None) -> torch.device:
-    """Torch device of this name; by default a GPU if there is one.
-
-    Raises:
-        DataError: There is no such device.
-    """
+    """Torch device of this name, by default a GPU if there is one; DataError for one that is not there."""
     if name is None:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -154,11 +149,7 @@ def size(text: str) -> tuple[int, int]:
 
 
 def writable_folder(path: Path, asked: str) -> Path:
-    """Create a folder before any work starts.
-
-    Raises:
-        DataError: It cannot be created; the message names ``asked``, the value of ``--output``.
-    """
+    """Create a folder before any work starts; DataError names ``asked``, the value of ``--output``."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -46,11 +46,7 @@ class Recording(Dataset[dict[str, Any]]):
         return len(self.tokens)
 
     def by_token(self, token: str) -> dict[str, Any]:
-        """The sample with this token.
-
-        Raises:
-            DataError: No such sample.
-        """
+        """The sample with this token; DataError if there is none."""
         if token not in self._index:
             some = ", ".join(self.tokens[:3])
             raise DataError(
@@ -172,8 +168,7 @@ class LazyFrame(Mapping[str, Any]):
 
     def __init__(self, fields: Mapping[str, Any], load: Callable[[], Any]) -> None:
         self._fields, self._load = dict(fields), load
-        self.is_broken = False
-        """Whether an access failed."""
+        self.is_broken = False  # whether an access failed
 
     def __getitem__(self, key: str) -> Any:
         if key == "images" and key not in self._fields:

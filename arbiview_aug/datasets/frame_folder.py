@@ -37,8 +37,7 @@ CALIBRATION_FILE = "calib.json"
 SEQUENCE_FILE = "sequence.json"
 POINTS_FILE = "lidar.npy"
 
-_CACHED_MASKS = 16
-"""Masks that a worker keeps: those of two eight-camera rigs, 2 MB each at full size."""
+_CACHED_MASKS = 16  # masks that a worker keeps: those of two eight-camera rigs, 2 MB each at full size
 
 
 @dataclass(frozen=True)

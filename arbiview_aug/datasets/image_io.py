@@ -122,8 +122,7 @@ def reduced_rig(rig: Rig, reduce: Reduce) -> Rig:
 def read_header(path: Path, label: str) -> tuple[str, tuple[int, int]]:
     """Read format and (h, w) of a JPEG or PNG file; ``label`` names camera and file in messages.
 
-    Raises:
-        DataError: A missing, empty or truncated file, or one of another format.
+    DataError for a missing, empty or truncated file, or one of another format.
     """
     try:
         data = path.read_bytes()
@@ -205,8 +204,7 @@ def _decode_jpeg_in_place(out: ByteArray, path: Path, reduce: int) -> bool:
     return True
 
 
-JPEG_QUALITY = 96
-"""Quality at 4:4:4 chroma; costs at most 0.08 dB (``tests/acceptance/test_converted.py``)."""
+JPEG_QUALITY = 96  # quality at 4:4:4 chroma; costs at most 0.08 dB (``tests/acceptance/test_converted.py``)
 
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111)
 
@@ -214,8 +212,7 @@ _JPEG = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTO
 def encoded_image(image: torch.Tensor, suffix: str = ".jpg") -> bytes:
     """Encode an RGB image (3, h, w) uint8 as ``.jpg``, at ``JPEG_QUALITY``, or lossless ``.png``.
 
-    Raises:
-        SampleTypeError: The image is of another type.
+    SampleTypeError for images of another type.
     """
     if image.dtype != torch.uint8:
         raise SampleTypeError(

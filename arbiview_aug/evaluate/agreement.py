@@ -25,8 +25,7 @@ from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import build_plan
 
-MIN_PIXELS = 500
-"""Least number of pixels to fit and to test."""
+MIN_PIXELS = 500  # least number of pixels to fit and to test
 
 
 class OverlapScore(NamedTuple):

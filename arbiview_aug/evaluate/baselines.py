@@ -20,8 +20,7 @@ from arbiview_aug.render.plan import build_plan
 Renderer = Callable[[Rig, Sequence[Image], Rig], list[RenderedView]]
 """Maps a source rig, its images and a target rig to one view per target camera."""
 
-SPLIT_DEPTH_M = 50.0
-"""Depth above the horizon row in ``row_split``, from UniDrive."""
+SPLIT_DEPTH_M = 50.0  # depth above the horizon row in ``row_split``, from UniDrive
 
 
 def own_camera(source: Rig, images: Sequence[Image], target: Rig) -> list[RenderedView]:
@@ -84,10 +83,7 @@ def crop_and_slide(source: Rig, images: Sequence[Image], target: Rig) -> list[Re
 def row_split(source: Rig, images: Sequence[Image], target: Rig) -> list[RenderedView]:
     """Project the road plane below the horizon row and a plane 50 m ahead above it, as UniDrive does.
 
-    Nearest-neighbour sampling; the last source in the rig's order wins.
-
-    Raises:
-        SampleError: Lenses other than pinhole.
+    Nearest-neighbour sampling; the last source in the rig's order wins. SampleError for lenses other than pinhole.
     """
     if any(not camera.is_rectilinear for camera in (*source, *target)):
         raise SampleError("row_split: expected pinhole cameras; use Rig.undistorted()")

@@ -27,9 +27,7 @@ Render = Callable[[Mapping[str, Any], Rig], list[RenderedView]]
 """Renders a sample for a target rig: one view per target camera."""
 
 Exposure = Literal["raw", "even"]
-EXPOSURES: tuple[Exposure, ...] = ("raw", "even")
-"""Exposures as recorded, and made even."""
-
+EXPOSURES: tuple[Exposure, ...] = ("raw", "even")  # exposures as recorded, and made even
 _CACHED_TRUTHS = 8  # one for each target would take a gigabyte
 
 

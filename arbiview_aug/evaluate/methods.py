@@ -25,8 +25,7 @@ from arbiview_aug.transforms.settings import RenderPath
 
 Sample = Mapping[str, Any]
 
-OURS: tuple[Quality, ...] = ("draft", "fast", "accurate")
-"""Presets other than the published method."""
+OURS: tuple[Quality, ...] = ("draft", "fast", "accurate")  # presets other than the published method
 
 INPAINTED, GENERATED = "fast, inpainted", "generator"
 """Rows of ``fast`` with holes filled by Telea's inpainting, and by the shipped weights."""

@@ -35,8 +35,7 @@ REAL_FRAMES = ("nuscenes-one", "ddad-one")
 SYNTHETIC = "synthetic"
 SYNTHETIC_FRAMES, SYNTHETIC_SEED, SYNTHETIC_SIZE = 3, 0, (256, 704)
 
-REDUCE: Reduce = 2
-"""Decoding factor of real images."""
+REDUCE: Reduce = 2  # decoding factor of real images
 
 SETS = ("paper", "yaw", "vehicles", "truck")
 

@@ -49,11 +49,8 @@ def shifted_target(rig: Rig, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.
     return without_masks(rig.shifted(x_m, y_m, z_m).turned(yaw_deg=yaw_deg))
 
 
-VEHICLES = ("waymo", "argoverse2", "lyft_l5", "nuplan")
-"""Shipped rigs used as other vehicles."""
-
-TRUCK_UP_M = 1.0
-"""Height of a truck's cameras over a sedan's."""
+VEHICLES = ("waymo", "argoverse2", "lyft_l5", "nuplan")  # shipped rigs used as other vehicles
+TRUCK_UP_M = 1.0  # height of a truck's cameras over a sedan's
 
 
 def vehicle_targets(rig: Rig) -> dict[str, Rig]:

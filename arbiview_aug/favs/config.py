@@ -191,11 +191,7 @@ PRESETS: dict[str, FavsConfig | PaperConfig] = {
 
 
 def favs_config(quality: Quality | FavsConfig | PaperConfig) -> FavsConfig | PaperConfig:
-    """Look up a preset by name; a config is passed through.
-
-    Raises:
-        ValueError: An unknown preset.
-    """
+    """Look up a preset by name, ValueError for an unknown one; a config is passed through."""
     if isinstance(quality, FavsConfig | PaperConfig):
         return quality
     if not isinstance(quality, str) or quality not in PRESETS:

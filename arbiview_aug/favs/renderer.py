@@ -27,8 +27,7 @@ from arbiview_aug.favs.stage2_features import NO_MATCHES, FeatureReport, Region,
 from arbiview_aug.favs.stage3_objects import AlignmentReport, Detection, align_objects, declined, find_objects
 from arbiview_aug.favs.stage4_fusion import Float32Image, Warp, adaptive_fusion, source_pixels, warp_perspective
 
-SAME_CENTER_M = 1e-6
-"""Distance below which two camera centres coincide."""
+SAME_CENTER_M = 1e-6  # distance below which two camera centres coincide
 
 
 @dataclass(frozen=True)

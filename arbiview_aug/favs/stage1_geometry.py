@@ -23,15 +23,13 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import CalibrationError
 
-MAX_AREA_RATIO = 16.0
-"""Largest change of area: beyond four times along each side there is no usable texture."""
+MAX_AREA_RATIO = 16.0  # largest change of area: beyond four times along each side there is no usable texture
 
 
 def h_geom(source: Camera, target: Camera) -> FloatArray:
     """Compute the (3, 3) rotation-only homography H_geom = K2 R2 R1⁻¹ K1⁻¹, exact at infinite depth.
 
-    Raises:
-        CalibrationError: A camera is not a pinhole camera.
+    CalibrationError for a camera that is not a pinhole camera.
     """
     check_pinhole((source, target))
     return target.K @ _relative_rotation(source, target) @ np.linalg.inv(source.K)
@@ -52,9 +50,7 @@ def h_planar(source: Camera, target: Camera, normal: FloatArray, distance_m: flo
 
     R = R2 R1⁻¹ and t, the source's centre in the target's frame, take source to target: X2 = R X1 + t. The minus sign
     means the plane n·X1 = −d: ``normal`` (3,) points from it towards the source, at ``distance_m`` > 0.
-
-    Raises:
-        CalibrationError: A camera is not a pinhole camera, or the distance is not positive.
+    CalibrationError for other distances, and cameras that are not pinhole cameras.
     """
     check_pinhole((source, target))
     if not distance_m > 0:

@@ -29,9 +29,7 @@ from arbiview_aug.favs.stage1_geometry import check_homography
 GreyImage = npt.NDArray[np.uint8]
 Case = Literal["feature", "blended", "geometric"]
 
-REFERENCE_WIDTH_PX = 800
-"""Target width at which ``PaperConfig`` states its lengths."""
-
+REFERENCE_WIDTH_PX = 800  # target width at which ``PaperConfig`` states its lengths
 _NEIGHBOURS = 2  # the ratio test compares the nearest with the second-nearest
 _FLANN_LINEAR = 0  # exact; kd-trees depend on the state of OpenCV's random generator
 

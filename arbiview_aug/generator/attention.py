@@ -26,8 +26,7 @@ from arbiview_aug.generator.correspondence import MASKED, TAPS, TokenWindow, tap
 
 HEAD_WIDTH = 32
 
-_INFINITY_LOGIT = 2.0
-"""Initial scalar of level infinity, 0 for the others: w = .79, .11, .11."""
+_INFINITY_LOGIT = 2.0  # initial scalar of level infinity, 0 for the others: w = .79, .11, .11
 
 
 class PositionalEncoding(nn.Module):

@@ -29,8 +29,7 @@ class Autoencoder(nn.Module):
     def encode(self, images: torch.Tensor) -> torch.Tensor:
         """Encode images (..., 3, H, W) in [0, 1] to latents (..., C, H / f, W / f), without sampling.
 
-        Raises:
-            GeneratorError: With weights in float16.
+        GeneratorError with weights in float16, as in ``decode``.
         """
         images = images * 2 - 1
         if self.vae is None:
@@ -41,11 +40,7 @@ class Autoencoder(nn.Module):
         return latents.reshape(*images.shape[:-3], *latents.shape[-3:])
 
     def decode(self, latents: torch.Tensor) -> torch.Tensor:
-        """Decode latents (..., C, h, w) to images (..., 3, H, W), in [0, 1] up to over- and undershoot.
-
-        Raises:
-            GeneratorError: With weights in float16.
-        """
+        """Decode latents (..., C, h, w) to images (..., 3, H, W), in [0, 1] up to over- and undershoot."""
         if self.vae is None:
             images = functional.pixel_shuffle(latents, self.patch)
         else:

@@ -27,8 +27,7 @@ _MAX_MESSAGE = 500  # characters of torch's message, which names every tensor
 def write_checkpoint(folder: Path, config: Mapping[str, Any], tensors: Mapping[str, torch.Tensor]) -> None:
     """Write a checkpoint to a folder, which is created if needed, or replace the one there.
 
-    Raises:
-        OutputError: The disk is full, or the folder cannot be written; the former checkpoint is unchanged.
+    OutputError if the disk is full, or the folder cannot be written; the former checkpoint is unchanged.
     """
     save = optional_package("safetensors.torch", "generator").save
     weights = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()})
@@ -42,11 +41,7 @@ def write_checkpoint(folder: Path, config: Mapping[str, Any], tensors: Mapping[s
 
 
 def read_checkpoint(folder: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-    """Read a checkpoint: its configuration, and its tensors on the CPU.
-
-    Raises:
-        GeneratorError: No checkpoint, one of another format, or a broken one.
-    """
+    """Read a checkpoint's configuration, and its tensors on the CPU; GeneratorError for none, or a broken one."""
     safetensors = optional_package("safetensors.torch", "generator")
     config, weights = read_config(folder)
     try:
@@ -58,8 +53,7 @@ def read_checkpoint(folder: Path) -> tuple[dict[str, Any], dict[str, torch.Tenso
 def read_config(folder: Path) -> tuple[dict[str, Any], str]:
     """Read a checkpoint's configuration and the name of its weights, which contains their checksum.
 
-    Raises:
-        GeneratorError: No checkpoint, or one of another format.
+    GeneratorError for no checkpoint, or one of another format.
     """
     path = folder / CONFIG_FILE
     if not path.is_file():
@@ -77,8 +71,7 @@ def read_config(folder: Path) -> tuple[dict[str, Any], str]:
 def load_weights(module: nn.Module, tensors: Mapping[str, torch.Tensor], folder: Path, assign: bool = False) -> None:
     """Load exactly the weights of a module; ``assign`` replaces its tensors instead of copying into them.
 
-    Raises:
-        GeneratorError: Names that are missing, extra or of another shape.
+    GeneratorError for names that are missing, extra or of another shape.
     """
     try:
         module.load_state_dict(tensors, assign=assign)

@@ -25,11 +25,8 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 
 RAY_CHANNELS = 6
-POSE_WIDTH = 16
-"""Numbers of a pose: R (9), t (3), K (4)."""
-
-_OCTAVES = 4
-"""Number of Fourier frequencies π, 2π, 4π, 8π."""
+POSE_WIDTH = 16  # numbers of a pose: R (9), t (3), K (4)
+_OCTAVES = 4  # number of Fourier frequencies π, 2π, 4π, 8π
 
 
 class Views(NamedTuple):

@@ -33,8 +33,7 @@ _Config = TypeVar("_Config")
 def from_plain(kind: type[_Config], data: Any, where: str, error: type[ArbiviewError] = GeneratorError) -> _Config:
     """Build a dataclass, and those nested in it, from plain data; ``where`` comes first in errors.
 
-    Raises:
-        ArbiviewError: Of type ``error``: unknown or missing keys. Impossible values raise the dataclass's own.
+    ``error`` for unknown or missing keys; impossible values raise the dataclass's own.
     """
     if not isinstance(data, Mapping):
         raise error(f"{where}: expected a mapping, got {type(data).__name__}")

@@ -30,8 +30,7 @@ from arbiview_aug.render.requirements import SAME_CENTER_M
 FACING_M = 10.0
 """Distance of the plane that faces the camera: at a baseline of 1 m a 3-token window about it spans 7 to 17 m."""
 
-LEVELS = ("infinity", "road", "facing")
-"""The depth levels; pairs whose centres coincide have the first alone."""
+LEVELS = ("infinity", "road", "facing")  # the depth levels; pairs whose centres coincide have the first alone
 
 
 class Correspondence(NamedTuple):
@@ -172,11 +171,8 @@ def stacked(frames: Sequence[Correspondence]) -> Correspondence:
 
 
 # --- windows ----------------------------------------------------------------------------------------------------------
-TAPS = 9
-"""Integer taps of the 3 x 3 window around p_j, row by row; the fifth is the token nearest to it."""
-
-MASKED = -1e4
-"""Logit of masked taps: finite in every dtype, so that a fully masked row stays finite."""
+TAPS = 9  # integer taps of the 3 x 3 window around p_j, row by row; the fifth is the token nearest to it
+MASKED = -1e4  # logit of masked taps: finite in every dtype, so that a fully masked row stays finite
 
 
 class TokenWindow(NamedTuple):

@@ -22,8 +22,7 @@ from arbiview_aug.generator.attention import CrossViewAttention
 from arbiview_aug.generator.conditioning import PoseContext, Views, input_channels
 from arbiview_aug.generator.correspondence import LEVELS, TokenWindow
 
-TIMESTEPS = 1000
-"""Diffusion steps in training (Sec. Training Parameters)."""
+TIMESTEPS = 1000  # diffusion steps in training (Sec. Training Parameters)
 
 REGRESSION = TIMESTEPS
 """Time at which the denoiser predicts x0 in one step, from the pre-filled latent instead of a noisy one."""

@@ -16,18 +16,14 @@ from arbiview_aug.generator.inpainting import GREY, RADIUS_PX
 from arbiview_aug.render.rendered import RenderedFrame
 from arbiview_aug.sample.batching import stacked
 
-Holes = Literal["fill", "mean", "black"]
-"""How pixels are filled that no source sees."""
-
-CELLS = 64
-"""Cells along a view's shorter side."""
+Holes = Literal["fill", "mean", "black"]  # how pixels are filled that no source sees
+CELLS = 64  # cells along a view's shorter side
 
 REACH = 1 / 8
 """Share of a view's shorter side by which it is continued outside the sources' images; measured on synthetic streets:
 2 to 10 dB better than the mean colour up to 1/16, -0.6 to 5.5 dB up to 1/8, -1.8 to 4.7 dB up to 1/4."""
 
-_MIN_COVERAGE = 64
-"""In 255ths: cells with less coverage are holes; their colour would be noise."""
+_MIN_COVERAGE = 64  # in 255ths: cells with less coverage are holes; their colour would be noise
 
 
 def fill_frame(rendered: RenderedFrame, how: Holes) -> RenderedFrame:

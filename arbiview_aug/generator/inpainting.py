@@ -6,14 +6,9 @@ import cv2
 import numpy as np
 import torch
 
-RADIUS_PX = 3.0
-"""Radius of Telea's neighbourhood, from OpenCV's example."""
-
-_MARGIN_PX = 8
-"""Margin around holes that Telea's method reads."""
-
-GREY = 0.5
-"""Value of images without known pixels."""
+RADIUS_PX = 3.0  # radius of Telea's neighbourhood, from OpenCV's example
+_MARGIN_PX = 8  # margin around holes that Telea's method reads
+GREY = 0.5  # value of images without known pixels
 
 
 def telea(image: torch.Tensor, hole: torch.Tensor) -> torch.Tensor:

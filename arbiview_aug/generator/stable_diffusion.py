@@ -28,13 +28,10 @@ PLAIN_UNET = {
 
 
 def load_part(kind: str, where: str | Path, subfolder: str, expected: Mapping[str, Any]) -> Any:
-    """Load a diffusers model (class ``kind``) and refuse missing or extra weights, of which diffusers only warns.
+    """Load a diffusers model (class ``kind``) and refuse what diffusers only warns of: missing or extra weights.
 
     ``where`` is a folder or hub id in diffusers' layout; from a hub id, safetensors are downloaded. ``expected`` are
-    entries that its configuration must have.
-
-    Raises:
-        GeneratorError: No such folder, another architecture, or weights that are missing, extra or of another shape.
+    entries that its configuration must have. GeneratorError if anything does not fit.
     """
     cls = getattr(optional_package("diffusers", "generator"), kind)
     label = f"{where}/{subfolder}"
@@ -64,12 +61,7 @@ def load_part(kind: str, where: str | Path, subfolder: str, expected: Mapping[st
 
 
 def empty_prompt(where: str | Path) -> torch.Tensor:
-    """(77, width) CLIP's embedding of the empty prompt; a generator's own folder contains it.
-
-    Raises:
-        GeneratorError: No text encoder in the folder.
-        ImportError: transformers is not installed.
-    """
+    """(77, width) CLIP's embedding of the empty prompt, by transformers; a generator's own folder contains it."""
     try:
         transformers = optional_package("transformers", "generator")
     except ImportError:

@@ -41,10 +41,8 @@ def check_other_keys(
 ) -> list[str]:
     """The keys that hold label maps; refuse others that may be bound to the source's pixels.
 
-    ``sizes`` are (h, w) of the images; ``label_keys`` and ``pass_keys`` are the user's.
-
-    Raises:
-        SampleError: A tensor of the images' height and width, or a torchvision tv_tensor, under another key.
+    ``sizes`` are (h, w) of the images; ``label_keys`` and ``pass_keys`` are the user's. SampleError for a tensor of the
+    images' height and width, or a torchvision tv_tensor, under another key.
     """
     absent = [key for key in label_keys if key not in sample]
     if absent:

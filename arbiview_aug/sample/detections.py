@@ -14,11 +14,8 @@ from arbiview_aug.favs.stage3_objects import Detection
 from arbiview_aug.sample.boxes_2d import outline
 from arbiview_aug.sample.inputs import Frame, numbers, read_scenes
 
-UNNAMED_TYPE = "upright"
-"""Type of labelled boxes without names."""
-
-OfCameras = Mapping[int, Sequence[Detection]]
-"""The detections of a frame, by the index of its camera."""
+UNNAMED_TYPE = "upright"  # type of labelled boxes without names
+OfCameras = Mapping[int, Sequence[Detection]]  # the detections of a frame, by the index of its camera
 
 
 def detections_of_frames(

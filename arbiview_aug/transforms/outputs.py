@@ -132,9 +132,7 @@ def target_labels(
 ) -> Any:
     """Render label maps, (..., N, H, W) or a list of (..., Hi, Wi), in the target's views.
 
-    Raises:
-        SampleError: Maps that do not fit the images, or a fill value that their type cannot hold.
-        SampleTypeError: Maps that are not tensors.
+    SampleError for maps that do not fit the images, or a fill value that their type cannot hold.
     """
     if not all(map(is_readable, value if isinstance(value, list | tuple) else [value])):
         got = type(value).__name__

@@ -14,8 +14,7 @@ from arbiview_aug.generator.batches import SOURCES_KEY, Completion
 
 RenderPath = Literal["favs", "inpaint", "diffusion"]
 
-OUTPUTS = ("source_camera", "source_frame", "confidence", SOURCES_KEY)
-"""Further keys of the output, on request."""
+OUTPUTS = ("source_camera", "source_frame", "confidence", SOURCES_KEY)  # further keys of the output, on request
 
 
 def completion_of(
@@ -26,11 +25,7 @@ def completion_of(
     min_confidence: float,
     seed: int,
 ) -> Completion | None:
-    """Checked settings of inpainting or a generator; None for ``path="favs"``.
-
-    Raises:
-        ValueError: Impossible settings, or settings of another path.
-    """
+    """Checked settings of inpainting or a generator, else ValueError; None for ``path="favs"``."""
     if path != "diffusion" and any(value is not None for value in (generator, steps, guidance)):
         raise ValueError(f"generator, steps, guidance: they are for path='diffusion', got path={path!r}")
     if path == "favs":

@@ -25,8 +25,7 @@ from arbiview_aug.evaluate.targets import without_masks
 
 REDUCES: tuple[Reduce, ...] = get_args(Reduce)
 
-SOURCES_OVER_VIEWS = 2
-"""Size of synthetic images relative to the views, so that decoding at half size pays."""
+SOURCES_OVER_VIEWS = 2  # size of synthetic images relative to the views, so that decoding at half size pays
 
 
 @dataclass(frozen=True)
@@ -57,10 +56,7 @@ class Recorded:
     def frame(self, index: int, reduce: Reduce, reference: Reduce) -> ScoredFrame:
         """Frame with images at 1 / ``reduce``, scored by the colours of images at 1 / ``reference``.
 
-        On real frames methods get the points of every other degree; the others score.
-
-        Raises:
-            DataError: There is neither truth nor LiDAR.
+        On real frames methods get the points of every other degree; the others score, and DataError if there are none.
         """
         sample = self.sample(index, reduce)
         if self.truth is not None:

@@ -25,8 +25,7 @@ from arbiview_aug.evaluate.methods import Method, Sample
 from arbiview_aug.evaluate.metrics import mean_of
 
 SIZE = (256, 704)
-LEAST_GAIN_DB = 0.2
-"""Smaller differences are noise on single frames."""
+LEAST_GAIN_DB = 0.2  # smaller differences are noise on single frames
 
 Row = Mapping[str, Any]
 P = ParamSpec("P")

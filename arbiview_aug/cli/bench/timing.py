@@ -26,9 +26,7 @@ from tqdm import tqdm
 
 from arbiview_aug.errors import DataError
 
-Clock = Callable[[Callable[[], Any]], float]
-"""Milliseconds of a call."""
-
+Clock = Callable[[Callable[[], Any]], float]  # milliseconds of a call
 _LEAST_ROUNDS = 3  # a median of fewer is a single time
 
 
@@ -139,11 +137,7 @@ def machine_line(report: Mapping[str, Any]) -> str:
 
 
 def show(table: str, report: Mapping[str, Any], path: Path) -> None:
-    """Print a report's table, and write its JSON.
-
-    Raises:
-        DataError: It cannot be written.
-    """
+    """Print a report's table, and write its JSON; DataError if it cannot be written."""
     print(table)  # first, so that an unwritable file does not lose the figures
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -52,8 +52,7 @@ from arbiview_aug.transforms.rig_retarget import RigRetarget
 Execution = Literal["opencv", "torch", "cuda"]
 
 REPEATS = 9
-REFERENCE: Reduce = 2
-"""Decoding factor of the images whose colours score."""
+REFERENCE: Reduce = 2  # decoding factor of the images whose colours score
 _ENOUGH_MS = 1000.0  # keeps a sweep of 63 settings at three minutes
 
 

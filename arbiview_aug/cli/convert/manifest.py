@@ -28,11 +28,7 @@ class Manifest:
         self.output, self.folder = output, output / FOLDER
 
     def begin(self, facts: Mapping[str, Any]) -> None:
-        """Write versions, settings and source of the output, or check that they are unchanged.
-
-        Raises:
-            DataError: The folder was begun with other facts.
-        """
+        """Write versions, settings and source of the output; DataError if it was begun with others."""
         path, text = self.folder / "settings.json", _text(facts)
         if not path.is_file():
             write_whole({path: text})

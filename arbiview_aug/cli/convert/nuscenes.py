@@ -79,11 +79,7 @@ _NEEDED: Mapping[str, Mapping[str, Kind]] = {
 
 
 class NuScenes(Writer):
-    """Tables, images and masks of the new cameras.
-
-    Raises:
-        CalibrationError: The target has lenses, or a camera with the name of another sensor.
-    """
+    """Tables, images and masks of the new cameras; CalibrationError for lenses, and names of other sensors."""
 
     def __init__(self, settings: Settings, data: NuScenesDataset) -> None:
         self.output, self.data, self.suffix = settings.output, data, settings.suffix

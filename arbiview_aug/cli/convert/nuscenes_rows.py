@@ -143,8 +143,7 @@ class NewCameras:
 
     def __init__(self, records: Iterable[Record], suffix: str) -> None:
         self.suffix = suffix
-        self.visible: dict[str, float] = {}
-        """Visible share of each annotation's box."""
+        self.visible: dict[str, float] = {}  # visible share of each annotation's box
         self._calibrations: dict[str, Row] = {}
         self._views: dict[str, list[tuple[str, Row]]] = {}
         for record in records:

@@ -30,11 +30,7 @@ class Actor:
 
 
 def ray_results(jobs: Jobs, workers: int, label: str, note: Callable[[Done], str]) -> Iterator[Done]:
-    """As ``cli.parallel.results``, in any order, by actors of the cluster at ``RAY_ADDRESS``, or of this machine.
-
-    Raises:
-        ImportError: Ray is not installed; with the command that installs it.
-    """
+    """As ``cli.parallel.results``, in any order, by actors of the cluster at ``RAY_ADDRESS``, or of this machine."""
     ray = optional_package("ray", "distributed")
     data = optional_package("ray.data", "distributed")
     ray.init(ignore_reinit_error=True, include_dashboard=False, log_to_driver=False)

@@ -22,8 +22,7 @@ from arbiview_aug.evaluate.report.tables import evaluation_tables
 from arbiview_aug.evaluate.run import Evaluation, evaluate
 from arbiview_aug.scene.scene import SURFACES
 
-CONVERTED = "converted"
-"""Name of the written views in tables."""
+CONVERTED = "converted"  # name of the written views in tables
 
 
 def converted(settings: Settings) -> Method:

@@ -23,8 +23,7 @@ from arbiview_aug.transforms.settings import RenderPath
 RETARGET_OPTIONS = ("path", "holes", "steps", "quality", "surface", "size", "fit")
 """Settings that ``RigRetarget`` takes under the same names."""
 
-FOLDER = "conversion"
-"""Subfolder of an output with manifest, provenance and report."""
+FOLDER = "conversion"  # subfolder of an output with manifest, provenance and report
 
 
 @dataclass(frozen=True, kw_only=True)

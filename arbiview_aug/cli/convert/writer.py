@@ -26,8 +26,7 @@ class Converted:
 class Writer(ABC):
     """Writes a converted data set in its source's format; a row of ``READERS`` names it.
 
-    Raises:
-        ArbiviewError: The format cannot hold the target's cameras.
+    ArbiviewError if the format cannot hold the target's cameras.
     """
 
     @abstractmethod
@@ -39,11 +38,7 @@ class Writer(ABC):
 
     @abstractmethod
     def check(self) -> None:
-        """Look for everything that could not be written, before hours of work end with it.
-
-        Raises:
-            DataError: The source or the target has something that the format cannot hold.
-        """
+        """Look for everything that could not be written, before hours of work end with it, and raise DataError."""
 
     @abstractmethod
     def stem(self, index: int, camera: int, name: str) -> str:

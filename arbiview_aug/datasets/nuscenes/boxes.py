@@ -91,8 +91,7 @@ def read_annotations(
 ) -> Annotations:
     """Read the annotations of the samples (number by token), which have times (S,) and numbers of scenes (S,).
 
-    Raises:
-        DataError: A malformed row, or a dangling token.
+    DataError for a malformed row, or a dangling token.
     """
     categories = tables.by_token("category")
     names = sorted({*tables.column("category", [*categories.values()], "name", TEXTS)})

@@ -30,11 +30,8 @@ from arbiview_aug.datasets.nuscenes.tables import (
 )
 from arbiview_aug.errors import DataError
 
-LIDAR = "LIDAR_TOP"
-"""Sensor whose time and ego pose are the sample's."""
-
-MAX_APART_S = 0.1
-"""Maximum time to a sweep's nearest image; cameras record every 50 to 100 ms."""
+LIDAR = "LIDAR_TOP"  # sensor whose time and ego pose are the sample's
+MAX_APART_S = 0.1  # maximum time to a sweep's nearest image; cameras record every 50 to 100 ms
 
 IntArray = npt.NDArray[np.int64]
 
@@ -96,12 +93,9 @@ class Recordings:
         return bool(self.keyframes[self.rows["sample"][row], 0] == row)
 
     def around(self, row: int) -> IntArray:
-        """(cameras,) rows of all cameras in the same turn as a row of the first.
+        """(cameras,) rows of all cameras in the same turn as a row of the first; DataError beyond ``MAX_APART_S``.
 
         Cameras expose one after the other: the delay to the first camera's exposure is nearest to that of the keyframe.
-
-        Raises:
-            DataError: A camera has no image within ``MAX_APART_S``.
         """
         time_us, record = self.rows["time_us"], self.rows[row]
         keyframe_us = time_us[self.keyframes[record["sample"]]]
@@ -122,10 +116,8 @@ def read_recordings(
 ) -> Recordings:
     """Read the recordings of the samples (number by token), which lie in ``scenes``, by the cameras ``channels``.
 
-    ``sweeps`` also reads the images between keyframes, nine tenths of two tables.
-
-    Raises:
-        DataError: A malformed row, a dangling token, or a sample that lacks a recording.
+    ``sweeps`` also reads the images between keyframes, nine tenths of two tables. DataError for a malformed row, a
+    dangling token, or a sample that lacks a recording.
     """
     wanted = [*channels, LIDAR]
     calibrated, channel_of, sensor2ego, K = _calibrations(tables, wanted)

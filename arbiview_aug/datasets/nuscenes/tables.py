@@ -19,14 +19,12 @@ from arbiview_aug.errors import DataError, SampleTypeError
 
 _QUATERNION_NORM_TOLERANCE = 1e-3
 
-_BATCH = 1 << 10
-"""Rows in memory at once, 1.5 MB; the largest tables have 2.6 million."""
+_BATCH = 1 << 10  # rows in memory at once, 1.5 MB; the largest tables have 2.6 million
 
 _BLOCK, _LONGEST_ROW = 1 << 20, 1 << 16
 """Characters read at once, and an upper bound on a row's, so that no block ends within a row."""
 
-_LONGEST_TOKEN = 255
-"""Maximum characters of a token, which names files; nuScenes' own have 32."""
+_LONGEST_TOKEN = 255  # maximum characters of a token, which names files; nuScenes' own have 32
 
 _LARGEST_WHOLE, _LARGEST = 2**53, 1e9
 """Bounds on whole numbers (exact in float64) and on positions (m) and pixels."""
@@ -117,11 +115,7 @@ class Tables:
         return [row for batch in self.batches(table) for row in batch]
 
     def batches(self, table: str) -> Iterator[list[Row]]:
-        """Yield a table's rows in batches.
-
-        Raises:
-            DataError: The table is missing, or no JSON list of objects.
-        """
+        """Yield a table's rows in batches; DataError if it is missing, or no JSON list of objects."""
         if self.nusc is not None:
             rows = getattr(self.nusc, table, None)
             if not isinstance(rows, list | tuple):
@@ -160,12 +154,9 @@ class Tables:
         return found
 
     def column(self, table: str, rows: Sequence[Row], key: str, kind: Kind, default: Any = None) -> list[Any]:
-        """Values of one column, checked at once, and row by row to name the invalid one.
+        """Values of one column, checked at once, and row by row to name the invalid one in a DataError.
 
         ``default`` replaces missing values and null; with None they are errors.
-
-        Raises:
-            DataError: A missing or invalid value.
         """
         try:
             if default is None:
@@ -267,8 +258,7 @@ class Tokens:
     def places_in(self, other: Tokens, or_empty: bool) -> npt.NDArray[np.int64]:
         """(rows,) row of another table that each token names, -1 for an empty token, which ``or_empty`` allows.
 
-        Raises:
-            DataError: A dangling token.
+        DataError for a dangling token.
         """
         wanted, there = self._all(), other._all()
         if not len(there):

@@ -22,8 +22,7 @@ from arbiview_aug.datasets.synthetic.street import make_scene
 
 LIDAR_POSITION_M = (0.9, 0.0, 1.9)
 """Ego x, y and height over the road: a roof-mounted sensor, as on nuScenes' vehicles."""
-LIDAR_BEAMS_DEG = (-30.67, 10.67)
-"""Elevations of the lowest and the highest of 32 beams (Velodyne HDL-32E)."""
+LIDAR_BEAMS_DEG = (-30.67, 10.67)  # elevations of the lowest and the highest of 32 beams (Velodyne HDL-32E)
 LIDAR_COLUMNS = 1088
 LIDAR_RANGE_M = (1.0, 90.0)
 LIDAR_NOISE_M = 0.02  # one sigma
@@ -251,5 +250,4 @@ def _ring(
     return Rig(cameras, ground_z_m=0.0, name=name)
 
 
-GROUND_CLASSES = (SceneClass.GROUND, SceneClass.SIDEWALK)
-"""Classes that vehicles and people stand on."""
+GROUND_CLASSES = (SceneClass.GROUND, SceneClass.SIDEWALK)  # classes that vehicles and people stand on

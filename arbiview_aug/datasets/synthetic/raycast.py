@@ -16,14 +16,12 @@ from torch import Tensor
 
 from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, Scene
 
-SKY_ID, GROUND_ID = -1, -2
-"""Ids of hits on no primitive."""
+SKY_ID, GROUND_ID = -1, -2  # ids of hits on no primitive
 
 _MIN_COS = 0.2
 """Packets with a ray further than 78 degrees off their axis have no pyramid: every primitive is a candidate."""
 
-_PAIRS_PER_STEP = 96
-"""Packets handled at a time: temporaries of 96 x 6 x 256 floats fit in a core's cache."""
+_PAIRS_PER_STEP = 96  # packets handled at a time: temporaries of 96 x 6 x 256 floats fit in a core's cache
 
 
 class LocalScene(NamedTuple):

@@ -69,26 +69,20 @@ BOX, ELLIPSOID, CYLINDER = 0, 1, 2
 class Street:
     """Layout of the road: plain numbers in the street frame, metres."""
 
-    lanes: int
-    """Lanes in each direction; traffic keeps to the right."""
+    lanes: int  # lanes in each direction; traffic keeps to the right
     lane_width_m: float
-    half_width_m: Range
-    """Road edge to the right (y < 0) and to the left (y > 0), both positive."""
+    half_width_m: Range  # road edge to the right (y < 0) and to the left (y > 0), both positive
     parking: tuple[bool, bool]
     sidewalk_m: Range
-    verge_m: Range
-    """Width of the grass between kerb and paving; 0 for none."""
+    verge_m: Range  # width of the grass between kerb and paving; 0 for none
     kerb_m: float
-    crossing_x_m: float
-    """Centre of the crossing street, infinite where there is none."""
+    crossing_x_m: float  # centre of the crossing street, infinite where there is none
     crossing_half_m: float
     zebra: bool
     solid_centre: bool
     yellow_centre: bool
-    asphalt: float
-    """Mean grey of the asphalt, 0 to 1."""
-    wear: float
-    """Strength of cracks, patches and stains, about 0.5 to 1.5."""
+    asphalt: float  # mean grey of the asphalt, 0 to 1
+    wear: float  # strength of cracks, patches and stains, about 0.5 to 1.5
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,11 +14,8 @@ from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, SKY_ID
 from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, Material, Scene
 from arbiview_aug.datasets.synthetic.texture import mix, octave, step
 
-_CHUNK = 32768
-"""Hits shaded at a time: each temporary stays in the cache."""
-
-_HAZE_M = 1100.0
-"""Distance at which half of the light is the air's."""
+_CHUNK = 32768  # hits shaded at a time: each temporary stays in the cache
+_HAZE_M = 1100.0  # distance at which half of the light is the air's
 
 
 class SceneTables(NamedTuple):

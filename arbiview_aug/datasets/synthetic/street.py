@@ -30,8 +30,7 @@ _KINDS = (BoxClass.CAR, BoxClass.VAN, BoxClass.TRUCK, BoxClass.BUS)
 _MOVING_SHARES = (0.62, 0.18, 0.14, 0.06)
 _PARKED_SHARES = (0.76, 0.19, 0.05, 0.0)
 _SPEED_MPS = (6.0, 14.0)
-_WAITING = 0.2
-"""Share of the people and of the traffic in other directions that stands still."""
+_WAITING = 0.2  # share of the people and of the traffic in other directions that stands still
 
 
 def make_scene(seed: int, index: int) -> Scene:

@@ -16,8 +16,7 @@ from arbiview_aug.evaluate.images import Image, to_bytes
 
 Picture = npt.NDArray[np.uint8]
 INK, PAPER = (40, 40, 40), (255, 255, 255)
-HOLE = (255, 0, 160)
-"""Colour of uncovered regions; rare on streets."""
+HOLE = (255, 0, 160)  # colour of uncovered regions; rare on streets
 
 _GAP_PX = 6
 _CAPTION_PX, _CAPTION_SCALE = 20, 0.42

@@ -8,11 +8,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from arbiview_aug.evaluate.run import Evaluation
 
-Columns = Sequence[tuple[str, str]]
-"""Headings, and the format of the cells below them: fields of a row."""
-
-Table = tuple[str, Mapping[str, Mapping[str, float]], Columns, str]
-"""Title, metrics by row, columns and notes."""
+Columns = Sequence[tuple[str, str]]  # headings, and the format of the cells below them: fields of a row
+Table = tuple[str, Mapping[str, Mapping[str, float]], Columns, str]  # title, metrics by row, columns and notes
 
 SEEN = ("seen", "{seen:.1%}")
 TRUTH_COLUMNS = (

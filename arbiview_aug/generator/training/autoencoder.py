@@ -21,8 +21,7 @@ from arbiview_aug.generator.training.losses import Perceptual
 from arbiview_aug.generator.training.masks import one_of
 
 FOLDER = "autoencoder"
-_SCALE_IMAGES = 64
-"""Number of images that set the latents' scale, to within 0.1 %."""
+_SCALE_IMAGES = 64  # number of images that set the latents' scale, to within 0.1 %
 
 _MESSAGE_EVERY = 250
 
@@ -41,11 +40,8 @@ def train_autoencoder(
 
     L1 + KL, and VGG's distance if there are weights (Rombach et al. 2022, without their discriminator). Afterwards
     latents are scaled to unit variance. The stage takes minutes; a stopped one starts again. Does nothing without
-    settings of this stage; the other arguments are those of ``Trainer``.
-
-    Raises:
-        TrainingError: The saved one has another architecture; a loss is not finite.
-        OutputError: It could not be saved.
+    settings of this stage; the other arguments are those of ``Trainer``. TrainingError if the saved one has another
+    architecture, or a loss is not finite.
     """
     stage, vae, folder = config.autoencoder, generator.autoencoder.vae, output / FOLDER
     if stage is None or vae is None:

@@ -61,11 +61,7 @@ def _copy_parameters(module: nn.Module, values: Mapping[str, torch.Tensor]) -> N
 def save_state(
     folder: Path, config: TrainConfig, step: int, module: nn.Module, average: Average, optimiser: torch.optim.Optimizer
 ) -> None:
-    """Write the state after ``step`` steps.
-
-    Raises:
-        OutputError: The disk is full, or the folder cannot be written; the last state is unchanged.
-    """
+    """Write the state after ``step`` steps; OutputError if it fails, and the last state is unchanged."""
     tensors = {f"weights.{n}": p.detach() for n, p in module.named_parameters() if p.requires_grad}
     tensors |= {f"average.{name}": value for name, value in average.values.items()}
     for k, state in optimiser.state_dict()["state"].items():
@@ -74,11 +70,7 @@ def save_state(
 
 
 def saved_config(folder: Path, otherwise: TrainConfig) -> TrainConfig:
-    """The settings of the run whose state a folder holds; ``otherwise`` without a state.
-
-    Raises:
-        TrainingError: The state is broken.
-    """
+    """The settings of the run whose state a folder holds, TrainingError if broken; ``otherwise`` without a state."""
     return _training_config(folder, read_config(folder)[0]) if has_state(folder) else otherwise
 
 
@@ -92,11 +84,7 @@ def _training_config(folder: Path, data: Mapping[str, Any]) -> TrainConfig:
 def load_state(
     folder: Path, config: TrainConfig, module: nn.Module, average: Average, optimiser: torch.optim.Optimizer
 ) -> int:
-    """Load a saved state into a run; returns its number of steps.
-
-    Raises:
-        TrainingError: The state belongs to a run with other settings, or is broken.
-    """
+    """Load a saved state into a run; returns its steps. TrainingError for other settings, or a broken state."""
     try:
         data, tensors = read_checkpoint(folder)
         step = int(data["step"])

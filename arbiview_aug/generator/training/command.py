@@ -25,16 +25,11 @@ from arbiview_aug.generator.training.trainer import Trainer
 
 COMMANDS = ("train", "evaluate")
 
-_TIMEOUT = timedelta(hours=3)
-"""Timeout of the other processes, while one trains the autoencoder or scores."""
+_TIMEOUT = timedelta(hours=3)  # timeout of the other processes, while one trains the autoencoder or scores
 
 
 def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> int:
-    """Run the command and return its exit status.
-
-    Raises:
-        ArbiviewError: Settings, data or weights that cannot be used.
-    """
+    """Run the command and return its exit status."""
     config = overridden(CONFIGS[arguments.config](), arguments.set)
     output = writable_folder(Path(arguments.output), arguments.output)
     if arguments.command == "evaluate":
@@ -88,11 +83,7 @@ def _discard(message: str) -> None:
 
 
 def check_weights(config: TrainConfig, weights: str | None) -> None:
-    """Check, before any work, that weights are given exactly if ``fresh`` needs them.
-
-    Raises:
-        TrainingError: A frozen U-Net without weights, or weights for a configuration without one.
-    """
+    """Check, before any work, that weights are given exactly if ``fresh`` needs them; TrainingError otherwise."""
     name = config.generator.name
     if config.generator.frozen_unet and weights is None:
         raise TrainingError(

@@ -120,9 +120,7 @@ class TrainConfig:
 def overridden(config: TrainConfig, settings: Sequence[str]) -> TrainConfig:
     """The config with settings such as ``steps=100`` or ``loss.geo=0`` applied together; values as in JSON.
 
-    Raises:
-        TrainingError: An unknown key, or a value of another type.
-        GeneratorError: Settings of the generator that do not fit together.
+    TrainingError for an unknown key, or a value of another type; GeneratorError for settings that do not fit together.
     """
     data = asdict(config)
     for setting in settings:

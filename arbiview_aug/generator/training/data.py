@@ -22,14 +22,9 @@ from arbiview_aug.generator.training.checkpointing import STOP_SIGNALS
 from arbiview_aug.image_ops import resized
 from arbiview_aug.lru_cache import LRUCache
 
-SHARES = (0.6, 0.2)
-"""Shares of the scenes for training and validation; the rest are held out (Sec. Dataset)."""
-
-_BLOCKS = 10
-"""Number of scenes into which a drive without scenes is cut."""
-
-CACHE_BYTES = 4 * 2**30
-"""Memory for frames, of all workers together: 8,000 of six 128 x 224 images."""
+SHARES = (0.6, 0.2)  # shares of the scenes for training and validation; the rest are held out (Sec. Dataset)
+_BLOCKS = 10  # number of scenes into which a drive without scenes is cut
+CACHE_BYTES = 4 * 2**30  # memory for frames, of all workers together: 8,000 of six 128 x 224 images
 
 
 class TrainingFrame(NamedTuple):
@@ -138,11 +133,8 @@ def open_frames(
 ) -> Frames:
     """Open the frames (h, w) that ``--data`` names: ``KIND:PATH``, or a number of synthetic ``scenes``.
 
-    Streets are rendered on ``device``; workers cannot render on a GPU.
-
-    Raises:
-        TrainingError: An unknown kind of data.
-        DataError: The folder holds no such data.
+    Streets are rendered on ``device``; workers cannot render on a GPU. TrainingError for an unknown kind, DataError for
+    a folder without such data.
     """
     kind, _, folder = data.partition(":")
     if data == "synthetic":

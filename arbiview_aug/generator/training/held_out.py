@@ -23,8 +23,7 @@ from arbiview_aug.generator.training.masks import one_of, retarget
 from arbiview_aug.generator.training.measure import Interval, bootstrap, hole_psnr
 from arbiview_aug.generator.training.pseudo_views import Rendered, favs
 
-MIN_HOLES = 0.05
-"""Smallest share of holes in a drawn target."""
+MIN_HOLES = 0.05  # smallest share of holes in a drawn target
 
 _TRIES = 20
 

@@ -115,8 +115,7 @@ class Perceptual(nn.Module):
 def load_perceptual(weights: str | Path | None) -> Perceptual:
     """VGG16 with torchvision's ImageNet weights: from a file, else from torch hub's cache, else downloaded.
 
-    Raises:
-        TrainingError: Missing or wrong weights; the message says how to get them.
+    TrainingError for missing or wrong weights, with how to get them.
     """
     models = optional_package("torchvision.models", "generator")
     try:

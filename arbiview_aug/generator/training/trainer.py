@@ -29,8 +29,7 @@ from arbiview_aug.generator.training.step import Step, draw
 
 _LOG_EVERY = 10
 _DEVIATION_ITEMS = 32
-_MIN_DEVIATION = 0.02
-"""Lower bound of the residual's deviation, 2.5 grey levels: the error of rendering twice."""
+_MIN_DEVIATION = 0.02  # lower bound of the residual's deviation, 2.5 grey levels: the error of rendering twice
 
 _SEEDS = {"items": 1, "validation": 2, "masks": 3, "draws": 4}
 """Offsets of the random streams: validation never sees training's draws."""
@@ -133,9 +132,7 @@ class Trainer:
     def train(self) -> bool:
         """Train to the last step, or until SIGTERM or SIGINT, and save; returns whether all steps are done.
 
-        Raises:
-            TrainingError: A loss is not finite.
-            OutputError: The last state could not be saved.
+        TrainingError if a loss is not finite, OutputError if the last state could not be saved.
         """
         config = self.config
         writer = None
@@ -168,11 +165,7 @@ class Trainer:
         return self.done == config.steps
 
     def train_step(self, batch: Batch) -> dict[str, float]:
-        """Update the weights once; returns the loss terms.
-
-        Raises:
-            TrainingError: A term is not finite; nothing was updated.
-        """
+        """Update the weights once; returns the loss terms, TrainingError if one is not finite."""
         config = self.config
         number = self.done * self.accelerator.num_processes + self.accelerator.process_index
         rng = torch.Generator().manual_seed((10 * config.seed + _SEEDS["draws"]) * 2**32 + number)
@@ -217,11 +210,7 @@ class Trainer:
         return bool(self.accelerator.reduce(count, "sum") > 0)  # all processes stop after the same step
 
     def save(self) -> None:
-        """Write the state, and the generator with averaged weights.
-
-        Raises:
-            OutputError: One could not be written; the last saved one is unchanged.
-        """
+        """Write the state, and the generator with averaged weights; after an OutputError the last is unchanged."""
         try:
             if self.is_main:
                 denoiser = self.generator.denoiser
