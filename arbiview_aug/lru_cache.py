@@ -25,7 +25,6 @@ class LRUCache(Generic[K, V]):
         self._lock = threading.Lock()
 
     def get(self, key: K, make: Callable[[], V]) -> V:
-        """The value of a key, made if it is missing."""
         with self._lock:
             if key in self._values:
                 self.hits += 1
@@ -42,7 +41,6 @@ class LRUCache(Generic[K, V]):
 
     @property
     def size(self) -> int:
-        """Total size of the values."""
         with self._lock:
             return sum(map(self._size, self._values.values()))
 

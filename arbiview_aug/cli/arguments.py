@@ -65,7 +65,6 @@ def add_data(parser: argparse.ArgumentParser, without: str | None = None, **opti
 
 
 def add_target(group: argparse._ActionsContainer, *, required: bool = False) -> None:
-    """Add ``--target`` to a parser or one of its groups."""
     default = "" if required else f" (default: a higher five-camera rig; with --data, {REAL_TARGET})"
     text = f"rig to render: a shipped one ({', '.join(shipped_rigs())}), or a rig file{default}"
     group.add_argument("--target", metavar="RIG", required=required, help=text)
@@ -98,14 +97,12 @@ def add_frames(parser: argparse.ArgumentParser, default: int | None, text: str =
 
 
 def add_reduce(parser: argparse.ArgumentParser) -> None:
-    """Add ``--reduce``."""
     parser.add_argument(
         "--reduce", type=int, choices=get_args(Reduce), default=1, help="decode images at 1/N of their size"
     )
 
 
 def add_output(parser: argparse.ArgumentParser, text: str = "folder to write to") -> None:
-    """Add ``--output``, a folder."""
     parser.add_argument("--output", default="output", metavar="DIR", help=text)
 
 

@@ -15,8 +15,6 @@ from arbiview_aug.errors import DataError
 
 @dataclass(frozen=True)
 class Reader:
-    """One kind of data set."""
-
     description: str  # such a folder, for messages and help texts
     recognises: Callable[[Path], bool]  # whether a folder is of this kind
     open: Callable[..., Recording]  # opens a folder, given the other keywords of ``open_data``

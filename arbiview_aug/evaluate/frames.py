@@ -40,8 +40,6 @@ class LidarReference(NamedTuple):
 
 @dataclass(frozen=True)
 class ScoredFrame:
-    """A sample for methods, and its references."""
-
     sample: dict[str, Any]  # ``rig``, ``images`` and other keys that methods may use
     lidar: Mapping[Exposure, LidarReference] = field(default_factory=dict)  # by exposure; empty without points
     held_out: bool = False  # whether ``sample`` has points, and others score

@@ -17,8 +17,6 @@ Image = npt.NDArray[np.uint8] | npt.NDArray[np.floating[Any]]
 
 
 class RenderedView(NamedTuple):
-    """A rendered view."""
-
     image: Image  # (h, w, 3), black where nothing covers it
     coverage: BoolArray  # (h, w) bool, where some source saw it
     confidence: npt.NDArray[np.float32] | None = None  # (h, w) in [0, 1], if the renderer gives it

@@ -135,7 +135,6 @@ def one_camera(sample: Sample, camera: int) -> dict[str, Any]:
 
 
 def views_of(out: Sample) -> list[RenderedView]:
-    """Views of a retargeted sample."""
     images, coverage = as_arrays(out["images"]), [mask.cpu().numpy() for mask in out["coverage"]]
     confidence = [c.float().cpu().numpy() for c in out["confidence"]] if "confidence" in out else [None] * len(images)
     generated = [g.cpu().numpy() for g in out["generated"]] if "generated" in out else [None] * len(images)

@@ -128,7 +128,6 @@ def _data_sets(
 
 
 def _bare(sample: Mapping[str, Any]) -> dict[str, Any]:
-    """Drop labels."""
     return {key: value for key, value in sample.items() if key not in ("boxes_3d", "detections")}
 
 

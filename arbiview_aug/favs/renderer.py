@@ -44,8 +44,6 @@ class SourceReport:
 
 @dataclass(frozen=True)
 class PaperView:
-    """One target view."""
-
     image: torch.Tensor  # (3, h, w) in the type of the source images, black where no source sees
     source_camera: npt.NDArray[np.int8]  # (h, w) index of the source with the largest weight, -1 for none
     reports: tuple[SourceReport, ...]  # one for each source that the target shows

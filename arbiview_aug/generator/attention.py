@@ -63,7 +63,6 @@ class GEGLU(nn.Module):
         self.outer = nn.Linear(4 * width, width)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """(..., width) to (..., width)."""
         value, gate = self.inner(x).chunk(2, -1)
         return self.outer(value * functional.gelu(gate))
 

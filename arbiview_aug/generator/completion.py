@@ -143,7 +143,6 @@ def complete(
 
 
 def _settings(generator: GeneratorNetworks, steps: int | None, guidance: float | None) -> GeneratorConfig:
-    """The generator's configuration with the settings of one call."""
     config = generator.config
     config = replace(
         config,

@@ -75,7 +75,6 @@ class UNetConfig:
         check_fields(self, f"a divisor of {widths}", lambda g: not any(w % g for w in widths), "norm_groups")
 
     def arguments(self, in_channels: int, out_channels: int) -> dict[str, Any]:
-        """Arguments of ``UNet2DConditionModel``."""
         return {
             "in_channels": in_channels,
             "out_channels": out_channels,
@@ -112,7 +111,6 @@ class AutoencoderConfig:
         return 2 ** (len(self.widths) - 1) if self.widths else self.patch
 
     def arguments(self) -> dict[str, Any]:
-        """Arguments of ``AutoencoderKL``."""
         return {
             "down_block_types": ("DownEncoderBlock2D",) * len(self.widths),
             "up_block_types": ("UpDecoderBlock2D",) * len(self.widths),

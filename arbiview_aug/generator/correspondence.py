@@ -41,7 +41,6 @@ class Correspondence(NamedTuple):
     valid: torch.Tensor  # (B, Q, J, L, h, w) bool, M_j^(l)
 
     def to(self, device: torch.device | str) -> Correspondence:
-        """Copy to a device."""
         return Correspondence(*(value.to(device, non_blocking=True) for value in self))
 
     def without(self, views: int, dropped: torch.Tensor) -> Correspondence:

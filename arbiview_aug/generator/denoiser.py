@@ -89,7 +89,6 @@ class Denoiser(nn.Module):
 
     @property
     def dtype(self) -> torch.dtype:
-        """Data type of the weights."""
         return self.unet.conv_in.weight.dtype
 
     def own_parameters(self) -> list[nn.Parameter]:

@@ -31,7 +31,6 @@ class FrameGeometry(NamedTuple):
     source_reads: list[Correspondence]  # of the sources in the other sources
 
     def to(self, device: torch.device | str) -> FrameGeometry:
-        """Copy to a device."""
         tensors = (value.to(device, non_blocking=True) for value in self[:4])
         return FrameGeometry._make([*tensors, *self[4:]]).with_reads(lambda reads: reads.to(device))
 
@@ -54,7 +53,6 @@ class FrameGeometry(NamedTuple):
         return [window(c, sources + targets) for c in reads]
 
     def source_windows(self) -> list[TokenWindow]:
-        """Windows of the sources."""
         return [window(c, self.source_pose.shape[1]) for c in self.source_reads]
 
 

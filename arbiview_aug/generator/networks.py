@@ -25,5 +25,4 @@ class GeneratorNetworks(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Device of the weights."""
         return self.denoiser.regression.weight.device

@@ -97,7 +97,6 @@ class ResizeRig(_PixelTransform):
         self.size = _checked_pair("size", size, 1)
 
     def extra_repr(self) -> str:
-        """Settings, for ``repr``."""
         return f"size={self.size}"
 
     def _image(self, image: torch.Tensor) -> torch.Tensor:
@@ -120,8 +119,7 @@ class CropRig(_PixelTransform):
         top: First row.
         left: First column.
         size: (h, w) of the window, which must lie within every image.
-        label_keys: Keys that hold label maps (..., N, H, W), besides ``tv_tensors.Mask``.
-        pass_keys: Keys to keep although they look bound to pixels.
+        label_keys: As for ``ResizeRig``, like ``pass_keys``.
     """
 
     def __init__(
@@ -138,7 +136,6 @@ class CropRig(_PixelTransform):
         self.size = _checked_pair("size", size, 1)
 
     def extra_repr(self) -> str:
-        """Settings, for ``repr``."""
         return f"top={self.top}, left={self.left}, size={self.size}"
 
     def _image(self, image: torch.Tensor) -> torch.Tensor:

@@ -30,8 +30,6 @@ SOURCES_OVER_VIEWS = 2  # size of synthetic images relative to the views, so tha
 
 @dataclass(frozen=True)
 class Recorded:
-    """Frames on disk."""
-
     name: str  # shown in tables
     root: Path  # the folder, or ``KIND:PATH``
     truth: Callable[[int, Rig], RenderedViews] | None = None  # renders a frame's true views for a rig

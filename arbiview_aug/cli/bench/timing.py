@@ -39,7 +39,6 @@ class Quartiles(NamedTuple):
 
 
 def quartiles(times_ms: npt.NDArray[np.float64]) -> Quartiles:
-    """Median and quartiles of (n,) times."""
     q1, median, q3 = np.quantile(times_ms, [0.25, 0.5, 0.75]).tolist()
     return Quartiles(median, q1, q3)
 

@@ -58,8 +58,6 @@ _ENOUGH_MS = 1000.0  # keeps a sweep of 63 settings at three minutes
 
 @dataclass(frozen=True)
 class Setting:
-    """A point of the sweep."""
-
     quality: Quality
     surface: SurfaceName
     reduce: Reduce  # images are decoded at 1 / this
@@ -68,7 +66,6 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """Name in tables."""
         depth = ["depth held"] if self.cached else []
         return ", ".join([self.quality, self.surface, *depth, f"1/{self.reduce}", self.execution])
 

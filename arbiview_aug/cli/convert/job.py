@@ -34,8 +34,6 @@ State = Literal["made", "kept", "skipped", "failed", "stopped"]
 
 
 class Done(NamedTuple):
-    """Result of a sample."""
-
     token: str
     state: State
     coverage: float = 0.0  # share of its pixels that some source saw

@@ -22,8 +22,6 @@ left out, ``skipped``: the reason."""
 
 
 class Manifest:
-    """The records of an output folder."""
-
     def __init__(self, output: Path) -> None:
         self.output, self.folder = output, output / FOLDER
 
@@ -41,11 +39,9 @@ class Manifest:
             )
 
     def path(self, token: str) -> Path:
-        """Path of a sample's record."""
         return self.folder / "samples" / f"{file_name(token)}.json"
 
     def record(self, token: str) -> Record | None:
-        """Read a sample's record, if any."""
         path = self.path(token)
         return _read(path) if path.is_file() else None
 
@@ -62,7 +58,6 @@ class Manifest:
         return record if all(file.is_file() and file.stat().st_size == files[file] for file in files) else None
 
     def write(self, record: Record, owner: str) -> None:
-        """Write a sample's record."""
         write_whole({self.path(record["token"]): _text(record)}, owner)
 
     def write_provenance(self, facts: Mapping[str, Any], tokens: Sequence[str]) -> None:

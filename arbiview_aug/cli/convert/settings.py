@@ -58,7 +58,6 @@ class Settings:
         return self.target if self.size is None else self.target.resized(self.size, self.fit)
 
     def open(self) -> Recording:
-        """Open the source."""
         neighbours = Neighbours(count=self.neighbours) if self.neighbours else None
         return open_data(self.root, kind=self.kind, version=self.version, reduce=self.reduce, neighbours=neighbours)
 

@@ -14,8 +14,6 @@ from arbiview_aug.cli.convert.settings import Settings
 
 @dataclass(frozen=True)
 class Converted:
-    """A converted sample."""
-
     index: int  # number of the sample in the source
     sample: Mapping[str, Any]  # the sample as read
     out: Mapping[str, Any]  # the retargeted sample

@@ -73,7 +73,6 @@ class Recordings:
         return head if tail is None else f"{head}{self.rows['time_us'][row]}{tail}"
 
     def size(self, row: int) -> tuple[int, int]:
-        """(h, w) in pixels."""
         return int(self.rows["height"][row]), int(self.rows["width"][row])
 
     def ego2global(self, rows: Any) -> FloatArray:
@@ -85,7 +84,6 @@ class Recordings:
         return found
 
     def time_s(self, rows: Any) -> FloatArray:
-        """Seconds (...,) of rows (...,)."""
         return np.asarray(1e-6 * self.rows["time_us"][rows])
 
     def is_keyframe(self, row: int) -> bool:

@@ -111,7 +111,6 @@ class Tables:
         return inside(self.root, f"{self.version}/{table}.json", f"nuScenes {self.root}: table {table}")
 
     def rows(self, table: str) -> list[Row]:
-        """All rows of a small table."""
         return [row for batch in self.batches(table) for row in batch]
 
     def batches(self, table: str) -> Iterator[list[Row]]:
@@ -142,7 +141,6 @@ class Tables:
             raise self.error(table, "JSON", getattr(error, "msg", str(error)), "unpack the archive again") from None
 
     def row(self, table: str, number: int) -> Row:
-        """Row ``number`` of a table."""
         return next(islice(chain.from_iterable(self.batches(table)), number, None))
 
     def by_token(self, table: str) -> dict[str, Row]:
@@ -206,7 +204,6 @@ class Tables:
         return found[0].astype(np.float64, copy=False)
 
     def rotations(self, table: str, rows: Sequence[Row]) -> FloatArray:
-        """(len(rows), 3, 3) from the column ``rotation``."""
         return rotation_from_quaternion(self.quaternions(table, rows))
 
     def quaternions(self, table: str, rows: Sequence[Row]) -> FloatArray:

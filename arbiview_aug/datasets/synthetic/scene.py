@@ -98,45 +98,27 @@ class Light:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """One street scene; P primitives and B labelled boxes in the street frame.
+    """One street scene; P primitives and B labelled boxes in the street frame."""
 
-    Attributes:
-        kind: (P,) BOX, ELLIPSOID or CYLINDER.
-        center: (P, 3) metres.
-        rotation: (P, 3, 3) local axes as columns in the street frame.
-        half: (P, 3) half extents along the local axes; a cylinder's axis is its local z.
-        planes: (P, 6, 4) outward half-spaces n·p <= b of boxes, street frame: front, rear, left, right, top, bottom.
-        corners: (P, 8, 3) a convex hull around each primitive, street frame.
-        material, cls, instance: (P,) ``Material``, ``SceneClass``, row of ``boxes`` or -1.
-        color: (P, 3) display RGB, 0 to 1.
-        param: (P, 4) numbers whose meaning is the material's.
-        boxes: (B, 7) centre x y z, length, width, height, yaw (radians), street frame.
-        box_classes: (B,) ``BoxClass``.
-        velocities: (B, 2) of the boxes, m/s, street frame.
-        speed_mps: Speed of the vehicle, straight ahead.
-        ego2street: (4, 4) pose of the vehicle, its road plane at z = 0.
-        salt: Seed of the textures.
-    """
-
-    kind: IntArray
-    center: FloatArray
-    rotation: FloatArray
-    half: FloatArray
-    planes: FloatArray
-    corners: FloatArray
-    material: IntArray
-    cls: IntArray
-    instance: IntArray
-    color: FloatArray
-    param: FloatArray
-    boxes: FloatArray
-    box_classes: IntArray
-    velocities: FloatArray
-    speed_mps: float
-    ego2street: FloatArray
+    kind: IntArray  # (P,) BOX, ELLIPSOID or CYLINDER
+    center: FloatArray  # (P, 3) metres
+    rotation: FloatArray  # (P, 3, 3) local axes as columns
+    half: FloatArray  # (P, 3) half extents along the local axes; a cylinder's axis is its local z
+    planes: FloatArray  # (P, 6, 4) outward half-spaces n·p <= b of boxes: front, rear, left, right, top, bottom
+    corners: FloatArray  # (P, 8, 3) a convex hull around each primitive
+    material: IntArray  # (P,) ``Material``
+    cls: IntArray  # (P,) ``SceneClass``
+    instance: IntArray  # (P,) row of ``boxes``, or -1
+    color: FloatArray  # (P, 3) display RGB, 0 to 1
+    param: FloatArray  # (P, 4) numbers whose meaning is the material's
+    boxes: FloatArray  # (B, 7) centre x y z, length, width, height, yaw (radians)
+    box_classes: IntArray  # (B,) ``BoxClass``
+    velocities: FloatArray  # (B, 2) of the boxes, m/s
+    speed_mps: float  # of the vehicle, straight ahead
+    ego2street: FloatArray  # (4, 4) pose of the vehicle, its road plane at z = 0
     street: Street
     light: Light
-    salt: int
+    salt: int  # seed of the textures
 
     def __len__(self) -> int:
         return len(self.kind)

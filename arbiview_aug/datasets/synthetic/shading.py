@@ -34,8 +34,6 @@ class SceneTables(NamedTuple):
 
     @classmethod
     def build(cls, scene: Scene) -> SceneTables:
-        """Make the tables, light map included."""
-
         def put(array: np.ndarray) -> Tensor:
             return torch.as_tensor(np.ascontiguousarray(array, np.float32 if array.dtype.kind == "f" else np.int64))
 

@@ -18,7 +18,6 @@ COLOURS = ("#1f64c8", "#d65414", "#1e8c3c", "#8c3caa", "#966e14")
 
 
 def draw_rigs(rigs: Sequence[Rig]) -> Picture:
-    """Draw ``rig_figure`` as (h, w, 3) pixels."""
     # Without pyplot: no global state and no display.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 

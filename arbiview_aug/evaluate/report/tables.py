@@ -86,7 +86,6 @@ def evaluation_tables(done: Evaluation, methods: Sequence[str]) -> list[Table]:
 
 
 def text_table(title: str, rows: Mapping[str, Mapping[str, float]], columns: Columns, notes: str = "") -> str:
-    """Title, Markdown table and notes."""
     table = metric_table([{"name": name, **row} for name, row in rows.items()], columns)
     return f"{title}:\n\n{table}\n\n{notes}".rstrip()
 

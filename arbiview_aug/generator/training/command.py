@@ -29,7 +29,6 @@ _TIMEOUT = timedelta(hours=3)  # timeout of the other processes, while one train
 
 
 def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> int:
-    """Run the command and return its exit status."""
     config = overridden(CONFIGS[arguments.config](), arguments.set)
     output = writable_folder(Path(arguments.output), arguments.output)
     if arguments.command == "evaluate":

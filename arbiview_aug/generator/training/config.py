@@ -83,8 +83,6 @@ class AutoencoderTraining:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """A training run."""
-
     generator: GeneratorConfig
     pseudo_views: PseudoViewConfig = field(default_factory=PseudoViewConfig)
     loss: LossConfig = field(default_factory=LossConfig)

@@ -36,8 +36,6 @@ class TrainingFrame(NamedTuple):
 
 
 class Split(NamedTuple):
-    """Indices of frames."""
-
     training: list[int]
     validation: list[int]
     held_out: list[int]

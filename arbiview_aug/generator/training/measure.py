@@ -38,8 +38,6 @@ def mean_hole_psnr(images: Mapping[str, torch.Tensor], batch: Batch) -> dict[str
 
 
 class Interval(NamedTuple):
-    """A mean and its 95 % bootstrap interval."""
-
     mean: float
     low: float
     high: float

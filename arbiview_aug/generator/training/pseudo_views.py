@@ -56,12 +56,10 @@ class Batch(NamedTuple):
     tokens: tuple[str, ...]  # names of the items
 
     def to(self, device: torch.device | str) -> Batch:
-        """Copy to a device."""
         return Batch._make([*(value.to(device) for value in self[:-1]), self.tokens])
 
     @property
     def conditions(self) -> Conditions:
-        """The generator's inputs."""
         return Conditions(self.condition, self.known, self.confidence, self.sources, self.seen)
 
     @property
@@ -71,7 +69,6 @@ class Batch(NamedTuple):
 
 
 def collate(items: Sequence[Batch]) -> Batch:
-    """Concatenate items."""
     *tensors, geometries, tokens = zip(*items, strict=True)
     return Batch._make([*map(torch.cat, tensors), batched(geometries), tuple(itertools.chain(*tokens))])
 
