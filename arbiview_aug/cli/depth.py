@@ -18,7 +18,7 @@ from arbiview_aug.datasets.registry import open_data, split_kind
 from arbiview_aug.errors import ArbiviewError, WarnOnce, described
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames, warn_lost
-from arbiview_aug.temporal.motion_depth import motion_depth
+from arbiview_aug.temporal.motion_depth import compile_matching, motion_depth
 
 
 class Done(NamedTuple):
@@ -34,8 +34,8 @@ class Done(NamedTuple):
 class _Frames(Dataset[Done]):
     """Frames whose depth is computed and written on access, in a DataLoader's workers."""
 
-    def __init__(self, data: Any, tokens: Sequence[str], depths: DepthFolder, device: str) -> None:
-        self.data, self.tokens, self.depths, self.device = data, tokens, depths, device
+    def __init__(self, data: Any, tokens: Sequence[str], depths: DepthFolder) -> None:
+        self.data, self.tokens, self.depths = data, tokens, depths
 
     def __len__(self) -> int:
         return len(self.data)
@@ -66,7 +66,7 @@ class _Frames(Dataset[Done]):
                 used.remove(neighbour.name)  # the frame is done again once the neighbour can be read
                 return None
 
-        found = motion_depth(frame.rig, frame.images, neighbours, boxes, load, self.device)
+        found = motion_depth(frame.rig, frame.images, neighbours, boxes, load)
         self.depths.write(token, rig, found, used)
         return Done(token, found.density, str(found))
 
@@ -81,19 +81,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     add_data(parser)
     parser.add_argument("--output", metavar="FOLDER", help=f"where to write (default: {FOLDER} in the data's folder)")
-    parser.add_argument("--device", default="cpu", help="where to compute: cpu, cuda, cuda:1")
-    parser.add_argument("--workers", type=count, default=1, metavar="N", help="processes, on the CPU")
+    parser.add_argument("--device", default="cpu", help="without effect: compiled code on the CPU matches the images")
+    parser.add_argument("--workers", type=count, default=1, metavar="N", help="processes")
     arguments = parser.parse_args(argv)
-    device = device_named(arguments.device)
+    device_named(arguments.device)
     data: Any = open_data(arguments.data, neighbours=WANTED)
     _, root = split_kind(arguments.data)
     folder = Path(arguments.output) if arguments.output else inside(root, FOLDER, "depth from motion")
     depths = DepthFolder(writable_folder(folder, str(folder)))
-    frames = _Frames(data, data.tokens, depths, str(device))
-    workers = arguments.workers if device.type == "cpu" else 1  # one process keeps a GPU busy
+    frames = _Frames(data, data.tokens, depths)
+    compile_matching()
     warned: list[str] = []
     with gathered_warnings(warned):
-        done = list(results(frames, workers, "depth from motion"))
+        done = list(results(frames, arguments.workers, "depth from motion"))
     for line in warned:
         print(line, file=sys.stderr)
     return _summary(done, depths)

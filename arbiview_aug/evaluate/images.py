@@ -12,7 +12,8 @@ import torch
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.errors import SampleError
 
-Image = npt.NDArray[np.uint8] | npt.NDArray[np.floating[Any]]  # (h, w, 3) RGB, 0-255
+Image = npt.NDArray[np.uint8] | npt.NDArray[np.floating[Any]]
+"""(h, w, 3) RGB on the scale 0-255, uint8 or float."""
 
 
 class RenderedView(NamedTuple):

@@ -18,16 +18,15 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.projection import project_rays
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.environment import compilation_announced
 from arbiview_aug.sample.neighbours import Neighbour
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.depth_maps import motion_camera, points_of_depth
 from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.temporal.change import BOX_MARGIN_M
-from arbiview_aug.temporal.plane_sweep import INVALID, SweptSurface, reduced_grey, scores_opencv, scores_torch
+from arbiview_aug.temporal.plane_sweep import WALLS, SweptImage, reduced_grey
 from arbiview_aug.temporal.pose_check import CORRECTED_PX, MAX_CORRECTIONS, MAX_ERROR_PX, PoseSamples, pose_error
-from arbiview_aug.temporal.semi_global import aggregate
 
 BEST_TRAVEL_M, TRAVEL_M = 1.2, (0.4, 3.0)
 """Best travel to a neighbour, and the range allowed: shorter baselines measure nothing, longer ones hide too much."""
@@ -42,6 +41,9 @@ FARTHEST_M = 80.0
 
 LEAST_SHIFT_PX = 0.06
 """Least motion of a pixel on all sides when its inverse distance grows by a tenth."""
+
+_NEARER, _MORE = 1e-3, 10
+"""Share of confirmed pixels at half the size that may be nearer than the nearest wall, and walls added to that one."""
 
 _SPECKLE_PX = 100
 """Smallest patch of one distance, in images 400 px wide."""
@@ -76,11 +78,10 @@ class MotionDepth:
 
 
 class _Side(NamedTuple):
-    """A neighbour with its cameras and grey images at the working size."""
+    """A neighbour with its images at the working size."""
 
     neighbour: Neighbour
-    cameras: list[Camera]
-    greys: list[Layer]
+    images: list[SweptImage]
 
 
 class _Estimate(NamedTuple):
@@ -94,18 +95,18 @@ Load = Callable[[Neighbour], Sequence[torch.Tensor] | None]
 """Reads the images of a neighbour; None if they cannot be read, and another one is taken."""
 
 
+@compilation_announced()
 def motion_depth(
     rig: Rig,
     images: Sequence[torch.Tensor],
     neighbours: Sequence[Neighbour],
     boxes: FloatArray | None,
     load: Load,
-    device: torch.device | str = "cpu",
 ) -> MotionDepth:
     """Estimate depth from one neighbour before the frame and one after it, or from one if there is only one.
 
-    Poses are checked on the result (``arbiview_aug.temporal.pose_check``). Small errors are corrected and the images
-    matched again.
+    Images are matched at half the size first. Poses are checked on the result
+    (``arbiview_aug.temporal.pose_check``); small errors are corrected and the images matched again.
 
     Args:
         rig: Rig of the current frame.
@@ -113,9 +114,7 @@ def motion_depth(
         neighbours: Other frames of the drive, in the current frame's ego frame.
         boxes: (B, 7) labelled objects of the current frame, ego frame, which are left out.
         load: Reads a neighbour's images.
-        device: Device for the matching scores.
     """
-    device = torch.device(device)
     cameras = [_without_objects(motion_camera(camera), boxes) for camera in rig]
 
     def declined(reason: str) -> MotionDepth:
@@ -123,17 +122,17 @@ def motion_depth(
 
     sides = []
     for candidates in _by_side(neighbours):
-        side = next((loaded for one in candidates if (loaded := _loaded(one, load)) is not None), None)
+        side = next((loaded for one in candidates if (loaded := _loaded(one, load, rig.ground_z_m)) is not None), None)
         sides += [] if side is None else [side]
     if not sides:
         least, most = TRAVEL_M
         return declined(f"no frame {least:g} to {most:g} m before or after it can be used")
-    greys = [reduced_grey(camera, image) for camera, image in zip(rig, images, strict=True)]
-    families = [SweptSurface(camera, rig.ground_z_m) for camera in cameras]
+    swept = _swept(rig, cameras, images, rig.ground_z_m)
     words = f"from {' and '.join(side.neighbour.name for side in sides)}"
     for correction in range(MAX_CORRECTIONS + 1):
-        estimates = [_match(f, grey, k, sides, device) for k, (f, grey) in enumerate(zip(families, greys, strict=True))]
-        errors = [pose_error(_pose_samples(families, greys, estimates, side)) for side in sides]
+        others = [[side.images[k] for side in sides] for k in range(len(swept))]
+        coarse = [_coarse(one, of_sides) for one, of_sides in zip(swept, others, strict=True)]
+        errors = [pose_error(_pose_samples(swept, coarse, side)) for side in sides]
         measured = [error for error in errors if error is not None]
         if len(measured) < len(sides):
             lost = sides[errors.index(None)].neighbour.name
@@ -144,12 +143,13 @@ def motion_depth(
         if correction < MAX_CORRECTIONS:
             words += f"{'; poses corrected by' if correction == 0 else ', then'} {' and '.join(map(str, measured))}"
             sides = [
-                side._replace(cameras=[camera.moved(error.correction) for camera in side.cameras])
+                side._replace(images=[one.moved(error.correction) for one in side.images])
                 for side, error in zip(sides, measured, strict=True)
             ]
         elif worst.error_px > MAX_ERROR_PX:
             return declined(f"the pose of frame {sides[measured.index(worst)].neighbour.name} errs by {worst}")
-    return MotionDepth(tuple(_depth_m(f, one) for f, one in zip(families, estimates, strict=True)), words)
+    fine = map(_match, swept, others, map(_walls, swept, coarse))
+    return MotionDepth(tuple(map(_depth_m, swept, others, fine)), words)
 
 
 def _by_side(neighbours: Sequence[Neighbour]) -> tuple[list[Neighbour], list[Neighbour]]:
@@ -159,13 +159,17 @@ def _by_side(neighbours: Sequence[Neighbour]) -> tuple[list[Neighbour], list[Nei
     return [one for one in usable if one.ahead_m <= 0], [one for one in usable if one.ahead_m > 0]
 
 
-def _loaded(neighbour: Neighbour, load: Load) -> _Side | None:
+def _loaded(neighbour: Neighbour, load: Load, ground_z_m: float) -> _Side | None:
     images = load(neighbour)
     if images is None:
         return None
     cameras = [_without_objects(motion_camera(camera), neighbour.boxes) for camera in neighbour.rig]
-    greys = [reduced_grey(camera, image) for camera, image in zip(neighbour.rig, images, strict=True)]
-    return _Side(neighbour, cameras, greys)
+    return _Side(neighbour, _swept(neighbour.rig, cameras, images, ground_z_m))
+
+
+def _swept(rig: Rig, cameras: list[Camera], images: Sequence[torch.Tensor], ground_z_m: float) -> list[SweptImage]:
+    greys = [reduced_grey(camera, image) for camera, image in zip(rig, images, strict=True)]
+    return [SweptImage(camera, grey, ground_z_m) for camera, grey in zip(cameras, greys, strict=True)]
 
 
 def _without_objects(camera: Camera, boxes: FloatArray | None) -> Camera:
@@ -178,94 +182,87 @@ def _without_objects(camera: Camera, boxes: FloatArray | None) -> Camera:
     return replace(camera, mask=mask)
 
 
-def _match(family: SweptSurface, grey: Layer, k: int, sides: Sequence[_Side], device: torch.device) -> _Estimate:
-    """Estimate the distances of one camera's pixels from the scores of all sides together.
+def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer) -> _Estimate:
+    """Estimate the distances of one camera's pixels from the costs of all sides together.
 
     Two sides must agree, each matched alone. A single side is confirmed by matching back from it.
     """
-    totals, alone, seen = None, [], []
-    for side in sides:
-        scores = _scores(family, grey, side.cameras[k], side.greys[k], device)
-        smooth = aggregate(scores)
-        alone.append(_peak(family, smooth)[0])
-        totals = smooth if totals is None else totals + smooth
-        seen.append(scores)
-    assert totals is not None
-    q, index = _peak(family, totals)
-    visible = torch.stack([scores.gather(0, index[None])[0] > INVALID for scores in seen]).any(0).cpu().numpy()
-    if len(sides) == 2:
-        agree = _agree(alone[0], alone[1])
+    q, alone = _search(image, others, walls)
+    if len(others) == 2:
+        agree = _agree(*alone)
     else:
-        agree = _confirmed(family, q, grey, sides[0].cameras[k], sides[0].greys[k], device)
-    valid = visible & agree & (q > 1 / FARTHEST_M)
-    for side in sides:
-        valid &= np.hypot(*np.moveaxis(_shift(family, side.cameras[k], q), -1, 0)) >= LEAST_SHIFT_PX
-    return _Estimate(q, valid)
+        agree = _confirmed(image, q, others[0], _search(others[0], [image], walls)[0])
+    visible = [cv2.remap(o.unmasked, image.positions(o.camera, q), None, cv2.INTER_NEAREST) for o in others]  # type: ignore[call-overload]
+    return _Estimate(q, agree & (np.max(visible, 0) > 0))
 
 
-def _confirmed(
-    family: SweptSurface, q: Layer, grey: Layer, camera: Camera, other: Layer, device: torch.device
-) -> BoolArray:
+def _search(image: SweptImage, others: Sequence[SweptImage], walls: Layer) -> tuple[Layer, list[Layer]]:
+    """Inverse distances (h, w) by all sides together, and by each side alone."""
+    from arbiview_aug.temporal.kernels import aggregate, find_least
+
+    totals = [aggregate(image.costs(other, walls)) for other in others]
+    alone = [image.inverse_distance(find_least(total, walls[1])) for total in totals]
+    together = sum(totals[1:], totals[0])
+    return image.inverse_distance(find_least(together, walls[1])), alone
+
+
+def _confirmed(image: SweptImage, q: Layer, other: SweptImage, back: Layer) -> BoolArray:
     """(h, w) whether matching back from a neighbour's pixels gives the same distances."""
-    back = SweptSurface(camera, family.ground_z_m)
-    own, _ = _peak(back, aggregate(_scores(back, other, family.camera, grey, device)))
-    there: Any = cv2.remap(own, _positions(family, camera, q).astype(np.float32), None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
-    offset = family.camera.center_m - camera.center_m
-    away = np.linalg.norm(offset * q[..., None] + family.directions, axis=-1)
+    there: Any = cv2.remap(back, image.positions(other.camera, q), None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
+    offset = image.camera.center_m - other.camera.center_m
+    away = np.linalg.norm(offset * q[..., None] + image.directions, axis=-1)
     return _agree(there, (q / np.maximum(away, 1e-9)).astype(np.float32))
 
 
-def _scores(family: SweptSurface, grey: Layer, camera: Camera, other: Layer, device: torch.device) -> torch.Tensor:
-    if device.type == "cpu":
-        return torch.from_numpy(scores_opencv(family, grey, camera, other))
-    return scores_torch(family, grey, camera, other, device)
+@compilation_announced()
+def compile_matching() -> None:
+    """Compile the kernels, or load them from numba's cache: in the parent process, before workers are forked."""
+    camera = Camera.looking(name="small", azimuth_deg=0, width_px=16, height_px=16, horizontal_fov_deg=90)
+    image = SweptImage(camera, np.zeros((16, 16), np.float32), 0.0)
+    _match(image, [image], WALLS[:2])
 
 
 def _agree(one: Layer, two: Layer) -> BoolArray:
     return np.asarray(np.abs(one - two) <= AGREEMENT * np.maximum(one, two) + _AGREEMENT_PER_M)
 
 
-def _pose_samples(
-    families: Sequence[SweptSurface], greys: Sequence[Layer], estimates: Sequence[_Estimate], side: _Side
-) -> list[PoseSamples]:
-    samples = []
-    for family, camera, grey, other, (q, valid) in zip(
-        families, side.cameras, greys, side.greys, estimates, strict=True
-    ):
-        at, shift = _positions(family, camera, q), _shift(family, camera, q)
-        samples.append(PoseSamples(family, camera, grey, other, q, valid, at, shift))
-    return samples
+def _coarse(image: SweptImage, others: Sequence[SweptImage]) -> _Estimate:
+    """Estimate the distances at half the size, and enlarge them."""
+    small = _match(image.halved, [other.halved for other in others], WALLS[::2])
+    both = small.inverse_distance, small.valid.astype(np.float32)
+    q, valid = (np.asarray(cv2.resize(layer, image.camera.size[::-1]), np.float32) for layer in both)
+    return _Estimate(q, valid > 0.5)
 
 
-def _shift(family: SweptSurface, camera: Camera, q: Layer) -> FloatArray:
-    """(h, w, 2) motion of a side's pixels along the epipolar lines when inverse distances grow by a tenth."""
-    return _positions(family, camera, q * np.float32(1.1)) - _positions(family, camera, q)
+def _walls(image: SweptImage, coarse: _Estimate) -> Layer:
+    """The walls up to the nearest that was confirmed, and some more; noise does not confirm any."""
+    wall = coarse.inverse_distance / np.maximum(image.horizontal, 1e-6)
+    upright = wall[coarse.valid & (coarse.inverse_distance > 1.02 * image.road)]
+    nearest = np.quantile(upright, 1 - _NEARER) if len(upright) else WALLS[-1]
+    return WALLS[: int(nearest / WALLS[1]) + _MORE]
 
 
-def _positions(family: SweptSurface, camera: Camera, inverse_distance: Layer) -> FloatArray:
-    offset = family.camera.center_m - camera.center_m
-    uv, valid = project_rays(camera, family.directions, inverse_distance.astype(np.float64), offset)
-    return np.where(valid[..., None], uv, -1e4)
+def _measurable(image: SweptImage, others: Sequence[SweptImage], q: Layer) -> BoolArray:
+    """(h, w) whether inverse distances are large enough, and move the pixels of all sides."""
+    shifts = [np.linalg.norm(image.shift(other.camera, q), axis=-1) for other in others]
+    return np.asarray((q > 1 / FARTHEST_M) & (np.min(shifts, 0) >= LEAST_SHIFT_PX))
 
 
-def _peak(family: SweptSurface, scores: torch.Tensor) -> tuple[Layer, torch.Tensor]:
-    """Inverse distances (h, w) of the best scores, refined by a parabola, and the index of the best hypothesis."""
-    peak, index = scores.max(0)
-    last = len(scores) - 1
-    before, after = (scores.gather(0, (index + d).clamp(0, last)[None])[0] for d in (-1, 1))
-    curvature = before - 2 * peak + after
-    inside = (index > 0) & (index < last) & (curvature < -1e-6)
-    offset = torch.where(inside, 0.5 * (before - after) / torch.where(inside, curvature, 1), 0).clamp(-0.5, 0.5)
-    wall = (index + offset).cpu().numpy() * family.walls[1]
-    return np.asarray(family.inverse_distance(wall), np.float32), index
+def _pose_samples(images: Sequence[SweptImage], estimates: Sequence[_Estimate], side: _Side) -> list[PoseSamples]:
+    return [
+        PoseSamples(image, other, q, valid & _measurable(image, [other], q))
+        for image, other, (q, valid) in zip(images, side.images, estimates, strict=True)
+    ]
 
 
-def _depth_m(family: SweptSurface, estimate: _Estimate) -> Layer:
+def _depth_m(image: SweptImage, others: Sequence[SweptImage], estimate: _Estimate) -> Layer:
     """z-depth (h, w), 0 outside the mask, where invalid, and in small patches."""
-    camera, q = family.camera, estimate.inverse_distance
-    valid = estimate.valid if camera.mask is None else estimate.valid & camera.mask
+    camera, (q, valid) = image.camera, estimate
+    valid = valid & _measurable(image, others, q)
+    if camera.mask is not None:
+        valid &= camera.mask
     valid = _without_speckles(q, valid)
-    z = family.directions @ camera.cam2ego[:3, 2]
+    z = image.directions @ camera.cam2ego[:3, 2]
     return np.where(valid & (z > 1e-6), z / np.maximum(q, 1e-9), 0).astype(np.float32)
 
 

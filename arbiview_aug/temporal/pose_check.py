@@ -14,11 +14,10 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.projection import project_rays
 from arbiview_aug.scene.panorama import Layer
-from arbiview_aug.temporal.plane_sweep import SweptSurface
+from arbiview_aug.temporal.plane_sweep import SweptImage
 
 CORRECTED_PX = 0.15
 """Mean displacement in matched images above which a pose is corrected; exact poses measure 0.02 to 0.1."""
@@ -45,24 +44,16 @@ class PoseSamples(NamedTuple):
     """Correspondences of one camera's pixels in a neighbour's image.
 
     Attributes:
-        family: Swept surface of the camera.
-        source: The neighbour's camera.
-        grey: (h, w) the camera's image.
-        other: (h', w') the neighbour's image.
+        image: The camera's image.
+        other: The neighbour's.
         inverse_distance: (h, w) along the camera's rays, 1/m.
         valid: (h, w) bool.
-        at: (h, w, 2) corresponding pixels in the neighbour.
-        shift: (h, w, 2) their motion along the epipolar line when the inverse distance grows by a tenth.
     """
 
-    family: SweptSurface
-    source: Camera
-    grey: Layer
-    other: Layer
+    image: SweptImage
+    other: SweptImage
     inverse_distance: Layer
     valid: BoolArray
-    at: FloatArray
-    shift: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,20 +101,21 @@ def _equations(sample: PoseSamples) -> tuple[FloatArray, FloatArray, FloatArray]
     x holds turns about the ego's axes in degrees and shifts along its y and z in metres. Images are compared at their
     local mean and contrast, as in the sweep's correlation.
     """
-    at = sample.at.astype(np.float32)
-    warped: Any = cv2.remap(sample.other, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-    one, two = _normalised(sample.grey), _normalised(warped)
-    mean = (sample.grey + warped) / 2
+    at = sample.image.positions(sample.other.camera, sample.inverse_distance)
+    warped: Any = cv2.remap(sample.other.grey, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+    one, two = _normalised(sample.image.grey), _normalised(warped)
+    mean = (sample.image.grey + warped) / 2
     # Gradients of the warped image stand for those of the neighbour's: the warp is close to the identity.
     gx, gy = (cv2.Sobel((one + two) / 2, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1)))
     contrast = np.hypot(*(cv2.Sobel(mean, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1))))
-    length = np.maximum(np.hypot(sample.shift[..., 0], sample.shift[..., 1]), 1e-9)
-    ex, ey = sample.shift[..., 0] / length, sample.shift[..., 1] / length
+    shift = sample.image.shift(sample.other.camera, sample.inverse_distance)
+    length = np.maximum(np.hypot(shift[..., 0], shift[..., 1]), 1e-9)
+    ex, ey = shift[..., 0] / length, shift[..., 1] / length
     across = np.abs(gx * ex + gy * ey) <= _ACROSS * np.hypot(gx, gy)
     use = sample.valid & (contrast > _CONTRAST_LEVELS) & across
     if not use.any():
         return None
-    motion = _motion(sample, use)
+    motion = _motion(sample, use, at[use])
     normal = np.stack([-ey[use], ex[use]], -1)
     off_line = np.einsum("nk,nkp->np", normal, motion)  # [n, 5] px per unit
     gradient = gx[use] * normal[:, 0] + gy[use] * normal[:, 1]
@@ -132,21 +124,21 @@ def _equations(sample: PoseSamples) -> tuple[FloatArray, FloatArray, FloatArray]
 
 
 def _normalised(image: Layer) -> Layer:
-    mean = cv2.GaussianBlur(image, (0, 0), 5)
-    spread = np.sqrt(np.maximum(cv2.GaussianBlur(image * image, (0, 0), 5) - mean * mean, 0) + 4)
+    mean = cv2.blur(image, (15, 15))
+    spread = np.sqrt(np.maximum(cv2.blur(image * image, (15, 15)) - mean * mean, 0) + 4)
     return np.asarray((image - mean) / spread)
 
 
-def _motion(sample: PoseSamples, use: BoolArray) -> FloatArray:
+def _motion(sample: PoseSamples, use: BoolArray, at: Layer) -> FloatArray:
     """(n, 2, 5) motion of the corresponding pixels per unit of turn and shift of the neighbour."""
-    family, source = sample.family, sample.source
-    directions, q = family.directions[use], sample.inverse_distance[use].astype(np.float64)
+    image, source = sample.image, sample.other.camera
+    directions, q = image.directions[use], sample.inverse_distance[use].astype(np.float64)
     columns = []
     for axis in range(5):
         step = _TURN_DEG if axis < 3 else _SHIFT_M
         moved = source.moved(_pose(step * np.eye(5)[axis]))
-        uv, _ = project_rays(moved, directions, q, family.camera.center_m - moved.center_m)
-        columns.append((uv - sample.at[use]) / step)
+        uv, _ = project_rays(moved, directions, q, image.camera.center_m - moved.center_m)
+        columns.append((uv - at) / step)
     return np.stack(columns, -1)
 
 

@@ -282,7 +282,6 @@ class FramePlanner:
             neighbours,
             scene.boxes,
             lambda neighbour: neighbour_images(neighbour, frame.images, self.warn),
-            frame.images[0].device,
         )
         if not depth.density:
             self.warn("motion", str(depth))

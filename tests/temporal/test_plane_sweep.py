@@ -1,23 +1,17 @@
-"""Plane sweep: the family of surfaces, and equal scores on the CPU and on any device."""
+"""Plane sweep: the family of surfaces, and kernels against plain loops in float64."""
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from arbiview_aug import Camera
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.scene.depth_maps import motion_camera
-from arbiview_aug.temporal.plane_sweep import (
-    HYPOTHESES,
-    INVALID,
-    NEAREST_M,
-    SweptSurface,
-    reduced_grey,
-    scores_opencv,
-    scores_torch,
-)
-from arbiview_aug.temporal.semi_global import JUMP, STEP, aggregate
+from arbiview_aug.temporal.kernels import INVALID, JUMP, NOISE_LEVELS, PER_CORRELATION, STEP, aggregate, find_least
+from arbiview_aug.temporal.plane_sweep import NEAREST_M, WALLS, SweptImage, reduced_grey
 from tests import helpers
 
 SIZE = (48, 80)
@@ -31,10 +25,14 @@ def textured(size: tuple[int, int], seed: int = 0) -> np.ndarray:
     return rng.uniform(0, 255, size).astype(np.float32)
 
 
+def swept(seen_by: Camera, seed: int = 0, ground_z_m: float = 0.0) -> SweptImage:
+    return SweptImage(seen_by, textured(seen_by.size, seed), ground_z_m)
+
+
 def test_surfaces_are_the_road_and_upright_walls() -> None:
-    family = SweptSurface(camera(position_m=(1, 2, 1.5)), -0.3)
+    family = swept(camera(position_m=(1, 2, 1.5)), ground_z_m=-0.3)
     origin = family.camera.center_m
-    for wall in (0.0, 0.1, float(family.walls[-1])):
+    for wall in (0.0, 0.1, float(WALLS[-1])):
         q = family.inverse_distance(wall)
         points = origin + family.directions / np.maximum(q, 1e-9)[..., None]
         down = family.directions[..., 2] < 0
@@ -45,34 +43,60 @@ def test_surfaces_are_the_road_and_upright_walls() -> None:
             np.testing.assert_allclose(radius, 1 / wall, rtol=1e-5)
         else:
             assert not q[~down].any()
-    assert family.walls[-1] == pytest.approx(1 / NEAREST_M) and len(family.walls) == HYPOTHESES
+    assert WALLS[-1] == pytest.approx(1 / NEAREST_M)
 
 
-@pytest.mark.parametrize("lens", ["pinhole", "radtan"])
-def test_both_executions_agree(lens: str) -> None:
-    distortion = (-0.05, 0.01, 0.0, 0.0) if lens == "radtan" else ()
+def correlation(image: SweptImage, other: SweptImage, wall: float) -> Any:
+    """(h, w) normalised cross-correlation of windows in float64, NaN where the other image shows nothing."""
+    q = image.inverse_distance(wall).astype(np.float64)
+    uv, _, valid = other.camera.project_cam(
+        (image.directions + (image.camera.center_m - other.camera.center_m) * q[..., None])
+        @ other.camera.cam2ego[:3, :3]
+    )
+    uv = np.where(valid[..., None], uv, 1e5)
+    size = np.array(other.camera.size[::-1])
+    inner = np.clip(uv, 0, size - 1)
+    (c, r), (t, s) = (np.moveaxis(part, -1, 0) for part in np.divmod(np.minimum(inner, size - 1 - 1e-9), 1))
+    c, r, grey = c.astype(int), r.astype(int), other.grey.astype(np.float64)
+    above, below = (grey[row, c] * (1 - t) + grey[row, c + 1] * t for row in (r, r + 1))
+    read = above * (1 - s) + below * s
+    column, row = np.moveaxis(np.rint(inner).astype(int), -1, 0)
+    seen = (inner == uv).all(-1) & (other.unmasked[row, column] > 0)
+
+    def mean(values: Any) -> Any:
+        padded = np.pad(np.asarray(values, np.float64), 3, mode="edge")
+        return np.lib.stride_tricks.sliding_window_view(padded, (7, 7)).mean((-1, -2))
+
+    one, two = image.grey.astype(np.float64), read
+    variances = [mean(x * x) - mean(x) ** 2 + NOISE_LEVELS**2 for x in (one, two)]
+    found = (mean(one * two) - mean(one) * mean(two)) / np.sqrt(variances[0] * variances[1])
+    return np.where(seen, found, np.nan)
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "radtan", "fisheye"])
+def test_costs_are_correlations(lens: str) -> None:
+    """Every wall's, those of the road among them, which are copied from the wall before."""
+    distortion = {"pinhole": (), "radtan": (-0.05, 0.01, 0.0, 0.0), "fisheye": (0.01, 0.0, 0.0, 0.0)}[lens]
     mask = np.ones(SIZE, bool)
     mask[30:, :20] = False
-    here = camera(lens=lens, distortion=distortion)
+    here = camera(lens=lens, distortion=distortion).turned(pitch_deg=-10)
     there = camera(lens=lens, distortion=distortion, position_m=(0.6, 0.05, 1.52), mask=mask)
-    family, one, two = SweptSurface(here, 0.0), textured(SIZE), textured(SIZE, 1)
-    fast = scores_opencv(family, one, there, two)
-    plain = scores_torch(family, one, there, two, torch.device("cpu")).numpy()
-    assert fast.shape == (HYPOTHESES, *SIZE)
-    unseen = fast == INVALID
-    assert 0.05 < unseen.mean() < 0.9
-    assert (unseen != (plain == INVALID)).mean() < 1e-3  # positions on a pixel's border
-    both = ~unseen & (plain != INVALID)
-    assert np.abs(fast - plain)[both].max() < 0.02 and np.abs(fast - plain)[both].mean() < 5e-4
+    image, other = swept(here), swept(there, 1)
+    costs = image.costs(other, WALLS)
+    for k in (0, 1, 7, 30, 60, 95):
+        true = correlation(image, other, WALLS[k])
+        unseen = costs[..., k] == INVALID
+        assert 0.05 < unseen.mean() < 0.9 and (unseen != np.isnan(true)).mean() < 2e-3  # on a pixel's border
+        both = ~unseen & ~np.isnan(true)
+        error = np.abs(costs[..., k][both] - (1 - true[both]) * PER_CORRELATION) / PER_CORRELATION
+        assert error.max() < 0.02 and error.mean() < 1e-3
 
 
 def test_exposure_does_not_matter() -> None:
-    here, there = camera(), camera(position_m=(0.5, 0, 1.5))
-    family, image = SweptSurface(here, 0.0), textured(SIZE)
-    one = scores_opencv(family, image, there, image)
-    two = scores_opencv(family, image, there, 0.6 * image + 20)
-    seen = one > INVALID
-    assert np.abs(one - two)[seen].max() < 1e-2
+    image, there = swept(camera()), camera(position_m=(0.5, 0, 1.5))
+    one = image.costs(SweptImage(there, image.grey, 0.0), WALLS).astype(float)
+    two = image.costs(SweptImage(there, 0.6 * image.grey + 20, 0.0), WALLS).astype(float)
+    assert np.abs(one - two).max() < 1e-2 * PER_CORRELATION
 
 
 def test_images_are_halved_to_about_400_px() -> None:
@@ -91,11 +115,11 @@ def test_images_are_halved_to_about_400_px() -> None:
 def test_aggregation_is_semi_global_matching_along_four_paths() -> None:
     """Against a naive loop over pixels and hypotheses."""
     rng = np.random.default_rng(0)
-    scores = rng.uniform(-1, 1, (5, 4, 6)).astype(np.float32)
-    K, h, w = scores.shape
-    cost, total = 1 - scores, np.zeros_like(scores)
+    costs = rng.integers(0, INVALID, (4, 6, 5)).astype(np.uint16)
+    h, w, K = costs.shape
+    total = np.zeros(costs.shape, int)
     for dy, dx in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        path = np.zeros_like(scores)
+        path = np.zeros(costs.shape, int)
         rows = range(h) if dy >= 0 else range(h - 1, -1, -1)
         columns = range(w) if dx >= 0 else range(w - 1, -1, -1)
         for y in rows:
@@ -103,10 +127,15 @@ def test_aggregation_is_semi_global_matching_along_four_paths() -> None:
                 py, px = y - dy, x - dx
                 for k in range(K):
                     if not (0 <= py < h and 0 <= px < w):
-                        path[k, y, x] = cost[k, y, x]
+                        path[y, x, k] = costs[y, x, k]
                         continue
-                    before = path[:, py, px]
-                    near = [before[j] + STEP for j in (k - 1, k + 1) if 0 <= j < K]
-                    path[k, y, x] = cost[k, y, x] + min([before[k], before.min() + JUMP, *near]) - before.min()
+                    before = path[py, px].astype(int)
+                    near = [before[j] + int(STEP) for j in (k - 1, k + 1) if 0 <= j < K]
+                    path[y, x, k] = costs[y, x, k] + min([before[k], before.min() + int(JUMP), *near]) - before.min()
         total += path
-    np.testing.assert_allclose(aggregate(torch.from_numpy(scores)).numpy(), -total / 4, atol=1e-5)
+    np.testing.assert_array_equal(aggregate(costs), total)
+
+
+def test_the_least_is_refined_by_a_parabola() -> None:
+    total = np.array([[[9, 4, 1, 2, 7], [1, 4, 5, 6, 7], [5, 5, 5, 5, 5]]], np.uint16)
+    np.testing.assert_allclose(find_least(total, np.float32(0.5)), [[0.5 * 2.25, 0, 0]])

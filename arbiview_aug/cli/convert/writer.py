@@ -48,4 +48,8 @@ class Writer(ABC):
 
     @abstractmethod
     def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
-        """Write what belongs to all samples: ``records`` of the converted ones, tokens of those ``left_out``; notes."""
+        """Write what belongs to all samples: ``records`` of the converted ones, tokens of those ``left_out``.
+
+        Returns:
+            Notes for people.
+        """
