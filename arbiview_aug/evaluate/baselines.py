@@ -17,9 +17,7 @@ from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tens
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import build_plan
 
-Renderer = Callable[[Rig, Sequence[Image], Rig], list[RenderedView]]
-"""Maps a source rig, its images and a target rig to one view per target camera."""
-
+Renderer = Callable[[Rig, Sequence[Image], Rig], list[RenderedView]]  # source rig, its images, target rig to views
 SPLIT_DEPTH_M = 50.0  # depth above the horizon row in ``row_split``, from UniDrive
 
 

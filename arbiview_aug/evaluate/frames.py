@@ -23,8 +23,7 @@ from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tens
 from arbiview_aug.evaluate.lidar import ColouredPoints, coloured_points, equalised, lidar_split, sparse_metrics
 from arbiview_aug.evaluate.metrics import truth_metrics
 
-Render = Callable[[Mapping[str, Any], Rig], list[RenderedView]]
-"""Renders a sample for a target rig: one view per target camera."""
+Render = Callable[[Mapping[str, Any], Rig], list[RenderedView]]  # a view for each of the target rig
 
 Exposure = Literal["raw", "even"]
 EXPOSURES: tuple[Exposure, ...] = ("raw", "even")  # exposures as recorded, and made even

@@ -12,8 +12,7 @@ import torch
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.errors import SampleError
 
-Image = npt.NDArray[np.uint8] | npt.NDArray[np.floating[Any]]
-"""(h, w, 3) RGB on the scale 0-255, uint8 or float."""
+Image = npt.NDArray[np.uint8] | npt.NDArray[np.floating[Any]]  # (h, w, 3) RGB, 0-255
 
 
 class RenderedView(NamedTuple):

@@ -10,8 +10,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.datasets.nuscenes.reader import CAMERA_RING
 
-PAPER_SHARES = (0.2, -0.2, 0.4, -0.4, 0.5, -0.25)
-"""The paper's six configurations, as shares of the azimuth spacing: yaws of 11/14, 22/28, 27.5/35 and 13.75/17.5°."""
+PAPER_SHARES = (0.2, -0.2, 0.4, -0.4, 0.5, -0.25)  # of the azimuth spacing: 11/14, 22/28, 27.5/35, 13.75/17.5°
 
 YAWS_DEG = (11.0, -11.0, 22.0, -22.0, 35.0)
 UP_M = 0.6

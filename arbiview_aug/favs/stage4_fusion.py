@@ -58,10 +58,9 @@ def warp_perspective(image: Float32Image, H: FloatArray, size: tuple[int, int], 
 def source_pixels(
     H: FloatArray, source_size: tuple[int, ...], size: tuple[int, int]
 ) -> tuple[npt.NDArray[np.float32], BoolArray]:
-    """Map each target pixel to the source by H⁻¹; H gives positive third coordinates in front.
+    """Source pixel (h, w, 2) float32 of each target pixel by H⁻¹; H gives positive third coordinates in front.
 
-    Returns:
-        (h, w, 2) float32 source pixels; (h, w) bool, True in front of the source and between its outermost pixels.
+    Also (h, w) bool, True in front of the source and between its outermost pixels.
     """
     back = np.linalg.inv(H)
     x, y = np.arange(size[1], dtype=np.float64), np.arange(size[0], dtype=np.float64)[:, None]
@@ -132,8 +131,7 @@ def fusion_weight(
 def fuse(images: FloatArray, weights: FloatArray) -> tuple[FloatArray, BoolArray]:
     """I_target = Σ w⁽ⁱ⁾ I_warped⁽ⁱ⁾ / Σ w⁽ⁱ⁾ of warped sources (S, h, w, 3) and weights (S, h, w) >= 0.
 
-    Returns:
-        (h, w, 3) fused image, 0 where all weights are zero; (h, w) bool, True where any is positive.
+    (h, w, 3), 0 where all weights are zero; and (h, w) bool, True where any is positive.
     """
     # Divided by the largest first: the sum of subnormal weights would lose digits.
     largest = weights.max(axis=0)
@@ -149,8 +147,7 @@ def adaptive_fusion(
 ) -> tuple[Float32Image, npt.NDArray[np.int64]]:
     """Weight and fuse the warped sources of one target view.
 
-    Returns:
-        (h, w, 3) fused image; (h, w) index of the source with the largest weight, -1 where there is none.
+    (h, w, 3) fused image; (h, w) index of the source with the largest weight, -1 where there is none.
     """
     weights = [
         fusion_weight(warp.image, warp.coverage, quality, k == primary, config)

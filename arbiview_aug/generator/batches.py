@@ -16,8 +16,7 @@ from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
 from arbiview_aug.sample.batching import gathered, leading_shape, rewrapped, split, stacked
 from arbiview_aug.sample.inputs import Frame, names_of_frames, read_frames
 
-SOURCES_KEY = "sources"
-"""Key of a retargeted sample that holds its source sample, for completion after collating."""
+SOURCES_KEY = "sources"  # holds the source sample of a retargeted one, for completion after collating
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -31,9 +31,7 @@ from arbiview_aug.sample.batching import stacked
 
 ALMOST_COMPLETE = 0.995  # share of known pixels from which a view is inpainted: what is left is a seam
 SOURCES_PER_TARGET = 2  # source branches of a target camera, as in training (Algorithm 1: left and right)
-
-Maps = torch.Tensor | Sequence[torch.Tensor]
-"""One tensor with a leading camera dimension, or a tensor per camera."""
+Maps = torch.Tensor | Sequence[torch.Tensor]  # with a leading camera dimension, or a tensor per camera
 
 
 class Completed(NamedTuple):

@@ -27,9 +27,7 @@ from arbiview_aug.cameras.camera import Camera, Rays
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.render.requirements import SAME_CENTER_M
 
-FACING_M = 10.0
-"""Distance of the plane that faces the camera: at a baseline of 1 m a 3-token window about it spans 7 to 17 m."""
-
+FACING_M = 10.0  # of the plane that faces the camera: at a baseline of 1 m a 3-token window spans 7 to 17 m
 LEVELS = ("infinity", "road", "facing")  # the depth levels; pairs whose centres coincide have the first alone
 
 
@@ -72,10 +70,8 @@ def ray_map(query: Camera, key: Camera, plane: FloatArray) -> FloatArray:
 def correspond(query: Camera, rays: Rays, key: Camera, planes: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Map the tokens (h, w) of view i, ``query``, with their rays in its own frame, to view j, ``key``, over planes.
 
-    The planes (L, 3) n_l / d_l lie in the query's frame; the first is infinity. The key has the size of the grid.
-
-    Returns:
-        p_j^(l) (L, h, w, 2), 0 where not valid, and M_j^(l) (L, h, w).
+    The planes (L, 3) n_l / d_l lie in the query's frame; the first is infinity. The key has the size of the grid. Gives
+    p_j^(l) (L, h, w, 2), 0 where not valid, and M_j^(l) (L, h, w).
     """
     directions = np.where(rays.valid[..., None], rays.directions, 0.0)
     with np.errstate(over="ignore", invalid="ignore"):  # calibrations of 1e300 m

@@ -23,14 +23,11 @@ from arbiview_aug.generator.conditioning import PoseContext, Views, input_channe
 from arbiview_aug.generator.correspondence import LEVELS, TokenWindow
 
 TIMESTEPS = 1000  # diffusion steps in training (Sec. Training Parameters)
-
-REGRESSION = TIMESTEPS
-"""Time at which the denoiser predicts x0 in one step, from the pre-filled latent instead of a noisy one."""
+REGRESSION = TIMESTEPS  # predicts x0 in one step, from the pre-filled latent instead of a noisy one
 
 KeysValues = tuple[torch.Tensor, torch.Tensor]
 
-Sources = list[KeysValues]
-"""Keys and values (B, S, T, width) of S source branches for each cross-view block, in the order they run."""
+Sources = list[KeysValues]  # (B, S, T, width) of S source branches, for each cross-view block in the order they run
 
 
 class Rows(NamedTuple):

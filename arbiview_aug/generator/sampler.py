@@ -15,8 +15,7 @@ import torch
 from arbiview_aug.environment import optional_package
 from arbiview_aug.generator.denoiser import REGRESSION, TIMESTEPS
 
-Predict = Callable[[torch.Tensor, int], torch.Tensor]
-"""Maps (x_t (B, N, C, h, w) float32, t) to the schedule's prediction, or to x0 at t = ``REGRESSION``."""
+Predict = Callable[[torch.Tensor, int], torch.Tensor]  # maps (x_t, t) to the prediction, or to x0 at ``REGRESSION``
 
 
 def noise_schedule(*, prediction: str, zero_snr: bool) -> Any:

@@ -12,8 +12,7 @@ import torch
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError
 
-_EMPTY_PROMPT = [49406, *[49407] * 76]
-"""CLIP's tokens of "": start of text, then end of text up to Stable Diffusion's 77."""
+_EMPTY_PROMPT = [49406, *[49407] * 76]  # CLIP's tokens of "": start of text, then end of text up to 77
 
 PLAIN_UNET = {
     "mid_block_type": "UNetMidBlock2DCrossAttn",

@@ -20,8 +20,7 @@ from arbiview_aug.scene.boxes import checked_boxes, draw_boxes, is_over, meets, 
 _NEAR_M = 0.1  # near plane
 _CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))  # [8, 3]
 _EDGES = np.array([(a, b) for a in range(8) for b in range(a) if (_CORNERS[a] != _CORNERS[b]).sum() == 1])  # [12, 2]
-_LENS_STEPS = 33
-"""Points along an edge that a lens bends: steps of 3 degrees for a car 2 m away, 0.2 px at a focal length of 600 px."""
+_LENS_STEPS = 33  # points along an edge that a lens bends: 3 degrees for a car 2 m away, 0.2 px at f = 600 px
 
 
 class ImageBoxes(NamedTuple):

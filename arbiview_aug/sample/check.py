@@ -27,9 +27,7 @@ PIXEL_BOUND_KEYS = (
 )
 """Keys bound to the source's pixels; they are dropped, as they would be stale in the target's views."""
 
-EGO_KEYS = ("points", "boxes_3d", "ego2world")
-"""Keys in the ego frame; they pass, or move with ``label_frame="target"``."""
-
+EGO_KEYS = ("points", "boxes_3d", "ego2world")  # they pass, or move with ``label_frame="target"``
 _MAX_ENTRIES = 64  # checked per list: longer lists are tokens or numbers
 
 

@@ -22,8 +22,7 @@ from arbiview_aug.scene.point_cloud import checked_points
 from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.surface import Points
 
-MOTION_KEY = "motion_depth_m"
-"""Depth from motion computed offline: (N, h, w) z-depth at the size of ``scene.depth_maps.motion_camera``."""
+MOTION_KEY = "motion_depth_m"  # (N, h, w) z-depth computed offline, at the size of ``motion_camera``
 
 CALIBRATION_KEYS = (
     "images",

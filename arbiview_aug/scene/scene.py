@@ -119,7 +119,8 @@ def _point_cloud(points: Points | None, scene: Scene, ground_z_m: float) -> Surf
     boxes = scene.boxes if scene.boxes is not None and len(scene.boxes) else None
     if len(points) == 0:
         return scene.surface("street" if boxes is None else "objects", ground_z_m)
-    street = _street(scene, ground_z_m)
+    # One type and layout: kernels are compiled for each.
+    street, points = _street(scene, ground_z_m), np.ascontiguousarray(points, np.float32)
     return PointCloudSurface(street, points) if boxes is None else PointCloudWithBoxes.among(street, points, boxes)
 
 

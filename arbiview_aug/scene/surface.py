@@ -21,7 +21,7 @@ SurfaceName = Literal["auto", "far", "ground", "street", "objects", "lidar", "mo
 """Names in ``scene.SURFACES``. ``auto`` decides per pair of target and source camera."""
 
 Points = npt.NDArray[np.float32] | npt.NDArray[np.float64]
-"""(P, 3) points in their recorded precision, not copied; computations use float64."""
+"""(P, 3) points in their recorded precision; surfaces use float32."""
 
 MAX_INVERSE_DISTANCE = 100.0
 """Upper limit, 1 cm: keeps points finite when a camera touches a surface."""

@@ -29,8 +29,7 @@ OnError = Literal["report", "skip", "fatal"]
 """Policy for samples that cannot be read or rendered: ``report`` converts the others and leaves the output unfinished,
 ``skip`` leaves the sample out and reports it, ``fatal`` stops."""
 
-State = Literal["made", "kept", "skipped", "failed", "stopped"]
-"""``kept``: made by an earlier run; ``skipped``, ``failed``: cannot be read or rendered; ``stopped``: not written."""
+State = Literal["made", "kept", "skipped", "failed", "stopped"]  # kept: made by an earlier run; stopped: not written
 
 
 class Done(NamedTuple):

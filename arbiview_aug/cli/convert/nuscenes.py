@@ -85,8 +85,7 @@ class NuScenes(Writer):
         self.output, self.data, self.suffix = settings.output, data, settings.suffix
         self.target = settings.target
         self.tables = Tables(data.root, data.version, None)
-        self.there = [name for name in _TABLES if self.tables.path(name).is_file()]
-        """Existing tables in writing order."""
+        self.there = [name for name in _TABLES if self.tables.path(name).is_file()]  # in writing order
         lenses = [f"{camera.name} ({camera.lens})" for camera in self.target if not camera.is_rectilinear]
         if lenses:
             name = self.target.name or "the target"

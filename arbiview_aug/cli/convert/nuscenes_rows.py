@@ -44,8 +44,7 @@ class Remaining:
             for token in reversed(tokens):
                 later = later if token in left_out else token
                 self._stand_in[token] = later
-        self.drives = [*self._drives.values()]
-        """Tokens of the remaining samples, by scene, in the order of their times."""
+        self.drives = [*self._drives.values()]  # tokens by scene, in order of time
         self._sensors, self._calibrated = kept_sensors(tables)
         lidar = {row["token"] for row in tables.rows("sensor") if row["channel"] == LIDAR}
         self._lidar = {row["token"] for row in tables.rows("calibrated_sensor") if row["sensor_token"] in lidar}

@@ -20,9 +20,7 @@ from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import RenderPath
 
-RETARGET_OPTIONS = ("path", "holes", "steps", "quality", "surface", "size", "fit")
-"""Settings that ``RigRetarget`` takes under the same names."""
-
+RETARGET_OPTIONS = ("path", "holes", "steps", "quality", "surface", "size", "fit")  # as ``RigRetarget`` names them
 FOLDER = "conversion"  # subfolder of an output with manifest, provenance and report
 
 

@@ -12,12 +12,10 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.scene.boxes import draw_boxes, silhouette_sums
 
-LEVELS = ("1", "2", "3", "4")
-"""Tokens of nuScenes' table ``visibility``: 0 to 40, 40 to 60, 60 to 80 and 80 to 100 %."""
+LEVELS = ("1", "2", "3", "4")  # tokens of nuScenes' table ``visibility``: 0 to 40, 40 to 60, 60 to 80 and 80 to 100 %
 
 _BOUNDS = (0.4, 0.6, 0.8)
-_RASTER_PX = 400
-"""Approximate image width that boxes are rasterised at: on nuScenes, a car at 50 m has 100 pixels."""
+_RASTER_PX = 400  # approximate width that boxes are rasterised at: a nuScenes car at 50 m has 100 pixels
 
 
 def visible_shares(rig: Rig, coverage: Sequence[BoolArray], boxes: FloatArray) -> FloatArray:

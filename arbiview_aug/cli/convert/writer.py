@@ -48,8 +48,4 @@ class Writer(ABC):
 
     @abstractmethod
     def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
-        """Write what belongs to all samples: ``records`` of the converted ones, tokens of those ``left_out``.
-
-        Returns:
-            Notes for people.
-        """
+        """Write what belongs to all samples: ``records`` of the converted ones, tokens of those ``left_out``; notes."""

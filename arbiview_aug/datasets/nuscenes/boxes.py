@@ -12,8 +12,7 @@ import numpy.typing as npt
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Tables, Tokens
 
-MAX_STEP_S = 1.5
-"""Maximum time between annotations for a velocity, doubled for central differences (``NuScenes.box_velocity``)."""
+MAX_STEP_S = 1.5  # between annotations for a velocity; doubled for central differences (``NuScenes.box_velocity``)
 
 IntArray = npt.NDArray[np.int32]
 SingleArray = npt.NDArray[np.float32]

@@ -20,14 +20,9 @@ from arbiview_aug.errors import DataError, SampleTypeError
 _QUATERNION_NORM_TOLERANCE = 1e-3
 
 _BATCH = 1 << 10  # rows in memory at once, 1.5 MB; the largest tables have 2.6 million
-
-_BLOCK, _LONGEST_ROW = 1 << 20, 1 << 16
-"""Characters read at once, and an upper bound on a row's, so that no block ends within a row."""
-
+_BLOCK, _LONGEST_ROW = 1 << 20, 1 << 16  # characters read at once, and of a row at most: no block ends within a row
 _LONGEST_TOKEN = 255  # maximum characters of a token, which names files; nuScenes' own have 32
-
-_LARGEST_WHOLE, _LARGEST = 2**53, 1e9
-"""Bounds on whole numbers (exact in float64) and on positions (m) and pixels."""
+_LARGEST_WHOLE, _LARGEST = 2**53, 1e9  # of whole numbers (exact in float64), and of positions (m) and pixels
 
 _SPACE, _DELIMITER = re.compile(r"\s*"), re.compile(r"\s*([,\]])\s*")
 
@@ -64,8 +59,7 @@ def _are_whole(values: list[Any]) -> bool:
 
 
 TEXTS = Kind("as text", _are_texts)
-FILES = Kind("as text", lambda values: {*map(type, values)} <= {str})
-"""File names; ``atomic_io.inside`` refuses impossible ones on access."""
+FILES = Kind("as text", lambda values: {*map(type, values)} <= {str})  # ``inside`` refuses impossible names
 LINKS = Kind("as a token or an empty text", _are_links)
 TOKENS = Kind(f"as a token of 1 to {_LONGEST_TOKEN} letters", lambda values: _are_links(values) and all(values))
 FLAGS = Kind("as true or false", lambda values: {*map(type, values)} <= {bool})

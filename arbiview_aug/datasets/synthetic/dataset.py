@@ -20,8 +20,7 @@ from arbiview_aug.datasets.synthetic.render import Renderer, stack_or_list
 from arbiview_aug.datasets.synthetic.scene import Material, Scene, SceneClass
 from arbiview_aug.datasets.synthetic.street import make_scene
 
-LIDAR_POSITION_M = (0.9, 0.0, 1.9)
-"""Ego x, y and height over the road: a roof-mounted sensor, as on nuScenes' vehicles."""
+LIDAR_POSITION_M = (0.9, 0.0, 1.9)  # ego x, y and height over the road: on the roof, as on nuScenes' vehicles
 LIDAR_BEAMS_DEG = (-30.67, 10.67)  # elevations of the lowest and the highest of 32 beams (Velodyne HDL-32E)
 LIDAR_COLUMNS = 1088
 LIDAR_RANGE_M = (1.0, 90.0)

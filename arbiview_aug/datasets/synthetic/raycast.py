@@ -17,10 +17,7 @@ from torch import Tensor
 from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, Scene
 
 SKY_ID, GROUND_ID = -1, -2  # ids of hits on no primitive
-
-_MIN_COS = 0.2
-"""Packets with a ray further than 78 degrees off their axis have no pyramid: every primitive is a candidate."""
-
+_MIN_COS = 0.2  # packets with a ray further than 78 degrees off their axis have no pyramid: all are candidates
 _PAIRS_PER_STEP = 96  # packets handled at a time: temporaries of 96 x 6 x 256 floats fit in a core's cache
 
 
@@ -125,10 +122,8 @@ def _inside(sides: Tensor, corners: Tensor) -> Tensor:
 def cast(local: LocalScene, start: Tensor, rays: Tensor, candidates: Candidates) -> tuple[Tensor, Tensor]:
     """Find the first hits of packets of unit rays (n, 3, R) from ``start`` (n or 1, 3), in the street frame.
 
-    ``local`` may be several scenes, one after the other, each relative to the origin of other packets.
-
-    Returns:
-        (n, R) distance, infinite for the sky; (n, R) int64 row in the scene, ``GROUND_ID`` or ``SKY_ID``.
+    ``local`` may be several scenes, one after the other, each relative to the origin of other packets. Gives (n, R)
+    distance, infinite for the sky, and (n, R) int64 row in the scene, ``GROUND_ID`` or ``SKY_ID``.
     """
     t, hit = _ground(start[:, 2:], rays)
     order = torch.sort(candidates.rank, stable=True).indices

@@ -19,8 +19,7 @@ from arbiview_aug.datasets.synthetic.scene import (
     yaw_matrix,
 )
 
-CLEAR_X_M, CLEAR_Y_M = (-3.0, 6.5), 2.2
-"""Rectangle of the ego frame without objects, so that no camera of any sensible rig is inside one."""
+CLEAR_X_M, CLEAR_Y_M = (-3.0, 6.5), 2.2  # of the ego frame without objects: no camera of a sensible rig is inside one
 
 END_M = 260.0
 BLOCK_DEPTH_M = 140.0

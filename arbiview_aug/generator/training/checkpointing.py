@@ -112,8 +112,7 @@ def load_state(
     return step
 
 
-_MAY_DIFFER = ("workers", "save_every", "validate_every", "validation_items")
-"""Settings that a resumed run may change."""
+_MAY_DIFFER = ("workers", "save_every", "validate_every", "validation_items")  # in a resumed run
 
 
 def has_state(folder: Path) -> bool:

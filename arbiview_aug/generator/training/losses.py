@@ -15,8 +15,7 @@ from arbiview_aug.generator.config import Prediction
 from arbiview_aug.generator.denoiser import Rows
 from arbiview_aug.generator.training.config import GeoMode
 
-VGG_LAYERS = (3, 8, 15, 22)
-"""relu1_2, relu2_2, relu3_3, relu4_3 of torchvision's ``vgg16().features`` (Johnson et al. 2016); λ_l = 1/4."""
+VGG_LAYERS = (3, 8, 15, 22)  # relu1_2, 2_2, 3_3, 4_3 of torchvision's vgg16 (Johnson et al. 2016); λ_l = 1/4
 
 
 class Diffusion:

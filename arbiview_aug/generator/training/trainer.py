@@ -30,9 +30,7 @@ from arbiview_aug.generator.training.step import Step, draw
 _LOG_EVERY = 10
 _DEVIATION_ITEMS = 32
 _MIN_DEVIATION = 0.02  # lower bound of the residual's deviation, 2.5 grey levels: the error of rendering twice
-
-_SEEDS = {"items": 1, "validation": 2, "masks": 3, "draws": 4}
-"""Offsets of the random streams: validation never sees training's draws."""
+_SEEDS = {"items": 1, "validation": 2, "masks": 3, "draws": 4}  # offsets: no stream sees another's draws
 
 
 class Trainer:
