@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -85,13 +86,13 @@ class AtlasLayout:
 
     slots: tuple[Slot, ...]
 
-    @property
+    @cached_property
     def size(self) -> tuple[int, int]:
         """(h, w) of the atlas."""
         corners = [(slot.y + slot.size[0], slot.x + slot.size[1]) for slot in self.slots]
         return max((1, *(y for y, _ in corners))), max((1, *(x for _, x in corners)))
 
-    @property
+    @cached_property
     def is_stack(self) -> bool:
         """Whether all are sources at full size in their order: an (N, H, W, 3) block of images *is* the atlas."""
         return all(slot.level == slot.x == 0 and slot.y == slot.source * slot.size[0] for slot in self.slots)

@@ -62,8 +62,9 @@ def render_opencv(
         for y in range(0, h, STRIP_ROWS):
             rows = slice(y, y + STRIP_ROWS)
             strip = buffer[rows]
-            read_ahead(rows_of_bytes, 3 * atlas.itemsize, target.at.packed[rows], target.source_camera[rows])
-            _remap(atlas, target.at.xy[rows], target.at.frac[rows], target.interpolation, dst=strip)
+            xy = target.at.xy[rows]
+            read_ahead(rows_of_bytes, 3 * atlas.itemsize, xy.view(np.int32)[..., 0], target.source_camera[rows])
+            _remap(atlas, xy, target.at.frac[rows], target.interpolation, dst=strip)
             if target.edge is not None:
                 _put_edge(target.edge.rows(y, y + STRIP_ROWS, w), atlas, strip)
             # Tone the views, not the sources: these have more pixels, and would have to be copied.
