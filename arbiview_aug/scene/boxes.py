@@ -164,7 +164,7 @@ def points_in(boxes: FloatArray, points: Points, air_m: float = 0.0) -> list[npt
     """For each box (B, 7) the indices of the points (P, 3) in it, widened by ``air_m`` on all sides."""
     from arbiview_aug.scene.kernels import points_in as pairs_of
 
-    box, point = pairs_of(np.ascontiguousarray(boxes), np.ascontiguousarray(points), air_m)
+    box, point = pairs_of(np.ascontiguousarray(boxes), np.ascontiguousarray(points, np.float32), air_m)
     point = point[np.argsort(box, kind="stable")]
     ends = np.cumsum(np.bincount(box, minlength=len(boxes)))
     return [point[end - count : end] for end, count in zip(ends, np.diff(ends, prepend=0), strict=True)]

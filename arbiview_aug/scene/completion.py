@@ -10,7 +10,7 @@ from arbiview_aug.cameras.kernels import angle_row, rays_row
 from arbiview_aug.environment import compiled
 from arbiview_aug.scene import panorama
 from arbiview_aug.scene.kernels import columns_of_box, slabs_row, upsampled_row
-from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, NEAREST_M
+from arbiview_aug.scene.panorama import CELL_RAD, NEAREST_M
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
@@ -88,8 +88,8 @@ def drop_hidden(q: Any, number: Any, points: Any, origin: Any) -> tuple[Any, Any
     """
     h, w = q.shape
     across, down = q.copy(), q.copy()
-    _window_max(across, 2 * _ASIDE + 1, _FAR)
-    _window_max(down, _FAR, 2 * _ASIDE + 1)
+    _window_max(across, 2 * _ASIDE, _FAR - 1)
+    _window_max(down, _FAR - 1, 2 * _ASIDE)
     cells, n = np.empty(h * w, np.int64), 0
     for y in range(h):
         inside = _FAR <= y < h - _FAR
@@ -188,8 +188,8 @@ def _average_sides(r: Any, q: Any, near: Any, far: Any, share: Any) -> None:
             if min(y, h - 1 - y) < edge or min(x, w - 1 - x) < edge:
                 near[y, x], far[y, x], share[y, x] = r[y, x], r[y, x], _ONE
     high, low = r.copy(), -r
-    _window_max(high, size, size)  # of the window whose first row and column it is
-    _window_max(low, size, size)
+    _window_max(high, side, side)  # of the window that begins there
+    _window_max(low, side, side)
     wide, nearer, of_near = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
     sums, total = np.zeros((3, size, m), np.float32), np.zeros((3, m), np.float32)
     per, flat = np.float32(1 / (size * size)), np.empty(m, np.float32)
@@ -244,14 +244,14 @@ def _slide(row: Any, oldest: Any, total: Any) -> None:
 
 @compiled
 def _window_max(a: Any, rows: int, columns: int) -> None:
-    """Replace each cell of ``a`` (h, w) by the largest of the window whose first row and column it is."""
+    """Replace each cell of ``a`` (h, w) by the largest of those up to so many rows and columns on."""
     h, w = a.shape
     line = np.empty(w, np.float32)
     for y in range(h):
         row = a[y]
         size = 1
-        while size < columns:
-            step = min(size, columns - size)
+        while size <= columns:
+            step = min(size, columns + 1 - size)
             for x in range(w):  # line[:] = row takes three times as long
                 line[x] = row[x]
             other = line[step:]
@@ -259,8 +259,8 @@ def _window_max(a: Any, rows: int, columns: int) -> None:
                 row[x] = max(line[x], other[x])
             size += step
     size = 1
-    while size < rows:
-        step = min(size, rows - size)
+    while size <= rows:
+        step = min(size, rows + 1 - size)
         for y in range(h - step):
             row, other = a[y], a[y + step]
             for x in range(w):
@@ -278,19 +278,19 @@ def _hidden_below(known: Any) -> Any:
 
 
 @compiled
-def hidden_depths(layers: Any, base: Any, out: Any) -> None:
+def hidden_depths(layers: Any, base: Any, step: int, out: Any) -> None:
     """Inverse distances (h, w) below which points are hidden by a panorama's layers; 0 where nothing was measured.
 
-    ``base`` (ny + 1, nx + 1) is the static surface, on every ``BASE_STEP``-th cell.
+    ``base`` (ny + 1, nx + 1) is the static surface, on every ``step``-th cell.
     """
     h, w = out.shape
     near, far, share, measured = layers[0], layers[1], layers[2], layers[3]
     side = 2 * _SHRINK
     silent, line = _ONE - measured, np.empty(base.shape[1], np.float32)
-    _window_max(silent, side + 1, side + 1)
+    _window_max(silent, side, side)
     static, known = np.empty(w, np.float32), np.empty(w, np.float32)
     for y in range(h):
-        upsampled_row(base, BASE_STEP, y, 0, line, static)
+        upsampled_row(base, step, y, 0, line, static)
         one, two, part = near[y], far[y], share[y]
         for x in range(w):
             known[x] = static[x] + (one[x] if part[x] > _HALF else two[x])

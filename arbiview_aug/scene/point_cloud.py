@@ -125,12 +125,13 @@ class Panorama:
         """Points of a smaller inverse distance are hidden by what certainly stands there; 0 where it is silent."""
         from arbiview_aug.scene.completion import hidden_depths
 
-        rows, columns = (np.arange(0, n + BASE_STEP, BASE_STEP) * np.float32(CELL_RAD) for n in self.layers.shape[1:])
+        ends = (n + BASE_STEP for n in self.layers.shape[1:])
+        rows, columns = (np.arange(0, end, BASE_STEP, dtype=np.float32) * np.float32(CELL_RAD) for end in ends)
         azimuth, elevation = self._place[0] + columns, (self._place[2] + rows)[:, None]
         level, up = np.cos(elevation), np.broadcast_to(np.sin(elevation), (len(rows), len(columns)))
         rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up])
         hidden = np.empty(self.layers.shape[1:], np.float32)
-        hidden_depths(self.layers, self._street.along(self._origin, rays), hidden)
+        hidden_depths(self.layers, self._street.along(self._origin, rays), BASE_STEP, hidden)
         return hidden
 
     def cells(self, rays: Layer, R: FloatArray) -> tuple[Layer, Layer]:
