@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from timeit import timeit
 
 import cv2
 
@@ -23,7 +24,7 @@ from arbiview_aug.cli.arguments import (
 )
 from arbiview_aug.cli.evaluate import frames_text, measured, open_frames
 from arbiview_aug.evaluate.images import as_arrays
-from arbiview_aug.evaluate.methods import Method, Sample, retargeting, views_of
+from arbiview_aug.evaluate.methods import Method, retargeting, views_of
 from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.evaluate.report.sheet import frame_sheet
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
@@ -57,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with gathered_warnings(notes):
         (target,), sample = done.targets.values(), data[0]
         retarget = RigRetarget(target, quality=arguments.quality, surface=arguments.surface, path=arguments.path)
-        times_ms = [_call_ms(retarget, sample) for _ in range(1 + _TIMED_CALLS)]
+        times_ms = [1e3 * timeit(partial(retarget, sample), number=1) for _ in range(1 + _TIMED_CALLS)]
         views, explained = views_of(retarget(sample)), retarget.explain(sample)
     for note in dict.fromkeys(notes):
         print(f"note: {note}\n")
@@ -106,9 +107,3 @@ def _compared(quality: Quality, surface: SurfaceName, path: RenderPath) -> list[
     filled = [retargeting(quality, surface, f"{own}, {name}", path=fill) for name, fill in fills.items()]
     others = [retargeting("fast" if quality == "paper" else quality, s, s) for s in _COMPARED if s != own]
     return [retargeting(quality, surface, own), *others, *filled]
-
-
-def _call_ms(retarget: RigRetarget, sample: Sample) -> float:
-    start = time.perf_counter()
-    retarget(sample)
-    return 1e3 * (time.perf_counter() - start)

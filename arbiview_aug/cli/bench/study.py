@@ -174,26 +174,22 @@ def advice(
     """
     if budget_ms is None and min_psnr_db is None:
         return None
-    harmless = [row for row in rows if row["harm"] is None]
     left_out = next((row["harm"] for row in rows if row["harm"] is not None), None)
-    front = pareto_front(harmless)
+    found = {"setting": None, "left_out": left_out, "measured": None, "again": None}
+    front = pareto_front([row for row in rows if row["harm"] is None])
+    if not front:
+        return found | {"reason": "nothing was measured that may be recommended"}
     if budget_ms is not None:
         candidates = [row for row in reversed(front) if row["q3_ms"] <= budget_ms]
         reason = f"the most accurate within {budget_ms:g} ms a frame"
+        missed = f"nothing keeps to {budget_ms:g} ms: the fastest takes {front[0]['median_ms']:.1f} ms"
     else:
-        candidates = [row for row in front if row["psnr_db"] >= min_psnr_db]  # type: ignore[operator]
+        candidates, best = [row for row in front if row["psnr_db"] >= min_psnr_db], front[-1]  # type: ignore[operator]
         reason = f"the fastest of at least {min_psnr_db:g} dB"
+        missed = f"nothing reaches {min_psnr_db:g} dB: the best has {best['psnr_db']:.2f} dB ({best['name']})"
     for row in candidates:
         again = measure_again(row)
         if budget_ms is None or again.median_ms <= budget_ms:
             figures = {key: row[key] for key in ("psnr_db", *Quartiles._fields)}
-            found = {"setting": row["name"], "reason": reason, "left_out": left_out}
-            return found | {"measured": figures, "again": again._asdict()}
-    if not harmless:
-        reason = "nothing was measured that may be recommended"
-    elif budget_ms is not None:
-        reason = f"nothing keeps to {budget_ms:g} ms: the fastest takes {front[0]['median_ms']:.1f} ms"
-    else:
-        best = front[-1]
-        reason = f"nothing reaches {min_psnr_db:g} dB: the best has {best['psnr_db']:.2f} dB ({best['name']})"
-    return {"setting": None, "reason": reason, "left_out": left_out, "measured": None, "again": None}
+            return found | {"setting": row["name"], "reason": reason, "measured": figures, "again": again._asdict()}
+    return found | {"reason": missed}

@@ -56,7 +56,9 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
         used = [*split.training, *split.validation]
         if device.type != "cpu" and config.workers:
             frames.check_fits(used)
-        frames.prepare(used, workers=_readers(len(used)) if device.type == "cpu" else 0, show=show)
+        # Each process takes a second to start, a street half a second to render.
+        readers = min(8, os.cpu_count() or 1) if device.type == "cpu" and len(used) >= 16 else 0
+        frames.prepare(used, workers=readers, show=show)
     options: dict[str, Any] = {
         "perceptual": _perceptual(config, arguments.vgg_weights, say),
         "show": show,
@@ -70,11 +72,6 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
     else:
         Trainer(config, frames, generator, output, **options).train()
     return 0
-
-
-def _readers(count: int) -> int:
-    """Number of rendering processes: each takes a second to start, a street half a second to render."""
-    return min(8, os.cpu_count() or 1) if count >= 16 else 0
 
 
 def _discard(message: str) -> None:

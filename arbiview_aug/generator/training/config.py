@@ -17,10 +17,6 @@ GeoMode = Literal["normalised", "frobenius_sum"]
 _check = partial(check_fields, error=TrainingError)
 
 
-def _is_share(value: float) -> bool:
-    return 0 <= value <= 1
-
-
 @dataclass(frozen=True, kw_only=True)
 class PseudoViewConfig:
     """Pseudo views (Algorithm 1) and what is added to them; probabilities are per training item."""
@@ -41,7 +37,7 @@ class PseudoViewConfig:
 
     def __post_init__(self) -> None:
         shares = ("moved", "transplanted", "hidden", "leave_one_out", "virtual", "real_sources")
-        _check(self, "a probability", _is_share, *shares)
+        _check(self, "a probability", lambda p: 0 <= p <= 1, *shares)
         _check(self, "at least 1", lambda n: n >= 1, "pairs", "mask_bank")
         _check(self, "0 <= low <= high <= 90", lambda yaw: 0 <= yaw[0] <= yaw[1] <= 90, "yaw_deg")
         _check(self, "0 < low <= high", lambda factor: 0 < factor[0] <= factor[1], "focal")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -149,7 +149,8 @@ class Trainer:
                         self._log(writer, bar, terms)
                     if self.done % config.validate_every == 0 or last:
                         self._validate(writer)
-                    if self._should_stop(asked):
+                    stops = torch.tensor(float(len(asked)), device=self.device)
+                    if self.accelerator.reduce(stops, "sum") > 0:  # all processes stop after the same step
                         break
                     if self.done % config.save_every == 0 and not last:
                         self._save_or_warn()
@@ -202,11 +203,7 @@ class Trainer:
             )
         )
 
-    # --- stopping and saving ------------------------------------------------------------------------------------------
-    def _should_stop(self, asked: Sequence[int]) -> bool:
-        count = torch.tensor(float(len(asked)), device=self.device)
-        return bool(self.accelerator.reduce(count, "sum") > 0)  # all processes stop after the same step
-
+    # --- saving -------------------------------------------------------------------------------------------------------
     def save(self) -> None:
         """Write the state, and the generator with averaged weights; after an OutputError the last is unchanged."""
         try:
