@@ -37,20 +37,16 @@ _CACHED_TRANSFORMS = 8  # the targets of a set; full-size plans take 50 MB each
 class Method:
     """A row of a table.
 
-    Attributes:
-        name: Shown in tables.
-        render: Maps a sample with ``rig`` and a target rig (in its own ego frame) to one view per target camera.
-        reads_points: Whether it may use the sample's ``points``, so that only a part of them can score it.
-        render_alone: Maps a sample, the index of a source camera and a one-camera target rig to the view from that
-            source alone, with the scene estimated from all cameras; None if nothing is estimated from several.
-        plans: Whether the first call plans and takes longer.
+    ``render`` maps a sample with ``rig`` and a target rig (in its own ego frame) to one view per target camera.
+    ``render_alone`` maps a sample, the index of a source camera and a one-camera target rig to the view from it
+    alone, with the scene estimated from all cameras; None if nothing is estimated from several.
     """
 
     name: str
     render: Callable[[Sample, Rig], list[RenderedView]]
-    reads_points: bool = False
+    reads_points: bool = False  # may use the sample's ``points``, so that only a part of them can score it
     render_alone: Callable[[Sample, int, Rig], RenderedView] | None = None
-    plans: bool = True
+    plans: bool = True  # whether the first call plans and takes longer
 
     def alone(self, sample: Sample, camera: int, target: Rig) -> RenderedView:
         """Render a one-camera target from one source camera alone."""

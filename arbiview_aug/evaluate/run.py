@@ -19,22 +19,16 @@ from arbiview_aug.evaluate.metrics import mean_of
 class Evaluation:
     """Measurements as plain data, and the views of the first frame.
 
-    Attributes:
-        views: One row for each frame, target, camera and method: metrics beside those four names.
-        pairs: One row for each frame, method and pair of neighbours: ``kind`` is ``overlap`` (two sources) or
-            ``consistency`` (two views of ``target``).
-        pictures: Views of the first frame by (target, method).
-        targets: Rigs of the first frame by name.
-        first: The first frame.
-        declined: Reason why a method could not render, by method.
+    ``views`` has a row for each frame, target, camera and method: metrics beside those four names. ``pairs`` has one
+    for each frame, method and pair of neighbours: ``kind`` is ``overlap`` (two sources) or ``consistency`` (two views).
     """
 
     views: list[dict[str, Any]] = field(default_factory=list)
     pairs: list[dict[str, Any]] = field(default_factory=list)
-    pictures: dict[tuple[str, str], list[RenderedView]] = field(default_factory=dict)
-    targets: dict[str, Rig] = field(default_factory=dict)
+    pictures: dict[tuple[str, str], list[RenderedView]] = field(default_factory=dict)  # of ``first``, by target, method
+    targets: dict[str, Rig] = field(default_factory=dict)  # of the first frame, by name
     first: ScoredFrame | None = None
-    declined: dict[str, str] = field(default_factory=dict)
+    declined: dict[str, str] = field(default_factory=dict)  # why a method could not render
 
     def means(self, method: str, target: str | None = None) -> dict[str, float]:
         """Mean the per-image values over cameras and frames; over all targets by default."""

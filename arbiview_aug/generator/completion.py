@@ -35,17 +35,11 @@ Maps = torch.Tensor | Sequence[torch.Tensor]  # with a leading camera dimension,
 
 
 class Completed(NamedTuple):
-    """Target views without holes.
+    """Target views without holes; tensors, or lists over the views if their sizes differ."""
 
-    Attributes:
-        images: (M, 3, h, w), or a list of (3, h, w) if sizes differ, of the given dtype; known pixels unchanged.
-        generated: (M, h, w) bool, or a list: pixels that no camera saw and that were filled.
-        denoised: Indices of the views that the denoiser completed; the others were complete or inpainted.
-    """
-
-    images: torch.Tensor | list[torch.Tensor]
-    generated: torch.Tensor | list[torch.Tensor]
-    denoised: list[int]
+    images: torch.Tensor | list[torch.Tensor]  # (M, 3, h, w) of the given dtype; known pixels unchanged
+    generated: torch.Tensor | list[torch.Tensor]  # (M, h, w) bool, pixels that no camera saw and that were filled
+    denoised: list[int]  # views that the denoiser completed; the others were complete or inpainted
 
 
 class Conditions(NamedTuple):

@@ -47,14 +47,9 @@ class Denoiser(nn.Module):
         cross_view: Whether views read each other at each level, the finest first; empty: at all.
         signal: (T,) √ᾱ_t of the schedule: the network then predicts the residual between image and condition. None
             leaves its output as it is, for Stable Diffusion's weights.
-
-    Attributes:
-        deviation: (2,) standard deviation of the residual inside holes and outside; measured before training.
-        cross_view: The cross-view blocks, by index among encoder, middle and decoder blocks.
-        gradient_checkpointing: Recompute blocks in the backward pass.
     """
 
-    deviation: torch.Tensor
+    deviation: torch.Tensor  # (2,) of the residual inside holes and outside; measured before training
 
     def __init__(
         self,

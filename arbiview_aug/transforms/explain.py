@@ -23,23 +23,14 @@ from arbiview_aug.temporal.motion_depth import MotionDepth
 
 @dataclass(frozen=True)
 class Explanation:
-    """Why a frame is rendered as it is; ``str`` prints it, ``as_dict`` gives plain data.
-
-    Attributes:
-        plan: The render plan.
-        harmonisation: The sources' gains and why, if they are harmonised.
-        depth: Depth from overlap, if it was asked for and matters.
-        motion: Depth from motion, if it was estimated.
-        fills: How other frames of the drive fill holes, if there are any.
-        harm: Why a detector suffers, if cameras move over a static surface.
-    """
+    """Why a frame is rendered as it is; ``str`` prints it, ``as_dict`` gives plain data."""
 
     plan: RenderPlan
-    harmonisation: PhotometricReport | None = None
-    depth: OverlapDepth | None = None
-    motion: MotionDepth | None = None
-    fills: Fills | None = None
-    harm: str | None = None
+    harmonisation: PhotometricReport | None = None  # the sources' gains and why, if they are harmonised
+    depth: OverlapDepth | None = None  # from overlap, if it was asked for and matters
+    motion: MotionDepth | None = None  # depth from motion, if it was estimated
+    fills: Fills | None = None  # how other frames of the drive fill holes, if there are any
+    harm: str | None = None  # why a detector suffers, if cameras move over a static surface
 
     def as_dict(self) -> list[dict[str, Any]]:
         """One entry for each target camera: coverage, share to invent, and its sources with surface and reason.
