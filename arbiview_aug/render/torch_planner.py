@@ -88,9 +88,8 @@ def build_plans(
             for m, camera in enumerate(request.target):
                 coarse = min(camera.size) >= SMALL_SIDE_PX
                 coarse &= is_within_wall(camera.center_m) or not SURFACES[surface].has_wall
-                groups.setdefault((camera.size, config.grid_step_px if coarse else 1, name, with_boxes), []).append(
-                    (f, m)
-                )
+                step = config.grid_step_px if coarse else 1
+                groups.setdefault((camera.size, step, name, with_boxes), []).append((f, m))
         batches = []
         for (size, step, name, _), views in groups.items():
             count = max(1, _MOST_PIXELS // math.prod(size))
@@ -102,9 +101,7 @@ def build_plans(
             batch.find_winners()
             for f, pairs in zip(batch.frames, batch.read, strict=True):
                 read[f].update(pairs)
-        layouts = [
-            AtlasLayout.for_sources(r.source.sizes, list(pairs)) for r, pairs in zip(requests, read, strict=True)
-        ]
+        layouts = [AtlasLayout.for_sources(r.source.sizes, list(of)) for r, of in zip(requests, read, strict=True)]
         found = {view: of_view for batch in batches for view, of_view in batch.maps_into(layouts)}
         plans = []
         for f, (request, layout) in enumerate(zip(requests, layouts, strict=True)):
@@ -272,9 +269,8 @@ class _ViewBatch:
             for f, row in zip(self.frames, self.numbers.tolist(), strict=True)
         ]
         # A missing source is never who wins: -1 is for none.
-        self.number = on_device(np.where(self.numbers < 0, -2, self.numbers).astype(np.int8), self.device)[
-            ..., None, None
-        ]
+        number = np.where(self.numbers < 0, -2, self.numbers).astype(np.int8)[..., None, None]
+        self.number = on_device(number, self.device)
         self.offset_m = self._table(lambda camera, source: camera.center_m - source.center_m, np.zeros(3))
         self.baseline_m = np.linalg.norm(self.offset_m, axis=-1)
         self.is_near = self._table(self._is_near, False)
@@ -530,21 +526,19 @@ class _ViewBatch:
                 pixel = edges[row].flatten().nonzero()[:, 0]
                 edge = pixel, grid[row].view(1, -1, 2)[:, pixel]
             certain = None if certainty is None else certainty[row]
-            covered = float(self.won_px[row].sum()) / math.prod(self.size)
-            yield (
-                view,
-                ViewMaps(
-                    grid[row],
-                    self.winner[row],
-                    blends[row],
-                    edge,
-                    ways[row],
-                    certain,
-                    self.occluded[row],
-                    tuple(slots[row]),
-                    covered,
-                ),
+            covered, used = float(self.won_px[row].sum()) / math.prod(self.size), tuple(slots[row])
+            parts = (
+                grid[row],
+                self.winner[row],
+                blends[row],
+                edge,
+                ways[row],
+                certain,
+                self.occluded[row],
+                used,
+                covered,
             )
+            yield view, ViewMaps(*parts)
 
     def _weights(self) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Seam weights and certainties in 255ths of all sources (V, K, ny + 1, nx + 1)."""

@@ -9,7 +9,6 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
-import torch
 
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rays import CameraMaps
@@ -110,8 +109,7 @@ class FramePlanner:
         self.config, self.surface, self.harmoniser = config, surface, harmoniser
         self.refinement, self.reach, self.warn = refinement, reach, warn
         self.mixed, self.strict, self.unseen = mixed, strict, unseen
-        self.plans: LRUCache[bytes, RenderPlan] = LRUCache(cache_bytes, attrgetter("nbytes"))
-        self.device_plans: LRUCache[Any, RenderPlan] = LRUCache(cache_bytes, attrgetter("nbytes"))
+        self.plans: LRUCache[Any, RenderPlan] = LRUCache(cache_bytes, attrgetter("nbytes"))
         self._last_plan: LRUCache[bytes, RenderPlan] = LRUCache(1)
         self.maps = CameraMaps()
         self._pairs: LRUCache[tuple[bytes, bytes], _RigPair] = LRUCache(_MAX_RIG_PAIRS)
@@ -148,7 +146,7 @@ class FramePlanner:
         fills_holes = self.reach is not None and isinstance(given, list | tuple) and len(given) > 0
         is_needed = any(pair.needs_geometry for pair in pairs)
         scenes: Sequence[Scene] = ()
-        on_device = not explained and given is None and self._plans_on(frames[0].images[0].device)
+        on_device = not explained and given is None and self._plans_on_device(frames)
         if is_needed or self.surface != "auto" or fills_holes:  # objects decide what neighbours may fill
             scenes = (on_device and scenes_on_device(sample, frames, lead, self.surface)) or ()
             if not all(SURFACES[self._surface(scene)].on_device for scene in scenes) or not scenes:
@@ -214,9 +212,13 @@ class FramePlanner:
         """The surface that a scene is rendered over."""
         return scene.best if self.surface == "auto" else self.surface
 
-    def _plans_on(self, device: torch.device) -> bool:
-        """Whether plans for images on a device are made there by tensor code; those for the CPU's are compiled."""
-        return device.type != "cpu" and isinstance(self.config, FavsConfig) and not self.config.overlap_depth
+    def _plans_on_device(self, frames: Sequence[Frame]) -> bool:
+        """Whether plans are made by tensor code on the images' device; those for the CPU's are compiled."""
+        if frames[0].images[0].device.type == "cpu" or not isinstance(self.config, FavsConfig):
+            return False
+        from arbiview_aug.cameras.kernels import LENS_CODES
+
+        return not self.config.overlap_depth and all(c.lens in LENS_CODES for frame in frames for c in frame.rig)
 
     def _made_on_device(
         self, pairs: Sequence[_RigPair], frames: Sequence[Frame], scenes: Sequence[Scene]
@@ -234,7 +236,7 @@ class FramePlanner:
             if not SURFACES[self._surface(scene)].on_device:
                 continue
             keys[number] = key = (pair.road_key, device) if is_road else number
-            if key not in self.device_plans:
+            if key not in self.plans:
                 requests.setdefault(key, Request(frame.rig, pair.target, scene))
         made = build_plans(list(requests.values()), self.surface, self.config, device, self.maps)
         found = dict(zip(requests, made, strict=True))
@@ -242,7 +244,7 @@ class FramePlanner:
             self.warn_unreachable(request.target, [view.covered for view in plan.on_devices[device]])
         for key in keys.values():
             if isinstance(key, tuple):
-                found[key] = self.device_plans.get(key, partial(found.__getitem__, key))
+                found[key] = self.plans.get(key, partial(found.__getitem__, key))
         return {number: found[key] for number, key in keys.items()}
 
     def _built(self, source: Rig, target: Rig, scene: Scene, config: FavsConfig) -> RenderPlan:

@@ -206,22 +206,22 @@ def test_a_batch_is_retargeted_by_tensor_code(monkeypatch: pytest.MonkeyPatch) -
     }
     target = load_rig("waymo").resized((64, 176))
     expected = RigRetarget(target, **settings)(sample)
-    monkeypatch.setattr(FramePlanner, "_plans_on", lambda self, device: True)
+    monkeypatch.setattr(FramePlanner, "_plans_on_device", lambda self, frames: True)
     retarget = RigRetarget(target, **settings)
     found = retarget(sample)
-    assert found.keys() == expected.keys() and len(retarget.planner.device_plans) == 0
+    assert found.keys() == expected.keys() and len(retarget.plans) == 0
     assert (found["images"].int() - expected["images"].int()).abs().float().mean() <= 0.05
     assert (found["confidence"] - expected["confidence"]).abs().mean() <= 1e-3
     for key in ("coverage", "source_camera", "source_frame", "segmentation"):
         assert (found[key] != expected[key]).float().mean() <= MOST_OFF
     street = {key: value for key, value in sample.items() if key != "boxes_3d"}
     assert torch.equal(retarget(street)["images"], retarget(street)["images"])
-    assert len(retarget.planner.device_plans) == 2  # calibrations that come back
+    assert len(retarget.plans) == 2  # calibrations that come back
     assert "street surface" in str(retarget.explain(street))
 
 
 def test_gradients_flow_to_the_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(FramePlanner, "_plans_on", lambda self, device: True)
+    monkeypatch.setattr(FramePlanner, "_plans_on_device", lambda self, frames: True)
     rig = nuscenes()
     images = torch.stack(noise_images(rig)).float().div(255).requires_grad_()
     sample = {"images": images, "rig": rig, "boxes_3d": torch.from_numpy(boxes_around(6))}
