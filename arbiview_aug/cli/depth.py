@@ -11,7 +11,7 @@ import torch
 from torch.utils.data import Dataset
 
 from arbiview_aug.atomic_io import inside
-from arbiview_aug.cli.arguments import add_data, command_parser, count, device_named, gathered_warnings, writable_folder
+from arbiview_aug.cli.arguments import add_data, command_parser, count, gathered_warnings, writable_folder
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.motion_depth import FOLDER, WANTED, DepthFolder
 from arbiview_aug.datasets.registry import open_data, split_kind
@@ -81,10 +81,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     add_data(parser)
     parser.add_argument("--output", metavar="FOLDER", help=f"where to write (default: {FOLDER} in the data's folder)")
-    parser.add_argument("--device", default="cpu", help="without effect: compiled code on the CPU matches the images")
     parser.add_argument("--workers", type=count, default=1, metavar="N", help="processes")
     arguments = parser.parse_args(argv)
-    device_named(arguments.device)
     data: Any = open_data(arguments.data, neighbours=WANTED)
     _, root = split_kind(arguments.data)
     folder = Path(arguments.output) if arguments.output else inside(root, FOLDER, "depth from motion")

@@ -130,12 +130,6 @@ def test_what_was_found_from_less_is_found_again(recorded: Path, tmp_path: Path,
     assert main(asked) == 0 and "4 were there before" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("device", ["gpu", "cuda:99", "meta"])
-def test_devices_that_are_not_there(recorded: Path, device: str, capsys) -> None:
-    assert main(["depth", "--data", str(recorded), "--device", device]) == 2
-    assert "--device: expected cpu" in capsys.readouterr().err
-
-
 def test_a_broken_frame_is_no_neighbour(recorded: Path, tmp_path: Path) -> None:
     shutil.copytree(recorded, tmp_path / "drive")
     (tmp_path / "drive" / "002" / "calib.json").write_text("{")

@@ -181,7 +181,7 @@ HELP = {
     "bench": ("--data [KIND:]PATH", "--budget-ms", "--target", "speed", "loader"),
     "convert": ("--data [KIND:]PATH", "--target RIG", "--output DIR", "--quality", "--surface", "--workers"),
     "demo": ("--data [KIND:]PATH", "--target RIG", "--output DIR", "--quality", "--surface", "--seed N seed of"),
-    "depth": ("--data [KIND:]PATH", "--output", "--device"),
+    "depth": ("--data [KIND:]PATH", "--output", "--workers"),
     "evaluate": ("--data [KIND:]PATH", "--target RIG", "--output DIR", "--quality", "--yaws", "--paper"),
     "inspect": ("RIG", "--output FILE"),
     "train": ("--data", "--output DIR", "--config", "--set KEY=VALUE"),
