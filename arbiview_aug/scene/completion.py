@@ -364,15 +364,16 @@ def _between(nodes: Any, step: int, out: Any) -> None:
 def _between_rows(nodes: Any, step: int, y: int, h: int, around: Any, out: Any) -> None:
     """Values (w,) in row ``y`` of h between nodes (ny + 1, nx + 1).
 
-    ``around`` (2, w + 1) holds the rows of nodes before and after it, and in its last column which they are.
+    ``around`` (2, w + 1) holds the rows of nodes around it, odd ones second, and in its last column which is the upper.
     """
     j, w = y // step, out.shape[0]
     if around[0, w] != j:
-        _between(nodes[j], step, around[0, :w])
-        _between(nodes[j + 1], step, around[1, :w])
+        if around[0, w] != j - 1:
+            _between(nodes[j], step, around[j % 2, :w])
+        _between(nodes[j + 1], step, around[(j + 1) % 2, :w])
         around[0, w] = j
     t = np.float32(y - j * step) / np.float32(max(min(step, h - 1 - j * step), 1))
-    above, below = around[0], around[1]
+    above, below = around[j % 2], around[(j + 1) % 2]
     for x in range(w):
         out[x] = above[x] + (below[x] - above[x]) * t
 
@@ -392,7 +393,7 @@ def add_residuals(rows: Any, columns: Any, step: int, layers: Any, q: Any) -> No
     _, height, width = layers.shape
     flat = layers.reshape(4, height * width)
     near, far, share = flat[0], flat[1], flat[2]
-    around, first, work = np.full((2, 2, w + 1), -1, np.float32), np.empty(w, np.uint32), np.empty((4, w), np.float32)
+    around, first, work = np.full((2, 2, w + 1), -2, np.float32), np.empty(w, np.uint32), np.empty((4, w), np.float32)
     v, u, down, right = work[0], work[1], work[2], work[3]
     for y in range(h):
         _between_rows(rows, step, y, h, around[0], v)
@@ -412,7 +413,7 @@ def add_residuals(rows: Any, columns: Any, step: int, layers: Any, q: Any) -> No
 def interpolate_layer(rows: Any, columns: Any, step: int, layer: Any, apart: int, out: Any) -> None:
     """Values (h, w) between those of a panorama's layer every ``apart`` pixels; the rest is as in ``add_residuals``."""
     h, w = out.shape
-    around, v, u = np.full((3, 2, w + 1), -1, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    around, v, u = np.full((3, 2, w + 1), -2, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
     nodes = np.empty((-(-h // apart) + 1, -(-w // apart) + 1), np.float32)
     for j in range(nodes.shape[0]):
         y = min(j * apart, h - 1)
