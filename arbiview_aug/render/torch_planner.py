@@ -62,7 +62,7 @@ class Request(NamedTuple):
 
     source: Rig
     target: Rig  # in the source's ego frame
-    scene: Scene  # its boxes may lie on the device, in rows padded by zeros
+    scene: Scene  # boxes and points may lie on the device, padded by rows of zeros and of NaN
 
 
 def build_plans(
