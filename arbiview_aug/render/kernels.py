@@ -488,7 +488,7 @@ def upsample_where(nodes: Any, step: int, winner: Any, number: int, out: Any) ->
 
 @compiled
 def read_ahead(atlas: Any, pixel: int, packed: Any, winner: Any) -> int:
-    """Read what a strip of a view is about to read from an atlas, so that it lies in the cache.
+    """Read what a strip of a view is about to read from an atlas, so that it lies in the cache; the result is no use.
 
     The view itself reads along slanted lines with gaps, which no cache foresees: it would take up to twice as long.
 
@@ -497,9 +497,6 @@ def read_ahead(atlas: Any, pixel: int, packed: Any, winner: Any) -> int:
         pixel: Bytes of one of its pixels.
         packed: (h, w) ``FixedMap.packed``.
         winner: (h, w) int8 source, -1 where none is read.
-
-    Returns:
-        A number without meaning, so that nothing is optimised away.
     """
     (h, w), found = winner.shape, 0
     ends = np.empty((4, 128), np.int32)  # first and last row and column of each source
@@ -519,4 +516,4 @@ def read_ahead(atlas: Any, pixel: int, packed: Any, winner: Any) -> int:
                 for row in range(top, min(bottom + 2, atlas.shape[0])):
                     for at in range(left * pixel, min((right + 2) * pixel, atlas.shape[1]), 64):
                         found ^= atlas[row, at]
-    return found
+    return found  # else nothing would be read

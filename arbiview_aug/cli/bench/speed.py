@@ -54,10 +54,7 @@ BOUNDS: Mapping[tuple[int, int], Mapping[str, float]] = {
         **{f"street, held, {fit} from full size, contiguous": 2.0 for fit in ("squashed", "cropped")},
         **{f"{known}, two neighbours": 20.0 for known in ("street", "75 boxes")},
     },
-    FULL_SIZE: {
-        **{"street": 2.5, "LiDAR": 3.5, "LiDAR, 75 boxes": 4.0},
-        **{f"{n} boxes": 3.0 for n in BOXES},
-    },
+    FULL_SIZE: {"street": 2.5, "LiDAR": 3.5, "LiDAR, 75 boxes": 4.0, **{f"{n} boxes": 3.0 for n in BOXES}},
 }
 """Largest ratios of calls by the size of the views, from nuScenes' images."""
 
@@ -65,8 +62,7 @@ _FLOOR = "bare cv2.remap"
 _ENOUGH_MS = 1500.0
 _TRAVEL_M = 1.2  # between neighbouring frames
 _STEP_M, _STEPS = 1e-4, 200
-_GAINS = (0.8, 1.1, 0.9, 1.25, 1.05, 0.95)
-"""Gains of the sources, as far apart as on a real frame."""
+_GAINS = (0.8, 1.1, 0.9, 1.25, 1.05, 0.95)  # of the sources, as far apart as on a real frame
 
 Sample = Mapping[str, Any]
 Calls = dict[str, Callable[[], Any]]
