@@ -469,7 +469,7 @@ def seen_image(planes: Any, target: Any, q: Any, face: Any, source: Any, visible
     work = np.empty((_WORK_ROWS, w), np.float32)
     inside, seen = np.empty(w, np.int32), np.empty(w, np.int32)
     for y in range(h):
-        _evaluate_row(planes, target, q, face, source, y, 0, w, work, inside, seen)
+        _evaluate_row(planes, target, q, face, source, y, np.int64(0), w, work, inside, seen)
         for x in range(w):
             visible[y, x] = seen[x] != 0
 

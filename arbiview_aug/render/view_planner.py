@@ -244,7 +244,9 @@ class ViewPlanner:
         visible = np.zeros(seen.shape, bool)
         at_nodes = np.ix_(*self.nodes)
         face = geometry.face[at_nodes] if geometry.face.size else geometry.face
-        given = kernel[-1][:, self.nodes[0][:, None], self.nodes[1][None]] if kind < 0 else kernel[-1]
+        given = np.ascontiguousarray(
+            kernel[-1][:, self.nodes[0][:, None], self.nodes[1][None]] if kind < 0 else kernel[-1]
+        )
         seen_image(self.node_rays, self.rays.parameters, geometry.q[at_nodes], face, (*kernel[:-1], given), visible)
         self.counters[f"pairs_{name}"] += 1
         score = (
