@@ -20,10 +20,10 @@ from arbiview_aug.cameras.lens import FloatArray
 EXPECTED_ERROR_LEVELS = 10.0
 """Confidence is exp(-e / this) for an expected error of e grey levels of 255: 0.5 means 7 levels, 0.9 means 1."""
 
-_DECORRELATION_RAD = 0.01
+DECORRELATION_RAD = 0.01
 """Displacement over which a view's details become unrelated; insensitive from 0.3 to 2 times."""
 
-_RESOLUTION_POWER = 0.5
+RESOLUTION_POWER = 0.5
 """A source with half or twice the target's resolution keeps 70 % of the detail; insensitive from 0.25 to 1."""
 
 _ERROR_PER_CONTRAST = 0.55
@@ -44,8 +44,8 @@ def certainty(parallax_rad: FloatArray, pixels_per_pixel: FloatArray) -> FloatAr
         pixels_per_pixel: (...,) source pixels per target pixel along the worse axis; fewer blur, more alias.
     """
     ratio = np.clip(pixels_per_pixel, 1e-3, 1e3)
-    detail = np.minimum(ratio, 1 / ratio) ** _RESOLUTION_POWER
-    return np.asarray(np.exp(-parallax_rad / _DECORRELATION_RAD) * detail)
+    detail = np.minimum(ratio, 1 / ratio) ** RESOLUTION_POWER
+    return np.asarray(np.exp(-parallax_rad / DECORRELATION_RAD) * detail)
 
 
 def confidence(

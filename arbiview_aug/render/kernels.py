@@ -16,13 +16,13 @@ from arbiview_aug.scene.kernels import upsampled_row
 
 _ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
 _TINY, _MOST = np.float32(1e-30), np.float32(1e30)
-_LEAST_INCIDENCE = np.float32(0.05)
+LEAST_INCIDENCE = np.float32(0.05)
 """Sine of the flattest angle at which a source may look along a face: that of the road 30 m from a car's cameras."""
 
 _BORDER_PX = np.float32(1.0)  # maps bulge between the corners of a cell
 _OUTSIDE = np.int32((OUTSIDE << 16) | (OUTSIDE & 0xFFFF))  # both coordinates of a packed position
 _WORK_ROWS = 11  # of scratch memory in ``_evaluate_row``
-_MAP_LIMIT_PX = np.float32(32000)
+MAP_LIMIT_PX = np.float32(32000)
 _MAX_SIDE_PX = 32767
 _AHEAD_COLUMNS, _MOST_AHEAD = 176, 32  # of a strip at a time; at most so many pixels are read for each of its own
 
@@ -163,7 +163,7 @@ def measure_nodes(
 @compiled
 def _fixed(value: Any) -> Any:
     """32nds of a pixel."""
-    return np.int32(np.rint(min(max(value, -_MAP_LIMIT_PX), _MAP_LIMIT_PX) * np.float32(32)))
+    return np.int32(np.rint(min(max(value, -MAP_LIMIT_PX), MAP_LIMIT_PX) * np.float32(32)))
 
 
 @compiled
@@ -232,7 +232,7 @@ def _occlude_row(
             number = face[i]
             if number < 0:
                 pz[i] = _ZERO if guess else pz[i]
-            elif before_m[number] <= _ZERO or before_m[number] * pz[i] < _LEAST_INCIDENCE:
+            elif before_m[number] <= _ZERO or before_m[number] * pz[i] < LEAST_INCIDENCE:
                 pz[i] = -_ONE
             elif h and number_at[place[i]] == number // 6:
                 pz[i] = _MOST

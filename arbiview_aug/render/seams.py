@@ -17,7 +17,7 @@ from arbiview_aug.render.view_plan import BlendRegion
 Nodes = npt.NDArray[np.float32]
 
 _STRIP_PX = 128  # slanted seams make narrow rectangles
-_LEAST_SHARE = 1 / 256  # a source that adds less than this to a pixel cannot change a grey level
+LEAST_SHARE = 1 / 256  # a source that adds less than this to a pixel cannot change a grey level
 
 
 def seam_weights(scores: Sequence[Nodes], border_px: Sequence[Nodes], radius: int, width_px: float) -> list[Nodes]:
@@ -77,7 +77,7 @@ def blend_regions(
     for contribution in contributions:
         put_second(*contribution, winner, both, second, xy, frac, several)
     rows = np.empty((max(sources) + 1, -(-h // _STRIP_PX), several.shape[1], 2), np.int64)
-    band_rows(several, step, _STRIP_PX, both, second, _LEAST_SHARE, rows)
+    band_rows(several, step, _STRIP_PX, both, second, LEAST_SHARE, rows)
     # In content order: rectangles overlap, and blending rounds.
     for source, strip in product(sources, range(rows.shape[1])):
         first, last = rows[source, strip].T

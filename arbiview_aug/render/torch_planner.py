@@ -24,11 +24,11 @@ from arbiview_aug.cameras.torch_rays import TINY, length, on_device, pixel_rays,
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.image_ops import level_size
 from arbiview_aug.render.atlas import OUTSIDE, AtlasLayout
-from arbiview_aug.render.confidence import _DECORRELATION_RAD, _RESOLUTION_POWER
-from arbiview_aug.render.kernels import _LEAST_INCIDENCE, _MAP_LIMIT_PX
+from arbiview_aug.render.confidence import DECORRELATION_RAD, RESOLUTION_POWER
+from arbiview_aug.render.kernels import LEAST_INCIDENCE, MAP_LIMIT_PX
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.requirements import SAME_CENTER_M
-from arbiview_aug.render.seams import _LEAST_SHARE
+from arbiview_aug.render.seams import LEAST_SHARE
 from arbiview_aug.render.torch_backend import Blend, ViewMaps
 from arbiview_aug.render.view_planner import (
     MAGNIFIED,
@@ -37,8 +37,8 @@ from arbiview_aug.render.view_planner import (
     halvings,
     source_bounds,
 )
-from arbiview_aug.scene.boxes import _BOX_ERROR, _UNLABELLED
-from arbiview_aug.scene.point_cloud import _MEASURED_SPREAD, occlusion_level
+from arbiview_aug.scene.boxes import BOX_ERROR, UNLABELLED
+from arbiview_aug.scene.point_cloud import MEASURED_SPREAD, occlusion_level
 from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
 from arbiview_aug.scene.torch_points import PanoramaViews, upsampled
@@ -246,9 +246,9 @@ class _ViewBatch:
         self.uncertainty = static_uncertainty(self.directions, on_nodes.double(), centers_m)
         if self.has_points:
             (near,) = views.read((views.measured,), self._on_nodes(ego))
-            self.uncertainty = torch.where(near > 0.5, _MEASURED_SPREAD * on_nodes, self.uncertainty)
+            self.uncertainty = torch.where(near > 0.5, MEASURED_SPREAD * on_nodes, self.uncertainty)
         elif self.boxes is not None:
-            self.uncertainty = torch.where(on_nodes <= on_street, _UNLABELLED * self.uncertainty, _BOX_ERROR * on_nodes)
+            self.uncertainty = torch.where(on_nodes <= on_street, UNLABELLED * self.uncertainty, BOX_ERROR * on_nodes)
 
     # --- what sources see ---------------------------------------------------------------------------------------------
     def _find_sources(self) -> None:
@@ -364,7 +364,7 @@ class _ViewBatch:
         return torch.where(edge >= 0, torch.minimum(edge, bank.at(v / CELL_PX, u / CELL_PX, slice(None))), edge)
 
     def _resolution(self, u: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-        """As ``ViewPlanner._resolution``."""
+        """As ``kernels.measure_nodes``."""
         if min(self.size) < 2:
             return torch.ones_like(u)
         parts = []
@@ -431,7 +431,7 @@ class _ViewBatch:
         if self.is_solid:
             seen = inside & ~self._hidden(u, v, nearness, face, k)
         # The outer half pixel of a full image lies outside the halved one: its border pixel is read.
-        limit = float(_MAP_LIMIT_PX)
+        limit = float(MAP_LIMIT_PX)
         fu, fv = (
             (torch.where(n >= 0, torch.minimum(p.clamp(min=0), n), p).clamp(-limit, limit) * 32).round().int()
             for p, n in ((u, right), (v, bottom))
@@ -450,7 +450,7 @@ class _ViewBatch:
             return self.shadow.between(v, u, k) > nearness
         face = torch.where(self.near[:, k] > 0, face, -1)
         before_m = self.before_m[:, k].gather(-1, face.clamp(min=0).long().flatten(-2)).view(face.shape)
-        away = (before_m <= 0) | (before_m * nearness < float(_LEAST_INCIDENCE))
+        away = (before_m <= 0) | (before_m * nearness < float(LEAST_INCIDENCE))
         hides, by = self.shadow.at(v.round(), u.round(), k), self.solid.at(v.round(), u.round(), k)
         hidden = (hides > nearness) & (by != torch.div(face, 6, rounding_mode="floor")) | away
         behind = hides > (nearness if self.has_points else 0)
@@ -487,7 +487,7 @@ class _ViewBatch:
                     better, upsampled(certain[:, k], self.step, self.size).round().to(torch.uint8), certainty
                 )
         share = share / (best + share).clamp(min=TINY)
-        share = torch.where((share >= _LEAST_SHARE) & (second >= 0), share, 0.0)
+        share = torch.where((share >= LEAST_SHARE) & (second >= 0), share, 0.0)
         second = torch.where(share > 0, second, -1)
         counts = [
             torch.stack([(who == self.number[:, k]).sum((1, 2)) for k in range(K)], 1) for who in (winner, second)
@@ -561,14 +561,14 @@ class _ViewBatch:
         if not config.certainty:
             return self._seam_weights(score), None
         ratio = self.resolution.clamp(1e-3, 1e3)
-        detail = torch.minimum(ratio, 1 / ratio) ** _RESOLUTION_POWER
-        certain = 255 * torch.exp(-across_m * spread / _DECORRELATION_RAD) * detail
+        detail = torch.minimum(ratio, 1 / ratio) ** RESOLUTION_POWER
+        certain = 255 * torch.exp(-across_m * spread / DECORRELATION_RAD) * detail
         known = torch.where(self.valid, certain, 0.0).float()
         around = _blurred(known, 2) / _blurred(self.valid.float(), 2).clamp(min=1e-6)
         return self._seam_weights(score), torch.where(self.valid, known, around)
 
     def _seam_weights(self, score: torch.Tensor) -> torch.Tensor:
-        """As ``ViewPlanner._seam_weights``."""
+        """As ``seams.seam_weights``."""
         width_px = self.config.seam_width * self.size[1]
         if width_px == 0 or score.shape[1] < 2:
             return score

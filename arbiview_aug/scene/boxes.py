@@ -19,10 +19,10 @@ from arbiview_aug.errors import SampleError
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene.surface import LayeredSurface, OcclusionMap, Points, StaticSurface, Surface
 
-_UNLABELLED = 0.45
+UNLABELLED = 0.45
 """Share of the street's uncertainty due to unlabelled objects. Fitted on synthetic streets, seeds 100 to 105."""
 
-_BOX_ERROR = 0.08
+BOX_ERROR = 0.08
 """Mean relative error of a box face's inverse distance. Fitted on synthetic streets, seeds 100 to 105."""
 
 
@@ -90,8 +90,8 @@ class BoxSurface(LayeredSurface):
         """Expected error (...,) in 1/m of boxes, and of the street because of unlabelled objects."""
         assert isinstance(self.street, StaticSurface)
         on_street = inverse_distance <= (1 + _ROUNDING) * self.street.inverse_distance(origin, directions)
-        street = _UNLABELLED * self.street.uncertainty(origin, directions, inverse_distance)
-        return np.where(on_street, street, _BOX_ERROR * inverse_distance)
+        street = UNLABELLED * self.street.uncertainty(origin, directions, inverse_distance)
+        return np.where(on_street, street, BOX_ERROR * inverse_distance)
 
 
 def box_rows(

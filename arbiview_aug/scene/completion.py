@@ -23,10 +23,10 @@ _CHUNK = 1024  # points worked on at once
 # row (from bit 7) and column of the seed as seen from the cell, plus 64. Distances are those of Borgefors' 5 x 5 mask.
 _ROW, _OWN, _NO_SEED = 1 << 7, np.int32(64 * 128 + 64), np.int32(1 << 30)
 _SIDE, _CORNER, _KNIGHT = 1024 << 14, 1434 << 14, 2250 << 14
-_REACH, _SUPPORT = np.float32(panorama.REACH_RAD / CELL_RAD), np.float32(panorama.SUPPORT_RAD / CELL_RAD)
-_FAR, _ASIDE = round(panorama.SEE_THROUGH_RAD / CELL_RAD), round(panorama.SIDE_RAD / CELL_RAD)
-_RADIUS, _SHRINK = round(panorama.SMOOTH_RAD / 2 / CELL_RAD), round(panorama.SHRINK_RAD / CELL_RAD)
-_STEP, _STEP_PER_M, _SOME = np.float32(panorama.STEP), np.float32(panorama.STEP_PER_M), np.float32(1e-3)
+REACH_CELLS, SUPPORT_CELLS = np.float32(panorama.REACH_RAD / CELL_RAD), np.float32(panorama.SUPPORT_RAD / CELL_RAD)
+SEE_THROUGH_CELLS, SIDE_CELLS = round(panorama.SEE_THROUGH_RAD / CELL_RAD), round(panorama.SIDE_RAD / CELL_RAD)
+SMOOTH_CELLS, SHRINK_CELLS = round(panorama.SMOOTH_RAD / 2 / CELL_RAD), round(panorama.SHRINK_RAD / CELL_RAD)
+_STEP, _STEP_PER_M, LEAST_WEIGHT = np.float32(panorama.STEP), np.float32(panorama.STEP_PER_M), np.float32(1e-3)
 
 
 @compiled
@@ -88,17 +88,17 @@ def drop_hidden(q: Any, number: Any, points: Any, origin: Any) -> tuple[Any, Any
     """
     h, w = q.shape
     across, down = q.copy(), q.copy()
-    _window_max(across, 2 * _ASIDE, _FAR - 1)
-    _window_max(down, _FAR - 1, 2 * _ASIDE)
+    _window_max(across, 2 * SIDE_CELLS, SEE_THROUGH_CELLS - 1)
+    _window_max(down, SEE_THROUGH_CELLS - 1, 2 * SIDE_CELLS)
     cells, n = np.empty(h * w, np.int64), 0
     for y in range(h):
-        inside = _FAR <= y < h - _FAR
+        inside = SEE_THROUGH_CELLS <= y < h - SEE_THROUGH_CELLS
         for x in range(w):
             if q[y, x] <= _ZERO:
                 continue
-            if inside and _FAR <= x < w - _FAR:
-                one = min(across[y - _ASIDE, x - _FAR], across[y - _ASIDE, x + 1])
-                two = min(down[y - _FAR, x - _ASIDE], down[y + 1, x - _ASIDE])
+            if inside and SEE_THROUGH_CELLS <= x < w - SEE_THROUGH_CELLS:
+                one = min(across[y - SIDE_CELLS, x - SEE_THROUGH_CELLS], across[y - SIDE_CELLS, x + 1])
+                two = min(down[y - SEE_THROUGH_CELLS, x - SIDE_CELLS], down[y + 1, x - SIDE_CELLS])
                 if q[y, x] < _hidden_below(max(one, two)):
                     continue
             cells[n] = y * w + x
@@ -131,12 +131,12 @@ def complete(cells: Any, own: Any, residuals: Any, layers: Any) -> None:
         for x in range(w):
             away[x] = np.float32(code[y + 2, x + 2] >> 14) * np.float32(1 / 1024)
         for x in range(w):
-            measured[y, x] = _ONE if away[x] <= _SUPPORT else _ZERO
+            measured[y, x] = _ONE if away[x] <= SUPPORT_CELLS else _ZERO
         for x in range(w):
-            if away[x] >= _REACH:
+            if away[x] >= REACH_CELLS:
                 r[y, x] = q[y, x] = _ZERO
             else:
-                fade = min(_TWO - _TWO * away[x] / _REACH, _ONE)
+                fade = min(_TWO - _TWO * away[x] / REACH_CELLS, _ONE)
                 from_y, from_x = seed(code[y + 2, x + 2])
                 r[y, x], q[y, x] = r[y + from_y, x + from_x] * fade, q[y + from_y, x + from_x]
     _average_sides(r, q, layers[0], layers[1], layers[2])
@@ -181,7 +181,7 @@ def _average_sides(r: Any, q: Any, near: Any, far: Any, share: Any) -> None:
     All that is averaged about a step then knows of it. Near the border, which only filters read, nothing is averaged.
     """
     h, w = r.shape
-    side, edge = 2 * _RADIUS, 3 * _RADIUS
+    side, edge = 2 * SMOOTH_CELLS, 3 * SMOOTH_CELLS
     size, n, m = side + 1, w - 2 * side, w - 2 * edge  # of a window, and of the rows where they fit
     for y in range(h):
         for x in range(w):
@@ -208,21 +208,21 @@ def _average_sides(r: Any, q: Any, near: Any, far: Any, share: Any) -> None:
             _slide(nearer if k == 0 else here if k == 1 else of_near, sums[k, y % size], total[k])
         if y < 2 * side:
             continue
-        y0 = y - _RADIUS
+        y0 = y - SMOOTH_CELLS
         own, q0, r0, share0 = total[0], q[y0, edge : w - edge], r[y0, edge : w - edge], share[y0, edge : w - edge]
         for x in range(m):
             share0[x] = own[x] * per
-        h0, l0 = high[y0 - _RADIUS, side : side + m], low[y0 - _RADIUS, side : side + m]
+        h0, l0 = high[y0 - SMOOTH_CELLS, side : side + m], low[y0 - SMOOTH_CELLS, side : side + m]
         for x in range(m):  # the mean where nothing steps
             flat[x] = total[1, x] * per if h0[x] + l0[x] <= _STEP * q0[x] + _STEP_PER_M else np.nan
         out, part = near[y0, edge : w - edge], total[2]
         for x in range(m):
-            one = part[x] * per / max(share0[x], _SOME) if share0[x] > _SOME else r0[x]
+            one = part[x] * per / max(share0[x], LEAST_WEIGHT) if share0[x] > LEAST_WEIGHT else r0[x]
             out[x] = flat[x] if flat[x] == flat[x] else one
         out, part, every = far[y0, edge : w - edge], total[2], total[1]
         for x in range(m):
             rest = _ONE - share0[x]
-            one = (every[x] - part[x]) * per / max(rest, _SOME) if rest > _SOME else r0[x]
+            one = (every[x] - part[x]) * per / max(rest, LEAST_WEIGHT) if rest > LEAST_WEIGHT else r0[x]
             out[x] = flat[x] if flat[x] == flat[x] else one
 
 
@@ -285,7 +285,7 @@ def hidden_depths(layers: Any, base: Any, step: int, out: Any) -> None:
     """
     h, w = out.shape
     near, far, share, measured = layers[0], layers[1], layers[2], layers[3]
-    side = 2 * _SHRINK
+    side = 2 * SHRINK_CELLS
     silent, line = _ONE - measured, np.empty(base.shape[1], np.float32)
     _window_max(silent, side, side)
     static, known = np.empty(w, np.float32), np.empty(w, np.float32)
@@ -294,10 +294,10 @@ def hidden_depths(layers: Any, base: Any, step: int, out: Any) -> None:
         one, two, part = near[y], far[y], share[y]
         for x in range(w):
             known[x] = static[x] + (one[x] if part[x] > _HALF else two[x])
-        row, inner, hidden = out[y], known[_SHRINK:], silent[min(max(y - _SHRINK, 0), h - 1 - side)]
+        row, inner, hidden = out[y], known[SHRINK_CELLS:], silent[min(max(y - SHRINK_CELLS, 0), h - 1 - side)]
         for x in range(w):
             row[x] = _ZERO
-        row = row[_SHRINK:]
+        row = row[SHRINK_CELLS:]
         for x in range(w - side):  # closes gaps between scan lines, but not outwards
             row[x] = _hidden_below(inner[x]) if hidden[x] == _ZERO else _ZERO
 

@@ -29,14 +29,14 @@ OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
 _STEEP = 0.9
 """Sine of the elevation up to which azimuths are interpolated: 64 degrees."""
 
-_NODES_RAD = 4 * CELL_RAD
+NODES_RAD = 4 * CELL_RAD
 """Distance of nodes between which positions in a panorama are interpolated, to 1/50 of a cell."""
 
-_ROOM = 5  # cells by which panoramas are wider than what is asked first: later questions fit in
+ROOM_CELLS = 5  # cells by which panoramas are wider than what is asked first: later questions fit in
 
-_AIR = np.array([BOX_AIR_M, SIDE_RAD / RASTER_RAD], np.float32)
+OBJECT_AIR = np.array([BOX_AIR_M, SIDE_RAD / RASTER_RAD], np.float32)
 
-_MEASURED_SPREAD = 0.05
+MEASURED_SPREAD = 0.05
 """Spread of a measured inverse distance, as a share of it: half of STEP, below which densification follows a slope."""
 
 
@@ -62,7 +62,9 @@ class Window(NamedTuple):
             math.ceil(a.max() / CELL_RAD) + room - first for a, first in ((elevation, row), (azimuth, column))
         )
         row, top = max(row, -TURN // 4), min(row + rows, TURN // 4)
-        return cls(row, column, top - row, columns) if columns <= TURN - 2 * _ROOM else cls(row, 0, top - row, TURN)
+        return (
+            cls(row, column, top - row, columns) if columns <= TURN - 2 * ROOM_CELLS else cls(row, 0, top - row, TURN)
+        )
 
     def holds(self, other: Window) -> bool:
         """Whether another window lies within this one."""
@@ -158,7 +160,7 @@ class PointCloudSurface(DenseSurface):
     objects: tuple[ScannedObject, ...] = ()
     _panoramas: dict[bytes, list[Panorama]] = field(default_factory=dict, repr=False)
     _shadows: dict[Camera, OcclusionMap] = field(default_factory=dict, repr=False)
-    _nodes: dict[Camera, tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
+    nodes_of: dict[Camera, tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", self.points[~own_car(self.points)])
@@ -208,7 +210,7 @@ class PointCloudSurface(DenseSurface):
         near = np.empty(rays.shape[2], np.float32)
         read_layer(*(cells[0] for cells in view.cells(rays, np.eye(3))), view.layers[3], near)
         unknown = self.street.uncertainty(origin, directions, inverse_distance)
-        return np.where(near.reshape(unknown.shape) > 0.5, _MEASURED_SPREAD * inverse_distance, unknown)
+        return np.where(near.reshape(unknown.shape) > 0.5, MEASURED_SPREAD * inverse_distance, unknown)
 
     def _draw_objects(self, camera: Camera, rays: PixelRays, mode: int, image: Layer) -> None:
         """Draw the objects that a camera may see by their points (``completion.draw_scanned``)."""
@@ -221,23 +223,23 @@ class PointCloudSurface(DenseSurface):
         for box, number in zip(boxes, numbers, strict=True):
             raster = self.objects[number].raster(center)
             if raster.nearest.size:
-                draw_scanned(rays.planes, rays.parameters, R, box, rays.cones, CELL_PX, raster, _AIR, mode, image)
+                draw_scanned(rays.planes, rays.parameters, R, box, rays.cones, CELL_PX, raster, OBJECT_AIR, mode, image)
 
     def _located(self, camera: Camera, rays: PixelRays) -> tuple[Panorama, Layer, Layer, int]:
         """The panorama around a camera; rows and columns in it (ny + 1, nx + 1) of nodes, and how far these are apart.
 
         Kept for the next question.
         """
-        if camera not in self._nodes:
-            step, R = max(1, int(_NODES_RAD * float(rays.parameters[0]))), camera.cam2ego[:3, :3]
-            local, directions = _nodes(rays, step, R)
+        if camera not in self.nodes_of:
+            step, R = max(1, int(NODES_RAD * float(rays.parameters[0]))), camera.cam2ego[:3, :3]
+            local, directions = nodes_of(rays, step, R)
             view = self.view(camera.center_m, directions)
             # A lens may have no rays somewhere; azimuths bend near the zenith, and jump in a panorama all around.
             steep = len(directions) == 0 or float(np.abs(directions[:, 2]).max()) > _STEEP
             if step > 1 and (steep or view.window.columns >= TURN or len(directions) < local[0].size):
-                step, (local, _) = 1, _nodes(rays, 1, R)
-            self._nodes[camera] = view, *view.cells(local, R), step
-        return self._nodes[camera]
+                step, (local, _) = 1, nodes_of(rays, 1, R)
+            self.nodes_of[camera] = view, *view.cells(local, R), step
+        return self.nodes_of[camera]
 
     def view(self, origin: FloatArray, directions: FloatArray) -> Panorama:
         """The panorama around a centre that holds rays (..., 3)."""
@@ -245,12 +247,12 @@ class PointCloudSurface(DenseSurface):
         asked, held = Window.around(directions), self._panoramas.setdefault(origin.tobytes(), [])
         found = next((p for p in held if p.window.holds(asked)), None)
         if found is None:
-            found = Panorama(Window.around(directions, _ROOM), origin, self.points, self.street)
+            found = Panorama(Window.around(directions, ROOM_CELLS), origin, self.points, self.street)
             held.append(found)
         return found
 
 
-def _nodes(rays: PixelRays, step: int, R: FloatArray) -> tuple[Layer, FloatArray]:
+def nodes_of(rays: PixelRays, step: int, R: FloatArray) -> tuple[Layer, FloatArray]:
     """Rays (3, ny + 1, nx + 1) of nodes, the last ones on the last pixels; those there are (n, 3), in the ego frame."""
     local = rays.at(*(np.minimum(np.arange(0, n + step, step), n - 1) for n in rays.size))
     return local, local[:, local.any(axis=0)].T @ R.T

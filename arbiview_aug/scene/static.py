@@ -28,7 +28,7 @@ class Far(StaticSurface):
         return np.zeros(directions.shape[:-1])
 
 
-_FREE, _DENSITY = 0.1, 1.33
+FREE_SHARE, OBJECT_DENSITY = 0.1, 1.33
 """Free share of the way to the wall, and object density beyond. Fitted on synthetic streets, seeds 100 to 105."""
 
 
@@ -66,12 +66,12 @@ class _RoadAndWall(StaticSurface):
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Mean error (...,) in 1/m caused by unknown objects, within a quarter on most of six synthetic streets.
 
-        A ray meets objects between ``_FREE`` of the way to the wall and the surface, at ``_DENSITY`` per such way: the
-        integral of (1/t - 1/t_surface) over t. The road nearby is certain, the wall is not.
+        A ray meets objects between ``FREE_SHARE`` of the way to the wall and the surface, at ``OBJECT_DENSITY`` per
+        such way: the integral of (1/t - 1/t_surface) over t. The road nearby is certain, the wall is not.
         """
         wall = wall_inverse_distance(origin, directions, Street.half_length_m, Street.half_width_m)
-        t = np.clip(wall / np.maximum(inverse_distance, 1e-9), _FREE, 1.0)
-        return np.asarray(_DENSITY * wall * (np.log(t / _FREE) - 1 + _FREE / t))
+        t = np.clip(wall / np.maximum(inverse_distance, 1e-9), FREE_SHARE, 1.0)
+        return np.asarray(OBJECT_DENSITY * wall * (np.log(t / FREE_SHARE) - 1 + FREE_SHARE / t))
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,17 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import CameraMaps
 from arbiview_aug.cameras.torch_rays import on_device
-from arbiview_aug.scene.completion import _ASIDE, _FAR, _RADIUS, _REACH, _SHRINK, _SOME, _SUPPORT
+from arbiview_aug.scene.completion import (
+    LEAST_WEIGHT,
+    REACH_CELLS,
+    SEE_THROUGH_CELLS,
+    SHRINK_CELLS,
+    SIDE_CELLS,
+    SMOOTH_CELLS,
+    SUPPORT_CELLS,
+)
 from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, NEAREST_M, STEP, STEP_PER_M
-from arbiview_aug.scene.point_cloud import _NODES_RAD, _ROOM, OWN_CAR_M, Window, _nodes
+from arbiview_aug.scene.point_cloud import NODES_RAD, OWN_CAR_M, ROOM_CELLS, Window, nodes_of
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 from arbiview_aug.scene.torch_surface import static_image
 
@@ -97,7 +105,7 @@ class PanoramaViews:
         rays = torch.stack([level * azimuth.cos(), level * azimuth.sin(), up], 1)
         static = upsampled(static_image(True, rays, self._centers_m, self._ground_z_m), BASE_STEP, self._size)
         known = static + torch.where(self.share > 0.5, self.near, self.far)
-        silent = _max(_pad(1 - self.measured, [_SHRINK] * 4, value=1.0), 2 * _SHRINK + 1, stride=1)
+        silent = _max(_pad(1 - self.measured, [SHRINK_CELLS] * 4, value=1.0), 2 * SHRINK_CELLS + 1, stride=1)
         return torch.where(silent == 0, _hidden(known), 0.0)
 
     def _nearest_points(self, points: torch.Tensor, bounds: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -142,32 +150,32 @@ class PanoramaViews:
     def _is_hidden(self, q: torch.Tensor) -> torch.Tensor:
         """Points that shine through gaps of what is nearer on both sides of them."""
         H, W = self._size
-        padded = _pad(q, (_FAR,) * 4)
-        across = _max(padded, (2 * _ASIDE + 1, _FAR), stride=1)[:, _FAR - _ASIDE :]
-        down = _max(padded, (_FAR, 2 * _ASIDE + 1), stride=1)[:, :, _FAR - _ASIDE :]
-        one = torch.minimum(across[:, :H, :W], across[:, :H, _FAR + 1 : _FAR + 1 + W])
-        two = torch.minimum(down[:, :H, :W], down[:, _FAR + 1 : _FAR + 1 + H, :W])
-        return (q < _hidden(torch.maximum(one, two))) & self._inner(_FAR)
+        padded = _pad(q, (SEE_THROUGH_CELLS,) * 4)
+        across = _max(padded, (2 * SIDE_CELLS + 1, SEE_THROUGH_CELLS), stride=1)[:, SEE_THROUGH_CELLS - SIDE_CELLS :]
+        down = _max(padded, (SEE_THROUGH_CELLS, 2 * SIDE_CELLS + 1), stride=1)[:, :, SEE_THROUGH_CELLS - SIDE_CELLS :]
+        one = torch.minimum(across[:, :H, :W], across[:, :H, SEE_THROUGH_CELLS + 1 : SEE_THROUGH_CELLS + 1 + W])
+        two = torch.minimum(down[:, :H, :W], down[:, SEE_THROUGH_CELLS + 1 : SEE_THROUGH_CELLS + 1 + H, :W])
+        return (q < _hidden(torch.maximum(one, two))) & self._inner(SEE_THROUGH_CELLS)
 
     def _complete(self, q: torch.Tensor, residual: torch.Tensor) -> None:
         """Give every cell the residual of the nearest point, averaged on both sides of a step."""
         code = spread(torch.where(q > 0, OWN, NO_SEED).int())
         away = (code >> 14).float() / 1024
-        self.measured = (away <= float(_SUPPORT)).float()
+        self.measured = (away <= float(SUPPORT_CELLS)).float()
         H, W = self._size
         y, x = (torch.arange(n, device=q.device) for n in self._size)
         dy, dx = seed_of(code)
         row, column = (y[:, None] + dy).clamp(0, H - 1), (x + dx).clamp(0, W - 1)
         seed = (row * W + column).flatten(1).long()
-        reached = away < float(_REACH)
+        reached = away < float(REACH_CELLS)
         r, q = (torch.where(reached, p.flatten(1).gather(1, seed).view_as(p), 0.0) for p in (residual, q))
-        r = r * (2 - 2 * away / float(_REACH)).clamp(max=1)
-        some = float(_SOME)
-        high, low = _around(r, 2 * _RADIUS, _max), -_around(-r, 2 * _RADIUS, _max)
+        r = r * (2 - 2 * away / float(REACH_CELLS)).clamp(max=1)
+        some = float(LEAST_WEIGHT)
+        high, low = _around(r, 2 * SMOOTH_CELLS, _max), -_around(-r, 2 * SMOOTH_CELLS, _max)
         nearer = (2 * r > high + low).float()
-        share, every, part = (_around(p, _RADIUS, _mean) for p in (nearer, r, r * nearer))
-        high, low = _around(r, _RADIUS, _max), -_around(-r, _RADIUS, _max)
-        flat, inner = high - low <= STEP * q + STEP_PER_M, self._inner(3 * _RADIUS)
+        share, every, part = (_around(p, SMOOTH_CELLS, _mean) for p in (nearer, r, r * nearer))
+        high, low = _around(r, SMOOTH_CELLS, _max), -_around(-r, SMOOTH_CELLS, _max)
+        flat, inner = high - low <= STEP * q + STEP_PER_M, self._inner(3 * SMOOTH_CELLS)
         near = torch.where(share > some, part / share.clamp(min=some), r)
         far = torch.where(1 - share > some, (every - part) / (1 - share).clamp(min=some), r)
         near, far = torch.where(flat, every, near), torch.where(flat, every, far)
@@ -178,9 +186,9 @@ class PanoramaViews:
 def window_of(camera: Camera, maps: CameraMaps) -> Window:
     """The part of the sphere that is made dense for a camera."""
     rays = maps.rays(camera)
-    step = max(1, int(_NODES_RAD * float(rays.parameters[0])))
-    _, directions = _nodes(rays, step, camera.cam2ego[:3, :3])
-    return Window.around(directions, _ROOM)
+    step = max(1, int(NODES_RAD * float(rays.parameters[0])))
+    _, directions = nodes_of(rays, step, camera.cam2ego[:3, :3])
+    return Window.around(directions, ROOM_CELLS)
 
 
 def upsampled(nodes: torch.Tensor, step: int, size: Sequence[int], ends: bool = False) -> torch.Tensor:

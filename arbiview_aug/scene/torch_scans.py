@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from arbiview_aug.scene.panorama import NEAREST_M
-from arbiview_aug.scene.point_cloud import _AIR
+from arbiview_aug.scene.point_cloud import OBJECT_AIR
 from arbiview_aug.scene.scanned_objects import BOX_AIR_M, RASTER_RAD, SCANNED_POINTS
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 from arbiview_aug.scene.torch_points import JUMPS, NO_SEED, OWN, moved_seed, seed_of
@@ -148,7 +148,7 @@ class ScannedViews:
         camera, box, self._pixel = pixels_of_boxes(rays, rows, seen)
         planes, own = rays.transpose(0, 1).flatten(1), rows[camera, box][:, None]
         enter, leave = slabs(own, planes[:, self._pixel])
-        _, far = slabs(own, planes[:, self._pixel], air=float(_AIR[0]))  # it leaves the air around the box
+        _, far = slabs(own, planes[:, self._pixel], air=float(OBJECT_AIR[0]))  # it leaves the air around the box
         self._behind = 1 / far.clamp(min=1 / MAX_INVERSE_DISTANCE)
         mine = pair[camera, box][:, None]
         x, y, z = ego.transpose(0, 1).flatten(1)[:, self._pixel]
@@ -165,7 +165,7 @@ class ScannedViews:
         highest = one + (two - one) * (inner - c)
         r = torch.minimum(row.round().clamp(min=0).long(), (h - 1).clamp(min=0))
         at = (self._start[mine] + r * w + inner.round().long()).clamp(max=len(self._nearest) - 1)
-        self._met, self._may = may & (row <= highest), may & (row <= highest + float(_AIR[1]))
+        self._met, self._may = may & (row <= highest), may & (row <= highest + float(OBJECT_AIR[1]))
         self._own = torch.where(row <= highest, self._nearest[at], 0.0)
 
 

@@ -12,7 +12,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rays import CELL_PX
 from arbiview_aug.cameras.torch_rays import TINY, cell_cones, on_device
-from arbiview_aug.scene.static import _DENSITY, _FREE, WALL_CENTER_M, Ground, Street
+from arbiview_aug.scene.static import FREE_SHARE, OBJECT_DENSITY, WALL_CENTER_M, Ground, Street
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 
 _FLAT = 1e-12
@@ -61,8 +61,8 @@ def wall_image(rays: torch.Tensor, centers_m: FloatArray, reach_m: tuple[float, 
 def static_uncertainty(rays: torch.Tensor, q: torch.Tensor, centers_m: FloatArray) -> torch.Tensor:
     """As ``static._RoadAndWall.uncertainty``, (V, h, w)."""
     wall = wall_image(rays, centers_m)
-    t = (wall / q.clamp(min=1e-9)).clamp(_FREE, 1.0)
-    return _DENSITY * wall * (torch.log(t / _FREE) - 1 + _FREE / t)
+    t = (wall / q.clamp(min=1e-9)).clamp(FREE_SHARE, 1.0)
+    return OBJECT_DENSITY * wall * (torch.log(t / FREE_SHARE) - 1 + FREE_SHARE / t)
 
 
 # --- boxes ------------------------------------------------------------------------------------------------------------
