@@ -38,7 +38,10 @@ def sample(k: int) -> dict[str, Any]:
     [
         {"cache_bytes": 2**30},
         {"cache_bytes": 20_000},  # plans are dropped all the time
-        {"harmonise": True, "quality": "accurate", "refinement": RefinementCache(key="scene", max_bytes=1)},
+        pytest.param(
+            {"harmonise": True, "quality": "accurate", "refinement": RefinementCache(key="scene", max_bytes=1)},
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_threads_do_not_disturb_each_other(settings: dict[str, Any]) -> None:

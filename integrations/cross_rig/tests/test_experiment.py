@@ -108,9 +108,10 @@ def test_true_pixels_replace_what_was_rendered(done):
 
 
 @pytest.mark.slow
-def test_variants_without_a_mask_lift_every_pixel(done):
+def test_variants_without_a_mask_lift_every_pixel(tmp_path):
     """Black holes: the pixels of the masked variant. Filled holes: what was seen is the same bit for bit."""
-    more = replace(done, settings=replace(TINY, changes=("up70",), variants=("auto", "auto_black", "auto_fill")))
+    settings = replace(TINY, changes=("up70",), variants=("auto", "auto_black", "auto_fill"))
+    more = Run(settings=settings, output=tmp_path)
     assert list(run(more, 1, lambda line: None)) == [3, 2, 1, 0]
     masked, black, filled = jobs(more.settings)
     assert more.images(black).store().key == more.images(masked).store().key != more.images(filled).store().key

@@ -163,6 +163,7 @@ def test_shards_write_the_same_bytes(
         main([*asked, "--num-shards", "3", "--shard-index", "3"])
 
 
+@pytest.mark.slow
 def test_processes_write_the_same_bytes(
     sources: dict[str, Path], undisturbed: dict[str, dict[str, bytes]], tmp_path: Path
 ) -> None:
