@@ -128,6 +128,8 @@ def motion_depth(
         least, most = TRAVEL_M
         return declined(f"no frame {least:g} to {most:g} m before or after it can be used")
     swept = _swept(rig, cameras, images, rig.ground_z_m)
+    if any(min(one.camera.size) < 2 for part in (swept, *(side.images for side in sides)) for one in part):
+        return declined("images one pixel wide or high have nothing to interpolate")
     words = f"from {' and '.join(side.neighbour.name for side in sides)}"
     for correction in range(MAX_CORRECTIONS + 1):
         others = [[side.images[k] for side in sides] for k in range(len(swept))]

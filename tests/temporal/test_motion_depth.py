@@ -142,6 +142,12 @@ def test_the_street_replaces_declined_depth_with_a_warning(sample: dict[str, Any
     assert torch.equal(out["images"], RigRetarget(target, surface="street")(sample | {"neighbours": []})["images"])
 
 
+@pytest.mark.parametrize("size", [(1, 8), (8, 1)])
+def test_images_of_one_pixel_are_declined(size: tuple[int, int]) -> None:
+    tiny = found(Standing(SIDE.resized(size), num_frames=3, lidar=False, neighbours=Neighbours())[1])
+    assert "images one pixel wide or high" in str(tiny) and not tiny.density
+
+
 def test_messages(sample: dict[str, Any]) -> None:
     bare = {key: value for key, value in sample.items() if key != "neighbours"}
     motion = RigRetarget(SIDE.shifted(y_m=0.5), surface="motion")
