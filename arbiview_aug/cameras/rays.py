@@ -107,8 +107,7 @@ class CameraMaps:
 
     def rays(self, camera: Camera, known: PixelRays | None = None) -> PixelRays:
         """The rays of a camera; ``known`` are taken for it from now on."""
-        key = camera.size, camera.lens, camera.distortion, camera.K.tobytes()
-        return self._cache.get(key, lambda: known or pixel_rays(camera))
+        return self._cache.get(_lens_key(camera), lambda: known or pixel_rays(camera))
 
     def copy_on(self, device: torch.device, key: Any, make: Callable[[], Any]) -> torch.Tensor:
         """What ``make`` gives for a content key, on a device; held."""
@@ -116,8 +115,7 @@ class CameraMaps:
 
     def rays_on(self, camera: Camera, device: torch.device) -> torch.Tensor:
         """The unit rays (3, h, w) of a lens on a device; held."""
-        key = camera.size, camera.lens, camera.distortion, camera.K.tobytes()
-        return self.copy_on(device, key, lambda: self.rays(camera).planes)
+        return self.copy_on(device, _lens_key(camera), lambda: self.rays(camera).planes)
 
     def clean_pixels(self, camera: Camera, level: int) -> npt.NDArray[np.uint8]:
         """255 (h, w) where a source halved ``level`` times shows no part of the own car; (0, 0) without a mask."""
@@ -132,6 +130,11 @@ class CameraMaps:
             return none
         mask = camera.mask
         return self._cache.get((camera.mask_key, name), lambda: none if mask.all() else make(mask))
+
+
+def _lens_key(camera: Camera) -> Any:
+    """What the rays of a camera's pixels depend on."""
+    return camera.size, camera.lens, camera.distortion, camera.K.tobytes()
 
 
 def pixel_rays(camera: Camera) -> PixelRays:

@@ -160,7 +160,7 @@ class PointCloudSurface(DenseSurface):
     objects: tuple[ScannedObject, ...] = ()
     _panoramas: dict[bytes, list[Panorama]] = field(default_factory=dict, repr=False)
     _shadows: dict[Camera, OcclusionMap] = field(default_factory=dict, repr=False)
-    nodes_of: dict[Camera, tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
+    _nodes: dict[Camera, tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", self.points[~own_car(self.points)])
@@ -230,7 +230,7 @@ class PointCloudSurface(DenseSurface):
 
         Kept for the next question.
         """
-        if camera not in self.nodes_of:
+        if camera not in self._nodes:
             step, R = max(1, int(NODES_RAD * float(rays.parameters[0]))), camera.cam2ego[:3, :3]
             local, directions = nodes_of(rays, step, R)
             view = self.view(camera.center_m, directions)
@@ -238,8 +238,8 @@ class PointCloudSurface(DenseSurface):
             steep = len(directions) == 0 or float(np.abs(directions[:, 2]).max()) > _STEEP
             if step > 1 and (steep or view.window.columns >= TURN or len(directions) < local[0].size):
                 step, (local, _) = 1, nodes_of(rays, 1, R)
-            self.nodes_of[camera] = view, *view.cells(local, R), step
-        return self.nodes_of[camera]
+            self._nodes[camera] = view, *view.cells(local, R), step
+        return self._nodes[camera]
 
     def view(self, origin: FloatArray, directions: FloatArray) -> Panorama:
         """The panorama around a centre that holds rays (..., 3)."""
