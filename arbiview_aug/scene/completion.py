@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,8 @@ _SIDE, _CORNER, _KNIGHT = 1024 << 14, 1434 << 14, 2250 << 14
 REACH_CELLS, SUPPORT_CELLS = np.float32(panorama.REACH_RAD / CELL_RAD), np.float32(panorama.SUPPORT_RAD / CELL_RAD)
 SEE_THROUGH_CELLS, SIDE_CELLS = round(panorama.SEE_THROUGH_RAD / CELL_RAD), round(panorama.SIDE_RAD / CELL_RAD)
 SMOOTH_CELLS, SHRINK_CELLS = round(panorama.SMOOTH_RAD / 2 / CELL_RAD), round(panorama.SHRINK_RAD / CELL_RAD)
+REACH_ROWS = math.ceil(REACH_CELLS) + 4 * SMOOTH_CELLS + 1 - panorama.HALO
+"""Beyond so many rows below and above all points a window's halo, too, shows the static surface."""
 _STEP, _STEP_PER_M, LEAST_WEIGHT = np.float32(panorama.STEP), np.float32(panorama.STEP_PER_M), np.float32(1e-3)
 
 
@@ -47,6 +50,20 @@ def cells_row(x: Any, y: Any, z: Any, place: Any, level: Any, row: Any, column: 
     angle_row(level, z, row)
     for i in range(n):
         row[i] = (_HALF_PI - row[i] - low) * per_rad
+
+
+@compiled
+def elevations(points: Any, origin: Any) -> Any:
+    """Sines (2,) of the lowest and highest elevation of the points (P, 3) as seen from ``origin``."""
+    low, high = 1.0, -1.0
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+        length2 = x * x + y * y + z * z
+        if length2 >= NEAREST_M * NEAREST_M:
+            sine2 = z * abs(z) / length2
+            low, high = min(low, sine2), max(high, sine2)
+    ends = np.array([low, high])
+    return np.sign(ends) * np.sqrt(np.abs(ends))
 
 
 @compiled
@@ -348,10 +365,6 @@ def read_layer(rows: Any, columns: Any, layer: Any, out: Any) -> None:
 def _between(nodes: Any, step: int, out: Any) -> None:
     """Values (n,) between nodes ``step`` apart; the last ones lie on the last pixel."""
     n = out.shape[0]
-    if step == 1:
-        for i in range(n):
-            out[i] = nodes[i]
-        return
     for i in range(nodes.shape[0] - 1):
         first, last = i * step, min(i * step + step, n - 1)
         value, slope = nodes[i], (nodes[i + 1] - nodes[i]) / np.float32(max(last - first, 1))
@@ -367,6 +380,10 @@ def _between_rows(nodes: Any, step: int, y: int, h: int, around: Any, out: Any) 
     ``around`` (2, w + 1) holds the rows of nodes around it, odd ones second, and in its last column which is the upper.
     """
     j, w = y // step, out.shape[0]
+    if step == 1:
+        for x in range(w):
+            out[x] = nodes[y, x]
+        return
     if around[0, w] != j:
         if around[0, w] != j - 1:
             _between(nodes[j], step, around[j % 2, :w])

@@ -49,22 +49,29 @@ class Window(NamedTuple):
     columns: int
 
     @classmethod
-    def around(cls, directions: FloatArray, room: int = 0) -> Window:
-        """The smallest window that holds unit rays (n, 3), with room around it; all around where little is missing."""
+    def around(cls, directions: FloatArray, reach: tuple[int, int] = (-TURN, TURN)) -> Window:
+        """The smallest window that holds unit rays (n, 3), those in rows within ``reach`` if there are any."""
         if not len(directions):
             return cls(0, 0, 1, 1)
         x, y, z = directions.T
+        rows = np.arcsin(np.clip(z, -1, 1)) / CELL_RAD
+        low, high = max(math.floor(rows.min()), reach[0]), min(math.ceil(rows.max()), reach[1])
+        inside = (rows >= low) & (rows <= high)
+        if not inside.any():
+            return cls.around(directions)
+        x, y = x[inside], y[inside]
         middle = math.atan2(y.sum(), x.sum())
         azimuth = (np.arctan2(y, x) - middle + math.pi) % (2 * math.pi) - math.pi + middle
-        elevation = np.arcsin(np.clip(z, -1, 1))
-        row, column = (math.floor(a.min() / CELL_RAD) - room for a in (elevation, azimuth))
-        rows, columns = (
-            math.ceil(a.max() / CELL_RAD) + room - first for a, first in ((elevation, row), (azimuth, column))
-        )
-        row, top = max(row, -TURN // 4), min(row + rows, TURN // 4)
-        return (
-            cls(row, column, top - row, columns) if columns <= TURN - 2 * ROOM_CELLS else cls(row, 0, top - row, TURN)
-        )
+        column = math.floor(azimuth.min() / CELL_RAD)
+        return cls(low, column, high - low, math.ceil(azimuth.max() / CELL_RAD) - column)
+
+    @property
+    def roomy(self) -> Window:
+        """One with room for later questions around it; all around where little is missing."""
+        row, top = max(self.row - ROOM_CELLS, -TURN // 4), min(self.row + self.rows + ROOM_CELLS, TURN // 4)
+        columns = self.columns + 2 * ROOM_CELLS
+        place = (self.column - ROOM_CELLS, columns) if columns <= TURN - 2 * ROOM_CELLS else (0, TURN)
+        return Window(row, place[0], top - row, place[1])
 
     def holds(self, other: Window) -> bool:
         """Whether another window lies within this one."""
@@ -158,7 +165,7 @@ class PointCloudSurface(DenseSurface):
     street: StaticSurface
     points: Points
     objects: tuple[ScannedObject, ...] = ()
-    _panoramas: dict[bytes, list[Panorama]] = field(default_factory=dict, repr=False)
+    _panoramas: dict[bytes, tuple[tuple[int, int], list[Panorama]]] = field(default_factory=dict, repr=False)
     _shadows: dict[Camera, OcclusionMap] = field(default_factory=dict, repr=False)
     _nodes: dict[Camera, tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
 
@@ -237,17 +244,23 @@ class PointCloudSurface(DenseSurface):
             # A lens may have no rays somewhere; azimuths bend near the zenith, and jump in a panorama all around.
             steep = len(directions) == 0 or float(np.abs(directions[:, 2]).max()) > _STEEP
             if step > 1 and (steep or view.window.columns >= TURN or len(directions) < local[0].size):
-                step, (local, _) = 1, nodes_of(rays, 1, R)
+                step, local = 1, rays.planes if rays.planes.size else nodes_of(rays, 1, R)[0]
             self._nodes[camera] = view, *view.cells(local, R), step
         return self._nodes[camera]
 
     def view(self, origin: FloatArray, directions: FloatArray) -> Panorama:
         """The panorama around a centre that holds rays (..., 3)."""
-        directions = directions.reshape(-1, 3)
-        asked, held = Window.around(directions), self._panoramas.setdefault(origin.tobytes(), [])
+        from arbiview_aug.scene.completion import REACH_ROWS, elevations
+
+        if origin.tobytes() not in self._panoramas:
+            low, high = np.arcsin(elevations(self.points, origin)) / CELL_RAD
+            reach = math.floor(low) - REACH_ROWS, math.ceil(high) + REACH_ROWS
+            self._panoramas[origin.tobytes()] = reach, []
+        reach, held = self._panoramas[origin.tobytes()]
+        asked = Window.around(directions.reshape(-1, 3), reach)
         found = next((p for p in held if p.window.holds(asked)), None)
         if found is None:
-            found = Panorama(Window.around(directions, ROOM_CELLS), origin, self.points, self.street)
+            found = Panorama(asked.roomy, origin, self.points, self.street)
             held.append(found)
         return found
 

@@ -22,7 +22,7 @@ from arbiview_aug.scene.completion import (
     SUPPORT_CELLS,
 )
 from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, NEAREST_M, STEP, STEP_PER_M
-from arbiview_aug.scene.point_cloud import NODES_RAD, OWN_CAR_M, ROOM_CELLS, Window, nodes_of
+from arbiview_aug.scene.point_cloud import NODES_RAD, OWN_CAR_M, Window, nodes_of
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 from arbiview_aug.scene.torch_surface import static_image
 
@@ -188,7 +188,7 @@ def window_of(camera: Camera, maps: CameraMaps) -> Window:
     rays = maps.rays(camera)
     step = max(1, int(NODES_RAD * float(rays.parameters[0])))
     _, directions = nodes_of(rays, step, camera.cam2ego[:3, :3])
-    return Window.around(directions, ROOM_CELLS)
+    return Window.around(directions).roomy
 
 
 def upsampled(nodes: torch.Tensor, step: int, size: Sequence[int], ends: bool = False) -> torch.Tensor:
