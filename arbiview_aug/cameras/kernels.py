@@ -26,7 +26,7 @@ LENS_CODES = {"pinhole": 0, "radtan": 1, "fisheye": 2}
 _FOLD, _FIRST = 5, 6  # entries of ``camera_parameters``
 _ZERO, _ONE, _TWO, _THREE = np.float32(0), np.float32(1), np.float32(2), np.float32(3)
 _HALF = np.float32(0.5)
-_WIDEST = np.float32(2)  # distance of opposite unit vectors
+_NO_CONE = np.float32(-9)
 _CONE_ROOM = np.float32(1.05)
 _LEAST = np.float32(MIN_DEPTH)
 _TINY = np.float32(1e-30)
@@ -85,7 +85,8 @@ def rays_row(planes: Row, P: Row, y: int, x0: int, rx: Row, ry: Row, rz: Row) ->
 def cell_cones(planes: Row, P: Row, size: Row, step: int, cones: Row) -> None:
     """Cones (4, ny, nx) around the rays of square cells: the middle's ray, and how far any other's unit vector is off.
 
-    A cell whose middle or a corner has no ray, as at the border of a lens's image circle, gets the widest cone.
+    At the border of a lens's image circle, where pixels have no ray, it is around those there are. A cell without any
+    gets a negative width: nothing lies in its cone.
     """
     h, w = size
     _, ny, nx = cones.shape
@@ -105,7 +106,18 @@ def cell_cones(planes: Row, P: Row, size: Row, step: int, cones: Row) -> None:
                 a, b, c = lines[row, 0, column], lines[row, 1, column], lines[row, 2, column]
                 most = max(most, (a - x) * (a - x) + (b - y) * (b - y) + (c - z) * (c - z))
                 least = min(least, a * a + b * b + c * c)
-            spread = np.sqrt(most) * _CONE_ROOM if least > _HALF else _WIDEST
+            if least <= _HALF:
+                rays = planes[:, top : bottom + 1, left : right + 1]
+                x, y, z = rays[0].sum(), rays[1].sum(), rays[2].sum()
+                length, most = np.sqrt(x * x + y * y + z * z), _NO_CONE
+                if length > _ZERO:
+                    x, y, z = x / length, y / length, z / length
+                for row in range(rays.shape[1]):
+                    for column in range(rays.shape[2]):
+                        a, b, c = rays[0, row, column], rays[1, row, column], rays[2, row, column]
+                        if a * a + b * b + c * c > _HALF:
+                            most = max(most, (a - x) * (a - x) + (b - y) * (b - y) + (c - z) * (c - z))
+            spread = np.sqrt(most) * _CONE_ROOM if most >= _ZERO else _NO_CONE
             cones[0, j, i], cones[1, j, i], cones[2, j, i], cones[3, j, i] = x, y, z, spread
 
 

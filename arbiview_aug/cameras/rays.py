@@ -53,11 +53,11 @@ class PixelRays:
     @cached_property
     def cone(self) -> FloatArray:
         """(4,) middle of a cone around all rays, camera frame, and its half angle, radians."""
-        rays, spread = self.cones[:3].reshape(3, -1).astype(np.float64), self.cones[3].ravel()
-        middle = rays.sum(axis=1)
+        *rays, spread = self.cones[:, self.cones[3] >= 0].astype(np.float64)
+        middle = np.sum(rays, axis=1)
         middle /= max(float(np.linalg.norm(middle)), 1e-9)
         off_axis = np.arccos(np.clip(middle @ rays, -1, 1)) + 2 * np.arcsin(np.minimum(spread / 2, 1))
-        return np.array([*middle, off_axis.max()])
+        return np.array([*middle, off_axis.max(initial=0)])
 
     @property
     def nbytes(self) -> int:

@@ -14,6 +14,7 @@ from arbiview_aug import Rig, RigRetarget
 from arbiview_aug.cameras import lens as lens_module
 from arbiview_aug.cameras.camera import UNPROJECT_TOLERANCE_PX, Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray, Lens, LensName, RadTan
+from arbiview_aug.cameras.rays import CELL_PX, pixel_rays
 from arbiview_aug.errors import CalibrationError
 
 K = np.array([[410.0, 0.0, 318.0], [0.0, 405.0, 242.0], [0.0, 0.0, 1.0]])
@@ -168,6 +169,20 @@ def test_absurd_coefficients_stay_finite(lens: str, coefficient: float) -> None:
 def test_impossible_coefficients_are_refused(lens: str, coefficient: float) -> None:
     with pytest.raises(CalibrationError, match=r"distortion: expected finite numbers up to 1e\+06"):
         make("pinhole", lens=lens, distortion=(coefficient, 0.0, 0.0, 0.0))
+
+
+def test_cones_hold_the_rays_of_their_cells_and_are_narrow_at_the_border_of_the_image_circle() -> None:
+    lens = Camera(
+        name="lens", width_px=130, height_px=90, lens="fisheye", distortion=(0.0, 0.0, 0.0, 0.0),
+        K=np.array([[20.0, 0.0, 64.5], [0.0, 20.0, 44.5], [0.0, 0.0, 1.0]]), cam2ego=np.eye(4),
+    )  # fmt: skip
+    rays = pixel_rays(lens)
+    cones = rays.cones.repeat(CELL_PX, 1).repeat(CELL_PX, 2)[:, :90, :130]
+    valid = rays.planes.any(axis=0)
+    assert not valid.all() and (rays.cones[3] < 0).any()
+    off = np.linalg.norm(rays.planes - cones[:3], axis=0)
+    assert (off <= cones[3])[valid].all() and cones[3].max() < 0.5
+    assert (np.arccos(rays.cone[:3] @ rays.planes[:, valid]) <= rays.cone[3]).all()
 
 
 def test_names_of_the_type_are_those_of_the_table() -> None:
