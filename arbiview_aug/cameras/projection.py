@@ -52,8 +52,8 @@ def look_apart(one: Camera, two: Camera, nearest: float) -> bool:
 
     By the law of sines, the directions to a point at 1 / q from two centres differ by at most asin(baseline * q).
     """
-    sine = float(np.linalg.norm(one.center_m - two.center_m)) * nearest
+    sine = math.dist(one.center_m, two.center_m) * nearest
     if sine >= 1:
         return False
-    angle = math.acos(float(np.clip(one.cam2ego[:3, 2] @ two.cam2ego[:3, 2], -1, 1)))
+    angle = math.acos(min(max(float(one.cam2ego[:3, 2] @ two.cam2ego[:3, 2]), -1), 1))
     return angle > one.half_angle_rad + two.half_angle_rad + math.asin(sine) + 0.01

@@ -31,24 +31,30 @@ _AHEAD_COLUMNS, _MOST_AHEAD = 176, 32  # of a strip at a time; at most so many p
 def depth_range(q: Any, step: int, nearest: Any, farthest: Any) -> None:
     """Largest and smallest inverse distance (ny, nx) of each cell of an image (h, w)."""
     h, w = q.shape
-    nx = nearest.shape[1]
-    nearest[:] = _ZERO
-    farthest[:] = np.float32(1e9)
-    for y in range(h):
-        j = y // step
+    ny, nx = nearest.shape
+    high, low = np.empty(w, np.float32), np.empty(w, np.float32)
+    for j in range(ny):
+        high[:] = _ZERO
+        low[:] = np.float32(1e9)
+        for y in range(j * step, min(j * step + step, h)):
+            row = q[y]
+            for x in range(w):
+                high[x] = max(high[x], row[x])
+            for x in range(w):
+                low[x] = min(low[x], row[x])
         for i in range(nx):
-            high, low = nearest[j, i], farthest[j, i]
+            most, least = high[i * step], low[i * step]
             for x in range(i * step, min(i * step + step, w)):
-                value = q[y, x]
-                high, low = max(high, value), min(low, value)
-            nearest[j, i], farthest[j, i] = high, low
+                most, least = max(most, high[x]), min(least, low[x])
+            nearest[j, i], farthest[j, i] = most, least
 
 
 @compiled
 def cells_in_view(
-    rays: Any, nearest: Any, farthest: Any, A: Any, o: Any, kind: int, P: Any, size: Any, cone_rad: float, use: Any
-) -> None:
-    """Which cells of a target a source may see.
+    rays: Any, nearest: Any, farthest: Any, A: Any, o: Any, kind: int, P: Any, size: Any, cone_rad: float, open: Any,
+    columns: Any,
+) -> bool:  # fmt: skip
+    """Find the cells of a target that a source may see; return whether there is any.
 
     A cell is left out where its eight corners, the nodes' rays at its least and largest distance, all lie beyond one
     side of the source's image, read off homogeneous coordinates for a pinhole; for a lens, also outside its cone.
@@ -63,9 +69,11 @@ def cells_in_view(
         P: Its parameters.
         size: (2,) float32 its height and width.
         cone_rad: Angle off its axis beyond which it sees nothing.
-        use: (ny, nx) bool, written.
+        open: (ny, nx) bool, cells that it may change.
+        columns: (ny, 2) int64, written: first and last (exclusive) such cell of each row.
     """
-    ny, nx = use.shape
+    ny, nx = open.shape
+    found = False
     right, bottom = size[1] - _ONE + _BORDER_PX, size[0] - _ONE + _BORDER_PX
     work, common = np.empty((12, nx), np.float32), np.empty(nx, np.int32)
     x, y, z, u, v, a, b = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
@@ -104,30 +112,41 @@ def cells_in_view(
                 first_x[:], first_y[:], first_z[:] = x / a, y / a, z / a
             for i in range(nx):
                 together[i] = min(together[i], (first_x[i] * x[i] + first_y[i] * y[i] + first_z[i] * z[i]) / a[i])
+        columns[j, 0] = columns[j, 1] = 0
         for i in range(nx):
-            use[j, i] = common[i] == 0
-            if kind != 0 and use[j, i]:
-                use[j, i] = np.arccos(min(forward[i], _ONE)) <= cone_rad + np.arccos(max(together[i], -_ONE))
+            use = open[j, i] and common[i] == 0
+            if use and kind != 0:
+                use = np.arccos(min(forward[i], _ONE)) <= cone_rad + np.arccos(max(together[i], -_ONE))
+            if use:
+                columns[j, 0] = columns[j, 0] if columns[j, 1] else i
+                columns[j, 1] = i + 1
+                found = True
+    return found
 
 
 @compiled
 def measure_nodes(
-    u: Any, v: Any, y: Any, x: Any, size: Any, to_mask: Any, cell_px: int, directions: Any, offset_m: Any,
-    uncertainty: Any, resolution: Any, edge_px: Any, parallax_rad: Any,
+    rays: Any, q: Any, A: Any, o: Any, kind: int, P: Any, y: Any, x: Any, size: Any, to_mask: Any, cell_px: int,
+    offset_m: Any, uncertainty: Any, u: Any, v: Any, resolution: Any, edge_px: Any, parallax_rad: Any,
 ) -> None:  # fmt: skip
     """What weights depend on, at the nodes of a target.
 
     Args:
-        u: (ny, nx) float32 columns in the source.
-        v: (ny, nx) its rows.
+        rays: (3, ny, nx) of the nodes.
+        q: (ny, nx) inverse distances along them.
+        A: (3, 3) target to source.
+        o: (3,) the target's centre in the source's frame.
+        kind: The source's lens.
+        P: Its parameters.
         y: (ny,) the nodes' rows in the target.
         x: (nx,) their columns.
         size: (h, w) of the source.
         to_mask: (H, W) distance of each cell of the source to its mask, pixels; (0, 0) without one.
         cell_px: Side of those cells.
-        directions: (3, ny, nx) the nodes' rays, ego frame.
-        offset_m: (3,) the target's centre minus the source's.
+        offset_m: (3,) float64 the target's centre minus the source's, target's frame.
         uncertainty: (ny, nx) expected error of the inverse distance, 1/m.
+        u: (ny, nx) float32 columns in the source: given for lenses that kernels do not know, else written.
+        v: (ny, nx) its rows.
         resolution: (ny, nx) float64, written: source pixels per target pixel along the worse axis, which is the smaller
             singular value of the Jacobian.
         edge_px: (ny, nx) float64, written: ``rays.edge_distance``.
@@ -135,6 +154,11 @@ def measure_nodes(
             uncertainty.
     """
     ny, nx = u.shape
+    if kind >= 0:
+        work = np.empty((5, nx), np.float32)
+        for j in range(ny):
+            turn_row(rays[0, j], rays[1, j], rays[2, j], q[j], A, o, work[0], work[1], work[2])
+            project_row(work[0], work[1], work[2], kind, P, work[3], work[4], u[j], v[j])
     # The last nodes may coincide: their difference says nothing.
     last_y = max(ny - 2 - (ny > 2 and y[ny - 1] == y[ny - 2]), 0)
     last_x = max(nx - 2 - (nx > 2 and x[nx - 1] == x[nx - 2]), 0)
@@ -152,11 +176,7 @@ def measure_nodes(
             resolution[j, i] = np.sqrt(max(half_sum - root, 0.0))
         edge_distance_row(u[j], v[j], size, to_mask, cell_px, edge_px[j])
         for i in range(nx):
-            along = (
-                directions[0, j, i] * offset_m[0]
-                + directions[1, j, i] * offset_m[1]
-                + directions[2, j, i] * offset_m[2]
-            )
+            along = rays[0, j, i] * offset_m[0] + rays[1, j, i] * offset_m[1] + rays[2, j, i] * offset_m[2]
             parallax_rad[j, i] = np.sqrt(max(length2 - along * along, 0.0)) * uncertainty[j, i]
 
 
@@ -290,7 +310,8 @@ def _evaluate_row(
 @compiled
 def put_source(
     planes: Any, target: Any, q: Any, face: Any, source: Any, slot: Any, weight: Any, step: int, columns: Any,
-    best: Any, winner: Any, xy: Any, frac: Any, in_image: Any,
+    shared: Any, best: Any, winner: Any, xy: Any, frac: Any, in_image: Any,
+    next_best: Any, second: Any, next_xy: Any, next_frac: Any,
 ) -> None:  # fmt: skip
     """Let a source win the pixels that it sees with more weight than the best so far.
 
@@ -304,11 +325,16 @@ def put_source(
         weight: (ny + 1, nx + 1) its weight on the nodes.
         step: Side of a cell, pixels.
         columns: (ny, 2) first and last (exclusive) cell of each row of cells that it may see.
-        best: (h, w) float32 largest weight so far, below 0 where there is none; updated, as are the next four.
+        shared: (ny, nx) bool, cells in which the second-best source is kept.
+        best: (h, w) float32 largest weight so far, below 0 where there is none; updated, as are all that follow.
         winner: (h, w) int8.
         xy: (h, w) int32, two int16: whole pixels in the source.
         frac: (h, w) uint16, 32nds of a pixel.
         in_image: (h, w) uint8, 255 where some source's image contains the pixel.
+        next_best: (h, w) float32 weight of the second-best source in these cells, as ``clear_shared`` leaves it.
+        second: (h, w) int8 whose that is.
+        next_xy: (h, w) int32 where it is read.
+        next_frac: (h, w) uint16.
     """
     h, w = best.shape
     work, share = np.empty((_WORK_ROWS, w), np.float32), np.empty(w, np.float32)
@@ -331,6 +357,19 @@ def put_source(
             fu[i] = _fixed(u[i])
         for i in range(n):
             fv[i] = _fixed(v[i])
+        for i in range(columns[j, 0], columns[j, 1]):
+            if not shared[j, i]:
+                continue
+            for x in range(i * step, min(i * step + step, w)):
+                k = x - x0
+                if share[k] > best[y, x]:
+                    if best[y, x] > _ZERO:
+                        next_best[y, x], second[y, x] = best[y, x], winner[y, x]
+                        next_xy[y, x], next_frac[y, x] = xy[y, x], frac[y, x]
+                elif share[k] > next_best[y, x]:
+                    next_best[y, x], second[y, x] = share[k], me
+                    next_xy[y, x] = (((fv[k] >> 5) + top) << 16) | (((fu[k] >> 5) + left) & 0xFFFF)
+                    next_frac[y, x] = ((fv[k] & 31) << 5) | (fu[k] & 31)
         held, where, part, mine, image = (
             best[y, x0:x1],
             xy[y, x0:x1],
@@ -353,113 +392,84 @@ def put_source(
 
 
 @compiled
-def put_second(
-    planes: Any, target: Any, q: Any, face: Any, source: Any, slot: Any, weight: Any, step: int, columns: Any,
-    winner: Any, weights: Any, second: Any, xy: Any, frac: Any, shared: Any,
-) -> None:  # fmt: skip
-    """As ``put_source``, for the second-best source of pixels in cells that several have weight in.
-
-    Args: as there up to ``columns``, and
-        winner: (h, w) int8.
-        weights: (2, h, w) float32 weight of the winner, and the largest of all others; updated.
-        second: (h, w) int8 whose that is; updated.
-        xy: (h, w) int32 where it is read; updated.
-        frac: (h, w) uint16; updated.
-        shared: (ny, nx) bool, the cells.
-    """
-    h, w = winner.shape
-    work, share = np.empty((_WORK_ROWS, w), np.float32), np.empty(w, np.float32)
-    inside, seen = np.empty(w, np.int32), np.empty(w, np.int32)
-    number, left, top = slot
-    row = np.empty(weight.shape[1], np.float32)
-    for y in range(h):
-        j = y // step
-        i = columns[j, 0]
-        while i < columns[j, 1]:
-            if not shared[j, i]:
-                i += 1
-                continue
-            first = i
-            while i < columns[j, 1] and shared[j, i]:
-                i += 1
-            x0, x1 = first * step, min(i * step, w)
-            n = x1 - x0
-            _evaluate_row(planes, target, q, face, source, y, x0, n, work, inside[:n], seen[:n])
-            u, v = work[0, :n], work[1, :n]
-            upsampled_row(weight, step, y, x0, row, share[:n])
-            for k in range(n):
-                if not seen[k]:
-                    continue
-                x = x0 + k
-                if winner[y, x] == number:
-                    weights[0, y, x] = share[k]
-                elif share[k] > weights[1, y, x]:
-                    weights[1, y, x] = share[k]
-                    second[y, x] = number
-                    fu, fv = _fixed(u[k]), _fixed(v[k])
-                    xy[y, x] = (((fv >> 5) + top) << 16) | (((fu >> 5) + left) & 0xFFFF)
-                    frac[y, x] = ((fv & 31) << 5) | (fu & 31)
-
-
-@compiled
-def start_bands(shared: Any, step: int, weights: Any, second: Any) -> None:
-    """Clear what ``put_second`` updates, within cells that several sources have weight in."""
+def clear_shared(shared: Any, step: int, next_best: Any, second: Any) -> None:
+    """Clear the weights (h, w) of second-best sources (h, w) in shared cells (ny, nx) before ``put_source``."""
     h, w = second.shape
     for y in range(h):
         for i in range(shared.shape[1]):
             if shared[y // step, i]:
                 for x in range(i * step, min(i * step + step, w)):
-                    weights[0, y, x] = _ZERO
-                    weights[1, y, x] = _ZERO
-                    second[y, x] = -1
+                    next_best[y, x], second[y, x] = _ZERO, -1
 
 
 @compiled
-def band_rows(shared: Any, step: int, strip: int, weights: Any, second: Any, least: float, rows: Any) -> None:
-    """Turn weights of second sources into shares, and find the rows that each adds to.
+def find_bands(
+    shared: Any, step: int, strip: int, best: Any, share: Any, second: Any, least: float, sources: Any, bands: Any
+) -> int:
+    """Turn weights of second-best sources into shares, and find the rectangles that each adds to; return their number.
 
     Args:
-        shared: (ny, nx) bool cells as in ``put_second``.
+        shared: (ny, nx) bool cells as in ``put_source``.
         step: Side of a cell, pixels.
-        strip: Height of a strip, pixels.
-        weights: (2, h, w) as ``put_second`` leaves them; the second becomes a share, 0 below ``least``.
-        second: (h, w) int8 source.
+        strip: Height of a strip, pixels: slanted seams make narrow rectangles.
+        best: (h, w) weight of the winner.
+        share: (h, w) that of the second-best source; becomes its share, 0 below ``least``.
+        second: (h, w) int8 whose that is.
         least: Smallest share that counts.
-        rows: (sources, strips, nx, 2) int64 first and last (exclusive) row of each source in each column of cells of a
-            strip; (h, 0) where it adds nothing.
+        sources: (S,) sources in content order.
+        bands: (n, 5) int64, written: source, first and last (exclusive) row, first and last (exclusive) column.
     """
-    h, w = second.shape
-    rows[..., 0] = h
-    rows[..., 1] = 0
+    (h, w), nx = second.shape, shared.shape[1]
+    rows = np.empty((128, (h + strip - 1) // strip, nx, 2), np.int32)  # first and last of each column of cells
+    for k in sources:
+        rows[k, ..., 0] = h
+        rows[k, ..., 1] = 0
     for y in range(h):
-        for i in range(shared.shape[1]):
+        for i in range(nx):
             if not shared[y // step, i]:
                 continue
             for x in range(i * step, min(i * step + step, w)):
                 k = second[y, x]
-                if k < 0:
-                    weights[1, y, x] = _ZERO
+                part = share[y, x] / max(best[y, x] + share[y, x], _TINY)
+                share[y, x] = part if k >= 0 and part >= least else _ZERO
+                if share[y, x] > _ZERO:
+                    ends = rows[k, y // strip, i]
+                    ends[0], ends[1] = min(ends[0], y), max(ends[1], y + 1)
+    count = 0
+    for k in sources:
+        for s in range(rows.shape[1]):
+            for i in range(nx):
+                y0, y1 = rows[k, s, i, 0], rows[k, s, i, 1]
+                if y1 == 0:
                     continue
-                share = weights[1, y, x] / max(weights[0, y, x] + weights[1, y, x], _TINY)
-                weights[1, y, x] = share if share >= least else _ZERO
-                if share >= least:
-                    part = rows[k, y // strip, i]
-                    part[0], part[1] = min(part[0], y), max(part[1], y + 1)
+                band = bands[count - 1]
+                if count and band[0] == k and band[1] // strip == s and band[4] == i * step:
+                    band[1], band[2], band[4] = min(band[1], y0), max(band[2], y1), min((i + 1) * step, w)
+                else:
+                    band = bands[count]
+                    band[0], band[1], band[2], band[3], band[4] = k, y0, y1, i * step, min((i + 1) * step, w)
+                    count += 1
+    return count
 
 
 @compiled
-def cut_band(
-    y0: int, x0: int, source: int, shared: Any, step: int, share: Any, second: Any, xy: Any, frac: Any,
+def cut_bands(
+    bands: Any, shared: Any, step: int, share: Any, second: Any, xy: Any, frac: Any,
     band_xy: Any, band_frac: Any, weight: Any,
 ) -> None:  # fmt: skip
-    """Copy one source's positions and shares from row ``y0`` and column ``x0`` on; others read nothing, weight 0."""
-    for y in range(weight.shape[0]):
-        for x in range(weight.shape[1]):
-            adds = shared[(y0 + y) // step, (x0 + x) // step] and second[y0 + y, x0 + x] == source
-            adds = adds and share[y0 + y, x0 + x] > _ZERO
-            band_xy[y, x] = xy[y0 + y, x0 + x] if adds else _OUTSIDE
-            band_frac[y, x] = frac[y0 + y, x0 + x] if adds else 0
-            weight[y, x] = share[y0 + y, x0 + x] if adds else _ZERO
+    """Copy the positions and shares in rectangles (n, 5), one after the other; others than its source's read nothing.
+
+    ``band_xy``, ``band_frac`` and ``weight`` (all their pixels,) are written; the others are as in ``find_bands``.
+    """
+    at = 0
+    for k in range(bands.shape[0]):
+        for y in range(bands[k, 1], bands[k, 2]):
+            for x in range(bands[k, 3], bands[k, 4]):
+                adds = shared[y // step, x // step] and second[y, x] == bands[k, 0] and share[y, x] > _ZERO
+                band_xy[at] = xy[y, x] if adds else _OUTSIDE
+                band_frac[at] = frac[y, x] if adds else 0
+                weight[at] = share[y, x] if adds else _ZERO
+                at += 1
 
 
 @compiled
@@ -472,6 +482,33 @@ def seen_image(planes: Any, target: Any, q: Any, face: Any, source: Any, visible
         _evaluate_row(planes, target, q, face, source, y, np.int64(0), w, work, inside, seen)
         for x in range(w):
             visible[y, x] = seen[x] != 0
+
+
+@compiled
+def count_winners(winner: Any, in_image: Any, won_px: Any, occluded: Any) -> bool:
+    """Count the pixels that each source wins, and find those that lie in an image but are seen by none.
+
+    Args:
+        winner: (h, w) int8 source, -1 for none.
+        in_image: (h, w) uint8, as in ``put_source``.
+        won_px: (S,) int64, written.
+        occluded: (h, w) bool, written; whether there is any is returned.
+    """
+    h, w = winner.shape
+    won_px[:] = 0
+    found = np.uint8(0)
+    for y in range(h):
+        row, out = winner[y], occluded[y].view(np.uint8)
+        for k in range(won_px.shape[0]):
+            count = np.int32(0)
+            for x in range(w):
+                count += np.int32(row[x] == np.int8(k))
+            won_px[k] += count
+        for x in range(w):
+            out[x] = np.uint8((row[x] < 0) & (in_image[y, x] > 0))
+        for x in range(w):
+            found |= out[x]
+    return bool(found > 0)
 
 
 @compiled

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import product
 from typing import Any
 
 import cv2
@@ -16,7 +15,7 @@ from arbiview_aug.render.view_plan import BlendRegion
 
 Nodes = npt.NDArray[np.float32]
 
-_STRIP_PX = 128  # slanted seams make narrow rectangles
+_STRIP_PX = 128
 LEAST_SHARE = 1 / 256  # a source that adds less than this to a pixel cannot change a grey level
 
 
@@ -48,46 +47,53 @@ def seam_weights(scores: Sequence[Nodes], border_px: Sequence[Nodes], radius: in
     return weights
 
 
-def blend_regions(
-    contributions: Sequence[tuple[Any, ...]], winner: npt.NDArray[np.int8], memory: Memory
-) -> Iterator[BlendRegion]:
-    """Rectangles around the pixels that a second source adds to.
+class SecondBest:
+    """Second-best sources of a view's pixels in cells that several sources have weight in.
 
     Args:
-        contributions: The first nine arguments of ``kernels.put_source`` for each source, in content order.
-        winner: (h, w) index of the winning source.
+        weights: (ny + 1, nx + 1) of each source on the nodes.
+        step: Side of a cell, pixels.
+        size: (h, w) of the view.
         memory: Memory of images.
-    """
-    from arbiview_aug.render.kernels import band_rows, cut_band, put_second, start_bands
 
-    if len(contributions) < 2:
-        return
-    sources, step = [place[0] for *_, place, _weight, _step, _columns in contributions], contributions[0][7]
-    shared: Any = 0
-    for *_, weight, _step, _columns in contributions:
-        some = weight > 0
-        shared = shared + (some[1:, 1:] | some[1:, :-1] | some[:-1, 1:] | some[:-1, :-1]).view(np.uint8)
-    several = shared > 1
-    if not several.any():
-        return
-    h, w = winner.shape
-    both, second = memory.empty((2, h, w), np.float32), memory.empty((h, w), np.int8)
-    xy, frac = memory.empty((h, w), np.int32), memory.empty((h, w), np.uint16)
-    start_bands(several, step, both, second)
-    for contribution in contributions:
-        put_second(*contribution, winner, both, second, xy, frac, several)
-    rows = np.empty((max(sources) + 1, -(-h // _STRIP_PX), several.shape[1], 2), np.int64)
-    band_rows(several, step, _STRIP_PX, both, second, LEAST_SHARE, rows)
-    # In content order: rectangles overlap, and blending rounds.
-    for source, strip in product(sources, range(rows.shape[1])):
-        first, last = rows[source, strip].T
-        if not last.any():
-            continue
-        columns = np.flatnonzero(last)
-        for run in np.split(columns, np.flatnonzero(np.diff(columns) > 1) + 1):
-            y0, y1 = int(first[run].min()), int(last[run].max())
-            x0, x1 = int(run[0]) * step, min((int(run[-1]) + 1) * step, w)
-            at = FixedMap(np.empty((y1 - y0, x1 - x0, 2), np.int16), np.empty((y1 - y0, x1 - x0), np.uint16))
-            weight = np.empty((y1 - y0, x1 - x0), np.float32)
-            cut_band(y0, x0, source, several, step, both[1], second, xy, frac, at.packed, at.frac, weight)
-            yield BlendRegion(y0, x0, source, at, weight)
+    Attributes:
+        shared: (ny, nx) bool, those cells.
+        images: The last four arguments of ``kernels.put_source``, which updates them; (0, 0) without such cells.
+    """
+
+    def __init__(self, weights: Sequence[Nodes], step: int, size: tuple[int, int], memory: Memory) -> None:
+        from arbiview_aug.render.kernels import clear_shared
+
+        count = np.zeros([-(-n // step) for n in size], np.uint8)
+        for weight in weights:
+            some = weight > 0
+            count += some[1:, 1:] | some[1:, :-1] | some[:-1, 1:] | some[:-1, :-1]
+        self.shared, self._step = count > 1, step
+        size = size if self.shared.any() else (0, 0)
+        types = np.float32, np.int8, np.int32, np.uint16
+        self.images = tuple(memory.empty(size, kind) for kind in types)
+        clear_shared(self.shared, step, *self.images[:2])
+
+    def blend_regions(self, sources: Sequence[int], best: npt.NDArray[np.float32]) -> Iterator[BlendRegion]:
+        """Rectangles around the pixels that a second source adds to.
+
+        Args:
+            sources: All, in content order: rectangles overlap, and blending rounds.
+            best: (h, w) weight of the winning source.
+        """
+        from arbiview_aug.render.kernels import cut_bands, find_bands
+
+        share, second, *where = self.images
+        if not share.size:
+            return
+        bands = np.empty((len(sources) * -(-len(share) // _STRIP_PX) * self.shared.shape[1], 5), np.int64)
+        order = np.array(sources)
+        cells = self.shared, self._step
+        bands = bands[: find_bands(*cells, _STRIP_PX, best, share, second, LEAST_SHARE, order, bands)]
+        size = np.stack([bands[:, 2] - bands[:, 1], bands[:, 4] - bands[:, 3]], -1)
+        ends = [0, *np.cumsum(size.prod(axis=1)).tolist()]
+        xy, frac, weight = (np.empty(ends[-1], kind) for kind in (np.int32, np.uint16, np.float32))
+        cut_bands(bands, *cells, share, second, *where, xy, frac, weight)
+        for (source, y0, _, x0, _), (h, w), a, b in zip(bands.tolist(), size.tolist(), ends, ends[1:], strict=False):
+            at = FixedMap(xy[a:b].view(np.int16).reshape(h, w, 2), frac[a:b].reshape(h, w))
+            yield BlendRegion(y0, x0, source, at, weight[a:b].reshape(h, w))

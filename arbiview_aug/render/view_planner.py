@@ -24,7 +24,7 @@ from arbiview_aug.image_ops import at_level, level_size
 from arbiview_aug.render.atlas import AtlasLayout, FixedMap
 from arbiview_aug.render.confidence import certainty
 from arbiview_aug.render.requirements import SAME_CENTER_M
-from arbiview_aug.render.seams import blend_regions, seam_weights
+from arbiview_aug.render.seams import SecondBest, seam_weights
 from arbiview_aug.render.view_plan import BilinearFallback, SourceUse, ViewPlan
 from arbiview_aug.scene.point_cloud import occlusion_level
 from arbiview_aug.scene.scene import SURFACES
@@ -48,6 +48,8 @@ class _Geometry:
     Attributes:
         q: (h, w) float32 inverse distances along the pixels' rays, 1/m.
         face: (h, w) int32 faces of solids in front of the background, -1 elsewhere; (0, 0) without any.
+        on_nodes: (ny + 1, nx + 1) ``q`` on the nodes.
+        face_on_nodes: (ny + 1, nx + 1) ``face`` there.
         behind: (ny + 1, nx + 1) float32 inverse distances of the background on the nodes.
         nearest: (ny, nx) float32 largest inverse distance in each cell.
         farthest: (ny, nx) float32 least inverse distance in each cell.
@@ -56,6 +58,8 @@ class _Geometry:
 
     q: npt.NDArray[np.float32]
     face: npt.NDArray[np.int32]
+    on_nodes: npt.NDArray[np.float32]
+    face_on_nodes: npt.NDArray[np.int32]
     behind: npt.NDArray[np.float32]
     nearest: npt.NDArray[np.float32]
     farthest: npt.NDArray[np.float32]
@@ -108,14 +112,10 @@ class ViewPlanner:
         coarse = min(camera.size) >= SMALL_SIDE_PX
         coarse &= is_within_wall(camera.center_m) or not SURFACES[surface].has_wall
         self.step = config.grid_step_px if coarse else 1
-        corners = tuple(np.minimum(np.arange(0, n + self.step, self.step), n - 1) for n in camera.size)
-        self.corner_rays = self.rays.at(*corners)
-        # The outermost nodes lie half a cell inside: a magnified source does not see the outermost pixels.
-        inset = self.step // 2
-        self.nodes = tuple(c.clip(inset, n - 1 - inset) for c, n in zip(corners, camera.size, strict=True))
-        self.node_rays = self.rays.at(*self.nodes)
+        self.nodes = maps.nodes(camera, self.step)
         self._geometries: dict[str, _Geometry] = {}
-        self._open = np.ones(tuple(len(n) - 1 for n in self.nodes), bool)  # cells that sources elsewhere may change
+        # Cells that sources elsewhere may change.
+        self._open = np.ones(tuple(n - 1 for n in self.nodes.at_nodes.shape[1:]), bool)
         exact = {k: self._region(k) for k in order if self._baseline_m(k) < SAME_CENTER_M}
         for one in filter(None, exact.values()):
             self._open = self._open & self._around_unseen(one)
@@ -125,7 +125,7 @@ class ViewPlanner:
 
     # --- what a source sees -------------------------------------------------------------------------------------------
     def _baseline_m(self, index: int) -> float:
-        return float(np.linalg.norm(self.camera.center_m - self.source[index].center_m))
+        return math.dist(self.camera.center_m, self.source[index].center_m)
 
     def _choose_surface(self, baseline_m: float, focal_px: float) -> tuple[str, str]:
         if baseline_m < SAME_CENTER_M:
@@ -161,8 +161,8 @@ class ViewPlanner:
     @cached_property
     def _directions(self) -> FloatArray:
         """Rays of the nodes in the ego frame, float64."""
-        rays = self.node_rays.astype(np.float64).reshape(3, -1)
-        return np.moveaxis((self.camera.cam2ego[:3, :3] @ rays).reshape(self.node_rays.shape), 0, -1)
+        rays = self.nodes.at_nodes.astype(np.float64)
+        return np.moveaxis((self.camera.cam2ego[:3, :3] @ rays.reshape(3, -1)).reshape(rays.shape), 0, -1)
 
     def _geometry(self, name: str) -> _Geometry:
         if name in self._geometries:
@@ -187,8 +187,7 @@ class ViewPlanner:
 
         q = widened(surface.background.image(camera, rays, memory), 0)
         self.counters["dense_pixels"] += (y1 - y0) * (x1 - x0) if surface.background.is_dense else 0
-        at_nodes = np.ix_(*self.nodes)
-        behind = q[at_nodes]
+        behind = q[self.nodes.places]
         face = np.zeros((0, 0), np.int32)
         if surface.is_layered:
             solid, face = (widened(*one) for one in zip(surface.drawn(camera, rays, memory), (0, -1), strict=True))
@@ -197,18 +196,18 @@ class ViewPlanner:
             solid_px = int(np.count_nonzero(shown))
             self.counters["solid_pixels"] += solid_px
             face = face if solid_px else np.zeros((0, 0), np.int32)
-        uncertainty = surface.uncertainty(center, self._directions, q[at_nodes])
+        at_nodes = q[self.nodes.places], face[self.nodes.places] if face.size else face
+        uncertainty = surface.uncertainty(center, self._directions, at_nodes[0])
         nearest, farthest = np.empty((2, *self._open.shape), np.float32)
         depth_range(q, self.step, nearest, farthest)
-        self._geometries[name] = _Geometry(q, face, behind, nearest, farthest, uncertainty)
+        self._geometries[name] = _Geometry(q, face, *at_nodes, behind, nearest, farthest, uncertainty)
         return self._geometries[name]
 
     def _region(self, index: int) -> _Region | None:
         from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES, camera_parameters
         from arbiview_aug.render.kernels import cells_in_view, measure_nodes, seen_image
 
-        source = self.source[index]
-        offset_m = self.camera.center_m - source.center_m
+        source, nodes = self.source[index], self.nodes
         baseline_m, focal_px = self._baseline_m(index), float(self.camera.K[0, 0])
         name, reason = self._choose_surface(baseline_m, focal_px)
         if not self._open.any():
@@ -218,36 +217,34 @@ class ViewPlanner:
             return None
         A, o = relative_pose(self.camera, source)
         kind, P = LENS_CODES.get(source.lens, -1), camera_parameters(source)
-        use = self._open.copy()
         if kind >= 0:
-            size = np.array(source.size, np.float32)
-            cells_in_view(
-                self.corner_rays, geometry.nearest, geometry.farthest, A, o, kind, P, size, source.cone_rad, use
-            )
-            use &= self._open
-        if not use.any():
-            return None
-        u, v, _ = source_pixels(self.camera, self.node_rays, geometry.behind, source)
-        valid = np.abs(u) < 0.9 * FAR_AWAY_PX
+            columns, size = np.empty((len(self._open), 2), np.int64), np.array(source.size, np.float32)
+            if not cells_in_view(
+                nodes.at_corners, geometry.nearest, geometry.farthest, A, o, kind, P, size, source.cone_rad, self._open,
+                columns,
+            ):  # fmt: skip
+                return None
+            u, v = np.empty((2, *geometry.behind.shape), np.float32)
+        else:
+            columns = _spans(self._open)
+            u, v, _ = source_pixels(self.camera, nodes.at_nodes, geometry.behind, source)
         resolution, edge_px, parallax_rad = np.empty((3, *u.shape))
+        offset_m = (self.camera.center_m - source.center_m) @ self.camera.cam2ego[:3, :3]
         measure_nodes(
-            u, v, *self.nodes, source.size, self.maps.to_mask(source), CELL_PX, np.moveaxis(self._directions, -1, 0),
-            offset_m, geometry.uncertainty, resolution, edge_px, parallax_rad,
+            nodes.at_nodes, geometry.behind, A, o, kind, P, *(n.ravel() for n in nodes.places), source.size,
+            self.maps.to_mask(source), CELL_PX, offset_m, geometry.uncertainty, u, v, resolution, edge_px, parallax_rad,
         )  # fmt: skip
         if min(self.camera.size) < 2:
             resolution[:] = 1
         parallax = focal_px * parallax_rad
-        seen = valid & (edge_px > 0)
+        seen = edge_px > 0  # pixels that it cannot project lie far outside
         most = np.sort(resolution[seen][::4])
         level = halvings(most[len(most) // 5], source.size) if self.config.antialias and len(most) else 0
         kernel = self._kernel(source, level, surface, geometry, A, o)
         visible = np.zeros(seen.shape, bool)
-        at_nodes = np.ix_(*self.nodes)
-        face = geometry.face[at_nodes] if geometry.face.size else geometry.face
-        given = np.ascontiguousarray(
-            kernel[-1][:, self.nodes[0][:, None], self.nodes[1][None]] if kind < 0 else kernel[-1]
-        )
-        seen_image(self.node_rays, self.rays.parameters, geometry.q[at_nodes], face, (*kernel[:-1], given), visible)
+        given = np.ascontiguousarray(kernel[-1][(slice(None), *nodes.places)]) if kind < 0 else kernel[-1]
+        on_nodes = nodes.at_nodes, self.rays.parameters, geometry.on_nodes, geometry.face_on_nodes
+        seen_image(*on_nodes, (*kernel[:-1], given), visible)
         self.counters[f"pairs_{name}"] += 1
         score = (
             distance_weight(edge_px, min(source.size) / 2, self.config.distance_gamma)
@@ -262,13 +259,13 @@ class ViewPlanner:
             reason=reason,
             baseline_m=baseline_m,
             geometry=geometry,
-            columns=_spans(use),
+            columns=columns,
             kernel=kernel,
-            score=np.where(visible & (edge_px > 0), score, 0).astype(np.float32),
+            score=np.where(visible & seen, score, 0).astype(np.float32),
             parallax=parallax.astype(np.float32),
             border_px=(edge_px / np.maximum(resolution, 1e-3)).astype(np.float32),
             fineness=float(most[len(most) // 2]) / 2**level if len(most) else 1.0,
-            certainty=None if certain is None else _filled(certain, valid),
+            certainty=None if certain is None else _filled(certain, np.abs(u) < 0.9 * FAR_AWAY_PX),
         )
 
     def _kernel(self, source: Camera, level: int, surface: Any, geometry: _Geometry, A: Any, o: Any) -> tuple[Any, ...]:
@@ -309,7 +306,7 @@ class ViewPlanner:
     # --- who wins -----------------------------------------------------------------------------------------------------
     def finish(self, layout: AtlasLayout) -> ViewPlan:
         """Winners, maps into the atlas, and blended bands."""
-        from arbiview_aug.render.kernels import put_source, upsample_where
+        from arbiview_aug.render.kernels import count_winners, put_source, upsample_where
 
         size, memory = self.camera.size, self.maps.memory
         fixed = FixedMap.outside(size, memory)
@@ -317,16 +314,19 @@ class ViewPlanner:
         best = memory.full(size, -1, np.float32)  # a source that sees a pixel beats none, even with a weight of 0
         scores, borders = [region.score for region in self.regions], [region.border_px for region in self.regions]
         weights = seam_weights(scores, borders, self._seam_radius, self.config.seam_width * self.camera.width_px)
-        contributions = []
+        seconds = SecondBest(weights if self.config.seam_width else (), self.step, size, memory)
         for region, weight in zip(self.regions, weights, strict=True):
             slot = layout.slot(region.source, region.level)
             self.counters["cells"] += int((region.columns[:, 1] - region.columns[:, 0]).sum())
             place = region.source, slot.x, slot.y
-            contributions.append((*self._target(region), region.kernel, place, weight, self.step, region.columns))
-            put_source(*contributions[-1], best, winner, fixed.packed, fixed.frac, in_image)
-        count: Any = cv2.calcHist([winner.view(np.uint8)], [0], None, [256], [0, 256]).ravel()
+            put_source(
+                *self._target(region), region.kernel, place, weight, self.step, region.columns,
+                seconds.shared, best, winner, fixed.packed, fixed.frac, in_image, *seconds.images,
+            )  # fmt: skip
+        count, occluded = np.empty(len(self.source), np.int64), memory.empty(size, bool)
+        is_occluded = count_winners(winner, in_image, count, occluded)
         won_px = Counter({region.source: int(count[region.source]) for region in self.regions})
-        bands = tuple(blend_regions(contributions, winner, memory)) if self.config.seam_width else ()
+        bands = tuple(seconds.blend_regions([region.source for region in self.regions], best))
         certain = None
         if self.config.certainty:
             certain = memory.full(size, 0, np.uint8)
@@ -337,10 +337,7 @@ class ViewPlanner:
             fixed = fixed.rounded()
         edge = self._edge(fixed, winner, layout) if interpolation == "cubic" else None
         reports = tuple(self._reports(winner, won_px))
-        occluded = (winner < 0) & (in_image > 0)
-        return ViewPlan(
-            fixed, winner, bands, reports, interpolation, certain, edge, occluded if occluded.any() else None
-        )
+        return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge, occluded if is_occluded else None)
 
     def _target(self, region: _Region) -> tuple[Any, ...]:
         return self.rays.planes, self.rays.parameters, region.geometry.q, region.geometry.face
@@ -376,7 +373,7 @@ class ViewPlanner:
 
     def _reports(self, winner: npt.NDArray[np.int8], won_px: Counter[int]) -> Iterator[SourceUse]:
         """What each source that wins any pixel does, largest share first."""
-        on_nodes = winner[np.ix_(*self.nodes)]
+        on_nodes = winner[self.nodes.places]
         for region in sorted(self.regions, key=lambda r: -won_px[r.source]):
             if won_px[region.source] == 0:
                 continue
