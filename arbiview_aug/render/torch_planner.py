@@ -38,7 +38,7 @@ from arbiview_aug.render.view_planner import (
     source_bounds,
 )
 from arbiview_aug.scene.boxes import BOX_ERROR, UNLABELLED
-from arbiview_aug.scene.point_cloud import MEASURED_SPREAD, occlusion_level
+from arbiview_aug.scene.point_cloud import MEASURED_SPREAD, Cells, occlusion_level
 from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
 from arbiview_aug.scene.torch_points import PanoramaViews, upsampled
@@ -89,9 +89,9 @@ def build_plans(
                 coarse = min(camera.size) >= SMALL_SIDE_PX
                 coarse &= is_within_wall(camera.center_m) or not SURFACES[surface].has_wall
                 step = config.grid_step_px if coarse else 1
-                groups.setdefault((camera.size, step, name, with_boxes), []).append((f, m))
+                groups.setdefault((camera.size, Cells.for_camera(camera), step, name, with_boxes), []).append((f, m))
         batches = []
-        for (size, step, name, _), views in groups.items():
+        for (size, _, step, name, _), views in groups.items():
             count = max(1, _MOST_PIXELS // math.prod(size))
             for first in range(0, len(views), count):
                 some = views[first : first + count]
@@ -388,13 +388,13 @@ class _ViewBatch:
         if not self.is_solid:
             return
         scale = np.ones(self.numbers.shape)
-        sizes: dict[tuple[int, int], dict[Any, Camera]] = {}
+        sizes: dict[Any, dict[Any, Camera]] = {}
         for row, k in zip(*np.nonzero(self.is_near), strict=True):
             source, level = self.pairs[row][k], int(self.levels[row, k])
             coarser = level if self.boxes is not None else max(level, occlusion_level(source))
             scale[row, k] = 0.5 ** (coarser - level)
             half = halved_camera(source, coarser)
-            sizes.setdefault(half.size, {})[self._key(row, k)] = half
+            sizes.setdefault((half.size, Cells.for_camera(half)), {})[self._key(row, k)] = half
         self.scale = on_device(scale, self.device, torch.float32)[..., None, None]
         drawn: dict[Any, Any] = {}
         for of_size in sizes.values():

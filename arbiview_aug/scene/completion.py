@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from arbiview_aug.cameras.kernels import angle_row, rays_row
 from arbiview_aug.environment import compiled
 from arbiview_aug.scene import panorama
 from arbiview_aug.scene.kernels import columns_of_box, slabs_row, upsampled_row
-from arbiview_aug.scene.panorama import CELL_RAD, NEAREST_M
+from arbiview_aug.scene.panorama import NEAREST_M
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
@@ -24,11 +23,6 @@ _CHUNK = 1024  # points worked on at once
 # row (from bit 7) and column of the seed as seen from the cell, plus 64. Distances are those of Borgefors' 5 x 5 mask.
 _ROW, _OWN, _NO_SEED = 1 << 7, np.int32(64 * 128 + 64), np.int32(1 << 30)
 _SIDE, _CORNER, _KNIGHT = 1024 << 14, 1434 << 14, 2250 << 14
-REACH_CELLS, SUPPORT_CELLS = np.float32(panorama.REACH_RAD / CELL_RAD), np.float32(panorama.SUPPORT_RAD / CELL_RAD)
-SEE_THROUGH_CELLS, SIDE_CELLS = round(panorama.SEE_THROUGH_RAD / CELL_RAD), round(panorama.SIDE_RAD / CELL_RAD)
-SMOOTH_CELLS, SHRINK_CELLS = round(panorama.SMOOTH_RAD / 2 / CELL_RAD), round(panorama.SHRINK_RAD / CELL_RAD)
-REACH_ROWS = math.ceil(REACH_CELLS) + 4 * SMOOTH_CELLS + 1 - panorama.HALO
-"""Beyond so many rows below and above all points a window's halo, too, shows the static surface."""
 _STEP, _STEP_PER_M, LEAST_WEIGHT = np.float32(panorama.STEP), np.float32(panorama.STEP_PER_M), np.float32(1e-3)
 
 
@@ -97,26 +91,29 @@ def nearest_points(points: Any, origin: Any, bounds: Any, place: Any, q: Any, nu
 
 
 @compiled
-def drop_hidden(q: Any, number: Any, points: Any, origin: Any) -> tuple[Any, Any]:
-    """Drop points that shine through gaps of what is nearer on both sides of them (``SEE_THROUGH_RAD``).
+def drop_hidden(q: Any, number: Any, points: Any, origin: Any, away: int, side: int) -> tuple[Any, Any]:
+    """Drop points that shine through gaps of what is nearer on both sides of them.
 
-    ``q`` and ``number`` are those of ``nearest_points``. Returns the flat indices (n,) of cells that keep their point,
+    ``q`` and ``number`` are those of ``nearest_points``, ``away`` and ``side`` are ``SEE_THROUGH_RAD`` and ``SIDE_RAD``
+    in cells. Returns the flat indices (n,) of cells that keep their point,
     and its ray (3, 1, n) in the ego frame, float32.
     """
     h, w = q.shape
-    across, down = q.copy(), q.copy()
-    _window_max(across, 2 * SIDE_CELLS, SEE_THROUGH_CELLS - 1)
-    _window_max(down, SEE_THROUGH_CELLS - 1, 2 * SIDE_CELLS)
+    most, more = q.copy(), away - 1 - 2 * side  # windows are longer than wide
+    _window_max(most, 2 * side, 2 * side)
     cells, n = np.empty(h * w, np.int64), 0
     for y in range(h):
-        inside = SEE_THROUGH_CELLS <= y < h - SEE_THROUGH_CELLS
+        inside = away <= y < h - away
         for x in range(w):
             if q[y, x] <= _ZERO:
                 continue
-            if inside and SEE_THROUGH_CELLS <= x < w - SEE_THROUGH_CELLS:
-                one = min(across[y - SIDE_CELLS, x - SEE_THROUGH_CELLS], across[y - SIDE_CELLS, x + 1])
-                two = min(down[y - SEE_THROUGH_CELLS, x - SIDE_CELLS], down[y + 1, x - SIDE_CELLS])
-                if q[y, x] < _hidden_below(max(one, two)):
+            if inside and away <= x < w - away:
+                row, left, right = most[y - side], x - away, x + 1
+                across = min(max(row[left], row[left + more]), max(row[right], row[right + more]))
+                column, up, down = x - side, y - away, y + 1
+                above = max(most[up, column], most[up + more, column])
+                below = max(most[down, column], most[down + more, column])
+                if q[y, x] < _hidden_below(max(across, min(above, below))):
                     continue
             cells[n] = y * w + x
             n += 1
@@ -129,10 +126,11 @@ def drop_hidden(q: Any, number: Any, points: Any, origin: Any) -> tuple[Any, Any
 
 
 @compiled
-def complete(cells: Any, own: Any, residuals: Any, layers: Any) -> None:
+def complete(cells: Any, own: Any, residuals: Any, reach: float, support: float, smooth: int, layers: Any) -> None:
     """Give every cell the residual of the nearest point, averaged on a step's nearer and on its farther side.
 
     ``layers`` (4, h, w) becomes those of ``Panorama``; the points' flat cells, inverse distances, residuals are (n,).
+    The others are ``Cells.reach``, ``support`` and ``smooth``.
     """
     measured = layers[3]
     h, w = measured.shape
@@ -148,15 +146,15 @@ def complete(cells: Any, own: Any, residuals: Any, layers: Any) -> None:
         for x in range(w):
             away[x] = np.float32(code[y + 2, x + 2] >> 14) * np.float32(1 / 1024)
         for x in range(w):
-            measured[y, x] = _ONE if away[x] <= SUPPORT_CELLS else _ZERO
+            measured[y, x] = _ONE if away[x] <= support else _ZERO
         for x in range(w):
-            if away[x] >= REACH_CELLS:
+            if away[x] >= reach:
                 r[y, x] = q[y, x] = _ZERO
             else:
-                fade = min(_TWO - _TWO * away[x] / REACH_CELLS, _ONE)
+                fade = min(_TWO - _TWO * away[x] / reach, _ONE)
                 from_y, from_x = seed(code[y + 2, x + 2])
                 r[y, x], q[y, x] = r[y + from_y, x + from_x] * fade, q[y + from_y, x + from_x]
-    _average_sides(r, q, layers[0], layers[1], layers[2])
+    _average_sides(r, q, smooth, layers[0], layers[1], layers[2])
 
 
 @compiled
@@ -192,18 +190,21 @@ def seed(code: int) -> tuple[int, int]:
 
 
 @compiled
-def _average_sides(r: Any, q: Any, near: Any, far: Any, share: Any) -> None:
+def _average_sides(r: Any, q: Any, smooth: int, near: Any, far: Any, share: Any) -> None:
     """Average residuals over ``SMOOTH_RAD`` on both sides of steps; sides are told apart over twice that window.
 
     All that is averaged about a step then knows of it. Near the border, which only filters read, nothing is averaged.
     """
     h, w = r.shape
-    side, edge = 2 * SMOOTH_CELLS, 3 * SMOOTH_CELLS
+    side, edge = 2 * smooth, 3 * smooth
     size, n, m = side + 1, w - 2 * side, w - 2 * edge  # of a window, and of the rows where they fit
     for y in range(h):
         for x in range(w):
-            if min(y, h - 1 - y) < edge or min(x, w - 1 - x) < edge:
-                near[y, x], far[y, x], share[y, x] = r[y, x], r[y, x], _ONE
+            if x == edge and edge <= y < h - edge:
+                break
+            near[y, x], far[y, x], share[y, x] = r[y, x], r[y, x], _ONE
+        for x in range(w - edge, w):
+            near[y, x], far[y, x], share[y, x] = r[y, x], r[y, x], _ONE
     high, low = r.copy(), -r
     _window_max(high, side, side)  # of the window that begins there
     _window_max(low, side, side)
@@ -225,11 +226,11 @@ def _average_sides(r: Any, q: Any, near: Any, far: Any, share: Any) -> None:
             _slide(nearer if k == 0 else here if k == 1 else of_near, sums[k, y % size], total[k])
         if y < 2 * side:
             continue
-        y0 = y - SMOOTH_CELLS
+        y0 = y - smooth
         own, q0, r0, share0 = total[0], q[y0, edge : w - edge], r[y0, edge : w - edge], share[y0, edge : w - edge]
         for x in range(m):
             share0[x] = own[x] * per
-        h0, l0 = high[y0 - SMOOTH_CELLS, side : side + m], low[y0 - SMOOTH_CELLS, side : side + m]
+        h0, l0 = high[y0 - smooth, side : side + m], low[y0 - smooth, side : side + m]
         for x in range(m):  # the mean where nothing steps
             flat[x] = total[1, x] * per if h0[x] + l0[x] <= _STEP * q0[x] + _STEP_PER_M else np.nan
         out, part = near[y0, edge : w - edge], total[2]
@@ -295,14 +296,14 @@ def _hidden_below(known: Any) -> Any:
 
 
 @compiled
-def hidden_depths(layers: Any, base: Any, step: int, out: Any) -> None:
+def hidden_depths(layers: Any, base: Any, step: int, shrink: int, out: Any) -> None:
     """Inverse distances (h, w) below which points are hidden by a panorama's layers; 0 where nothing was measured.
 
-    ``base`` (ny + 1, nx + 1) is the static surface, on every ``step``-th cell.
+    ``base`` (ny + 1, nx + 1) is the static surface, on every ``step``-th cell; ``shrink`` is ``SHRINK_RAD`` in cells.
     """
     h, w = out.shape
     near, far, share, measured = layers[0], layers[1], layers[2], layers[3]
-    side = 2 * SHRINK_CELLS
+    side = 2 * shrink
     silent, line = _ONE - measured, np.empty(base.shape[1], np.float32)
     _window_max(silent, side, side)
     static, known = np.empty(w, np.float32), np.empty(w, np.float32)
@@ -311,10 +312,10 @@ def hidden_depths(layers: Any, base: Any, step: int, out: Any) -> None:
         one, two, part = near[y], far[y], share[y]
         for x in range(w):
             known[x] = static[x] + (one[x] if part[x] > _HALF else two[x])
-        row, inner, hidden = out[y], known[SHRINK_CELLS:], silent[min(max(y - SHRINK_CELLS, 0), h - 1 - side)]
+        row, inner, hidden = out[y], known[shrink:], silent[min(max(y - shrink, 0), h - 1 - side)]
         for x in range(w):
             row[x] = _ZERO
-        row = row[SHRINK_CELLS:]
+        row = row[shrink:]
         for x in range(w - side):  # closes gaps between scan lines, but not outwards
             row[x] = _hidden_below(inner[x]) if hidden[x] == _ZERO else _ZERO
 

@@ -1,9 +1,10 @@
 """Sparse points made dense, as one centre sees them: panoramas of inverse distance with edges kept.
 
-A panorama has one cell per 0.2 degrees of azimuth and elevation. Its cells hold *residuals* against a static surface,
-so that a road stays a plane between the scan lines, and what no point tells fades back to the static surface. Where
-the scene steps from near to far, a cell holds both, and the share of near ones around it; the outline runs where the
-share is one half. Interpolating the two layers and the share apart keeps outlines sharp between the cells too.
+A panorama has one cell per 0.2 degrees of azimuth and elevation, or per 0.4 for a coarse view. Its cells hold
+*residuals* against a static surface, so that a road stays a plane between the scan lines, and what no point tells fades
+back to the static surface. Where the scene steps from near to far, a cell holds both, and the share of near ones around
+it; the outline runs where the share is one half. Interpolating the two layers and the share apart keeps outlines sharp
+between the cells too.
 """
 
 from __future__ import annotations
@@ -51,8 +52,6 @@ SHRINK_RAD = math.radians(0.4)
 NEAREST_M = 0.5
 """Nearer to a centre than this nothing of the scene stands: such points are the vehicle's, or the camera itself."""
 
-BASE_STEP = 4  # cells, 0.8 degrees: a static surface is smooth
-HALO = round(math.radians(4.0) / CELL_RAD)
-"""Cells around a window that its filters need."""
-
-TURN = round(2 * math.pi / CELL_RAD)
+BASE_STEP = 4  # cells, 0.8 or 1.6 degrees: a static surface is smooth
+HALO_RAD = math.radians(4.0)
+"""Room around a window that its filters need."""

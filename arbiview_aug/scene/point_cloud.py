@@ -19,7 +19,18 @@ from arbiview_aug.cameras.rays import CELL_PX, PixelRays
 from arbiview_aug.errors import SampleError
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene.boxes import BoxSurface, box_rows
-from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, HALO, SIDE_RAD, TURN, Layer
+from arbiview_aug.scene.panorama import (
+    BASE_STEP,
+    CELL_RAD,
+    HALO_RAD,
+    REACH_RAD,
+    SEE_THROUGH_RAD,
+    SHRINK_RAD,
+    SIDE_RAD,
+    SMOOTH_RAD,
+    SUPPORT_RAD,
+    Layer,
+)
 from arbiview_aug.scene.scanned_objects import BOX_AIR_M, RASTER_RAD, ScannedObject, scanned_objects
 from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Points, StaticSurface
 
@@ -40,6 +51,41 @@ MEASURED_SPREAD = 0.05
 """Spread of a measured inverse distance, as a share of it: half of STEP, below which densification follows a slope."""
 
 
+class Cells(NamedTuple):
+    """The side of a panorama's cells, radians, and lengths in cells."""
+
+    rad: float
+    turn: int
+    halo: int
+    see_through: int
+    side: int
+    smooth: int
+    shrink: int
+    reach: np.float32
+    support: np.float32
+
+    @classmethod
+    def of(cls, rad: float) -> Cells:
+        """Those of ``rad``."""
+        angles = 2 * math.pi, HALO_RAD, SEE_THROUGH_RAD, SIDE_RAD, SMOOTH_RAD / 2, SHRINK_RAD
+        turn, halo, see_through, side, smooth, shrink = (round(angle / rad) for angle in angles)
+        reach, support = np.float32(REACH_RAD / rad), np.float32(SUPPORT_RAD / rad)
+        return cls(rad, turn, halo, see_through, side, smooth, shrink, reach, support)
+
+    @classmethod
+    def for_camera(cls, camera: Camera) -> Cells:
+        """Twice as wide where a pixel is wider than a cell: fisheye views of 256 x 704 change by -0.1 to +0.1 dB."""
+        return FINE if CELL_RAD * camera.K[0, 0] >= 1 else COARSE
+
+    @property
+    def beyond(self) -> float:
+        """So far below and above all points a window's halo, too, shows the static surface, radians."""
+        return (math.ceil(self.reach) + 4 * self.smooth + 1 - self.halo) * self.rad
+
+
+FINE, COARSE = Cells.of(CELL_RAD), Cells.of(2 * CELL_RAD)
+
+
 class Window(NamedTuple):
     """A part of the sphere, in cells: row 0 begins at the horizon, column 0 straight ahead."""
 
@@ -47,41 +93,45 @@ class Window(NamedTuple):
     column: int
     rows: int
     columns: int
+    cells: Cells = FINE
 
     @classmethod
-    def around(cls, directions: FloatArray, reach: tuple[int, int] = (-TURN, TURN)) -> Window:
-        """The smallest window that holds unit rays (n, 3), those in rows within ``reach`` if there are any."""
+    def around(cls, directions: FloatArray, cells: Cells, reach: tuple[float, float] = (-4, 4)) -> Window:
+        """The smallest window that holds unit rays (n, 3), those of elevations within ``reach`` if there are any."""
         if not len(directions):
-            return cls(0, 0, 1, 1)
+            return cls(0, 0, 1, 1, cells)
         x, y, z = directions.T
-        rows = np.arcsin(np.clip(z, -1, 1)) / CELL_RAD
-        low, high = max(math.floor(rows.min()), reach[0]), min(math.ceil(rows.max()), reach[1])
+        rows = np.arcsin(np.clip(z, -1, 1)) / cells.rad
+        low = math.floor(max(rows.min(), reach[0] / cells.rad))
+        high = math.ceil(min(rows.max(), reach[1] / cells.rad))
         inside = (rows >= low) & (rows <= high)
         if not inside.any():
-            return cls.around(directions)
+            return cls.around(directions, cells)
         x, y = x[inside], y[inside]
         middle = math.atan2(y.sum(), x.sum())
         azimuth = (np.arctan2(y, x) - middle + math.pi) % (2 * math.pi) - math.pi + middle
-        column = math.floor(azimuth.min() / CELL_RAD)
-        return cls(low, column, high - low, math.ceil(azimuth.max() / CELL_RAD) - column)
+        column = math.floor(azimuth.min() / cells.rad)
+        return cls(low, column, high - low, math.ceil(azimuth.max() / cells.rad) - column, cells)
 
     @property
     def roomy(self) -> Window:
         """One with room for later questions around it; all around where little is missing."""
-        row, top = max(self.row - ROOM_CELLS, -TURN // 4), min(self.row + self.rows + ROOM_CELLS, TURN // 4)
+        turn = self.cells.turn
+        row, top = max(self.row - ROOM_CELLS, -turn // 4), min(self.row + self.rows + ROOM_CELLS, turn // 4)
         columns = self.columns + 2 * ROOM_CELLS
-        place = (self.column - ROOM_CELLS, columns) if columns <= TURN - 2 * ROOM_CELLS else (0, TURN)
-        return Window(row, place[0], top - row, place[1])
+        place = (self.column - ROOM_CELLS, columns) if columns <= turn - 2 * ROOM_CELLS else (0, turn)
+        return Window(row, place[0], top - row, place[1], self.cells)
 
     def holds(self, other: Window) -> bool:
         """Whether another window lies within this one."""
-        beside = self.columns >= TURN or (other.column - self.column) % TURN + other.columns <= self.columns
+        turn = self.cells.turn
+        beside = self.columns >= turn or (other.column - self.column) % turn + other.columns <= self.columns
         return beside and self.row <= other.row and other.row + other.rows <= self.row + self.rows
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns, with the halo."""
-        return self.rows + 2 * HALO + 1, self.columns + 2 * HALO + 1
+        return self.rows + 2 * self.cells.halo + 1, self.columns + 2 * self.cells.halo + 1
 
     @property
     def place(self) -> Layer:
@@ -90,19 +140,19 @@ class Window(NamedTuple):
         Rows and columns are counted from the halo. That of a whole turn lacks at its start what lies before it; that at
         its end has both.
         """
-        lead = HALO if self.columns >= TURN else 0
-        return np.array(
-            [(self.column - HALO) * CELL_RAD, lead, (self.row - HALO) * CELL_RAD, 1 / CELL_RAD, TURN], np.float32
-        )
+        rad, turn, halo = self.cells[:3]
+        lead = halo if self.columns >= turn else 0
+        return np.array([(self.column - halo) * rad, lead, (self.row - halo) * rad, 1 / rad, turn], np.float32)
 
     @property
     def bounds(self) -> FloatArray:
         """(5,) sines of the lowest and highest elevation, cosine and sine of the middle azimuth, cosine of half the
         width: two cells beyond the halo."""
-        low, high = np.clip([self.row - HALO - 2, self.row + self.rows + HALO + 2], -TURN // 4, TURN // 4) * CELL_RAD
-        middle, half = self.column + self.columns / 2, min(self.columns / 2 + HALO + 2, TURN / 2)
-        cosine, sine = math.cos(middle * CELL_RAD), math.sin(middle * CELL_RAD)
-        return np.array([math.sin(low), math.sin(high), cosine, sine, math.cos(half * CELL_RAD)])
+        rad, turn, halo = self.cells[:3]
+        low, high = np.clip([self.row - halo - 2, self.row + self.rows + halo + 2], -turn // 4, turn // 4) * rad
+        middle, half = self.column + self.columns / 2, min(self.columns / 2 + halo + 2, turn / 2)
+        cosine, sine = math.cos(middle * rad), math.sin(middle * rad)
+        return np.array([math.sin(low), math.sin(high), cosine, sine, math.cos(half * rad)])
 
 
 class Panorama:
@@ -121,26 +171,28 @@ class Panorama:
         from arbiview_aug.scene.completion import complete, drop_hidden, nearest_points
 
         self.window, self._origin, self._street, self._place = window, origin, street, window.place
-        shape = window.shape
+        shape, cells = window.shape, window.cells
         q, number = np.zeros(shape, np.float32), np.empty(shape, np.int32)
         nearest_points(points, origin, window.bounds, self._place, q, number)
-        cells, rays = drop_hidden(q, number, points, origin)
-        own = q.reshape(-1)[cells]
+        found, rays = drop_hidden(q, number, points, origin, cells.see_through, cells.side)
+        own = q.reshape(-1)[found]
         self.layers = np.empty((4, *shape), np.float32)
-        complete(cells, own, own - street.along(origin, rays)[0], self.layers)
+        residual = own - street.along(origin, rays)[0]
+        complete(found, own, residual, cells.reach, cells.support, cells.smooth, self.layers)
 
     @cached_property
     def hidden_below(self) -> Layer:
         """Points of a smaller inverse distance are hidden by what certainly stands there; 0 where it is silent."""
         from arbiview_aug.scene.completion import hidden_depths
 
-        ends = (n + BASE_STEP for n in self.layers.shape[1:])
-        rows, columns = (np.arange(0, end, BASE_STEP, dtype=np.float32) * np.float32(CELL_RAD) for end in ends)
+        rad, ends = self.window.cells.rad, (n + BASE_STEP for n in self.layers.shape[1:])
+        rows, columns = (np.arange(0, end, BASE_STEP, dtype=np.float32) * np.float32(rad) for end in ends)
         azimuth, elevation = self._place[0] + columns, (self._place[2] + rows)[:, None]
         level, up = np.cos(elevation), np.broadcast_to(np.sin(elevation), (len(rows), len(columns)))
         rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up])
         hidden = np.empty(self.layers.shape[1:], np.float32)
-        hidden_depths(self.layers, self._street.along(self._origin, rays), BASE_STEP, hidden)
+        static = self._street.along(self._origin, rays)
+        hidden_depths(self.layers, static, BASE_STEP, self.window.cells.shrink, hidden)
         return hidden
 
     def cells(self, rays: Layer, R: FloatArray) -> tuple[Layer, Layer]:
@@ -165,7 +217,7 @@ class PointCloudSurface(DenseSurface):
     street: StaticSurface
     points: Points
     objects: tuple[ScannedObject, ...] = ()
-    _panoramas: dict[bytes, tuple[tuple[int, int], list[Panorama]]] = field(default_factory=dict, repr=False)
+    _panoramas: dict[bytes, tuple[tuple[float, float], list[Panorama]]] = field(default_factory=dict, repr=False)
     _shadows: dict[Camera, OcclusionMap] = field(default_factory=dict, repr=False)
     _nodes: dict[Camera, tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
 
@@ -240,27 +292,29 @@ class PointCloudSurface(DenseSurface):
         if camera not in self._nodes:
             step, R = max(1, int(NODES_RAD * float(rays.parameters[0]))), camera.cam2ego[:3, :3]
             local, directions = nodes_of(rays, step, R)
-            view = self.view(camera.center_m, directions)
+            view = self.view(camera.center_m, directions, Cells.for_camera(camera))
             # A lens may have no rays somewhere; azimuths bend near the zenith, and jump in a panorama all around.
             steep = len(directions) == 0 or float(np.abs(directions[:, 2]).max()) > _STEEP
-            if step > 1 and (steep or view.window.columns >= TURN or len(directions) < local[0].size):
+            if step > 1 and (steep or view.window.columns >= view.window.cells.turn or len(directions) < local[0].size):
                 step, local = 1, rays.planes if rays.planes.size else nodes_of(rays, 1, R)[0]
             self._nodes[camera] = view, *view.cells(local, R), step
         return self._nodes[camera]
 
-    def view(self, origin: FloatArray, directions: FloatArray) -> Panorama:
-        """The panorama around a centre that holds rays (..., 3)."""
-        from arbiview_aug.scene.completion import REACH_ROWS, elevations
+    def view(self, origin: FloatArray, directions: FloatArray, cells: Cells | None = None) -> Panorama:
+        """The panorama around a centre that holds rays (..., 3); without ``cells`` one that was made before will do."""
+        from arbiview_aug.scene.completion import elevations
 
         if origin.tobytes() not in self._panoramas:
-            low, high = np.arcsin(elevations(self.points, origin)) / CELL_RAD
-            reach = math.floor(low) - REACH_ROWS, math.ceil(high) + REACH_ROWS
-            self._panoramas[origin.tobytes()] = reach, []
-        reach, held = self._panoramas[origin.tobytes()]
-        asked = Window.around(directions.reshape(-1, 3), reach)
-        found = next((p for p in held if p.window.holds(asked)), None)
+            low, high = np.arcsin(elevations(self.points, origin))
+            self._panoramas[origin.tobytes()] = (low, high), []
+        (low, high), held = self._panoramas[origin.tobytes()]
+        around = lambda of: Window.around(  # noqa: E731
+            directions.reshape(-1, 3), of, (low - of.beyond, high + of.beyond)
+        )
+        suitable = (p for p in held if cells in (None, p.window.cells) and p.window.holds(around(p.window.cells)))
+        found = next(suitable, None)
         if found is None:
-            found = Panorama(asked.roomy, origin, self.points, self.street)
+            found = Panorama(around(cells or FINE).roomy, origin, self.points, self.street)
             held.append(found)
         return found
 

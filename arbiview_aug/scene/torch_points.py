@@ -12,17 +12,9 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import CameraMaps
 from arbiview_aug.cameras.torch_rays import on_device
-from arbiview_aug.scene.completion import (
-    LEAST_WEIGHT,
-    REACH_CELLS,
-    SEE_THROUGH_CELLS,
-    SHRINK_CELLS,
-    SIDE_CELLS,
-    SMOOTH_CELLS,
-    SUPPORT_CELLS,
-)
+from arbiview_aug.scene.completion import LEAST_WEIGHT
 from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, NEAREST_M, STEP, STEP_PER_M
-from arbiview_aug.scene.point_cloud import NODES_RAD, OWN_CAR_M, Window, nodes_of
+from arbiview_aug.scene.point_cloud import NODES_RAD, OWN_CAR_M, Cells, Window, nodes_of
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 from arbiview_aug.scene.torch_surface import static_image
 
@@ -36,7 +28,7 @@ class PanoramaViews:
     """What points say around C cameras' centres, as ``point_cloud.Panorama``; layers are (C, H, W).
 
     Args:
-        cameras: They decide what is seen of the sphere.
+        cameras: They decide what is seen of the sphere. Their cells are those of the first.
         maps: Rays of cameras.
         points: (C, P, 3) float64 ego frame; rows that are not finite are none.
         ground_z_m: (C,) height of the road.
@@ -47,6 +39,7 @@ class PanoramaViews:
     ) -> None:
         device = points.device
         windows = [window_of(camera, maps) for camera in cameras]
+        self._cells = windows[0].cells
         self._shapes = on_device(np.array([window.shape for window in windows]), device)
         self._size = tuple(max(sides) for sides in zip(*(window.shape for window in windows), strict=True))
         self._place = on_device(np.stack([window.place for window in windows]), device)[:, :, None, None]
@@ -98,14 +91,16 @@ class PanoramaViews:
 
     def _hidden_below(self) -> torch.Tensor:
         """As ``Panorama.hidden_below``."""
-        h, w = (torch.arange(0, n + BASE_STEP, BASE_STEP, device=self.near.device) * CELL_RAD for n in self._size)
+        rad, device = self._cells.rad, self.near.device
+        h, w = (torch.arange(0, n + BASE_STEP, BASE_STEP, device=device) * rad for n in self._size)
         first, _, low, _, _ = self._place.unbind(1)
         azimuth, elevation = first + w, low + h[:, None]
         level, up = elevation.cos(), elevation.sin().expand(-1, -1, len(w))
         rays = torch.stack([level * azimuth.cos(), level * azimuth.sin(), up], 1)
         static = upsampled(static_image(True, rays, self._centers_m, self._ground_z_m), BASE_STEP, self._size)
         known = static + torch.where(self.share > 0.5, self.near, self.far)
-        silent = _max(_pad(1 - self.measured, [SHRINK_CELLS] * 4, value=1.0), 2 * SHRINK_CELLS + 1, stride=1)
+        shrink = self._cells.shrink
+        silent = _max(_pad(1 - self.measured, [shrink] * 4, value=1.0), 2 * shrink + 1, stride=1)
         return torch.where(silent == 0, _hidden(known), 0.0)
 
     def _nearest_points(self, points: torch.Tensor, bounds: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -149,33 +144,34 @@ class PanoramaViews:
 
     def _is_hidden(self, q: torch.Tensor) -> torch.Tensor:
         """Points that shine through gaps of what is nearer on both sides of them."""
-        H, W = self._size
-        padded = _pad(q, (SEE_THROUGH_CELLS,) * 4)
-        across = _max(padded, (2 * SIDE_CELLS + 1, SEE_THROUGH_CELLS), stride=1)[:, SEE_THROUGH_CELLS - SIDE_CELLS :]
-        down = _max(padded, (SEE_THROUGH_CELLS, 2 * SIDE_CELLS + 1), stride=1)[:, :, SEE_THROUGH_CELLS - SIDE_CELLS :]
-        one = torch.minimum(across[:, :H, :W], across[:, :H, SEE_THROUGH_CELLS + 1 : SEE_THROUGH_CELLS + 1 + W])
-        two = torch.minimum(down[:, :H, :W], down[:, SEE_THROUGH_CELLS + 1 : SEE_THROUGH_CELLS + 1 + H, :W])
-        return (q < _hidden(torch.maximum(one, two))) & self._inner(SEE_THROUGH_CELLS)
+        (H, W), away, side = self._size, self._cells.see_through, self._cells.side
+        padded = _pad(q, (away,) * 4)
+        across = _max(padded, (2 * side + 1, away), stride=1)[:, away - side :]
+        down = _max(padded, (away, 2 * side + 1), stride=1)[:, :, away - side :]
+        one = torch.minimum(across[:, :H, :W], across[:, :H, away + 1 : away + 1 + W])
+        two = torch.minimum(down[:, :H, :W], down[:, away + 1 : away + 1 + H, :W])
+        return (q < _hidden(torch.maximum(one, two))) & self._inner(away)
 
     def _complete(self, q: torch.Tensor, residual: torch.Tensor) -> None:
         """Give every cell the residual of the nearest point, averaged on both sides of a step."""
         code = spread(torch.where(q > 0, OWN, NO_SEED).int())
         away = (code >> 14).float() / 1024
-        self.measured = (away <= float(SUPPORT_CELLS)).float()
+        reach, smooth = float(self._cells.reach), self._cells.smooth
+        self.measured = (away <= float(self._cells.support)).float()
         H, W = self._size
         y, x = (torch.arange(n, device=q.device) for n in self._size)
         dy, dx = seed_of(code)
         row, column = (y[:, None] + dy).clamp(0, H - 1), (x + dx).clamp(0, W - 1)
         seed = (row * W + column).flatten(1).long()
-        reached = away < float(REACH_CELLS)
+        reached = away < reach
         r, q = (torch.where(reached, p.flatten(1).gather(1, seed).view_as(p), 0.0) for p in (residual, q))
-        r = r * (2 - 2 * away / float(REACH_CELLS)).clamp(max=1)
+        r = r * (2 - 2 * away / reach).clamp(max=1)
         some = float(LEAST_WEIGHT)
-        high, low = _around(r, 2 * SMOOTH_CELLS, _max), -_around(-r, 2 * SMOOTH_CELLS, _max)
+        high, low = _around(r, 2 * smooth, _max), -_around(-r, 2 * smooth, _max)
         nearer = (2 * r > high + low).float()
-        share, every, part = (_around(p, SMOOTH_CELLS, _mean) for p in (nearer, r, r * nearer))
-        high, low = _around(r, SMOOTH_CELLS, _max), -_around(-r, SMOOTH_CELLS, _max)
-        flat, inner = high - low <= STEP * q + STEP_PER_M, self._inner(3 * SMOOTH_CELLS)
+        share, every, part = (_around(p, smooth, _mean) for p in (nearer, r, r * nearer))
+        high, low = _around(r, smooth, _max), -_around(-r, smooth, _max)
+        flat, inner = high - low <= STEP * q + STEP_PER_M, self._inner(3 * smooth)
         near = torch.where(share > some, part / share.clamp(min=some), r)
         far = torch.where(1 - share > some, (every - part) / (1 - share).clamp(min=some), r)
         near, far = torch.where(flat, every, near), torch.where(flat, every, far)
@@ -188,7 +184,7 @@ def window_of(camera: Camera, maps: CameraMaps) -> Window:
     rays = maps.rays(camera)
     step = max(1, int(NODES_RAD * float(rays.parameters[0])))
     _, directions = nodes_of(rays, step, camera.cam2ego[:3, :3])
-    return Window.around(directions).roomy
+    return Window.around(directions, Cells.for_camera(camera)).roomy
 
 
 def upsampled(nodes: torch.Tensor, step: int, size: Sequence[int], ends: bool = False) -> torch.Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from arbiview_aug.scene.boxes import BoxSurface, meets
-from arbiview_aug.scene.panorama import CELL_RAD, SIDE_RAD
+from arbiview_aug.scene.panorama import SIDE_RAD
 from arbiview_aug.scene.point_cloud import Panorama, PointCloudSurface, PointCloudWithBoxes
 from arbiview_aug.scene.scanned_objects import BOX_AIR_M, RASTER_RAD, ScannedObject
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE, StaticSurface, Surface
@@ -59,13 +59,13 @@ def occlusion_depth(
 
 def layer_at(view: Panorama, layer: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Bilinear values (...,) of a panorama's layer along unit rays (..., 3); its border beyond it."""
-    first, lead, low = view.window.place[:3].astype(np.float64)
+    (first, lead, low), rad = view.window.place[:3].astype(np.float64), view.window.cells.rad
     azimuth, elevation = (
         np.arctan2(directions[..., 1], directions[..., 0]),
         np.arcsin(np.clip(directions[..., 2], -1, 1)),
     )
-    column = lead + ((azimuth - first) / CELL_RAD - lead) % (2 * np.pi / CELL_RAD)
-    at = [np.clip(a, 0, n - 1) for a, n in zip(((elevation - low) / CELL_RAD, column), layer.shape, strict=True)]
+    column = lead + ((azimuth - first) / rad - lead) % (2 * np.pi / rad)
+    at = [np.clip(a, 0, n - 1) for a, n in zip(((elevation - low) / rad, column), layer.shape, strict=True)]
     (r, c), (s, t) = (a.astype(int) for a in at), (a % 1 for a in at)
     r1, c1 = (np.minimum(a + 1, n - 1) for a, n in zip((r, c), layer.shape, strict=True))
     above, below = layer[r, c] * (1 - t) + layer[r, c1] * t, layer[r1, c] * (1 - t) + layer[r1, c1] * t

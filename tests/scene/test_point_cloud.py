@@ -19,7 +19,7 @@ from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.render.plan import build_plan
 from arbiview_aug.scene.depth_maps import points_of_depth
 from arbiview_aug.scene.panorama import REACH_RAD
-from arbiview_aug.scene.point_cloud import PointCloudSurface, PointCloudWithBoxes, checked_points
+from arbiview_aug.scene.point_cloud import Cells, PointCloudSurface, PointCloudWithBoxes, checked_points
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.static import Street
 from tests import helpers
@@ -286,14 +286,16 @@ def test_images_say_what_single_rays_say(name: str, all_around: bool) -> None:
     points = np.concatenate([NEAR, FAR, FAR * [-1, 1, 1], [[x, y, 9.0] for x in range(12) for y in range(-5, 6)]])
     surface = PointCloudSurface(Street(), points)
     if all_around:
-        inverse_distance(surface, EYE, np.array([[1.0, 0, 0], [-1.0, 0, 0], [0.0, 1.0, 0], [0.0, -1.0, 0]]))
+        axes = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0.0, 1.0, 0], [0.0, -1.0, 0]])
+        surface.view(EYE, axes, Cells.for_camera(view))
     rays, valid = view.unproject(view.pixel_grid())
+    image, shadow = surface.image(view, pixel_rays(view)), surface.occlusion_map(view, pixel_rays(view))
     q, before = inverse_distance(surface, EYE, rays[valid]), occlusion_depth(surface, EYE, rays[valid])
     # Rounding decides on which side of an outline a pixel lies.
-    off = np.abs(surface.image(view, pixel_rays(view))[valid] - q)
+    off = np.abs(image[valid] - q)
     assert np.quantile(off, 0.99) < 2e-5 and (off > 1e-3).mean() < 0.003
     # Shadows are interpolated over a panorama's cell: their outlines are half a cell wider or narrower.
-    off = np.abs(surface.occlusion_map(view, pixel_rays(view)).beyond[valid] - before)
+    off = np.abs(shadow.beyond[valid] - before)
     assert np.median(off) < 1e-5 and (off > 1e-3).mean() < 0.03
 
 
