@@ -218,33 +218,30 @@ def _occlude_row(
     # The distance from the source, inverted: what must not be exceeded by what hides.
     for i in range(n):
         pz[i] = q[i] / max(np.sqrt(px[i] * px[i] + py[i] * py[i] + pz[i] * pz[i]), _TINY)
-    if h == 0:
-        hides[:] = _ZERO
-    else:
+    for i in range(n):
+        column[i] = min(max(u[i] * scale + shift, _ZERO), np.float32(w - 1))
+    for i in range(n):
+        row[i] = min(max(v[i] * scale + shift, _ZERO), np.float32(h - 1))
+    smooth = not guess and min(h, w) > 1
+    beyond, number_at = shadow.reshape(h * w), solid.reshape(h * w)
+    if not smooth or before_m.shape[0]:
         for i in range(n):
-            column[i] = min(max(u[i] * scale + shift, _ZERO), np.float32(w - 1))
+            place[i] = np.int32(np.rint(row[i])) * np.int32(w) + np.int32(np.rint(column[i]))
         for i in range(n):
-            row[i] = min(max(v[i] * scale + shift, _ZERO), np.float32(h - 1))
-        beyond = shadow.reshape(h * w)
-        if not guess and min(h, w) > 1:  # what was measured hides smoothly
-            top, left, wide = np.int32(h - 2), np.int32(w - 2), np.int32(w)
-            for i in range(n):
-                r, c = min(np.int32(row[i]), top), min(np.int32(column[i]), left)
-                k, s, t = r * wide + c, row[i] - np.float32(r), column[i] - np.float32(c)
-                above = beyond[k] * (_ONE - t) + beyond[k + 1] * t
-                below = beyond[k + w] * (_ONE - t) + beyond[k + w + 1] * t
-                hides[i] = above * (_ONE - s) + below * s
-        if guess or min(h, w) == 1 or before_m.shape[0]:
-            for i in range(n):
-                place[i] = np.int32(np.rint(row[i])) * np.int32(w) + np.int32(np.rint(column[i]))
-        if guess or min(h, w) == 1:
-            for i in range(n):
-                hides[i] = beyond[place[i]]
-    number_at = solid.reshape(h * w)
-    if h and not guess and before_m.shape[0]:  # silhouettes of solids do not
+            hides[i] = beyond[np.uint32(place[i])]
+    if smooth:  # what was measured hides smoothly, silhouettes of solids do not
+        top, left, right, down = np.float32(h - 2), np.float32(w - 2), np.uint64(1), np.uint64(w)
         for i in range(n):
-            if number_at[place[i]] >= 0 or (face.shape[0] and face[i] >= 0):
-                hides[i] = beyond[place[i]]
+            px[i] = np.float32(np.int32(min(row[i], top)))
+        for i in range(n):
+            py[i] = np.float32(np.int32(min(column[i], left)))
+        for i in range(n):
+            k = np.uint64(np.int32(px[i]) * np.int32(w) + np.int32(py[i]))
+            s, t = row[i] - px[i], column[i] - py[i]
+            above = beyond[k] * (_ONE - t) + beyond[k + right] * t
+            below = beyond[k + down] * (_ONE - t) + beyond[k + down + right] * t
+            is_solid = before_m.shape[0] and (number_at[place[i]] >= 0 or (face.shape[0] and face[i] >= 0))
+            hides[i] = hides[i] if is_solid else above * (_ONE - s) + below * s
     if face.shape[0] == 0 and guess:
         pz[:] = _ZERO
     elif face.shape[0]:
@@ -254,7 +251,7 @@ def _occlude_row(
                 pz[i] = _ZERO if guess else pz[i]
             elif before_m[number] <= _ZERO or before_m[number] * pz[i] < LEAST_INCIDENCE:
                 pz[i] = -_ONE
-            elif h and number_at[place[i]] == number // 6:
+            elif number_at[place[i]] == number // 6:
                 pz[i] = _MOST
     for i in range(n):
         seen[i] = seen[i] & (hides[i] <= pz[i])
@@ -283,7 +280,7 @@ def _evaluate_row(
         inside[i] = (u[i] >= low_u) & (u[i] <= high_u) & (v[i] >= low_v) & (v[i] <= high_v)
     for i in range(n):
         seen[i] = inside[i]
-    if shadow.shape[0] or face.shape[0]:
+    if shadow.shape[0]:
         faces = face[y, x0 : x0 + n] if face.shape[0] else face[:, 0]
         _occlude_row(
             q[y, x0 : x0 + n], faces, px, py, pz, u, v, rx, ry, rz, work[10].view(np.int32), bounds[6], before_m,
