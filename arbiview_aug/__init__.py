@@ -8,6 +8,7 @@ from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, Samp
 from arbiview_aug.favs.config import FavsConfig, PaperConfig
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.sample.boxes_2d import ImageBoxes, project_boxes_3d
+from arbiview_aug.sample.mistakes import CheckReport, Finding, check
 from arbiview_aug.transforms.resize import CropRig, ResizeRig
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
@@ -15,9 +16,11 @@ __all__ = [
     "ArbiviewError",
     "CalibrationError",
     "Camera",
+    "CheckReport",
     "CropRig",
     "DataError",
     "FavsConfig",
+    "Finding",
     "ImageBoxes",
     "MixedDataset",
     "PaperConfig",
@@ -30,6 +33,7 @@ __all__ = [
     "RigRetarget",
     "SampleError",
     "SampleTypeError",
+    "check",
     "load_rig",
     "project_boxes_3d",
     "shipped_rigs",

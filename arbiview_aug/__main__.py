@@ -11,6 +11,7 @@ from arbiview_aug.errors import exit_status
 
 COMMANDS = {
     "bench": ("arbiview_aug.cli.bench", "measure speed against accuracy, on your own data too"),
+    "check": ("arbiview_aug.cli.check", "find silent mistakes in a data set, and draw its labels into its images"),
     "convert": ("arbiview_aug.cli.convert.command", "write a data set as another vehicle's cameras would have seen it"),
     "demo": ("arbiview_aug.cli.demo", "retarget a synthetic street or real frames, with numbers and a picture"),
     "depth": ("arbiview_aug.cli.depth", "compute depth from motion of a drive's frames, for surface='motion'"),

@@ -53,6 +53,8 @@ TINY = {
     "evaluate --data FOLDER --target waymo": ["--reduce", "4", "--size", "40x72"],
     "evaluate --paper": ["--size", "16x44", "--frames", "1"],
     "evaluate --figure --data FOLDER": ["--reduce", "4"],
+    "check FOLDER": ["--reduce", "4"],
+    "check FOLDER --frames 5 --output output": ["--reduce", "4"],
     "inspect nuscenes waymo": [],
     "inspect nuscenes waymo --output docs/images/rigs.jpg": [],
     "inspect nuscenes truck.yaml": [],

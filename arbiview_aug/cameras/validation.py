@@ -11,13 +11,15 @@ from typing import Any, cast
 import numpy as np
 
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, LensName, canonical_name
-from arbiview_aug.cameras.rotations import nearest_rotation
+from arbiview_aug.cameras.rotations import CAMERA_AXES_IN_EGO, nearest_rotation
 from arbiview_aug.errors import CalibrationError
 
 ROTATION_TOLERANCE = 1e-4
 """Largest entry of |R Rᵀ - I| accepted as a rotation: published calibrations carry 5 to 7 digits."""
 
 _MAX_COEFFICIENT = 1e6  # real lenses stay below 1e3, and near 1e300 their polynomials overflow
+
+_FARTHEST_M, _MOST_HEIGHT_M = 20.0, 8.0  # of a vehicle's cameras, from the ego origin and over the road
 
 MAX_SIZE_PX = 32766
 """Largest image side: OpenCV's remap needs sizes below 32767."""
@@ -150,6 +152,46 @@ def checked_mask(name: str, value: Any, size: tuple[int, int]) -> BoolArray:
     array = array.copy()
     array.setflags(write=False)
     return array
+
+
+def pose_mistake(cam2ego: FloatArray, ground_z_m: float) -> tuple[str, str] | None:
+    """What poses (N, 4, 4) probably are instead, and the fix; None if most cameras stand upright over the road."""
+    looks_down = cam2ego[:, 2, 2] < -0.8  # such cameras have no lower edge
+    if ((_stands(cam2ego) | looks_down) & _is_mounted(cam2ego, ground_z_m)).mean() >= 0.5:
+        return None
+    body, metres, upside_down = np.eye(4), cam2ego.copy(), np.diag([1.0, -1, -1, 1])
+    body[:3, :3] = CAMERA_AXES_IN_EGO
+    metres[:, :3, 3] /= 1000
+    axes = f"by {CAMERA_AXES_IN_EGO.astype(int).tolist()} from the"
+    for right, found, fix in (
+        (metres, "positions in millimetres", "divide cam2ego[:3, 3] by 1000"),
+        (np.asarray(np.linalg.inv(cam2ego), np.float64), "ego2cam, the inverse", "pass np.linalg.inv(cam2ego)"),
+        (cam2ego @ body, "a body's axes (ROS: x forward, z up)", f"multiply cam2ego[:3, :3] {axes} right"),
+        (
+            body @ cam2ego,
+            "an ego frame with a camera's axes (z forward)",
+            f"multiply cam2ego[:3] {axes} left",
+        ),
+        (cam2ego @ upside_down, "OpenGL's axes (y up, z backward)", "negate cam2ego[:3, 1:3]"),
+    ):
+        if (_stands(right) & _is_mounted(right, ground_z_m)).mean() > 0.5:
+            return found, fix
+    heights = ", ".join(f"{z:+.1f}" for z in cam2ego[:, 2, 3] - ground_z_m)
+    if _stands(cam2ego).all():
+        return f"heights over the road of {heights} m", "is ground_z_m the road's height in the ego frame?"
+    return f"cameras that lie on their side or look up, {heights} m over the road", "compare docs/rigs.md"
+
+
+def _stands(cam2ego: FloatArray) -> BoolArray:
+    """(N,) whether an image's lower edge is down."""
+    return np.asarray(cam2ego[:, 2, 1] < -0.5)
+
+
+def _is_mounted(cam2ego: FloatArray, ground_z_m: float) -> BoolArray:
+    """(N,) whether cameras are at the height and distance of a vehicle's."""
+    height = cam2ego[:, 2, 3] - ground_z_m
+    near = np.abs(cam2ego[:, :2, 3]).max(axis=1) < _FARTHEST_M
+    return np.asarray(near & (height > 0) & (height < _MOST_HEIGHT_M))
 
 
 def _error(name: str, field: str, expected: str, got: str, fix: str = "") -> CalibrationError:

@@ -56,11 +56,15 @@ def data(text: str) -> str:
     return text
 
 
+def kinds_text() -> str:
+    """What each kind in ``KIND:PATH`` is, for help texts."""
+    return "; ".join(f"{kind}: {reader.description}" for kind, reader in READERS.items())
+
+
 def add_data(parser: argparse.ArgumentParser, without: str | None = None, **options: Any) -> None:
     """Add ``--data``; ``without`` describes the data used without it, None makes it required."""
-    kinds = "; ".join(f"{kind}: {reader.description}" for kind, reader in READERS.items())
     default = "" if without is None else f" (default: {without})"
-    text = f"real frames, by their path alone or with their kind. {kinds}{default}"
+    text = f"real frames, by their path alone or with their kind. {kinds_text()}{default}"
     parser.add_argument("--data", type=data, metavar="[KIND:]PATH", required=without is None, help=text, **options)
 
 
@@ -97,9 +101,12 @@ def add_frames(parser: argparse.ArgumentParser, default: int | None, text: str =
 
 
 def add_reduce(parser: argparse.ArgumentParser) -> None:
+    """Add ``--reduce`` and ``--clean-masks``."""
     parser.add_argument(
         "--reduce", type=int, choices=get_args(Reduce), default=1, help="decode images at 1/N of their size"
     )
+    text = "take specks out of frame folders' masks, and mask the dark rims of fisheye images without a mask"
+    parser.add_argument("--clean-masks", action="store_true", help=text)
 
 
 def add_output(parser: argparse.ArgumentParser, text: str = "folder to write to") -> None:

@@ -94,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     add_rendering(parser)
     add_frames(parser, 1)
     parser.add_argument("--width", type=count, default=1800, metavar="PX", help="width of the contact sheet")
-    parser.set_defaults(yaws=None, reduce=1)
+    parser.set_defaults(yaws=None, reduce=1, clean_masks=False)
     return parser
 
 

@@ -49,7 +49,7 @@ from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.surface import SurfaceName
 
 _FIXED = {
-    "paper": ("target", "yaws", "quality", "surface", "path", "generator", "steps", "seed", "reduce"),
+    "paper": ("target", "yaws", "quality", "surface", "path", "generator", "steps", "seed", "reduce", "clean_masks"),
     "figure": ("target", "yaws", "quality", "surface", "path", "generator", "steps", "frames"),
 }
 """Options that the two modes fix."""
@@ -62,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for mode, fixed in _FIXED.items():
         for name in fixed:
             if getattr(arguments, mode) and getattr(arguments, name) != parser.get_default(name):
-                parser.error(f"argument --{name}: --{mode} has its own; expected none")
+                parser.error(f"argument --{name.replace('_', '-')}: --{mode} has its own; expected none")
     folder = writable_folder(Path(arguments.output), arguments.output)
     notes: list[str] = []
     if arguments.paper:
@@ -128,7 +128,8 @@ def open_frames(arguments: argparse.Namespace, surfaces: Sequence[SurfaceName], 
     """Open ``--data``, or a synthetic drive; with neighbours where a surface needs them."""
     neighbours = WANTED if any("motion" in SURFACES[name].reads for name in surfaces) else None
     if arguments.data is not None:
-        return open_data(arguments.data, reduce=arguments.reduce, neighbours=neighbours)
+        options = {name: getattr(arguments, name) for name in ("reduce", "clean_masks")}
+        return open_data(arguments.data, neighbours=neighbours, **options)
     source = demo_source_rig(**({} if arguments.size is None else {"size": arguments.size}))
     frames = arguments.frames or 1
     return SyntheticDrive(source, num_frames=frames, seed=arguments.seed, lidar=lidar, neighbours=neighbours)

@@ -7,6 +7,7 @@ from arbiview_aug.datasets.motion_depth import WithMotionDepth
 from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
 from arbiview_aug.datasets.registry import open_data
 from arbiview_aug.datasets.wrappers import MixedDataset, RetargetedDataset, RetargetedIterable
+from arbiview_aug.sample.masks import cleaned_rig
 
 __all__ = [
     "FrameFolder",
@@ -17,6 +18,7 @@ __all__ = [
     "RetargetedDataset",
     "RetargetedIterable",
     "WithMotionDepth",
+    "cleaned_rig",
     "decode_images",
     "open_data",
     "reduced_camera",

@@ -6,6 +6,7 @@ import json
 import os
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -31,6 +32,7 @@ from arbiview_aug.datasets.drive import (
 )
 from arbiview_aug.datasets.image_io import Reduce, check_reduce, decode_images, reduced_rig
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, WarnOnce
+from arbiview_aug.sample.masks import cleaned_camera
 from arbiview_aug.scene.boxes import checked_boxes
 
 CALIBRATION_FILE = "calib.json"
@@ -92,6 +94,8 @@ class FrameFolder(WritableRecording):
         reduce: Decode the images at 1, 1/2 or 1/4 of their size; the rig follows (see ``decode_images``).
         load_points: Whether to read the points.
         neighbours: Which other frames of the drive come with a frame; None for none.
+        clean_masks: Turn over specks in masks, and mask the dark rim of fisheye images that have no mask. The rim is
+            found in the first, the middle and the last frame together (``cleaned_rig``).
 
     Raises:
         TypeError: ``neighbours`` is neither ``Neighbours`` nor None.
@@ -100,14 +104,22 @@ class FrameFolder(WritableRecording):
     """
 
     def __init__(
-        self, root: str | Path, *, reduce: Reduce = 1, load_points: bool = True, neighbours: Neighbours | None = None
+        self,
+        root: str | Path,
+        *,
+        reduce: Reduce = 1,
+        load_points: bool = True,
+        neighbours: Neighbours | None = None,
+        clean_masks: bool = False,
     ) -> None:
         check_reduce(reduce)
         check_neighbours(neighbours)
         self.root, self.reduce, self.load_points, self.neighbours = Path(root), reduce, load_points, neighbours
+        self.clean_masks = clean_masks
         self._frames = _find_frames(self.root)
         self.tokens = [frame.name for frame in self._frames]
         self._last_rig: tuple[str, Rig] | None = None
+        self._rims: dict[Camera, Camera] = {}
         self._times_s, order = _read_sequence(self.root, self._index)
         self._warn = WarnOnce()
         self._drive_names: list[str] = []
@@ -197,8 +209,25 @@ class FrameFolder(WritableRecording):
         if last is None or last[0] != key:
             rig = Rig.from_dict(data, where=frame.where)
             cameras = [_with_mask(camera, file, frame) for camera, file in zip(rig, masks, strict=True)]
+            cameras = list(map(self._cleaned, cameras)) if self.clean_masks else cameras
             last = self._last_rig = key, reduced_rig(rig.with_cameras(cameras), self.reduce)
         return last[1]
+
+    def _cleaned(self, camera: Camera) -> Camera:
+        """The camera with a mask that hides no specks, or the rim that is dark in several frames of the data."""
+        if camera.mask is not None or camera.is_rectilinear:
+            return cleaned_camera(camera)
+        if camera not in self._rims:
+            images = []
+            for k in sorted({0, len(self) // 2, len(self) - 1}):
+                with suppress(ArbiviewError):  # told when that frame is read
+                    entries = {c.get("name"): c for c in _read_calibration(self._frames[k])["cameras"]}
+                    if camera.name in entries:
+                        file = _image_file(entries[camera.name], self._frames[k])
+                        images.append(decode_images([file], names=[camera.name], sizes=[camera.size])[0])
+            brightest = torch.stack(images).amax(dim=0) if images else None
+            self._rims[camera] = cleaned_camera(camera, brightest)
+        return self._rims[camera]
 
 
 def _find_frames(root: Path) -> list[_Frame]:

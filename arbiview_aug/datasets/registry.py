@@ -25,13 +25,15 @@ READERS = {
     "frames": Reader(
         f"frame folder ({CALIBRATION_FILE} in it or in its folders)",
         lambda root: (root / CALIBRATION_FILE).is_file() or any(root.glob(f"*/{CALIBRATION_FILE}")),
-        lambda root, *, version, reduce, neighbours: FrameFolder(root, reduce=reduce, neighbours=neighbours),
+        lambda root, *, version, **options: FrameFolder(root, **options),
         writer="arbiview_aug.cli.convert.frame_folders:FrameFolders",
     ),
     "nuscenes": Reader(
         "nuScenes root (with a folder of tables such as v1.0-mini)",
         lambda root: bool(table_folders(root)),
-        lambda root, *, version, **options: NuScenesDataset(root, version or table_folders(root)[0], **options),
+        lambda root, *, version, clean_masks=False, **options: NuScenesDataset(
+            root, version or table_folders(root)[0], **options
+        ),
         writer="arbiview_aug.cli.convert.nuscenes:NuScenes",
     ),
 }
@@ -77,6 +79,7 @@ def open_data(
     version: str | None = None,
     reduce: Reduce = 1,
     neighbours: Neighbours | None = None,
+    clean_masks: bool = False,
 ) -> Recording:
     """Open a data set with the reader that fits it.
 
@@ -87,9 +90,11 @@ def open_data(
         version: nuScenes' folder of tables; by default v1.0-mini or v1.0-trainval, else the first one.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size.
         neighbours: Which other frames of the drive come with a sample; None for none.
+        clean_masks: As for ``FrameFolder``; nuScenes has no masks.
 
     Raises:
         DataError: There is no such folder, or no reader fits it.
     """
     root, reader = find_reader(data, kind)
-    return reader.open(root, version=version, reduce=reduce, neighbours=neighbours)
+    options = {"clean_masks": True} if clean_masks else {}  # not every reader has masks
+    return reader.open(root, version=version, reduce=reduce, neighbours=neighbours, **options)

@@ -77,16 +77,7 @@ def outline(camera: Camera, box: FloatArray) -> Outline | None:
     """The outline of a box (7,) in a camera's image; None if it is outside or holds the camera."""
     if is_over(box, camera.center_m) and abs(camera.center_m[2] - box[2]) <= box[5] / 2:
         return None
-    c, s = np.cos(box[6]), np.sin(box[6])
-    corners = (_CORNERS * box[3:6]) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + box[:3]
-    x = (corners - camera.center_m) @ camera.cam2ego[:3, :3]
-    one, two = x[_EDGES[:, 0]], x[_EDGES[:, 1]]
-    if not camera.lens_model.sees_behind:
-        ahead = np.maximum(one[:, 2], two[:, 2]) >= _NEAR_M
-        one, two = one[ahead], two[ahead]
-        one, two = _cut(one, two), _cut(two, one)
-    steps = np.linspace(0, 1, 2 if camera.is_rectilinear else _LENS_STEPS)[:, None, None]
-    points = (1 - steps) * one + steps * two
+    points = edge_points(camera, box)
     pixels, _, valid = camera.project_cam(points)  # [steps, edges, 2]
     if not valid.any():
         return None
@@ -109,6 +100,20 @@ def outline(camera: Camera, box: FloatArray) -> Outline | None:
         around.append(beyond[:, :2] / beyond[:, 2:])
     uncut, inside = (np.concatenate([p.min(axis=0), p.max(axis=0)]) for p in (np.concatenate(around), within))
     return Outline(uncut, inside)
+
+
+def edge_points(camera: Camera, box: FloatArray) -> FloatArray:
+    """Points (steps, edges, 3) along the edges of a box (7,) in a camera's frame, cut at the near plane."""
+    c, s = np.cos(box[6]), np.sin(box[6])
+    corners = (_CORNERS * box[3:6]) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + box[:3]
+    x = (corners - camera.center_m) @ camera.cam2ego[:3, :3]
+    one, two = x[_EDGES[:, 0]], x[_EDGES[:, 1]]
+    if not camera.lens_model.sees_behind:
+        ahead = np.maximum(one[:, 2], two[:, 2]) >= _NEAR_M
+        one, two = one[ahead], two[ahead]
+        one, two = _cut(one, two), _cut(two, one)
+    steps = np.linspace(0, 1, 2 if camera.is_rectilinear else _LENS_STEPS)[:, None, None]
+    return np.asarray((1 - steps) * one + steps * two)
 
 
 def _clipped(one: FloatArray, two: FloatArray, limits: FloatArray) -> FloatArray:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
 from arbiview_aug.cameras.key_names import misnamed
 from arbiview_aug.errors import SampleError
-from arbiview_aug.sample.inputs import CALIBRATION_KEYS
+from arbiview_aug.sample.inputs import CALIBRATION_KEYS, Frame
 
 PIXEL_BOUND_KEYS = (
     "boxes_2d",
@@ -97,3 +97,16 @@ def warn_of_misnamed(
         if found not in (*named, *PIXEL_BOUND_KEYS):
             message = f"the sample's {found!r} is not read; did you mean {meant!r}?"
             warn(f"key {found}", f"{message} Rename it, as RigRetarget documents it, or name it in pass_keys")
+
+
+def warn_of_rims(frames: Iterable[Frame], warn: Callable[[str, str], None]) -> None:
+    """Warn, by topic and message, of fisheye images with a dark rim that no mask hides."""
+    lenses = [(c, i) for f in frames for c, i in zip(f.rig, f.images, strict=True) if c.mask is None]
+    if all(camera.is_rectilinear for camera, _ in lenses):
+        return
+    from arbiview_aug.sample.masks import CLEANING, image_circle
+
+    for camera, image in lenses:
+        if image_circle(camera, image) is not None:
+            warn("rim", f"camera {camera.name!r}: the dark rim of the image is read as scene; mask it: {CLEANING}")
+            return

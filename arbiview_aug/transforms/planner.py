@@ -13,6 +13,7 @@ import numpy as np
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rays import CameraMaps
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cameras.validation import pose_mistake
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.favs.config import FavsConfig, PaperConfig
 from arbiview_aug.lru_cache import LRUCache
@@ -31,6 +32,7 @@ from arbiview_aug.temporal.fill import Fills, Reach, neighbour_images, plan_fill
 from arbiview_aug.temporal.motion_depth import MotionDepth, motion_depth
 
 _UNREACHABLE = 0.5  # warn of target cameras of which less than this share is covered
+_SUSPICIOUS = 0.3  # a rig of which less is covered may have wrong poses
 _MAX_RIG_PAIRS = 64  # one or two kilobytes each, beside the target's cameras
 
 
@@ -241,7 +243,8 @@ class FramePlanner:
         made = build_plans(list(requests.values()), self.surface, self.config, device, self.maps)
         found = dict(zip(requests, made, strict=True))
         for request, plan in zip(requests.values(), made, strict=True):
-            self.warn_unreachable(request.target, [view.covered for view in plan.on_devices[device]])
+            covered = [view.covered for view in plan.on_devices[device]]
+            self._judge_reach(request.source, request.target, request.scene, covered)
         for key in keys.values():
             if isinstance(key, tuple):
                 found[key] = self.plans.get(key, partial(found.__getitem__, key))
@@ -249,8 +252,15 @@ class FramePlanner:
 
     def _built(self, source: Rig, target: Rig, scene: Scene, config: FavsConfig) -> RenderPlan:
         plan = build_plan(source, target, surface=self.surface, config=config, scene=scene, maps=self.maps)
-        self.warn_unreachable(target, plan.coverage)
+        self._judge_reach(source, target, scene, plan.coverage)
         return plan
+
+    def _judge_reach(self, source: Rig, target: Rig, scene: Scene, coverages: Sequence[BoolArray | float]) -> None:
+        """As ``warn_unreachable``; over the road alone where objects hide all of a frame's target."""
+        assert isinstance(self.config, FavsConfig)
+        if not scene.is_empty and not any(np.any(coverage) for coverage in coverages):
+            coverages = build_plan(source, target, surface="street", config=self.config, maps=self.maps).coverage
+        self.warn_unreachable(source, target, coverages)
 
     # --- depth --------------------------------------------------------------------------------------------------------
     def _names(self, sample: Mapping[str, Any], count: int, lead: tuple[int, ...]) -> Sequence[object]:
@@ -290,18 +300,24 @@ class FramePlanner:
         return depth
 
     # --- warnings -----------------------------------------------------------------------------------------------------
-    def warn_unreachable(self, target: Rig, coverages: Sequence[BoolArray | float]) -> None:
-        """Warn once of target cameras that the sources hardly cover, by the coverage (h, w) or share of each."""
-        if "unreachable" in self.warn.topics:  # the means below take milliseconds
+    def warn_unreachable(self, source: Rig, target: Rig, coverages: Sequence[BoolArray | float]) -> None:
+        """Warn once of target cameras that the sources hardly cover, by the coverage (h, w) or share of each.
+
+        Raises:
+            SampleError: They cover none of the target's pixels.
+        """
+        is_empty = not any(np.any(coverage) for coverage in coverages)
+        if "unreachable" in self.warn.topics and not is_empty:  # the means below take milliseconds
             return
+        lost = f"the target rig {target.name!r} cannot be reached from this data"
+        if is_empty:
+            raise SampleError(f"{lost}: expected some pixels to be covered, got none. {_likely_cause(source, target)}")
         shares = [float(np.mean(coverage)) for coverage in coverages]
         poor = [f"{c.name} {share:.0%}" for c, share in zip(target, shares, strict=True) if share < _UNREACHABLE]
         if poor:
-            self.warn(
-                "unreachable",
-                f"the target rig {target.name!r} cannot be reached from this data: covered are {', '.join(poor)}. "
-                f"{self.unseen} Or choose another target",
-            )
+            cause = f"{_likely_cause(source, target)}. " if np.mean(shares) < _SUSPICIOUS else ""
+            covered = f"covered are {', '.join(poor)}. {cause}{self.unseen}"
+            self.warn("unreachable", f"{lost}: {covered} Or choose another target")
 
     def judge(self, plans: Sequence[FramePlan]) -> None:
         """Warn once if ``auto`` falls back to the static street although cameras move, which harms a detector.
@@ -318,3 +334,11 @@ class FramePlanner:
             if self.strict:
                 raise SampleError(f"strict=True: {message}")
             self.warn("static", message)
+
+
+def _likely_cause(source: Rig, target: Rig) -> str:
+    """Why a target sees nothing of the sources, and the fix."""
+    for whose, rig in (("source", source), ("target", target)):
+        if mistake := pose_mistake(rig.cam2ego, rig.ground_z_m):
+            return f"The {whose}'s cam2ego seems to be {mistake[0]}: {mistake[1]}"
+    return "No source camera looks where the target's do, or masks hide it; python -m arbiview_aug check tests the data"

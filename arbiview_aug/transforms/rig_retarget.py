@@ -29,7 +29,7 @@ from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.render.rendered import Execution, RenderedFrame, Renderer, as_rendered, resize_only
 from arbiview_aug.sample.batching import leading_shape
-from arbiview_aug.sample.check import check_other_keys, warn_of_misnamed
+from arbiview_aug.sample.check import check_other_keys, warn_of_misnamed, warn_of_rims
 from arbiview_aug.sample.inputs import Frame, read_frames
 from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.surface import SurfaceName
@@ -299,6 +299,7 @@ class RigRetarget(torch.nn.Module):
             calibrated = sample.get("rig") is not None or self.source_rig is not None
             named = (*self.label_keys, *self.pass_keys)
             warn_of_misnamed(sample, calibrated, not self._reads_ego_frame, named, self._warn)
+            warn_of_rims(frames, self._warn)
             self._checked = types
         return check_other_keys(sample, list(sizes), self.label_keys, self.pass_keys)
 
@@ -314,7 +315,7 @@ class RigRetarget(torch.nn.Module):
         """Render a frame by the paper's stages."""
         assert isinstance(self.config, PaperConfig)
         rendering = render_paper(frame.rig, plan.target, frame.images, self.config, plan.detections)
-        self.planner.warn_unreachable(plan.target, rendering.coverage)
+        self.planner.warn_unreachable(plan.source, plan.target, rendering.coverage)
         return rendering
 
     def _complete(

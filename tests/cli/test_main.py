@@ -180,6 +180,7 @@ def test_the_console_script() -> None:
 HELP = {
     "bench": ("--data [KIND:]PATH", "--budget-ms", "--target", "speed", "loader"),
     "convert": ("--data [KIND:]PATH", "--target RIG", "--output DIR", "--quality", "--surface", "--workers"),
+    "check": ("[KIND:]PATH", "--frames N", "--output DIR", "--clean-masks"),
     "demo": ("--data [KIND:]PATH", "--target RIG", "--output DIR", "--quality", "--surface", "--seed N seed of"),
     "depth": ("--data [KIND:]PATH", "--output", "--workers"),
     "evaluate": ("--data [KIND:]PATH", "--target RIG", "--output DIR", "--quality", "--yaws", "--paper"),

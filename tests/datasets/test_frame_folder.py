@@ -14,8 +14,9 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.datasets import FrameFolder
+from arbiview_aug.datasets import FrameFolder, open_data
 from arbiview_aug.errors import CalibrationError, DataError
+from arbiview_aug.sample.masks import without_specks
 
 Change = Callable[[dict[str, Any]], None]
 
@@ -247,3 +248,31 @@ def test_folders_that_are_none(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path)
     with pytest.raises(DataError, match="expected a calibration, found no file"):
         dataset[0]
+
+
+# --- masks that are cleaned -------------------------------------------------------------------------------------------
+def test_specks_in_masks_are_cleaned_on_demand(ddad_root: Path) -> None:
+    for reduce in (1, 4):
+        given, cleaned = (FrameFolder(ddad_root, reduce=reduce, clean_masks=clean)[0]["rig"] for clean in (False, True))
+        for one, two in zip(given, cleaned, strict=True):
+            assert two.mask is not None and (without_specks(two.mask) == two.mask).all()
+            assert (one.mask != two.mask).mean() < 3e-3
+    assert any((one.mask != two.mask).any() for one, two in zip(given, cleaned, strict=True))
+
+
+def test_rims_are_those_of_several_frames(fisheye_root: Path, tmp_path: Path) -> None:
+    """A dark first frame neither hides the rim nor widens it, and every frame gets the same rig."""
+    for name, gain in (("a", 0.1), ("b", 1.0), ("c", 0.5)):
+        shutil.copytree(fisheye_root, tmp_path / name)
+        for file in (tmp_path / name).glob("*.png"):
+            cv2.imwrite(str(file), (cv2.imread(str(file)) * gain).astype(np.uint8))
+    frames = FrameFolder(tmp_path, clean_masks=True)
+    rigs = [frames[k]["rig"] for k in (2, 0, 1)]
+    masks = [camera.mask for camera in rigs[0]]
+    assert [mask is not None for mask in masks] == [True, False, True, True], "past the left lens's fold all is dark"
+    assert all(0.15 < (~mask).mean() < 0.22 for mask in masks if mask is not None)
+    assert rigs[0] == rigs[1] == rigs[2] == FrameFolder(fisheye_root, clean_masks=True)[0]["rig"]
+    assert all(camera.mask is None for camera in open_data(tmp_path)[0]["rig"])
+    assert open_data(tmp_path, clean_masks=True)[0]["rig"] == rigs[0]
+    (tmp_path / "b" / "front.png").write_bytes(b"broken")
+    assert FrameFolder(tmp_path, clean_masks=True)[2]["rig"][1:] == rigs[0][1:], "its own message comes when it is read"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Rig, RigRetarget
+from arbiview_aug import Rig, RigRetarget, SampleError
 from arbiview_aug.errors import CalibrationError
 from arbiview_aug.render.atlas import AtlasLayout
 from arbiview_aug.render.plan import build_plan
@@ -98,8 +98,12 @@ def test_images_of_a_row_or_a_pixel(which: str, size: tuple[int, int], how: tupl
     surface = "auto" if quality == "paper" else "street"
     for rig in (target, source):
         retarget = RigRetarget(rig, quality=quality, surface=surface, execution=execution)
-        with no_numpy_warnings():
-            out = retarget({"images": images, "rig": source})
+        try:
+            with no_numpy_warnings():
+                out = retarget({"images": images, "rig": source})
+        except SampleError as error:  # between two rows or columns of pixel centres there is nothing
+            assert rig is target and "got none. No source camera looks" in str(error)
+            continue
         for k, (view, coverage) in enumerate(zip(out["images"], out["coverage"], strict=True)):
             assert view.isfinite().all() and 0 <= view.min() and view.max() <= 1
             seen = view[:, coverage]

@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -316,9 +317,9 @@ def test_the_warning_names_the_mixing_that_works() -> None:
 
 
 def test_cameras_are_where_they_were_asked_for_if_no_pixel_depends_on_the_street() -> None:
-    """Nothing is seen of the target: its boxes are not even read, and that says nothing of the street."""
+    """Nothing is seen of the target that moved: its boxes are not even read, and that says nothing of the street."""
     one = Rig([demo_source_rig((64, 176))[0]])
-    behind = one.turned(yaw_deg=180).shifted(z_m=0.5)
+    behind = Rig([one[0], replace(one[0].turned(yaw_deg=180).shifted(z_m=0.5), name="behind")])
     sample = {"images": torch.zeros((1, 3, 64, 176)), "rig": one, "boxes_3d": torch.from_numpy(CAR)}
     with pytest.warns(UserWarning, match="cannot be reached") as told:
         out = RigRetarget(behind)(sample)

@@ -6,6 +6,7 @@ import copy
 import pickle
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -702,19 +703,39 @@ def test_impossible_settings(settings: dict[str, Any], message: str) -> None:
 
 
 # --- warnings ---------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("execution", EXECUTIONS)
-def test_a_rig_that_sees_nothing_of_the_sources(execution: str) -> None:
+def seen_and_behind() -> tuple[Rig, Rig]:
+    """A rig of one camera, and one of the same camera and another that looks the other way."""
     source = ring().with_cameras([ring()[0]])
-    behind = source.turned(yaw_deg=180)
-    retarget = RigRetarget(behind, execution=execution, label_keys=["classes"], label_fill=9)
+    return source, Rig([source[0], replace(source[0].turned(yaw_deg=180), name="behind")], name="both")
+
+
+@pytest.mark.parametrize("execution", EXECUTIONS)
+def test_a_camera_that_sees_nothing_of_the_sources(execution: str) -> None:
+    source, target = seen_and_behind()
+    retarget = RigRetarget(target, execution=execution, label_keys=["classes"], label_fill=9)
     sample = sample_of(source, classes=torch.ones((1, *SIZE), dtype=torch.uint8))
-    with pytest.warns(UserWarning, match=r"target rig 'ring' cannot be reached from this data: covered are c0 0%"):
+    with pytest.warns(UserWarning, match=r"target rig 'both' cannot be reached from this data: covered are behind 0%"):
         out = retarget(sample)
-    assert not out["coverage"].any() and (out["classes"] == 9).all()
-    assert out["generated"].all() and (out["images"] == 128).all()  # there is no colour to go by
+    assert not out["coverage"][1].any() and (out["classes"][1] == 9).all() and out["generated"][1].all()
     assert "no source camera looks there" in str(retarget.explain(sample))
     retarget(sample)
     retarget({**sample, "cam2ego": sample["cam2ego"] + 0.0})  # once, whatever comes
+
+
+@pytest.mark.parametrize(("quality", "execution"), [*(("fast", one) for one in EXECUTIONS), ("paper", "auto")])
+def test_a_rig_that_sees_nothing_of_the_sources(quality: Any, execution: Any) -> None:
+    source = ring().with_cameras([ring()[0]])
+    retarget = RigRetarget(source.turned(yaw_deg=180), quality=quality, execution=execution)
+    for _ in range(2):  # each time
+        with pytest.raises(SampleError, match=r"got none\. No source camera looks where the target's do"):
+            retarget(sample_of(source))
+
+
+def test_an_object_that_hides_everything_is_no_error() -> None:
+    source = ring().with_cameras([ring()[0]])
+    before = torch.tensor([[3.0, 0, 1.5, 0.5, 40, 40, 0]])
+    out = RigRetarget(source.shifted(x_m=8.0), surface="objects")({**sample_of(source), "boxes_3d": before})
+    assert not out["coverage"].any()
 
 
 @pytest.mark.parametrize(
@@ -727,9 +748,9 @@ def test_a_rig_that_sees_nothing_of_the_sources(execution: str) -> None:
     ],
 )
 def test_the_warning_says_what_becomes_of_pixels_that_no_source_sees(settings: dict[str, Any], note: str) -> None:
-    source = ring().with_cameras([ring()[0]])
+    source, target = seen_and_behind()
     with pytest.warns(UserWarning, match=f"The rest (is )?{note}"):
-        RigRetarget(source.turned(yaw_deg=180), **settings)(sample_of(source))
+        RigRetarget(target, **settings)(sample_of(source))
 
 
 # --- executions, gradients and memory ---------------------------------------------------------------------------------

@@ -158,7 +158,10 @@ def _settings(arguments: argparse.Namespace) -> Settings:
         generator=None if arguments.generator is None else arguments.generator.absolute(),
         motion_depth=None if depth is None else depth.absolute(),
         suffix=f".{arguments.images}",  # type: ignore[arg-type]
-        **{name: getattr(arguments, name) for name in ("version", *RETARGET_OPTIONS, "reduce", "neighbours")},
+        **{
+            name: getattr(arguments, name)
+            for name in ("version", *RETARGET_OPTIONS, "reduce", "clean_masks", "neighbours")
+        },
     )
 
 

@@ -28,8 +28,8 @@ FOLDER = "conversion"  # subfolder of an output with manifest, provenance and re
 class Settings:
     """Source, output and everything that decides the output's bytes; ``convert --help`` explains each.
 
-    ``root``, ``kind``, ``version`` and ``reduce`` are those of ``open_data``, ``RETARGET_OPTIONS`` those of
-    ``RigRetarget``. ``motion_depth`` is None where depth is estimated from the neighbours.
+    ``root``, ``kind``, ``version``, ``reduce`` and ``clean_masks`` are those of ``open_data``, ``RETARGET_OPTIONS``
+    those of ``RigRetarget``. ``motion_depth`` is None where depth is estimated from the neighbours.
     """
 
     root: Path
@@ -46,6 +46,7 @@ class Settings:
     size: tuple[int, int] | None = None
     fit: Fit = "crop"
     reduce: Reduce = 1
+    clean_masks: bool = False
     neighbours: int = 0
     motion_depth: Path | None = None
     suffix: Literal[".jpg", ".png"] = ".jpg"
@@ -57,7 +58,8 @@ class Settings:
 
     def open(self) -> Recording:
         neighbours = Neighbours(count=self.neighbours) if self.neighbours else None
-        return open_data(self.root, kind=self.kind, version=self.version, reduce=self.reduce, neighbours=neighbours)
+        options = {name: getattr(self, name) for name in ("kind", "version", "reduce", "clean_masks")}
+        return open_data(self.root, neighbours=neighbours, **options)
 
     def retarget(self) -> RigRetarget:
         """The transform; each process or actor makes one."""
@@ -78,6 +80,7 @@ class Settings:
         return {
             **{name: getattr(self, name) for name in names},
             **({} if self.size is None else {"fit": self.fit}),
+            **({"clean_masks": True} if self.clean_masks else {}),
             "motion_depth": self.motion_depth is not None,
             "generator": {path.name: checksum(path) for path in files},
             "target": target,

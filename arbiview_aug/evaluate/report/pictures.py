@@ -10,13 +10,18 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from arbiview_aug.cameras.lens import BoolArray
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.images import Image, to_bytes
+from arbiview_aug.evaluate.lidar import visible_points
+from arbiview_aug.sample.boxes_2d import edge_points
 
 Picture = npt.NDArray[np.uint8]
 INK, PAPER = (40, 40, 40), (255, 255, 255)
 HOLE = (255, 0, 160)  # colour of uncovered regions; rare on streets
+_BOX = (0, 230, 255)
+_FARTHEST_M = 80.0  # points there, and beyond, are blue
 
 _GAP_PX = 6
 _CAPTION_PX, _CAPTION_SCALE = 20, 0.42
@@ -86,6 +91,40 @@ def overlay_confidence(image: Image, confidence: npt.NDArray[np.floating[Any]]) 
     colour = 255 * np.concatenate([np.minimum(1, 2 - 2 * value), np.minimum(1, 2 * value), 0 * value], axis=-1)
     grey = to_bytes(image).mean(axis=-1, keepdims=True)
     return to_bytes(0.5 * grey + 0.5 * colour)
+
+
+def draw_labels(camera: Camera, image: Image, points: FloatArray | None, boxes: FloatArray | None) -> Picture:
+    """Draw points by their depth, red to blue, and boxes with their headings into a camera's image (h, w, 3).
+
+    Args:
+        camera: The camera; what its mask hides is hatched.
+        image: On the scale 0-255.
+        points: (P, >=3) in the ego frame.
+        boxes: (B, 7).
+    """
+    picture = to_bytes(image).copy() if camera.mask is None else outline_coverage(image, camera.mask)
+    h, w = camera.size
+    width_px = max(1, h // 400)
+    if points is not None and len(points):
+        seen = visible_points(camera, points)
+        far_first = np.argsort(-seen.depth_m)
+        depth_m = seen.depth_m[far_first].clip(1, _FARTHEST_M)
+        shade = (255 * np.log(depth_m) / np.log(_FARTHEST_M)).astype(np.uint8)
+        colours = cv2.applyColorMap(255 - shade[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
+        column, row = np.round(seen.uv[far_first]).astype(int).T
+        for dx, dy in np.ndindex(width_px + 1, width_px + 1):
+            picture[np.minimum(row + dy, h - 1), np.minimum(column + dx, w - 1)] = colours
+    for box in np.zeros((0, 7)) if boxes is None else boxes:
+        ahead = np.array([np.cos(box[6]), np.sin(box[6]), 0.0]) * box[3]
+        heading = box[:3] + np.linspace(0.5, 1.0, 9)[:, None, None] * ahead
+        heading = (heading - camera.center_m) @ camera.cam2ego[:3, :3]
+        for lines, colour in ((edge_points(camera, box), _BOX), (heading, HOLE)):
+            uv, depth, valid = camera.project_cam(lines)  # [steps, lines, 2]
+            valid &= (np.abs(uv) < 4 * max(h, w)).all(axis=-1) & (camera.lens_model.sees_behind | (depth > 0.1))
+            ends = np.stack([uv[:-1], uv[1:]], axis=-2)[valid[:-1] & valid[1:]]
+            for one, two in np.round(ends).astype(int).tolist():
+                cv2.line(picture, one, two, colour, width_px, cv2.LINE_AA)
+    return picture
 
 
 def save_picture(path: str | Path, picture: Picture) -> Path:

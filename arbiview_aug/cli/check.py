@@ -1,0 +1,79 @@
+"""``python -m arbiview_aug check``: mistakes that rendering cannot notice, and the labels drawn into the images."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from arbiview_aug.cameras.rig import load_rig
+from arbiview_aug.cli.arguments import (
+    add_output,
+    add_reduce,
+    command_parser,
+    count,
+    data,
+    gathered_warnings,
+    kinds_text,
+    writable_folder,
+)
+from arbiview_aug.datasets.registry import open_data, split_kind
+from arbiview_aug.sample.mistakes import CheckReport, check, check_rig
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print one line for each finding, and draw the first frame; 1 if there are findings."""
+    parser = command_parser(
+        "check",
+        "Look for silent mistakes: yaw in degrees, other columns or axes, points in the LiDAR's frame, a wrong road, "
+        "K of another resolution, specks in masks, keys that are not read. Draws boxes and points into the images.",
+        "/data/frames --frames 5",
+    )
+    text = f"real frames, by their path alone or with their kind, or a rig file. {kinds_text()}"
+    parser.add_argument("data", metavar="[KIND:]PATH", help=text)
+    parser.add_argument("--frames", type=count, default=3, metavar="N", help="number of frames, spread over the data")
+    add_reduce(parser)
+    add_output(parser, "folder for the pictures")
+    arguments = parser.parse_args(argv)
+    kind, path = split_kind(arguments.data)
+    if kind is None and not path.is_dir():
+        report = CheckReport(tuple(check_rig(load_rig(arguments.data))))
+        print(report)
+        return int(not report.ok)
+    folder = writable_folder(Path(arguments.output), arguments.output)
+    notes: list[str] = []
+    with gathered_warnings(notes):
+        samples = open_data(data(arguments.data), reduce=arguments.reduce, clean_masks=arguments.clean_masks)
+        chosen = np.unique(np.linspace(0, len(samples) - 1, arguments.frames).round().astype(int)).tolist()
+        lines: dict[tuple[str, str], list[str]] = {}
+        for index in chosen:
+            sample = samples[index]
+            for finding in check(sample).findings:
+                lines.setdefault((finding.where, finding.fix), []).append(str(finding))
+            if index == chosen[0]:
+                pictures = _draw(sample, folder)
+    for note in notes:
+        print(note)
+    for same in lines.values():
+        print(same[0] if len(chosen) == 1 else f"{same[0]} ({len(same)} of {len(chosen)} frames)")
+    found = len(notes) + len(lines)
+    print(
+        f"{found or 'no'} finding{'s' * (found != 1)} in {len(chosen)} of {len(samples)} frames; pictures: {pictures}"
+    )
+    return int(found > 0)
+
+
+def _draw(sample: Mapping[str, Any], folder: Path) -> str:
+    """Write a picture for each camera of a reader's sample; return what they are called."""
+    # Imported late so that --help is quick.
+    from arbiview_aug.evaluate.images import as_arrays
+    from arbiview_aug.evaluate.report.pictures import draw_labels, save_picture
+
+    points, boxes = (None if sample.get(key) is None else sample[key].numpy() for key in ("points", "boxes_3d"))
+    for camera, image in zip(sample["rig"], as_arrays(sample["images"]), strict=True):
+        name = re.sub(r"[^\w+-]+", "-", camera.name)
+        save_picture(folder / f"check-{name}.png", draw_labels(camera, image, points, boxes))
+    return f"{folder}/check-*.png"

@@ -1,0 +1,142 @@
+"""Pixels that show no scene: specks in masks, and the dark rim around a fisheye's image circle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.cameras.rig import Rig
+
+SPECK_SHARE = 2e-4
+"""Largest speck as a share of the image. In DDAD's masks specks have up to 0.5e-4, parts of the car from 250e-4."""
+
+CLEANING = "clean_masks=True in the reader, --clean-masks, or arbiview_aug.datasets.cleaned_rig"
+"""How to mask what is no scene, for messages."""
+
+_DARK = 32  # of 255: rims have 0 to 30 beyond the vignette
+_SIDE_PX = 512  # images are searched at this size
+_LEAST_RIM, _LEAST_HIDDEN = 0.02, 0.005  # shares of the image: dark, and hidden where pixels have rays
+_OFF_CIRCLE = 0.01  # of the image's width: farther boundary pixels do not lie on the circle
+_LEAST_ON_CIRCLE = 0.6
+"""Share of a dark region's boundary on one circle: 0.92 to 1.00 on four real cameras, up to 0.22 on dark images."""
+
+_DIMMED = 0.8
+"""Brightness near the rim as a share of that farther inside; less is a vignette. On four real cameras 0.4 to 0.65."""
+
+_VIGNETTE = 0.93  # radius within the vignette as a share of the rim's
+_TRIALS = 200
+
+
+class Circle(NamedTuple):
+    """An image circle, an ellipse where pixels are not square: radii in pixels along x and y."""
+
+    center_px: FloatArray  # (2,)
+    radii_px: FloatArray  # (2,)
+
+    def holds(self, camera: Camera) -> BoolArray:
+        """The camera's pixels (h, w) within the circle."""
+        offset = (camera.pixel_grid() - self.center_px) / self.radii_px
+        return np.asarray((offset**2).sum(axis=-1) <= 1)
+
+
+def without_specks(mask: BoolArray) -> BoolArray:
+    """A mask (h, w) whose regions of less than ``SPECK_SHARE`` of the image are turned over."""
+    cleaned = mask.copy()
+    for value in (False, True):
+        _, labels, stats, _ = cv2.connectedComponentsWithStats((cleaned == value).astype(np.uint8), connectivity=8)
+        small = stats[:, cv2.CC_STAT_AREA] < SPECK_SHARE * mask.size
+        small[0] = False  # the other value
+        cleaned[small[labels]] = not value
+    return cleaned
+
+
+def image_circle(camera: Camera, image: torch.Tensor) -> Circle | None:
+    """Find the circle around which a fisheye's image is dark.
+
+    The dark regions at the corners must end in one circle, so that a dark scene is not taken for a rim.
+
+    Args:
+        camera: The camera; None is returned for lenses that keep straight lines straight.
+        image: Its image (3, h, w), uint8 or float in [0, 1].
+
+    Returns:
+        The circle within the vignette; None without a rim.
+    """
+    if camera.is_rectilinear:
+        return None
+    image = image.detach().amax(dim=0).cpu()
+    brightest = image.numpy() if image.dtype == torch.uint8 else (image.float() * 255).to(torch.uint8).numpy()
+    h, w = camera.size
+    scale = min(1.0, _SIDE_PX / max(h, w))
+    small = cv2.resize(brightest, (max(1, round(w * scale)), max(1, round(h * scale))), interpolation=cv2.INTER_AREA)
+    small = cv2.medianBlur(small, 5)
+    _, labels = cv2.connectedComponents((small < _DARK).astype(np.uint8))
+    corners = {int(label) for label in labels[[0, 0, -1, -1], [0, -1, 0, -1]]} - {0}
+    rim = np.isin(labels, list(corners)).astype(np.uint8)
+    if rim.mean() < _LEAST_RIM:
+        return None
+    inner = cv2.dilate(rim, np.ones((3, 3), np.uint8)) > rim
+    inner[[0, -1]] = inner[:, [0, -1]] = False
+    pixels = np.stack(np.meshgrid(*(np.arange(n) for n in rim.shape[::-1])), axis=-1)
+    pixels = (pixels + 0.5) * (w / small.shape[1], h / small.shape[0]) - 0.5  # of the camera's image
+    found = _fitted(pixels[inner], float(camera.K[0, 0] / camera.K[1, 1]), w)
+    if found is None:
+        return None
+    radius = np.linalg.norm((pixels - found.center_px) / found.radii_px, axis=-1)
+    within, beside = (small[(radius > low) & (radius < high)] for low, high in ((0.8, 0.9), (0.96, 1.0)))
+    if within.size and beside.size and np.median(beside) < _DIMMED * np.median(within):
+        found = found._replace(radii_px=_VIGNETTE * found.radii_px)
+        radius = radius / _VIGNETTE
+    # Pixels without a ray are never read.
+    return found if ((radius > 1) & camera.unproject(pixels).valid).mean() >= _LEAST_HIDDEN else None
+
+
+def _fitted(edge: FloatArray, stretch: float, width: int) -> Circle | None:
+    """The circle through most of the pixels (n, 2), y stretched by the pixels' aspect (RANSAC)."""
+    edge = edge * (1, stretch)
+    if len(edge) < 50:
+        return None
+    rng, best = np.random.default_rng(0), np.zeros(len(edge), bool)
+    for _ in range(_TRIALS):
+        center, radius = _circle(edge[rng.choice(len(edge), 3, replace=False)])
+        on = np.abs(np.linalg.norm(edge - center, axis=1) - radius) < _OFF_CIRCLE * width
+        best = on if radius < width and on.sum() > best.sum() else best
+    if best.mean() < _LEAST_ON_CIRCLE:
+        return None
+    center, radius = _circle(edge[best])
+    return Circle(center / (1, stretch), radius / np.array([1, stretch]))
+
+
+def _circle(points: FloatArray) -> tuple[FloatArray, float]:
+    """Centre and radius by algebraic least squares of points (n, 2)."""
+    ones = np.ones((len(points), 1))
+    x, y, c = np.linalg.lstsq(np.hstack([2 * points, ones]), (points**2).sum(axis=1), rcond=None)[0]
+    return np.array([x, y]), float(np.sqrt(max(c + x * x + y * y, 0.0)))
+
+
+def cleaned_rig(rig: Rig, images: Sequence[torch.Tensor]) -> Rig:
+    """The rig with masks that hide what is no scene.
+
+    Specks in masks are turned over; fisheye cameras without a mask whose images have a dark rim get one.
+
+    Args:
+        rig: The rig.
+        images: An image (3, h, w) of each camera, uint8 or float in [0, 1].
+    """
+    return rig.with_cameras(list(map(cleaned_camera, rig, images)))
+
+
+def cleaned_camera(camera: Camera, image: torch.Tensor | None = None) -> Camera:
+    """One camera of ``cleaned_rig``; without an image no rim is looked for."""
+    if camera.mask is not None:
+        mask = without_specks(camera.mask)
+        return camera if (mask == camera.mask).all() else replace(camera, mask=mask)
+    circle = None if image is None else image_circle(camera, image)
+    return camera if circle is None else replace(camera, mask=circle.holds(camera))

@@ -1,0 +1,315 @@
+"""``check``: mistakes in a sample that rendering cannot notice, found from its points, boxes, poses and masks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from arbiview_aug.cameras.key_names import misnamed
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cameras.validation import pose_mistake
+from arbiview_aug.sample.batching import leading_shape
+from arbiview_aug.sample.check import EGO_KEYS, PIXEL_BOUND_KEYS
+from arbiview_aug.sample.inputs import Frame, of_frames, read_frames
+from arbiview_aug.sample.masks import CLEANING, image_circle, without_specks
+from arbiview_aug.scene.boxes import checked_boxes, points_in
+from arbiview_aug.scene.point_cloud import checked_points, own_car
+from arbiview_aug.scene.surface import Points
+
+ROAD_M = 0.2
+"""Largest distance of the points' road from ``ground_z_m``; on three real frames and six streets it is up to 0.01."""
+
+_ROAD_RADIUS_M, _SECTORS, _LEAST_SECTORS, _LEAST_IN_SECTOR = 10.0, 36, 12, 20
+_ROAD_PERCENTILE = 10  # of a sector's points: those above stand on the road
+_OVER_ROAD_M = 0.3  # points above this are objects'
+
+_LIDAR_HEIGHT_M = 1.2  # points this far below the road come from the height of a LiDAR on a roof
+
+_LEAST_POINTS = 5  # in a box, for it to speak
+_MOST_POINTS = 50  # near boxes count as much as others
+_BETTER = 1.3  # times as many points: a box of another reading holds clearly more
+_LEAST_WINS, _WIN_RATIO = 3, 4
+"""Boxes that must hold more points in another reading, and how many for each that holds fewer. Right readings of two
+real frames and 40 streets win none or lose as many; wrong ones win all but one in ten."""
+
+_LONG_M, _LEAST_LONG, _MOST_LONG = 3.0, 3, 0.75
+"""Boxes longer than this are vehicles, longest along their length: 3 of them at least, three quarters of all."""
+
+_NEAR_M = 40.0  # boxes farther away stand on another height of the road
+_MANY_DEG = 2 * math.pi + 1e-3
+
+_OFF_CENTER, _OFF_CENTER_ALONE, _ALIKE = 0.04, 0.08, 0.06
+"""Principal points off centre by such a share of the width, in all cameras or in one alone, and by about the same of
+the height, are another resolution's. Real ones are off by up to 0.02 of the width, in both directions."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One probable mistake.
+
+    Attributes:
+        where: The camera or key.
+        expected: What is right.
+        found: What the sample says instead.
+        fix: What to do.
+    """
+
+    where: str
+    expected: str
+    found: str
+    fix: str
+
+    def __str__(self) -> str:
+        return f"{self.where}: expected {self.expected}, found {self.found}; {self.fix}"
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """The findings of ``check``; ``print`` shows one line each."""
+
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing was found."""
+        return not self.findings
+
+    def __str__(self) -> str:
+        return "\n".join(map(str, self.findings)) or "no findings"
+
+
+def check(sample: Mapping[str, Any], source_rig: Rig | None = None) -> CheckReport:
+    """Look for mistakes that rendering cannot notice.
+
+    Points in boxes tell the reading of the boxes and the frame of the points; the road in the points tells
+    ``ground_z_m``; poses are compared with cameras that stand upright over the road.
+
+    Args:
+        sample: A sample or batch as ``RigRetarget`` takes it.
+        source_rig: The rig of samples that carry none.
+
+    Raises:
+        ArbiviewError: What ``RigRetarget`` would refuse too.
+    """
+    frames = read_frames(sample, source_rig)
+    lead = leading_shape(sample["images"])
+    boxes, points = (_arrays(sample, key, frames, lead) for key in ("boxes_3d", "points"))
+    found = list(_key_findings(sample, source_rig is not None or sample.get("rig") is not None))
+    for frame, of_frame, cloud in zip(frames, boxes, points, strict=True):
+        found += check_rig(frame.rig)
+        found += _image_findings(frame)
+        found += _label_findings(frame.rig, of_frame, cloud)
+    return CheckReport(tuple(dict.fromkeys(found)))
+
+
+def check_rig(rig: Rig) -> list[Finding]:
+    """Mistakes in poses, intrinsics and masks alone."""
+    found = []
+    mistake = pose_mistake(rig.cam2ego, rig.ground_z_m)
+    if mistake is not None:
+        expected = "cameras upright over the road: cam2ego with axes right, down, forward, in metres"
+        found.append(Finding("cam2ego", expected, *mistake))
+    found += _resolution_findings(rig)
+    for camera in rig:
+        if camera.mask is None:
+            continue
+        turned = int((without_specks(camera.mask) != camera.mask).sum())
+        if turned:
+            fix = f"clean it: {CLEANING}"
+            found.append(Finding(f"camera {camera.name!r}: mask", "whole regions", f"specks of {turned} pixels", fix))
+        upper = camera.mask[: camera.height_px // 3].mean()
+        if upper < 0.2 < camera.mask.mean():
+            seen = f"{1 - upper:.0%} of the upper third hidden"
+            found.append(Finding(f"camera {camera.name!r}: mask", "True on the scene", seen, "pass ~mask"))
+    return found
+
+
+def _arrays(sample: Mapping[str, Any], key: str, frames: Sequence[Frame], lead: tuple[int, ...]) -> list[Any]:
+    """The boxes or points of each frame, checked; None where the sample has none."""
+    if sample.get(key) is None:
+        return [None] * len(frames)
+    checked: Callable[[Any], Any] = checked_boxes if key == "boxes_3d" else checked_points
+    return [checked(array) for array in of_frames(key, sample[key], len(frames), lead)]
+
+
+def _key_findings(sample: Mapping[str, Any], calibrated: bool) -> Iterator[Finding]:
+    lenses = () if calibrated else ("distortion", "lens", "ground_z_m")
+    for found, meant in misnamed(sample, ("neighbours", "depth_m", *EGO_KEYS, *lenses)).items():
+        if found not in PIXEL_BOUND_KEYS:
+            yield Finding(found, f"the name {meant!r}", "a key that is not read", f"did you mean {meant}? Rename it")
+
+
+def _resolution_findings(rig: Rig) -> Iterator[Finding]:
+    sizes = np.array([(camera.width_px, camera.height_px) for camera in rig])
+    off = (rig.K[:, :2, 2] + 0.5) / sizes - 0.5
+    together = (np.abs(off[:, 0]) > _OFF_CENTER).all() and len(set(np.sign(off[:, 0]))) == 1
+    least = _OFF_CENTER if together else _OFF_CENTER_ALONE
+    for camera, (x, y), (w, h) in zip(rig, off, sizes, strict=True):
+        if abs(x) > least and abs(x - y) < _ALIKE:
+            center = f"({camera.K[0, 2]:.0f}, {camera.K[1, 2]:.0f})"
+            yield Finding(
+                f"camera {camera.name!r}: K",
+                f"a principal point near the middle of {w} x {h} pixels",
+                f"{center}, the middle of about {w * (1 + 2 * x):.0f} x {h * (1 + 2 * y):.0f}",
+                "is K of another resolution? Camera.resize scales it",
+            )
+
+
+def _image_findings(frame: Frame) -> Iterator[Finding]:
+    for camera, image in zip(frame.rig, frame.images, strict=True):
+        circle = None if camera.mask is not None else image_circle(camera, image)
+        if circle is not None:
+            yield Finding(
+                f"camera {camera.name!r}: image",
+                "a mask that hides the dark rim around the image circle",
+                f"no mask, and {1 - circle.holds(camera).mean():.0%} of the image that would be read as scene",
+                f"mask it: {CLEANING}",
+            )
+
+
+# --- boxes and points -------------------------------------------------------------------------------------------------
+def _label_findings(rig: Rig, boxes: FloatArray | None, points: Points | None) -> list[Finding]:
+    found = []
+    road_m = None if points is None else road_height_m(points)
+    if boxes is not None and (np.abs(boxes[:, 6]) > _MANY_DEG).any():
+        largest = float(np.abs(boxes[:, 6]).max())
+        return [Finding("boxes_3d", "yaw in radians", f"yaw up to {largest:.1f}", "pass degrees through torch.deg2rad")]
+    if boxes is not None and len(boxes):
+        objects = None
+        if points is not None and road_m is not None:
+            objects = points[(points[:, 2] > road_m + _OVER_ROAD_M) & ~own_car(points)]
+        turned = objects is not None and road_m is not None and _frame_finding(boxes, objects, road_m - rig.ground_z_m)
+        if turned:
+            return [turned]
+        found += list(_box_findings(rig, boxes, objects))
+    if road_m is not None and abs(road_m - rig.ground_z_m) > ROAD_M:
+        found.append(_road_finding(rig, boxes, road_m))
+    return found
+
+
+def road_height_m(points: Points) -> float | None:
+    """Height of the road around the vehicle: the median over directions of each one's low points; None if unknown."""
+    points = points[~own_car(points)]
+    x, y, z = points[np.hypot(points[:, 0], points[:, 1]) < _ROAD_RADIUS_M, :3].T
+    sector = ((np.arctan2(y, x) / (2 * np.pi) + 0.5) * _SECTORS).astype(int) % _SECTORS
+    of_sectors = [z[sector == k] for k in range(_SECTORS)]
+    low = [np.percentile(heights, _ROAD_PERCENTILE) for heights in of_sectors if len(heights) >= _LEAST_IN_SECTOR]
+    return float(np.median(low)) if len(low) >= _LEAST_SECTORS else None
+
+
+def _road_finding(rig: Rig, boxes: FloatArray | None, road_m: float) -> Finding:
+    seen = f"{road_m:+.2f} in the points"
+    stand = None if boxes is None else _bottoms_m(rig, boxes)
+    if road_m - rig.ground_z_m < -_LIDAR_HEIGHT_M and (stand is None or abs(float(np.median(stand[0]))) < ROAD_M * 2):
+        fix = "are the points in the LiDAR's frame? Apply lidar2ego to them"
+        return Finding("points", f"the road at z = {rig.ground_z_m:+.2f} m, as ground_z_m says", seen, fix)
+    fix = f"set ground_z_m={road_m:.2f}, or move the points to the ego frame"
+    return Finding("ground_z_m", f"the road's height, {seen}", f"{rig.ground_z_m:+.2f}", fix)
+
+
+def _bottoms_m(rig: Rig, boxes: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """Heights (n,) of the near boxes' bottoms over the road, and the boxes' own; None where there are too few."""
+    near = boxes[np.hypot(boxes[:, 0], boxes[:, 1]) < _NEAR_M]
+    return (near[:, 2] - near[:, 5] / 2 - rig.ground_z_m, near[:, 5]) if len(near) >= _LEAST_WINS else None
+
+
+def _box_findings(rig: Rig, boxes: FloatArray, objects: Points | None) -> Iterator[Finding]:
+    """Another order of the columns, another yaw, another height of the centre."""
+    order = _order_finding(boxes, objects)
+    if order is not None:
+        yield order
+        return
+    if objects is not None:
+        yaw, quarter = boxes[:, 6], math.pi / 2
+        yaws = {"-yaw": -yaw, "yaw + pi / 2": yaw + quarter, "pi / 2 - yaw": quarter - yaw}
+        readings = {name: np.column_stack([boxes[:, :6], other]) for name, other in yaws.items()}
+        leads = {n: _lead(other, boxes, objects, _informative(boxes, other)) for n, other in readings.items()}
+        best = max(leads, key=lambda name: leads[name])
+        if leads[best]:
+            expected, seen = "yaw counter-clockwise from the x axis", f"more points in the boxes of {best}"
+            yield Finding("boxes_3d", expected, seen, f"pass {best}")
+    lifted = boxes + np.array([0, 0, 0.5, 0, 0, 0, 0]) * boxes[:, 5:6]
+    bottoms = _bottoms_m(rig, boxes)
+    sunk = False
+    if objects is not None:
+        sunk = _lead(lifted, boxes, objects) > 0
+    elif bottoms is not None:
+        share = bottoms[0] / bottoms[1]
+        sunk = bool(abs(np.median(share) + 0.5) < 0.15 and np.ptp(np.percentile(share, [25, 75])) < 0.3)
+    if sunk:
+        seen = "boxes half below it" if objects is None else "more points inside if z is the bottom"
+        yield Finding("boxes_3d", "z of the box's centre", seen, "add half the height to z")
+
+
+def _order_finding(boxes: FloatArray, objects: Points | None) -> Finding | None:
+    """Vehicles that are wider or higher than long; points decide between the first and a yaw that fits it."""
+    long = boxes[boxes[:, 3:6].max(axis=1) > _LONG_M]
+    if len(long) < _LEAST_LONG:
+        return None
+    share = np.bincount(long[:, 3:6].argmax(axis=1), minlength=3) / len(long)
+    expected = "columns x y z length width height yaw"
+    if share[2] >= _MOST_LONG:
+        seen = f"{share[2]:.0%} of {len(long)} vehicles highest along the sixth column"
+        return Finding("boxes_3d", expected, seen, "is it height, width, length? Reorder the columns")
+    if share[1] < _MOST_LONG:
+        return None
+    other = boxes[:, [0, 1, 2, 4, 3, 5, 6]]
+    if objects is not None and _lead(boxes, other, objects, _informative(boxes, other)):
+        return None  # the yaw is counted from the other side, and the boxes are right
+    seen = f"{share[1]:.0%} of {len(long)} vehicles wider than long"
+    return Finding("boxes_3d", expected, seen, "is it width, length, height? Swap columns 3 and 4")
+
+
+def _frame_finding(boxes: FloatArray, objects: Points, offset_m: float) -> Finding | None:
+    """Points that fit the boxes once they are turned by quarters and put on the road."""
+    leads = []
+    for quarters in range(4):
+        c, s = (round(f(quarters * math.pi / 2)) for f in (math.cos, math.sin))
+        moved = objects @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T - (0, 0, offset_m)
+        is_same = quarters == 0 and abs(offset_m) < _LIDAR_HEIGHT_M
+        leads.append(0 if is_same else _lead(boxes, boxes, moved, points=objects))
+    best = int(np.argmax(leads))
+    if not leads[best]:
+        return None
+    is_clear = leads[best] > 2 * sorted(leads)[-2]
+    turn = ("", "turned by -90 degrees", "turned by 180 degrees", "turned by 90 degrees")[best] if is_clear else "moved"
+    lower = f"{abs(offset_m):.1f} m {'lower' if offset_m < 0 else 'higher'}" if abs(offset_m) > ROAD_M else ""
+    seen = f"points {' and '.join(filter(None, (turn, lower)))}"
+    fix = "are they in the LiDAR's frame? Apply lidar2ego to them"
+    return Finding("points", "points and boxes in one ego frame", seen, fix)
+
+
+def _informative(one: FloatArray, two: FloatArray) -> Any:
+    """Boxes (B,) bool of which two readings clearly differ: not square, and not turned by half a turn."""
+    sides = np.sort(one[:, 3:5], axis=1)
+    quarter = np.where(one[:, 3] == two[:, 3], 0.0, math.pi / 2)  # sides were swapped
+    apart = np.abs((two[:, 6] - one[:, 6] + quarter + math.pi / 2) % math.pi - math.pi / 2)
+    return (sides[:, 1] > 1.5 * sides[:, 0]) & (apart > math.radians(15))
+
+
+def _lead(
+    one: FloatArray, two: FloatArray, objects: Points, which: Any = slice(None), *, points: Points | None = None
+) -> int:
+    """By how many points one reading of the boxes holds more than another, if it clearly does; else 0.
+
+    ``points`` are those of the other reading, if not the same.
+    """
+    counts, others = _counts(one[which], objects), _counts(two[which], objects if points is None else points)
+    wins, losses = _wins(counts, others), _wins(others, counts)
+    if wins < _LEAST_WINS or wins < _WIN_RATIO * losses:
+        return 0
+    return int((counts.clip(max=_MOST_POINTS) - others.clip(max=_MOST_POINTS)).sum())
+
+
+def _counts(boxes: FloatArray, points: Points) -> FloatArray:
+    return np.array([len(inside) for inside in points_in(boxes, points)], np.float64)
+
+
+def _wins(counts: FloatArray, others: FloatArray) -> int:
+    """The number of boxes with clearly more points."""
+    return int(((counts >= _LEAST_POINTS) & (counts > _BETTER * others)).sum())

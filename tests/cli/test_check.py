@@ -1,0 +1,88 @@
+"""The check command: findings, exit status and pictures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from arbiview_aug.__main__ import main
+from arbiview_aug.datasets import FrameFolder
+from arbiview_aug.evaluate.report.pictures import draw_labels
+from tests.helpers import camera, street_sample
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Two frames of a street as frame folders."""
+    sample = street_sample()
+    for name in ("a", "b"):
+        root = tmp_path / "data" / name
+        root.mkdir(parents=True)
+        calib = sample["rig"].to_dict() | {"boxes_3d": sample["boxes_3d"].tolist()}
+        for entry, image in zip(calib["cameras"], sample["images"], strict=True):
+            entry["file"] = f"{entry['name']}.png"
+            cv2.imwrite(str(root / entry["file"]), image.permute(1, 2, 0).numpy()[..., ::-1])
+        np.save(root / "lidar.npy", sample["points"].numpy())
+        (root / "calib.json").write_text(json.dumps(calib))
+    return tmp_path / "data"
+
+
+def change(frame: Path, **entries: object) -> None:
+    file = frame / "calib.json"
+    changed = json.loads(file.read_text()) | entries
+    file.write_text(json.dumps({key: value for key, value in changed.items() if value is not None}))
+
+
+def test_a_right_folder_has_no_findings(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(folder), "--output", str(tmp_path / "out")]) == 0
+    assert capsys.readouterr().out == f"no findings in 2 of 2 frames; pictures: {tmp_path / 'out'}/check-*.png\n"
+    assert len(list((tmp_path / "out").glob("check-*.png"))) == 6
+    picture = cv2.imread(str(tmp_path / "out" / "check-front.png"))
+    assert (picture != cv2.imread(str(folder / "a" / "front.png"))).any(axis=-1).mean() > 0.05
+
+
+def test_findings_are_lines_with_their_frames(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    boxes = json.loads((folder / "a" / "calib.json").read_text())["boxes_3d"]
+    degrees = [[*box[:6], float(np.degrees(box[6]))] for box in boxes]
+    change(folder / "a", boxes_3d=degrees)
+    change(folder / "b", ground_z_m=0.4, boxes3d=boxes, boxes_3d=None)
+    assert main(["check", str(folder), "--output", str(tmp_path)]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 4 and lines[-1].startswith("3 findings in 2 of 2 frames")
+    for begins, ends in (
+        ("boxes_3d: expected yaw in radians", "(1 of 2 frames)"),
+        ("ground_z_m: expected the road's height", "(1 of 2 frames)"),
+        (f"{folder / 'b' / 'calib.json'}: 'boxes3d' is not read", "did you mean 'boxes_3d'?"),
+    ):
+        assert any(line.startswith(begins) and line.endswith(ends) for line in lines), lines
+
+
+def test_a_rig_file_is_checked_alone(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = FrameFolder(folder)[0]["rig"]
+    for poses, status in ((rig.cam2ego, 0), (np.linalg.inv(rig.cam2ego), 1)):
+        data = rig.to_dict()
+        for entry, pose in zip(data["cameras"], poses, strict=True):
+            entry["cam2ego"] = pose.tolist()
+        (tmp_path / "rig.json").write_text(json.dumps(data))
+        assert main(["check", str(tmp_path / "rig.json")]) == status
+    assert capsys.readouterr().out.splitlines()[0] == "no findings"
+    assert main(["check", str(tmp_path / "none.yaml")]) == 2
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
+def test_boxes_are_drawn_where_they_are(lens: str) -> None:
+    front = camera(size=(96, 128), position_m=(0.0, 0.0, 1.0), lens=lens)
+    box = np.array([[10.0, 0, 1, 2, 2, 2, 0.5], [-10, 0, 1, 2, 2, 2, 0], [0, 0, 1, 40, 40, 10, 0]])
+    black = np.zeros((96, 128, 3), np.uint8)
+    drawn = draw_labels(front, black, None, box[:2]).any(axis=-1)
+    rows, columns = np.nonzero(drawn)
+    around = front.project(box[0, :3]).uv
+    assert np.abs(np.array([columns.mean(), rows.mean()]) - around).max() < 6
+    assert drawn.any() and drawn.mean() < 0.2
+    assert draw_labels(front, black, np.zeros((0, 3)), box).any(), "the camera may stand in a box"
+    points = draw_labels(front, black, box[:1, :3], None).any(axis=-1)
+    assert np.abs(np.argwhere(points).mean(axis=0)[::-1] - around).max() < 2

@@ -1,0 +1,139 @@
+"""Silent mistakes, made in right samples."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from arbiview_aug import Camera, Rig
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rotations import CAMERA_AXES_IN_EGO, rotation_z
+
+Sample = dict[str, Any]
+BODY = np.eye(4)
+BODY[:3, :3] = CAMERA_AXES_IN_EGO
+
+
+def turned(sample: Sample, yaw_deg: float) -> Sample:
+    """The sample in an ego frame turned about z, so that yaw conventions differ; it stays right."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_z(yaw_deg)
+    points, boxes = sample["points"].clone(), sample["boxes_3d"].clone()
+    for rows in (points, boxes):
+        rows[:, :3] = rows[:, :3] @ torch.from_numpy(pose[:3, :3].T).to(rows.dtype)
+    boxes[:, 6] = torch.remainder(boxes[:, 6] + math.radians(yaw_deg) + math.pi, 2 * math.pi) - math.pi
+    rig = sample["rig"].with_cameras([camera.moved(pose) for camera in sample["rig"]])
+    return {**sample, "rig": rig, "points": points, "boxes_3d": boxes}
+
+
+def columns(order: list[int]) -> Callable[[Sample], Sample]:
+    """Boxes with their first seven columns in another order."""
+    return lambda sample: {**sample, "boxes_3d": sample["boxes_3d"][:, order]}
+
+
+def yaws(change: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[Sample], Sample]:
+    def made(sample: Sample) -> Sample:
+        boxes = sample["boxes_3d"].clone()
+        boxes[:, 6] = change(boxes[:, 6])
+        return {**sample, "boxes_3d": boxes}
+
+    return made
+
+
+def at_the_bottom(sample: Sample) -> Sample:
+    boxes = sample["boxes_3d"].clone()
+    boxes[:, 2] -= boxes[:, 5] / 2
+    return {**sample, "boxes_3d": boxes}
+
+
+def without(*keys: str) -> Callable[[Sample], Sample]:
+    return lambda sample: {key: value for key, value in sample.items() if key not in keys}
+
+
+def lidar_frame(yaw_deg: float, forward_m: float = 0.94, up_m: float = 1.84) -> Callable[[Sample], Sample]:
+    """Points in the frame of a LiDAR on the roof; its x axis looks to ``-yaw_deg``."""
+
+    def made(sample: Sample) -> Sample:
+        points = sample["points"].clone()
+        points[:, :3] -= torch.tensor([forward_m, 0, up_m])
+        points[:, :3] = points[:, :3] @ torch.from_numpy(rotation_z(yaw_deg).T).to(points.dtype)
+        return {**sample, "points": points}
+
+    return made
+
+
+def ground(shift_m: float) -> Callable[[Sample], Sample]:
+    return lambda sample: {**sample, "rig": Rig(list(sample["rig"]), ground_z_m=sample["rig"].ground_z_m + shift_m)}
+
+
+def cameras(change: Callable[[Camera], Camera]) -> Callable[[Sample], Sample]:
+    return lambda sample: {**sample, "rig": sample["rig"].with_cameras(list(map(change, sample["rig"])))}
+
+
+def poses(change: Callable[[FloatArray], FloatArray]) -> Callable[[Sample], Sample]:
+    return cameras(lambda camera: replace(camera, cam2ego=change(camera.cam2ego)))
+
+
+def millimetres(cam2ego: FloatArray) -> FloatArray:
+    return np.hstack([cam2ego[:, :3], cam2ego[:, 3:] * [[1000], [1000], [1000], [1]]])
+
+
+def scaled_K(factor: float) -> Callable[[Sample], Sample]:
+    """K of images of ``factor`` times the size."""
+    return cameras(lambda camera: replace(camera, K=np.diag([factor, factor, 1]) @ camera.K))
+
+
+def speckled(sample: Sample) -> Sample:
+    mask = np.ones(sample["rig"][0].size, bool)
+    mask[-20:] = False
+    mask[5, 7], mask[-10, 30] = False, True
+    first = replace(sample["rig"][0], mask=mask)
+    return {**sample, "rig": sample["rig"].with_cameras([first, *list(sample["rig"])[1:]])}
+
+
+def inverted_mask(sample: Sample) -> Sample:
+    def own_car(camera: Camera) -> Camera:
+        mask = np.zeros(camera.size, bool)
+        mask[-camera.height_px // 4 :] = True
+        return replace(camera, mask=mask)
+
+    return cameras(own_car)(sample)
+
+
+def renamed(key: str, name: str) -> Callable[[Sample], Sample]:
+    return lambda sample: {name if k == key else k: value for k, value in sample.items()}
+
+
+quarter = math.pi / 2
+MISTAKES: dict[str, tuple[Callable[[Sample], Sample], str]] = {
+    "yaw in degrees": (yaws(torch.rad2deg), "boxes_3d: .*in radians.* torch.deg2rad"),
+    "width before length": (columns([0, 1, 2, 4, 3, 5, 6]), "boxes_3d: .*wider than long.*Swap columns 3 and 4"),
+    "height first": (columns([0, 1, 2, 5, 4, 3, 6]), "boxes_3d: .*highest along the sixth.*Reorder"),
+    "yaw the other way round": (yaws(lambda yaw: -yaw), "boxes_3d: .*; pass -yaw$"),
+    "yaw from the y axis": (yaws(lambda yaw: yaw - quarter), r"boxes_3d: .*; pass yaw \+ pi / 2$"),
+    "heading from north": (yaws(lambda yaw: quarter - yaw), "boxes_3d: .*; pass pi / 2 - yaw$"),
+    "z at the bottom": (at_the_bottom, "boxes_3d: .*centre.*add half the height"),
+    "LiDAR's frame": (lidar_frame(90), "points: .*1.8.*LiDAR's frame"),
+    "LiDAR's frame, turned back": (lidar_frame(180), "points: .*LiDAR's frame"),
+    "another frame of the same height": (lidar_frame(90, 0, 0), "points: .*LiDAR's frame"),
+    "ground_z_m too low": (ground(-0.33), r"ground_z_m: .*found -0.33; set ground_z_m=-?0.0\d"),
+    "ground_z_m too high": (ground(0.33), r"ground_z_m: .*found \+0.33; set ground_z_m=-?0.0\d"),
+    "ROS axes": (poses(lambda pose: pose @ BODY.T), r"cam2ego: .*ROS.*\[\[0, 0, 1\], \[-1, 0, 0\], \[0, -1, 0\]\]"),
+    "inverted cam2ego": (poses(np.linalg.inv), r"cam2ego: .*inverse.*np\.linalg\.inv"),
+    "millimetres": (poses(millimetres), "cam2ego: .*millimetres.* by 1000"),
+    "OpenGL's axes": (poses(lambda pose: pose @ np.diag([1.0, -1, -1, 1])), r"cam2ego: .*OpenGL.*negate"),
+    "an ego frame with a camera's axes": (poses(lambda pose: BODY.T @ pose), "cam2ego: .*from the left"),
+    "K of a smaller image": (scaled_K(0.8), "K: .*another resolution"),
+    "K of a larger image": (scaled_K(1.25), "K: .*another resolution"),
+    "specks in a mask": (speckled, "mask: .*specks of 2 pixels.*clean_masks=True"),
+    "an inverted mask": (inverted_mask, "mask: .*upper third hidden; pass ~mask"),
+    "gt_boxes": (renamed("boxes_3d", "gt_boxes"), "gt_boxes: .*did you mean boxes_3d"),
+    "boxes3d": (renamed("boxes_3d", "boxes3d"), "boxes3d: .*did you mean boxes_3d"),
+    "lidar_points": (renamed("points", "lidar_points"), "lidar_points: .*did you mean points"),
+}
+"""Each mistake, and how its finding reads."""

@@ -1,0 +1,149 @@
+"""``check`` finds every silent mistake, and nothing in right samples."""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import CheckReport, Finding, Rig, SampleError, check, load_rig, shipped_rigs
+from arbiview_aug.datasets import FrameFolder, cleaned_rig, open_data
+from arbiview_aug.sample.mistakes import check_rig, road_height_m
+from tests.helpers import street_sample
+from tests.sample.mistakes import MISTAKES, Sample, at_the_bottom, columns, lidar_frame, turned, without, yaws
+
+
+@lru_cache
+def right_street(seed: int = 0) -> Sample:
+    return street_sample(seed=seed)
+
+
+@pytest.fixture(scope="module")
+def street() -> Sample:
+    """In a turned frame: along its axes, some conventions of yaw agree."""
+    return turned(right_street(), 30)
+
+
+@pytest.fixture(scope="module")
+def nuscenes(nuscenes_root: Path) -> Sample:
+    return turned(open_data(f"nuscenes:{nuscenes_root}", reduce=4)[0], 30)
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+@pytest.mark.parametrize("frame", ["street", "nuscenes"])
+def test_a_silent_mistake_is_found(frame: str, mistake: str, request: pytest.FixtureRequest) -> None:
+    make, message = MISTAKES[mistake]
+    report = check(make(request.getfixturevalue(frame)))
+    assert not report.ok and any(re.search(message, str(finding)) for finding in report.findings), report
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (at_the_bottom, "boxes half below it; add half the height"),
+        (columns([0, 1, 2, 4, 3, 5, 6]), "Swap columns 3 and 4"),
+        (columns([0, 1, 2, 5, 4, 3, 6]), "Reorder"),
+        (yaws(torch.rad2deg), "deg2rad"),
+    ],
+)
+def test_boxes_alone_tell(make: Any, message: str, street: Sample, nuscenes: Sample) -> None:
+    for right in (street, nuscenes):
+        assert message in str(check(without("points")(make(right))))
+
+
+def test_the_road_alone_tells_points_of_the_lidar(street: Sample, nuscenes: Sample) -> None:
+    for right in (street, nuscenes):
+        report = str(check(without("boxes_3d")(lidar_frame(90)(right))))
+        assert report.startswith("points: ") and "LiDAR's frame" in report
+
+
+@pytest.mark.parametrize("yaw_deg", [0, 17, 45, pytest.param(90, marks=pytest.mark.slow)])
+def test_right_labels_have_no_findings(yaw_deg: float) -> None:
+    """Jittered as labels are, and with few points and boxes."""
+    for seed in (0, 3):
+        rng, sample = np.random.default_rng(seed), turned(right_street(seed), yaw_deg)
+        assert check(sample).ok, check(sample)
+        boxes = sample["boxes_3d"].clone()
+        jitter = np.zeros(boxes.shape)
+        jitter[:, :7] = rng.normal(0, [0.1, 0.1, 0.1, 0.05, 0.05, 0.05, 0.05], (len(boxes), 7))
+        few = {
+            "points": sample["points"][rng.random(len(sample["points"])) < 0.3],
+            "boxes_3d": boxes[rng.random(len(boxes)) < 0.4],
+        }
+        for changes in ({"boxes_3d": boxes + torch.from_numpy(jitter).to(boxes.dtype)}, few, {"points": None}):
+            assert check({**sample, **changes}).ok, check({**sample, **changes})
+
+
+def test_sides_and_yaw_that_are_both_swapped_are_the_same_boxes(street: Sample) -> None:
+    swapped = yaws(lambda yaw: yaw + torch.pi / 2)(columns([0, 1, 2, 4, 3, 5, 6])(street))
+    assert check(swapped).ok
+
+
+def test_given_frames_have_no_false_finding(data_root: Path) -> None:
+    """Specks in DDAD's masks are there, and so is the rim of three of four fisheye images."""
+    for name in ("nuscenes-one", "ddad-one", "kitti-stereo", "surround-fisheye"):
+        if not (data_root / name).is_dir():
+            pytest.skip(f"no frame {name} in {data_root}")
+        frames = FrameFolder(data_root / name, reduce=2)
+        for k in range(0, len(frames), 4):
+            wheres = {finding.where for finding in check(frames[k]).findings}
+            kind = {"ddad-one": "mask", "surround-fisheye": "image"}.get(name)
+            assert len(wheres) == {"mask": 5, "image": 3, None: 0}[kind], wheres
+            assert all(where.endswith(f": {kind}") for where in wheres)
+        sample = frames[0]
+        assert check({**sample, "rig": cleaned_rig(sample["rig"], sample["images"])}).ok
+    assert check(open_data(f"nuscenes:{data_root / 'nuscenes-one'}", reduce=4)[0]).ok
+
+
+def test_shipped_rigs_have_no_findings() -> None:
+    for name in shipped_rigs():
+        assert check_rig(load_rig(name)) == []
+
+
+def test_a_batch_is_checked_frame_by_frame(street: Sample) -> None:
+    wrong = yaws(torch.rad2deg)(street)
+    batch = {
+        "images": torch.stack([street["images"]] * 2),
+        "rig": street["rig"],
+        "boxes_3d": [street["boxes_3d"], wrong["boxes_3d"]],
+    }
+    (finding,) = check(batch).findings
+    assert "radians" in finding.expected
+
+
+def test_a_rig_may_be_given_apart(street: Sample) -> None:
+    sample = without("rig", "K", "cam2ego")(street)
+    assert check(sample, street["rig"]).ok
+    with pytest.raises(SampleError, match="expected calibration"):
+        check(sample)
+
+
+def test_the_report_is_plain_data() -> None:
+    finding = Finding("points", "metres", "feet", "convert them")
+    assert str(CheckReport((finding,))) == str(finding) == "points: expected metres, found feet; convert them"
+    assert str(CheckReport()) == "no findings" and CheckReport().ok and not CheckReport((finding,)).ok
+    with pytest.raises(AttributeError):
+        finding.fix = ""  # type: ignore[misc]
+
+
+def test_the_road_is_unknown_without_points_around_the_car() -> None:
+    rng = np.random.default_rng(0)
+    assert road_height_m(np.zeros((0, 3))) is None
+    ahead = rng.uniform((5, -2, -0.02), (9, 2, 0.02), (5000, 3))
+    assert road_height_m(ahead) is None
+    around = rng.uniform((-9, -9, 1.98), (9, 9, 2.02), (5000, 3))
+    assert road_height_m(around) == pytest.approx(2.0, abs=0.03)
+
+
+def test_a_rig_of_heights_that_no_vehicle_has(street: Sample) -> None:
+    rig = Rig(list(street["rig"]), ground_z_m=2.0)
+    (finding,) = check_rig(rig)
+    assert "is ground_z_m the road's height" in finding.fix
+    on_its_side = rig.with_cameras([camera.turned(roll_deg=90) for camera in street["rig"]])
+    (finding,) = check_rig(Rig(list(on_its_side)))
+    assert "lie on their side" in finding.found
