@@ -54,6 +54,10 @@ class SampleError(ArbiviewError, ValueError):
     """A sample whose images, calibration and labels do not fit together."""
 
 
+class UnreachableError(SampleError):
+    """A target rig of which the sources show no pixel."""
+
+
 class SampleTypeError(ArbiviewError, TypeError):
     """A sample value of a type that is not supported; the message gives the conversion to use."""
 

@@ -19,6 +19,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.overlap import TILE_PX, VIEW_SIZE, adjacent_pairs, half_way_view, odd_tiles
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.errors import UnreachableError
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors
 from arbiview_aug.evaluate.methods import Method
 from arbiview_aug.evaluate.metrics import psnr_db
@@ -85,7 +86,10 @@ def source_overlap(
     def from_one(view: Camera, k: int) -> tuple[Image, BoolArray]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # one camera need not cover the view
-            alone = method.alone(sample, k, rig.with_cameras([view]))
+            try:
+                alone = method.alone(sample, k, rig.with_cameras([view]))
+            except UnreachableError:
+                return np.zeros((*view.size, 3), np.uint8), np.zeros(view.size, bool)
         return alone.image, alone.coverage
 
     return overlap_scores(rig, from_one, size)

@@ -14,7 +14,7 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rays import CameraMaps
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import pose_mistake
-from arbiview_aug.errors import SampleError, WarnOnce
+from arbiview_aug.errors import SampleError, UnreachableError, WarnOnce
 from arbiview_aug.favs.config import FavsConfig, PaperConfig
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.harmonise import Harmoniser
@@ -304,14 +304,15 @@ class FramePlanner:
         """Warn once of target cameras that the sources hardly cover, by the coverage (h, w) or share of each.
 
         Raises:
-            SampleError: They cover none of the target's pixels.
+            UnreachableError: They cover none of the target's pixels.
         """
         is_empty = not any(np.any(coverage) for coverage in coverages)
         if "unreachable" in self.warn.topics and not is_empty:  # the means below take milliseconds
             return
         lost = f"the target rig {target.name!r} cannot be reached from this data"
         if is_empty:
-            raise SampleError(f"{lost}: expected some pixels to be covered, got none. {_likely_cause(source, target)}")
+            cause = _likely_cause(source, target)
+            raise UnreachableError(f"{lost}: expected some pixels to be covered, got none. {cause}")
         shares = [float(np.mean(coverage)) for coverage in coverages]
         poor = [f"{c.name} {share:.0%}" for c, share in zip(target, shares, strict=True) if share < _UNREACHABLE]
         if poor:

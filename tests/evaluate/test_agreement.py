@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.overlap import adjacent_pairs, half_way_view
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.evaluate.agreement import overlap_psnr, overlap_scores
+from arbiview_aug.evaluate.agreement import overlap_psnr, overlap_scores, source_overlap
 from arbiview_aug.evaluate.lidar import (
     coloured_points,
     equalised,
@@ -20,8 +21,9 @@ from arbiview_aug.evaluate.lidar import (
     lidar_split,
     sparse_metrics,
 )
+from arbiview_aug.evaluate.methods import retargeting
 from arbiview_aug.evaluate.targets import paper_target, shifted_target
-from tests.helpers import score_targets
+from tests.helpers import camera, score_targets
 
 AGREEMENT_DB = 0.01
 
@@ -138,3 +140,11 @@ def test_overlap_agrees(referee: ModuleType, frame: Frame) -> None:
         want = referee.overlap_psnr(images[0][0], images[1][0], both, fitted=fitted)
         assert ours == pytest.approx(want, abs=AGREEMENT_DB)
         assert overlap_psnr(images[0][0], images[1][0], both, fitted=fitted) == ours
+
+
+def test_a_camera_that_sees_nothing_of_a_half_way_view_has_no_score() -> None:
+    """Their fields of view overlap in azimuth, but one looks up and the other down."""
+    cameras = [camera("up", 20.0, elevation_deg=80.0), camera("down", -20.0, elevation_deg=-80.0)]
+    sample = {"images": torch.zeros(2, 3, 72, 96, dtype=torch.uint8), "rig": Rig(cameras)}
+    (score,) = source_overlap(sample, retargeting("fast", "street"), size=(20, 30))
+    assert score.pixels == 0

@@ -86,9 +86,7 @@ def test_depth_from_overlap_reaches_a_camera_alone() -> None:
     np.testing.assert_array_equal(same.image, without.image)
     corrections = overlap_depth(rig, list(sample["images"])).corrections
     assert corrections, "some pair is refined"
-    changed = [
-        (accurate.alone(sample, k, view).image != fast.alone(sample, k, view).image).any() for k in range(len(rig))
-    ]
+    changed = [(accurate.alone(sample, k, view).image != fast.alone(sample, k, view).image).any() for k in range(2)]
     assert any(changed)
 
 
