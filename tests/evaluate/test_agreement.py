@@ -23,7 +23,7 @@ from arbiview_aug.evaluate.lidar import (
 )
 from arbiview_aug.evaluate.methods import retargeting
 from arbiview_aug.evaluate.targets import paper_target, shifted_target
-from tests.helpers import camera, score_targets
+from tests.helpers import ring, score_targets
 
 AGREEMENT_DB = 0.01
 
@@ -144,7 +144,8 @@ def test_overlap_agrees(referee: ModuleType, frame: Frame) -> None:
 
 def test_a_camera_that_sees_nothing_of_a_half_way_view_has_no_score() -> None:
     """Their fields of view overlap in azimuth, but one looks up and the other down."""
-    cameras = [camera("up", 20.0, elevation_deg=80.0), camera("down", -20.0, elevation_deg=-80.0)]
-    sample = {"images": torch.zeros(2, 3, 72, 96, dtype=torch.uint8), "rig": Rig(cameras)}
+    up, down = ring(6)[:2]
+    rig = Rig([up.turned(pitch_deg=80), down.turned(pitch_deg=-80)])
+    sample = {"images": torch.zeros(2, 3, 72, 96, dtype=torch.uint8), "rig": rig}
     (score,) = source_overlap(sample, retargeting("fast", "street"), size=(20, 30))
     assert score.pixels == 0
