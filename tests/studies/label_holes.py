@@ -1,0 +1,300 @@
+"""``python -m tests.studies.label_holes``: whether holes draw the labels, on streets whose true holes are known.
+
+For every moved rig and surface: rings around labelled objects against the same rings slid sideways (the protocol of
+``label_leak``), holes against the true ones, fills against the true views, and a probe: a small classifier that learns
+on retargeted views to tell rings around objects from slid ones. What it finds on other retargeted views beyond what it
+finds on true ones is artefact.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from tqdm import tqdm
+
+from arbiview_aug import RigRetarget
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cli.arguments import add_output, command_parser, count, size, writable_folder
+from arbiview_aug.cli.bench.study import benchmark
+from arbiview_aug.cli.bench.timing import machine_line, show
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
+from arbiview_aug.datasets.synthetic.dataset import RenderedViews
+from arbiview_aug.sample.boxes_2d import project_boxes_3d
+
+Bools = npt.NDArray[np.bool_]
+Floats = npt.NDArray[np.floating]
+
+TARGETS = {"up70": lambda size: demo_source_rig(size).shifted(z_m=0.7), "van": demo_target_rig}
+MARGIN_PX, LEAST_PX, SHARE, SLIDES = 6, 8, 0.05, 20
+"""Of the protocol: half the width of a ring, the least side of an object, the share of holes that counts as leak, and
+how often a ring is slid."""
+
+PATCH_PX, PROBE_SLIDES, EPOCHS = 32, 4, 6
+
+
+class Street(NamedTuple):
+    """A sample, and for a target: its rig, true images (M, h, w, 3), true holes, rows of objects, rectangles."""
+
+    sample: dict[str, Any]
+    rig: Rig
+    images: npt.NDArray[np.uint8]
+    holes: Bools
+    objects: Bools
+    rectangles: list[Floats]
+
+
+# --- the truth --------------------------------------------------------------------------------------------------------
+def true_holes(rig: Rig, depth_m: Floats, target: Rig, target_depth_m: Floats) -> Bools:
+    """(M, h, w) pixels of exact depth that no source sees: within a pixel, 2 % and 0.1 m."""
+    holes = []
+    for camera, depth in zip(target, target_depth_m, strict=True):
+        rays = camera.unproject_cam(camera.pixel_grid()).directions
+        rays = rays / rays[..., 2:]
+        distance = np.where(np.isfinite(depth), depth, 1e5)[..., None]  # the sky
+        points = rays * distance @ camera.cam2ego[:3, :3].T + camera.center_m
+        seen = np.zeros(camera.size, bool)
+        for source, source_depth in zip(rig, depth_m, strict=True):
+            uv, z, valid = source.project(points)
+            valid &= source.contains(uv, 1e-6)
+            farthest = cv2.dilate(np.where(np.isfinite(source_depth), source_depth, 1e6), np.ones((3, 3), np.uint8))
+            x, y = np.where(valid[..., None], uv, 0).round().astype(int).clip(0, np.array(source.size[::-1]) - 1).T
+            seen |= valid & (z <= 1.02 * farthest[y.T, x.T] + 0.1)
+        holes.append(~seen)
+    return np.stack(holes)
+
+
+def make_street(drive: SyntheticDrive, index: int, target: Rig) -> Street:
+    """Street ``index`` with its truth for a target."""
+    sample, own, views = drive[index], drive.render(index), drive.render(index, target)
+    rectangles = []
+    for found in project_boxes_3d(sample["boxes_3d"], target):
+        wide, high = (found.boxes[:, 2:] - found.boxes[:, :2]).T
+        rectangles.append(found.boxes[(np.minimum(wide, high) >= LEAST_PX) & (found.visibility > 0)])
+    holes = true_holes(drive.rig, _array(own, "depth_m"), target, _array(views, "depth_m"))
+    return Street(
+        sample,
+        target,
+        _array(views, "images").transpose(0, 2, 3, 1),
+        holes,
+        _array(views, "instances") >= 0,
+        rectangles,
+    )
+
+
+def _array(views: RenderedViews, name: str) -> npt.NDArray[Any]:
+    return np.stack([np.asarray(view) for view in getattr(views, name)])
+
+
+# --- rings ------------------------------------------------------------------------------------------------------------
+def ring(size: tuple[int, int], box: Floats, margin: int = MARGIN_PX) -> Bools:
+    """(h, w) pixels up to ``margin`` on both sides of a rectangle's outline."""
+    (x0, y0, x1, y1), inside = box, np.zeros(size, bool)
+    inside[max(0, int(y0 - margin)) : int(y1 + margin) + 1, max(0, int(x0 - margin)) : int(x1 + margin) + 1] = True
+    inner = [max(0, int(value)) for value in (y0 + margin, y1 - margin, x0 + margin, x1 - margin)]
+    inside[inner[0] : inner[1], inner[2] : inner[3]] = False
+    return inside
+
+
+def slid(box: Floats, width: int, rng: np.random.Generator) -> Floats:
+    """A rectangle at another place of the same rows."""
+    x = rng.uniform(0, max(1.0, width - (box[2] - box[0])))
+    return np.array([x, box[1], x + box[2] - box[0], box[3]])
+
+
+def ring_holes(holes: Bools, rectangles: Sequence[Floats], seed: int = 0) -> tuple[list[float], list[float]]:
+    """Shares of holes (M, h, w) in the rings of objects, and in those slid sideways."""
+    rng, own, control = np.random.default_rng(seed), [], []
+    for hole, boxes in zip(holes, rectangles, strict=True):
+        for box in boxes:
+            own.append(float(hole[ring(hole.shape, box)].mean()))
+            places = [slid(box, hole.shape[1], rng) for _ in range(SLIDES)]
+            control += [float(hole[ring(hole.shape, place)].mean()) for place in places]
+    return own, control
+
+
+# --- the probe --------------------------------------------------------------------------------------------------------
+def patches(
+    images: npt.NDArray[np.uint8], rectangles: Sequence[Floats], seed: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rings as pictures (n, 4, PATCH_PX, PATCH_PX), grey inside, with their mask; and whether an object is there."""
+    rng, found, is_object = np.random.default_rng(seed), [], []
+    for image, boxes in zip(images, rectangles, strict=True):
+        for box in boxes:
+            for k in range(1 + PROBE_SLIDES):
+                place = box if k == 0 else slid(box, image.shape[1], rng)
+                mask = ring(image.shape[:2], place)
+                rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+                if not len(rows):
+                    continue
+                part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+                colour = np.where(mask[part][..., None], image[part], 128).astype(np.float32) / 255
+                layers = np.dstack([colour, mask[part].astype(np.float32)])
+                found.append(cv2.resize(layers, (PATCH_PX, PATCH_PX), interpolation=cv2.INTER_AREA).transpose(2, 0, 1))
+                is_object.append(k == 0)
+    return torch.from_numpy(np.stack(found)), torch.tensor(is_object, dtype=torch.float32)
+
+
+def train_probe(x: torch.Tensor, y: torch.Tensor, seed: int) -> torch.nn.Module:
+    """A small convolutional classifier of patches."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        widths = (4, 16, 32, 64)
+        layers: list[torch.nn.Module] = []
+        for one, two in itertools.pairwise(widths):
+            layers += [torch.nn.Conv2d(one, two, 3, padding=1), torch.nn.ReLU(), torch.nn.MaxPool2d(2)]
+        net = torch.nn.Sequential(*layers, torch.nn.Flatten(), torch.nn.Dropout(0.3), torch.nn.LazyLinear(1))
+        net(x[:1])
+        optimiser = torch.optim.AdamW(net.parameters(), 1e-3, weight_decay=1e-2)
+        weight = (1 - y.mean()) / y.mean()  # objects are the fewer
+        for _ in range(EPOCHS):
+            for rows in torch.randperm(len(x)).split(64):
+                mirrored = x[rows].flip(-1) if torch.rand(()) < 0.5 else x[rows]
+                loss = torch.nn.functional.binary_cross_entropy_with_logits(
+                    net(mirrored)[:, 0], y[rows], pos_weight=weight
+                )
+                optimiser.zero_grad()
+                loss.backward()
+                optimiser.step()
+    return net.eval()
+
+
+def area_under_curve(score: torch.Tensor, y: torch.Tensor) -> float:
+    """Probability that an object's ring scores above another (ties count half)."""
+    one, other = score[y > 0.5], score[y < 0.5]
+    return float(((one[:, None] > other).float() + 0.5 * (one[:, None] == other).float()).mean())
+
+
+def probe(streets: Sequence[Street], views: Sequence[npt.NDArray[np.uint8]], seed: int) -> tuple[float, float]:
+    """Areas under the curve on retargeted and on true views, mean over two folds of streets."""
+    areas = []
+    for fold in (0, 1):
+        rows = [k for k in range(len(streets)) if k % 2 == fold]
+        others = [k for k in range(len(streets)) if k % 2 != fold]
+        rectangles = [box for k in others for box in streets[k].rectangles]
+        net = train_probe(*patches(np.concatenate([views[k] for k in others]), rectangles, seed), seed)
+        rectangles = [box for k in rows for box in streets[k].rectangles]
+        for images in (views, [street.images for street in streets]):
+            x, y = patches(np.concatenate([images[k] for k in rows]), rectangles, seed + 1)
+            with torch.no_grad():
+                areas.append(area_under_curve(torch.cat([net(part)[:, 0] for part in x.split(512)]), y))
+    return float(np.mean(areas[0::2])), float(np.mean(areas[1::2]))
+
+
+# --- figures ----------------------------------------------------------------------------------------------------------
+def _psnr_db(square: Floats) -> float:
+    return float(10 * np.log10(255**2 / max(float(square.mean()), 1e-9)))
+
+
+def figures(streets: Sequence[Street], surface: str, seed: int) -> dict[str, float]:
+    """All columns of one surface over one target's streets."""
+    retarget = RigRetarget(streets[0].rig, surface=surface, neighbours=None)
+    views, rings, true_rings, controls, true_controls, errors = [], [], [], [], [], []
+    found = np.zeros(5)  # true positives, false positives, false negatives, hidden pixels of objects, those covered
+    for street in streets:
+        out = retarget(street.sample)
+        image, holes = np.asarray(out["images"]).transpose(0, 2, 3, 1), ~np.asarray(out["coverage"])
+        views.append(image)
+        for truth, own, control in ((holes, rings, controls), (street.holes, true_rings, true_controls)):
+            at_objects, elsewhere = ring_holes(truth, street.rectangles, seed)
+            own += at_objects
+            control += elsewhere
+        hidden = street.holes & street.objects
+        found += [
+            np.count_nonzero(mask)
+            for mask in (holes & street.holes, holes & ~street.holes, ~holes & street.holes, hidden, hidden & ~holes)
+        ]
+        square = np.square(image.astype(np.float32) - street.images).mean(-1)
+        errors.append([_psnr_db(square), _psnr_db(square[street.holes]), _psnr_db(square[~holes])])
+    hit, wrong, missed, hidden_px, hidden_covered = found
+    retargeted, true = probe(streets, views, seed)
+    return {
+        "leak": float(np.mean(np.array(rings) > SHARE)),
+        "control": float(np.mean(np.array(controls) > SHARE)),
+        "true_leak": float(np.mean(np.array(true_rings) > SHARE)),
+        "true_control": float(np.mean(np.array(true_controls) > SHARE)),
+        "ring_holes": float(np.mean(rings)),
+        "true_ring_holes": float(np.mean(true_rings)),
+        "precision": hit / (hit + wrong),
+        "recall": hit / (hit + missed),
+        "hidden_covered": hidden_covered / max(hidden_px, 1),
+        **dict(zip(("whole_db", "true_holes_db", "covered_db"), np.mean(errors, axis=0).tolist(), strict=True)),
+        "probe_retargeted": retargeted,
+        "probe_true": true,
+    }
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure, print the table, write the JSON."""
+    parser = command_parser(
+        "",
+        "Whether holes draw the labels, on synthetic streets whose true holes are known.",
+        "--streets 20",
+        program="python -m tests.studies.label_holes",
+    )
+    parser.add_argument("--size", type=size, default=(256, 704), metavar="HxW", help="of every view")
+    parser.add_argument("--streets", type=count, default=20, metavar="N")
+    parser.add_argument("--seed", type=int, default=50, metavar="N", help="of the streets and the probe")
+    parser.add_argument("--targets", nargs="+", choices=TARGETS, default=list(TARGETS))
+    parser.add_argument("--surfaces", nargs="+", default=["auto", "objects"], metavar="NAME")
+    add_output(parser)
+    arguments = parser.parse_args(argv)
+    folder = writable_folder(Path(arguments.output), arguments.output)
+    report = measure(arguments)
+    show(table(report), report, folder / "label_holes.json")
+    return 0
+
+
+@benchmark
+def measure(arguments: argparse.Namespace) -> dict[str, Any]:
+    """All rows."""
+    drive = SyntheticDrive(demo_source_rig(arguments.size), num_frames=arguments.streets, seed=arguments.seed)
+    rows = {}
+    for name in arguments.targets:
+        rig = TARGETS[name](arguments.size)
+        streets = [make_street(drive, k, rig) for k in tqdm(range(len(drive)), desc=name, leave=False)]
+        for surface in arguments.surfaces:
+            rows[f"{name} {surface}"] = figures(streets, surface, arguments.seed)
+    return {"streets": arguments.streets, "seed": arguments.seed, "size": list(arguments.size), "rows": rows}
+
+
+_COLUMNS = (
+    ("leak, control %", "{leak:.0%}, {control:.0%}"),
+    ("of true holes", "{true_leak:.0%}, {true_control:.0%}"),
+    ("holes in rings", "{ring_holes:.1%}"),
+    ("true", "{true_ring_holes:.1%}"),
+    ("precision, recall", "{precision:.0%}, {recall:.0%}"),
+    ("hidden, called covered", "{hidden_covered:.0%}"),
+    ("whole dB", "{whole_db:.2f}"),
+    ("true holes dB", "{true_holes_db:.2f}"),
+    ("covered dB", "{covered_db:.2f}"),
+    ("probe", "{probe_retargeted:.3f}"),
+    ("probe on true views", "{probe_true:.3f}"),
+)
+
+
+def table(report: dict[str, Any]) -> str:
+    """The rows as Markdown."""
+
+    def lines() -> Iterator[str]:
+        yield machine_line(report)
+        yield ""
+        yield "| | " + " | ".join(title for title, _ in _COLUMNS) + " |"
+        yield "| --- |" + " ---: |" * len(_COLUMNS)
+        for name, row in report["rows"].items():
+            yield f"| {name} | " + " | ".join(form.format(**row) for _, form in _COLUMNS) + " |"
+
+    return "\n".join(lines())
+
+
+if __name__ == "__main__":
+    sys.exit(main())
