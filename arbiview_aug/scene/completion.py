@@ -126,16 +126,20 @@ def drop_hidden(q: Any, number: Any, points: Any, origin: Any, away: int, side: 
 
 
 @compiled
-def complete(cells: Any, own: Any, residuals: Any, reach: float, support: float, smooth: int, layers: Any) -> None:
+def complete(
+    cells: Any, own: Any, residuals: Any, reach: float, support: float, smooth: int, work: Any, layers: Any
+) -> None:
     """Give every cell the residual of the nearest point, averaged on a step's nearer and on its farther side.
 
     ``layers`` (4, h, w) becomes those of ``Panorama``; the points' flat cells, inverse distances, residuals are (n,).
-    The others are ``Cells.reach``, ``support`` and ``smooth``.
+    ``reach``, ``support`` and ``smooth`` are those of ``Cells``, ``work`` (5, >= (h + 4) * (w + 4)) is scratch.
     """
     measured = layers[3]
     h, w = measured.shape
-    code = np.full((h + 4, w + 4), _NO_SEED, np.int32)
-    r, q = np.empty((h, w), np.float32), np.empty((h, w), np.float32)
+    r, q = work[0, : h * w].reshape(h, w), work[1, : h * w].reshape(h, w)
+    high, low = work[2, : h * w].reshape(h, w), work[3, : h * w].reshape(h, w)
+    code = work[4, : (h + 4) * (w + 4)].view(np.int32).reshape(h + 4, w + 4)
+    code[:] = _NO_SEED
     for i in range(cells.shape[0]):
         y, x = cells[i] // w, cells[i] % w
         code[y + 2, x + 2] = _OWN
@@ -154,7 +158,7 @@ def complete(cells: Any, own: Any, residuals: Any, reach: float, support: float,
                 fade = min(_TWO - _TWO * away[x] / reach, _ONE)
                 from_y, from_x = seed(code[y + 2, x + 2])
                 r[y, x], q[y, x] = r[y + from_y, x + from_x] * fade, q[y + from_y, x + from_x]
-    _average_sides(r, q, smooth, layers[0], layers[1], layers[2])
+    _average_sides(r, q, high, low, smooth, layers[0], layers[1], layers[2])
 
 
 @compiled
@@ -190,7 +194,7 @@ def seed(code: int) -> tuple[int, int]:
 
 
 @compiled
-def _average_sides(r: Any, q: Any, smooth: int, near: Any, far: Any, share: Any) -> None:
+def _average_sides(r: Any, q: Any, high: Any, low: Any, smooth: int, near: Any, far: Any, share: Any) -> None:
     """Average residuals over ``SMOOTH_RAD`` on both sides of steps; sides are told apart over twice that window.
 
     All that is averaged about a step then knows of it. Near the border, which only filters read, nothing is averaged.
@@ -205,7 +209,11 @@ def _average_sides(r: Any, q: Any, smooth: int, near: Any, far: Any, share: Any)
             near[y, x], far[y, x], share[y, x] = r[y, x], r[y, x], _ONE
         for x in range(w - edge, w):
             near[y, x], far[y, x], share[y, x] = r[y, x], r[y, x], _ONE
-    high, low = r.copy(), -r
+    for y in range(h):
+        for x in range(w):
+            high[y, x] = r[y, x]
+        for x in range(w):
+            low[y, x] = -r[y, x]
     _window_max(high, side, side)  # of the window that begins there
     _window_max(low, side, side)
     wide, nearer, of_near = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)

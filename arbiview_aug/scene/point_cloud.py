@@ -45,6 +45,8 @@ NODES_RAD = 4 * CELL_RAD
 
 ROOM_CELLS = 5  # cells by which panoramas are wider than what is asked first: later questions fit in
 
+_BLOCK = 1 << 16
+
 OBJECT_AIR = np.array([BOX_AIR_M, SIDE_RAD / RASTER_RAD], np.float32)
 
 MEASURED_SPREAD = 0.05
@@ -167,7 +169,9 @@ class Panorama:
             ``SUPPORT_RAD``, else 0.
     """
 
-    def __init__(self, window: Window, origin: FloatArray, points: Points, street: StaticSurface) -> None:
+    def __init__(
+        self, window: Window, origin: FloatArray, points: Points, street: StaticSurface, memory: Memory = FRESH
+    ) -> None:
         from arbiview_aug.scene.completion import complete, drop_hidden, nearest_points
 
         self.window, self._origin, self._street, self._place = window, origin, street, window.place
@@ -176,9 +180,12 @@ class Panorama:
         nearest_points(points, origin, window.bounds, self._place, q, number)
         found, rays = drop_hidden(q, number, points, origin, cells.see_through, cells.side)
         own = q.reshape(-1)[found]
-        self.layers = np.empty((4, *shape), np.float32)
         residual = own - street.along(origin, rays)[0]
-        complete(found, own, residual, cells.reach, cells.support, cells.smooth, self.layers)
+        # Windows differ by some rows from frame to frame: blocks of few sizes are found again.
+        block = -(-(shape[0] + 4) * (shape[1] + 4) // _BLOCK) * _BLOCK
+        self.layers = memory.empty((4 * block,), np.float32)[: 4 * q.size].reshape(4, *shape)
+        work = memory.empty((5, block), np.float32)
+        complete(found, own, residual, cells.reach, cells.support, cells.smooth, work, self.layers)
 
     @cached_property
     def hidden_below(self) -> Layer:
@@ -229,7 +236,7 @@ class PointCloudSurface(DenseSurface):
         from arbiview_aug.scene.completion import SHOW, add_residuals
 
         q = self.street.image(camera, rays, memory)
-        view, *cells = self._located(camera, rays)
+        view, *cells = self._located(camera, rays, memory)
         add_residuals(*cells, view.layers, q)
         self._draw_objects(camera, rays, SHOW, q)
         return q
@@ -253,7 +260,7 @@ class PointCloudSurface(DenseSurface):
         """
         from arbiview_aug.scene.completion import HIDE, HIDE_WIDE, interpolate_layer
 
-        view, *cells = self._located(camera, rays)
+        view, *cells = self._located(camera, rays, memory)
         apart = max(1, round(CELL_RAD * float(rays.parameters[0])))
         hidden = memory.empty(camera.size, np.float32)
         interpolate_layer(*cells, view.hidden_below, apart, hidden)
@@ -284,23 +291,25 @@ class PointCloudSurface(DenseSurface):
             if raster.nearest.size:
                 draw_scanned(rays.planes, rays.parameters, R, box, rays.cones, CELL_PX, raster, OBJECT_AIR, mode, image)
 
-    def _located(self, camera: Camera, rays: PixelRays) -> tuple[Panorama, Layer, Layer, int]:
+    def _located(self, camera: Camera, rays: PixelRays, memory: Memory) -> tuple[Panorama, Layer, Layer, int]:
         """The panorama around a camera; rows and columns in it (ny + 1, nx + 1) of nodes, and how far these are apart.
 
         Kept for the next question.
         """
         if camera not in self._nodes:
-            step, R = max(1, int(NODES_RAD * float(rays.parameters[0]))), camera.cam2ego[:3, :3]
-            local, directions = nodes_of(rays, step, R)
-            view = self.view(camera.center_m, directions, Cells.for_camera(camera))
-            # A lens may have no rays somewhere; azimuths bend near the zenith, and jump in a panorama all around.
+            R = camera.cam2ego[:3, :3]
+            directions, step = directions_of(rays, R)
+            view = self.view(camera.center_m, directions, Cells.for_camera(camera), memory)
+            # Azimuths bend near the zenith, and jump in a panorama all around.
             steep = len(directions) == 0 or float(np.abs(directions[:, 2]).max()) > _STEEP
-            if step > 1 and (steep or view.window.columns >= view.window.cells.turn or len(directions) < local[0].size):
-                step, local = 1, rays.planes if rays.planes.size else nodes_of(rays, 1, R)[0]
+            step = 1 if steep or view.window.columns >= view.window.cells.turn else step
+            local = rays.planes if step == 1 and rays.planes.size else nodes_of(rays, step)
             self._nodes[camera] = view, *view.cells(local, R), step
         return self._nodes[camera]
 
-    def view(self, origin: FloatArray, directions: FloatArray, cells: Cells | None = None) -> Panorama:
+    def view(
+        self, origin: FloatArray, directions: FloatArray, cells: Cells | None = None, memory: Memory = FRESH
+    ) -> Panorama:
         """The panorama around a centre that holds rays (..., 3); without ``cells`` one that was made before will do."""
         from arbiview_aug.scene.completion import elevations
 
@@ -314,15 +323,25 @@ class PointCloudSurface(DenseSurface):
         suitable = (p for p in held if cells in (None, p.window.cells) and p.window.holds(around(p.window.cells)))
         found = next(suitable, None)
         if found is None:
-            found = Panorama(around(cells or FINE).roomy, origin, self.points, self.street)
+            found = Panorama(around(cells or FINE).roomy, origin, self.points, self.street, memory)
             held.append(found)
         return found
 
 
-def nodes_of(rays: PixelRays, step: int, R: FloatArray) -> tuple[Layer, FloatArray]:
-    """Rays (3, ny + 1, nx + 1) of nodes, the last ones on the last pixels; those there are (n, 3), in the ego frame."""
-    local = rays.at(*(np.minimum(np.arange(0, n + step, step), n - 1) for n in rays.size))
-    return local, local[:, local.any(axis=0)].T @ R.T
+def nodes_of(rays: PixelRays, apart: int) -> Layer:
+    """Rays (3, ny + 1, nx + 1) of pixels so far apart, the last ones on the last pixels."""
+    return rays.at(*(np.minimum(np.arange(0, n + apart, apart), n - 1) for n in rays.size))
+
+
+def directions_of(rays: PixelRays, R: FloatArray) -> tuple[FloatArray, int]:
+    """Unit rays (n, 3) in the ego frame that span a view, and the pixels between nodes for its panorama."""
+    step = max(1, int(NODES_RAD * float(rays.parameters[0])))
+    for apart in (max(step, CELL_PX), step):  # an image circle ends between nodes
+        local = nodes_of(rays, apart)
+        valid = local.any(axis=0)
+        if valid.all():
+            return local.reshape(3, -1).T @ R.T, step
+    return local[:, valid].T @ R.T, 1
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from arbiview_aug.cameras.rays import CameraMaps
 from arbiview_aug.cameras.torch_rays import on_device
 from arbiview_aug.scene.completion import LEAST_WEIGHT
 from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, NEAREST_M, STEP, STEP_PER_M
-from arbiview_aug.scene.point_cloud import NODES_RAD, OWN_CAR_M, Cells, Window, nodes_of
+from arbiview_aug.scene.point_cloud import OWN_CAR_M, Cells, Window, directions_of
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 from arbiview_aug.scene.torch_surface import static_image
 
@@ -181,9 +181,7 @@ class PanoramaViews:
 
 def window_of(camera: Camera, maps: CameraMaps) -> Window:
     """The part of the sphere that is made dense for a camera."""
-    rays = maps.rays(camera)
-    step = max(1, int(NODES_RAD * float(rays.parameters[0])))
-    _, directions = nodes_of(rays, step, camera.cam2ego[:3, :3])
+    directions, _ = directions_of(maps.rays(camera), camera.cam2ego[:3, :3])
     return Window.around(directions, Cells.for_camera(camera)).roomy
 
 
