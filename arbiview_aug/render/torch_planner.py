@@ -38,7 +38,7 @@ from arbiview_aug.render.view_planner import (
     source_bounds,
 )
 from arbiview_aug.scene.boxes import BOX_ERROR, UNLABELLED
-from arbiview_aug.scene.point_cloud import MEASURED_SPREAD, Cells, occlusion_level
+from arbiview_aug.scene.point_cloud import COARSE, MEASURED_SPREAD, Cells, occlusion_level
 from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
 from arbiview_aug.scene.torch_points import PanoramaViews, upsampled
@@ -205,10 +205,12 @@ class _ViewBatch:
         self.own, self.points = {f: part[1] for f, part in split.items()}, {f: part[2] for f, part in split.items()}
         self.boxes = {f: torch.where(split[f][0][:, None], 0.0, boxes) for f, boxes in self.boxes.items()}
 
-    def _point_views(self, frames: Sequence[int], cameras: Sequence[Camera], rays: Any, ego: Any, poses: Poses) -> Any:
+    def _point_views(
+        self, frames: Sequence[int], cameras: Sequence[Camera], cells: Cells, rays: Any, ego: Any, poses: Poses
+    ) -> Any:
         """What the points say around cameras of frames, and the objects that show their shape there."""
         ground_z_m = np.array([self.requests[f].source.ground_z_m for f in frames])
-        views = PanoramaViews(cameras, self.maps, torch.stack([self.points[f] for f in frames]), ground_z_m)
+        views = PanoramaViews(cameras, cells, self.maps, torch.stack([self.points[f] for f in frames]), ground_z_m)
         if self.labels is None:
             return views, None
         order = list(self.own)
@@ -233,7 +235,8 @@ class _ViewBatch:
         self.q = self.behind = static_image(self.name != "ground", ego, centers_m, ground_z_m)
         on_street = self._on_nodes(self.behind)
         if self.has_points:
-            views, scans = self._point_views(self.frames, self.cameras, self.rays, ego, self.poses)
+            cells = Cells.for_camera(self.cameras[0])  # batches have equal ones
+            views, scans = self._point_views(self.frames, self.cameras, cells, self.rays, ego, self.poses)
             self.q = self.behind = views.image(ego, self.q)
             if scans is not None:
                 self.q = self.behind = scans.show(self.q)
@@ -388,13 +391,13 @@ class _ViewBatch:
         if not self.is_solid:
             return
         scale = np.ones(self.numbers.shape)
-        sizes: dict[Any, dict[Any, Camera]] = {}
+        sizes: dict[tuple[int, int], dict[Any, Camera]] = {}
         for row, k in zip(*np.nonzero(self.is_near), strict=True):
             source, level = self.pairs[row][k], int(self.levels[row, k])
             coarser = level if self.boxes is not None else max(level, occlusion_level(source))
             scale[row, k] = 0.5 ** (coarser - level)
             half = halved_camera(source, coarser)
-            sizes.setdefault((half.size, Cells.for_camera(half)), {})[self._key(row, k)] = half
+            sizes.setdefault(half.size, {})[self._key(row, k)] = half
         self.scale = on_device(scale, self.device, torch.float32)[..., None, None]
         drawn: dict[Any, Any] = {}
         for of_size in sizes.values():
@@ -412,7 +415,7 @@ class _ViewBatch:
         beyond = number = None
         if self.has_points:
             ego = torch.stack(turned(rays, poses.R.float()), 1)
-            views, scans = self._point_views(frames, cameras, rays, ego, poses)
+            views, scans = self._point_views(frames, cameras, COARSE, rays, ego, poses)
             beyond = views.hidden(ego)
             beyond = beyond if scans is None else torch.maximum(beyond, scans.hide(True))
         if self.boxes is not None:

@@ -134,30 +134,34 @@ def complete(
     ``layers`` (4, h, w) becomes those of ``Panorama``; the points' flat cells, inverse distances, residuals are (n,).
     ``reach``, ``support`` and ``smooth`` are those of ``Cells``, ``work`` (5, >= (h + 4) * (w + 4)) is scratch.
     """
-    measured = layers[3]
-    h, w = measured.shape
-    r, q = work[0, : h * w].reshape(h, w), work[1, : h * w].reshape(h, w)
-    high, low = work[2, : h * w].reshape(h, w), work[3, : h * w].reshape(h, w)
+    _, h, w = layers.shape
+    size = h * w
+    r, q = work[0, :size].reshape(h, w), work[1, :size].reshape(h, w)
+    high, low = work[2, :size].reshape(h, w), work[3, :size].reshape(h, w)
     code = work[4, : (h + 4) * (w + 4)].view(np.int32).reshape(h + 4, w + 4)
     code[:] = _NO_SEED
+    seeds = layers[:2].reshape(2, size)  # until the layers are known
+    seeds[:] = _ZERO
     for i in range(cells.shape[0]):
-        y, x = cells[i] // w, cells[i] % w
-        code[y + 2, x + 2] = _OWN
-        r[y, x], q[y, x] = residuals[i], own[i]
+        code[cells[i] // w + 2, cells[i] % w + 2] = _OWN
+        seeds[0, cells[i]], seeds[1, cells[i]] = residuals[i], own[i]
     spread(code)
-    away = np.empty(w, np.float32)
+    away, place, residual, nearest = np.empty(w, np.float32), np.empty(w, np.int32), seeds[0], seeds[1]
     for y in range(h):
+        line, measured, to_r, to_q, first = code[y + 2, 2 : w + 2], layers[3, y], r[y], q[y], np.int32(y * w)
         for x in range(w):
-            away[x] = np.float32(code[y + 2, x + 2] >> 14) * np.float32(1 / 1024)
+            away[x] = np.float32(line[x] >> 14) * np.float32(1 / 1024)
         for x in range(w):
-            measured[y, x] = _ONE if away[x] <= support else _ZERO
+            measured[x] = _ONE if away[x] <= support else _ZERO
         for x in range(w):
-            if away[x] >= reach:
-                r[y, x] = q[y, x] = _ZERO
-            else:
-                fade = min(_TWO - _TWO * away[x] / reach, _ONE)
-                from_y, from_x = seed(code[y + 2, x + 2])
-                r[y, x], q[y, x] = r[y + from_y, x + from_x] * fade, q[y + from_y, x + from_x]
+            rows, columns = seed(line[x])
+            place[x] = first + np.int32(x) + (np.int32(rows * w + columns) if away[x] < reach else np.int32(0))
+        for x in range(w):  # nothing is known at cells far from all points
+            to_q[x] = nearest[place[x]]
+        for x in range(w):
+            to_r[x] = residual[place[x]]
+        for x in range(w):
+            to_r[x] *= max(min(_TWO - _TWO * away[x] / reach, _ONE), _ZERO)
     _average_sides(r, q, high, low, smooth, layers[0], layers[1], layers[2])
 
 

@@ -28,18 +28,18 @@ class PanoramaViews:
     """What points say around C cameras' centres, as ``point_cloud.Panorama``; layers are (C, H, W).
 
     Args:
-        cameras: They decide what is seen of the sphere. Their cells are those of the first.
+        cameras: They decide what is seen of the sphere.
+        cells: Of all panoramas.
         maps: Rays of cameras.
         points: (C, P, 3) float64 ego frame; rows that are not finite are none.
         ground_z_m: (C,) height of the road.
     """
 
     def __init__(
-        self, cameras: Sequence[Camera], maps: CameraMaps, points: torch.Tensor, ground_z_m: np.ndarray
+        self, cameras: Sequence[Camera], cells: Cells, maps: CameraMaps, points: torch.Tensor, ground_z_m: np.ndarray
     ) -> None:
-        device = points.device
-        windows = [window_of(camera, maps) for camera in cameras]
-        self._cells = windows[0].cells
+        device, self._cells = points.device, cells
+        windows = [window_of(camera, cells, maps) for camera in cameras]
         self._shapes = on_device(np.array([window.shape for window in windows]), device)
         self._size = tuple(max(sides) for sides in zip(*(window.shape for window in windows), strict=True))
         self._place = on_device(np.stack([window.place for window in windows]), device)[:, :, None, None]
@@ -179,10 +179,10 @@ class PanoramaViews:
         self.share = torch.where(inner, share, 1.0)
 
 
-def window_of(camera: Camera, maps: CameraMaps) -> Window:
+def window_of(camera: Camera, cells: Cells, maps: CameraMaps) -> Window:
     """The part of the sphere that is made dense for a camera."""
     directions, _ = directions_of(maps.rays(camera), camera.cam2ego[:3, :3])
-    return Window.around(directions, Cells.for_camera(camera)).roomy
+    return Window.around(directions, cells).roomy
 
 
 def upsampled(nodes: torch.Tensor, step: int, size: Sequence[int], ends: bool = False) -> torch.Tensor:

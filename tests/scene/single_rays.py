@@ -6,7 +6,7 @@ import numpy as np
 
 from arbiview_aug.scene.boxes import BoxSurface, meets
 from arbiview_aug.scene.panorama import SIDE_RAD
-from arbiview_aug.scene.point_cloud import Panorama, PointCloudSurface, PointCloudWithBoxes
+from arbiview_aug.scene.point_cloud import COARSE, Panorama, PointCloudSurface, PointCloudWithBoxes
 from arbiview_aug.scene.scanned_objects import BOX_AIR_M, RASTER_RAD, ScannedObject
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE, StaticSurface, Surface
 
@@ -49,7 +49,7 @@ def occlusion_depth(
     surface: PointCloudSurface, origin: np.ndarray, directions: np.ndarray, widened: bool = True
 ) -> np.ndarray:
     """Inverse distances (...,) beyond which points hide what is behind them."""
-    view = surface.view(np.asarray(origin, np.float64), directions)
+    view = surface.view(np.asarray(origin, np.float64), directions, COARSE if widened else None)
     depth = layer_at(view, view.hidden_below, directions)
     flat = depth.reshape(-1)
     for met, own, behind in _objects_on(surface, origin, directions):
