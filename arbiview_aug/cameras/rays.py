@@ -88,35 +88,6 @@ class PixelRays:
         return rays
 
 
-@dataclass(frozen=True)
-class NodeRays:
-    """Viewing rays at the corners of square cells of pixels, camera frame.
-
-    Attributes:
-        at_corners: (3, ny + 1, nx + 1) float32 unit rays of the corners, the last ones on the last pixels.
-        places: Rows (ny + 1, 1) and columns (1, nx + 1) of the nodes: the outermost lie half a cell inside, as a
-            magnified source does not see the outermost pixels.
-        at_nodes: (3, ny + 1, nx + 1) float32 unit rays.
-    """
-
-    at_corners: Planes
-    places: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
-    at_nodes: Planes
-
-    @classmethod
-    def of(cls, rays: PixelRays, step: int) -> NodeRays:
-        """Those of a camera, ``step`` pixels apart."""
-        corners = [np.minimum(np.arange(0, n + step, step), n - 1) for n in rays.size]
-        inset = step // 2
-        y, x = (c.clip(inset, n - 1 - inset) for c, n in zip(corners, rays.size, strict=True))
-        return cls(rays.at(*corners), (y[:, None], x[None]), rays.at(y, x))
-
-    @property
-    def nbytes(self) -> int:
-        """Memory in bytes."""
-        return self.at_corners.nbytes + self.at_nodes.nbytes
-
-
 class CameraMaps:
     """Rays and masks of cameras by their content: what is costly and does not change from frame to frame.
 
@@ -138,9 +109,9 @@ class CameraMaps:
         """The rays of a camera; ``known`` are taken for it from now on."""
         return self._cache.get(_lens_key(camera), lambda: known or pixel_rays(camera))
 
-    def nodes(self, camera: Camera, step: int) -> NodeRays:
-        """The rays of nodes ``step`` pixels apart."""
-        return self._cache.get((_lens_key(camera), step), lambda: NodeRays.of(self.rays(camera), step))
+    def of_lens(self, camera: Camera, key: Any, make: Callable[[], Planes]) -> Planes:
+        """What ``make`` gives for the rays of a camera; held."""
+        return self._cache.get((_lens_key(camera), key), make)
 
     def copy_on(self, device: torch.device, key: Any, make: Callable[[], Any]) -> torch.Tensor:
         """What ``make`` gives for a content key, on a device; held."""

@@ -65,7 +65,7 @@ def cells_in_view(
         farthest: (ny, nx) least.
         A: (3, 3) target to source.
         o: (3,) the target's centre in the source's frame.
-        kind: The source's lens.
+        kind: The source's lens; it may see all open cells through one that kernels do not know.
         P: Its parameters.
         size: (2,) float32 its height and width.
         cone_rad: Angle off its axis beyond which it sees nothing.
@@ -79,10 +79,10 @@ def cells_in_view(
     x, y, z, u, v, a, b = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
     first_x, first_y, first_z, forward, together = work[7], work[8], work[9], work[10], work[11]
     for j in range(ny):
-        common[:] = 31
+        common[:] = 31 if kind >= 0 else 0
         forward[:] = -_ONE
         together[:] = _ONE
-        for c in range(8):
+        for c in range(8 if kind >= 0 else 0):
             jj, ii = j + (c >> 1 & 1), c & 1
             q = nearest[j] if c < 4 else farthest[j]
             corner = slice(ii, ii + nx)
@@ -115,7 +115,7 @@ def cells_in_view(
         columns[j, 0] = columns[j, 1] = 0
         for i in range(nx):
             use = open[j, i] and common[i] == 0
-            if use and kind != 0:
+            if use and kind > 0:
                 use = np.arccos(min(forward[i], _ONE)) <= cone_rad + np.arccos(max(together[i], -_ONE))
             if use:
                 columns[j, 0] = columns[j, 0] if columns[j, 1] else i
@@ -193,24 +193,12 @@ def _occlude_row(
 ) -> None:  # fmt: skip
     """Clear ``seen`` (n,) where something hides a point from a source, or its face is turned away from it.
 
-    Args:
-        q: (n,) inverse distances along the target's rays.
-        face: (n,) of solids, -1 for the background; (0,) without any.
-        px: (n,) points in the source's frame, times q; as are ``py`` and ``pz``, which is overwritten.
-        py: See there.
-        pz: See there.
-        u: (n,) positions in the source as it is read; as is ``v``.
-        v: See there.
-        column: (n,) float32 scratch; as are ``row``, ``hides`` and ``place``, which is int32.
-        row: See there.
-        hides: See there.
-        place: See there.
-        scale: Size of the shadow image by that of the source as it is read.
-        before_m: (F,) by how many metres the source lies before each face's plane.
-        shadow: (h, w) what has a smaller inverse distance is hidden, 0 for nothing.
-        solid: (h, w) by which solid.
-        guess: The background was not measured: whatever stands in its way hides it.
-        seen: (n,) int32, updated.
+    The points ``px``, ``py`` and ``pz`` lie in the source's frame, times ``q``; all three are overwritten. ``face``
+    numbers faces of solids, -1 for the background; (0,) without any. ``u`` and ``v`` are positions in the source as it
+    is read, of which the occlusion map has ``scale`` times the size; ``column`` to ``place``, int32, are scratch. The
+    source lies ``before_m`` (F,) metres before each face's plane. The map hides what has a smaller inverse distance
+    than ``shadow`` (h, w), 0 for nothing; ``solid`` says by which solid. A background that is a ``guess`` was not
+    measured: whatever stands in its way hides it.
     """
     n = q.shape[0]
     h, w = shadow.shape
@@ -328,8 +316,8 @@ def put_source(
         xy: (h, w) int32, two int16: whole pixels in the source.
         frac: (h, w) uint16, 32nds of a pixel.
         in_image: (h, w) uint8, 255 where some source's image contains the pixel.
-        next_best: (h, w) float32 weight of the second-best source in these cells, as ``clear_shared`` leaves it.
-        second: (h, w) int8 whose that is.
+        next_best: (h, w) float32 weight of the second-best source in these cells, 0 for none.
+        second: (h, w) int8 whose that is, -1 for none.
         next_xy: (h, w) int32 where it is read.
         next_frac: (h, w) uint16.
     """
@@ -386,17 +374,6 @@ def put_source(
             image[i] = np.uint8(255) if inside[i] else image[i]
         for i in range(n):
             held[i] = max(share[i], held[i])
-
-
-@compiled
-def clear_shared(shared: Any, step: int, next_best: Any, second: Any) -> None:
-    """Clear the weights (h, w) of second-best sources (h, w) in shared cells (ny, nx) before ``put_source``."""
-    h, w = second.shape
-    for y in range(h):
-        for i in range(shared.shape[1]):
-            if shared[y // step, i]:
-                for x in range(i * step, min(i * step + step, w)):
-                    next_best[y, x], second[y, x] = _ZERO, -1
 
 
 @compiled
@@ -479,33 +456,6 @@ def seen_image(planes: Any, target: Any, q: Any, face: Any, source: Any, visible
         _evaluate_row(planes, target, q, face, source, y, np.int64(0), w, work, inside, seen)
         for x in range(w):
             visible[y, x] = seen[x] != 0
-
-
-@compiled
-def count_winners(winner: Any, in_image: Any, won_px: Any, occluded: Any) -> bool:
-    """Count the pixels that each source wins, and find those that lie in an image but are seen by none.
-
-    Args:
-        winner: (h, w) int8 source, -1 for none.
-        in_image: (h, w) uint8, as in ``put_source``.
-        won_px: (S,) int64, written.
-        occluded: (h, w) bool, written; whether there is any is returned.
-    """
-    h, w = winner.shape
-    won_px[:] = 0
-    found = np.uint8(0)
-    for y in range(h):
-        row, out = winner[y], occluded[y].view(np.uint8)
-        for k in range(won_px.shape[0]):
-            count = np.int32(0)
-            for x in range(w):
-                count += np.int32(row[x] == np.int8(k))
-            won_px[k] += count
-        for x in range(w):
-            out[x] = np.uint8((row[x] < 0) & (in_image[y, x] > 0))
-        for x in range(w):
-            found |= out[x]
-    return bool(found > 0)
 
 
 @compiled

@@ -62,17 +62,14 @@ class SecondBest:
     """
 
     def __init__(self, weights: Sequence[Nodes], step: int, size: tuple[int, int], memory: Memory) -> None:
-        from arbiview_aug.render.kernels import clear_shared
-
         count = np.zeros([-(-n // step) for n in size], np.uint8)
         for weight in weights:
             some = weight > 0
             count += some[1:, 1:] | some[1:, :-1] | some[:-1, 1:] | some[:-1, :-1]
         self.shared, self._step = count > 1, step
         size = size if self.shared.any() else (0, 0)
-        types = np.float32, np.int8, np.int32, np.uint16
-        self.images = tuple(memory.empty(size, kind) for kind in types)
-        clear_shared(self.shared, step, *self.images[:2])
+        weight, second = memory.full(size, 0, np.float32), memory.full(size, -1, np.int8)
+        self.images = weight, second, memory.empty(size, np.int32), memory.empty(size, np.uint16)
 
     def blend_regions(self, sources: Sequence[int], best: npt.NDArray[np.float32]) -> Iterator[BlendRegion]:
         """Rectangles around the pixels that a second source adds to.

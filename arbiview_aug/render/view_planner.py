@@ -112,10 +112,17 @@ class ViewPlanner:
         coarse = min(camera.size) >= SMALL_SIDE_PX
         coarse &= is_within_wall(camera.center_m) or not SURFACES[surface].has_wall
         self.step = config.grid_step_px if coarse else 1
-        self.nodes = maps.nodes(camera, self.step)
+        corners = [np.minimum(np.arange(0, n + self.step, self.step), n - 1) for n in camera.size]
+        # The outermost nodes lie half a cell inside: a magnified source does not see the outermost pixels.
+        inset = self.step // 2
+        y, x = self.nodes = [c.clip(inset, n - 1 - inset) for c, n in zip(corners, camera.size, strict=True)]
+        self.at_nodes = y[:, None], x[None]
+        self.corner_rays, self.node_rays = maps.of_lens(
+            camera, self.step, lambda: np.stack([self.rays.at(*corners), self.rays.at(y, x)])
+        )
         self._geometries: dict[str, _Geometry] = {}
         # Cells that sources elsewhere may change.
-        self._open = np.ones(tuple(n - 1 for n in self.nodes.at_nodes.shape[1:]), bool)
+        self._open = np.ones([len(n) - 1 for n in self.nodes], bool)
         exact = {k: self._region(k) for k in order if self._baseline_m(k) < SAME_CENTER_M}
         for one in filter(None, exact.values()):
             self._open = self._open & self._around_unseen(one)
@@ -161,7 +168,7 @@ class ViewPlanner:
     @cached_property
     def _directions(self) -> FloatArray:
         """Rays of the nodes in the ego frame, float64."""
-        rays = self.nodes.at_nodes.astype(np.float64)
+        rays = self.node_rays.astype(np.float64)
         return np.moveaxis((self.camera.cam2ego[:3, :3] @ rays.reshape(3, -1)).reshape(rays.shape), 0, -1)
 
     def _geometry(self, name: str) -> _Geometry:
@@ -187,7 +194,7 @@ class ViewPlanner:
 
         q = widened(surface.background.image(camera, rays, memory), 0)
         self.counters["dense_pixels"] += (y1 - y0) * (x1 - x0) if surface.background.is_dense else 0
-        behind = q[self.nodes.places]
+        behind = q[self.at_nodes]
         face = np.zeros((0, 0), np.int32)
         if surface.is_layered:
             solid, face = (widened(*one) for one in zip(surface.drawn(camera, rays, memory), (0, -1), strict=True))
@@ -196,7 +203,7 @@ class ViewPlanner:
             solid_px = int(np.count_nonzero(shown))
             self.counters["solid_pixels"] += solid_px
             face = face if solid_px else np.zeros((0, 0), np.int32)
-        at_nodes = q[self.nodes.places], face[self.nodes.places] if face.size else face
+        at_nodes = q[self.at_nodes], face[self.at_nodes] if face.size else face
         uncertainty = surface.uncertainty(center, self._directions, at_nodes[0])
         nearest, farthest = np.empty((2, *self._open.shape), np.float32)
         depth_range(q, self.step, nearest, farthest)
@@ -207,7 +214,7 @@ class ViewPlanner:
         from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES, camera_parameters
         from arbiview_aug.render.kernels import cells_in_view, measure_nodes, seen_image
 
-        source, nodes = self.source[index], self.nodes
+        source = self.source[index]
         baseline_m, focal_px = self._baseline_m(index), float(self.camera.K[0, 0])
         name, reason = self._choose_surface(baseline_m, focal_px)
         if not self._open.any():
@@ -217,21 +224,19 @@ class ViewPlanner:
             return None
         A, o = relative_pose(self.camera, source)
         kind, P = LENS_CODES.get(source.lens, -1), camera_parameters(source)
-        if kind >= 0:
-            columns, size = np.empty((len(self._open), 2), np.int64), np.array(source.size, np.float32)
-            if not cells_in_view(
-                nodes.at_corners, geometry.nearest, geometry.farthest, A, o, kind, P, size, source.cone_rad, self._open,
-                columns,
-            ):  # fmt: skip
-                return None
-            u, v = np.empty((2, *geometry.behind.shape), np.float32)
-        else:
-            columns = _spans(self._open)
-            u, v, _ = source_pixels(self.camera, nodes.at_nodes, geometry.behind, source)
+        columns, size = np.empty((len(self._open), 2), np.int64), np.array(source.size, np.float32)
+        if not cells_in_view(
+            self.corner_rays, geometry.nearest, geometry.farthest, A, o, kind, P, size, source.cone_rad, self._open,
+            columns,
+        ):  # fmt: skip
+            return None
+        u, v = np.empty((2, *geometry.behind.shape), np.float32)
+        if kind < 0:
+            u, v, _ = source_pixels(self.camera, self.node_rays, geometry.behind, source)
         resolution, edge_px, parallax_rad = np.empty((3, *u.shape))
         offset_m = (self.camera.center_m - source.center_m) @ self.camera.cam2ego[:3, :3]
         measure_nodes(
-            nodes.at_nodes, geometry.behind, A, o, kind, P, *(n.ravel() for n in nodes.places), source.size,
+            self.node_rays, geometry.behind, A, o, kind, P, *self.nodes, source.size,
             self.maps.to_mask(source), CELL_PX, offset_m, geometry.uncertainty, u, v, resolution, edge_px, parallax_rad,
         )  # fmt: skip
         if min(self.camera.size) < 2:
@@ -242,8 +247,8 @@ class ViewPlanner:
         level = halvings(most[len(most) // 5], source.size) if self.config.antialias and len(most) else 0
         kernel = self._kernel(source, level, surface, geometry, A, o)
         visible = np.zeros(seen.shape, bool)
-        given = np.ascontiguousarray(kernel[-1][(slice(None), *nodes.places)]) if kind < 0 else kernel[-1]
-        on_nodes = nodes.at_nodes, self.rays.parameters, geometry.on_nodes, geometry.face_on_nodes
+        given = np.ascontiguousarray(kernel[-1][(slice(None), *self.at_nodes)]) if kind < 0 else kernel[-1]
+        on_nodes = self.node_rays, self.rays.parameters, geometry.on_nodes, geometry.face_on_nodes
         seen_image(*on_nodes, (*kernel[:-1], given), visible)
         self.counters[f"pairs_{name}"] += 1
         score = (
@@ -306,7 +311,7 @@ class ViewPlanner:
     # --- who wins -----------------------------------------------------------------------------------------------------
     def finish(self, layout: AtlasLayout) -> ViewPlan:
         """Winners, maps into the atlas, and blended bands."""
-        from arbiview_aug.render.kernels import count_winners, put_source, upsample_where
+        from arbiview_aug.render.kernels import put_source, upsample_where
 
         size, memory = self.camera.size, self.maps.memory
         fixed = FixedMap.outside(size, memory)
@@ -323,9 +328,7 @@ class ViewPlanner:
                 *self._target(region), region.kernel, place, weight, self.step, region.columns,
                 seconds.shared, best, winner, fixed.packed, fixed.frac, in_image, *seconds.images,
             )  # fmt: skip
-        count, occluded = np.empty(len(self.source), np.int64), memory.empty(size, bool)
-        is_occluded = count_winners(winner, in_image, count, occluded)
-        won_px = Counter({region.source: int(count[region.source]) for region in self.regions})
+        won_px = Counter({r.source: int(np.count_nonzero(winner == r.source)) for r in self.regions})
         bands = tuple(seconds.blend_regions([region.source for region in self.regions], best))
         certain = None
         if self.config.certainty:
@@ -337,7 +340,10 @@ class ViewPlanner:
             fixed = fixed.rounded()
         edge = self._edge(fixed, winner, layout) if interpolation == "cubic" else None
         reports = tuple(self._reports(winner, won_px))
-        return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge, occluded if is_occluded else None)
+        occluded: Any = (winner < 0) & (in_image > 0)
+        return ViewPlan(
+            fixed, winner, bands, reports, interpolation, certain, edge, occluded if occluded.any() else None
+        )
 
     def _target(self, region: _Region) -> tuple[Any, ...]:
         return self.rays.planes, self.rays.parameters, region.geometry.q, region.geometry.face
@@ -373,17 +379,18 @@ class ViewPlanner:
 
     def _reports(self, winner: npt.NDArray[np.int8], won_px: Counter[int]) -> Iterator[SourceUse]:
         """What each source that wins any pixel does, largest share first."""
-        on_nodes = winner[self.nodes.places]
+        on_nodes = winner[self.at_nodes]
         for region in sorted(self.regions, key=lambda r: -won_px[r.source]):
             if won_px[region.source] == 0:
                 continue
-            won = region.parallax[on_nodes == region.source]
+            won = np.sort(region.parallax[on_nodes == region.source])
+            middle = won[(len(won) - 1) // 2 : len(won) // 2 + 1]
             yield SourceUse(
                 source=region.source,
                 surface=region.surface,
                 reason=region.reason,
                 baseline_m=region.baseline_m,
-                parallax_px=float(np.median(won)) if won.size else 0.0,
+                parallax_px=float(middle.mean()) if won.size else 0.0,
                 share=won_px[region.source] / winner.size,
                 level=region.level,
             )
@@ -423,9 +430,3 @@ def _filled(values: FloatArray, valid: BoolArray) -> npt.NDArray[np.float32]:
     known = np.where(valid, values, 0).astype(np.float32)
     total, count = (cv2.blur(p, (5, 5), borderType=cv2.BORDER_REPLICATE) for p in (known, valid.astype(np.float32)))
     return np.where(valid, known, total / np.maximum(count, np.float32(1e-6)))
-
-
-def _spans(use: BoolArray) -> npt.NDArray[np.int64]:
-    """First and last (exclusive) True column (ny, 2) of each row."""
-    first, last = use.argmax(axis=1), use.shape[1] - use[:, ::-1].argmax(axis=1)
-    return np.stack([first, np.where(use.max(axis=1), last, first)], -1)
