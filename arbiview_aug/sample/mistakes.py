@@ -34,8 +34,8 @@ _LEAST_POINTS = 5  # in a box, for it to speak
 _MOST_POINTS = 50  # near boxes count as much as others
 _BETTER = 1.3  # times as many points: a box of another reading holds clearly more
 _LEAST_WINS, _WIN_RATIO = 3, 4
-"""Boxes that must hold more points in another reading, and how many for each that holds fewer. Right readings of two
-real frames and 40 streets win none or lose as many; wrong ones win all but one in ten."""
+"""Boxes that must hold more points in another reading, and how many for each that holds fewer. No other reading passes
+on 820 right frames: one of nuScenes and 40 streets, turned, thinned, with jittered labels."""
 
 _LONG_M, _LEAST_LONG, _MOST_LONG = 3.0, 3, 0.75
 """Boxes longer than this are vehicles, longest along their length: 3 of them at least, three quarters of all."""
@@ -101,14 +101,16 @@ def check(sample: Mapping[str, Any], source_rig: Rig | None = None) -> CheckRepo
     boxes, points = (_arrays(sample, key, frames, lead) for key in ("boxes_3d", "points"))
     found = list(_key_findings(sample, source_rig is not None or sample.get("rig") is not None))
     for frame, of_frame, cloud in zip(frames, boxes, points, strict=True):
-        found += check_rig(frame.rig)
+        # Holes of an earlier retargeting are masks too, of any shape.
+        own_masks = sample.get("coverage") is None and sample.get("ignore") is None
+        found += check_rig(frame.rig, masks=own_masks)
         found += _image_findings(frame)
         found += _label_findings(frame.rig, of_frame, cloud)
     return CheckReport(tuple(dict.fromkeys(found)))
 
 
-def check_rig(rig: Rig) -> list[Finding]:
-    """Mistakes in poses, intrinsics and masks alone."""
+def check_rig(rig: Rig, *, masks: bool = True) -> list[Finding]:
+    """Mistakes in poses, intrinsics and, where ``masks``, masks alone."""
     found = []
     mistake = pose_mistake(rig.cam2ego, rig.ground_z_m)
     if mistake is not None:
@@ -116,7 +118,7 @@ def check_rig(rig: Rig) -> list[Finding]:
         found.append(Finding("cam2ego", expected, *mistake))
     found += _resolution_findings(rig)
     for camera in rig:
-        if camera.mask is None:
+        if camera.mask is None or not masks:
             continue
         turned = int((without_specks(camera.mask) != camera.mask).sum())
         if turned:
@@ -181,11 +183,12 @@ def _label_findings(rig: Rig, boxes: FloatArray | None, points: Points | None) -
         return [Finding("boxes_3d", "yaw in radians", f"yaw up to {largest:.1f}", "pass degrees through torch.deg2rad")]
     if boxes is not None and len(boxes):
         objects = None
-        if points is not None and road_m is not None:
-            objects = points[(points[:, 2] > road_m + _OVER_ROAD_M) & ~own_car(points)]
-        turned = objects is not None and road_m is not None and _frame_finding(boxes, objects, road_m - rig.ground_z_m)
-        if turned:
-            return [turned]
+        if points is not None:
+            level_m = rig.ground_z_m if road_m is None else road_m
+            objects = points[(points[:, 2] > level_m + _OVER_ROAD_M) & ~own_car(points)]
+            turned = _frame_finding(boxes, objects, level_m - rig.ground_z_m)
+            if turned is not None:
+                return [turned]
         found += list(_box_findings(rig, boxes, objects))
     if road_m is not None and abs(road_m - rig.ground_z_m) > ROAD_M:
         found.append(_road_finding(rig, boxes, road_m))
@@ -208,7 +211,7 @@ def _road_finding(rig: Rig, boxes: FloatArray | None, road_m: float) -> Finding:
     if road_m - rig.ground_z_m < -_LIDAR_HEIGHT_M and (stand is None or abs(float(np.median(stand[0]))) < ROAD_M * 2):
         fix = "are the points in the LiDAR's frame? Apply lidar2ego to them"
         return Finding("points", f"the road at z = {rig.ground_z_m:+.2f} m, as ground_z_m says", seen, fix)
-    fix = f"set ground_z_m={road_m:.2f}, or move the points to the ego frame"
+    fix = f"set ground_z_m={road_m:.2f}; or, if points and boxes are in the LiDAR's frame, apply lidar2ego to both"
     return Finding("ground_z_m", f"the road's height, {seen}", f"{rig.ground_z_m:+.2f}", fix)
 
 
@@ -242,8 +245,10 @@ def _box_findings(rig: Rig, boxes: FloatArray, objects: Points | None) -> Iterat
         share = bottoms[0] / bottoms[1]
         sunk = bool(abs(np.median(share) + 0.5) < 0.15 and np.ptp(np.percentile(share, [25, 75])) < 0.3)
     if sunk:
-        seen = "boxes half below it" if objects is None else "more points inside if z is the bottom"
-        yield Finding("boxes_3d", "z of the box's centre", seen, "add half the height to z")
+        seen, fix = "more points inside if z is the bottom", "add half the height to z"
+        if objects is None:
+            seen, fix = "boxes half below the road", f"{fix}, or is ground_z_m wrong?"
+        yield Finding("boxes_3d", "z of the box's centre", seen, fix)
 
 
 def _order_finding(boxes: FloatArray, objects: Points | None) -> Finding | None:

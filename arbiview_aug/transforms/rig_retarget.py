@@ -272,6 +272,11 @@ class RigRetarget(torch.nn.Module):
 
         Returns:
             A new dict.
+
+        Raises:
+            SampleError: A sample that is incomplete or inconsistent, or shows no pixel of the target.
+            SampleTypeError: Values of a type that is not supported.
+            CalibrationError: Impossible K, cam2ego or lens.
         """
         self._limit_threads()
         frames, lead = read_frames(sample, self.source_rig), leading_shape(sample["images"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import CheckReport, Finding, Rig, SampleError, check, load_rig, shipped_rigs
+from arbiview_aug import CheckReport, Finding, Rig, RigRetarget, SampleError, check, load_rig, shipped_rigs
 from arbiview_aug.datasets import FrameFolder, cleaned_rig, open_data
 from arbiview_aug.sample.mistakes import check_rig, road_height_m
 from tests.helpers import street_sample
@@ -45,7 +46,7 @@ def test_a_silent_mistake_is_found(frame: str, mistake: str, request: pytest.Fix
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (at_the_bottom, "boxes half below it; add half the height"),
+        (at_the_bottom, "boxes half below the road; add half the height"),
         (columns([0, 1, 2, 4, 3, 5, 6]), "Swap columns 3 and 4"),
         (columns([0, 1, 2, 5, 4, 3, 6]), "Reorder"),
         (yaws(torch.rad2deg), "deg2rad"),
@@ -147,3 +148,21 @@ def test_a_rig_of_heights_that_no_vehicle_has(street: Sample) -> None:
     on_its_side = rig.with_cameras([camera.turned(roll_deg=90) for camera in street["rig"]])
     (finding,) = check_rig(Rig(list(on_its_side)))
     assert "lie on their side" in finding.found
+
+
+@pytest.mark.parametrize("target", ["waymo", "fisheye_surround"])
+def test_what_was_retargeted_has_no_findings(target: str) -> None:
+    rig = load_rig(target)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for holes in ("fill", "black"):
+            out = RigRetarget(rig.resized(0.1), surface="street", holes=holes)(right_street())
+            assert check(out).ok, check(out)
+
+
+def test_points_of_a_lidar_that_looks_ahead_alone(street: Sample) -> None:
+    """The road is unknown, but the boxes' points still tell their yaw."""
+    ahead = street["points"][street["points"][:, 0] > 7]
+    assert road_height_m(ahead.numpy()) is None
+    assert check({**street, "points": ahead}).ok
+    assert "pass -yaw" in str(check(yaws(lambda yaw: -yaw)({**street, "points": ahead})))
