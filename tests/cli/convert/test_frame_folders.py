@@ -111,6 +111,13 @@ def test_masks_of_the_targets_own_car(source: Path, tmp_path: Path) -> None:
     assert np.array_equal(found[0].mask, mask) and found[1].mask.all()
 
 
+def test_cleaned_masks_are_a_setting(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = command(source / "0000", tmp_path / "new")
+    assert main([*asked, "--clean-masks"]) == 0
+    assert json.loads((tmp_path / "new" / "conversion" / "provenance.json").read_text())["settings"]["clean_masks"]
+    assert main(asked) == 2 and "settings.clean_masks" in capsys.readouterr().err
+
+
 def test_what_was_made_up_is_said(source: Path, tmp_path: Path) -> None:
     assert main(command(source / "0001", tmp_path / "new", "--path", "inpaint")) == 0
     calib = json.loads((tmp_path / "new" / "0001" / "calib.json").read_text())
