@@ -286,7 +286,7 @@ class ViewPlanner:
         shadow, solid = nothing
         shadow_scale = 1.0
         if surface.is_layered or surface.is_dense:
-            # Points are known by cells: a pixel for each is enough. Silhouettes of objects are sharper.
+            # Points hide by cells: a pixel for each is enough. Silhouettes of objects are sharper.
             coarser = level if surface.is_layered else max(level, occlusion_level(source))
             half = halved_camera(source, coarser)
             shadow, solid = surface.occlusion_map(half, self.maps.rays(half), self.maps.memory)

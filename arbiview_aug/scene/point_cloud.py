@@ -376,8 +376,8 @@ class PointCloudWithBoxes(BoxSurface):
 
 
 def occlusion_level(camera: Camera) -> int:
-    """Halvings of a camera's image up to which a pixel is not wider than a cell of points."""
-    level = int(math.log2(max(CELL_RAD * float(camera.K[0, 0]), 1)))
+    """Halvings of a camera's image up to which a pixel is not wider than a coarse cell of points."""
+    level = int(math.log2(max(COARSE.rad * float(camera.K[0, 0]), 1)))
     return 0 if min(camera.size) >> level < 2 else level
 
 
