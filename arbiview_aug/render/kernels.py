@@ -53,8 +53,8 @@ def depth_range(q: Any, step: int, nearest: Any, farthest: Any) -> None:
 def cells_in_view(
     rays: Any, nearest: Any, farthest: Any, A: Any, o: Any, kind: int, P: Any, size: Any, cone_rad: float, open: Any,
     columns: Any,
-) -> bool:  # fmt: skip
-    """Find the cells of a target that a source may see; return whether there is any.
+) -> None:  # fmt: skip
+    """Find the cells of a target that a source may see.
 
     A cell is left out where its eight corners, the nodes' rays at its least and largest distance, all lie beyond one
     side of the source's image, read off homogeneous coordinates for a pinhole; for a lens, also outside its cone.
@@ -73,7 +73,6 @@ def cells_in_view(
         columns: (ny, 2) int64, written: first and last (exclusive) such cell of each row.
     """
     ny, nx = open.shape
-    found = False
     right, bottom = size[1] - _ONE + _BORDER_PX, size[0] - _ONE + _BORDER_PX
     work, common = np.empty((12, nx), np.float32), np.empty(nx, np.int32)
     x, y, z, u, v, a, b = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
@@ -120,8 +119,6 @@ def cells_in_view(
             if use:
                 columns[j, 0] = columns[j, 0] if columns[j, 1] else i
                 columns[j, 1] = i + 1
-                found = True
-    return found
 
 
 @compiled

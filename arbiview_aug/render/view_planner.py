@@ -29,7 +29,7 @@ from arbiview_aug.render.view_plan import BilinearFallback, SourceUse, ViewPlan
 from arbiview_aug.scene.point_cloud import occlusion_level
 from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
-from arbiview_aug.scene.surface import Surface
+from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE, Surface
 
 SMALL_SIDE_PX = 64  # weights of targets with a shorter side are evaluated at every pixel
 _SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
@@ -126,6 +126,13 @@ class ViewPlanner:
         exact = {k: self._region(k) for k in order if self._baseline_m(k) < SAME_CENTER_M}
         for one in filter(None, exact.values()):
             self._open = self._open & self._around_unseen(one)
+        if any(exact.values()):  # however far the scene is
+            near, far = (np.full(self._open.shape, q, np.float32) for q in (MAX_INVERSE_DISTANCE, 0))
+            seen, cells = np.zeros_like(self._open), np.arange(self._open.shape[1])
+            for k in set(order) - set(exact):
+                first, last = self._in_view(self.source[k], near, far).T
+                seen |= (first[:, None] <= cells) & (cells < last[:, None])
+            self._open = seen
         found = exact | {k: self._region(k) for k in order if k not in exact}
         # In content order, so that ties never depend on the order of the source list.
         self.regions = [region for k in order if (region := found[k]) is not None]
@@ -210,9 +217,20 @@ class ViewPlanner:
         self._geometries[name] = _Geometry(q, face, *at_nodes, behind, nearest, farthest, uncertainty)
         return self._geometries[name]
 
+    def _in_view(self, source: Camera, nearest: Any, farthest: Any) -> npt.NDArray[np.int64]:
+        """First and last (exclusive) open cell (ny, 2) of each row that a source may see, by ``_Geometry``'s depths."""
+        from arbiview_aug.cameras.kernels import LENS_CODES, camera_parameters
+        from arbiview_aug.render.kernels import cells_in_view
+
+        A, o = relative_pose(self.camera, source)
+        kind, P, size = LENS_CODES.get(source.lens, -1), camera_parameters(source), np.array(source.size, np.float32)
+        columns = np.empty((len(self._open), 2), np.int64)
+        cells_in_view(self.corner_rays, nearest, farthest, A, o, kind, P, size, source.cone_rad, self._open, columns)
+        return columns
+
     def _region(self, index: int) -> _Region | None:
         from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES, camera_parameters
-        from arbiview_aug.render.kernels import cells_in_view, measure_nodes, seen_image
+        from arbiview_aug.render.kernels import measure_nodes, seen_image
 
         source = self.source[index]
         baseline_m, focal_px = self._baseline_m(index), float(self.camera.K[0, 0])
@@ -224,11 +242,8 @@ class ViewPlanner:
             return None
         A, o = relative_pose(self.camera, source)
         kind, P = LENS_CODES.get(source.lens, -1), camera_parameters(source)
-        columns, size = np.empty((len(self._open), 2), np.int64), np.array(source.size, np.float32)
-        if not cells_in_view(
-            self.corner_rays, geometry.nearest, geometry.farthest, A, o, kind, P, size, source.cone_rad, self._open,
-            columns,
-        ):  # fmt: skip
+        columns = self._in_view(source, geometry.nearest, geometry.farthest)
+        if not columns.any():
             return None
         u, v = np.empty((2, *geometry.behind.shape), np.float32)
         if kind < 0:
