@@ -157,7 +157,7 @@ def checked_mask(name: str, value: Any, size: tuple[int, int]) -> BoolArray:
 def pose_mistake(cam2ego: FloatArray, ground_z_m: float) -> tuple[str, str] | None:
     """What poses (N, 4, 4) probably are instead, and the fix; None if most cameras stand upright over the road."""
     looks_down = cam2ego[:, 2, 2] < -0.8  # such cameras have no lower edge
-    if ((_stands(cam2ego) | looks_down) & _is_mounted(cam2ego, ground_z_m)).mean() >= 0.5:
+    if ((_stands(cam2ego) | looks_down) & is_mounted(cam2ego, ground_z_m)).mean() >= 0.5:
         return None
     body, metres, upside_down = np.eye(4), cam2ego.copy(), np.diag([1.0, -1, -1, 1])
     body[:3, :3] = CAMERA_AXES_IN_EGO
@@ -174,7 +174,7 @@ def pose_mistake(cam2ego: FloatArray, ground_z_m: float) -> tuple[str, str] | No
         ),
         (cam2ego @ upside_down, "OpenGL's axes (y up, z backward)", "negate cam2ego[:3, 1:3]"),
     ):
-        if (_stands(right) & _is_mounted(right, ground_z_m)).mean() > 0.5:
+        if (_stands(right) & is_mounted(right, ground_z_m)).mean() > 0.5:
             return found, fix
     heights = ", ".join(f"{z:+.1f}" for z in cam2ego[:, 2, 3] - ground_z_m)
     if _stands(cam2ego).all():
@@ -187,7 +187,7 @@ def _stands(cam2ego: FloatArray) -> BoolArray:
     return np.asarray(cam2ego[:, 2, 1] < -0.5)
 
 
-def _is_mounted(cam2ego: FloatArray, ground_z_m: float) -> BoolArray:
+def is_mounted(cam2ego: FloatArray, ground_z_m: float) -> BoolArray:
     """(N,) whether cameras are at the height and distance of a vehicle's."""
     height = cam2ego[:, 2, 3] - ground_z_m
     near = np.abs(cam2ego[:, :2, 3]).max(axis=1) < _FARTHEST_M

@@ -32,7 +32,7 @@ from arbiview_aug.datasets.drive import (
 )
 from arbiview_aug.datasets.image_io import Reduce, check_reduce, decode_images, reduced_rig
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, WarnOnce
-from arbiview_aug.sample.masks import cleaned_camera
+from arbiview_aug.sample.masks import image_circle, without_specks
 from arbiview_aug.scene.boxes import checked_boxes
 
 CALIBRATION_FILE = "calib.json"
@@ -119,7 +119,7 @@ class FrameFolder(WritableRecording):
         self._frames = _find_frames(self.root)
         self.tokens = [frame.name for frame in self._frames]
         self._last_rig: tuple[str, Rig] | None = None
-        self._rims: dict[Camera, Camera] = {}
+        self._rims: dict[tuple[Any, ...], BoolArray | None] = {}
         self._times_s, order = _read_sequence(self.root, self._index)
         self._warn = WarnOnce()
         self._drive_names: list[str] = []
@@ -208,16 +208,18 @@ class FrameFolder(WritableRecording):
         last = self._last_rig  # read once, for threads
         if last is None or last[0] != key:
             rig = Rig.from_dict(data, where=frame.where)
-            cameras = [_with_mask(camera, file, frame) for camera, file in zip(rig, masks, strict=True)]
-            cameras = list(map(self._cleaned, cameras)) if self.clean_masks else cameras
+            clean = self.clean_masks
+            cameras = [_with_mask(camera, file, frame, clean) for camera, file in zip(rig, masks, strict=True)]
+            cameras = list(map(self._without_rim, cameras)) if clean else cameras
             last = self._last_rig = key, reduced_rig(rig.with_cameras(cameras), self.reduce)
         return last[1]
 
-    def _cleaned(self, camera: Camera) -> Camera:
-        """The camera with a mask that hides no specks, or the rim that is dark in several frames of the data."""
+    def _without_rim(self, camera: Camera) -> Camera:
+        """The camera, if it has no mask, with one of the rim that is dark in several frames of the data."""
         if camera.mask is not None or camera.is_rectilinear:
-            return cleaned_camera(camera)
-        if camera not in self._rims:
+            return camera
+        key = camera.name, camera.size, camera.lens, camera.distortion, camera.K.tobytes()  # poses may differ by frame
+        if key not in self._rims:
             images = []
             for k in sorted({0, len(self) // 2, len(self) - 1}):
                 with suppress(ArbiviewError):  # told when that frame is read
@@ -225,9 +227,9 @@ class FrameFolder(WritableRecording):
                     if camera.name in entries:
                         file = _image_file(entries[camera.name], self._frames[k])
                         images.append(decode_images([file], names=[camera.name], sizes=[camera.size])[0])
-            brightest = torch.stack(images).amax(dim=0) if images else None
-            self._rims[camera] = cleaned_camera(camera, brightest)
-        return self._rims[camera]
+            circle = image_circle(camera, torch.stack(images).amax(dim=0)) if images else None
+            self._rims[key] = None if circle is None else circle.holds(camera)
+        return replace(camera, mask=self._rims[key])
 
 
 def _find_frames(root: Path) -> list[_Frame]:
@@ -307,11 +309,11 @@ def _mask_file(entry: Mapping[str, Any], frame: _Frame) -> Path | None:
     return frame.mask(file, label)
 
 
-def _with_mask(camera: Camera, path: Path | None, frame: _Frame) -> Camera:
+def _with_mask(camera: Camera, path: Path | None, frame: _Frame, clean: bool) -> Camera:
     if path is None:
         return camera
     try:
-        mask = _cached_mask(os.path.realpath(path))
+        mask = _cached_mask(os.path.realpath(path), clean)
     except CalibrationError:
         mask = read_mask(str(path), path.parent, f"{frame.where}: camera {camera.name!r}")  # again, in its frame's name
     try:
@@ -321,8 +323,9 @@ def _with_mask(camera: Camera, path: Path | None, frame: _Frame) -> Camera:
 
 
 @lru_cache(maxsize=_CACHED_MASKS)
-def _cached_mask(path: str) -> BoolArray:
-    return read_mask(path, Path(path).parent, "rig")
+def _cached_mask(path: str, clean: bool) -> BoolArray:
+    mask = read_mask(path, Path(path).parent, "rig")
+    return without_specks(mask) if clean else mask
 
 
 def _points_file(calib: Mapping[str, Any], frame: _Frame) -> Path | None:

@@ -130,13 +130,12 @@ def cleaned_rig(rig: Rig, images: Sequence[torch.Tensor]) -> Rig:
         rig: The rig.
         images: An image (3, h, w) of each camera, uint8 or float in [0, 1].
     """
-    return rig.with_cameras(list(map(cleaned_camera, rig, images)))
-
-
-def cleaned_camera(camera: Camera, image: torch.Tensor | None = None) -> Camera:
-    """One camera of ``cleaned_rig``; without an image no rim is looked for."""
-    if camera.mask is not None:
-        mask = without_specks(camera.mask)
-        return camera if (mask == camera.mask).all() else replace(camera, mask=mask)
-    circle = None if image is None else image_circle(camera, image)
-    return camera if circle is None else replace(camera, mask=circle.holds(camera))
+    cameras = []
+    for camera, image in zip(rig, images, strict=True):
+        if camera.mask is not None:
+            mask = without_specks(camera.mask)
+            camera = camera if (mask == camera.mask).all() else replace(camera, mask=mask)
+        elif (circle := image_circle(camera, image)) is not None:
+            camera = replace(camera, mask=circle.holds(camera))
+        cameras.append(camera)
+    return rig.with_cameras(cameras)

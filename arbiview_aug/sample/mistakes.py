@@ -12,7 +12,7 @@ import numpy as np
 from arbiview_aug.cameras.key_names import misnamed
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cameras.validation import pose_mistake
+from arbiview_aug.cameras.validation import is_mounted, pose_mistake
 from arbiview_aug.sample.batching import leading_shape
 from arbiview_aug.sample.check import EGO_KEYS, PIXEL_BOUND_KEYS
 from arbiview_aug.sample.inputs import Frame, of_frames, read_frames
@@ -116,6 +116,11 @@ def check_rig(rig: Rig, *, masks: bool = True) -> list[Finding]:
     if mistake is not None:
         expected = "cameras upright over the road: cam2ego with axes right, down, forward, in metres"
         found.append(Finding("cam2ego", expected, *mistake))
+    for camera, mounted in zip(rig, is_mounted(rig.cam2ego, rig.ground_z_m), strict=True):
+        if mistake is None and not mounted:
+            at = ", ".join(f"{x:.1f}" for x in camera.center_m)
+            fix = "compare it with the other cameras': metres, and cam2ego instead of its inverse?"
+            found.append(Finding(f"camera {camera.name!r}: cam2ego", "a place on a vehicle", f"({at}) m", fix))
     found += _resolution_findings(rig)
     for camera in rig:
         if camera.mask is None or not masks:
@@ -308,7 +313,7 @@ def _lead(
     wins, losses = _wins(counts, others), _wins(others, counts)
     if wins < _LEAST_WINS or wins < _WIN_RATIO * losses:
         return 0
-    return int((counts.clip(max=_MOST_POINTS) - others.clip(max=_MOST_POINTS)).sum())
+    return max(0, int((counts.clip(max=_MOST_POINTS) - others.clip(max=_MOST_POINTS)).sum()))
 
 
 def _counts(boxes: FloatArray, points: Points) -> FloatArray:

@@ -272,6 +272,7 @@ def test_rims_are_those_of_several_frames(fisheye_root: Path, tmp_path: Path) ->
     assert [mask is not None for mask in masks] == [True, False, True, True], "past the left lens's fold all is dark"
     assert all(0.15 < (~mask).mean() < 0.22 for mask in masks if mask is not None)
     assert rigs[0] == rigs[1] == rigs[2] == FrameFolder(fisheye_root, clean_masks=True)[0]["rig"]
+    assert len(frames._rims) == 4, "found once"
     assert all(camera.mask is None for camera in open_data(tmp_path)[0]["rig"])
     assert open_data(tmp_path, clean_masks=True)[0]["rig"] == rigs[0]
     (tmp_path / "b" / "front.png").write_bytes(b"broken")

@@ -141,6 +141,13 @@ def test_the_road_is_unknown_without_points_around_the_car() -> None:
     assert road_height_m(around) == pytest.approx(2.0, abs=0.03)
 
 
+def test_one_camera_elsewhere(street: Sample) -> None:
+    first, *others = street["rig"]
+    for wrong in (first.shifted(x_m=1500.0), first.shifted(z_m=-2.0)):
+        (finding,) = check_rig(Rig([wrong, *others]))
+        assert finding.where == "camera 'front': cam2ego" and "its inverse" in finding.fix
+
+
 def test_a_rig_of_heights_that_no_vehicle_has(street: Sample) -> None:
     rig = Rig(list(street["rig"]), ground_z_m=2.0)
     (finding,) = check_rig(rig)
