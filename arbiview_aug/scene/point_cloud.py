@@ -18,19 +18,9 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import CELL_PX, PixelRays
 from arbiview_aug.errors import SampleError
 from arbiview_aug.image_ops import FRESH, Memory
+from arbiview_aug.scene import panorama
 from arbiview_aug.scene.boxes import BoxSurface, box_rows
-from arbiview_aug.scene.panorama import (
-    BASE_STEP,
-    CELL_RAD,
-    HALO_RAD,
-    REACH_RAD,
-    SEE_THROUGH_RAD,
-    SHRINK_RAD,
-    SIDE_RAD,
-    SMOOTH_RAD,
-    SUPPORT_RAD,
-    Layer,
-)
+from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, SIDE_RAD, Layer
 from arbiview_aug.scene.scanned_objects import BOX_AIR_M, RASTER_RAD, ScannedObject, scanned_objects
 from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Points, StaticSurface
 
@@ -69,9 +59,10 @@ class Cells(NamedTuple):
     @classmethod
     def of(cls, rad: float) -> Cells:
         """Those of ``rad``."""
-        angles = 2 * math.pi, HALO_RAD, SEE_THROUGH_RAD, SIDE_RAD, (SMOOTH_RAD - rad) / 2, SHRINK_RAD
-        turn, halo, see_through, side, smooth, shrink = (round(angle / rad) for angle in angles)
-        reach, support = np.float32(REACH_RAD / rad), np.float32(SUPPORT_RAD / rad)
+        angles = 2 * math.pi, panorama.HALO_RAD, panorama.SEE_THROUGH_RAD, SIDE_RAD, (panorama.SMOOTH_RAD - rad) / 2
+        turn, halo, see_through, side, smooth = (round(angle / rad) for angle in angles)
+        reach, support = np.float32(panorama.REACH_RAD / rad), np.float32(panorama.SUPPORT_RAD / rad)
+        shrink = round(panorama.SHRINK_RAD / rad)
         return cls(rad, turn, halo, see_through, side, smooth, shrink, reach, support)
 
     @classmethod
