@@ -297,8 +297,7 @@ class ViewPlanner:
         if kind < 0:
             u, v, _ = source_pixels(self.camera, self.rays.at(*map(np.arange, self.camera.size)), geometry.q, source)
             given = at_level(np.stack([u, v]), level).astype(np.float32)
-        nothing = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32)
-        shadow, solid = nothing
+        shadow, solid = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32)
         shadow_scale = 1.0
         if surface.is_layered or surface.is_dense:
             # Points hide by cells: a pixel for each is enough. Silhouettes of objects are sharper.
