@@ -17,6 +17,7 @@ import pytest
 import torch
 
 from arbiview_aug import ArbiviewError, Camera, FavsConfig, PaperConfig, RandomRig, Rig, RigRetarget, load_rig
+from arbiview_aug import check as find_mistakes
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.errors import CalibrationError, SampleError, SampleTypeError
 from arbiview_aug.sample.batching import is_readable
@@ -103,6 +104,15 @@ def check(samples: range, files: range, folder: Path, worst: Worst) -> None:
 
 def test_mutated_inputs(frame_folder: Path, worst: Worst) -> None:
     check(range(120), range(100), frame_folder, worst)
+
+
+def test_mutated_inputs_are_checked() -> None:
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        for seed in range(100):
+            rng = random.Random(seed)
+            sample = misuse.mutated(misuse.sample(rng), rng)
+            works_or_refuses(lambda sample=sample: str(find_mistakes(sample)), seed, (ArbiviewError,))
 
 
 @pytest.mark.timeout(1800)
