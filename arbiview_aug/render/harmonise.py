@@ -8,12 +8,10 @@ gains are accepted.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -26,13 +24,12 @@ from arbiview_aug.cameras.rays import edge_distance
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import check_ranges
-from arbiview_aug.image_ops import at_level, level_size, write_halved
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.tone_curve import KNEE, ToneCurve
 from arbiview_aug.scene.static import Street
 
 _VIEW_SIZE, _TILE_PX = (225, 400), 16  # the evaluation's views and tiles at half resolution
-_SOURCE_WIDTH_PX = 320  # sources are halved down to no less: exposure is seen at any resolution, edges mislead
+_STEP_PX = 4  # every fourth pixel of each fourth row is read: medians need no more
 _Pixels = npt.NDArray[np.float32]
 
 
@@ -105,7 +102,7 @@ class SharedPixels(NamedTuple):
 
     a: int  # index of one camera in content order
     b: int  # and of the other
-    at: _Pixels  # (2, n, 2) positions in each of the two halved images, fitted pixels first
+    at: npt.NDArray[np.int64]  # (2, n) rows x width + columns in each of the two images, fitted pixels first
     fitted: int  # number of pixels to fit; the rest are held out
 
 
@@ -113,7 +110,6 @@ class Overlaps(NamedTuple):
     """All overlaps of a rig."""
 
     order: tuple[int, ...]  # camera indices in content order: results must not depend on the list's
-    levels: tuple[int, ...]  # halvings of each camera's image, in content order
     pairs: tuple[SharedPixels, ...]  # adjacent pairs that share enough pixels
 
 
@@ -122,31 +118,26 @@ def find_overlaps(rig: Rig, config: HarmoniseConfig | None = None) -> Overlaps:
     config = config or HarmoniseConfig()
     order = tuple(content_order(rig.cameras))
     rig = rig.with_cameras([rig[k] for k in order])
-    levels = tuple(source_level(camera, _SOURCE_WIDTH_PX) for camera in rig)
-    even = ~odd_tiles(_VIEW_SIZE, _TILE_PX)
-    held_out = odd_tiles(_VIEW_SIZE, _TILE_PX // 2)[even]
+    even = ~odd_tiles(_VIEW_SIZE, _TILE_PX)[::_STEP_PX, ::_STEP_PX]
+    held_out = odd_tiles(_VIEW_SIZE, _TILE_PX // 2)[::_STEP_PX, ::_STEP_PX][even]
     surface = Street(ground_z_m=rig.ground_z_m)
     pairs = []
     for a, b in adjacent_pairs(rig):
         view = half_way_view(rig[a], rig[b], _VIEW_SIZE)
-        rays, valid = ego_rays(view, view.pixel_grid()[even])
+        rays, valid = ego_rays(view, view.pixel_grid()[::_STEP_PX, ::_STEP_PX][even])
         q = surface.inverse_distance(view.center_m, rays)
         both = np.flatnonzero(valid)
-        reads: list[npt.NDArray[np.floating]] = []
+        reads: list[npt.NDArray[np.int64]] = []
         for k in (a, b):
-            uv, seen = project_halved(rig[k], levels[k], view.center_m, rays[both], q[both])
+            uv, seen = project_halved(rig[k], 0, view.center_m, rays[both], q[both])
             both = both[seen]
-            reads = [read[seen] for read in reads] + [at_level(uv[seen], levels[k])]
+            x, y = uv[seen].round().astype(np.int64).T
+            reads = [read[seen] for read in reads] + [y * rig[k].width_px + x]
         fitted_first = np.argsort(held_out[both], kind="stable")
         count = int((~held_out[both]).sum())
-        if min(count, len(both) - count) >= config.min_pixels:
-            pairs.append(SharedPixels(a, b, np.stack(reads)[:, fitted_first].astype(np.float32), count))
-    return Overlaps(order, levels, tuple(pairs))
-
-
-def source_level(camera: Camera, width_px: int) -> int:
-    """How many times an image can be halved down to no less than ``width_px`` columns."""
-    return max(0, math.floor(math.log2(camera.width_px / width_px)))
+        if _STEP_PX**2 * min(count, len(both) - count) >= config.min_pixels:
+            pairs.append(SharedPixels(a, b, np.stack(reads)[:, fitted_first], count))
+    return Overlaps(order, tuple(pairs))
 
 
 def project_halved(
@@ -191,8 +182,8 @@ def estimate_gains(
     none = (1.0,) * len(rig)
     if not overlaps.pairs:
         return PhotometricReport(none, False, "no two cameras overlap enough")
-    small = [reduced(images[k], level) for k, level in zip(overlaps.order, overlaps.levels, strict=True)]
-    read = [(pair, _read(small[pair.a], pair.at[0]), _read(small[pair.b], pair.at[1])) for pair in overlaps.pairs]
+    ordered = [images[k] for k in overlaps.order]
+    read = [(pair, _read(ordered[pair.a], pair.at[0]), _read(ordered[pair.b], pair.at[1])) for pair in overlaps.pairs]
     ratios = [_log_ratio(one[: pair.fitted], two[: pair.fitted], config) for pair, one, two in read]
     if all(ratio is None for ratio in ratios):
         return PhotometricReport(none, False, "too few pixels in the overlaps are neither dark nor saturated")
@@ -213,26 +204,12 @@ def estimate_gains(
     return PhotometricReport(gains, True, reason, before, after)
 
 
-def reduced(image: torch.Tensor, level: int) -> _Pixels:
-    """Convert an image (3, H, W) to (h, w, 3) float32 in [0, 1], halved ``level`` times."""
-    image = image.detach()
+def _read(image: torch.Tensor, at: npt.NDArray[np.int64]) -> _Pixels:
+    """The pixels (n, 3) of an image (3, H, W) at n places, float32 in [0, 1]."""
+    rows, columns = (torch.from_numpy(k).to(image.device) for k in np.divmod(at, image.shape[2]))
+    values = image.detach()[:, rows, columns].cpu()
     top = np.float32(255 if image.dtype == torch.uint8 else 1)
-    if image.device.type != "cpu" or image.dtype not in (torch.uint8, torch.float32):
-        planes = torch.nn.functional.avg_pool2d(image.float(), 2**level).cpu().numpy()
-        small = np.ascontiguousarray(planes.transpose(1, 2, 0))
-    else:
-        size = level_size((image.shape[1], image.shape[2]), level)
-        small = np.empty((*size, 3), np.uint8 if image.dtype == torch.uint8 else np.float32)
-        write_halved(image, level, small)
-    return np.multiply(small, 1 / top, dtype=np.float32)
-
-
-def _read(image: _Pixels, at: _Pixels) -> _Pixels:
-    """Sample the image at positions (n, 2): (n, 3)."""
-    columns = 1024  # remap's sizes must stay below 32767
-    padded = np.pad(at, ((0, -len(at) % columns), (0, 0))).reshape(-1, columns, 2)
-    values = cv2.remap(image, padded, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
-    return np.nan_to_num(values.reshape(-1, 3)[: len(at)], copy=False)
+    return np.nan_to_num(values.float().numpy().T / top, copy=False)
 
 
 def _log_ratio(one: _Pixels, two: _Pixels, config: HarmoniseConfig) -> tuple[float, float] | None:
@@ -244,13 +221,13 @@ def _log_ratio(one: _Pixels, two: _Pixels, config: HarmoniseConfig) -> tuple[flo
         r, g, b = pixels.T
         light.append((r + g + b).astype(np.float64))
         use &= (light[-1] > 3 * config.dark) & (np.maximum(np.maximum(r, g), b) < config.bright)
-    if use.sum() < config.min_pixels:
+    if _STEP_PX**2 * use.sum() < config.min_pixels:
         return None
     ratio = np.log(light[0][use] / light[1][use])
     middle = float(np.median(ratio))
     spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
     # Neighbouring pixels err together: a fitted tile (8 x 8) counts once.
-    tiles = use.sum() / (_TILE_PX // 2) ** 2
+    tiles = use.sum() * (2 * _STEP_PX / _TILE_PX) ** 2
     return middle, spread**2 / tiles + config.pair_log_error**2
 
 
@@ -288,7 +265,8 @@ def _raw_db(pairs: Sequence[tuple[npt.NDArray[np.floating], npt.NDArray[np.float
 
 
 Harmonise = bool | HarmoniseConfig | Sequence[float] | None
-"""A user's choice: None or False for none, True or a config to estimate gains for every frame, or given gains."""
+"""A user's choice: None to estimate gains in frames where a view shows several sources, True or a config to do so in
+every frame, given gains, or False for none."""
 
 
 class Harmoniser:
@@ -303,8 +281,9 @@ class Harmoniser:
 
     def __init__(self, choice: Harmonise = None) -> None:
         self.config = choice if isinstance(choice, HarmoniseConfig) else HarmoniseConfig()
-        self.estimates = choice is True or isinstance(choice, HarmoniseConfig)
-        self.gains = None if self.estimates or choice is None or choice is False else _checked_gains(choice)
+        self.estimates = choice is None or choice is True or isinstance(choice, HarmoniseConfig)
+        self.gains = None if self.estimates or choice is False else _checked_gains(choice)
+        self._always = choice is not None
         self.is_on = self.estimates or self.gains is not None
         self._overlaps: LRUCache[bytes, Overlaps] = LRUCache(_CACHED_RIGS)
 
@@ -324,9 +303,12 @@ class Harmoniser:
         overlaps = self._overlaps.get(rig.content_key, lambda: find_overlaps(rig, self.config))
         return estimate_gains(rig, images, self.config, overlaps=overlaps)
 
-    def curves(self, rig: Rig, images: Sequence[torch.Tensor]) -> tuple[ToneCurve, ...] | None:
-        """A tone curve for each camera; None if the images stay as they are."""
-        if not self.is_on:
+    def curves(self, rig: Rig, images: Sequence[torch.Tensor], mixes: bool = True) -> tuple[ToneCurve, ...] | None:
+        """A tone curve for each camera; None if the images stay as they are.
+
+        ``mixes`` says whether a view shows several sources.
+        """
+        if not self.is_on or not (mixes or self._always):
             return None
         gains = self.report(rig, images).gains
         return None if all(g == 1 for g in gains) else tuple(ToneCurve(g, self.config.knee) for g in gains)

@@ -11,6 +11,7 @@ declined pair stays the same, bit for bit.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -25,9 +26,9 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.overlap import adjacent_pairs, half_way_view, odd_tiles
 from arbiview_aug.cameras.projection import ego_rays, project_rays
 from arbiview_aug.cameras.rig import Rig, content_order
-from arbiview_aug.image_ops import at_level
+from arbiview_aug.image_ops import at_level, level_size, write_halved
 from arbiview_aug.render.dense_flow import dense_flow, why_ambiguous
-from arbiview_aug.render.harmonise import project_halved, reduced, source_level
+from arbiview_aug.render.harmonise import project_halved
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.corrected import Correction
 from arbiview_aug.scene.static import Street
@@ -306,3 +307,22 @@ def _fitted_db(one: npt.NDArray[Any], two: npt.NDArray[Any], fit: BoolArray, tes
         gain, offset = np.linalg.lstsq(np.stack([x[fit], np.ones(int(fit.sum()))], 1), y[fit], rcond=None)[0]
         errors.append(float(np.mean((x[test] * gain + offset - y[test]) ** 2)))
     return float(10 * np.log10(255**2 / max(float(np.mean(errors)), 1e-9)))
+
+
+def source_level(camera: Camera, width_px: int) -> int:
+    """How many times an image can be halved down to no less than ``width_px`` columns."""
+    return max(0, math.floor(math.log2(camera.width_px / width_px)))
+
+
+def reduced(image: torch.Tensor, level: int) -> npt.NDArray[np.float32]:
+    """Convert an image (3, H, W) to (h, w, 3) float32 in [0, 1], halved ``level`` times."""
+    image = image.detach()
+    top = np.float32(255 if image.dtype == torch.uint8 else 1)
+    if image.device.type != "cpu" or image.dtype not in (torch.uint8, torch.float32):
+        planes = torch.nn.functional.avg_pool2d(image.float(), 2**level).cpu().numpy()
+        small = np.ascontiguousarray(planes.transpose(1, 2, 0))
+    else:
+        size = level_size((image.shape[1], image.shape[2]), level)
+        small = np.empty((*size, 3), np.uint8 if image.dtype == torch.uint8 else np.float32)
+        write_halved(image, level, small)
+    return np.multiply(small, 1 / top, dtype=np.float32)

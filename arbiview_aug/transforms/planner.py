@@ -182,7 +182,8 @@ class FramePlanner:
             surface = self._surface(scene)
             if neighbours and self.reach is not None:
                 fills = plan_fills(plan, neighbours, scene, surface, self.config, self.reach, self.maps)
-            curves = self.harmoniser.curves(frame.rig, frame.images) if self.harmoniser.is_on else None
+            mixes = not plan.targets or any(len(view.pairs) > 1 for view in plan.targets)
+            curves = self.harmoniser.curves(frame.rig, frame.images, mixes)
             harm = pair.harm if SURFACES[surface].is_static else None
             plans.append(FramePlan(frame.rig, pair.target, plan, {}, depth, motion, fills, curves, harm))
         return plans
