@@ -13,11 +13,15 @@ from arbiview_aug.cameras.kernels import edge_distance_row, project_row, rays_ro
 from arbiview_aug.environment import compiled
 from arbiview_aug.render.atlas import OUTSIDE
 from arbiview_aug.scene.kernels import upsampled_row
+from arbiview_aug.scene.shapes import PIECES
 
 _ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
 _TINY, _MOST = np.float32(1e-30), np.float32(1e30)
 LEAST_INCIDENCE = np.float32(0.05)
 """Sine of the flattest angle at which a source may look along a face: that of the road 30 m from a car's cameras."""
+
+SAME_OBJECT_M = np.float32(0.15)
+"""So much nearer a piece of an object must be to hide another of it: they touch, and are drawn half a pixel wider."""
 
 _BORDER_PX = np.float32(1.0)  # maps bulge between the corners of a cell
 _OUTSIDE = np.int32((OUTSIDE << 16) | (OUTSIDE & 0xFFFF))  # both coordinates of a packed position
@@ -236,8 +240,10 @@ def _occlude_row(
                 pz[i] = _ZERO if guess else pz[i]
             elif before_m[number] <= _ZERO or before_m[number] * pz[i] < LEAST_INCIDENCE:
                 pz[i] = -_ONE
-            elif number_at[place[i]] == number // 6:
+            elif number_at[place[i]] == number // 6:  # pieces are convex
                 pz[i] = _MOST
+            elif number_at[place[i]] // PIECES == number // (6 * PIECES):
+                pz[i] = pz[i] / max(_ONE - SAME_OBJECT_M * pz[i], _TINY)
     for i in range(n):
         seen[i] = seen[i] & (hides[i] <= pz[i])
 

@@ -25,7 +25,7 @@ from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.image_ops import level_size
 from arbiview_aug.render.atlas import OUTSIDE, AtlasLayout
 from arbiview_aug.render.confidence import DECORRELATION_RAD, RESOLUTION_POWER
-from arbiview_aug.render.kernels import LEAST_INCIDENCE, MAP_LIMIT_PX
+from arbiview_aug.render.kernels import LEAST_INCIDENCE, MAP_LIMIT_PX, SAME_OBJECT_M
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.render.seams import LEAST_SHARE
@@ -40,16 +40,18 @@ from arbiview_aug.render.view_planner import (
 from arbiview_aug.scene.boxes import BOX_ERROR, UNLABELLED
 from arbiview_aug.scene.point_cloud import COARSE, MEASURED_SPREAD, Cells, occlusion_level
 from arbiview_aug.scene.scene import SURFACES, Scene
+from arbiview_aug.scene.shapes import PIECES
 from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
 from arbiview_aug.scene.torch_points import PanoramaViews, upsampled
-from arbiview_aug.scene.torch_scans import ScannedViews, scanned
 from arbiview_aug.scene.torch_surface import (
     Poses,
     before_faces,
-    draw_boxes,
-    occluding_boxes,
+    candidates,
+    draw_solids,
+    fit_profiles,
     static_image,
     static_uncertainty,
+    widened,
 )
 
 _MOST_PIXELS = 1 << 24  # of views planned at once: 64 MiB for each map
@@ -177,6 +179,7 @@ class _ViewBatch:
         self.has_points = name == "lidar"
         layered = name == "objects" or (self.has_points and has_boxes(scenes[self.frames[0]]))
         self.boxes = self._boxes(scenes) if layered else None
+        self.solids = {f: candidates(boxes)[:, 0] for f, boxes in (self.boxes or {}).items()}
         if self.has_points:
             self._split_points(scenes)
         self._find_surface()
@@ -198,29 +201,28 @@ class _ViewBatch:
         given = {f: torch.as_tensor(scene.points)[:, :3].to(self.device, torch.float64) for f, scene in scenes.items()}
         most = max(map(len, given.values()))
         self.points = {f: _pad(p, (0, 0, 0, most - len(p)), value=math.nan) for f, p in given.items()}
-        self.all_points, self.labels, self.own = self.points, self.boxes, {}
-        if self.boxes is None:
-            return
-        split = {f: scanned(boxes, self.points[f]) for f, boxes in self.boxes.items()}
-        self.own, self.points = {f: part[1] for f, part in split.items()}, {f: part[2] for f, part in split.items()}
-        self.boxes = {f: torch.where(split[f][0][:, None], 0.0, boxes) for f, boxes in self.boxes.items()}
+        for f, boxes in (self.boxes or {}).items():
+            self.solids[f], self.points[f] = fit_profiles(boxes, candidates(boxes), self.points[f])
 
-    def _point_views(
-        self, frames: Sequence[int], cameras: Sequence[Camera], cells: Cells, rays: Any, ego: Any, poses: Poses
-    ) -> Any:
-        """What the points say around cameras of frames, and the objects that show their shape there."""
+    def _point_views(self, frames: Sequence[int], cameras: Sequence[Camera], cells: Cells) -> PanoramaViews:
+        """What the points say around cameras of frames."""
         ground_z_m = np.array([self.requests[f].source.ground_z_m for f in frames])
-        views = PanoramaViews(cameras, cells, self.maps, torch.stack([self.points[f] for f in frames]), ground_z_m)
-        if self.labels is None:
-            return views, None
-        order = list(self.own)
-        frame = on_device([order.index(f) for f in frames], self.device)
-        own, points = (torch.stack(list(part.values())) for part in (self.own, self.all_points))
-        return views, ScannedViews(rays, ego, poses, torch.stack([self.labels[f] for f in frames]), own, points, frame)
+        return PanoramaViews(cameras, cells, self.maps, torch.stack([self.points[f] for f in frames]), ground_z_m)
 
-    def _boxes_of(self, frames: Sequence[int]) -> torch.Tensor:
+    def _pixel_rad(self, cameras: Sequence[Camera]) -> torch.Tensor:
+        return on_device(np.array([1 / camera.K[0, 0] for camera in cameras]), self.device)
+
+    def _drawn_solids(
+        self, frames: Sequence[int], cameras: Sequence[Camera], rays: torch.Tensor, poses: Poses, lift: float = 0.0
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Inverse distances of the objects, and faces or -1."""
+        boxes, planes = self._objects_of(frames)
+        return draw_solids(rays, poses, boxes, widened(poses, boxes, planes, self._pixel_rad(cameras), lift))
+
+    def _objects_of(self, frames: Sequence[int]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Boxes (n, B, 7) of frames, and planes (n, B, pieces, 6, 4) of what they hold."""
         assert self.boxes is not None
-        return torch.stack([self.boxes[f] for f in frames])
+        return torch.stack([self.boxes[f] for f in frames]), torch.stack([self.solids[f] for f in frames])
 
     def _find_surface(self) -> None:
         """Inverse distances at all pixels, faces of solids, and the expected error on the nodes."""
@@ -236,14 +238,12 @@ class _ViewBatch:
         on_street = self._on_nodes(self.behind)
         if self.has_points:
             cells = Cells.for_camera(self.cameras[0])  # batches have equal ones
-            views, scans = self._point_views(self.frames, self.cameras, cells, self.rays, ego, self.poses)
+            views = self._point_views(self.frames, self.cameras, cells)
             self.q = self.behind = views.image(ego, self.q)
-            if scans is not None:
-                self.q = self.behind = scans.show(self.q)
         if self.boxes is not None:
-            solid, self.face = draw_boxes(self.rays, self.poses, self._boxes_of(self.frames))
+            solid, self.face = self._drawn_solids(self.frames, self.cameras, self.rays, self.poses)
             if self.has_points:
-                self.face = torch.where(solid < torch.maximum(views.hidden(ego), scans.hide(False)), -1, self.face)
+                self.face = torch.where(solid < views.hidden(ego), -1, self.face)
             self.q = torch.where(self.face >= 0, solid, self.behind)
         on_nodes = self._on_nodes(self.q)
         self.uncertainty = static_uncertainty(self.directions, on_nodes.double(), centers_m)
@@ -407,7 +407,7 @@ class _ViewBatch:
         self.solid = self._bank(lambda row, k: drawn.get(self._key(row, k), none)[1], torch.tensor(-1).int())
         if self.boxes is not None:
             centers_m = self.poses.center_m[:, None] - on_device(self.offset_m, self.device)
-            self.before_m = before_faces(self._boxes_of(self.frames)[:, None], centers_m)
+            self.before_m = before_faces(self._objects_of(self.frames)[1][:, None], centers_m)
 
     def _drawn(self, frames: Sequence[int], cameras: Sequence[Camera]) -> Iterator[tuple[Any, Any]]:
         """What hides from cameras of one size, inverse distances (h, w), and the boxes' rows; None for none."""
@@ -415,12 +415,11 @@ class _ViewBatch:
         beyond = number = None
         if self.has_points:
             ego = torch.stack(turned(rays, poses.R.float()), 1)
-            views, scans = self._point_views(frames, cameras, COARSE, rays, ego, poses)
-            beyond = views.hidden(ego)
-            beyond = beyond if scans is None else torch.maximum(beyond, scans.hide(True))
+            beyond = self._point_views(frames, cameras, COARSE).hidden(ego)
         if self.boxes is not None:
-            pixel_rad = on_device(np.array([1 / camera.K[0, 0] for camera in cameras]), self.device)
-            q, number = occluding_boxes(rays, poses, self._boxes_of(frames), pixel_rad)
+            q, number = self._drawn_solids(frames, cameras, rays, poses, lift=1.0)
+            q = q / (1 + 2 * self._pixel_rad(cameras)).float()[:, None, None]
+            number = torch.div(number, 6, rounding_mode="floor").int()
             number = number if beyond is None else torch.where(q > beyond, number, -1)
             beyond = q if beyond is None else torch.maximum(q, beyond)
         assert beyond is not None
@@ -455,7 +454,10 @@ class _ViewBatch:
         before_m = self.before_m[:, k].gather(-1, face.clamp(min=0).long().flatten(-2)).view(face.shape)
         away = (before_m <= 0) | (before_m * nearness < float(LEAST_INCIDENCE))
         hides, by = self.shadow.at(v.round(), u.round(), k), self.solid.at(v.round(), u.round(), k)
-        hidden = (hides > nearness) & (by != torch.div(face, 6, rounding_mode="floor")) | away
+        piece, whole = (torch.div(face, n, rounding_mode="floor") for n in (6, 6 * PIECES))
+        same = torch.div(by, PIECES, rounding_mode="floor") == whole
+        least = torch.where(same, nearness / (1 - float(SAME_OBJECT_M) * nearness).clamp(min=TINY), nearness)
+        hidden = (hides > least) & (by != piece) | away
         behind = hides > (nearness if self.has_points else 0)
         if self.has_points:  # what was measured hides smoothly, solids do not
             behind = torch.where(by < 0, self.shadow.between(v, u, k) > nearness, behind)

@@ -146,5 +146,5 @@ def _of_camera(camera: Camera, boxes: FloatArray) -> ImageBoxes:
     silhouette_px = silhouette_sums(camera, boxes, np.ones(camera.size))
     _, face = draw_boxes(camera, boxes)
     shown = face >= 0 if camera.mask is None else (face >= 0) & camera.mask
-    visible_px = np.bincount(face[shown] // 6, minlength=len(boxes))
+    visible_px = np.bincount(face[shown], minlength=len(boxes))
     return ImageBoxes(rows, inside, 1 - inside_px / uncut_px, visible_px / np.maximum(silhouette_px, 1))

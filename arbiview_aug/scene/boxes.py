@@ -17,6 +17,7 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import CELL_PX, PixelRays, pixel_rays
 from arbiview_aug.errors import SampleError
 from arbiview_aug.image_ops import FRESH, Memory
+from arbiview_aug.scene.shapes import whole
 from arbiview_aug.scene.surface import LayeredSurface, OcclusionMap, Points, StaticSurface, Surface
 
 UNLABELLED = 0.45
@@ -26,20 +27,25 @@ BOX_ERROR = 0.08
 """Mean relative error of a box face's inverse distance. Fitted on synthetic streets, seeds 100 to 105."""
 
 
+TOP = 0.9
+"""Upward part of a face's normal, above which it is a top: windscreens have up to 0.87."""
+
 _ROUNDING = 1e-4  # of float32 images against float64
 
 
 @dataclass(frozen=True, eq=False)
 class BoxSurface(LayeredSurface):
-    """Boxes standing on the street.
+    """Labelled objects standing on the street: what their boxes hold (``scene.shapes``).
 
     Attributes:
-        street: The surface behind the boxes.
+        street: The surface behind the objects.
         boxes: (B, 7) centre x, y, z, length, width, height (metres), yaw (radians), in the ego frame.
+        solids: (B, pieces, 6, 4) planes of what they hold.
     """
 
     street: Surface
     boxes: FloatArray
+    solids: FloatArray
     _shadows: dict[Camera, OcclusionMap] = field(default_factory=dict, repr=False)
 
     @property
@@ -49,42 +55,52 @@ class BoxSurface(LayeredSurface):
 
     # --- images -------------------------------------------------------------------------------------------------------
     def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
-        """What boxes hide from a source; kept for the next target."""
+        """What objects hide from a source; kept for the next target."""
         if camera not in self._shadows:
             pixel_rad = float(1 / camera.K[0, 0])
-            boxes, scale = self._enlarged(camera.center_m, pixel_rad), 1 / (1 + 2 * pixel_rad)  # a lookup's error
-            onto = self._hidden(camera, rays, memory, widened=True)
-            drawn = draw_boxes(camera, boxes, rays, memory, scale=scale, faces=False, onto=onto)
+            scale = 1 / (1 + 2 * pixel_rad)  # a lookup's error
+            onto = self._hidden(camera, rays, memory, coarse=True)
+            planes = self._widened(camera.center_m, pixel_rad, lift=1.0)
+            drawn = draw_solids(camera, self.boxes, planes, rays, memory, scale=scale, faces=False, onto=onto)
             self._shadows[camera] = OcclusionMap(*drawn)
         return self._shadows[camera]
 
     def drawn(
         self, camera: Camera, rays: PixelRays, memory: Memory = FRESH
     ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
-        """Inverse distances (h, w) of the boxes' faces along a camera's rays where nothing hides them; faces, or -1.
+        """Inverse distances (h, w) of the objects' faces along a camera's rays where nothing hides them; faces, or -1.
 
-        A face's number is 6 x the box's row + 2 x the axis across it + 1 for the one further along that axis.
+        A face's number is 6 x its piece + that of its plane; ``face_objects`` and ``face_is_top`` tell what it is.
         """
-        return draw_boxes(camera, self.boxes, rays, memory, onto=self._hidden(camera, rays, memory, widened=False))
+        onto = self._hidden(camera, rays, memory, coarse=False)
+        planes = self._widened(camera.center_m, float(1 / camera.K[0, 0]))
+        return draw_solids(camera, self.boxes, planes, rays, memory, onto=onto)
 
-    def _hidden(self, camera: Camera, rays: PixelRays, memory: Memory, *, widened: bool) -> npt.NDArray[np.float32]:
+    def _hidden(self, camera: Camera, rays: PixelRays, memory: Memory, *, coarse: bool) -> npt.NDArray[np.float32]:
         """Inverse distances (h, w) beyond which something else hides, 0 where nothing does."""
         return np.asarray(memory.full(camera.size, 0, np.float32))
 
     def before_faces(self, origin: FloatArray) -> FloatArray:
-        """By how many metres a point lies before the planes of all faces (6 B,)."""
-        before_m = np.empty((len(self.boxes), 6))
-        local, half = _in_box_frames(self.boxes, origin), self.boxes[:, 3:6] / 2
-        before_m[:, 0::2], before_m[:, 1::2] = -local - half, local - half
-        return before_m.reshape(-1)
+        """By how many metres a point lies before the planes of all faces (n,)."""
+        return np.asarray((self.solids[..., :3] @ origin - self.solids[..., 3]).reshape(-1))
 
-    def _enlarged(self, origin: FloatArray, pixel_rad: float) -> FloatArray:
-        """The boxes widened by half a pixel, as border pixels mix colours, and lifted, so that the road stays free."""
-        boxes = self.boxes.copy()
-        more_m = pixel_rad / 2 * np.linalg.norm(boxes[:, :3] - origin, axis=-1)
-        boxes[:, 2] += more_m
-        boxes[:, 3:5] += 2 * more_m[:, None]
-        return boxes
+    @property
+    def face_objects(self) -> npt.NDArray[np.int64]:
+        """Rows (n,) of the boxes that the faces belong to."""
+        return np.repeat(np.arange(len(self.boxes)), 6 * self.solids.shape[1])
+
+    @property
+    def face_is_top(self) -> BoolArray:
+        """Whether faces (n,) look upwards: roofs and bonnets."""
+        return np.asarray(self.solids[..., 2].reshape(-1) > TOP)
+
+    def _widened(self, origin: FloatArray, pixel_rad: float, lift: float = 0.0) -> FloatArray:
+        """The planes, half a pixel wider, as border pixels mix colours; floors ``lift`` pixels higher."""
+        pixel_m = pixel_rad * np.linalg.norm(self.boxes[:, :3] - origin, axis=-1)
+        planes = self.solids.copy()
+        planes[..., [0, 1, 2, 3, 5], 3] += pixel_m[:, None, None] / 2
+        planes[:, 0, 4, 3] -= pixel_m * lift
+        return planes
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Expected error (...,) in 1/m of boxes, and of the street because of unlabelled objects."""
@@ -94,21 +110,25 @@ class BoxSurface(LayeredSurface):
         return np.where(on_street, street, BOX_ERROR * inverse_distance)
 
 
-def box_rows(
-    camera: Camera, boxes: FloatArray, rays: PixelRays
+def solid_rows(
+    camera: Camera, boxes: FloatArray, planes: FloatArray, rays: PixelRays
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
-    """The boxes of (B, 7) that a camera may see as ``kernels.draw_boxes`` reads them, (n, 20), and their rows (n,)."""
-    from arbiview_aug.scene.kernels import box_rows as describe
+    """Pieces (B, pieces, 6, 4) that a camera may see as ``kernels.draw_solids`` reads them, and their numbers (n,)."""
+    from arbiview_aug.scene.kernels import ROW
+    from arbiview_aug.scene.kernels import solid_rows as describe
 
-    rows, numbers = np.empty((len(boxes), 20), np.float32), np.empty(len(boxes), np.int64)
+    most = planes.shape[0] * planes.shape[1] + 1
+    rows, numbers = np.empty((most, ROW), np.float32), np.empty(most, np.int64)
     pose = np.ascontiguousarray(camera.cam2ego[:3, :3]), np.ascontiguousarray(camera.center_m)
-    count = describe(np.ascontiguousarray(boxes), pose[1], pose[0], rays.cone, rows, numbers)
+    boxes, planes = np.ascontiguousarray(boxes), np.ascontiguousarray(planes)
+    count = describe(boxes, planes, pose[1], pose[0], rays.cone, rows, numbers)
     return rows[:count], numbers[:count]
 
 
-def draw_boxes(
+def draw_solids(
     camera: Camera,
     boxes: FloatArray,
+    planes: FloatArray,
     rays: PixelRays | None = None,
     memory: Memory = FRESH,
     *,
@@ -116,27 +136,33 @@ def draw_boxes(
     faces: bool = True,
     onto: npt.NDArray[np.float32] | None = None,
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
-    """Rasterise boxes (B, 7).
+    """Rasterise the pieces (B, pieces, 6, 4) of what boxes (B, 7) hold.
 
     Args:
         camera: The camera.
         boxes: (B, 7).
+        planes: (B, pieces, 6, 4) as ``shapes.solids`` gives them.
         rays: The camera's rays, if they are known.
         memory: Memory of the images.
         scale: Factor of the inverse distances.
-        faces: Number the faces: 6 x the box's row + 2 x the axis across it + 1 for the one further along that axis.
+        faces: Number the faces: 6 x piece + plane; else the pieces.
         onto: (h, w) inverse distances that stand there, drawn over by what is nearer; 0 by default.
 
     Returns:
-        (h, w) inverse distances of the nearest faces, or of what stands there; (h, w) the boxes' rows or faces, or -1.
+        (h, w) inverse distances of the nearest faces, or of what stands there; (h, w) the pieces or faces, or -1.
     """
-    from arbiview_aug.scene.kernels import draw_boxes as draw
+    from arbiview_aug.scene.kernels import draw_solids as draw
 
     rays = rays or pixel_rays(camera)
     q = memory.full(camera.size, 0, np.float32) if onto is None else onto
-    number = memory.full(camera.size, -1, np.int32)
-    draw(rays.planes, rays.parameters, *box_rows(camera, boxes, rays), rays.cones, CELL_PX, scale, faces, q, number)
+    number, rows = memory.full(camera.size, -1, np.int32), solid_rows(camera, boxes, planes, rays)
+    draw(rays.planes, rays.parameters, *rows, rays.cones, CELL_PX, scale, faces, q, number)
     return q, number
+
+
+def draw_boxes(camera: Camera, boxes: FloatArray) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
+    """Rasterise whole boxes (B, 7): inverse distances (h, w) of the nearest, 0 for none; (h, w) its row, or -1."""
+    return draw_solids(camera, boxes, whole(boxes), faces=False)
 
 
 def silhouette_sums(camera: Camera, boxes: FloatArray, weight: FloatArray) -> FloatArray:
@@ -144,9 +170,8 @@ def silhouette_sums(camera: Camera, boxes: FloatArray, weight: FloatArray) -> Fl
     from arbiview_aug.scene.kernels import sum_silhouettes
 
     rays, sums = pixel_rays(camera), np.zeros(len(boxes))
-    sum_silhouettes(
-        rays.planes, rays.parameters, *box_rows(camera, boxes, rays), rays.cones, CELL_PX, weight, sums
-    )  # fmt: skip
+    rows = solid_rows(camera, boxes, whole(boxes), rays)
+    sum_silhouettes(rays.planes, rays.parameters, *rows, rays.cones, CELL_PX, weight, sums)
     return sums
 
 
@@ -179,13 +204,6 @@ def _in_box_frame(box: FloatArray, vectors: FloatArray) -> FloatArray:
     """Ego-frame vectors (..., 3) along the box's length, width and height."""
     c, s = np.cos(box[6]), np.sin(box[6])
     return vectors @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _in_box_frames(boxes: FloatArray, origin: FloatArray) -> FloatArray:
-    """One point (B, 3) in the frames of all boxes."""
-    c, s = np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
-    x, y, z = (origin - boxes[:, :3]).T
-    return np.stack([c * x + s * y, c * y - s * x, z], axis=-1)
 
 
 def checked_boxes(boxes: Any) -> FloatArray:

@@ -6,17 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.cameras.kernels import angle_row, rays_row
+from arbiview_aug.cameras.kernels import angle_row
 from arbiview_aug.environment import compiled
 from arbiview_aug.scene import panorama
-from arbiview_aug.scene.kernels import columns_of_box, slabs_row, upsampled_row
+from arbiview_aug.scene.kernels import upsampled_row
 from arbiview_aug.scene.panorama import NEAREST_M
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _MOST = np.float32(MAX_INVERSE_DISTANCE)
 _HALF_PI = np.float32(np.pi / 2)
-SHOW, HIDE, HIDE_WIDE = 0, 1, 2
 _CHUNK = 1024  # points worked on at once
 
 # A cell's nearest seed in one int32, so that the nearer of two is their minimum: distance in 1/1024 cell (from bit 14),
@@ -455,110 +454,6 @@ def interpolate_layer(rows: Any, columns: Any, step: int, layer: Any, apart: int
         read_layer(v[: nodes.shape[1]], u[: nodes.shape[1]], layer, nodes[j])
     for y in range(h):
         _between_rows(nodes, apart, y, h, around[2], out[y])
-
-
-@compiled
-def scan(points: Any, origin: Any, azimuth: float, per_rad: float) -> tuple[Any, Any, Any]:
-    """Rasterise the points (n, 3) of an object about an azimuth as a centre sees them (``scanned_objects.Raster``)."""
-    work, turn = np.empty((7, points.shape[0]), np.float32), np.float32(2 * np.pi * per_rad)
-    place, n = np.array([azimuth, -turn / 2, 0.0, per_rad, turn], np.float32), 0
-    for i in range(points.shape[0]):
-        x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
-        length = np.sqrt(x * x + y * y + z * z)
-        if length >= NEAREST_M:
-            work[0, n], work[1, n], work[2, n], work[3, n] = x / length, y / length, z / length, 1 / length
-            n += 1
-    if n == 0:
-        return place, np.zeros((0, 0), np.float32), np.zeros(0, np.float32)
-    row, column = work[5, :n], work[6, :n]
-    cells_row(work[0, :n], work[1, :n], work[2, :n], place, work[4, :n], row, column)
-    low, left = row.min(), column.min()
-    place[0], place[2] = place[0] + left / per_rad, low / per_rad
-    h, w = int(np.rint(row.max() - low)) + 1, int(np.rint(column.max() - left)) + 1
-    nearest, code = np.zeros((h, w), np.float32), np.full((h + 4, w + 4), _NO_SEED, np.int32)
-    top = np.full(w, -1, np.float32)
-    for i in range(n):
-        r, c = int(np.rint(row[i] - low)), int(np.rint(column[i] - left))
-        nearest[r, c], code[r + 2, c + 2] = max(nearest[r, c], work[3, i]), _OWN
-        top[c] = max(top[c], row[i] - low)
-    spread(code)
-    for r in range(h):
-        for c in range(w):
-            from_r, from_c = seed(code[r + 2, c + 2])
-            nearest[r, c] = nearest[r + from_r, c + from_c]
-    last = 0  # the first and the last column have points
-    for c in range(w):
-        if top[c] >= _ZERO:
-            for k in range(last + 1, c):
-                top[k] = top[last] + (top[c] - top[last]) * np.float32((k - last) / (c - last))
-            last = c
-    return place, nearest, top
-
-
-@compiled
-def draw_scanned(
-    planes: Any, P: Any, R: Any, box: Any, cones: Any, step: int, raster: Any, air: Any, mode: int, image: Any
-) -> None:  # fmt: skip
-    """Draw an object by its points into inverse distances or an occlusion map (``scanned_objects.ScannedObject``).
-
-    Args:
-        planes: (3, h, w) rays, or (3, 0, 0) for a pinhole.
-        P: ``camera_parameters``.
-        R: (3, 3) float32 camera to ego.
-        box: (20,) as in ``draw_boxes``.
-        cones: ``cell_cones``.
-        step: Side of a cell, pixels.
-        raster: What ``scan`` returns.
-        air: (2,) float32: how far outside its box its points may lie, metres; how far above its highest points it may
-            hide, cells of the raster.
-        mode: ``SHOW``: where it is met in front of what ``image`` (h, w) says. ``HIDE``: what it hides. ``HIDE_WIDE``:
-            what it may hide, a little above its points too.
-        image: (h, w) float32, updated.
-    """
-    h, w = image.shape
-    _, ny, nx = cones.shape
-    place, nearest, top = raster
-    rows, columns = nearest.shape
-    last = np.float32(columns) - _HALF
-    work, near_box = np.empty((11, w), np.float32), np.empty(nx, np.bool_)
-    sx, sy, sz, hx, hy, hz = box[9], box[10], box[11], box[12] + air[0], box[13] + air[0], box[14] + air[0]
-    above = air[1] if mode == HIDE_WIDE else _ZERO
-    most = np.sin(min(place[2] + (top.max() + above) / place[3], _HALF_PI)) + np.float32(1e-4)
-    lowest = R[2, 0] * cones[0] + R[2, 1] * cones[1] + R[2, 2] * cones[2] - cones[3]
-    for j in range(ny):
-        x0, n = columns_of_box(box, cones[:, j], near_box, step, w)
-        while n > 0 and lowest[j, x0 // step] > most:  # cells over its highest points
-            x0, n = x0 + step, n - step
-        while n > 0 and lowest[j, (x0 + n - 1) // step] > most:
-            n = (x0 + n - 1) // step * step - x0
-        if n <= 0:
-            continue
-        rx, ry, rz, ix, iy, iz = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n], work[5, :n]
-        enter, leave, behind, row, column = work[6, :n], work[7, :n], work[8, :n], work[9, :n], work[10, :n]
-        for y in range(j * step, min(j * step + step, h)):
-            rays_row(planes, P, y, x0, rx, ry, rz)
-            slabs_row(box, rx, ry, rz, ix, iy, iz, enter, leave)
-            for x in range(n):  # it leaves the air around the box
-                far = min(-sx * ix[x] + hx * abs(ix[x]), -sy * iy[x] + hy * abs(iy[x]))
-                behind[x] = _ONE / max(min(far, -sz * iz[x] + hz * abs(iz[x])), _ONE / _MOST)
-            _turned_row(R, rx, ry, rz, ix, iy, iz)
-            cells_row(ix, iy, iz, place, rx, row, column)
-            out = image[y, x0 : x0 + n]
-            for x in range(n):
-                if leave[x] < enter[x] or enter[x] <= _ZERO or column[x] < -_HALF or column[x] > last:
-                    continue
-                inner = min(max(column[x], _ZERO), last - _HALF)
-                c = int(inner)
-                highest = top[c] + (top[min(c + 1, columns - 1)] - top[c]) * (inner - np.float32(c))
-                if row[x] > highest + above:
-                    continue
-                r = min(max(int(np.rint(row[x])), 0), rows - 1)
-                own = nearest[r, int(np.rint(inner))] if row[x] <= highest else _ZERO
-                if mode == SHOW:
-                    if own > _ZERO and out[x] < behind[x]:
-                        out[x] = own
-                elif (mode == HIDE_WIDE or own > _ZERO) and behind[x] > out[x]:
-                    out[x] = behind[x]
 
 
 @compiled

@@ -13,9 +13,7 @@ from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _TINY = np.float32(1e-30)
 _MOST = np.float32(MAX_INVERSE_DISTANCE)
-
-_HALF = np.float32(0.5)
-_FLAT = np.float32(1e-12)
+ROW = 35
 
 GROUND, STREET = 0, 1
 
@@ -76,179 +74,273 @@ def static_image(planes: Any, P: Any, R: Any, kind: int, S: Any, q: Any) -> None
 
 
 @compiled
-def box_rows(boxes: Any, center: Any, R: Any, axis: Any, rows: Any, numbers: Any) -> int:
-    """Describe the boxes (B, 7) that a camera may see, as ``draw_boxes`` reads them; return how many there are.
+def solid_rows(boxes: Any, planes: Any, center: Any, R: Any, axis: Any, rows: Any, numbers: Any) -> int:
+    """Describe the pieces of boxes that a camera may see, as ``draw_solids`` reads them; return how many there are.
 
-    A box that holds the camera is its own vehicle, and is not seen.
+    A box that holds the camera is its own vehicle, and is not seen. The inverse distance at which a ray meets a plane
+    n x = d is -n r / (n c - d): planes that the camera lies before are entered, others left.
 
     Args:
         boxes: (B, 7) float64 centre, length, width, height, yaw, ego frame.
+        planes: (B, pieces, 6, 4) float64.
         center: (3,) the camera's.
         R: (3, 3) float64 camera to ego.
         axis: (4,) middle of a cone around the camera's rays, camera frame, and its half angle.
-        rows: (B, 20) float32, written.
-        numbers: (B,) int64, written: the rows among all boxes.
+        rows: (B x pieces, ROW) float32, written.
+        numbers: (B x pieces,) int64, written: the pieces among all.
     """
-    count = 0
-    away, start, half = np.empty(3), np.empty(3), np.empty(3)
+    count, pieces = 0, planes.shape[1]
+    away, middle = np.empty(3), np.empty(3)
     for k in range(boxes.shape[0]):
         c, s = np.cos(boxes[k, 6]), np.sin(boxes[k, 6])
         for i in range(3):
-            away[i], half[i] = boxes[k, i] - center[i], boxes[k, 3 + i] / 2
-        start[0], start[1], start[2] = -(c * away[0] + s * away[1]), s * away[0] - c * away[1], -away[2]
-        if abs(start[0]) <= half[0] and abs(start[1]) <= half[1] and abs(start[2]) <= half[2]:
+            away[i] = boxes[k, i] - center[i]
+        x, y, half = c * away[0] + s * away[1], s * away[0] - c * away[1], boxes[k, 3:6] / 2
+        if abs(x) <= half[0] and abs(y) <= half[1] and abs(away[2]) <= half[2]:
             continue
         distance = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2)
-        radius = np.sqrt(half[0] ** 2 + half[1] ** 2 + half[2] ** 2)
-        row, off_axis = rows[count], 0.0
+        radius, off_axis = np.sqrt(half[0] ** 2 + half[1] ** 2 + half[2] ** 2), 0.0
         for i in range(3):
-            row[16 + i] = (away[0] * R[0, i] + away[1] * R[1, i] + away[2] * R[2, i]) / distance
-            off_axis += row[16 + i] * axis[i]
+            middle[i] = (away[0] * R[0, i] + away[1] * R[1, i] + away[2] * R[2, i]) / distance
+            off_axis += middle[i] * axis[i]
         angle = np.arcsin(min(radius / distance, 1.0))
         if distance > radius and np.arccos(min(max(off_axis, -1.0), 1.0)) > axis[3] + angle + 0.01:
             continue
-        for i in range(3):
-            row[i], row[3 + i], row[6 + i] = c * R[0, i] + s * R[1, i], c * R[1, i] - s * R[0, i], R[2, i]
-            row[9 + i], row[12 + i] = start[i], half[i]
-        row[15] = distance + radius
-        row[19] = np.cos(angle) if distance > radius else -9.0
-        numbers[count] = k
-        count += 1
+        for piece in range(pieces):
+            if planes[k, piece, 0, 3] < -1e5:
+                continue
+            row, before, behind = rows[count], 0, 5
+            for face in range(6):
+                n = planes[k, piece, face]
+                away_m = n[0] * center[0] + n[1] * center[1] + n[2] * center[2] - n[3]
+                at = before if away_m > 0 else behind
+                per = -1 / (max(away_m, 1e-6) if away_m > 0 else min(away_m, -1e-6))
+                for i in range(3):
+                    row[4 * at + i] = (n[0] * R[0, i] + n[1] * R[1, i] + n[2] * R[2, i]) * per
+                row[4 * at + 3], row[29 + at] = abs(per), face
+                before, behind = before + (away_m > 0), behind - (away_m <= 0)
+            row[24], row[25], row[26], row[27] = before, middle[0], middle[1], middle[2]
+            row[28] = np.cos(angle) if distance > radius else -9.0
+            numbers[count] = pieces * k + piece
+            count += before > 0
     return count
 
 
 @compiled
-def draw_boxes(
-    planes: Any, P: Any, boxes: Any, numbers: Any, cones: Any, step: int, scale: float, faces: bool, q: Any, number: Any
+def draw_solids(
+    planes: Any, P: Any, rows: Any, numbers: Any, cones: Any, step: int, scale: float, faces: bool, q: Any, number: Any
 ) -> None:
-    """Rasterise boxes into a z-buffer by the slab test, run of cells by run of cells.
+    """Rasterise pieces into a z-buffer, run of cells by run of cells.
 
     Args:
         planes: (3, h, w) rays, or (3, 0, 0) for a pinhole.
         P: ``camera_parameters``.
-        boxes: (B, 20) float32: rotation from camera to box frame (9), the camera's centre in the box's frame (3), half
-            sizes (3), the farthest corner's distance, the direction of its middle (3), the cosine of its cone.
-        numbers: (B,) their rows among all boxes.
+        rows: (n, ROW) float32: six planes, those that the camera lies before first, each as the inverse distance along
+            rays x, y, z and its slope (24); how many are before; the direction of its box's middle (3) and the cosine
+            of its cone; the planes' numbers (6).
+        numbers: (n,) the pieces among all.
         cones: ``cell_cones``.
         step: Side of a cell, pixels.
         scale: Factor of the inverse distances.
-        faces: Number the boxes' faces, else the boxes.
+        faces: Number the faces: 6 x piece + plane, else the pieces.
         q: (h, w) float32 inverse distance of the nearest face so far, 0 where there is none; updated.
-        number: (h, w) int32 row of the nearest box; with ``faces`` 6 x row + 2 x axis + 1 for the face further along
-            the axis; updated.
+        number: (h, w) int32 the nearest face or piece; updated.
     """
     h, w = q.shape
     _, ny, nx = cones.shape
-    work, near_box = np.empty((8, w), np.float32), np.empty(nx, np.bool_)
+    work, near_box = np.empty((5, w), np.float32), np.empty(nx, np.bool_)
     factor = np.float32(scale)
-    for k in range(boxes.shape[0]):
-        b, me = boxes[k], np.int32(numbers[k])
-        sx, sy, sz, hx, hy, hz = b[9], b[10], b[11], b[12], b[13], b[14]
+    for k in range(rows.shape[0]):
+        b, me = rows[k], np.int32(numbers[k])
         for j in range(ny):
-            x0, n = columns_of_box(b, cones[:, j], near_box, step, w)
+            x0, n = columns_of_piece(b, cones[:, j], near_box, step, w)
             if n == 0:
                 continue
-            rx, ry, rz, ix = work[0, :n], work[1, :n], work[2, :n], work[3, :n]
-            iy, iz, enter, leave = work[4, :n], work[5, :n], work[6, :n], work[7, :n]
+            rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
             for y in range(j * step, min(j * step + step, h)):
                 rays_row(planes, P, y, x0, rx, ry, rz)
-                slabs_row(b, rx, ry, rz, ix, iy, iz, enter, leave)
+                through_row(b, rx, ry, rz, enter, leave)
                 near, which = q[y, x0 : x0 + n], number[y, x0 : x0 + n]
-                for x in range(n):  # the first distance below 1 cm counts as 1 cm
-                    met = (leave[x] >= enter[x]) & (enter[x] > _ZERO)
-                    leave[x] = min(_ONE / enter[x], _MOST) * factor if met else _ZERO
                 if faces:
-                    for x in range(n):  # the axis whose slab it enters last
-                        first, second = -sx * ix[x] - hx * abs(ix[x]), -sy * iy[x] - hy * abs(iy[x])
-                        third = -sz * iz[x] - hz * abs(iz[x])
-                        face = np.int32(0) if ix[x] > _ZERO else np.int32(1)
-                        other = np.int32(2) if iy[x] > _ZERO else np.int32(3)
-                        face = other if second > first else face
-                        other = np.int32(4) if iz[x] > _ZERO else np.int32(5)
-                        face = other if third > max(first, second) else face
-                        which[x] = np.int32(6) * me + face if leave[x] > near[x] else which[x]
+                    first_face_row(b, rx, ry, rz, enter, leave, np.int32(6) * me, near, which)
                 else:
                     for x in range(n):
-                        which[x] = me if leave[x] > near[x] else which[x]
-                for x in range(n):
-                    near[x] = max(near[x], leave[x])
+                        met = (enter[x] > leave[x]) & (min(enter[x], _MOST) * factor > near[x])
+                        which[x] = me if met else which[x]
+                for x in range(n):  # the first distance below 1 cm counts as 1 cm
+                    value = min(enter[x], _MOST) * factor if enter[x] > leave[x] else _ZERO
+                    near[x] = max(near[x], value)
 
 
 @compiled
 def sum_silhouettes(
-    planes: Any, P: Any, boxes: Any, numbers: Any, cones: Any, step: int, weight: Any, sums: Any
+    planes: Any, P: Any, rows: Any, numbers: Any, cones: Any, step: int, weight: Any, sums: Any
 ) -> None:
-    """Add weights (h, w) of the pixels whose rays meet a box to its sum, whatever stands before it.
+    """Add weights (h, w) of the pixels whose rays meet a piece to its sum, whatever stands before it.
 
-    ``sums`` (all boxes,) float64 is updated; the other arguments are as in ``draw_boxes``.
+    ``sums`` (all pieces,) float64 is updated; the other arguments are as in ``draw_solids``.
     """
     h, w = weight.shape
     _, ny, nx = cones.shape
-    work, near_box = np.empty((8, w), np.float32), np.empty(nx, np.bool_)
-    for k in range(boxes.shape[0]):
-        b = boxes[k]
+    work, near_box = np.empty((5, w), np.float32), np.empty(nx, np.bool_)
+    for k in range(rows.shape[0]):
+        b = rows[k]
         for j in range(ny):
-            x0, n = columns_of_box(b, cones[:, j], near_box, step, w)
+            x0, n = columns_of_piece(b, cones[:, j], near_box, step, w)
             if n == 0:
                 continue
-            rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[6, :n], work[7, :n]
+            rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
             for y in range(j * step, min(j * step + step, h)):
                 rays_row(planes, P, y, x0, rx, ry, rz)
-                slabs_row(b, rx, ry, rz, work[3, :n], work[4, :n], work[5, :n], enter, leave)
+                through_row(b, rx, ry, rz, enter, leave)
                 for x in range(n):
-                    if leave[x] >= enter[x] and enter[x] > _ZERO:
+                    if enter[x] > leave[x]:
                         sums[numbers[k]] += weight[y, x0 + x]
 
 
 @compiled
-def columns_of_box(b: Any, cones: Any, near: Any, step: int, w: int) -> tuple[int, int]:
-    """First column and number of columns of the cells in a row that hold rays which may meet a box; 0 for none.
+def columns_of_piece(b: Any, cones: Any, near: Any, step: int, w: int) -> tuple[int, int]:
+    """First column and number of columns of the cells in a row that hold rays which may meet a piece; 0 for none.
 
-    Cells (n,) are sorted out by the cone around the box, then by whether the middle's ray meets a box that is larger by
-    what the cell's rays spread up to the farthest corner.
+    Cells (n,) are sorted out by the cone around the box, then by the planes: a cell's rays differ from its middle's by
+    ``cones[3]`` at most.
     """
-    cx, cy, cz, least = b[16], b[17], b[18], b[19]
-    first, last = near.shape[0], 0
+    cx, cy, cz, least = b[25], b[26], b[27], b[28]
+    first, last, before = near.shape[0], 0, int(b[24])
     for i in range(near.shape[0]):
         near[i] = cones[0, i] * cx + cones[1, i] * cy + cones[2, i] * cz >= least - cones[3, i]
     for i in range(near.shape[0]):
         if not near[i]:
             continue
-        air = cones[3, i] * b[15]
-        low, high = np.float32(-1e30), np.float32(1e30)
-        for axis in range(3):
-            g = b[3 * axis] * cones[0, i] + b[3 * axis + 1] * cones[1, i] + b[3 * axis + 2] * cones[2, i]
-            g = g if abs(g) > _FLAT else _FLAT
-            middle, reach = -b[9 + axis] / g, (b[12 + axis] + air) / abs(g)
-            low, high = max(low, middle - reach), min(high, middle + reach)
-        if low <= high and high > _ZERO:
+        enter, leave = np.float32(1e30), _ZERO
+        for k in range(6):
+            value = b[4 * k] * cones[0, i] + b[4 * k + 1] * cones[1, i] + b[4 * k + 2] * cones[2, i]
+            air = b[4 * k + 3] * cones[3, i]
+            if k < before:
+                enter = min(enter, value + air)
+            else:
+                leave = max(leave, value - air)
+        if enter >= leave and enter > _ZERO:
             first, last = min(first, i), i + 1
     return first * step, max(min(last * step, w) - first * step, 0)
 
 
 @compiled
-def slabs_row(b: Any, rx: Any, ry: Any, rz: Any, ix: Any, iy: Any, iz: Any, enter: Any, leave: Any) -> None:
-    """Distances (n,) at which rays enter and leave a box (20,); rays of length 0 miss it.
-
-    ``ix``, ``iy`` and ``iz`` (n,) become the inverse of their directions in the box's frame.
-    """
-    sx, sy, sz, hx, hy, hz = b[9], b[10], b[11], b[12], b[13], b[14]
-    _invert_row(b[0], b[1], b[2], rx, ry, rz, ix)
-    _invert_row(b[3], b[4], b[5], rx, ry, rz, iy)
-    _invert_row(b[6], b[7], b[8], rx, ry, rz, iz)
-    for i in range(enter.shape[0]):
-        first = max(-sx * ix[i] - hx * abs(ix[i]), -sy * iy[i] - hy * abs(iy[i]))
-        enter[i] = max(first, -sz * iz[i] - hz * abs(iz[i]))
-    for i in range(leave.shape[0]):
-        last = min(-sx * ix[i] + hx * abs(ix[i]), -sy * iy[i] + hy * abs(iy[i]))
-        leave[i] = min(last, -sz * iz[i] + hz * abs(iz[i]))
+def through_row(b: Any, rx: Any, ry: Any, rz: Any, enter: Any, leave: Any) -> None:
+    """Inverse distances (n,) at which rays enter and leave a piece; those that enter before they leave meet it."""
+    before = int(b[24])
+    # Three planes at a time: some twice.
+    for part in range(0, before, 3):
+        k, j, i = 4 * part, 4 * min(part + 1, before - 1), 4 * min(part + 2, before - 1)
+        a0, a1, a2, b0, b1, b2 = b[k], b[k + 1], b[k + 2], b[j], b[j + 1], b[j + 2]
+        c0, c1, c2 = b[i], b[i + 1], b[i + 2]
+        if part:
+            for x in range(enter.shape[0]):
+                one, two = a0 * rx[x] + a1 * ry[x] + a2 * rz[x], b0 * rx[x] + b1 * ry[x] + b2 * rz[x]
+                enter[x] = min(min(one, two), enter[x])
+        else:
+            for x in range(enter.shape[0]):
+                one, two = a0 * rx[x] + a1 * ry[x] + a2 * rz[x], b0 * rx[x] + b1 * ry[x] + b2 * rz[x]
+                enter[x] = min(min(one, two), c0 * rx[x] + c1 * ry[x] + c2 * rz[x])
+    for part in range(before, 6, 3):
+        k, j, i = 4 * part, 4 * min(part + 1, 5), 4 * min(part + 2, 5)
+        a0, a1, a2, b0, b1, b2 = b[k], b[k + 1], b[k + 2], b[j], b[j + 1], b[j + 2]
+        c0, c1, c2 = b[i], b[i + 1], b[i + 2]
+        if part > before:
+            for x in range(leave.shape[0]):
+                one, two = a0 * rx[x] + a1 * ry[x] + a2 * rz[x], b0 * rx[x] + b1 * ry[x] + b2 * rz[x]
+                leave[x] = max(max(one, two), leave[x])
+        else:
+            for x in range(leave.shape[0]):
+                one, two = a0 * rx[x] + a1 * ry[x] + a2 * rz[x], b0 * rx[x] + b1 * ry[x] + b2 * rz[x]
+                leave[x] = max(max(max(one, two), c0 * rx[x] + c1 * ry[x] + c2 * rz[x]), _ZERO)
 
 
 @compiled
-def _invert_row(a: float, b: float, c: float, rx: Any, ry: Any, rz: Any, inverse: Any) -> None:
-    for i in range(inverse.shape[0]):
-        g = a * rx[i] + b * ry[i] + c * rz[i]
-        inverse[i] = _ONE / (g if abs(g) > _FLAT else _FLAT)
+def first_face_row(
+    b: Any, rx: Any, ry: Any, rz: Any, enter: Any, leave: Any, first: int, near: Any, which: Any
+) -> None:
+    """Number the planes (n,) by which rays enter a piece, where that is nearer than ``near`` (n,)."""
+    for k in range(int(b[24])):
+        a0, a1, a2, face = b[4 * k], b[4 * k + 1], b[4 * k + 2], first + np.int32(b[29 + k])
+        for x in range(which.shape[0]):
+            met = (enter[x] > leave[x]) & (min(enter[x], _MOST) > near[x])
+            last = a0 * rx[x] + a1 * ry[x] + a2 * rz[x] <= enter[x]
+            which[x] = face if met & last else which[x]
+
+
+@compiled
+def planes_of(box: Any, profile: Any, planes: Any) -> None:
+    """Planes (pieces, 6, 4), ego frame, of a profile (pieces, 8) in a box (7,): see ``shapes.Piece``."""
+    c, s = np.cos(box[6]), np.sin(box[6])
+    for piece in range(profile.shape[0]):
+        low, high = profile[piece, 0] * box[5], profile[piece, 1] * box[5]
+        for face in range(6):
+            n, side = planes[piece, face], 2 * (face & 1) - 1
+            if face < 4:
+                size, at = box[3 + face // 2], (2, 3, 4, 4)[face]
+                reach, lean = profile[piece, at] * size, profile[piece, (5, 6, 7, 7)[face]] * size
+                reach = -reach if face == 0 else reach
+                along, across = (side, 0) if face < 2 else (0, side)
+                n[0], n[1] = c * along - s * across, s * along + c * across
+                n[2] = lean / max(high - low, 1e-9)
+                n[3] = reach + n[2] * low
+            else:
+                n[0], n[1], n[2], n[3] = 0, 0, side, -low if face == 4 else high
+            length = np.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2)
+            for i in range(4):
+                n[i] /= length
+            n[3] = n[3] + n[0] * box[0] + n[1] * box[1] + n[2] * box[2] if high > low else -1e6  # nothing
+
+
+@compiled
+def beside(planes: Any, point: Any) -> float:
+    """By how many metres a point (3,) lies outside pieces (n, 6, 4), less than 0 within."""
+    nearest = np.inf
+    for piece in range(planes.shape[0]):
+        farthest = -np.inf
+        for face in range(6):
+            n = planes[piece, face]
+            farthest = max(farthest, n[0] * point[0] + n[1] * point[1] + n[2] * point[2] - n[3])
+        nearest = min(nearest, farthest)
+    return nearest
+
+
+@compiled
+def fit_profiles(
+    boxes: Any, profiles: Any, fitting: Any, points: Any, within: Any, ends: Any, least: int, air: float, planes: Any,
+    is_own: Any,
+) -> None:  # fmt: skip
+    """Give boxes (B, 7) the profile that their points lie nearest to, by the least mean distance up to ``1.5 air``.
+
+    Args:
+        boxes: (B, 7).
+        profiles: (K, pieces, 8).
+        fitting: (B, n) numbers of those that fit a box; a range, its last repeated.
+        points: (P, 3).
+        within: (n,) numbers of points in boxes, box after box.
+        ends: (B,) where they end.
+        least: So many points choose.
+        air: Points so near are the object's own unless they lie as near to the box's floor.
+        planes: (B, pieces, 6, 4), written.
+        is_own: (P,) set for the points of objects.
+    """
+    some = np.empty(planes.shape[1:])
+    for k in range(boxes.shape[0]):
+        own = within[ends[k - 1] if k else 0 : ends[k]]
+        best, found = np.inf, fitting[k, 0]
+        if fitting[k, -1] > found and own.shape[0] >= least:
+            for number in range(found, fitting[k, -1] + 1):
+                planes_of(boxes[k], profiles[number], some)
+                total = 0.0
+                for i in range(0, own.shape[0], 1 + own.shape[0] // 256):
+                    total += min(abs(beside(some, points[own[i]])), 1.5 * air)
+                if total < best - 1e-9:
+                    best, found = total, number
+        planes_of(boxes[k], profiles[found], planes[k])
+        floor = boxes[k, 2] - boxes[k, 5] / 2 + air
+        for i in own:
+            is_own[i] |= points[i, 2] > floor and beside(planes[k], points[i]) < air
 
 
 @compiled

@@ -19,9 +19,9 @@ from arbiview_aug.cameras.rays import CELL_PX, PixelRays
 from arbiview_aug.errors import SampleError
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene import panorama
-from arbiview_aug.scene.boxes import BoxSurface, box_rows
+from arbiview_aug.scene.boxes import BoxSurface
 from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, SIDE_RAD, Layer
-from arbiview_aug.scene.scanned_objects import BOX_AIR_M, RASTER_RAD, ScannedObject, scanned_objects
+from arbiview_aug.scene.shapes import solids_among
 from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Points, StaticSurface
 
 OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
@@ -36,8 +36,6 @@ NODES_RAD = 4 * CELL_RAD
 ROOM_CELLS = 5  # cells by which panoramas are wider than what is asked first: later questions fit in
 
 _BLOCK = 1 << 16
-
-OBJECT_AIR = np.array([BOX_AIR_M, SIDE_RAD / RASTER_RAD], np.float32)
 
 MEASURED_SPREAD = 0.05
 """Spread of a measured inverse distance, as a share of it: half of STEP, below which densification follows a slope."""
@@ -209,12 +207,10 @@ class PointCloudSurface(DenseSurface):
     Attributes:
         street: What there is where nothing was measured.
         points: (P, 3) in the ego frame, finite, metres.
-        objects: Whose points are among them: nothing behind these is seen through gaps between their points.
     """
 
     street: StaticSurface
     points: Points
-    objects: tuple[ScannedObject, ...] = ()
     _panoramas: dict[bytes, tuple[tuple[float, float], list[Panorama]]] = field(default_factory=dict, repr=False)
     _shadows: dict[Camera, OcclusionMap] = field(default_factory=dict, repr=False)
     _nodes: dict[tuple[Camera, Cells], tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
@@ -224,12 +220,11 @@ class PointCloudSurface(DenseSurface):
 
     def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> Layer:
         """The points' dense surface at all pixels, 1/m (h, w)."""
-        from arbiview_aug.scene.completion import SHOW, add_residuals
+        from arbiview_aug.scene.completion import add_residuals
 
         q = self.street.image(camera, rays, memory)
         view, *cells = self._located(camera, rays, Cells.for_camera(camera), memory)
         add_residuals(*cells, view.layers, q)
-        self._draw_objects(camera, rays, SHOW, q)
         return q
 
     def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
@@ -244,19 +239,14 @@ class PointCloudSurface(DenseSurface):
             self._shadows[camera] = OcclusionMap(self.hidden(camera, rays, memory), solid)
         return self._shadows[camera]
 
-    def hidden(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH, *, widened: bool = True) -> Layer:
-        """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart.
+    def hidden(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH, *, coarse: bool = True) -> Layer:
+        """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart."""
+        from arbiview_aug.scene.completion import interpolate_layer
 
-        With ``widened`` objects reach half a scan line's spacing above their highest points: they may, and a source
-        that shows them there must not be read for the background.
-        """
-        from arbiview_aug.scene.completion import HIDE, HIDE_WIDE, interpolate_layer
-
-        view, *cells = self._located(camera, rays, COARSE if widened else Cells.for_camera(camera), memory)
+        view, *cells = self._located(camera, rays, COARSE if coarse else Cells.for_camera(camera), memory)
         apart = max(1, round(CELL_RAD * float(rays.parameters[0])))
         hidden = memory.empty(camera.size, np.float32)
         interpolate_layer(*cells, view.hidden_below, apart, hidden)
-        self._draw_objects(camera, rays, HIDE_WIDE if widened else HIDE, hidden)
         return np.asarray(hidden)
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
@@ -269,19 +259,6 @@ class PointCloudSurface(DenseSurface):
         read_layer(*(cells[0] for cells in view.cells(rays, np.eye(3))), view.layers[3], near)
         unknown = self.street.uncertainty(origin, directions, inverse_distance)
         return np.where(near.reshape(unknown.shape) > 0.5, MEASURED_SPREAD * inverse_distance, unknown)
-
-    def _draw_objects(self, camera: Camera, rays: PixelRays, mode: int, image: Layer) -> None:
-        """Draw the objects that a camera may see by their points (``completion.draw_scanned``)."""
-        from arbiview_aug.scene.completion import draw_scanned
-
-        if not self.objects:
-            return
-        boxes, numbers = box_rows(camera, np.array([one.box for one in self.objects]), rays)
-        center, R = np.ascontiguousarray(camera.center_m), camera.cam2ego[:3, :3].astype(np.float32)
-        for box, number in zip(boxes, numbers, strict=True):
-            raster = self.objects[number].raster(center)
-            if raster.nearest.size:
-                draw_scanned(rays.planes, rays.parameters, R, box, rays.cones, CELL_PX, raster, OBJECT_AIR, mode, image)
 
     def _located(
         self, camera: Camera, rays: PixelRays, cells: Cells, memory: Memory
@@ -340,13 +317,12 @@ def directions_of(rays: PixelRays, R: FloatArray) -> tuple[FloatArray, int]:
 
 @dataclass(frozen=True, eq=False)
 class PointCloudWithBoxes(BoxSurface):
-    """Labelled boxes among points made dense: a box decides within its silhouette, what was measured before it wins.
+    """Labelled objects among points: a shape decides within its silhouette, what was measured before it wins.
 
-    An object of few points is its box; they are left out of the panoramas, where they would blur over its outline. One
-    of many is what they say (``ScannedObject``).
+    An object's points choose its shape and are left out of the panoramas, where they would blur over its outline.
 
     Attributes:
-        street: The points' surface; ``among`` leaves out those within boxes.
+        street: The points' surface; ``among`` leaves out those of objects.
         boxes: (B, 7), as in ``BoxSurface``.
     """
 
@@ -355,11 +331,11 @@ class PointCloudWithBoxes(BoxSurface):
     @classmethod
     def among(cls, street: StaticSurface, points: Points, boxes: FloatArray) -> PointCloudWithBoxes:
         """Boxes (B, 7) among points (P, 3)."""
-        objects, boxes, in_box = scanned_objects(boxes, points)
-        return cls(PointCloudSurface(street, points[~in_box], objects), boxes)
+        planes, is_own = solids_among(boxes, points)
+        return cls(PointCloudSurface(street, points[~is_own]), boxes, planes)
 
-    def _hidden(self, camera: Camera, rays: PixelRays, memory: Memory, *, widened: bool) -> Layer:
-        return self.street.hidden(camera, rays, memory, widened=widened)
+    def _hidden(self, camera: Camera, rays: PixelRays, memory: Memory, *, coarse: bool) -> Layer:
+        return self.street.hidden(camera, rays, memory, coarse=coarse)
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Small where a point is near, the street's elsewhere: 1/m (...,)."""

@@ -13,6 +13,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.scene.boxes import BoxSurface
 from arbiview_aug.scene.corrected import CorrectedSurface, Correction
 from arbiview_aug.scene.point_cloud import PointCloudSurface, PointCloudWithBoxes
+from arbiview_aug.scene.shapes import solids
 from arbiview_aug.scene.static import Far, Ground, Street
 from arbiview_aug.scene.surface import Points, StaticSurface, Surface, SurfaceName
 
@@ -111,7 +112,7 @@ def _street(scene: Scene, ground_z_m: float) -> StaticSurface:
 
 def _boxes(scene: Scene, ground_z_m: float) -> Surface:
     assert scene.boxes is not None
-    return BoxSurface(_street(scene, ground_z_m), scene.boxes)
+    return BoxSurface(_street(scene, ground_z_m), scene.boxes, solids(scene.boxes))
 
 
 def _point_cloud(points: Points | None, scene: Scene, ground_z_m: float) -> Surface:

@@ -32,6 +32,7 @@ from arbiview_aug.render.view_plan import ViewPlan
 from arbiview_aug.sample.neighbours import Neighbour, Warn, warn_lost
 from arbiview_aug.scene.boxes import BoxSurface
 from arbiview_aug.scene.scene import Scene
+from arbiview_aug.scene.shapes import whole
 from arbiview_aug.scene.static import Far, Street
 from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Surface
 from arbiview_aug.temporal.change import BOX_MARGIN_M, ChangeRisk, change_risks
@@ -205,7 +206,7 @@ def plan_fills(
     fills = []
     for neighbour in neighbours:
         boxes = neighbour.labelled + np.array([0, 0, 0, 2 * BOX_MARGIN_M, 2 * BOX_MARGIN_M, 0, 0])
-        of_holes: Any = _HoleSurface(holes, full, BoxSurface(Street(), boxes) if len(boxes) else None)
+        of_holes: Any = _HoleSurface(holes, full, BoxSurface(Street(), boxes, whole(boxes)) if len(boxes) else None)
         views = build_plan(neighbour.rig, rig, surface=surface, config=config, scene=of_holes, maps=maps)
         shown = [_shown(hole, view, neighbour) for hole, view in zip(holes, views.targets, strict=True)]
         if any((hole.free & one.shows).any() for hole, one in zip(holes, shown, strict=True)):

@@ -8,6 +8,7 @@ from arbiview_aug import Rig, RigRetarget
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.render.confidence import certainty, confidence
 from arbiview_aug.scene.boxes import BoxSurface
+from arbiview_aug.scene.shapes import solids
 from arbiview_aug.scene.static import Far, Street
 from tests.helpers import street_sample
 from tests.scene.single_rays import inverse_distance
@@ -49,7 +50,7 @@ def test_near_road_is_surer_than_the_wall() -> None:
 
 
 def test_boxes_make_the_street_surer() -> None:
-    eye, scene = np.array([0.0, 0.0, 1.5]), BoxSurface(Street(), CAR)
+    eye, scene = np.array([0.0, 0.0, 1.5]), BoxSurface(Street(), CAR, solids(CAR))
     rays = np.array([[8.0, 0.0, -0.5], [8.0, 4.0, -0.2]])
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     q = inverse_distance(scene, eye, rays)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from arbiview_aug.scene.boxes import BoxSurface, meets
-from arbiview_aug.scene.panorama import SIDE_RAD
+from arbiview_aug.scene.boxes import BoxSurface
 from arbiview_aug.scene.point_cloud import COARSE, Panorama, PointCloudSurface, PointCloudWithBoxes
-from arbiview_aug.scene.scanned_objects import BOX_AIR_M, RASTER_RAD, ScannedObject
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE, StaticSurface, Surface
 
 
@@ -16,19 +14,15 @@ def inverse_distance(surface: Surface, origin: np.ndarray, directions: np.ndarra
     if isinstance(surface, StaticSurface):
         return surface.inverse_distance(origin, directions)
     if isinstance(surface, BoxSurface):
-        first, _ = boxes_ahead(surface.boxes, origin, directions)
+        first, _ = solids_ahead(surface.boxes, surface.solids, origin, directions)
         shown = first > 0
         if isinstance(surface, PointCloudWithBoxes):
-            shown &= first >= occlusion_depth(surface.street, origin, directions, widened=False)
+            shown &= first >= occlusion_depth(surface.street, origin, directions, coarse=False)
         return np.where(shown, first, inverse_distance(surface.street, origin, directions))
     assert isinstance(surface, PointCloudSurface)
     view = surface.view(np.asarray(origin, np.float64), directions)
     near, far, share = (layer_at(view, layer, directions) for layer in view.layers[:3])
     q = surface.street.inverse_distance(origin, directions) + np.where(share > 0.5, near, far)
-    flat = q.reshape(-1)
-    for met, own, behind in _objects_on(surface, origin, directions):
-        shown = (own > 0) & (flat[met] < behind)
-        flat[met[shown]] = own[shown]
     return np.clip(q, 0.0, MAX_INVERSE_DISTANCE)
 
 
@@ -39,22 +33,18 @@ def occludes(
     if isinstance(surface, PointCloudSurface):
         return q < occlusion_depth(surface, origin, directions)
     assert isinstance(surface, BoxSurface)
-    first, _ = boxes_ahead(surface._enlarged(origin, pixel_rad), origin, directions)
+    first, _ = solids_ahead(surface.boxes, surface._widened(origin, pixel_rad, lift=1.0), origin, directions)
     if surface.street.is_guess:
         return first > 0
     return (first > q * (1 + 2 * pixel_rad)) | occludes(surface.street, origin, directions, q, pixel_rad)
 
 
 def occlusion_depth(
-    surface: PointCloudSurface, origin: np.ndarray, directions: np.ndarray, widened: bool = True
+    surface: PointCloudSurface, origin: np.ndarray, directions: np.ndarray, coarse: bool = True
 ) -> np.ndarray:
     """Inverse distances (...,) beyond which points hide what is behind them."""
-    view = surface.view(np.asarray(origin, np.float64), directions, COARSE if widened else None)
-    depth = layer_at(view, view.hidden_below, directions)
-    flat = depth.reshape(-1)
-    for met, own, behind in _objects_on(surface, origin, directions):
-        flat[met] = np.maximum(flat[met], behind if widened else np.where(own > 0, behind, 0))
-    return depth
+    view = surface.view(np.asarray(origin, np.float64), directions, COARSE if coarse else None)
+    return layer_at(view, view.hidden_below, directions)
 
 
 def layer_at(view: Panorama, layer: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -72,57 +62,30 @@ def layer_at(view: Panorama, layer: np.ndarray, directions: np.ndarray) -> np.nd
     return np.asarray(above * (1 - s) + below * s)
 
 
-def boxes_ahead(boxes: np.ndarray, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse distance (...,) to the first box along each ray, 0 for none, and the face's number, -1 for none."""
+def solids_ahead(
+    boxes: np.ndarray, solids: np.ndarray, origin: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse distance (...,) to the first piece of what boxes hold along each ray, 0 for none, and its face, or -1."""
     rays = directions.reshape(-1, 3)
     q, face = np.zeros(len(rays)), np.full(len(rays), -1)
-    for row, box in enumerate(boxes):
-        enter, leave, number, holds = _through(box, origin, rays)
-        nearest = np.where((leave >= enter) & (enter > 0), 1 / np.maximum(enter, 1 / MAX_INVERSE_DISTANCE), 0.0)
-        first = (nearest > q) & (not holds)
-        q[first], face[first] = nearest[first], 6 * row + number[first]
+    for row, (box, pieces) in enumerate(zip(boxes, solids, strict=True)):
+        c, s = np.cos(box[6]), np.sin(box[6])
+        start = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ (origin - box[:3])
+        if (np.abs(start) <= box[3:6] / 2).all():
+            continue
+        for piece, planes in enumerate(pieces):
+            enter, leave, number = _through(planes, origin, rays)
+            nearest = np.where((leave >= enter) & (enter > 0), 1 / np.maximum(enter, 1 / MAX_INVERSE_DISTANCE), 0.0)
+            first = nearest > q
+            q[first], face[first] = nearest[first], 6 * (len(pieces) * row + piece) + number[first]
     return q.reshape(directions.shape[:-1]), face.reshape(directions.shape[:-1])
 
 
-def _through(box: np.ndarray, origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
-    """Distances (n,) at which rays enter and leave a box, the face they enter by, and whether it holds the origin."""
-    c, s = np.cos(box[6]), np.sin(box[6])
-    to_box = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    start, half, local = to_box @ (origin - box[:3]), box[3:6] / 2, rays @ to_box.T
-    local = np.where(np.abs(local) < 1e-12, 1e-12, local)
-    one, two = (-half - start) / local, (half - start) / local
-    near, far = np.minimum(one, two), np.maximum(one, two)
-    axis = near.argmax(axis=-1)
-    number = 2 * axis + (np.take_along_axis(local, axis[:, None], axis=-1)[:, 0] < 0)
-    return near.max(axis=-1), far.min(axis=-1), number, bool((np.abs(start) <= half).all())
-
-
-def _objects_on(
-    surface: PointCloudSurface, origin: np.ndarray, directions: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """For each scanned object the rays that meet its box, its inverse distances, and those at which they leave it."""
-    rays = directions.reshape(-1, 3)
-    found = []
-    for one in surface.objects:
-        met = np.flatnonzero(meets(one.box, origin, rays))
-        found.append((met, *_scanned(one, origin, rays[met])))
-    return found
-
-
-def _scanned(one: ScannedObject, origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    place, nearest, top = one.raster(np.asarray(origin, np.float64))
-    if not nearest.size or not len(rays):
-        return np.zeros(len(rays)), np.zeros(len(rays))
-    azimuth, elevation = np.arctan2(rays[:, 1], rays[:, 0]), np.arcsin(np.clip(rays[:, 2], -1, 1))
-    column = ((azimuth - place[0] + np.pi) % (2 * np.pi) - np.pi) / RASTER_RAD
-    height = (elevation - place[2]) / RASTER_RAD
-    h, w = nearest.shape
-    # Its outline runs half a cell beyond the outermost points.
-    across = (column >= -0.5) & (column <= w - 0.5)
-    highest = np.interp(column, np.arange(w), top)
-    row = np.clip(np.round(height), 0, h - 1).astype(np.intp)
-    own = nearest[row, np.clip(np.round(column), 0, w - 1).astype(np.intp)]
-    wide = one.box + 2 * BOX_AIR_M * np.array([0, 0, 0, 1, 1, 1, 0])
-    behind = 1 / np.maximum(_through(wide, origin, rays)[1], 1 / MAX_INVERSE_DISTANCE)
-    hides = across & (height <= highest + SIDE_RAD / RASTER_RAD)
-    return np.where(across & (height <= highest), own, 0.0), np.where(hides, behind, 0.0)
+def _through(planes: np.ndarray, origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distances (n,) at which rays enter and leave a piece (6, 4), and the plane they enter by."""
+    before, towards = planes[:, :3] @ origin - planes[:, 3], -rays @ planes[:, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = before / towards
+    near, far = np.where(towards > 0, at, -np.inf), np.where(towards < 0, at, np.inf)
+    beside = ((towards == 0) & (before > 0)).any(axis=1)
+    return near.max(axis=1), np.where(beside, -np.inf, far.min(axis=1)), near.argmax(axis=1)

@@ -39,7 +39,7 @@ def visible_shares(rig: Rig, coverage: Sequence[BoolArray], boxes: FloatArray) -
         inside = (rows >= 0) & (rows < small.shape[0]) & (columns >= 0) & (columns < small.shape[1])
         seen = np.flatnonzero(inside)[small[rows[inside], columns[inside]]]
         y, x = y[seen], x[seen]
-        shown += np.bincount(face[y, x] // 6, angle[y, x], minlength=len(boxes))
+        shown += np.bincount(face[y, x], angle[y, x], minlength=len(boxes))
     return np.minimum(np.divide(shown, total, out=np.zeros(len(boxes)), where=total > 0), 1.0)
 
 

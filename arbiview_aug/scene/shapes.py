@@ -1,0 +1,127 @@
+"""Solids inside labelled boxes: what a car, a person or a cone fills of its box, as up to two convex pieces.
+
+A piece is a tapered slab of six planes n · x <= d. Shares of bodies are those of production cars: the glasshouse is
+about a third of the height, the bonnet a quarter of the length, and a windscreen leans by 60 to 65 degrees.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.scene.surface import Points
+
+PIECES = 2
+"""Pieces of an object."""
+
+LEAST_POINTS = 20
+"""So many points choose among profiles."""
+
+AIR_M = 0.2
+"""So far outside an object points are its own."""
+
+
+class Piece(NamedTuple):
+    """A tapered slab in shares of its box's length, width and height, from -0.5 to 0.5.
+
+    Attributes:
+        bottom: Height.
+        top: Height.
+        rear: At its bottom.
+        front: At its bottom.
+        side: Half its width at its bottom.
+        rear_lean: How far the rear leans in, up to its top.
+        front_lean: The front.
+        side_lean: Each side.
+    """
+
+    bottom: float
+    top: float
+    rear: float = -0.5
+    front: float = 0.5
+    side: float = 0.5
+    rear_lean: float = 0.0
+    front_lean: float = 0.0
+    side_lean: float = 0.0
+
+
+def _car(waist: float, rear: float, rear_lean: float) -> tuple[Piece, Piece]:
+    """A car with a body up to its waist, and a cabin from ``rear`` on."""
+    body = Piece(-0.5, waist, rear_lean=min(0.5 + rear, 0.03), front_lean=0.02, side_lean=0.03)
+    return body, Piece(waist, 0.5, rear, 0.25, 0.47, rear_lean, 0.18, 0.09)
+
+
+_BOX = (Piece(-0.5, 0.5),)
+_CARS = tuple(
+    _car(waist, *rear)
+    for waist in (0.10, 0.03)
+    for rear in ((-0.47, 0.12), (-0.38, 0.18), (-0.49, 0.05))  # hatchback, saloon, estate
+)
+_VANS = ((Piece(-0.5, 0.0, front_lean=0.02), Piece(0.0, 0.5, -0.5, 0.37, 0.5, 0.01, 0.08, 0.05)), _BOX)
+_LARGE = ((Piece(-0.5, 0.5, front_lean=0.015, rear_lean=0.005, side_lean=0.01),), _BOX)
+_PERSON = ((Piece(-0.5, 0.33, -0.35, 0.35, 0.38), Piece(0.33, 0.5, -0.25, 0.25, 0.2, 0.05, 0.05, 0.05)),)
+_CONE = ((Piece(-0.5, 0.5, rear_lean=0.4, front_lean=0.4, side_lean=0.4),),)
+_KINDS = (_CARS, _VANS, _LARGE, _PERSON, _CONE, (_BOX,))
+_FROM_M = (3.0, 1.3, 1.1), (3.0, 1.3, 1.1), (3.0, 1.3, 1.95), (0.0, 0.0, 1.2), (0.0, 0.0, 0.3), (0.0, 0.0, 0.0)
+_TO_M = (5.6, 2.8, 1.95), (6.6, 2.8, 2.8), (30.0, 3.5, 5.0), (1.2, 1.2, 2.2), (0.7, 0.7, 1.2), (np.inf,) * 3
+KIND_M = np.array([_FROM_M, _TO_M])
+"""Least and largest length, width and height (2, kinds, 3) of cars, vans, lorries and buses, people, cones, and others.
+An object is of the first kind that it fits."""
+
+_NOTHING = Piece(0.5, 0.5, 0.0, 0.0, 0.0)
+PROFILES = np.array([[*one, _NOTHING][:PIECES] for kind in _KINDS for one in kind], np.float64)
+"""All profiles (K, 2, 8), kind after kind."""
+
+_COUNTS = np.array([len(kind) for kind in _KINDS])
+OF_KIND = np.cumsum(_COUNTS)[:, None] - _COUNTS[:, None] + np.minimum(np.arange(_COUNTS.max()), _COUNTS[:, None] - 1)
+"""Numbers (kinds, most) of each kind's profiles, the last again where it has fewer."""
+
+
+def kinds(boxes: FloatArray) -> npt.NDArray[np.int64]:
+    """What boxes (B, 7) may hold, by their sizes: rows (B,) of ``KIND_M``."""
+    sizes = boxes[:, None, 3:6]
+    return np.asarray(((sizes >= KIND_M[0]) & (sizes <= KIND_M[1])).all(axis=-1).argmax(axis=-1))
+
+
+def solids(boxes: FloatArray) -> FloatArray:
+    """Planes (B, 2, 6, 4) of what boxes (B, 7) hold: points n · x <= d of the ego frame lie in a piece.
+
+    Planes are those of the rear, the front, the right, the left, the bottom and the top. Of the profiles that fit a
+    box, it is the first.
+    """
+    return _planes(boxes, PROFILES[OF_KIND[kinds(boxes), 0]])
+
+
+def solids_among(boxes: FloatArray, points: Points) -> tuple[FloatArray, BoolArray]:
+    """What boxes (B, 7) hold, as ``solids`` gives it, by the points (P, 3) in them; which points (P,) are theirs.
+
+    Of the profiles that fit a box it is the one whose faces lie nearest to its points. Points within ``AIR_M`` of it
+    are its own: mirrors, and the noise of points and labels. This far over the box's floor they may be the road's.
+    """
+    from arbiview_aug.scene.kernels import fit_profiles, points_in
+
+    boxes = np.ascontiguousarray(boxes)
+    found = np.empty((len(boxes), PIECES, 6, 4)), np.zeros(len(points), bool)
+    points = np.ascontiguousarray(points, np.float32)
+    box, point = points_in(boxes, points, AIR_M)
+    point = point[np.argsort(box, kind="stable")]
+    ends = np.cumsum(np.bincount(box, minlength=len(boxes)))
+    fit_profiles(boxes, PROFILES, OF_KIND[kinds(boxes)], points, point, ends, LEAST_POINTS, AIR_M, *found)
+    return found
+
+
+def whole(boxes: FloatArray) -> FloatArray:
+    """Planes (B, 1, 6, 4) of the boxes' own faces."""
+    return _planes(boxes, np.broadcast_to(np.array([_BOX], np.float64), (len(boxes), 1, 8)))
+
+
+def _planes(boxes: FloatArray, profiles: FloatArray) -> FloatArray:
+    from arbiview_aug.scene.kernels import planes_of
+
+    planes = np.empty((*profiles.shape[:2], 6, 4))
+    for box, profile, out in zip(boxes, profiles, planes, strict=True):
+        planes_of(box, profile, out)
+    return planes
