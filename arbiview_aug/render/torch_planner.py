@@ -216,8 +216,8 @@ class _ViewBatch:
         self, frames: Sequence[int], cameras: Sequence[Camera], rays: torch.Tensor, poses: Poses, lift: float = 0.0
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Inverse distances of the objects, and faces or -1."""
-        boxes, planes = self._objects_of(frames)
-        return draw_solids(rays, poses, boxes, widened(poses, boxes, planes, self._pixel_rad(cameras), lift))
+        objects = widened(poses, *self._objects_of(frames), self._pixel_rad(cameras), lift)
+        return draw_solids(rays, poses, *objects)
 
     def _objects_of(self, frames: Sequence[int]) -> tuple[torch.Tensor, torch.Tensor]:
         """Boxes (n, B, 7) of frames, and planes (n, B, pieces, 6, 4) of what they hold."""
@@ -417,7 +417,7 @@ class _ViewBatch:
             ego = torch.stack(turned(rays, poses.R.float()), 1)
             beyond = self._point_views(frames, cameras, COARSE).hidden(ego)
         if self.boxes is not None:
-            q, number = self._drawn_solids(frames, cameras, rays, poses, lift=1.0)
+            q, number = self._drawn_solids(frames, cameras, rays, poses, lift=0.5)
             q = q / (1 + 2 * self._pixel_rad(cameras)).float()[:, None, None]
             number = torch.div(number, 6, rounding_mode="floor").int()
             number = number if beyond is None else torch.where(q > beyond, number, -1)

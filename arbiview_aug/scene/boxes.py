@@ -60,8 +60,8 @@ class BoxSurface(LayeredSurface):
             pixel_rad = float(1 / camera.K[0, 0])
             scale = 1 / (1 + 2 * pixel_rad)  # a lookup's error
             onto = self._hidden(camera, rays, memory, coarse=True)
-            planes = self._widened(camera.center_m, pixel_rad, lift=1.0)
-            drawn = draw_solids(camera, self.boxes, planes, rays, memory, scale=scale, faces=False, onto=onto)
+            widened = self._widened(camera.center_m, pixel_rad, lift=0.5)
+            drawn = draw_solids(camera, *widened, rays, memory, scale=scale, faces=False, onto=onto)
             self._shadows[camera] = OcclusionMap(*drawn)
         return self._shadows[camera]
 
@@ -73,8 +73,8 @@ class BoxSurface(LayeredSurface):
         A face's number is 6 x its piece + that of its plane; ``face_objects`` and ``face_is_top`` tell what it is.
         """
         onto = self._hidden(camera, rays, memory, coarse=False)
-        planes = self._widened(camera.center_m, float(1 / camera.K[0, 0]))
-        return draw_solids(camera, self.boxes, planes, rays, memory, onto=onto)
+        widened = self._widened(camera.center_m, float(1 / camera.K[0, 0]))
+        return draw_solids(camera, *widened, rays, memory, onto=onto)
 
     def _hidden(self, camera: Camera, rays: PixelRays, memory: Memory, *, coarse: bool) -> npt.NDArray[np.float32]:
         """Inverse distances (h, w) beyond which something else hides, 0 where nothing does."""
@@ -94,13 +94,14 @@ class BoxSurface(LayeredSurface):
         """Whether faces (n,) look upwards: roofs and bonnets."""
         return np.asarray(self.solids[..., 2].reshape(-1) > TOP)
 
-    def _widened(self, origin: FloatArray, pixel_rad: float, lift: float = 0.0) -> FloatArray:
-        """The planes, half a pixel wider, as border pixels mix colours; floors ``lift`` pixels higher."""
+    def _widened(self, origin: FloatArray, pixel_rad: float, lift: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Boxes and planes half a pixel wider, as border pixels mix colours; floors ``lift`` pixels higher."""
         pixel_m = pixel_rad * np.linalg.norm(self.boxes[:, :3] - origin, axis=-1)
-        planes = self.solids.copy()
+        boxes, planes = self.boxes.copy(), self.solids.copy()
+        boxes[:, 3:6] += pixel_m[:, None]
         planes[..., [0, 1, 2, 3, 5], 3] += pixel_m[:, None, None] / 2
         planes[:, 0, 4, 3] -= pixel_m * lift
-        return planes
+        return boxes, planes
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Expected error (...,) in 1/m of boxes, and of the street because of unlabelled objects."""

@@ -187,13 +187,14 @@ def before_faces(planes: torch.Tensor, center_m: torch.Tensor) -> torch.Tensor:
 
 def widened(
     poses: Poses, boxes: torch.Tensor, planes: torch.Tensor, pixel_rad: torch.Tensor, lift: float = 0.0
-) -> torch.Tensor:
+) -> tuple[torch.Tensor, torch.Tensor]:
     """As ``BoxSurface._widened``, of boxes (C, B, 7) and planes (C, B, pieces, 6, 4)."""
     pixel_m = pixel_rad[:, None] * (boxes[..., :3] - poses.center_m[:, None]).norm(dim=-1)
-    planes = planes.clone()
+    grown = torch.where(boxes[..., 3:6] > 0, boxes[..., 3:6] + pixel_m[..., None], 0.0)  # padding stays without a size
+    boxes, planes = torch.cat([boxes[..., :3], grown, boxes[..., 6:]], -1), planes.clone()
     planes[..., [0, 1, 2, 3, 5], 3] += pixel_m[..., None, None] / 2
     planes[:, :, 0, 4, 3] -= pixel_m * lift
-    return planes
+    return boxes, planes
 
 
 # --- what boxes hold --------------------------------------------------------------------------------------------------

@@ -138,12 +138,19 @@ def box_distance(box: np.ndarray, origin: np.ndarray, directions: np.ndarray, sh
     return np.where((enter <= leave) & (enter > 0), enter, np.inf)
 
 
+def half_pixel_wider(box: np.ndarray, camera: Camera) -> np.ndarray:
+    """A box (7,) as a camera's view shows it: with the pixels on its border, which mix colours. Its floor stays."""
+    more_m = np.linalg.norm(box[:3] - camera.center_m) / camera.K[0, 0] / 2
+    return box + more_m * np.array([0, 0, 0.5, 2, 2, 1, 0])
+
+
 def seen(source: Camera, target: Camera, surface: str, ground_z_m: float, boxes: np.ndarray | None = None) -> Seen:
     """Where the target's pixels lie in the source; ``valid`` says nothing of image bounds, masks or obstacles."""
     directions, certain = rays(target)
     q = inverse_distance("street" if boxes is not None else surface, target.center_m, directions, ground_z_m)
     if boxes is not None:  # a labelled box wins over the guessed street, even where it stands a little below the road
-        box = np.minimum.reduce([box_distance(box, target.center_m, directions) for box in boxes])
+        wider = [half_pixel_wider(box, target) for box in boxes]
+        box = np.minimum.reduce([box_distance(box, target.center_m, directions) for box in wider])
         q = np.where(np.isfinite(box), 1 / box, q)
     with np.errstate(all="ignore"):
         point = np.where(q[..., None] > 1e-9, target.center_m + directions / q[..., None], np.nan)

@@ -93,7 +93,8 @@ def check(plan: RenderPlan, surface: str, scene: Scene, worst: Worst) -> None:
             source = plan.source[index]
             won = view.source_camera == index
             assert ray_valid[won].all()
-            q = inverse_distance(scene.surface(name, plan.source.ground_z_m), target.center_m, directions[won])
+            over = scene.surface(name, plan.source.ground_z_m)
+            q = inverse_distance(over, target.center_m, directions[won], float(1 / target.K[0, 0]))
             uv, valid = project_rays(source, directions[won], q, target.center_m - source.center_m)
             ahead = (directions[won] + q[:, None] * (target.center_m - source.center_m)) @ source.cam2ego[:3, 2] > 0
             assert source.lens == "fisheye" or ahead.all(), f"{source.name} over {name}: what is read lies behind it"

@@ -9,12 +9,14 @@ from arbiview_aug.scene.point_cloud import COARSE, Panorama, PointCloudSurface, 
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE, StaticSurface, Surface
 
 
-def inverse_distance(surface: Surface, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """1/m (...,) at which unit rays (..., 3) meet a surface."""
+def inverse_distance(
+    surface: Surface, origin: np.ndarray, directions: np.ndarray, pixel_rad: float = 0.0
+) -> np.ndarray:
+    """1/m (...,) at which unit rays (..., 3) meet a surface, as a camera of such pixels shows it."""
     if isinstance(surface, StaticSurface):
         return surface.inverse_distance(origin, directions)
     if isinstance(surface, BoxSurface):
-        first, _ = solids_ahead(surface.boxes, surface.solids, origin, directions)
+        first, _ = solids_ahead(*surface._widened(origin, pixel_rad), origin, directions)
         shown = first > 0
         if isinstance(surface, PointCloudWithBoxes):
             shown &= first >= occlusion_depth(surface.street, origin, directions, coarse=False)
@@ -33,7 +35,7 @@ def occludes(
     if isinstance(surface, PointCloudSurface):
         return q < occlusion_depth(surface, origin, directions)
     assert isinstance(surface, BoxSurface)
-    first, _ = solids_ahead(surface.boxes, surface._widened(origin, pixel_rad, lift=1.0), origin, directions)
+    first, _ = solids_ahead(*surface._widened(origin, pixel_rad, lift=0.5), origin, directions)
     if surface.street.is_guess:
         return first > 0
     return (first > q * (1 + 2 * pixel_rad)) | occludes(surface.street, origin, directions, q, pixel_rad)

@@ -86,8 +86,8 @@ def test_drawn_boxes_equal_cast_rays(lens: dict) -> None:
     camera = dataclasses.replace(camera, **lens)
     boxes = np.concatenate([crowd(60), [[12, 2, 0.8, 4.5, 1.8, 1.5, 2.5], [9, 6, 0.8, 0.7, 0.6, 1.7, 0.5]]])
     scene = BoxSurface(Street(), boxes, solids(boxes))
-    planes = scene._widened(camera.center_m, 1 / camera.K[0, 0])
-    q, face = solids_ahead(boxes, planes, camera.center_m, camera.unproject(camera.pixel_grid()).directions)
+    widened = scene._widened(camera.center_m, 1 / camera.K[0, 0])
+    q, face = solids_ahead(*widened, camera.center_m, camera.unproject(camera.pixel_grid()).directions)
     drawn, drawn_face = scene.drawn(camera, pixel_rays(camera))
     shown = drawn_face >= 0
     assert np.array_equal(shown, drawn > 0) and shown.sum() > 3000
