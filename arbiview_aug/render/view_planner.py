@@ -118,11 +118,12 @@ class ViewPlanner:
         y, x = self.nodes = [c.clip(inset, n - 1 - inset) for c, n in zip(corners, camera.size, strict=True)]
         self.at_nodes = y[:, None], x[None]
         self.corner_rays, self.node_rays = maps.of_lens(
-            camera, self.step, lambda: np.stack([self.rays.at(*corners), self.rays.at(y, x)])
+            camera, self.step, lambda: np.stack([continued(self.rays.at(*corners)), self.rays.at(y, x)])
         )
         self._geometries: dict[str, _Geometry] = {}
-        # Cells that sources elsewhere may change.
-        self._open = np.ones([len(n) - 1 for n in self.nodes], bool)
+        # Cells that sources elsewhere may change: none without a ray.
+        has_ray = self.corner_rays.any(axis=0)
+        self._open = has_ray[1:, 1:] & has_ray[1:, :-1] & has_ray[:-1, 1:] & has_ray[:-1, :-1]
         exact = {k: self._region(k) for k in order if self._baseline_m(k) < SAME_CENTER_M}
         for one in filter(None, exact.values()):
             self._open = self._open & self._around_unseen(one)
@@ -435,6 +436,22 @@ def halved_camera(camera: Camera, level: int) -> Camera:
     """The camera of an image that was halved ``level`` times."""
     h, w = level_size(camera.size, level)
     return camera.crop(0, 0, (h << level, w << level)).resize((h, w)) if level else camera
+
+
+def continued(rays: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Rays (3, ny, nx) of nodes, those up to two nodes outside a lens's image circle as if it went on.
+
+    Lenses turn fast at their rim: rays go on four times as fast, and the cells there hold all of their pixels' rays.
+    """
+    (ny, nx), known = rays.shape[1:], rays.any(axis=0)
+    for _ in range(0 if known.all() else 2):
+        wide, further = np.pad(rays, ((0, 0), (2, 2), (2, 2))), np.zeros_like(rays)
+        for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+            one, two = (wide[:, 2 + k * dy : 2 + k * dy + ny, 2 + k * dx : 2 + k * dx + nx] for k in (1, 2))
+            further += one.any(axis=0) * np.where(two.any(axis=0), 5 * one - 4 * two, one)
+        length = np.linalg.norm(further, axis=0)
+        rays = np.where(rays.any(axis=0), rays, further / np.maximum(length, np.float32(1e-30)))
+    return rays
 
 
 def _filled(values: FloatArray, valid: BoolArray) -> npt.NDArray[np.float32]:

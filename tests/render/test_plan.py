@@ -121,6 +121,13 @@ def test_only_what_the_scene_requires_is_evaluated() -> None:
     assert plan.counters["bands"] == 0
 
 
+def test_no_cell_outside_an_image_circle_is_evaluated() -> None:
+    rig = load_rig("fisheye_surround").resized((256, 704))
+    plan = build_plan(half_size("nuscenes"), rig.with_cameras([rig[1]]))
+    assert plan.counters["pairs_street"] == 6
+    assert plan.counters["cells"] < 0.2 * 6 * 32 * 88
+
+
 def test_exact_source_wins_wherever_it_sees() -> None:
     source = half_size("nuscenes")
     plan = build_plan(source, source.turned(yaw_deg=22), surface="street")
