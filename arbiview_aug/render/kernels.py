@@ -1,4 +1,4 @@
-"""Compiled inner loops of planning: which cells a source may see, its pixels, and who wins them.
+"""Compiled inner loops of planning, which cells a source may see, its pixels, and who wins them; and of filling holes.
 
 A target is worked on row by row; every loop over a row writes one array, so that it becomes vector instructions.
 """
@@ -23,6 +23,7 @@ LEAST_INCIDENCE = np.float32(0.05)
 SAME_OBJECT_M = np.float32(0.15)
 """So much nearer a piece of an object must be to hide another of it: they touch, and are drawn half a pixel wider."""
 
+_LEAST_KNOWN = np.float32(0.25)  # a cell of less known area says nothing of its column
 _BORDER_PX = np.float32(1.0)  # maps bulge between the corners of a cell
 _OUTSIDE = np.int32((OUTSIDE << 16) | (OUTSIDE & 0xFFFF))  # both coordinates of a packed position
 _WORK_ROWS = 11  # of scratch memory in ``_evaluate_row``
@@ -462,6 +463,108 @@ def seen_image(planes: Any, target: Any, q: Any, face: Any, source: Any, visible
 
 
 @compiled
+def farthest_occluded(q: Any, face: Any, layers: Any, cell: int, farthest: Any) -> None:
+    """Least inverse distance (ny, nx) of the occluded background in each cell; infinity without any.
+
+    Args:
+        q: (h, w) inverse distances, 0 where unknown.
+        face: (h, w) int32 faces of objects, -1 elsewhere; (0, 0) without any.
+        layers: (h, w) uint8, 1 (``view_plan.OCCLUDED``) where a pixel is a hole in a source's image.
+        cell: Side of a cell, pixels.
+        farthest: (ny, nx) float32, written.
+    """
+    (h, w), (ny, nx) = q.shape, farthest.shape
+    low = np.empty(w, np.float32)
+    for j in range(ny):
+        low[:] = np.inf
+        for y in range(j * cell, min(j * cell + cell, h)):
+            row, layer = q[y], layers[y]
+            if face.shape[0]:
+                faces = face[y]
+                for x in range(w):
+                    low[x] = min(low[x], row[x]) if (layer[x] == 1) & (faces[x] < 0) & (row[x] > _ZERO) else low[x]
+            else:
+                for x in range(w):
+                    low[x] = min(low[x], row[x]) if (layer[x] == 1) & (row[x] > _ZERO) else low[x]
+        for i in range(nx):
+            least = low[i * cell]
+            for x in range(i * cell, min(i * cell + cell, w)):
+                least = min(least, low[x])
+            farthest[j, i] = least
+
+
+@compiled
+def mark_objects(q: Any, face: Any, winner: Any, limit: Any, cell: int, layers: Any) -> None:
+    """Mark objects, and what is nearer than occluded background beside it.
+
+    Args:
+        q: (h, w) inverse distances.
+        face: (h, w) int32 faces of objects, -1 elsewhere; (0, 0) without any.
+        winner: (h, w) int8 source, -1 for none.
+        limit: (ny, nx) float32 inverse distances above which seen pixels of a cell are nearer.
+        cell: Side of a cell, pixels.
+        layers: (h, w) uint8, updated to ``view_plan.OBJECT``.
+    """
+    (h, w), nx = q.shape, limit.shape[1]
+    limits = np.empty(w, np.float32)
+    for y in range(h):
+        row, who, out = q[y], winner[y], layers[y]
+        for i in range(nx):
+            limits[i * cell : i * cell + cell] = limit[y // cell, i]
+        for x in range(w):
+            out[x] = np.uint8(2) if (row[x] > limits[x]) & (who[x] >= 0) else out[x]
+        if face.shape[0]:
+            faces = face[y]
+            for x in range(w):
+                out[x] = np.uint8(2) if faces[x] >= 0 else out[x]
+
+
+@compiled
+def find_paint(
+    face: Any, part: Any, winner: Any, reach: int, step: int, margin: int, found: Any
+) -> tuple[int, int]:  # fmt: skip
+    """Find the unseen pixels of objects, and a sample of seen ones; return their numbers.
+
+    Args:
+        face: (h, w) int32 faces of objects, -1 elsewhere.
+        part: (F,) int32 part of an object that a face belongs to.
+        winner: (h, w) int8 source, -1 for none.
+        reach: Distance up to which seen pixels of the same part are looked for.
+        step: Distance of samples.
+        margin: Distance at which pixels around a sample must be of its face.
+        found: (5, h w) int32, written: the attributes of ``view_plan.Paint``.
+    """
+    h, w = face.shape
+    hidden, sampled = 0, 0
+    for y in range(h):
+        for x in range(w):
+            number = face[y, x]
+            if number < 0:
+                continue
+            if winner[y, x] < 0:
+                own, beside = part[number], -1
+                for far in range(1, reach + 1):
+                    for way in range(4):
+                        yy, xx = y + (way == 2) * far - (way == 3) * far, x + (way == 0) * far - (way == 1) * far
+                        if beside < 0 and 0 <= yy < h and 0 <= xx < w and winner[yy, xx] >= 0 and face[yy, xx] >= 0:
+                            beside = yy * w + xx if part[face[yy, xx]] == own else -1
+                    if beside >= 0:
+                        break
+                found[0, hidden], found[1, hidden], found[2, hidden] = y * w + x, own, beside
+                hidden += 1
+            elif y % step == 0 and x % step == 0 and min(y, x, h - 1 - y, w - 1 - x) >= margin:
+                if (
+                    face[y - margin, x] == number
+                    and face[y + margin, x] == number
+                    and face[y, x - margin] == number
+                    and face[y, x + margin] == number
+                ):
+                    found[3, sampled], found[4, sampled] = y * w + x, part[number]
+                    sampled += 1
+    return hidden, sampled
+
+
+@compiled
 def upsample_where(nodes: Any, step: int, winner: Any, number: int, out: Any) -> None:
     """Put node values (ny + 1, nx + 1), interpolated and rounded, into (h, w) uint8 where a source wins."""
     h, w = winner.shape
@@ -504,3 +607,166 @@ def read_ahead(atlas: Any, pixel: int, packed: Any, winner: Any) -> int:
                     for at in range(left * pixel, min((right + 2) * pixel, atlas.shape[1]), 64):
                         found ^= atlas[row, at]
     return found  # else nothing would be read
+
+
+# --- filling holes ----------------------------------------------------------------------------------------------------
+@compiled
+def sum_cells(view: Any, known: Any, cell: int, sums: Any) -> None:
+    """Mean over each cell of its known pixels' colours, the others counting as 0, and the known share.
+
+    Args:
+        view: (3, h, w), of any type.
+        known: (h, w) uint8, 1 where a pixel is known, else 0.
+        cell: Side of a cell, pixels.
+        sums: (4, ny, nx) float32, written.
+    """
+    h, w = known.shape
+    ny, nx = sums.shape[1:]
+    row, per_pixel = np.empty(w, np.float32), _ONE / np.float32(cell * cell)
+    for c in range(4):
+        for j in range(ny):
+            for x in range(w):
+                row[x] = _ZERO
+            for y in range(j * cell, min(j * cell + cell, h)):
+                mark = known[y]
+                if c < 3:
+                    plane = view[c, y]
+                    for x in range(w):
+                        row[x] += np.float32(plane[x]) * np.float32(mark[x])
+                else:
+                    for x in range(w):
+                        row[x] += np.float32(mark[x])
+            for i in range(nx):
+                total = _ZERO
+                for x in range(i * cell, min(i * cell + cell, w)):
+                    total += row[x]
+                sums[c, j, i] = total * per_pixel
+
+
+@compiled
+def halve(fine: Any, tall: int, coarse: Any) -> None:
+    """Add up cells (4, ny, nx) by ``tall`` (1 or 2) rows and 2 columns, at most to full cells."""
+    ny, nx = fine.shape[1:]
+    share = _ONE / np.float32(2 // tall)
+    for j in range(coarse.shape[1]):
+        for i in range(coarse.shape[2]):
+            for c in range(4):
+                total = _ZERO
+                for y in range(j * tall, min(j * tall + tall, ny)):
+                    for x in range(2 * i, min(2 * i + 2, nx)):
+                        total += fine[c, y, x]
+                coarse[c, j, i] = total * share
+            known = coarse[3, j, i]
+            if known > _ONE:
+                for c in range(4):
+                    coarse[c, j, i] /= known
+
+
+@compiled
+def complete(coarse: Any, tall: int, fine: Any) -> None:
+    """Complete what cells (4, ny, nx) do not know by coarser ones, complete themselves; see ``halve``."""
+    ny, nx = fine.shape[1:]
+    rows, columns = coarse.shape[1:]
+    for j in range(ny):
+        at = min(max((np.float32(j) + _HALF) / np.float32(tall) - _HALF, _ZERO), np.float32(rows - 1))
+        j0 = int(at)
+        j1, s = min(j0 + 1, rows - 1), at - np.float32(j0)
+        for i in range(nx):
+            missing = _ONE - fine[3, j, i]
+            if missing <= _ZERO:
+                continue
+            at = min(max((np.float32(i) + _HALF) * _HALF - _HALF, _ZERO), np.float32(columns - 1))
+            i0 = int(at)
+            i1, t = min(i0 + 1, columns - 1), at - np.float32(i0)
+            for c in range(4):
+                above = coarse[c, j0, i0] + t * (coarse[c, j0, i1] - coarse[c, j0, i0])
+                below = coarse[c, j1, i0] + t * (coarse[c, j1, i1] - coarse[c, j1, i0])
+                fine[c, j, i] += missing * (above + s * (below - above))
+
+
+@compiled
+def continue_columns(sums: Any, complete: Any, reach: float, out: Any) -> None:
+    """Continue the nearest known cells of each column, fading into the complete ones within ``reach`` cells.
+
+    Args:
+        sums: (4, ny, nx) of ``sum_cells``.
+        complete: (4, ny, nx) complete cells.
+        reach: Distance at which both weigh the same.
+        out: (4, ny, nx) float32, written.
+    """
+    ny, nx = sums.shape[1:]
+    above = np.empty(ny, np.int64)
+    for i in range(nx):
+        last = -1
+        for j in range(ny):
+            last = j if sums[3, j, i] > _LEAST_KNOWN else last
+            above[j] = last
+        below = ny
+        for j in range(ny - 1, -1, -1):
+            below = j if sums[3, j, i] > _LEAST_KNOWN else below
+            if sums[3, j, i] >= _ONE:
+                for c in range(4):
+                    out[c, j, i] = sums[c, j, i]
+                continue
+            up = _ONE / np.float32(max(j - above[j], 1)) if above[j] >= 0 else _ZERO
+            down = _ONE / np.float32(max(below - j, 1)) if below < ny else _ZERO
+            weight = np.float32(reach) / (_ONE + np.float32(reach) * (up + down))
+            for c in range(4):
+                value = complete[c, j, i] * (_ONE - weight * (up + down))
+                if above[j] >= 0:
+                    value += weight * up * sums[c, above[j], i] / sums[3, above[j], i]
+                if below < ny:
+                    value += weight * down * sums[c, below, i] / sums[3, below, i]
+                out[c, j, i] = value
+
+
+@compiled
+def put_cells(cells: Any, cell: int, chosen: Any, rounding: float, view: Any) -> None:
+    """Interpolate cells (4, ny, nx) into the chosen pixels (h, w) uint8 of a view (3, h, w); add ``rounding``."""
+    (h, w), (ny, nx) = chosen.shape, cells.shape[1:]
+    rows, left, share = np.empty((3, nx + 1), np.float32), np.empty(w, np.int32), np.empty(w, np.float32)
+    for x in range(w):
+        at = min(max((np.float32(x) + _HALF) / np.float32(cell) - _HALF, _ZERO), np.float32(nx - 1))
+        left[x], share[x] = np.int32(at), at - np.float32(np.int32(at))
+    for y in range(h):
+        found = np.uint8(0)
+        for x in range(w):
+            found |= chosen[y, x]
+        if not found:
+            continue
+        at = min(max((np.float32(y) + _HALF) / np.float32(cell) - _HALF, _ZERO), np.float32(ny - 1))
+        j0 = int(at)
+        j1, s = min(j0 + 1, ny - 1), at - np.float32(j0)
+        for c in range(3):
+            row, above, below = rows[c], cells[c, j0], cells[c, j1]
+            for i in range(nx):
+                row[i] = above[i] + s * (below[i] - above[i]) + np.float32(rounding)
+            row[nx] = row[nx - 1]
+        for x in range(w):
+            if chosen[y, x]:
+                i, t = left[x], share[x]
+                for c in range(3):
+                    view[c, y, x] = rows[c, i] + t * (rows[c, i + 1] - rows[c, i])
+
+
+@compiled
+def paint(pixel: Any, part: Any, beside: Any, table: Any, seen: Any, view: Any) -> None:
+    """Paint the unseen pixels of a view: by the pixel beside them, else in their part's colour where it is known.
+
+    Args:
+        pixel: (n,) into the flattened view; as are ``part`` and ``beside`` an attribute of ``view_plan.Paint``.
+        part: (n,).
+        beside: (n,).
+        table: (P, 3) float32 colours of the parts; the first is negative where unknown.
+        seen: (h w,) bool.
+        view: (3, h w), painted.
+    """
+    for k in range(pixel.shape[0]):
+        at, source, own = pixel[k], beside[k], part[k]
+        if seen[at]:
+            continue
+        for c in range(3):
+            if source >= 0:
+                view[c, at] = view[c, source]
+            elif own < table.shape[0] and table[own, 0] >= _ZERO:
+                view[c, at] = table[own, c]

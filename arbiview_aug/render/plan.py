@@ -92,7 +92,7 @@ def build_plan(
 @cache
 def compile_kernels() -> None:
     """Compile what plans call, or load it from numba's cache: in the parent process, before workers are forked."""
-    from arbiview_aug.render.kernels import read_ahead
+    from arbiview_aug.render import kernels
 
     views = [
         Camera.looking(
@@ -110,7 +110,15 @@ def compile_kernels() -> None:
     scene, config = Scene(boxes=boxes, points=wall), FavsConfig(certainty=True)
     for surface in ("ground", "objects", "lidar"):
         plan = build_plan(source, target, surface=surface, config=config, scene=scene)
-    read_ahead(np.zeros((1, 3), np.uint8), 3, plan.targets[0].at.packed, plan.targets[0].source_camera)
+    kernels.read_ahead(np.zeros((1, 3), np.uint8), 3, plan.targets[0].at.packed, plan.targets[0].source_camera)
+    cells, pixel, colours = np.ones((2, 4, 2, 2), np.float32), np.zeros(1, np.int32), np.ones((1, 3), np.float32)
+    kernels.halve(cells[0], 2, cells[1])
+    kernels.complete(cells[0], 2, cells[1])
+    kernels.continue_columns(cells[0], cells[0], 1.0, cells[1])
+    for view in (np.zeros((3, 2, 2), np.uint8), np.zeros((3, 2, 2), np.float32)):
+        kernels.sum_cells(view, np.zeros((2, 2), np.uint8), 1, cells[0])
+        kernels.put_cells(cells[0], 1, np.zeros((2, 2), np.uint8), 0.5, view)
+        kernels.paint(pixel, pixel, pixel, colours, np.zeros(4, bool), view.reshape(3, 4))
 
 
 def _built(

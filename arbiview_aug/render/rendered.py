@@ -12,7 +12,6 @@ import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.framing import Fit, framing
-from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.renderer import PaperRendering, paper_labels
@@ -23,6 +22,7 @@ from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.tone_curve import ToneCurve
 from arbiview_aug.render.torch_backend import render_torch
+from arbiview_aug.render.view_plan import Paint
 from arbiview_aug.sample.batching import barred, covered, framed, stacked
 from arbiview_aug.sample.inputs import Frame
 
@@ -51,7 +51,8 @@ class RenderedFrame:
         source_frame: Int8, 0 for the current frame, n + 1 for number n of its neighbours, -1 where uncovered.
         confidence: Float32 in [0, 1], 0 where uncovered.
         generated: Bool, True where a filler made up the pixel; None before filling.
-        occluded: (h, w) bool of each view, uncovered pixels inside some source's image; None for none.
+        layers: (h, w) uint8 of each view as in ``ViewPlan``, or None.
+        paint: That of each view as in ``ViewPlan``, what makes it, or None.
         certainty: (h, w) uint8 of each view as in ``ViewPlan``, for ``confidence_of``.
         seams: (h, w) float32 of each view, by how much blending changed it, for ``confidence_of``.
         labels: Renders label maps; None if there are none.
@@ -64,7 +65,8 @@ class RenderedFrame:
     source_frame: Maps | None = None
     confidence: Maps | None = None
     generated: Maps | None = None
-    occluded: Sequence[BoolArray | torch.Tensor | None] = ()
+    layers: Sequence[npt.NDArray[np.uint8] | torch.Tensor | None] = ()
+    paint: Sequence[Paint | Callable[[], Paint | None] | None] = ()
     certainty: Sequence[npt.NDArray[np.uint8] | torch.Tensor] = ()
     seams: Sequence[torch.Tensor] = ()
     labels: LabelRenderer | None = None
@@ -173,8 +175,8 @@ def _rendered(
     else:
         views = plan.targets
         winners = [torch.from_numpy(view.source_camera) for view in views]
-    occluded = [view.occluded for view in views]
-    rendered = _from_winners(images, plan.target, winners, occluded, partial(render_labels, plan), outputs)
+    rendered = _from_winners(images, plan.target, winners, partial(render_labels, plan), outputs)
+    rendered = replace(rendered, layers=[view.layers for view in views], paint=[view.paint for view in views])
     if "confidence" not in outputs:
         return rendered
     rendered = replace(
@@ -187,7 +189,6 @@ def _from_winners(
     images: list[torch.Tensor],
     rig: Rig,
     winners: Sequence[torch.Tensor],
-    occluded: Sequence[BoolArray | torch.Tensor | None],
     labels: Callable[[Sequence[torch.Tensor], float], list[torch.Tensor]],
     outputs: Collection[str],
 ) -> RenderedFrame:
@@ -198,7 +199,6 @@ def _from_winners(
         covered(winners),
         source_camera=stacked([winner.clone() for winner in winners]) if "source_camera" in outputs else None,
         source_frame=stacked([winner.clamp(max=0) for winner in winners]) if "source_frame" in outputs else None,
-        occluded=occluded,
         labels=lambda maps, fill: labels(maps, fill(maps[0].dtype)),
     )
 
@@ -213,9 +213,10 @@ def confidence_of(rendered: RenderedFrame) -> Maps:
 def as_rendered(rendering: PaperRendering, outputs: Collection[str] = ()) -> RenderedFrame:
     """Convert the rendering of ``quality="paper"``; ``outputs`` as in ``Renderer.render``."""
     views = rendering.targets
-    winners, occluded = [torch.from_numpy(view.source_camera) for view in views], [view.occluded for view in views]
-    labels = partial(paper_labels, rendering)
-    return _from_winners([view.image for view in views], rendering.target, winners, occluded, labels, outputs)
+    winners, labels = [torch.from_numpy(view.source_camera) for view in views], partial(paper_labels, rendering)
+    rendered = _from_winners([view.image for view in views], rendering.target, winners, labels, outputs)
+    layers = [view.occluded if view.occluded is None else view.occluded.view(np.uint8) for view in views]
+    return replace(rendered, layers=layers, paint=[None] * len(views))
 
 
 # --- resized only -----------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ than one second source. A plan's grids are computed once for each device.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -20,7 +20,7 @@ import torch
 from arbiview_aug.render.atlas import AtlasLayout, Slot
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.tone_curve import ToneCurve
-from arbiview_aug.render.view_plan import ViewPlan
+from arbiview_aug.render.view_plan import Paint, ViewPlan
 
 
 @dataclass(frozen=True)
@@ -41,16 +41,17 @@ class ViewMaps:
     source: torch.Tensor  # (h, w) int8 index of the winning source, -1 where none sees
     blend: Blend | None
     edge: tuple[torch.Tensor, torch.Tensor] | None  # the view's ``BilinearFallback``: (n,) int64 and (1, n, 2) float32
-    interpolation: str  # as in ``ViewPlan``, like the next two
+    interpolation: str  # as in ``ViewPlan``, like the next three
     certainty: torch.Tensor | None  # (h, w) uint8
-    occluded: torch.Tensor | None  # (h, w) bool
+    layers: torch.Tensor | None  # (h, w) uint8
+    paint: Callable[[], Paint | None]  # made when it is asked for: it is read back from the device
     slots: tuple[Slot, ...]  # where its sources lie in the atlas
     covered: float  # share of its pixels that some source sees
 
     @property
     def nbytes(self) -> int:
         """Memory in bytes."""
-        further = [part for part in (self.certainty, self.occluded) if part is not None]
+        further = [part for part in (self.certainty, self.layers) if part is not None]
         tensors = [self.grid, self.source, *(self.edge or ()), *further]
         if self.blend is not None:
             tensors += [self.blend.pixel, self.blend.grid, self.blend.weight, self.blend.source]
@@ -68,9 +69,9 @@ def maps_on(plan: RenderPlan, device: torch.device) -> Sequence[ViewMaps]:
 
 def _view_maps(plan: RenderPlan, target: ViewPlan, device: torch.device) -> ViewMaps:
     atlas_size = plan.layout.size
-    source, certainty, occluded, pixel = (
+    source, certainty, layers, pixel = (
         None if array is None else torch.from_numpy(array).to(device)
-        for array in (target.source_camera, target.certainty, target.occluded, target.edge and target.edge.pixel)
+        for array in (target.source_camera, target.certainty, target.layers, target.edge and target.edge.pixel)
     )
     assert source is not None
     edge = None
@@ -78,9 +79,8 @@ def _view_maps(plan: RenderPlan, target: ViewPlan, device: torch.device) -> View
         edge = pixel, _grid(target.edge.at.to_float(), atlas_size, device)
     grid, blend = _grid(target.at.to_float(), atlas_size, device), _blend(target, atlas_size, device)
     slots = tuple(plan.layout.slot(pair.source, pair.level) for pair in target.pairs)
-    return ViewMaps(
-        grid, source, blend, edge, target.interpolation, certainty, occluded, slots, float(target.coverage.mean())
-    )
+    seen, paint = float(target.coverage.mean()), lambda: target.paint
+    return ViewMaps(grid, source, blend, edge, target.interpolation, certainty, layers, paint, slots, seen)
 
 
 def positions(grid: torch.Tensor, atlas_size: tuple[int, int]) -> torch.Tensor:

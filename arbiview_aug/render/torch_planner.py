@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import cv2
@@ -30,6 +31,7 @@ from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.render.seams import LEAST_SHARE
 from arbiview_aug.render.torch_backend import Blend, ViewMaps
+from arbiview_aug.render.view_plan import NEARER, OBJECT, Paint, nearer_cells
 from arbiview_aug.render.view_planner import (
     MAGNIFIED,
     SMALL_SIDE_PX,
@@ -37,11 +39,11 @@ from arbiview_aug.render.view_planner import (
     halvings,
     source_bounds,
 )
-from arbiview_aug.scene.boxes import BOX_ERROR, UNLABELLED
+from arbiview_aug.scene.boxes import BOX_ERROR, UNLABELLED, BoxSurface
 from arbiview_aug.scene.point_cloud import COARSE, MEASURED_SPREAD, Cells, occlusion_level
 from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.shapes import PIECES
-from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
+from arbiview_aug.scene.static import Far, is_within_wall, worst_parallax_px
 from arbiview_aug.scene.torch_points import PanoramaViews, upsampled
 from arbiview_aug.scene.torch_surface import (
     Poses,
@@ -503,7 +505,37 @@ class _ViewBatch:
             for row, levels, count in zip(self.numbers, self.levels, self.won_px + added_px, strict=True)
         ]
         self.winner, self.second, self.at, self.at_second = winner, second, at, at_second
-        self.share, self.certainty, self.occluded = share, certainty, in_image & (winner < 0)
+        self.share, self.certainty, self.layers = share, certainty, self._layers(in_image & (winner < 0))
+
+    def _layers(self, occluded: torch.Tensor) -> torch.Tensor:
+        """The views' layers (V, h, w) uint8: ``kernels.mark_objects``."""
+        step, (h, w), reach = self.step, self.size, nearer_cells(self.size, self.step)
+        layers = occluded.to(torch.uint8)
+        behind = occluded & (self.q > 0)
+        behind = behind if self.face is None else behind & (self.face < 0)
+        nearness = torch.where(behind, -self.q, -math.inf)
+        cells = _pad(nearness, (0, -w % step, 0, -h % step), value=-math.inf)
+        cells = torch.nn.functional.max_pool2d(cells[:, None], step)
+        cells = torch.nn.functional.max_pool2d(cells, 2 * reach + 1, 1, reach)[:, 0]
+        limit = -NEARER * cells.repeat_interleave(step, 1).repeat_interleave(step, 2)[:, :h, :w]
+        layers[(self.winner >= 0) & (self.q > limit)] = OBJECT
+        if self.face is not None:
+            layers[self.face >= 0] = OBJECT
+        used = on_device(self.is_near.any(1), self.device) & occluded.any(2).any(1)
+        return torch.where(used[:, None, None], layers, occluded.byte())
+
+    def _paint(self, row: int) -> Callable[[], Paint | None]:
+        """Makes a view's paint once it is asked for."""
+        if self.face is None or not self.is_near[row].any():
+            return lambda: None
+        (boxes,), (solids,) = self._objects_of([self.frames[row]])
+        on_view = boxes, solids, self.face[row], self.winner[row]
+
+        def made() -> Paint:
+            boxes, solids, face, winner = (part.cpu().numpy() for part in on_view)
+            return Paint.of(face, winner, BoxSurface(Far(), boxes, solids).face_parts)
+
+        return cache(made)
 
     def maps_into(self, layouts: Sequence[AtlasLayout]) -> Iterator[tuple[tuple[int, int], ViewMaps]]:
         """The maps of each view into its frame's atlas."""
@@ -539,7 +571,8 @@ class _ViewBatch:
                 edge,
                 ways[row],
                 certain,
-                self.occluded[row],
+                self.layers[row],
+                self._paint(row),
                 used,
                 covered,
             )

@@ -12,6 +12,10 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.render.atlas import FixedMap
 from arbiview_aug.render.tone_curve import TonePatch, patches
 
+_SAMPLES = 64  # colours of objects are read so many times along a view's shorter side
+_INSIDE_PX = 2  # this far inside their faces: pixels at a border mix two colours
+_BESIDE_PX = 8  # cracks are narrower than twice this
+
 
 @dataclass(frozen=True)
 class SourceUse:
@@ -55,6 +59,54 @@ class BilinearFallback:
         return self.pixel.nbytes + self.at.nbytes
 
 
+BACKGROUND, OCCLUDED, OBJECT = range(3)
+"""Layers of a view's pixels: background that is seen, or outside all images; background that something hides; objects,
+and what is nearer than occluded background beside it."""
+
+NEARER, NEARER_REACH = 1.5, 1 / 16
+"""Pixels so many times nearer than occluded background, within this share of the view's shorter side beside it, are not
+what continues it."""
+
+
+def nearer_cells(size: tuple[int, int], step: int) -> int:
+    """``NEARER_REACH`` of a view (h, w) in cells of ``step`` pixels, at least one."""
+    return max(1, round(NEARER_REACH * min(size) / step))
+
+
+@dataclass(frozen=True)
+class Paint:
+    """Parts of objects that no source sees, and where their colours are read in the view.
+
+    Attributes:
+        pixel: (n,) int32 unseen pixels of objects, into the flattened view.
+        part: (n,) int32 what they show: twice the object's number, 1 more on its top.
+        beside: (n,) int32 the nearest seen pixel of the same part in its row or column, -1 for none nearby.
+        sample: (m,) int32 seen pixels of objects, a sample.
+        sample_part: (m,) int32 what those show.
+    """
+
+    pixel: npt.NDArray[np.int32]
+    part: npt.NDArray[np.int32]
+    beside: npt.NDArray[np.int32]
+    sample: npt.NDArray[np.int32]
+    sample_part: npt.NDArray[np.int32]
+
+    @classmethod
+    def of(cls, face: npt.NDArray[np.int32], winner: npt.NDArray[np.int8], parts: npt.NDArray[np.int32]) -> Paint:
+        """The paint of a view of faces (h, w), winning sources, and the parts (n,) of faces."""
+        from arbiview_aug.render.kernels import find_paint
+
+        step = max(1, min(face.shape) // _SAMPLES)
+        found = np.empty((5, face.size), np.int32)
+        hidden, sampled = find_paint(face, parts, winner, _BESIDE_PX, step, _INSIDE_PX, found)
+        return cls(*found[:3, :hidden].copy(), *found[3:, :sampled].copy())
+
+    @property
+    def nbytes(self) -> int:
+        """Memory in bytes."""
+        return 3 * self.pixel.nbytes + 2 * self.sample.nbytes
+
+
 @dataclass(frozen=True)
 class ViewPlan:
     """How one target view is rendered.
@@ -67,8 +119,8 @@ class ViewPlan:
         interpolation: ``nearest``, ``linear`` or ``cubic``.
         certainty: (h, w) ``confidence.certainty`` of the winning source in 255ths, 0 where uncovered; on request.
         edge: Pixels that must not be read by cubics.
-        occluded: (h, w) bool, uncovered pixels that lie in some source's image, behind an object or the source's own
-            car; None if there are none.
+        layers: (h, w) uint8 layer of each pixel, for fillers; None if no pixel in a source's image is occluded.
+        paint: Unseen parts of objects; None without ``layers`` or objects.
     """
 
     at: FixedMap
@@ -78,7 +130,8 @@ class ViewPlan:
     interpolation: str = "linear"
     certainty: npt.NDArray[np.uint8] | None = None
     edge: BilinearFallback | None = None
-    occluded: BoolArray | None = None
+    layers: npt.NDArray[np.uint8] | None = None
+    paint: Paint | None = None
 
     @property
     def coverage(self) -> BoolArray:
@@ -104,5 +157,5 @@ class ViewPlan:
     def nbytes(self) -> int:
         """Memory in bytes."""
         bands = sum(b.at.nbytes + b.weight.nbytes for b in self.bands)
-        further = sum(part.nbytes for part in (self.certainty, self.edge, self.occluded) if part is not None)
+        further = sum(part.nbytes for part in (self.certainty, self.edge, self.layers, self.paint) if part is not None)
         return self.at.nbytes + self.source_camera.nbytes + bands + further

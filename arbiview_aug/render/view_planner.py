@@ -25,7 +25,14 @@ from arbiview_aug.render.atlas import AtlasLayout, FixedMap
 from arbiview_aug.render.confidence import certainty
 from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.render.seams import SecondBest, seam_weights
-from arbiview_aug.render.view_plan import BilinearFallback, SourceUse, ViewPlan
+from arbiview_aug.render.view_plan import (
+    NEARER,
+    BilinearFallback,
+    Paint,
+    SourceUse,
+    ViewPlan,
+    nearer_cells,
+)
 from arbiview_aug.scene.point_cloud import occlusion_level
 from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
@@ -355,10 +362,26 @@ class ViewPlanner:
             fixed = fixed.rounded()
         edge = self._edge(fixed, winner, layout) if interpolation == "cubic" else None
         reports = tuple(self._reports(winner, won_px))
-        occluded: Any = (winner < 0) & (in_image > 0)
-        return ViewPlan(
-            fixed, winner, bands, reports, interpolation, certain, edge, occluded if occluded.any() else None
-        )
+        layers = ((winner < 0) & (in_image > 0)).view(np.uint8)
+        if not layers.any():
+            return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge)
+        paint = self._mark_objects(winner, layers)
+        return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge, layers, paint)
+
+    def _mark_objects(self, winner: npt.NDArray[np.int8], layers: npt.NDArray[np.uint8]) -> Paint | None:
+        """Complete a view's layers where sources elsewhere show what is near."""
+        from arbiview_aug.render.kernels import farthest_occluded, mark_objects
+
+        near = next((region for region in self.regions if region.surface != "far"), None)
+        if near is None:
+            return None
+        surface, geometry = cast(Any, self.surface_by_name(near.surface)), near.geometry
+        farthest = np.empty(self._open.shape, np.float32)
+        farthest_occluded(geometry.q, geometry.face, layers, self.step, farthest)
+        side = 2 * nearer_cells(self.camera.size, self.step) + 1
+        limit = cv2.erode(NEARER * farthest, np.ones((side, side), np.uint8))
+        mark_objects(geometry.q, geometry.face, winner, limit, self.step, layers)
+        return Paint.of(geometry.face, winner, surface.face_parts) if geometry.face.size else None
 
     def _target(self, region: _Region) -> tuple[Any, ...]:
         return self.rays.planes, self.rays.parameters, region.geometry.q, region.geometry.face

@@ -94,6 +94,11 @@ class BoxSurface(LayeredSurface):
         """Whether faces (n,) look upwards: roofs and bonnets."""
         return np.asarray(self.solids[..., 2].reshape(-1) > TOP)
 
+    @property
+    def face_parts(self) -> npt.NDArray[np.int32]:
+        """Twice the object of each face (n,), 1 more for tops: what fillers paint in one colour."""
+        return (2 * self.face_objects + self.face_is_top).astype(np.int32)
+
     def _widened(self, origin: FloatArray, pixel_rad: float, lift: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """Boxes and planes half a pixel wider, as border pixels mix colours; floors ``lift`` pixels higher."""
         pixel_m = pixel_rad * np.linalg.norm(self.boxes[:, :3] - origin, axis=-1)

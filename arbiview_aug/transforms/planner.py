@@ -141,7 +141,7 @@ class FramePlanner:
         pairs = [self._pair(frame.rig, target) for frame in frames]
         if isinstance(self.config, PaperConfig):
             detections: Sequence[OfCameras] = [{}] * len(frames)
-            if self.config.use_detections:
+            if self.config.use_detections and any(sample.get(key) is not None for key in ("detections", "boxes_3d")):
                 detections = detections_of_frames(sample, frames, lead)
             return [FramePlan(f.rig, p.target, detections=d) for f, p, d in zip(frames, pairs, detections, strict=True)]
         given = sample.get("neighbours")

@@ -77,12 +77,13 @@ class RigRetarget(torch.nn.Module):
         source_rig: The rig of every sample that carries none.
         path: ``favs``: stitching; ``holes`` says what becomes of pixels that no source sees. ``inpaint``: Telea's
             inpainting fills them at full size. ``diffusion``: a generator (``arbiview_aug.generator``) fills them.
-        holes: What pixels become that neither a source nor ``neighbours`` show, with ``path="favs"``. ``fill``:
-            occluded pixels, and those outside all source images by up to an eighth of the view's shorter side, are
-            continued from their borders; farther ones get the mean colour of the frame's views. ``mean``: all get that
-            colour. ``black``: they stay black. Filled pixels are True in ``generated`` (..., M, h, w) bool; their
-            ``coverage`` stays False, ``confidence`` 0, ``source_camera`` -1 and labels ``label_fill``. Covered pixels
-            are not changed.
+        holes: What pixels become that neither a source nor ``neighbours`` show, with ``path="favs"``. ``fill``: the
+            background is continued behind objects, mostly along rows, and outside all source images, mostly along
+            columns; unseen parts of labelled objects take their object's colour, tops that of its top as a source sees
+            it, else of its sides in the frame's light. ``mean``: all get the mean colour of the frame's views.
+            ``black``: they stay black. Filled pixels are True in ``generated`` (..., M, h, w) bool; their ``coverage``
+            stays False, ``confidence`` 0, ``source_camera`` -1 and labels ``label_fill``. Covered pixels are not
+            changed.
         generator: For ``diffusion``: ``Generator.from_pretrained(DIR)``; None loads the shipped weights, trained on
             synthetic streets alone. A generator on a GPU needs ``num_workers=0``, or ``generator.complete_batch`` after
             collating.
