@@ -376,13 +376,15 @@ def read_layer(rows: Any, columns: Any, layer: Any, out: Any) -> None:
 @compiled
 def _between(nodes: Any, step: int, out: Any) -> None:
     """Values (n,) between nodes ``step`` apart; the last ones lie on the last pixel."""
-    n = out.shape[0]
-    for i in range(nodes.shape[0] - 1):
-        first, last = i * step, min(i * step + step, n - 1)
-        value, slope = nodes[i], (nodes[i + 1] - nodes[i]) / np.float32(max(last - first, 1))
-        part = out[first : min(first + step, n)]
-        for k in range(part.shape[0]):
-            part[k] = value + slope * np.float32(k)
+    whole = nodes.shape[0] - 2
+    for k in range(step):
+        part, t = out[k : whole * step : step], np.float32(k) / np.float32(step)
+        for i in range(part.shape[0]):
+            part[i] = nodes[i] + (nodes[i + 1] - nodes[i]) * t
+    last = out[whole * step :]
+    for k in range(last.shape[0]):
+        t = np.float32(k) / np.float32(max(last.shape[0] - 1, 1))
+        last[k] = nodes[whole] + (nodes[whole + 1] - nodes[whole]) * t
 
 
 @compiled

@@ -68,6 +68,11 @@ class Cells(NamedTuple):
         """Coarse where a pixel is wider than a cell: fisheye views of 256 x 704 gain 0 to 0.2 dB."""
         return FINE if CELL_RAD * camera.K[0, 0] >= 1 else COARSE
 
+    def apart(self, camera: Camera) -> int:
+        """Pixels between rays along which it is known what hides: a fine cell about, a coarse one at most."""
+        pixels = self.rad * float(camera.K[0, 0])
+        return max(1, round(pixels) if self.rad == CELL_RAD else int(pixels))
+
     @property
     def beyond(self) -> float:
         """So far below and above all points a window's halo, too, shows the static surface, radians."""
@@ -213,6 +218,7 @@ class PointCloudSurface(DenseSurface):
     points: Points
     _panoramas: dict[bytes, tuple[tuple[float, float], list[Panorama]]] = field(default_factory=dict, repr=False)
     _shadows: dict[Camera, OcclusionMap] = field(default_factory=dict, repr=False)
+    _latest: dict[bytes, Panorama] = field(default_factory=dict, repr=False)
     _nodes: dict[tuple[Camera, Cells], tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -243,10 +249,10 @@ class PointCloudSurface(DenseSurface):
         """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart."""
         from arbiview_aug.scene.completion import interpolate_layer
 
-        view, *cells = self._located(camera, rays, COARSE if coarse else Cells.for_camera(camera), memory)
-        apart = max(1, round(CELL_RAD * float(rays.parameters[0])))
+        cells = COARSE if coarse else Cells.for_camera(camera)
+        view, *nodes = self._located(camera, rays, cells, memory)
         hidden = memory.empty(camera.size, np.float32)
-        interpolate_layer(*cells, view.hidden_below, apart, hidden)
+        interpolate_layer(*nodes, view.hidden_below, cells.apart(camera), hidden)
         return np.asarray(hidden)
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
@@ -254,7 +260,7 @@ class PointCloudSurface(DenseSurface):
         from arbiview_aug.scene.completion import read_layer
 
         rays = np.moveaxis(directions.reshape(1, -1, 3), -1, 0).astype(np.float32, order="C")
-        view = self.view(origin, directions)
+        view = self._latest.get(origin.tobytes()) or self.view(origin, directions)  # of a window, no more is open
         near = np.empty(rays.shape[2], np.float32)
         read_layer(*(cells[0] for cells in view.cells(rays, np.eye(3))), view.layers[3], near)
         unknown = self.street.uncertainty(origin, directions, inverse_distance)
@@ -276,6 +282,7 @@ class PointCloudSurface(DenseSurface):
             step = 1 if steep or view.window.columns >= view.window.cells.turn else step
             local = rays.planes if step == 1 and rays.planes.size else nodes_of(rays, step)
             self._nodes[camera, cells] = view, *view.cells(local, R), step
+        self._latest[camera.center_m.tobytes()] = self._nodes[camera, cells][0]
         return self._nodes[camera, cells]
 
     def view(
@@ -310,8 +317,9 @@ def directions_of(rays: PixelRays, R: FloatArray) -> tuple[FloatArray, int]:
     for apart in (max(step, CELL_PX), step):  # an image circle ends between nodes
         local = nodes_of(rays, apart)
         valid = local.any(axis=0)
-        if valid.all():
-            return local.reshape(3, -1).T @ R.T, step
+        if valid.all():  # windows end at the border, or about a pole
+            parts = local[:, ::4, ::4], local[:, [0, -1]], local[:, :, [0, -1]]
+            return np.concatenate([part.reshape(3, -1) for part in parts], axis=1).T @ R.T, step
     return local[:, valid].T @ R.T, 1
 
 

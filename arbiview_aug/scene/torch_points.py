@@ -13,7 +13,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import CameraMaps
 from arbiview_aug.cameras.torch_rays import on_device
 from arbiview_aug.scene.completion import LEAST_WEIGHT
-from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, NEAREST_M, STEP, STEP_PER_M
+from arbiview_aug.scene.panorama import BASE_STEP, NEAREST_M, STEP, STEP_PER_M
 from arbiview_aug.scene.point_cloud import OWN_CAR_M, Cells, Window, directions_of
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 from arbiview_aug.scene.torch_surface import static_image
@@ -44,7 +44,7 @@ class PanoramaViews:
         self._size = tuple(max(sides) for sides in zip(*(window.shape for window in windows), strict=True))
         self._place = on_device(np.stack([window.place for window in windows]), device)[:, :, None, None]
         bounds = on_device(np.stack([window.bounds for window in windows]), device)
-        self._apart = np.array([max(1, round(CELL_RAD * float(camera.K[0, 0]))) for camera in cameras])
+        self._apart = np.array([cells.apart(camera) for camera in cameras])
         self._centers_m, self._ground_z_m = np.stack([camera.center_m for camera in cameras]), ground_z_m
         q, residual = self._nearest_points(points, bounds)
         q = torch.where(self._is_hidden(q), 0.0, q)
