@@ -3,7 +3,7 @@
 The target is the front camera on even streets and the front-left one on odd ones: three sources serve them.
 
 Each street is rendered twice: with its vehicles and people as they are (``shapes``), and with each replaced by a block
-that fills its label (``blocks``). What a box cannot know, a cabin narrower than its label, shows in the difference.
+that fills its label (``blocks``), and planned so. What a profile cannot know shows in the difference.
 
 Truth is read off the ray caster's depth images. A target pixel's scene point is *seen* by a source where it projects
 into its image and no pixel within one of it is nearer; *hidden* where all pixels within one of it are nearer, in every
@@ -29,8 +29,10 @@ from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_sou
 from arbiview_aug.datasets.synthetic.scene import BoxClass, Material, Scene, SceneBuilder
 from arbiview_aug.render.labels import render_labels
 from arbiview_aug.render.plan import build_plan
-from arbiview_aug.scene.boxes import checked_boxes, draw_boxes
+from arbiview_aug.scene.boxes import BoxSurface, checked_boxes, draw_boxes
 from arbiview_aug.scene.scene import Scene as Geometry
+from arbiview_aug.scene.shapes import PIECES, whole
+from arbiview_aug.scene.static import Street
 from tests.helpers import few_or_all
 
 pytestmark = pytest.mark.timeout(1800)
@@ -116,9 +118,14 @@ def measure(seed: int, found: dict[tuple[str, str, str], Found]) -> None:
     drive = SyntheticDrive(source, num_frames=1, seed=seed, lidar=False, supersampling=1)
     scene = drive.scene(0)
     geometry = Geometry(checked_boxes(scene.boxes_ego(rig.ground_z_m)))
+    filled = np.repeat(whole(geometry.boxes), PIECES, axis=1)  # what blocks are
+    filled[:, 1:, :, 3] = -1e6  # no further piece
+    of_blocks = BoxSurface(Street(ground_z_m=rig.ground_z_m), geometry.boxes, filled)
     vehicles = np.flatnonzero(scene.box_classes != BoxClass.PEDESTRIAN)
     for world in WORLDS:
         drive._scene = (0, blocks(scene) if world == "blocks" else scene)
+        if world == "blocks":
+            geometry._surfaces["objects", rig.ground_z_m] = of_blocks
         recorded = drive.render(0)
         depth_m, instances = recorded.depth_m.numpy(), recorded.instances.numpy()
         for move, shift in MOVES.items():
@@ -208,7 +215,15 @@ def test_no_colour_of_an_object_leaves_its_box(found: dict, world: str, move: st
 
 @pytest.mark.parametrize("move", MOVES)
 def test_what_blocks_hid_and_nothing_else_is_a_hole(found: dict, move: str) -> None:
-    """Vehicles do not fill their boxes: for ``shapes`` the printed table says how much is missed."""
+    """Profiles are not the vehicles themselves: for ``shapes`` the printed table says how much is missed."""
     here = found["blocks", move, "objects"]
     assert here.share("right", "marked") >= 0.95
     assert here.share("within 2 px", "hidden") >= 0.95
+
+
+@pytest.mark.parametrize("move", MOVES)
+def test_holes_of_vehicles_are_not_their_boxes(found: dict, move: str) -> None:
+    """Six streets: precision and recall 0.85, 0.88 from above, 0.82, 0.79 from the left; of boxes 0.53 to 0.58."""
+    here = found["shapes", move, "objects"]
+    assert here.share("right", "marked") >= 0.78
+    assert here.share("within 2 px", "hidden") >= 0.75
