@@ -9,6 +9,7 @@ from arbiview_aug.favs.config import FavsConfig, PaperConfig
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.sample.boxes_2d import ImageBoxes, project_boxes_3d
 from arbiview_aug.sample.mistakes import CheckReport, Finding, check
+from arbiview_aug.sample.training import lift_mask, visible_boxes
 from arbiview_aug.transforms.resize import CropRig, ResizeRig
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
@@ -34,7 +35,9 @@ __all__ = [
     "SampleError",
     "SampleTypeError",
     "check",
+    "lift_mask",
     "load_rig",
     "project_boxes_3d",
     "shipped_rigs",
+    "visible_boxes",
 ]
