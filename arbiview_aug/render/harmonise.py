@@ -265,8 +265,7 @@ def _raw_db(pairs: Sequence[tuple[npt.NDArray[np.floating], npt.NDArray[np.float
 
 
 Harmonise = bool | HarmoniseConfig | Sequence[float] | None
-"""A user's choice: None to estimate gains in frames where a view shows several sources, True or a config to do so in
-every frame, given gains, or False for none."""
+"""A user's choice: None or False for none, True or a config to estimate gains for every frame, or given gains."""
 
 
 class Harmoniser:
@@ -281,9 +280,8 @@ class Harmoniser:
 
     def __init__(self, choice: Harmonise = None) -> None:
         self.config = choice if isinstance(choice, HarmoniseConfig) else HarmoniseConfig()
-        self.estimates = choice is None or choice is True or isinstance(choice, HarmoniseConfig)
-        self.gains = None if self.estimates or choice is False else _checked_gains(choice)
-        self._always = choice is not None
+        self.estimates = choice is True or isinstance(choice, HarmoniseConfig)
+        self.gains = None if self.estimates or choice is None or choice is False else _checked_gains(choice)
         self.is_on = self.estimates or self.gains is not None
         self._overlaps: LRUCache[bytes, Overlaps] = LRUCache(_CACHED_RIGS)
 
@@ -303,12 +301,9 @@ class Harmoniser:
         overlaps = self._overlaps.get(rig.content_key, lambda: find_overlaps(rig, self.config))
         return estimate_gains(rig, images, self.config, overlaps=overlaps)
 
-    def curves(self, rig: Rig, images: Sequence[torch.Tensor], mixes: bool = True) -> tuple[ToneCurve, ...] | None:
-        """A tone curve for each camera; None if the images stay as they are.
-
-        ``mixes`` says whether a view shows several sources.
-        """
-        if not self.is_on or not (mixes or self._always):
+    def curves(self, rig: Rig, images: Sequence[torch.Tensor]) -> tuple[ToneCurve, ...] | None:
+        """A tone curve for each camera; None if the images stay as they are."""
+        if not self.is_on:
             return None
         gains = self.report(rig, images).gains
         return None if all(g == 1 for g in gains) else tuple(ToneCurve(g, self.config.knee) for g in gains)

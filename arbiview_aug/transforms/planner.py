@@ -182,8 +182,7 @@ class FramePlanner:
             surface = self._surface(scene)
             if neighbours and self.reach is not None:
                 fills = plan_fills(plan, neighbours, scene, surface, self.config, self.reach, self.maps)
-            mixes = not plan.targets or any(len(view.pairs) > 1 for view in plan.targets)
-            curves = self.harmoniser.curves(frame.rig, frame.images, mixes)
+            curves = self.harmoniser.curves(frame.rig, frame.images) if self.harmoniser.is_on else None
             harm = pair.harm if SURFACES[surface].is_static else None
             plans.append(FramePlan(frame.rig, pair.target, plan, {}, depth, motion, fills, curves, harm))
         return plans

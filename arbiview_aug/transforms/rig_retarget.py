@@ -105,10 +105,9 @@ class RigRetarget(torch.nn.Module):
             detector: a warning says so once, unless ``p`` leaves half of the samples untouched. Points and boxes need a
             new plan for every frame.
         strict: Raise SampleError instead of that warning.
-        harmonise: Bring the sources to one exposure (``arbiview_aug.render.harmonise``). None: in frames where a view
-            shows several sources, a gain for each camera is estimated from their overlaps, and used if held-out pixels
-            of the overlaps agree better (never with ``paper``). True or a ``HarmoniseConfig``: the same in every frame.
-            Numbers are used as gains. False: off. Samples that ``p`` skips keep their exposures.
+        harmonise: Bring the sources to one exposure (``arbiview_aug.render.harmonise``): True or a ``HarmoniseConfig``
+            estimates a gain for each camera in every frame; numbers are used as gains. Off by default, and for samples
+            that ``p`` skips.
         refinement: Cache for the depth from overlap of ``quality="accurate"``, which depends on the images. None
             computes depth and plans for every frame; a ``RefinementCache`` reuses both where its key is the same.
         neighbours: What other frames of the drive (the sample's ``neighbours``, see ``arbiview_aug.sample.neighbours``)
@@ -226,7 +225,7 @@ class RigRetarget(torch.nn.Module):
         self.planner = FramePlanner(
             self.config,
             surface,
-            Harmoniser(False if harmonise is None and isinstance(self.config, PaperConfig) else harmonise),
+            Harmoniser(harmonise),
             refinement,
             cache_bytes=0 if drawn_anew else cache_bytes,
             reach=neighbours,

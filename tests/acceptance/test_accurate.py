@@ -52,7 +52,7 @@ class Frame(ProtocolFrame):
     """Rendered and scored."""
 
     def render(self, target: Rig, quality: Quality) -> tuple[list[Image], BoolArray]:
-        retarget = RigRetarget(target, source_rig=self.rig, quality=quality, harmonise=False, holes="black")
+        retarget = RigRetarget(target, source_rig=self.rig, quality=quality, holes="black")
         out = retarget({"images": as_tensors(self.images)})
         return as_arrays(out["images"]), out["coverage"].numpy()
 
@@ -245,8 +245,7 @@ def test_slower_is_better(streets: Truth, move: str) -> None:
 def test_slower_is_better_around_boxes(streets: Truth, move: str) -> None:
     """Objects are where their labels say, whatever was measured: on them within 0.03 dB.
 
-    It was 0.01 where a box covered all of its object. Wheels and mirrors stand out of the shapes, over what is
-    measured.
+    It was 0.01 where a box covered all of its object: wheels and mirrors stand out of shapes, over what is measured.
     """
     fast, accurate = (np.nanmean(streets[move, "objects", quality], axis=0) for quality in QUALITIES)
     assert (accurate >= fast - [0, 0, 0.03]).all()

@@ -76,7 +76,7 @@ UNIFORM = ("blank", "grey", "saturated")
     ("kind", "how"),
     sampled(
         [*UNIFORM, "noise", "checkerboard", "coarse checkerboard", "gradient"],
-        [*((q, False) for q in QUALITIES), ("fast", True), ("accurate", True)],
+        [*((q, None) for q in QUALITIES), ("fast", True), ("accurate", True)],
     ),
 )
 def test_every_quality_keeps_the_range_of_the_images(kind: str, how: tuple[Any, bool | None]) -> None:

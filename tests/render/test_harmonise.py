@@ -148,7 +148,7 @@ def test_harmful_gains_are_declined(street) -> None:
     report = estimate_gains(rig, spoiled, strict, overlaps=overlaps)
     assert not report.accepted and report.gains == (1.0,) * 6 and "would not help" in report.reason
     assert report.raw_db_after > report.raw_db_before  # what it would have been
-    assert torch.equal(retargeted(rig, spoiled, harmonise=strict), retargeted(rig, spoiled, harmonise=False))
+    assert torch.equal(retargeted(rig, spoiled, harmonise=strict), retargeted(rig, spoiled))
     # Where fitted pixels lie, the first camera reads a brighter image: a lie that the others uncover.
     lies = [image.clone() for image in images]
     for pair in overlaps.pairs:
@@ -263,7 +263,7 @@ def test_the_transform(street) -> None:
     rig, images = street
     spoiled = exposed(images, 0, 1.3)
     sample = {"images": torch.stack(spoiled), "rig": rig}
-    plain, estimating = (RigRetarget(rig.turned(yaw_deg=20), harmonise=choice) for choice in (False, True))
+    plain, estimating = RigRetarget(rig.turned(yaw_deg=20)), RigRetarget(rig.turned(yaw_deg=20), harmonise=True)
     report = estimating.harmonisation(sample)
     assert isinstance(report, PhotometricReport) and report == estimate_gains(rig, spoiled)
     out = estimating(sample)["images"]
@@ -282,20 +282,6 @@ def test_the_transform(street) -> None:
     assert "gains" not in str(plain.explain(sample)) and plain.harmonisation(sample).reason == "harmonise is off"
     assert fixed.harmonisation(sample).reason == "given"
     assert "harmonise=off" in repr(plain) and "max_gain" in repr(estimating)
-
-
-def test_views_of_several_sources_are_harmonised_by_default(street) -> None:
-    rig, images = street
-    sample = {"images": torch.stack(exposed(images, 0, 1.3)), "rig": rig}
-
-    def views(target: Rig, harmonise: bool | None) -> torch.Tensor:
-        return RigRetarget(target, harmonise=harmonise)(sample)["images"]
-
-    turned = rig.turned(yaw_deg=20)
-    assert torch.equal(views(turned, None), views(turned, True))
-    assert not torch.equal(views(turned, None), views(turned, False))
-    assert torch.equal(views(rig, None), views(rig, False)) and not torch.equal(views(rig, None), views(rig, True))
-    assert "harmonise=off" in repr(RigRetarget(rig, quality="paper"))
 
 
 def test_messages(street) -> None:
