@@ -358,9 +358,9 @@ def _blocks_row(rows: Any, columns: Any, h: int, w: int, first: Any, down: Any, 
 @compiled
 def _mixed(layer: Any, i: int, w: int, s: float, t: float) -> float:
     """Bilinear value in the 2 x 2 cells from flat index ``i`` on, in rows of ``w``."""
-    j, k, m = np.uint32(i + 1), np.uint32(i + w), np.uint32(i + w + 1)
-    above = layer[i] + (layer[j] - layer[i]) * t
-    return above + (layer[k] + (layer[m] - layer[k]) * t - above) * s
+    i, one, w = np.uint64(i), np.uint64(1), np.uint64(w)  # signed sums are slower
+    above = layer[i] + (layer[i + one] - layer[i]) * t
+    return above + (layer[i + w] + (layer[i + w + one] - layer[i + w]) * t - above) * s
 
 
 @compiled
