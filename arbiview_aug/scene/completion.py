@@ -356,7 +356,7 @@ def _blocks_row(rows: Any, columns: Any, h: int, w: int, first: Any, down: Any, 
 
 
 @compiled
-def _mixed(layer: Any, i: int, w: int, s: float, t: float) -> float:
+def _mixed(layer: Any, i: Any, w: Any, s: float, t: float) -> float:
     """Bilinear value in the 2 x 2 cells from flat index ``i`` on, in rows of ``w``."""
     i, one, w = np.uint64(i), np.uint64(1), np.uint64(w)  # signed sums are slower
     above = layer[i] + (layer[i + one] - layer[i]) * t
