@@ -23,6 +23,9 @@ LEAST_INCIDENCE = np.float32(0.05)
 SAME_OBJECT_M = np.float32(0.15)
 """So much nearer a piece of an object must be to hide another of it: they touch, and are drawn half a pixel wider."""
 
+WHOLE = 0.97
+"""Share of an object's nodes, among those of the source that sees most, from which a source sees it whole."""
+
 _LEAST_KNOWN = np.float32(0.25)  # a cell of less known area says nothing of its column
 _BORDER_PX = np.float32(1.0)  # maps bulge between the corners of a cell
 _OUTSIDE = np.int32((OUTSIDE << 16) | (OUTSIDE & 0xFFFF))  # both coordinates of a packed position
@@ -180,6 +183,94 @@ def measure_nodes(
         for i in range(nx):
             along = rays[0, j, i] * offset_m[0] + rays[1, j, i] * offset_m[1] + rays[2, j, i] * offset_m[2]
             parallax_rad[j, i] = np.sqrt(max(length2 - along * along, 0.0)) * uncertainty[j, i]
+
+
+@compiled
+def node_winners(
+    scores: Any, parallax: Any, boxes: Any, center: Any, R: Any, rays: Any, axis: Any, node_rad: float, winner: Any
+) -> None:  # fmt: skip
+    """Which source has the largest weight on each node, but for labelled objects that a seam would cross.
+
+    A seam repeats or cuts what it crosses. Such an object is read from one source, where that sees it: of the sources
+    that see it whole, the one of the least parallax. Nearer objects decide last. Objects that a source shows exactly,
+    from the target's own centre, stay as they are.
+
+    Args:
+        scores: (K, ny, nx) weight of each source, 0 where it sees nothing.
+        parallax: (K, ny, nx) its expected displacement.
+        boxes: (B, 7) float64 centre, length, width, height, yaw, ego frame; the nearest last.
+        center: (3,) the target's.
+        R: (3, 3) float64 target to ego.
+        rays: (3, ny, nx) of the nodes.
+        axis: (4,) middle of a cone around the target's rays, camera frame, and its half angle.
+        node_rad: Angle between nodes: objects are wider by it.
+        winner: (ny, nx) int8, written: the first of the best sources, -1 for none.
+    """
+    K, ny, nx = scores.shape
+    n = ny * nx
+    score, error, ray = scores.reshape(K, n), parallax.reshape(K, n), rays.reshape(3, n)
+    x, y, z = ray[0], ray[1], ray[2]
+    first, best, own = np.empty(n, np.int8), np.zeros(n, np.float32), winner.reshape(n)
+    first[:] = -1
+    for k in range(K):
+        for i in range(n):
+            first[i] = np.int8(k) if score[k, i] > best[i] else first[i]
+        for i in range(n):
+            best[i] = max(best[i], score[k, i])
+    own[:] = first
+    near, inside, along = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.float32)
+    axes, to_box, across, count, total = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(K), np.empty(K)
+    for b in range(boxes.shape[0]):
+        c, s, away, half = np.cos(boxes[b, 6]), np.sin(boxes[b, 6]), boxes[b, :3] - center, boxes[b, 3:6] / 2
+        far = np.sqrt((away**2).sum())
+        margin = node_rad * far
+        reach = np.sqrt((half**2).sum()) + 2 * margin
+        for i in range(3):
+            axes[0, i], axes[1, i], axes[2, i] = c * R[0, i] + s * R[1, i], c * R[1, i] - s * R[0, i], R[2, i]
+            to_box[i] = R[0, i] * away[0] + R[1, i] * away[1] + R[2, i] * away[2]
+        for i in range(3):
+            across[i] = axes[i, 0] * to_box[0] + axes[i, 1] * to_box[1] + axes[i, 2] * to_box[2]
+        outside = far > reach
+        if outside and (to_box * axis[:3]).sum() < far * np.cos(min(axis[3] + np.arcsin(reach / far), np.pi)):
+            continue
+        ax, ay, az = np.float32(to_box[0]), np.float32(to_box[1]), np.float32(to_box[2])
+        bound = np.float32(np.sqrt(far**2 - reach**2)) if outside else -_MOST
+        for i in range(n):
+            along[i] = ax * x[i] + ay * y[i] + az * z[i]
+        around, within, low, high, exact = 0, 0, K, -1, False
+        for i in range(n):
+            if along[i] <= bound:
+                continue
+            enter, leave, enter_wide, leave_wide = -1e9, 1e9, -1e9, 1e9
+            for k in range(3):
+                d = axes[k, 0] * x[i] + axes[k, 1] * y[i] + axes[k, 2] * z[i]
+                inverse = 1 / d if abs(d) > 1e-12 else 1e12
+                middle, less, more = across[k] * inverse, half[k] * abs(inverse), (half[k] + margin) * abs(inverse)
+                enter, leave = max(enter, middle - less), min(leave, middle + less)
+                enter_wide, leave_wide = max(enter_wide, middle - more), min(leave_wide, middle + more)
+            if leave_wide >= enter_wide and enter_wide > 0:
+                near[around] = i
+                around += 1
+                low, high = min(low, first[i] if first[i] >= 0 else K), max(high, first[i])
+            if leave >= enter and enter > 0:
+                inside[within] = i
+                within += 1
+                exact = exact or best[i] > _ONE
+        if exact or low >= high:
+            continue
+        count[:] = 0
+        total[:] = 0
+        for k in range(K):
+            for j in range(within):
+                count[k] += score[k, inside[j]] > _ZERO
+                total[k] += error[k, inside[j]]
+        one = -1
+        for k in range(K):
+            if count[k] > 0 and count[k] >= WHOLE * count.max() and (one < 0 or total[k] < total[one]):
+                one = k
+        for j in range(around if one >= 0 else 0):
+            if score[one, near[j]] > _ZERO:
+                own[near[j]] = one
 
 
 @compiled

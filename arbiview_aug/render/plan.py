@@ -24,7 +24,7 @@ from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.render.atlas import AtlasLayout
 from arbiview_aug.render.view_plan import ViewPlan
 from arbiview_aug.render.view_planner import ViewPlanner
-from arbiview_aug.scene.scene import Scene
+from arbiview_aug.scene.scene import SURFACES, Scene
 
 
 @dataclass(frozen=True)
@@ -128,8 +128,10 @@ def _built(
     order = content_order(source.cameras)
     maps = maps or CameraMaps()
     by_name = partial(scene.surface, ground_z_m=source.ground_z_m)
+    boxes = scene.boxes if "boxes" in SURFACES[surface].reads else None
     planners = [
-        ViewPlanner(source, order, camera, surface, scene.best, by_name, config, counters, maps) for camera in target
+        ViewPlanner(source, order, camera, surface, scene.best, by_name, boxes, config, counters, maps)
+        for camera in target
     ]
     used = [(region.source, region.level) for planner in planners for region in planner.regions]
     layout = AtlasLayout.for_sources(source.sizes, used)

@@ -19,28 +19,19 @@ _STRIP_PX = 128
 LEAST_SHARE = 1 / 256  # a source that adds less than this to a pixel cannot change a grey level
 
 
-def seam_weights(scores: Sequence[Nodes], border_px: Sequence[Nodes], radius: int, width_px: float) -> list[Nodes]:
+def seam_weights(winner: npt.NDArray[np.int8], border_px: Sequence[Nodes], radius: int, width_px: float) -> list[Nodes]:
     """Weights on the nodes: each source's winning area, softened over the seams, fading at its own border.
 
     Args:
-        scores: (ny, nx) stage-4 weight of each source, 0 where it sees nothing.
+        winner: (ny, nx) source of each node, -1 for none.
         border_px: (ny, nx) distance to the border of what it sees, target pixels.
         radius: Half the width of a seam, in nodes.
-        width_px: Width of a seam, target pixels; 0 for hard seams.
-
-    Returns:
-        (ny, nx) for each source; the scores themselves for one source, or for hard seams.
+        width_px: Width of a seam, target pixels.
     """
-    if width_px == 0 or len(scores) < 2:
-        return list(scores)
-    best = np.maximum.reduce(scores)
     weights: list[Nodes] = []
-    taken = np.zeros(best.shape, bool)
-    for score, border in zip(scores, border_px, strict=True):
-        label = (score == best) & (score > 0) & ~taken
-        taken |= label
+    for k, border in enumerate(border_px):
         # Two passes of a box make a smooth ramp.
-        soft: Any = label.astype(np.float32)
+        soft: Any = (winner == k).astype(np.float32)
         for _ in range(2):
             soft = cv2.blur(soft, (2 * radius + 1, 2 * radius + 1), borderType=cv2.BORDER_REPLICATE)
         weights.append(soft * np.clip(border / np.float32(width_px), 0, 1))

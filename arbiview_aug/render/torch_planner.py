@@ -26,7 +26,7 @@ from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.image_ops import level_size
 from arbiview_aug.render.atlas import OUTSIDE, AtlasLayout
 from arbiview_aug.render.confidence import DECORRELATION_RAD, RESOLUTION_POWER
-from arbiview_aug.render.kernels import LEAST_INCIDENCE, MAP_LIMIT_PX, SAME_OBJECT_M
+from arbiview_aug.render.kernels import LEAST_INCIDENCE, MAP_LIMIT_PX, SAME_OBJECT_M, WHOLE
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.render.seams import LEAST_SHARE
@@ -594,18 +594,19 @@ class _ViewBatch:
         bonus = np.where(self.baseline_m < SAME_CENTER_M, config.primary_bonus, 1.0)
         focal_, half_, bonus_ = (on_device(part, self.device)[..., None, None] for part in (focal, half, bonus))
         score = (self.edge_px / half_).clamp(0, 1) ** config.distance_gamma
-        score = score * (self.resolution.clamp(0.05, 1) / (1 + focal_ * across_m * spread)) * bonus_
+        parallax = focal_ * across_m * spread
+        score = score * (self.resolution.clamp(0.05, 1) / (1 + parallax)) * bonus_
         score = torch.where(visible & (self.edge_px > 0), score, 0.0).float()
         if not config.certainty:
-            return self._seam_weights(score), None
+            return self._seam_weights(score, parallax), None
         ratio = self.resolution.clamp(1e-3, 1e3)
         detail = torch.minimum(ratio, 1 / ratio) ** RESOLUTION_POWER
         certain = 255 * torch.exp(-across_m * spread / DECORRELATION_RAD) * detail
         known = torch.where(self.valid, certain, 0.0).float()
         around = _blurred(known, 2) / _blurred(self.valid.float(), 2).clamp(min=1e-6)
-        return self._seam_weights(score), torch.where(self.valid, known, around)
+        return self._seam_weights(score, parallax), torch.where(self.valid, known, around)
 
-    def _seam_weights(self, score: torch.Tensor) -> torch.Tensor:
+    def _seam_weights(self, score: torch.Tensor, parallax: torch.Tensor) -> torch.Tensor:
         """As ``seams.seam_weights``."""
         width_px = self.config.seam_width * self.size[1]
         if width_px == 0 or score.shape[1] < 2:
@@ -613,9 +614,40 @@ class _ViewBatch:
         best, label = score.max(1, keepdim=True)
         numbers = torch.arange(score.shape[1], device=self.device)[:, None, None]
         soft = ((label == numbers) & (best > 0)).float()
+        if self.boxes is not None:
+            label = self._read_whole(soft.flatten(2), score.flatten(2), parallax.float().flatten(2)).view_as(label)
+            soft = ((label == numbers) & (best > 0)).float()
         for _ in range(2):
             soft = _blurred(soft, max(1, round(width_px / self.step / 2)))
         return soft * ((self.edge_px / self.resolution.clamp(min=1e-3)).float() / width_px).clamp(0, 1)
+
+    def _read_whole(self, won: torch.Tensor, score: torch.Tensor, parallax: torch.Tensor) -> torch.Tensor:
+        """As ``kernels.node_winners``, of nodes (V, K, N) as one-hot vectors; the winners (V, N)."""
+        boxes, rays = self._objects_of(self.frames)[0], self.directions.flatten(2).float()
+        away, yaw = boxes[..., :3] - self.poses.center_m[:, None], boxes[..., 6]
+        far = away.norm(dim=-1)
+        margin = self.step * self._pixel_rad(self.cameras)[:, None] * far
+        c, s, zero = yaw.cos(), yaw.sin(), torch.zeros_like(yaw)
+        turn = torch.stack([c, s, zero, -s, c, zero, zero, zero, zero + 1], -1).unflatten(-1, (3, 3))
+        along = turn.flatten(1, 2).float() @ rays
+        inverse = 1 / torch.where(along.abs() < TINY, TINY, along).unflatten(1, (-1, 3))
+        middle = (turn @ away[..., None]).float() * inverse
+
+        def meets(half: torch.Tensor) -> torch.Tensor:
+            reach = half.float()[..., None] * inverse.abs()
+            enter = (middle - reach).amax(2)
+            return ((middle + reach).amin(2) >= enter) & (enter > 0)
+
+        inside, around = meets(boxes[..., 3:6] / 2), meets(boxes[..., 3:6] / 2 + margin[..., None])
+        own = inside.mT.float()
+        count = (score > 0).float() @ own
+        most = count.amax(1)
+        one = torch.where(count >= WHOLE * most[:, None], parallax @ own, math.inf).argmin(1)
+        exact = (score.amax(1, keepdim=True) > 1).float() @ own > 0
+        mixed = ((won @ around.mT.float() > 0).sum(1) > 1) & (most > 0) & ~exact[:, 0]
+        may = around & mixed[..., None] & (score > 0).gather(1, one[..., None].expand(-1, -1, score.shape[2]))
+        nearest, box = torch.where(may, far[..., None], math.inf).min(1)
+        return torch.where(nearest.isfinite(), one.gather(1, box), won.argmax(1))
 
     def _interpolation(self, row: int) -> str:
         """As ``ViewPlanner._interpolation``."""

@@ -107,12 +107,13 @@ class ViewPlanner:
         surface: str,
         best: str,
         surface_by_name: Callable[[str], Surface],
+        boxes: FloatArray | None,
         config: FavsConfig,
         counters: Counter[str],
         maps: CameraMaps,
     ) -> None:
         self.source, self.camera, self.surface, self.config = source, camera, surface, config
-        self.best, self.surface_by_name = best, surface_by_name
+        self.best, self.surface_by_name, self.boxes = best, surface_by_name, boxes
         self.counters, self.maps = counters, maps
         self.rays = maps.rays(camera)
         # From outside, the far wall is a narrow strip with edges, which cells could step over.
@@ -339,8 +340,7 @@ class ViewPlanner:
         fixed = FixedMap.outside(size, memory)
         winner, in_image = memory.full(size, -1, np.int8), memory.full(size, 0, np.uint8)
         best = memory.full(size, -1, np.float32)  # a source that sees a pixel beats none, even with a weight of 0
-        scores, borders = [region.score for region in self.regions], [region.border_px for region in self.regions]
-        weights = seam_weights(scores, borders, self._seam_radius, self.config.seam_width * self.camera.width_px)
+        weights = self._weights()
         seconds = SecondBest(weights if self.config.seam_width else (), self.step, size, memory)
         for region, weight in zip(self.regions, weights, strict=True):
             slot = layout.slot(region.source, region.level)
@@ -382,6 +382,25 @@ class ViewPlanner:
         limit = cv2.erode(NEARER * farthest, np.ones((side, side), np.uint8))
         mark_objects(geometry.q, geometry.face, winner, limit, self.step, layers)
         return Paint.of(geometry.face, winner, surface.face_parts) if geometry.face.size else None
+
+    def _weights(self) -> list[npt.NDArray[np.float32]]:
+        """Weights of the sources on the nodes: their scores, for one source or hard seams."""
+        from arbiview_aug.render.kernels import node_winners
+
+        scores, width_px = [region.score for region in self.regions], self.config.seam_width * self.camera.width_px
+        if width_px == 0 or len(scores) < 2:
+            return scores
+        winner = np.empty(scores[0].shape, np.int8)
+        stacked, boxes, cone = np.stack(scores), np.zeros((0, 7)), np.zeros(4)
+        parallax = stacked  # unused without boxes
+        if self.boxes is not None and len(self.boxes):
+            near_last = np.argsort(-np.linalg.norm(self.boxes[:, :3] - self.camera.center_m, axis=-1), kind="stable")
+            boxes, cone = self.boxes[near_last, :7], self.rays.cone
+            parallax = np.stack([region.parallax for region in self.regions])
+        pose = np.ascontiguousarray(self.camera.center_m), np.ascontiguousarray(self.camera.cam2ego[:3, :3])
+        node_rad = self.step / float(self.camera.K[0, 0])
+        node_winners(stacked, parallax, boxes, *pose, self.node_rays, cone, node_rad, winner)
+        return seam_weights(winner, [region.border_px for region in self.regions], self._seam_radius, width_px)
 
     def _target(self, region: _Region) -> tuple[Any, ...]:
         return self.rays.planes, self.rays.parameters, region.geometry.q, region.geometry.face

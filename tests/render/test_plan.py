@@ -13,6 +13,7 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.plan import RenderPlan, build_plan, plan_key
+from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.scene import Scene
 from tests.helpers import in_atlas, in_source, sampled
 
@@ -136,6 +137,22 @@ def test_exact_source_wins_wherever_it_sees() -> None:
         seam_px = 0.02 * view.coverage.shape[1]
         inner = cv2.erode(visible.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=int(2 * seam_px)) > 0
         assert np.all(view.source_camera[inner] == k)
+
+
+def test_a_seam_passes_beside_a_labelled_object() -> None:
+    def eye(y: float) -> Camera:
+        return Camera.looking(
+            name=f"y {y}", azimuth_deg=0, position_m=(0, y, 1.5), width_px=192, height_px=96, horizontal_fov_deg=80
+        )
+
+    source, target, box = Rig([eye(1.0), eye(-1.0)]), Rig([eye(0.0)]), np.array([[9.0, 0.3, 1, 2, 2, 2, 0.2]])
+    shown = draw_boxes(target[0], box)[1] == 0
+    crossed, beside = (
+        build_plan(source, target, surface=surface, scene=Scene(boxes=box)).targets[0].source_camera
+        for surface in ("street", "objects")
+    )
+    assert set(np.unique(crossed[shown])) == {0, 1} == set(np.unique(beside))
+    assert len(np.unique(beside[shown])) == 1
 
 
 def test_order_of_sources_changes_nothing_but_indices() -> None:
