@@ -146,6 +146,7 @@ class _HoleSurface(DenseSurface):
     full: Surface
     objects: BoxSurface | None
     best: ClassVar[str] = "street"
+    boxes: ClassVar[None] = None  # fills have no seams
 
     def surface(self, name: str, ground_z_m: float) -> Surface:
         """It; at a camera's own centre no distance matters."""
