@@ -317,9 +317,8 @@ def directions_of(rays: PixelRays, R: FloatArray) -> tuple[FloatArray, int]:
     for apart in (max(step, CELL_PX), step):  # an image circle ends between nodes
         local = nodes_of(rays, apart)
         valid = local.any(axis=0)
-        if valid.all():  # windows end at the border, or about a pole
-            parts = local[:, ::4, ::4], local[:, [0, -1]], local[:, :, [0, -1]]
-            return np.concatenate([part.reshape(3, -1) for part in parts], axis=1).T @ R.T, step
+        if valid.all():
+            return local.reshape(3, -1).T @ R.T, step
     return local[:, valid].T @ R.T, 1
 
 
