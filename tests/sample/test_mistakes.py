@@ -157,6 +157,7 @@ def test_a_rig_of_heights_that_no_vehicle_has(street: Sample) -> None:
     assert "lie on their side" in finding.found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", ["waymo", "fisheye_surround"])
 def test_what_was_retargeted_has_no_findings(target: str) -> None:
     rig = load_rig(target)

@@ -38,6 +38,7 @@ def test_area_under_the_curve() -> None:
     assert area_under_curve(torch.zeros(4), y) == 0.5
 
 
+@pytest.mark.slow
 def test_nothing_is_hidden_from_the_same_cameras() -> None:
     rig = demo_source_rig((48, 128))
     rig = rig.with_cameras(rig.cameras[:2])
