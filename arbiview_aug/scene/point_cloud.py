@@ -15,7 +15,7 @@ import numpy as np
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.rays import CELL_PX, PixelRays
+from arbiview_aug.cameras.rays import PixelRays
 from arbiview_aug.errors import SampleError
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene import panorama
@@ -314,12 +314,9 @@ def nodes_of(rays: PixelRays, apart: int) -> Layer:
 def directions_of(rays: PixelRays, R: FloatArray) -> tuple[FloatArray, int]:
     """Unit rays (n, 3) in the ego frame that span a view, and the pixels between nodes for its panorama."""
     step = max(1, int(NODES_RAD * float(rays.parameters[0])))
-    for apart in (max(step, CELL_PX), step):  # an image circle ends between nodes
-        local = nodes_of(rays, apart)
-        valid = local.any(axis=0)
-        if valid.all():
-            return local.reshape(3, -1).T @ R.T, step
-    return local[:, valid].T @ R.T, 1
+    local = nodes_of(rays, step)
+    valid = local.any(axis=0)
+    return local[:, valid].T @ R.T, step if valid.all() else 1  # an image circle ends between nodes
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,12 +58,13 @@ def errors(plan: RenderPlan, surface: str, scene: Scene, at_most: int, edges: bo
     rng = np.random.default_rng(0)
     found, stepped = [np.zeros(0)], [np.zeros(0, bool)]
     for view, camera in zip(plan.targets, plan.target, strict=True):
-        seen = np.flatnonzero(view.coverage)
+        seen, pixel_rad = np.flatnonzero(view.coverage), float(1 / camera.K[0, 0])
         some = np.sort(seen[rng.integers(len(seen), size=at_most)]) if len(seen) > at_most else seen
         y, x = np.unravel_index(some, camera.size)
         if edges:
             rays, _ = ego_rays(camera, camera.pixel_grid())
-            edge = near_steps(inverse_distance(scene.surface(surface, plan.source.ground_z_m), camera.center_m, rays))
+            over = scene.surface(surface, plan.source.ground_z_m)
+            edge = near_steps(inverse_distance(over, camera.center_m, rays, pixel_rad))
         read = FixedMap(view.at.xy[y, x][:, None], view.at.frac[y, x][:, None]).to_float()[:, 0].astype(np.float64)
         winner = view.source_camera[y, x]
         for pair in view.pairs:
@@ -71,7 +72,7 @@ def errors(plan: RenderPlan, surface: str, scene: Scene, at_most: int, edges: bo
             source, offset_m = plan.source[pair.source], camera.center_m - plan.source[pair.source].center_m
             name = "far" if np.linalg.norm(offset_m) < 1e-6 else surface
             rays, valid = ego_rays(camera, np.stack([x[won], y[won]], -1).astype(np.float64))
-            q = inverse_distance(scene.surface(name, plan.source.ground_z_m), camera.center_m, rays)
+            q = inverse_distance(scene.surface(name, plan.source.ground_z_m), camera.center_m, rays, pixel_rad)
             uv, ahead = project_rays(source, rays, q, offset_m)
             assert valid.all() and ahead.all()
             slot = plan.layout.slot(pair.source, pair.level)
