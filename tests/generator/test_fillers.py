@@ -70,6 +70,7 @@ def test_only_holes_differ_and_they_are_marked(street: dict[str, Any], dtype: to
     assert outs["fill"]["images"][pixels].float().std() > 0
 
 
+@pytest.mark.slow
 def test_filled_holes_are_nearer_to_the_truth_than_black_ones() -> None:
     from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 
@@ -349,6 +350,7 @@ def test_cracks_in_objects_take_the_colour_beside_them() -> None:
     assert torch.equal(out[:, 30, 20], expected)
 
 
+@pytest.mark.slow
 def test_both_executions_and_types_fill_alike_with_held_plans(street: dict[str, Any]) -> None:
     as_float = street | {"images": street["images"].float() / 255}
     for surface in ("objects", "lidar"):
