@@ -130,8 +130,7 @@ class ViewPlanner:
         )
         self._geometries: dict[str, _Geometry] = {}
         # Cells that sources elsewhere may change: none without a ray.
-        has_ray = self.corner_rays.any(axis=0)
-        self._open = has_ray[1:, 1:] & has_ray[1:, :-1] & has_ray[:-1, 1:] & has_ray[:-1, :-1]
+        self._open = _whole_cells(self.corner_rays.any(axis=0))
         exact = {k: self._region(k) for k in order if self._baseline_m(k) < SAME_CENTER_M}
         for one in filter(None, exact.values()):
             self._open = self._open & self._around_unseen(one)
@@ -139,7 +138,7 @@ class ViewPlanner:
             near, far = (np.full(self._open.shape, q, np.float32) for q in (MAX_INVERSE_DISTANCE, 0))
             seen, cells = np.zeros_like(self._open), np.arange(self._open.shape[1])
             for k in set(order) - set(exact):
-                first, last = self._in_view(self.source[k], near, far).T
+                first, last = self._in_view(self.source[k], self._projection(self.source[k]), near, far).T
                 seen |= (first[:, None] <= cells) & (cells < last[:, None])
             self._open = seen
         found = exact | {k: self._region(k) for k in order if k not in exact}
@@ -164,8 +163,7 @@ class ViewPlanner:
         """Cells (ny, nx) that an exact source does not certainly win, and those around them that seams may reach."""
         from arbiview_aug.render.kernels import depth_range, seen_image
 
-        seen = region.score > 1  # no weight of a source elsewhere exceeds 1
-        whole = seen[1:, 1:] & seen[1:, :-1] & seen[:-1, 1:] & seen[:-1, :-1]
+        whole = _whole_cells(region.score > 1)  # no weight of a source elsewhere exceeds 1
         # Borders, masks and image circles may lie between nodes.
         visible = np.zeros(self.camera.size, bool)
         seen_image(*self._target(region), region.kernel, visible)
@@ -226,19 +224,24 @@ class ViewPlanner:
         self._geometries[name] = _Geometry(q, face, *at_nodes, behind, nearest, farthest, uncertainty)
         return self._geometries[name]
 
-    def _in_view(self, source: Camera, nearest: Any, farthest: Any) -> npt.NDArray[np.int64]:
-        """First and last (exclusive) open cell (ny, 2) of each row that a source may see, by ``_Geometry``'s depths."""
+    def _projection(self, source: Camera) -> tuple[Any, ...]:
+        """Relative pose (2 arrays), lens and parameters of a source, as kernels read them."""
         from arbiview_aug.cameras.kernels import LENS_CODES, camera_parameters
+
+        return *relative_pose(self.camera, source), LENS_CODES.get(source.lens, -1), camera_parameters(source)
+
+    def _in_view(
+        self, source: Camera, projection: tuple[Any, ...], nearest: Any, farthest: Any
+    ) -> npt.NDArray[np.int64]:
+        """First and last (exclusive) open cell (ny, 2) of each row that a source may see, by ``_Geometry``'s depths."""
         from arbiview_aug.render.kernels import cells_in_view
 
-        A, o = relative_pose(self.camera, source)
-        kind, P, size = LENS_CODES.get(source.lens, -1), camera_parameters(source), np.array(source.size, np.float32)
-        columns = np.empty((len(self._open), 2), np.int64)
-        cells_in_view(self.corner_rays, nearest, farthest, A, o, kind, P, size, source.cone_rad, self._open, columns)
+        size, columns = np.array(source.size, np.float32), np.empty((len(self._open), 2), np.int64)
+        cells_in_view(self.corner_rays, nearest, farthest, *projection, size, source.cone_rad, self._open, columns)
         return columns
 
     def _region(self, index: int) -> _Region | None:
-        from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES, camera_parameters
+        from arbiview_aug.cameras.kernels import FAR_AWAY_PX
         from arbiview_aug.render.kernels import measure_nodes, seen_image
 
         source = self.source[index]
@@ -249,9 +252,8 @@ class ViewPlanner:
         surface, geometry = cast(Any, self.surface_by_name(name)), self._geometry(name)
         if look_apart(self.camera, source, float(geometry.nearest.max())):
             return None
-        A, o = relative_pose(self.camera, source)
-        kind, P = LENS_CODES.get(source.lens, -1), camera_parameters(source)
-        columns = self._in_view(source, geometry.nearest, geometry.farthest)
+        A, o, kind, P = projection = self._projection(source)
+        columns = self._in_view(source, projection, geometry.nearest, geometry.farthest)
         if not columns.any():
             return None
         u, v = np.empty((2, *geometry.behind.shape), np.float32)
@@ -451,6 +453,11 @@ class ViewPlanner:
                 share=won_px[region.source] / winner.size,
                 level=region.level,
             )
+
+
+def _whole_cells(on_nodes: BoolArray) -> BoolArray:
+    """Cells (ny, nx) of which all four nodes (ny + 1, nx + 1) are True."""
+    return on_nodes[1:, 1:] & on_nodes[1:, :-1] & on_nodes[:-1, 1:] & on_nodes[:-1, :-1]
 
 
 def halvings(resolution: float, size: tuple[int, int]) -> int:

@@ -17,7 +17,7 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import CELL_PX, PixelRays, pixel_rays
 from arbiview_aug.errors import SampleError
 from arbiview_aug.image_ops import FRESH, Memory
-from arbiview_aug.scene.shapes import whole
+from arbiview_aug.scene.shapes import points_by_box, whole
 from arbiview_aug.scene.surface import LayeredSurface, OcclusionMap, Points, StaticSurface, Surface
 
 UNLABELLED = 0.45
@@ -193,11 +193,7 @@ def meets(box: FloatArray, origin: FloatArray, directions: FloatArray) -> BoolAr
 
 def points_in(boxes: FloatArray, points: Points, air_m: float = 0.0) -> list[npt.NDArray[np.int64]]:
     """For each box (B, 7) the indices of the points (P, 3) in it, widened by ``air_m`` on all sides."""
-    from arbiview_aug.scene.kernels import points_in as pairs_of
-
-    box, point = pairs_of(np.ascontiguousarray(boxes), np.ascontiguousarray(points, np.float32), air_m)
-    point = point[np.argsort(box, kind="stable")]
-    ends = np.cumsum(np.bincount(box, minlength=len(boxes)))
+    point, ends = points_by_box(boxes, points, air_m)
     return [point[end - count : end] for end, count in zip(ends, np.diff(ends, prepend=0), strict=True)]
 
 

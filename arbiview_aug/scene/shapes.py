@@ -101,16 +101,24 @@ def solids_among(boxes: FloatArray, points: Points) -> tuple[FloatArray, BoolArr
     Of the profiles that fit a box it is the one whose faces lie nearest to its points. Points within ``AIR_M`` of it
     are its own: mirrors, and the noise of points and labels. This far over the box's floor they may be the road's.
     """
-    from arbiview_aug.scene.kernels import fit_profiles, points_in
+    from arbiview_aug.scene.kernels import fit_profiles
 
     boxes = np.ascontiguousarray(boxes)
     found = np.empty((len(boxes), PIECES, 6, 4)), np.zeros(len(points), bool)
     points = np.ascontiguousarray(points, np.float32)
-    box, point = points_in(boxes, points, AIR_M)
-    point = point[np.argsort(box, kind="stable")]
-    ends = np.cumsum(np.bincount(box, minlength=len(boxes)))
-    fit_profiles(boxes, PROFILES, OF_KIND[kinds(boxes)], points, point, ends, LEAST_POINTS, AIR_M, *found)
+    within = points_by_box(boxes, points, AIR_M)
+    fit_profiles(boxes, PROFILES, OF_KIND[kinds(boxes)], points, *within, LEAST_POINTS, AIR_M, *found)
     return found
+
+
+def points_by_box(
+    boxes: FloatArray, points: Points, air_m: float
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Indices (n,) of the points (P, 3) in boxes (B, 7) widened by ``air_m``, box by box; where each box ends (B,)."""
+    from arbiview_aug.scene.kernels import points_in
+
+    box, point = points_in(np.ascontiguousarray(boxes), np.ascontiguousarray(points, np.float32), air_m)
+    return point[np.argsort(box, kind="stable")], np.cumsum(np.bincount(box, minlength=len(boxes)))
 
 
 def whole(boxes: FloatArray) -> FloatArray:
