@@ -23,7 +23,7 @@ from arbiview_aug.generator.generator import shipped_weights
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, fill
 from integrations.cross_rig.labels import Grid, box_cells, visible_objects
 from integrations.cross_rig.variant import Variant
-from integrations.cross_rig.views import ViewMaker
+from integrations.cross_rig.views import ViewMaker, with_noise
 from integrations.cross_rig.worlds import CHANGES, STREET_SEEDS, Size, Split, source_rig
 
 _WORLD = "arbiview_aug.datasets.synthetic"
@@ -199,7 +199,8 @@ class _VariantFrames:
         if "points" in self.variant.reads:
             frame["points"] = self.drive.points(index)
         if "depth_m" in self.variant.reads:
-            frame["depth_m"] = torch.from_numpy(self.store.read(index, "depth_m").astype(np.float32))
+            depth = torch.from_numpy(self.store.read(index, "depth_m").astype(np.float32))
+            frame["depth_m"] = with_noise(depth, self.variant.depth_noise, index) if self.variant.depth_noise else depth
         if "neighbours" in self.variant.reads:
             frame |= self._neighbours(index)
         return self.views(index, frame)

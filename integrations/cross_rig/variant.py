@@ -32,6 +32,8 @@ class Variant:
             package's generator.
         masked: The network masks them by ``coverage``. Otherwise every pixel counts as seen, as in stock detectors.
         random: Targets are drawn around B, one for each frame.
+        depth_noise: Standard deviation of the relative error of A's true depths that it is given instead of a learned
+            depth's.
         stays: B's cameras stay in the very centres of those of A that look most alike, or at their heights.
         truth: To find out where the rest is lost: B's true pixels where something is covered, or where nothing is
             (which then counts as seen).
@@ -47,6 +49,7 @@ class Variant:
     holes: Literal["black", "fill", "generator"] = "black"
     masked: bool = True
     random: bool = False
+    depth_noise: float = 0.0
     stays: Literal["centre", "height"] | None = None
     truth: Literal["covered", "holes"] | None = None
 
@@ -58,5 +61,6 @@ class Variant:
     def views_spec(self) -> dict[str, Any]:
         """What its images depend on, besides rigs and code: variants that differ in how they draw share them."""
         settings = {"kind": self.kind, "surface": self.surface, "reads": list(self.reads), "holes": self.holes}
-        extra = {"random": RANDOM if self.random else None, "stays": self.stays, "truth": self.truth}
+        extra: dict[str, Any] = {"random": RANDOM if self.random else None, "stays": self.stays, "truth": self.truth}
+        extra["depth_noise"] = self.depth_noise or None
         return settings | {name: value for name, value in extra.items() if value is not None}

@@ -28,6 +28,14 @@ VARIANTS: dict[str, Variant] = {
         Variant(name="same_centre", title="street at A's centres", kind="retarget", surface="street", stays="centre"),
         Variant(name="far_mixed", title="far + raw", kind="retarget", surface="far", mixed=True),
         Variant(name="depth", title="true depth", kind="retarget", surface="lidar", reads=("depth_m",)),
+        Variant(
+            name="learned",
+            title="true depth with 5 % noise",
+            kind="retarget",
+            surface="lidar",
+            reads=("depth_m",),
+            depth_noise=0.05,
+        ),
         Variant(name="street_mixed", title="street + raw", kind="retarget", surface="street", mixed=True),
         Variant(
             name="objects_mixed",

@@ -83,6 +83,15 @@ class ViewMaker:
         }
 
 
+def with_noise(depth_m: torch.Tensor, deviation: float, index: int) -> torch.Tensor:
+    """Depths (N, h, w) with relative errors that are alike within patches of 8 px, as a network makes them."""
+    n, h, w = depth_m.shape
+    generator = torch.Generator().manual_seed(index)
+    patches = torch.randn((1, n, -(-h // 8) + 1, -(-w // 8) + 1), generator=generator)
+    errors = torch.nn.functional.interpolate(patches, (h, w), mode="bicubic", align_corners=True)[0]
+    return depth_m / (1 + deviation * errors / errors.std()).clamp(min=0.1)
+
+
 def at_source_centres(source: Rig, target: Rig) -> Rig:
     """The target rig, in the source's ego frame, with each camera in the centre of the source camera most like it."""
     moves = (most_alike(source, camera).center_m - camera.center_m for camera in target)
