@@ -86,6 +86,12 @@ def ddad_root(data_root: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
+def kitti_root(data_root: Path) -> Path:
+    """Eleven real frames of a drive, each with a photograph from 0.54 m to the right."""
+    return _frame(data_root, "kitti-stereo")
+
+
+@pytest.fixture(scope="session")
 def fisheye_root(data_root: Path) -> Path:
     """Four real fisheye cameras, as PNGs."""
     return _frame(data_root, "surround-fisheye")

@@ -51,6 +51,7 @@ TINY = {
     "demo --data FOLDER --target waymo": ["--size", "64x112"],
     "evaluate --data FOLDER --yaws paper": ["--reduce", "4", "--size", "40x72"],
     "evaluate --data FOLDER --target waymo": ["--reduce", "4", "--size", "40x72"],
+    "evaluate --displaced --data FOLDER": ["--surface", "street", "--reduce", "4", "--frames", "1"],
     "evaluate --paper": ["--size", "16x44", "--frames", "1"],
     "evaluate --figure --data FOLDER": ["--reduce", "4"],
     "check FOLDER": ["--reduce", "4"],
@@ -197,7 +198,8 @@ def test_the_commands_run(
 ) -> None:
     arguments = shlex.split(command)
     if "FOLDER" in arguments:
-        arguments[arguments.index("FOLDER")] = str(request.getfixturevalue("nuscenes_root"))
+        root = request.getfixturevalue("kitti_root" if "--displaced" in arguments else "nuscenes_root")
+        arguments[arguments.index("FOLDER")] = str(root)
     if "--paper" in arguments:  # whole, it takes long
         monkeypatch.delenv("ARBIVIEW_DATA", raising=False)
         monkeypatch.setattr(paper_study, "SETS", ("truck",))

@@ -1,6 +1,7 @@
 """``python -m arbiview_aug evaluate``: the quality of rendered views, in numbers and pictures.
 
 Real frames are scored by sparse LiDAR metrics, overlap and consistency; synthetic streets by the true views.
+``--displaced`` scores real frames by photographs that another camera took, or the next frame's cameras.
 ``--paper`` measures the paper's tables, ``--figure`` draws its figures.
 """
 
@@ -11,7 +12,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +31,11 @@ from arbiview_aug.cli.arguments import (
     named_steps,
     writable_folder,
 )
-from arbiview_aug.datasets import open_data
+from arbiview_aug.datasets import FrameFolder, open_data
 from arbiview_aug.datasets.motion_depth import WANTED
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.errors import DataError
+from arbiview_aug.evaluate.displaced import COPY, displaced_frames, surfaces_for
 from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.methods import Method, retargeting
@@ -51,8 +53,9 @@ from arbiview_aug.scene.surface import SurfaceName
 _FIXED = {
     "paper": ("target", "yaws", "quality", "surface", "path", "generator", "steps", "seed", "reduce", "clean_masks"),
     "figure": ("target", "yaws", "quality", "surface", "path", "generator", "steps", "frames"),
+    "displaced": ("target", "yaws", "seed", "size"),
 }
-"""Options that the two modes fix."""
+"""Options that the modes fix."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -63,6 +66,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         for name in fixed:
             if getattr(arguments, mode) and getattr(arguments, name) != parser.get_default(name):
                 parser.error(f"argument --{name.replace('_', '-')}: --{mode} has its own; expected none")
+    if arguments.displaced and arguments.data is None:
+        parser.error("argument --displaced: expected --data FOLDER with it, found none")
     folder = writable_folder(Path(arguments.output), arguments.output)
     notes: list[str] = []
     if arguments.paper:
@@ -97,10 +102,18 @@ def _parser() -> argparse.ArgumentParser:
     add_rendering(parser, several=True)
     parser.add_argument("--generator", metavar="DIR", help="generator of --path diffusion (default: the package's own)")
     parser.add_argument("--steps", nargs="+", type=count, default=[4], metavar="N", help="steps of the generator")
-    add_frames(parser, None, "number of frames (default: 1; --paper: 3 synthetic ones)")
+    add_frames(parser, None, "number of frames (default: 1; --paper: 3 synthetic ones; --displaced: all)")
     add_reduce(parser)
     add_output(parser)
     what = parser.add_mutually_exclusive_group()
+    what.add_argument(
+        "--displaced",
+        nargs="?",
+        const=True,
+        metavar="NEXT",
+        help="photographs as truth: of the frames' `truth` camera (docs/formats.md), else of the next frame of the "
+        "drive; with NEXT of this frame folder's first frame. Surfaces: a copy, and all that the data offers",
+    )
     what.add_argument(
         "--paper",
         action="store_true",
@@ -163,7 +176,7 @@ def scored_frames(data: Any, frames: int, hand_over_points: bool) -> Iterator[tu
             yield name, make_frame(sample, hand_over_points=hand_over_points)
 
 
-def _methods(arguments: argparse.Namespace) -> list[Method]:
+def _methods(arguments: argparse.Namespace, **settings: Any) -> list[Method]:
     """All chosen settings, with confidence maps where they have one."""
     generator = None
     if "diffusion" in arguments.path:
@@ -172,7 +185,7 @@ def _methods(arguments: argparse.Namespace) -> list[Method]:
     methods = []
     for quality, surface, path in product(arguments.quality, arguments.surface, arguments.path):
         outputs = () if quality == "paper" else ("confidence",)
-        make = partial(retargeting, quality, surface, outputs=outputs, path=path)
+        make = partial(retargeting, quality, surface, outputs=outputs, path=path, **settings)
         if path == "diffusion":
             methods += [make(generator=generator, steps=steps) for steps in arguments.steps]
         else:
@@ -200,19 +213,24 @@ def measured(
 
 # --- the three modes --------------------------------------------------------------------------------------------------
 def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> str:
-    methods = _methods(arguments)
-    data = open_frames(arguments, arguments.surface)
-    done = measured(arguments, data, methods, notes)
+    if arguments.displaced:
+        methods, done = _displaced(arguments, notes)
+    else:
+        methods = _methods(arguments)
+        done = measured(arguments, open_frames(arguments, arguments.surface), methods, notes)
     if not done.views:
         raise DataError("; ".join(done.declined.values()))
     assert done.first is not None
     notes.extend(f"{name}: {why}" for name, why in done.declined.items())
     names = [method.name for method in methods]
     tables = evaluation_tables(done, names)
-    title = f"{arguments.data or f'Synthetic streets, seed {arguments.seed}'}: {frames_text(arguments, data)}"
+    count_of = len({view["frame"] for view in done.views})
+    source = arguments.data or f"Synthetic streets, seed {arguments.seed}"
+    title = f"{source}: {count_of} frame{'s' * (count_of > 1)}"
     settings = {key: value for key, value in vars(arguments).items() if key not in _FIXED}
-    report = {"arguments": settings, "scored_on_other_points": done.first.held_out}
-    report |= {"means": tables[0][1], "agreement": tables[1][1], "views": done.views, "pairs": done.pairs}
+    report: dict[str, Any] = {"arguments": settings, "scored_on_other_points": done.first.held_out}
+    report |= dict(zip(("means", "agreement"), (rows for _, rows, *_ in tables), strict=False))
+    report |= {"views": done.views, "pairs": done.pairs}
     (folder / "evaluate.json").write_text(json.dumps(report, indent=1) + "\n")
     sample = done.first.sample
     for (target, method), views in done.pictures.items():
@@ -223,6 +241,30 @@ def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> 
     (folder / "report.html").write_text(html_report(title, done, names, tables, notes), encoding="utf-8")
     printed = "\n\n".join(text_table(*table) for table in tables)
     return f"{title}\n\n{printed}\n\nreport: {folder / 'report.html'}\nnumbers: {folder / 'evaluate.json'}"
+
+
+def _displaced(arguments: argparse.Namespace, notes: list[str]) -> tuple[list[Method], Evaluation]:
+    """Evaluate a copy and the surfaces on photographs; holes are not read from neighbours."""
+    data, given = open_frames(arguments, ["motion"]), arguments.displaced
+    with named_steps(notes) as tick:
+        next_frame = FrameFolder(given, reduce=arguments.reduce)[0] if isinstance(given, str) else None
+        count_of = min(arguments.frames or len(data), len(data))
+        frames = displaced_frames(data, count_of, next_frame)
+        first = next(frames, None)
+        if first is None:
+            expected = "a 'truth' camera in calib.json, or a later frame of the drive (sequence.json and ego2world)"
+            raise DataError(f"--displaced: {arguments.data}: expected {expected}, found none; see docs/formats.md")
+        if arguments.surface == ["auto"]:
+            arguments.surface = surfaces_for(first[1].sample)
+        methods = [COPY, *_methods(arguments, neighbours=None)]
+        done = evaluate(
+            chain([first], frames),
+            lambda _: {},
+            methods,
+            lambda name, steps: tick(name, steps * count_of),
+            agreement=False,
+        )
+    return methods, done
 
 
 def _paper(arguments: argparse.Namespace, folder: Path) -> str:

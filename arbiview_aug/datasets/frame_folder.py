@@ -152,6 +152,20 @@ class FrameFolder(WritableRecording):
             sample["neighbours"] = [self._neighbour(self._drive_names[k]) for k in others]
         return sample
 
+    def truth(self, index: int) -> dict[str, Any] | None:
+        """``rig`` and ``images`` of a frame's ``truth`` camera, by default of its first camera's size; None without."""
+        frame = self._frames[index]
+        calib = _read_calibration(frame)
+        entry = calib.get("truth")
+        if entry is None:
+            return None
+        if not isinstance(entry, dict):
+            raise CalibrationError(f"{frame.where}: truth: expected a camera's mapping, got {type(entry).__name__}")
+        size = {key: calib["cameras"][0].get(key) for key in ("width", "height")} if calib["cameras"] else {}
+        calib = {**calib, "cameras": [size | entry]}
+        rig = self._rig(calib, frame)
+        return camera_fields(rig, self._images(calib, frame, rig), frame.name)
+
     def _boxes_pose_time(self, calib: Mapping[str, Any], frame: _Frame) -> dict[str, Any]:
         found: dict[str, Any] = {}
         if calib.get("boxes_3d") is not None:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
+from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
@@ -27,15 +28,19 @@ def own_camera(source: Rig, images: Sequence[Image], target: Rig) -> list[Render
     "Geometric" of the paper's Table 2: projection by H = K' R' Rᵀ K⁻¹, without fusion.
     """
     views = []
-    axes = source.cam2ego[:, :3, 2]
     for camera in target:
-        nearest = int(np.argmax(axes @ camera.cam2ego[:3, 2]))
-        index = source.names.index(camera.name) if camera.name in source.names else nearest
+        index = own_index(source, camera)
         alone = source.with_cameras([source[index]])
         plan = build_plan(alone, target.with_cameras([camera]), surface="far")
         (view,) = as_arrays(render_opencv(plan, as_tensors([images[index]])))
         views.append(RenderedView(view, plan.coverage[0]))
     return views
+
+
+def own_index(source: Rig, camera: Camera) -> int:
+    """Index of the source camera of the same name, or else of the nearest direction."""
+    nearest = int(np.argmax(source.cam2ego[:, :3, 2] @ camera.cam2ego[:3, 2]))
+    return source.names.index(camera.name) if camera.name in source.names else nearest
 
 
 def crop_and_slide(source: Rig, images: Sequence[Image], target: Rig) -> list[RenderedView]:

@@ -37,12 +37,25 @@ class LidarReference(NamedTuple):
     points: ColouredPoints
 
 
+class Photographs(NamedTuple):
+    """Images that the cameras of a rig took, as truth."""
+
+    rig: Rig  # in the frame's ego frame, without masks
+    images: torch.Tensor | Sequence[torch.Tensor]
+    valid: Sequence[BoolArray]  # (h, w) pixels that score, by camera
+
+    def of_rig(self, _: Rig) -> Photographs:
+        """``ScoredFrame.truth`` of their own rig."""
+        return self
+
+
 @dataclass(frozen=True)
 class ScoredFrame:
     sample: dict[str, Any]  # ``rig``, ``images`` and other keys that methods may use
     lidar: Mapping[Exposure, LidarReference] = field(default_factory=dict)  # by exposure; empty without points
     held_out: bool = False  # whether ``sample`` has points, and others score
-    truth: Callable[[Rig], RenderedViews] | None = None  # renders the true views of a rig; None on real frames
+    truth: Callable[[Rig], RenderedViews | Photographs] | None = None  # the true views of a rig; None if unknown
+    target: Rig | None = None  # the rig that alone has a truth, that of photographs; None for any rig
 
     @property
     def scored_sample(self) -> dict[str, Any]:
@@ -96,10 +109,13 @@ def scores(
     rows = [{"seen": float(view.coverage.mean())} for view in views]
     if frame.truth is not None:
         truth = frame.truth(target)
-        for row, view, true, tensor in zip(rows, views, as_arrays(truth.images), truth.classes, strict=True):
-            classes = tensor.numpy()
-            valid = classes != SceneClass.VOID
-            found = truth_metrics(view.image, true, coverage=view.coverage, classes=regions(classes), valid=valid)
+        for k, (row, view, true) in enumerate(zip(rows, views, as_arrays(truth.images), strict=True)):
+            if isinstance(truth, Photographs):
+                valid, parts = truth.valid[k], None
+            else:
+                classes = truth.classes[k].numpy()
+                valid, parts = classes != SceneClass.VOID, regions(classes)
+            found = truth_metrics(view.image, true, coverage=view.coverage, classes=parts, valid=valid)
             row |= {f"true_{name}": value for name, value in found.items()}
     for k, (exposure, reference) in enumerate(references):
         rendered = views if k == 0 else render(reference.sample, target)

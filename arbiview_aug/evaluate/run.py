@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import CalibrationError, SampleError
 from arbiview_aug.evaluate.agreement import OverlapScore, source_overlap, summary, target_consistency
@@ -13,6 +15,9 @@ from arbiview_aug.evaluate.frames import ScoredFrame, scores
 from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import Method
 from arbiview_aug.evaluate.metrics import mean_of
+
+PHOTOGRAPHS = "photographs"
+"""Name of the target whose photographs are the truth."""
 
 
 @dataclass
@@ -35,6 +40,14 @@ class Evaluation:
         rows = [row for row in self.views if row["method"] == method and target in (None, row["target"])]
         return mean_of([{key: value for key, value in row.items() if not isinstance(value, str)} for row in rows])
 
+    def spread(self, method: str, metric: str) -> float:
+        """Standard deviation over the frames of a metric's mean."""
+        frames: dict[str, list[float]] = {}
+        for row in self.views:
+            if row["method"] == method and metric in row:
+                frames.setdefault(row["frame"], []).append(row[metric])
+        return float(np.std([np.mean(values) for values in frames.values()])) if frames else 0.0
+
     def agreement(self, method: str) -> dict[str, float]:
         """Summarize the pairs of sources (``overlap_...``) and of rendered views (``consistency_...``)."""
         row: dict[str, float] = {}
@@ -54,12 +67,13 @@ def evaluate(
 ) -> Evaluation:
     """Run every method on every named frame and target.
 
-    ``targets`` maps a source rig to the rigs to render, by name. ``tick`` is called before each step with its name and
-    the frame's number of steps. ``agreement`` measures that of neighbours too.
+    ``targets`` maps a source rig to the rigs to render, by name, unless a frame has a ``target`` of its own. ``tick``
+    is called before each step with its name and the frame's number of steps. ``agreement`` measures that of neighbours
+    too.
     """
     done = Evaluation()
     for name, frame in frames:
-        rigs = dict(targets(frame.sample["rig"]))
+        rigs = dict(targets(frame.sample["rig"])) if frame.target is None else {PHOTOGRAPHS: frame.target}
         if done.first is None:
             done.first, done.targets = frame, rigs
         steps = len(methods) * (agreement + len(rigs))

@@ -115,7 +115,7 @@ def motion_depth(
         boxes: (B, 7) labelled objects of the current frame, ego frame, which are left out.
         load: Reads a neighbour's images.
     """
-    cameras = [_without_objects(motion_camera(camera), boxes) for camera in rig]
+    cameras = [without_objects(motion_camera(camera), boxes) for camera in rig]
 
     def declined(reason: str) -> MotionDepth:
         return MotionDepth(tuple(np.zeros(camera.size, np.float32) for camera in cameras), reason)
@@ -165,7 +165,7 @@ def _loaded(neighbour: Neighbour, load: Load, ground_z_m: float) -> _Side | None
     images = load(neighbour)
     if images is None:
         return None
-    cameras = [_without_objects(motion_camera(camera), neighbour.boxes) for camera in neighbour.rig]
+    cameras = [without_objects(motion_camera(camera), neighbour.boxes) for camera in neighbour.rig]
     return _Side(neighbour, _swept(neighbour.rig, cameras, images, ground_z_m))
 
 
@@ -174,7 +174,7 @@ def _swept(rig: Rig, cameras: list[Camera], images: Sequence[torch.Tensor], grou
     return [SweptImage(camera, grey, ground_z_m) for camera, grey in zip(cameras, greys, strict=True)]
 
 
-def _without_objects(camera: Camera, boxes: FloatArray | None) -> Camera:
+def without_objects(camera: Camera, boxes: FloatArray | None) -> Camera:
     """Mask labelled objects, with a margin around them."""
     if boxes is None or not len(boxes):
         return camera

@@ -140,6 +140,8 @@ def test_figures(nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixt
         ["--paper", "--figure"],
         ["--paper", "--yaws", "yaw"],
         ["--figure", "--surface", "far"],
+        ["--displaced"],
+        ["--displaced", "--target", "waymo", "--data", "."],
     ],
 )
 def test_wrong_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:

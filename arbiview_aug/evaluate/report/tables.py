@@ -30,6 +30,19 @@ TRUTH_NOTES = (
     "pixels that no source saw. sharp: gradient energy there, relative to the truth. whole view: PSNR of all pixels; "
     "holes are black unless a path fills them."
 )
+PHOTOGRAPH_COLUMNS = (
+    SEEN,
+    ("PSNR dB", "{true_covered_psnr_db:.2f}"),
+    ("spread", "{spread_db:.2f}"),
+    ("MAE", "{true_covered_mae:.2f}"),
+    ("SSIM", "{true_covered_ssim:.4f}"),
+    ("whole view", "{true_psnr_db:.2f}"),
+)
+PHOTOGRAPH_NOTES = (
+    "seen: share of the pixels that the method covers. PSNR, MAE, SSIM: of those, means over all cameras and frames. "
+    "spread: standard deviation of the frames' PSNR. whole view: PSNR of all pixels, holes black. copy: the source "
+    "image as it is. The photographed vehicle itself and labelled objects that moved do not score."
+)
 SPARSE_COLUMNS = (
     SEEN,
     ("raw dB", "{raw_psnr_db:.2f}"),
@@ -65,7 +78,10 @@ _HELD_OUT = "Methods get the points of every other degree of azimuth; the points
 
 
 def evaluation_tables(done: Evaluation, methods: Sequence[str]) -> list[Table]:
-    """Tabulate views against their reference (a row per method and target) and agreement (a row per method)."""
+    """Tabulate views against their reference (a row per method and target) and agreement (a row per method).
+
+    Against photographs there is no agreement.
+    """
     assert done.first is not None
     names = [name for name in methods if name not in done.declined]
     rows: dict[str, dict[str, float]] = {}
@@ -74,6 +90,9 @@ def evaluation_tables(done: Evaluation, methods: Sequence[str]) -> list[Table]:
             rows |= {f"{name}: {target}": done.means(name, target) for target in done.targets}
         rows[f"{name}: all" if len(done.targets) > 1 else name] = done.means(name)
     table: Table = ("Views, no truth and no LiDAR points to compare with", rows, (SEEN,), "")
+    if done.first.target is not None:
+        rows = {name: row | {"spread_db": done.spread(name, "true_covered_psnr_db")} for name, row in rows.items()}
+        return [("Against photographs", rows, PHOTOGRAPH_COLUMNS, PHOTOGRAPH_NOTES)]
     if done.first.truth is not None:
         table = ("Against the true views, where some source camera saw", rows, TRUTH_COLUMNS, TRUTH_NOTES)
     elif done.first.lidar:

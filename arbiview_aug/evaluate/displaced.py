@@ -1,0 +1,90 @@
+"""Photographs from displaced cameras as truth: a frame's ``truth`` camera, or the cameras of the next frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import cv2
+import numpy as np
+
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets.frame_folder import FrameFolder
+from arbiview_aug.errors import DataError
+from arbiview_aug.evaluate.baselines import own_index
+from arbiview_aug.evaluate.frames import Photographs, ScoredFrame
+from arbiview_aug.evaluate.images import RenderedView, as_arrays
+from arbiview_aug.evaluate.methods import Method
+from arbiview_aug.evaluate.targets import without_masks
+from arbiview_aug.sample.inputs import read_frames
+from arbiview_aug.sample.neighbours import neighbours_of_frames
+from arbiview_aug.scene.surface import SurfaceName
+from arbiview_aug.temporal.motion_depth import without_objects
+
+
+def displaced_frames(data: Any, count: int, next_frame: Mapping[str, Any] | None) -> Iterator[tuple[str, ScoredFrame]]:
+    """Name and frame of the first ``count`` samples with photographs; methods get all that a sample has.
+
+    The truth is a ``FrameFolder``'s ``truth`` camera; else ``next_frame``, or the nearest neighbour recorded later.
+    """
+    for index in range(len(data)):
+        if count == 0:
+            return
+        sample, found = data[index], None
+        if next_frame is None and isinstance(data, FrameFolder):
+            found = data.truth(index)
+        if found is not None:
+            photographs = _photographs(found["rig"], found["images"])
+        else:
+            if next_frame is not None:
+                sample = {**sample, "neighbours": [next_frame]}
+            later = _next_frame(sample)
+            if later is None:
+                continue
+            photographs, sample = later
+        yield str(sample.get("token", index)), ScoredFrame(sample, truth=photographs.of_rig, target=photographs.rig)
+        count -= 1
+
+
+def _next_frame(sample: dict[str, Any]) -> tuple[Photographs, dict[str, Any]] | None:
+    """Photographs of the nearest later neighbour, and the sample with the other neighbours, if there are others."""
+    problems: list[str] = []
+    (frame,) = read_frames(sample, None)
+    (neighbours,) = neighbours_of_frames(sample, [frame], (), lambda _, message: problems.append(message))
+    later = next((one for one in neighbours if one.is_later), None)
+    if later is None:
+        if problems:
+            raise DataError(problems[0])
+        return None
+    moved = later.labelled if later.moved is None else later.moved
+    rig = later.rig.with_cameras([without_objects(camera, moved) for camera in later.rig])
+    others = [entry for k, entry in enumerate(sample["neighbours"]) if k != later.number]
+    return _photographs(rig, later.images(frame.images)), sample | ({"neighbours": others} if others else {})
+
+
+def _photographs(rig: Rig, images: Any) -> Photographs:
+    """Photographs whose masked pixels do not score."""
+    valid = [np.ones(camera.size, bool) if camera.mask is None else camera.mask for camera in rig]
+    return Photographs(without_masks(rig), images, valid)
+
+
+def _copy(sample: Mapping[str, Any], target: Rig) -> list[RenderedView]:
+    """Copy the source image of the same name, else of the nearest direction."""
+    rig: Rig = sample["rig"]
+    images, views = as_arrays(sample["images"]), []
+    for camera in target:
+        image: Any = cv2.resize(images[own_index(rig, camera)], camera.size[::-1], interpolation=cv2.INTER_AREA)
+        views.append(RenderedView(image, np.ones(camera.size, bool)))
+    return views
+
+
+COPY = Method("copy", _copy, plans=False)
+"""The source image itself."""
+
+
+def surfaces_for(sample: Mapping[str, Any]) -> list[SurfaceName]:
+    """Surfaces that a sample has the geometry for, from the least to the most."""
+    found: list[SurfaceName] = ["ground", "street"]
+    found += ["objects"] if sample.get("boxes_3d") is not None else []
+    found += ["lidar"] if sample.get("points") is not None else []
+    return found + (["motion"] if sample.get("neighbours") else [])
