@@ -14,6 +14,7 @@ from typing import Any
 from arbiview_aug.cli.arguments import device_named
 from arbiview_aug.errors import DataError
 from integrations.cross_rig.experiment import Run, run
+from integrations.cross_rig.families import FAMILIES
 from integrations.cross_rig.report import markdown, write_report
 from integrations.cross_rig.settings import Settings, full, jobs, large, pilot, quick
 from integrations.cross_rig.variants import VARIANTS
@@ -72,6 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     change.add_argument(
         "--variants", "--arms", nargs="+", choices=VARIANTS, metavar="VARIANT", help=", ".join(VARIANTS)
     )
+    change.add_argument("--families", nargs="+", choices=FAMILIES, metavar="FAMILY", help=", ".join(FAMILIES))
     change.add_argument("--seeds", nargs="+", type=int, metavar="SEED")
     change.add_argument("--train-frames", type=int, metavar="N")
     change.add_argument("--val-frames", type=int, metavar="N")
@@ -84,7 +86,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _settings(arguments: argparse.Namespace) -> Settings:
     settings = PRESETS[arguments.preset]()
-    names = ("changes", "variants", "seeds", "train_frames", "val_frames", "test_frames")
+    names = ("changes", "variants", "families", "seeds", "train_frames", "val_frames", "test_frames")
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
     of_schedule = {n: getattr(arguments, n) for n in ("steps", "precision", "device") if getattr(arguments, n)}

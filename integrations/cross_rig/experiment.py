@@ -7,23 +7,24 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from integrations.cross_rig.cache import code_hash, content_hash
-from integrations.cross_rig.frames import Source, make_frames, one_thread
+from integrations.cross_rig.frames import Source, box_store, make_boxes, make_frames, one_thread
 from integrations.cross_rig.labels import Grid, covered_cells
-from integrations.cross_rig.model import BevDetector
+from integrations.cross_rig.model import Detector
 from integrations.cross_rig.settings import Job, Settings, jobs
-from integrations.cross_rig.training import Draws, FrameSet, Tested, evaluate, train
+from integrations.cross_rig.training import Draws, FrameSet, Schedule, Tested, evaluate, train
 from integrations.cross_rig.variant import Variant
-from integrations.cross_rig.worlds import Split
+from integrations.cross_rig.worlds import SPLITS, Split
 
 Log = Callable[[str], None]
 
@@ -62,14 +63,29 @@ class Run:
         state = labels.store().stacked("state", self.settings.train_frames)
         counts = covered_cells(Grid(), images.rig)
         return FrameSet(
-            images.store(), images.rig, state, counts, retargeted=job.variant.renders, masked=job.variant.masked
+            images.store(),
+            images.rig,
+            state,
+            counts,
+            self.boxes("train", self.settings.train_frames),
+            retargeted=job.variant.renders,
+            masked=job.variant.masked,
         )
 
     def true_set(self, split: Split, change: str | None, num_frames: int) -> FrameSet:
         """Frames as a rig really sees them."""
         source = self.source(split, change)
         state = source.store().stacked("state", num_frames)
-        return FrameSet(source.store(), source.rig, state, covered_cells(Grid(), source.rig))
+        boxes = self.boxes(split, num_frames)
+        return FrameSet(source.store(), source.rig, state, covered_cells(Grid(), source.rig), boxes)
+
+    def boxes(self, split: Split, num_frames: int) -> npt.NDArray[np.float32]:
+        """(F, n, 7) vehicles of a split's streets."""
+        return box_store(self.output / "frames", split).stacked("boxes", num_frames)
+
+    def schedule(self, job: Job) -> Schedule:
+        """Of a job's training."""
+        return replace(self.settings.schedule, family=job.family)
 
     def draws(self, job: Job) -> Draws:
         """The batches of a job's training."""
@@ -101,7 +117,8 @@ class Run:
                 "mixed": job.variant.mixed,
                 "augmented": job.variant.augmented,
                 "count": count,
-                "schedule": asdict(self.settings.schedule),
+                "schedule": asdict(self.schedule(job)),
+                "boxes": box_store(self.output / "frames", "train").key,
                 "seed": job.seed,
                 "code": code_hash("integrations.cross_rig.training"),
             }
@@ -154,18 +171,18 @@ class Run:
                 val = self.true_set("val", change, self.settings.val_frames)
                 test = self.true_set("test", change, self.settings.test_frames)
                 height = test.store.stacked("height_dm", self.settings.test_frames)
-                tested = evaluate(model, val, test, height, self.settings.schedule)
+                tested = evaluate(model, val, test, height, self.schedule(job))
                 text = json.dumps(_result(job, change, trained, tested))
                 _write(path, partial(Path.write_text, data=text))
                 lines.append(f"{change} val {100 * tested.val_iou:.1f}")
         return f"{job.name}: {trained['cpu_s']:.0f} s of training, {', '.join(lines)}"
 
-    def _trained(self, job: Job) -> tuple[BevDetector, dict[str, Any]]:
+    def _trained(self, job: Job) -> tuple[Detector, dict[str, Any]]:
         path = self.output / "models" / f"{self.training_key(job)}.pt"
-        schedule = self.settings.schedule
+        schedule = self.schedule(job)
         if path.is_file():
             saved = torch.load(path, weights_only=True, map_location=schedule.device)
-            model = BevDetector(Grid(), schedule.backbone).to(schedule.device)
+            model = Detector(Grid(), schedule.family, schedule.backbone).to(schedule.device)
             model.load_state_dict(saved["weights"])
             return model.eval(), saved["trained"]
         start = time.process_time()
@@ -192,6 +209,9 @@ def _result(job: Job, change: str, trained: dict[str, Any], tested: Tested) -> d
         "test_cpu_s": tested.cpu_s,
         "by_distance": tested.tally.by_distance.tolist(),
         "by_height": tested.tally.by_height.tolist(),
+        # No NaN in JSON: -1 does not count.
+        "matched": np.nan_to_num(np.round(tested.matched, 4), nan=-1).tolist(),
+        "positives": tested.positives.tolist(),
     }
 
 
@@ -205,6 +225,8 @@ def _write(path: Path, write: Callable[[Path], object]) -> None:
 
 def run(setup: Run, workers: int, log: Log) -> Iterator[int]:
     """Make everything that is missing; yields the number of missing trainings, before the first and after each."""
+    for split in SPLITS:
+        make_boxes(setup.output / "frames", split, getattr(setup.settings, f"{split}_frames"))
     for source, count in setup.sources():
         start = time.monotonic()
         for done, todo in make_frames(source, count, workers):
@@ -230,21 +252,21 @@ def run(setup: Run, workers: int, log: Log) -> Iterator[int]:
             yield len(missing) - done
 
 
-def load_results(setup: Run) -> dict[str, dict[str, dict[int, dict[str, Any]]]]:
-    """The results that are there: by change, variant and seed."""
+def load_results(setup: Run, family: str) -> dict[str, dict[str, dict[int, dict[str, Any]]]]:
+    """The results of a family that are there: by change, variant and seed."""
     found: dict[str, dict[str, dict[int, dict[str, Any]]]] = {}
-    for job in jobs(setup.settings):
+    for job in (job for job in jobs(setup.settings) if job.family == family):
         for change, path in setup.result_paths(job).items():
             if path.is_file():
                 found.setdefault(change, {}).setdefault(job.variant.name, {})[job.seed] = json.loads(path.read_text())
     return found
 
 
-def same_frames(setup: Run, change: str) -> dict[str, str]:
+def same_frames(setup: Run, change: str, family: str) -> dict[str, str]:
     """For each variant whose frames equal another's bit by bit, the first with the same frames."""
     first: dict[Path, str] = {}
     same = {}
-    for job in jobs(setup.settings):
+    for job in (job for job in jobs(setup.settings) if job.family == family):
         path = setup.result_paths(job).get(change)
         if path is not None and first.setdefault(path, job.variant.name) != job.variant.name:
             same[job.variant.name] = first[path]

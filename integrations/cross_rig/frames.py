@@ -20,6 +20,7 @@ from arbiview_aug.datasets import LazyFrame, Neighbours
 from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.generator import shipped_weights
+from integrations.cross_rig.boxes import vehicle_boxes
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, fill
 from integrations.cross_rig.labels import Grid, box_cells, visible_objects
 from integrations.cross_rig.variant import Variant
@@ -118,6 +119,25 @@ class Source:
     def true(self) -> Source:
         """The same streets as the rig of these images really sees them."""
         return replace(self, variant=None)
+
+
+def box_store(root: Path, split: Split) -> FrameStore:
+    """Boxes of a split's vehicles, in A's ego frame; of no rendering."""
+    spec = {
+        "format": _FORMAT,
+        "boxes": code_hash("integrations.cross_rig.boxes"),
+        "streets": STREET_SEEDS[split],
+        "world": code_hash(_WORLD, within=_WORLD),
+    }
+    return FrameStore(root, spec)
+
+
+def make_boxes(root: Path, split: Split, num_frames: int) -> None:
+    """Make what is missing."""
+    store = box_store(root, split)
+    drive = SyntheticDrive(source_rig((96, 256)), num_frames=_MAX_FRAMES, seed=STREET_SEEDS[split], lidar=False)
+    for chunk in store.missing(num_frames):
+        fill(store, lambda k: {"boxes": vehicle_boxes(Grid(), drive.scene(k), drive.rig.ground_z_m)}, chunk)
 
 
 def make_frames(source: Source, num_frames: int, workers: int) -> Iterator[tuple[int, int]]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from integrations.cross_rig.cell_counts import DISTANCES_M, HEIGHTS_M, iou
 from integrations.cross_rig.experiment import Run, load_results, rendering_seconds, same_frames
-from integrations.cross_rig.scoring import variant_scores
+from integrations.cross_rig.scoring import ap_scores, iou_scores
 from integrations.cross_rig.settings import jobs
 from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.worlds import CHANGES
@@ -24,14 +24,17 @@ Results = Mapping[str, Mapping[int, Mapping[str, Any]]]
 
 def write_report(setup: Run) -> dict[str, Any]:
     """Write ``report.json``, ``report.md`` and ``report.png`` from the results that are there; returns the first."""
-    results = load_results(setup)
-    changes = {
-        name: _of_change(results[name], rendering_seconds(setup, name)) | {"same_frames": same_frames(setup, name)}
-        for name in setup.settings.changes
-        if name in results
-    }
+    changes, there = {}, 0
+    for family in setup.settings.families:
+        results = load_results(setup, family)
+        there += sum(len(seeds) for variants in results.values() for seeds in variants.values())
+        for name in (name for name in setup.settings.changes if name in results):
+            changes[name if family == "voxels" else f"{name}-{family}"] = {
+                "title": CHANGES[name].title + ("" if family == "voxels" else f", {family}"),
+                **_of_change(results[name], rendering_seconds(setup, name)),
+                "same_frames": same_frames(setup, name, family),
+            }
     total = sum(len(setup.tested_on(job)) for job in jobs(setup.settings))
-    there = sum(len(seeds) for variants in results.values() for seeds in variants.values())
     report = {
         "settings": asdict(setup.settings),
         "tests_done": there,
@@ -52,14 +55,20 @@ def _of_change(variants: Results, rendering: Mapping[str, float]) -> dict[str, A
     if not seeds:
         return {"seeds": [], "variants": {}}
     cells = {name: np.array([variants[name][s]["by_distance"] for s in seeds]) for name in variants}  # [S, F, bins, 3]
-    scores = variant_scores({name: array.sum(2) for name, array in cells.items()})
+    scores = iou_scores({name: array.sum(2) for name, array in cells.items()})
+    told = {
+        name: tuple(np.array([variants[name][s][key] for s in seeds], float) for key in ("matched", "positives"))
+        for name in variants
+    }
+    precisions = ap_scores({name: (np.where(m < 0, np.nan, m), positives) for name, (m, positives) in told.items()})
     rows = {}
     for name in (n for n in VARIANTS if n in variants):
         heights = np.array([variants[name][s]["by_height"] for s in seeds]).sum((0, 1))
         trained = [variants[name][s]["trained"] for s in seeds]
         rows[name] = {
             "title": VARIANTS[name].title,
-            **asdict(scores[name]),
+            **{"iou" if key == "value" else key: figure for key, figure in asdict(scores[name]).items()},
+            "ap": asdict(precisions[name]),
             "by_distance_iou": iou(cells[name].sum((0, 1))).tolist(),
             "by_height_recall": (heights[:, 0] / np.maximum(heights[:, 1], 1)).tolist(),
             "thresholds": [variants[name][s]["threshold"] for s in seeds],
@@ -88,18 +97,23 @@ def markdown(report: Mapping[str, Any]) -> str:
     ]
     distances = [f"{a:g}–{b:g} m" for a, b in pairwise(DISTANCES_M)]
     heights = [f"{a:g}–{b:g} m high" for a, b in pairwise(HEIGHTS_M)]
-    head = ["variant", "IoU", "over raw", "recovered %", *(f"IoU {d}" for d in distances)]
+    scored = any("ap" in row for row in rows)
+    head = ["variant", "IoU", "over raw", "recovered %", *(["AP", "AP recovered %"] if scored else [])]
+    head += [*(f"IoU {d}" for d in distances)]
     head += [*(f"recall {h}" for h in heights), "loading"]
     for name, change in report["changes"].items():
         if not change["variants"]:
             continue
-        lines += ["", f"**{CHANGES[name].title}**, seeds {', '.join(map(str, change['seeds']))}", ""]
+        title, seeds = change.get("title") or CHANGES[name].title, ", ".join(map(str, change["seeds"]))
+        lines += ["", f"**{title}**, seeds {seeds}", ""]
         lines += ["| " + " | ".join(head) + " |", "| --- |" + " ---: |" * (len(head) - 1)]
         for variant, row in change["variants"].items():
             same = change["same_frames"].get(variant)
             title = row["title"] + (f" (the frames of {change['variants'][same]['title']})" if same else "")
             cells = [title, _text(row["iou"], 1), _text(row["over_raw"], 1, sign=True)]
             cells.append(_text(row["share"], 0))
+            if scored:
+                cells += [_text(row["ap"]["value"], 1), _text(row["ap"]["share"], 0)]
             cells += [f"{100 * value:.1f}" for value in (*row["by_distance_iou"], *row["by_height_recall"])]
             cells.append(f"{1000 * row['loading_cpu_s']:.1f}")
             lines.append("| " + " | ".join(cells) + " |")
@@ -140,7 +154,7 @@ def save_plot(report: Mapping[str, Any], path: Path) -> None:
             score = variants[name]["iou"]
             middle, low, high = (100 * score.get(part, score["value"]) for part in ("value", "low", "high"))
             panel.errorbar(middle, k, xerr=[[max(middle - low, 0)], [max(high - middle, 0)]], fmt="o", color="#1f77b4")
-        panel.set_title(CHANGES[change].title, fontsize=10)
+        panel.set_title(report["changes"][change]["title"], fontsize=10)
         panel.set_xlabel("IoU, %")
         panel.grid(True, axis="x", alpha=0.2)
     panels[0].set_yticks(range(len(names)), list(titles.values()))

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
+from integrations.cross_rig.boxes import average_precision
 from integrations.cross_rig.cell_counts import Counts, Floats, iou
 
 MIN_GAP = 0.05
 """Oracle minus raw below which a share says nothing: the intervals of both are about a fifth of it."""
 
 _DRAWS = 2000
-_BLOCK = 200
+_DRAWS_OF_AP = 200  # each sorts out every detection again
 
 
 @dataclass(frozen=True)
@@ -25,38 +28,41 @@ class Interval:
     high: float
 
 
-def bootstrap_ious(counts: Mapping[str, Counts], *, seed: int = 0, draws: int = _DRAWS) -> dict[str, Floats]:
-    """IoUs of resampled experiments: seeds drawn with replacement, then frames, the same ones for all of them.
+class Resampled(NamedTuple):
+    """Resampled experiments: seeds drawn with replacement, then frames, the same ones for all of them.
 
     All seeds are tested on the same frames, so that what is easy or hard about these does not average out over seeds.
     All variants share the draws: seeds and frames are paired, so differences have their own, smaller intervals.
 
-    Args:
-        counts: By variant, (S, F, 3); the same S and F throughout.
-        seed: Of the draws.
-        draws: How many.
-
-    Returns:
-        By variant, (draws,).
+    Attributes:
+        seeds: (draws, S) how often each seed was drawn.
+        frames: (draws, F) how often each frame was drawn.
     """
-    shapes = {array.shape for array in counts.values()}
-    if len(shapes) != 1:
-        raise ValueError(f"bootstrap_ious: expected variants with the same seeds and frames, got {sorted(shapes)}")
-    (num_seeds, num_frames, _) = shapes.pop()
+
+    seeds: Floats
+    frames: Floats
+
+
+def resampled(num_seeds: int, num_frames: int, draws: int, seed: int = 0) -> Resampled:
+    """Draws of seeds and frames."""
     rng = np.random.default_rng(seed)
-    # Every variant's columns side by side: one product of frame weights with all of them.
-    columns = np.stack(list(counts.values()), 2).astype(np.float64)  # [S, F, variants, 3]
-    sums = np.zeros((draws, columns.shape[2], 3))
-    for start in range(0, draws, _BLOCK):
-        block = min(_BLOCK, draws - start)
-        drawn = rng.integers(num_seeds, size=(block, num_seeds))
-        weights = rng.multinomial(num_frames, np.full(num_frames, 1 / num_frames), size=block).astype(np.float64)
-        for slot in range(num_seeds):
-            for s in range(num_seeds):
-                rows = np.flatnonzero(drawn[:, slot] == s)
-                sums[start + rows] += np.einsum("rf,fac->rac", weights[rows], columns[s], optimize=True)
-    ious = iou(sums)
-    return {name: ious[:, k] for k, name in enumerate(counts)}
+    alike = [rng.multinomial(n, np.full(n, 1 / n), size=draws).astype(np.float64) for n in (num_seeds, num_frames)]
+    return Resampled(*alike)
+
+
+def bootstrap_ious(counts: Mapping[str, Counts], *, draws: int = _DRAWS) -> dict[str, Floats]:
+    """IoUs (draws,) of resampled experiments by variant, from (S, F, 3) counts; the same S and F throughout."""
+    seeds, frames = resampled(*_one_shape(counts), draws)
+    of_seeds = {name: np.einsum("rf,sfc->rsc", frames, array, optimize=True) for name, array in counts.items()}
+    return {name: iou(np.einsum("rs,rsc->rc", seeds, sums)) for name, sums in of_seeds.items()}
+
+
+def _one_shape(counts: Mapping[str, npt.NDArray[Any]]) -> tuple[int, int]:
+    shapes = {array.shape[:2] for array in counts.values()}
+    if len(shapes) != 1:
+        raise ValueError(f"scores: expected variants with the same seeds and frames, got {sorted(shapes)}")
+    (shape,) = shapes
+    return shape[0], shape[1]
 
 
 def interval(value: float, draws: Floats) -> Interval:
@@ -67,38 +73,54 @@ def interval(value: float, draws: Floats) -> Interval:
 
 @dataclass(frozen=True)
 class VariantScore:
-    """A variant under one change.
+    """A variant under one change by one metric.
 
     Attributes:
-        iou: Of all seeds' frames together.
-        over_raw: IoU minus raw's.
+        value: IoU of all seeds' frames together, or mean AP of the seeds.
+        over_raw: Value minus raw's.
         share: (variant - raw) / (oracle - raw); None where the gap is below ``MIN_GAP`` or no oracle was trained.
-        seeds: IoU of each seed.
+        seeds: Value of each seed.
     """
 
-    iou: Interval
+    value: Interval
     over_raw: Interval | None
     share: Interval | None
     seeds: list[float]
 
 
-def variant_scores(
-    counts: Mapping[str, Counts], *, raw: str = "raw", oracle: str = "oracle"
-) -> dict[str, VariantScore]:
+def iou_scores(counts: Mapping[str, Counts]) -> dict[str, VariantScore]:
     """Scores of the variants of one change, from (S, F, 3) counts by variant."""
-    draws = bootstrap_ious(counts)
     values = {name: float(iou(array.sum((0, 1)))) for name, array in counts.items()}
-    has_gap = raw in counts and oracle in counts and values[oracle] - values[raw] >= MIN_GAP
+    seeds = {name: iou(array.sum(1)) for name, array in counts.items()}
+    return _scores(values, seeds, bootstrap_ious(counts))
+
+
+def ap_scores(detections: Mapping[str, tuple[Floats, Floats]]) -> dict[str, VariantScore]:
+    """Scores of the variants of one change, from ``boxes.match`` (S, F, k, 5) and boxes that count (S, F)."""
+    num_seeds, num_frames = _one_shape({name: matched for name, (matched, _) in detections.items()})
+    draws = resampled(num_seeds, num_frames, _DRAWS_OF_AP)
+    weights = np.concatenate([np.ones((1, num_frames)), draws.frames])
+    of_seeds = {
+        name: np.stack([average_precision(*seed, weights) for seed in zip(*arrays, strict=True)], -1)
+        for name, arrays in detections.items()
+    }  # [1 + draws, S]
+    seeds = {name: array[0] for name, array in of_seeds.items()}
+    drawn = {name: (array[1:] * draws.seeds).mean(1) for name, array in of_seeds.items()}
+    return _scores({name: float(array.mean()) for name, array in seeds.items()}, seeds, drawn)
+
+
+def _scores(
+    values: Mapping[str, float], seeds: Mapping[str, Floats], draws: Mapping[str, Floats]
+) -> dict[str, VariantScore]:
+    raw, oracle = values.get("raw"), values.get("oracle")
     scores = {}
-    for name, array in counts.items():
+    for name, value in values.items():
         over = share = None
-        if raw in counts and name != raw:
-            over = interval(values[name] - values[raw], draws[name] - draws[raw])
-        if has_gap and name not in (raw, oracle):
-            gap = values[oracle] - values[raw]
+        if raw is not None and name != "raw":
+            over = interval(value - raw, draws[name] - draws["raw"])
+        if raw is not None and oracle is not None and oracle - raw >= MIN_GAP and name not in ("raw", "oracle"):
             # A draw whose gap is nil would make its share infinite: its place in the order is what counts.
-            gaps = np.maximum(draws[oracle] - draws[raw], 1e-3)
-            share = interval((values[name] - values[raw]) / gap, (draws[name] - draws[raw]) / gaps)
-        seeds = [float(value) for value in iou(array.sum(1))]
-        scores[name] = VariantScore(interval(values[name], draws[name]), over, share, seeds)
+            gaps = np.maximum(draws["oracle"] - draws["raw"], 1e-3)
+            share = interval((value - raw) / (oracle - raw), (draws[name] - draws["raw"]) / gaps)
+        scores[name] = VariantScore(interval(value, draws[name]), over, share, [float(one) for one in seeds[name]])
     return scores

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import product
 from typing import TypeVar
 
+from integrations.cross_rig.families import FAMILIES
 from integrations.cross_rig.training import Schedule
 from integrations.cross_rig.variant import Variant
 from integrations.cross_rig.variants import VARIANTS
@@ -36,7 +39,8 @@ class Settings:
         seeds: Of the trainings; each variant is trained once with each.
         changes: Names of ``worlds.CHANGES``.
         variants: Names of ``variants.VARIANTS``.
-        schedule: Of every training.
+        families: Names of ``families.FAMILIES``.
+        schedule: Of every training; each job's family replaces its own.
 
     Raises:
         ValueError: Unknown names, or a count below 1.
@@ -49,11 +53,13 @@ class Settings:
     seeds: tuple[int, ...] = (0, 1, 2)
     changes: tuple[str, ...] = tuple(CHANGES)
     variants: tuple[str, ...] = tuple(VARIANTS)
+    families: tuple[str, ...] = ("voxels",)
     schedule: Schedule = field(default_factory=lambda: Schedule(steps=900))
 
     def __post_init__(self) -> None:
         named_rows("variants", self.variants, VARIANTS)
         named_rows("changes", self.changes, CHANGES)
+        named_rows("families", self.families, FAMILIES)
         for name in ("train_frames", "val_frames", "test_frames"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected a whole number above 0, got {getattr(self, name)}")
@@ -67,26 +73,29 @@ class Job:
         variant: How.
         change: For which vehicle B; None where B does not matter (raw frames): one training serves every change.
         seed: Of its initialisation and its draws, the same for every variant.
+        family: Of the detector.
     """
 
     variant: Variant
     change: str | None
     seed: int
+    family: str = "voxels"
 
     @property
     def name(self) -> str:
         """For files and logs."""
-        return f"{self.variant.name}-{self.change or 'any'}-{self.seed}"
+        return f"{self.variant.name}-{self.change or 'any'}-{self.family}-{self.seed}"
 
 
 def jobs(settings: Settings) -> list[Job]:
     """All trainings; a whole seed before the next, so that an interrupted run has every variant."""
     found = []
-    for seed in settings.seeds:
-        variants = named_rows("variants", settings.variants, VARIANTS)
-        found += [Job(variant=variant, change=None, seed=seed) for variant in variants if variant.kind == "raw"]
+    variants = named_rows("variants", settings.variants, VARIANTS)
+    for seed, family in product(settings.seeds, settings.families):
+        made = partial(Job, seed=seed, family=family)
+        found += [made(variant=variant, change=None) for variant in variants if variant.kind == "raw"]
         for change in settings.changes:
-            found += [Job(variant=variant, change=change, seed=seed) for variant in variants if variant.kind != "raw"]
+            found += [made(variant=variant, change=change) for variant in variants if variant.kind != "raw"]
     return found
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -13,13 +13,18 @@ import torch.nn.functional as F
 
 from arbiview_aug import Rig
 from integrations.cross_rig.augmentation import scaled_and_cropped
+from integrations.cross_rig.boxes import box_loss, decode, match, real_boxes
 from integrations.cross_rig.cache import FrameStore
 from integrations.cross_rig.cell_counts import Tally, iou, tally
+from integrations.cross_rig.encoders import Backbone
+from integrations.cross_rig.families import Batch
 from integrations.cross_rig.labels import HIDDEN, VEHICLE, Grid
-from integrations.cross_rig.model import Backbone, Batch, BevDetector
+from integrations.cross_rig.model import Answer, Detector
 
 THRESHOLDS = tuple(round(0.05 * k, 2) for k in range(1, 20))
 _EVAL_BATCH = 4
+_BOXES = 0.05
+"""Share of the boxes' loss, which is some twenty times that of the cells."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +32,7 @@ class Schedule:
     """The same for every variant.
 
     Attributes:
+        family: Of the model.
         steps: Of the optimiser.
         batch: Frames a step.
         lr: The peak of a one-cycle schedule; AdamW's default decay.
@@ -36,6 +42,7 @@ class Schedule:
     """
 
     steps: int
+    family: str = "voxels"
     batch: int = 4
     lr: float = 3e-3
     backbone: Backbone = "small"
@@ -52,6 +59,7 @@ class FrameSet:
         rig: The cameras of frames that bring no calibration.
         state: (F, cells, cells) of ``labels``.
         counts: (cells, cells) bool, the cells that count.
+        boxes: (F, n, 7) vehicles, padded with NaN.
         retargeted: Whether the store has coverage and calibration.
         masked: Whether its coverage is used; otherwise every pixel counts as seen.
     """
@@ -60,6 +68,7 @@ class FrameSet:
     rig: Rig
     state: npt.NDArray[np.uint8]
     counts: npt.NDArray[np.bool_]
+    boxes: npt.NDArray[np.float32]
     retargeted: bool = False
     masked: bool = True
 
@@ -73,7 +82,7 @@ class FrameSet:
             if self.masked:
                 packed = self.store.read(index, "coverage")
                 covered = np.unpackbits(packed, axis=-1, count=images.shape[-1]).astype(bool)
-        return _Frame(images, covered, K, cam2ego, self.state[index], self.counts)
+        return _Frame(images, covered, K, cam2ego, self.state[index], self.counts, self.boxes[index])
 
 
 @dataclass(frozen=True)
@@ -84,6 +93,7 @@ class _Frame:
     cam2ego: npt.NDArray[np.float32]
     state: npt.NDArray[np.uint8]
     counts: npt.NDArray[np.bool_]
+    boxes: npt.NDArray[np.float32]
 
 
 def batched(frames: list[_Frame]) -> Batch:
@@ -101,6 +111,7 @@ def batched(frames: list[_Frame]) -> Batch:
         frame=torch.arange(len(frames)).repeat_interleave(torch.tensor(lengths)),
         state=torch.from_numpy(np.stack([frame.state for frame in frames])),
         counts=torch.from_numpy(np.stack([frame.counts for frame in frames])),
+        boxes=torch.from_numpy(np.stack([frame.boxes for frame in frames])),
     )
 
 
@@ -139,23 +150,25 @@ class Draws:
             if self.augmented:
                 start = time.process_time()
                 images, coverage, K = scaled_and_cropped(frame.images, frame.K, self.rng)
-                frame = _Frame(images, coverage, K, frame.cam2ego, frame.state, frame.counts)
+                frame = replace(frame, images=images, coverage=coverage, K=K)
                 self.augment_s += time.process_time() - start
             frames.append(frame)
         return batched(frames)
 
 
-def loss(logits: torch.Tensor, batch: Batch) -> torch.Tensor:
-    """Mean binary cross-entropy over the cells that count."""
+def loss(answer: Answer, batch: Batch) -> torch.Tensor:
+    """Mean binary cross-entropy over the cells that count, and a share of the boxes' loss."""
     counts = batch.counts & (batch.state != HIDDEN)
-    return F.binary_cross_entropy_with_logits(logits.float()[counts], (batch.state == VEHICLE)[counts].float())
+    truth = (batch.state == VEHICLE)[counts].float()
+    cells = F.binary_cross_entropy_with_logits(answer.occupancy.float()[counts], truth)
+    return cells + _BOXES * box_loss(answer.boxes, batch.boxes, batch.state, batch.counts, Grid())
 
 
-def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[BevDetector, list[float]]:
+def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[Detector, list[float]]:
     """A trained detector and its mean loss over each tenth of the steps."""
     torch.manual_seed(seed)
     device = torch.device(schedule.device)
-    model = BevDetector(Grid(), schedule.backbone).to(device).to(memory_format=torch.channels_last)
+    model = Detector(Grid(), schedule.family, schedule.backbone).to(device).to(memory_format=torch.channels_last)
     optimizer = torch.optim.AdamW(model.parameters(), lr=schedule.lr)
     cycle = torch.optim.lr_scheduler.OneCycleLR(optimizer, schedule.lr, total_steps=schedule.steps)
     losses = []
@@ -163,8 +176,8 @@ def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[BevDetector, lis
     for _ in range(schedule.steps):
         batch = draws.batch(schedule.batch).to(device)
         with _autocast(schedule):
-            logits = model(batch)
-        value = loss(logits, batch)
+            answer = model(batch)
+        value = loss(answer, batch)
         optimizer.zero_grad(set_to_none=True)
         value.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
@@ -179,16 +192,19 @@ def _autocast(schedule: Schedule) -> torch.autocast:
 
 
 @torch.no_grad()
-def probabilities(model: BevDetector, frames: FrameSet, num_frames: int, schedule: Schedule) -> np.ndarray:
-    """(F, cells, cells) float16."""
-    out = []
+def answers(
+    model: Detector, frames: FrameSet, num_frames: int, schedule: Schedule
+) -> tuple[npt.NDArray[np.float16], npt.NDArray[np.float32]]:
+    """Probabilities of cells (F, cells, cells), and detections (F, k, 8) of ``boxes.decode``."""
+    cells, detections = [], []
     for start in range(0, num_frames, _EVAL_BATCH):
         indices = range(start, min(start + _EVAL_BATCH, num_frames))
         batch = batched([frames.frame(k) for k in indices]).to(torch.device(schedule.device))
         with _autocast(schedule):
-            logits = model(batch)
-        out.append(logits.float().sigmoid().cpu().numpy().astype(np.float16))
-    return np.concatenate(out)
+            answer = model(batch)
+        cells.append(answer.occupancy.float().sigmoid().cpu().numpy().astype(np.float16))
+        detections.append(decode(answer.boxes, Grid(), apart=schedule.family != "queries").cpu().numpy())
+    return np.concatenate(cells), np.concatenate(detections)
 
 
 def best_threshold(probability: np.ndarray, frames: FrameSet) -> tuple[float, float]:
@@ -203,20 +219,30 @@ def best_threshold(probability: np.ndarray, frames: FrameSet) -> tuple[float, fl
 
 @dataclass(frozen=True)
 class Tested:
-    """What a model reached on vehicle B."""
+    """What a model reached on vehicle B.
+
+    Attributes:
+        threshold, val_iou: Of validation.
+        tally: Of cells.
+        matched: (F, k, 5) of ``boxes.match``.
+        positives: (F,) boxes that count.
+    """
 
     threshold: float
     val_iou: float
     tally: Tally
+    matched: npt.NDArray[np.floating]
+    positives: npt.NDArray[np.integer]
     cpu_s: float
 
 
-def evaluate(
-    model: BevDetector, val: FrameSet, test_set: FrameSet, height_dm: np.ndarray, schedule: Schedule
-) -> Tested:
+def evaluate(model: Detector, val: FrameSet, test_set: FrameSet, height_dm: np.ndarray, schedule: Schedule) -> Tested:
     """Threshold on validation streets, counts on test streets; both as B sees them, with B's calibration."""
     start = time.process_time()
-    threshold, val_iou = best_threshold(probabilities(model, val, len(val.state), schedule), val)
-    predicted = probabilities(model, test_set, len(test_set.state), schedule) > threshold
-    counts = tally(predicted, test_set.state, height_dm, test_set.counts)
-    return Tested(threshold, val_iou, counts, time.process_time() - start)
+    threshold, val_iou = best_threshold(answers(model, val, len(val.state), schedule)[0], val)
+    probability, detections = answers(model, test_set, len(test_set.state), schedule)
+    counts = tally(probability > threshold, test_set.state, height_dm, test_set.counts)
+    frames = list(zip(detections, test_set.boxes, test_set.state, strict=True))
+    matched = np.stack([match(*frame, test_set.counts) for frame in frames])
+    positives = np.array([real_boxes(boxes, state, test_set.counts).sum() for _, boxes, state in frames])
+    return Tested(threshold, val_iou, counts, matched, positives, time.process_time() - start)

@@ -17,6 +17,8 @@ Size = tuple[int, int]
 
 Split = Literal["train", "val", "test"]
 
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+
 STREET_SEEDS: dict[Split, int] = {"train": 101, "val": 102, "test": 103}
 """Seeds of ``SyntheticDrive``: datasets with different seeds share no street."""
 

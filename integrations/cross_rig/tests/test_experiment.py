@@ -42,7 +42,7 @@ def done(tmp_path_factory) -> Run:
 
 
 def counts(setup: Run) -> dict[str, list]:
-    return {variant: by_seed[0]["by_distance"] for variant, by_seed in load_results(setup)["fov50"].items()}
+    return {variant: by_seed[0]["by_distance"] for variant, by_seed in load_results(setup, "voxels")["fov50"].items()}
 
 
 @pytest.mark.slow
@@ -82,7 +82,7 @@ def test_variants_with_the_same_frames_are_one_training(done):
     """Every surface is the same when the centres stay: only the far one is trained."""
     more = replace(done, settings=replace(TINY, variants=("raw", "far", "street", "oracle")))
     assert list(run(more, 1, lambda line: None)) == [1, 0]
-    results = load_results(more)["fov50"]
+    results = load_results(more, "voxels")["fov50"]
     assert set(results) == {"raw", "far", "street", "oracle"} and results["far"] == results["street"]
     report = write_report(more)
     assert report["changes"]["fov50"]["same_frames"] == {"street": "far"}
@@ -135,7 +135,19 @@ def test_report(done):
     for name, row in rows.items():
         assert (row["loading_cpu_s"] > 0) == (name in ("scale_crop", "objects_mixed"))
         assert 0 <= row["iou"]["low"] <= row["iou"]["value"] <= row["iou"]["high"] <= 1
+        assert 0 <= row["ap"]["value"]["value"] <= 1
     assert "| objects + raw |" in markdown(report)
+
+
+@pytest.mark.slow
+def test_families_have_tables_of_their_own(done):
+    more = replace(done, settings=replace(TINY, variants=("raw", "oracle"), families=("depths", "queries", "voxels")))
+    assert list(run(more, 1, lambda line: None)) == [4, 3, 2, 1, 0]
+    report = write_report(more)
+    assert set(report["changes"]) == {"fov50", "fov50-depths", "fov50-queries"} and report["tests_done"] == 6
+    assert "**FOV 65° → 50°, queries**, seeds 0" in markdown(report)
+    values = [change["variants"]["raw"]["iou"]["value"] for change in report["changes"].values()]
+    assert len(set(values)) == 3
 
 
 def test_labels_are_the_sources_within_the_targets_cells(done):
@@ -167,7 +179,7 @@ def test_presets():
     # Raw and scale/crop once for each seed, five variants for each change: 3 * (2 + 3 * 5).
     assert len(jobs(pilot())) == 51
     names = [job.name for job in jobs(full())]
-    assert len(names) == len(set(names)) == 3 * (2 + 6 * 25)
+    assert len(names) == len(set(names)) == 3 * (2 + 6 * 26)
 
 
 def test_keys_follow_what_matters(done):

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from integrations.cross_rig.families import DEPTHS_M, FAMILIES, Batch, Depths, read_at, voxel_bags
 from integrations.cross_rig.labels import Grid
-from integrations.cross_rig.model import Batch, BevDetector, voxel_bags
+from integrations.cross_rig.model import Detector
 from integrations.cross_rig.worlds import source_rig
 
 SIZE = (32, 64)
@@ -24,13 +25,20 @@ def batch(rigs, images=None, coverage=None) -> Batch:
         frame=torch.arange(len(rigs)).repeat_interleave(torch.tensor([len(rig) for rig in rigs])),
         state=torch.zeros((len(rigs), 20, 20), dtype=torch.uint8),
         counts=torch.ones((len(rigs), 20, 20), dtype=torch.bool),
+        boxes=torch.full((len(rigs), 3, 7), torch.nan),
     )
 
 
-@pytest.fixture
-def model() -> BevDetector:
+@pytest.fixture(params=FAMILIES)
+def model(request) -> Detector:
     torch.manual_seed(0)
-    return BevDetector(GRID).eval()
+    return Detector(GRID, request.param).eval()
+
+
+@pytest.fixture
+def voxels() -> Detector:
+    torch.manual_seed(0)
+    return Detector(GRID).eval()
 
 
 @pytest.mark.parametrize("stride", [1, 4])
@@ -55,19 +63,53 @@ def test_a_voxel_reads_the_pixel_that_it_projects_to(stride):
     assert outside.any() and not read[outside].any()
 
 
-def test_moving_a_camera_moves_the_features(model):
+def test_moving_a_camera_moves_the_features(voxels):
     rig = source_rig(SIZE)
-    still, moved = (model.voxel_features(batch([r])) for r in (rig, rig.shifted(1.0, 0, 0)))
+    seen = []
+    for metres in (0.0, 1.0, 2.0):
+        frames = batch([rig.shifted(metres, 0, 0)])
+        seen.append(voxels.family.voxel_features(voxels.features(frames), frames))
     # Voxels are 2 m wide here: one column of them is seen from a place half a voxel further back.
-    assert not torch.allclose(still, moved)
-    farther = rig.shifted(2.0, 0, 0)
-    shifted = model.voxel_features(batch([farther]))
-    torch.testing.assert_close(shifted[:, :, 1:], still[:, :, :-1], atol=1e-3, rtol=1e-3)
+    assert not torch.allclose(seen[0], seen[1])
+    torch.testing.assert_close(seen[2][:, :, 1:], seen[0][:, :, :-1], atol=1e-3, rtol=1e-3)
+
+
+def test_features_are_lifted_to_where_their_rays_lead():
+    """All of the probability at one depth: the cell that the camera model gives."""
+    family = Depths(GRID, 4, 8)
+    front = source_rig(SIZE).with_cameras([source_rig(SIZE)["front"]])
+    frames = batch([front])
+    for depth in (3, 6):
+        probability = torch.zeros(1, len(DEPTHS_M), SIZE[0] // 4, SIZE[1] // 4)
+        probability[0, DEPTHS_M.index(depth), 4, 10] = 1
+        lifted = family.bags(frames, probability).sums(torch.ones(1, 1, SIZE[0] // 4, SIZE[1] // 4))[:, 0]
+        (cell,) = lifted.nonzero()
+        rays, _ = front["front"].unproject_cam(np.array([[10 * 4 + 1.5, 4 * 4 + 1.5]]))
+        point = front["front"].cam2ego[:3, :3] @ (rays[0] / rays[0, 2] * depth) + front["front"].center_m
+        assert (int(cell) // 10, int(cell) % 10) == tuple(int(c) for c in (point[:2] + 10) // 2)
+        assert lifted[cell] == 1
+
+
+def test_points_read_the_pixel_that_they_project_to():
+    rig = source_rig(SIZE)
+    front = rig.with_cameras([rig["front"]])
+    rng = np.random.default_rng(0)
+    points = np.stack([rng.uniform(4, 20, 200), rng.uniform(-8, 8, 200), rng.uniform(0, 3, 200)], 1)
+    v, u = np.indices((SIZE[0] // 4, SIZE[1] // 4)) * 4 + 1.5
+    maps = torch.from_numpy(np.stack([u, v])[None]).float()
+    read = read_at(maps, batch([front]), torch.from_numpy(points[None]).float())[0].numpy()
+    uv, depth, _ = rig["front"].project(points)
+    inner = (depth > 0) & (uv > 2).all(-1) & (uv < (SIZE[1] - 3, SIZE[0] - 3)).all(-1)
+    assert inner.sum() > 50
+    np.testing.assert_allclose(read[inner], uv[inner], atol=2e-3)
+    outside = (depth <= 0) | (uv < -0.5).any(-1) | (uv > (SIZE[1] - 0.5, SIZE[0] - 0.5)).any(-1)
+    assert outside.any() and not read[outside].any()
 
 
 def test_gradients_reach_every_parameter(model):
     model.train()
-    model(batch([source_rig(SIZE), source_rig(SIZE)])).square().mean().backward()
+    answer = model(batch([source_rig(SIZE), source_rig(SIZE)]))
+    (answer.occupancy.square().mean() + answer.boxes.square().mean()).backward()
     for name, parameter in model.named_parameters():
         assert parameter.grad is not None and torch.isfinite(parameter.grad).all(), name
         # Normalisation takes away what a bias or a mean adds, but for rounding.
@@ -85,9 +127,17 @@ def test_uncovered_pixels_do_not_matter(model):
         torch.testing.assert_close(model(whole), model(batch([rig], images=painted, coverage=coverage)))
 
 
-def test_voxels_that_only_uncovered_pixels_show_are_empty(model):
-    nothing = torch.zeros((6, *SIZE), dtype=torch.bool)
-    assert not model.voxel_features(batch([source_rig(SIZE)], coverage=nothing)).any()
+def test_calibration_is_read(model):
+    """The same images from cameras elsewhere say something else."""
+    rig = source_rig(SIZE)
+    with torch.no_grad():
+        here, there = model(batch([rig])), model(batch([rig.shifted(0, 0, 0.7)]))
+    assert not torch.allclose(here.occupancy, there.occupancy, atol=1e-4)
+
+
+def test_voxels_that_only_uncovered_pixels_show_are_empty(voxels):
+    frames = batch([source_rig(SIZE)], coverage=torch.zeros((6, *SIZE), dtype=torch.bool))
+    assert not voxels.family.voxel_features(voxels.features(frames), frames).any()
 
 
 def test_frames_of_a_batch_do_not_mix(model):
@@ -97,15 +147,17 @@ def test_frames_of_a_batch_do_not_mix(model):
     both = batch([rig, front])
     with torch.no_grad():
         together = model(both)
-        first, second = (model(batch([r], images=i)) for r, i in ((rig, both.images[:6]), (front, both.images[6:])))
-    torch.testing.assert_close(together, torch.cat([first, second]), atol=1e-4, rtol=1e-4)
+        parts = [model(batch([r], images=i)) for r, i in ((rig, both.images[:6]), (front, both.images[6:]))]
+    for whole, *alone in zip(together, *parts, strict=True):
+        torch.testing.assert_close(whole, torch.cat(alone), atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.slow
 def test_the_larger_backbone_trains():
     torch.manual_seed(0)
-    model = BevDetector(GRID, "resnet34")
-    model(batch([source_rig(SIZE)] * 2)).square().mean().backward()
+    model = Detector(GRID, backbone="resnet34")
+    answer = model(batch([source_rig(SIZE)] * 2))
+    (answer.occupancy.square().mean() + answer.boxes.square().mean()).backward()
     assert all(
         torch.isfinite(p.grad).all() and p.grad.abs().max() > 0 for p in model.parameters() if p.grad is not None
     )

@@ -5,7 +5,7 @@ import pytest
 
 from integrations.cross_rig.cell_counts import iou, tally
 from integrations.cross_rig.labels import HIDDEN, VEHICLE
-from integrations.cross_rig.scoring import bootstrap_ious, variant_scores
+from integrations.cross_rig.scoring import ap_scores, bootstrap_ious, iou_scores
 
 
 def frames(hits: np.ndarray) -> np.ndarray:
@@ -19,11 +19,11 @@ def share(p: float, count: int = 1000, seeds: int = 1) -> np.ndarray:
 
 
 def test_frame_interval_is_the_binomial_one():
-    score = variant_scores({"raw": frames(share(0.3))})["raw"]
+    score = iou_scores({"raw": frames(share(0.3))})["raw"]
     half = 1.96 * np.sqrt(0.3 * 0.7 / 1000)
-    assert score.iou.value == pytest.approx(0.3)
-    assert score.iou.high - 0.3 == pytest.approx(half, rel=0.1)
-    assert 0.3 - score.iou.low == pytest.approx(half, rel=0.1)
+    assert score.value.value == pytest.approx(0.3)
+    assert score.value.high - 0.3 == pytest.approx(half, rel=0.1)
+    assert 0.3 - score.value.low == pytest.approx(half, rel=0.1)
 
 
 def test_seeds_widen_the_interval():
@@ -50,7 +50,7 @@ def test_variants_are_paired():
 
 def test_share_recovered():
     variants = {"raw": share(0.4, seeds=3), "variant": share(0.5, seeds=3), "oracle": share(0.6, seeds=3)}
-    score = variant_scores({name: frames(hits) for name, hits in variants.items()})["variant"]
+    score = iou_scores({name: frames(hits) for name, hits in variants.items()})["variant"]
     assert score.share is not None and score.over_raw is not None
     assert score.share.value == pytest.approx(0.5) and score.over_raw.value == pytest.approx(0.1)
     assert score.share.low < 0.5 < score.share.high
@@ -60,9 +60,24 @@ def test_share_recovered():
 
 def test_no_share_of_a_small_gap_or_without_an_oracle():
     variants = {"raw": share(0.40), "variant": share(0.42), "oracle": share(0.44)}
-    assert variant_scores({name: frames(hits) for name, hits in variants.items()})["variant"].share is None
+    assert iou_scores({name: frames(hits) for name, hits in variants.items()})["variant"].share is None
     del variants["oracle"]
-    assert variant_scores({name: frames(hits) for name, hits in variants.items()})["variant"].share is None
+    assert iou_scores({name: frames(hits) for name, hits in variants.items()})["variant"].share is None
+
+
+def test_ap_is_paired_and_averaged_over_seeds():
+    """A detector that finds every other box, and one that finds all: 0.5 and 1, less what nuScenes leaves out."""
+    frames = 40
+    found = np.ones((2, frames, 1, 5)) * (np.arange(frames) % 2 == 0)[:, None, None]
+    found[..., 0] = np.linspace(0.9, 0.5, frames)[:, None]
+    missed = np.where(found == 0, np.nan, found)
+    positives = np.ones((2, frames))
+    whole = np.ones((2, frames, 1, 5))
+    scores = ap_scores({"raw": (missed, positives), "oracle": (whole, positives)})
+    assert scores["oracle"].value.value == pytest.approx(1)
+    assert scores["raw"].value.value == pytest.approx(40 / 90, abs=0.01)  # recall above 0.5 and below 0.1 is nothing
+    over = scores["oracle"].over_raw
+    assert over is not None and over.low > 0.3 and scores["raw"].seeds[0] == scores["raw"].seeds[1]
 
 
 def test_variants_of_different_length_are_refused():

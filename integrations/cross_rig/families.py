@@ -1,0 +1,307 @@
+"""Three families of camera-only detectors: how image features come to a grid in the ego frame.
+
+``Voxels`` averages what voxels project to, ``Depths`` lifts features by a distribution over depths, ``Queries`` reads
+features at 3D points. Each reads ``K`` and ``cam2ego`` of every image, and weighs features by what was covered. With
+full coverage every pixel counts, as in stock detectors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from integrations.cross_rig.encoders import STRIDE, Residual
+from integrations.cross_rig.labels import Grid
+
+VOXEL_HEIGHTS_M = (0.4, 1.2, 2.0, 2.8)
+"""Over the road: slices of 0.8 m up to a truck's roof."""
+
+DEPTHS_M = tuple(range(2, 36))
+"""Centres of the depth bins, along the optical axis; the grid's corners are 35 m away."""
+
+_LIFTED_M = (-1.0, 4.0)
+"""Heights over the road of the points that count."""
+
+_LAYERS, _POINTS, _HEADS = 3, 4, 4
+_REACH_M = 2.0
+"""Of a query: how far from its reference point it may read."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Frames of any rigs whose images have one size; T images in all.
+
+    Attributes:
+        images: (T, 3, h, w) uint8.
+        coverage: (T, h, w) bool.
+        K: (T, 3, 3) float32.
+        cam2ego: (T, 4, 4) float32, poses in an ego frame whose road is at z = 0.
+        frame: (T,) int64, the frame of each image, ascending.
+        state: (B, cells, cells) uint8 of ``labels``.
+        counts: (B, cells, cells) bool, the cells that count.
+        boxes: (B, n, 7) float32 vehicles, padded with NaN.
+    """
+
+    images: Tensor
+    coverage: Tensor
+    K: Tensor
+    cam2ego: Tensor
+    frame: Tensor
+    state: Tensor
+    counts: Tensor
+    boxes: Tensor
+
+    def to(self, device: torch.device) -> Batch:
+        """The same on a device."""
+        return Batch(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
+    def covered(self) -> Tensor:
+        """(T, h / 4, w / 4) share of each feature's pixels that is covered."""
+        return F.avg_pool2d(self.coverage[:, None].float(), STRIDE)[:, 0]
+
+
+class Bags(NamedTuple):
+    """For each place, the features that it sums: arguments of ``F.embedding_bag``.
+
+    Attributes:
+        rows: (P,) int64 rows of the features (T * h * w, C).
+        weights: (P,) float32.
+        offsets: (places,) int64, where each place's rows begin.
+    """
+
+    rows: Tensor
+    weights: Tensor
+    offsets: Tensor
+
+    def sums(self, features: Tensor) -> Tensor:
+        """(places, C) weighted sums of features (T, C, h, w)."""
+        flat = features.permute(0, 2, 3, 1).reshape(-1, features.shape[1]).float()
+        return F.embedding_bag(self.rows, flat, self.offsets, mode="sum", per_sample_weights=self.weights)
+
+
+class Projected(NamedTuple):
+    """Points in images.
+
+    Attributes:
+        pixel: (T, P, 2).
+        inside: (T, P) bool, in front of the camera and in its image.
+    """
+
+    pixel: Tensor
+    inside: Tensor
+
+
+def project(batch: Batch, points: Tensor) -> Projected:
+    """Project points (T, P, 3) or (P, 3) of the ego frame into every image."""
+    height, width = batch.images.shape[-2:]
+    ego2cam = torch.linalg.inv(batch.cam2ego)
+    cam = points @ ego2cam[:, :3, :3].mT + ego2cam[:, None, :3, 3]
+    depth = cam[..., 2]
+    pixel = (cam @ batch.K.mT)[..., :2] / depth.clamp(min=0.1)[..., None]
+    inside = (depth > 0.1) & (pixel > -0.5).all(-1) & (pixel[..., 0] < width - 0.5) & (pixel[..., 1] < height - 0.5)
+    return Projected(pixel, inside)
+
+
+def voxel_bags(batch: Batch, voxels: Tensor, feature_size: tuple[int, int], stride: int) -> Bags:
+    """Weigh the four features around what voxels project to by bilinearity and coverage.
+
+    Args:
+        batch: Calibration and coverage.
+        voxels: (V, 3) ego frame.
+        feature_size: (h, w) of the feature maps.
+        stride: Pixels of a feature.
+
+    Returns:
+        Weights of one voxel of a frame sum to 1, or to 0 where nothing was covered.
+    """
+    fh, fw = feature_size
+    pixel, inside = project(batch, voxels)
+    num_frames, num_voxels = len(batch.state), len(voxels)
+    image, voxel = inside.nonzero(as_tuple=True)
+    bag = batch.frame[image] * num_voxels + voxel
+    bag, order = bag.sort(stable=True)
+    image, voxel = image[order], voxel[order]
+    # Pixel centres are integers: feature (0, 0) is centred on pixel (stride - 1) / 2.
+    at = (pixel[image, voxel] - (stride - 1) / 2) / stride
+    low = at.floor()
+    share = at - low
+    covered = F.avg_pool2d(batch.coverage[:, None].float(), stride).flatten()
+    rows, weights = [], []
+    for dy in (0, 1):
+        for dx in (0, 1):
+            x, y = low[:, 0].long() + dx, low[:, 1].long() + dy
+            in_map = (x >= 0) & (x < fw) & (y >= 0) & (y < fh)
+            row = (image * fh + y.clamp(0, fh - 1)) * fw + x.clamp(0, fw - 1)
+            wx = share[:, 0] if dx else 1 - share[:, 0]
+            wy = share[:, 1] if dy else 1 - share[:, 1]
+            rows.append(row)
+            weights.append(wx * wy * in_map * covered[row])
+    weight = torch.stack(weights, 1)  # [P / 4, 4]
+    total = torch.zeros(num_frames * num_voxels, device=weight.device).index_add_(0, bag, weight.sum(1))
+    weight = weight / total[bag].clamp(min=1e-6)[:, None]
+    count = torch.bincount(bag, minlength=num_frames * num_voxels) * 4
+    return Bags(torch.stack(rows, 1).flatten(), weight.flatten(), count.cumsum(0) - count)
+
+
+class Voxels(nn.Module):
+    """Voxel sampling (SimpleBEV, Harley et al., ICRA 2023): no depth distribution, one average for each voxel.
+
+    Args:
+        grid: Of the labels; cells of the map are twice as wide.
+        channels: Of the features.
+        width: Of the map.
+    """
+
+    voxels: Tensor
+
+    def __init__(self, grid: Grid, channels: int, width: int) -> None:
+        super().__init__()
+        self.side = grid.cells // 2
+        xy = torch.from_numpy(Grid(grid.side_m, self.side).centres()).float().flatten(0, 1)
+        slices = [torch.cat([xy, torch.full((len(xy), 1), z)], 1) for z in VOXEL_HEIGHTS_M]
+        self.register_buffer("voxels", torch.cat(slices), persistent=False)  # slice by slice
+        self.map = _map_network(channels * len(VOXEL_HEIGHTS_M), width)
+
+    def voxel_features(self, features: Tensor, batch: Batch) -> Tensor:
+        """(B, heights, side, side, C): what each voxel sees; zero where nothing is covered."""
+        with torch.autocast(features.device.type, enabled=False):  # coordinates are never rounded to bf16
+            bags = voxel_bags(batch, self.voxels, (features.shape[-2], features.shape[-1]), STRIDE)
+        return bags.sums(features).view(len(batch.state), len(VOXEL_HEIGHTS_M), self.side, self.side, -1)
+
+    def forward(self, features: Tensor, batch: Batch) -> Tensor:
+        """(B, width, side, side) map of features (T, C, h, w)."""
+        stacked = self.voxel_features(features, batch).permute(0, 1, 4, 2, 3).flatten(1, 2)
+        return self.map(stacked)
+
+
+class Depths(nn.Module):
+    """Lifting by a learned distribution over depths (LSS, Philion and Fidler, ECCV 2020; BEVDet): sums over columns.
+
+    Args: as of ``Voxels``.
+    """
+
+    depths: Tensor
+
+    def __init__(self, grid: Grid, channels: int, width: int) -> None:
+        super().__init__()
+        self.grid = Grid(grid.side_m, grid.cells // 2)
+        self.register_buffer("depths", torch.tensor(DEPTHS_M).float(), persistent=False)
+        self.distribution = nn.Sequential(Residual(channels), nn.Conv2d(channels, len(DEPTHS_M), 1))
+        self.map = _map_network(channels, width)
+
+    def bags(self, batch: Batch, probability: Tensor) -> Bags:
+        """Sort the points of all features and depths by the cell of the map that they lie in.
+
+        Args:
+            batch: Calibration and coverage.
+            probability: (T, depths, h, w).
+        """
+        fh, fw = probability.shape[-2:]
+        side, device = self.grid.cells, probability.device
+        v, u = torch.meshgrid(torch.arange(fh, device=device), torch.arange(fw, device=device), indexing="ij")
+        pixel = torch.stack([u, v, torch.ones_like(u)], -1).reshape(-1, 3).float()
+        pixel[:, :2] = pixel[:, :2] * STRIDE + (STRIDE - 1) / 2
+        rays = pixel @ (batch.cam2ego[:, :3, :3] @ torch.linalg.inv(batch.K)).mT  # [T, h * w, 3]
+        points = rays[:, None] * self.depths[:, None, None] + batch.cam2ego[:, None, None, :3, 3]
+        cell = ((points[..., :2] + self.grid.side_m / 2) / self.grid.cell_m).floor().long()
+        low, high = _LIFTED_M
+        inside = ((cell >= 0) & (cell < side)).all(-1) & (points[..., 2] > low) & (points[..., 2] < high)
+        image, depth, feature = inside.nonzero(as_tuple=True)
+        x, y = cell[image, depth, feature].unbind(-1)
+        place, order = ((batch.frame[image] * side + x) * side + y).sort(stable=True)
+        image, depth, feature = image[order], depth[order], feature[order]
+        row = image * fh * fw + feature
+        weight = probability.flatten(2)[image, depth, feature] * batch.covered().flatten()[row]
+        count = torch.bincount(place, minlength=len(batch.state) * side * side)
+        return Bags(row, weight, count.cumsum(0) - count)
+
+    def forward(self, features: Tensor, batch: Batch) -> Tensor:
+        """(B, width, side, side) map of features (T, C, h, w)."""
+        logits = self.distribution(features)
+        with torch.autocast(features.device.type, enabled=False):
+            bags = self.bags(batch, logits.float().softmax(1))
+        side = self.grid.cells
+        lifted = bags.sums(features).view(len(batch.state), side, side, -1)
+        return self.map(lifted.permute(0, 3, 1, 2))
+
+
+class Queries(nn.Module):
+    """Queries with 3D references (DETR3D, Wang et al., CoRL 2021; PETR): features are read where points project to.
+
+    Reference points lie on a grid; each query answers for its own cell, so that no matching is needed. Each layer
+    reads at learned points around the reference, lets queries attend to each other, and passes on.
+
+    Args: as of ``Voxels``, but that cells of the map are four times as wide.
+    """
+
+    references: Tensor
+
+    def __init__(self, grid: Grid, channels: int, width: int) -> None:
+        super().__init__()
+        self.side = grid.cells // 4
+        xy = torch.from_numpy(Grid(grid.side_m, self.side).centres()).float().flatten(0, 1)
+        references = torch.cat([xy, torch.full((len(xy), 1), 0.8)], 1)
+        self.register_buffer("references", references, persistent=False)
+        self.position = nn.Sequential(nn.Linear(2, width), nn.ReLU(), nn.Linear(width, width))
+        self.scale_m = grid.side_m / 2
+        self.layers = nn.ModuleList(_QueryLayer(channels, width) for _ in range(_LAYERS))
+
+    def forward(self, features: Tensor, batch: Batch) -> Tensor:
+        """(B, width, side, side) queries as a map."""
+        query = self.position(self.references[:, :2] / self.scale_m).expand(len(batch.state), -1, -1)
+        for layer in self.layers:
+            query = layer(query, self.references, features, batch)
+        return query.mT.reshape(len(batch.state), -1, self.side, self.side)
+
+
+class _QueryLayer(nn.Module):
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__()
+        self.offsets = nn.Linear(width, _POINTS * 3)
+        nn.init.normal_(self.offsets.weight, std=0.01)
+        with torch.no_grad():  # the points begin above each other
+            heights = torch.linspace(-0.4, 0.8, _POINTS) / _REACH_M
+            self.offsets.bias.copy_(torch.stack([0 * heights, 0 * heights, heights.atanh()], 1).flatten())
+        self.value = nn.Linear(_POINTS * channels, width)
+        self.attention = nn.MultiheadAttention(width, _HEADS, batch_first=True)
+        self.feed = nn.Sequential(nn.Linear(width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width))
+        self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(3))
+
+    def forward(self, query: Tensor, references: Tensor, features: Tensor, batch: Batch) -> Tensor:
+        offsets = self.offsets(query).float().unflatten(-1, (_POINTS, 3)).tanh() * _REACH_M
+        with torch.autocast(features.device.type, enabled=False):
+            points = (references[:, None] + offsets).flatten(1, 2)
+            seen = read_at(features.float(), batch, points).unflatten(1, (-1, _POINTS)).flatten(2)
+        query = self.norms[0](query + self.value(seen))
+        query = self.norms[1](query + self.attention(query, query, query, need_weights=False)[0])
+        return self.norms[2](query + self.feed(query))
+
+
+def read_at(features: Tensor, batch: Batch, points: Tensor) -> Tensor:
+    """(B, P, C) features where points (B, P, 3) project to, averaged over a frame's images with what they cover."""
+    fh, fw = features.shape[-2:]
+    pixel, inside = project(batch, points[batch.frame])
+    at = (pixel - (STRIDE - 1) / 2) / STRIDE
+    place = (2 * (at + 0.5) / torch.tensor([fw, fh], device=at.device) - 1)[:, :, None]
+    covered = batch.covered()[:, None]
+    maps = torch.cat([features * covered, covered], 1)
+    read = F.grid_sample(maps, place, padding_mode="border", align_corners=False)[..., 0].mT * inside[..., None]
+    summed = torch.zeros(len(points), *read.shape[1:], device=read.device).index_add_(0, batch.frame, read)
+    return summed[..., :-1] / summed[..., -1:].clamp(min=1e-6)
+
+
+def _map_network(channels: int, width: int) -> nn.Sequential:
+    reduce = nn.Sequential(nn.Conv2d(channels, width, 1, bias=False), nn.BatchNorm2d(width), nn.ReLU())
+    return nn.Sequential(reduce, *(Residual(width, dilation=d) for d in (1, 2, 4)))
+
+
+FAMILIES: dict[str, type[Voxels] | type[Depths] | type[Queries]] = {
+    "voxels": Voxels,
+    "depths": Depths,
+    "queries": Queries,
+}
+"""By name on the command line."""
