@@ -59,7 +59,7 @@ class Run:
     def training_set(self, job: Job) -> FrameSet:
         """A job's frames. What counts: objects that the rig of the recording sees, in the cells that B covers."""
         images = self.images(job)
-        labels = images.original() if job.variant.renders else images
+        labels = self.source("train") if job.variant.labels_of_a else images
         state = labels.store().stacked("state", self.settings.train_frames)
         counts = covered_cells(Grid(), images.rig)
         return FrameSet(
@@ -113,8 +113,9 @@ class Run:
             {
                 "frames": images.store().digest(names, count),
                 "rig": images.rig.content_key.hex(),
-                "raw": raw if job.variant.mixed or job.variant.renders else None,  # the labels are A's
+                "raw": raw if job.variant.mixed or job.variant.labels_of_a else None,  # the labels are A's
                 "mixed": job.variant.mixed,
+                "labels": job.variant.labels,
                 "augmented": job.variant.augmented,
                 "count": count,
                 "schedule": asdict(self.schedule(job)),

@@ -23,8 +23,9 @@ from arbiview_aug.generator.generator import shipped_weights
 from integrations.cross_rig.boxes import vehicle_boxes
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, fill
 from integrations.cross_rig.labels import Grid, box_cells, visible_objects
+from integrations.cross_rig.noise import LATE_S, noisy_boxes, noisy_depth, thinned, turned
 from integrations.cross_rig.variant import Variant
-from integrations.cross_rig.views import ViewMaker, with_noise
+from integrations.cross_rig.views import ViewMaker
 from integrations.cross_rig.worlds import CHANGES, STREET_SEEDS, Size, Split, source_rig
 
 _WORLD = "arbiview_aug.datasets.synthetic"
@@ -87,6 +88,7 @@ class Source:
                 "arm": variant.views_spec(),  # the key that names existing frame stores
                 "renderer": code_hash(f"arbiview_aug.{renderer}", without=_UNUSED[variant.holes]),
                 # What a variant says of its views is in ``variant``; another variant's needs may change without it.
+                "noise": code_hash("integrations.cross_rig.noise") if variant.noise else None,
                 "views": code_hash("integrations.cross_rig.views", without=("integrations.cross_rig.variant",)),
             }
             if variant.holes == "generator":
@@ -207,23 +209,32 @@ class _VariantFrames:
         assert source.variant is not None
         self.variant, self.original = source.variant, source.original()
         self.store = self.original.store()
-        self.views = ViewMaker(self.variant, self.original.rig, source.rig)
-        seed = STREET_SEEDS[source.split]
-        self.drive = SyntheticDrive(self.original.rig, num_frames=_MAX_FRAMES, seed=seed, lidar=False)
+        rig, noise, seed = self.original.rig, self.variant.noise, STREET_SEEDS[source.split]
+        self.views = ViewMaker(self.variant, turned(rig) if noise == "calibration" else rig, source.rig)
+        self.drive = SyntheticDrive(rig, num_frames=_MAX_FRAMES, seed=seed, lidar=False)
+        self.measured = _Later(self.drive, LATE_S) if noise == "late" else self.drive
 
     def __call__(self, index: int) -> Arrays:
         frame: dict[str, Any] = {"images": torch.from_numpy(self.store.read(index, "images").copy())}
         if "boxes_3d" in self.variant.reads:
-            boxes = self.drive.scene(index).boxes_ego(self.original.rig.ground_z_m)
+            boxes = self.measured.scene(index).boxes_ego(self.original.rig.ground_z_m)
             frame["boxes_3d"] = torch.from_numpy(boxes.astype(np.float32))
+            change = {"boxes": noisy_boxes, "missed": thinned}.get(self.variant.noise or "")
+            if change is not None:
+                frame["boxes_3d"] = change(frame["boxes_3d"], index)
         if "points" in self.variant.reads:
-            frame["points"] = self.drive.points(index)
+            frame["points"] = self.measured.points(index)
         if "depth_m" in self.variant.reads:
             depth = torch.from_numpy(self.store.read(index, "depth_m").astype(np.float32))
-            frame["depth_m"] = with_noise(depth, self.variant.depth_noise, index) if self.variant.depth_noise else depth
+            frame["depth_m"] = noisy_depth(depth, index) if self.variant.noise == "depth" else depth
         if "neighbours" in self.variant.reads:
             frame |= self._neighbours(index)
-        return self.views(index, frame)
+        arrays = self.views(index, frame)
+        if "visible" in arrays:
+            scene = self.drive.scene(index)
+            boxes = scene.boxes_ego(self.original.rig.ground_z_m)
+            arrays["state"] = box_cells(Grid(), boxes, scene.box_classes, arrays.pop("visible")).state
+        return arrays
 
     def _neighbours(self, index: int) -> dict[str, Any]:
         """The frames before and after, and the pose that they refer to; rendered when they are asked for."""

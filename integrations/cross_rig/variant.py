@@ -9,6 +9,7 @@ from arbiview_aug.scene.surface import SurfaceName
 
 Kind = Literal["raw", "oracle", "row_split", "retarget"]
 Geometry = Literal["points", "boxes_3d", "depth_m", "neighbours"]
+Noise = Literal["depth", "boxes", "missed", "late", "calibration"]
 
 
 RANDOM: dict[str, Any] = {"yaw_deg": 5.0, "pitch_deg": 2.0, "height_m": 0.2, "focal_scale": 0.1}
@@ -32,8 +33,9 @@ class Variant:
             package's generator.
         masked: The network masks them by ``coverage``. Otherwise every pixel counts as seen, as in stock detectors.
         random: Targets are drawn around B, one for each frame.
-        depth_noise: Standard deviation of the relative error of A's true depths that it is given instead of a learned
-            depth's.
+        noise: What is wrong with the geometry that it is given (``noise.py``); the labels are right.
+        labels: Whose rig says which vehicles are hidden: A's, which recorded, B's views as they were rendered
+            (``visible_boxes``). None: A's, and for an oracle B's true ones.
         stays: B's cameras stay in the very centres of those of A that look most alike, or at their heights.
         truth: To find out where the rest is lost: B's true pixels where something is covered, or where nothing is
             (which then counts as seen).
@@ -49,7 +51,8 @@ class Variant:
     holes: Literal["black", "fill", "generator"] = "black"
     masked: bool = True
     random: bool = False
-    depth_noise: float = 0.0
+    noise: Noise | None = None
+    labels: Literal["A", "views"] | None = None
     stays: Literal["centre", "height"] | None = None
     truth: Literal["covered", "holes"] | None = None
 
@@ -58,9 +61,14 @@ class Variant:
         """Whether it has a training set of its own on disk."""
         return self.kind in ("row_split", "retarget")
 
+    @property
+    def labels_of_a(self) -> bool:
+        """Whether vehicles that A does not see count for nothing."""
+        return self.labels == "A" or (self.renders and self.labels is None)
+
     def views_spec(self) -> dict[str, Any]:
         """What its images depend on, besides rigs and code: variants that differ in how they draw share them."""
         settings = {"kind": self.kind, "surface": self.surface, "reads": list(self.reads), "holes": self.holes}
         extra: dict[str, Any] = {"random": RANDOM if self.random else None, "stays": self.stays, "truth": self.truth}
-        extra["depth_noise"] = self.depth_noise or None
+        extra |= {"noise": self.noise, "labels": self.labels if self.renders else None}
         return settings | {name: value for name, value in extra.items() if value is not None}

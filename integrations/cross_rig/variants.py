@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from integrations.cross_rig.variant import Geometry, Variant
+from integrations.cross_rig.variant import Geometry, Noise, Variant
 
+NOISES: dict[Noise, str] = {
+    "boxes": "boxes 10 cm and 2° off",
+    "missed": "a tenth of the boxes missed",
+    "late": "points and boxes 50 ms late",
+    "calibration": "cameras turned by 0.2°",
+}
 _ALL: tuple[Geometry, ...] = ("points", "boxes_3d")
 VARIANTS: dict[str, Variant] = {
     variant.name: variant
@@ -34,7 +40,7 @@ VARIANTS: dict[str, Variant] = {
             kind="retarget",
             surface="lidar",
             reads=("depth_m",),
-            depth_noise=0.05,
+            noise="depth",
         ),
         Variant(name="street_mixed", title="street + raw", kind="retarget", surface="street", mixed=True),
         Variant(
@@ -94,6 +100,39 @@ VARIANTS: dict[str, Variant] = {
             mixed=True,
         ),
         Variant(name="random", title="RandomRig around B, auto", kind="retarget", reads=_ALL, random=True),
+        *(
+            Variant(
+                name=f"auto_fill_{noise}",
+                title=f"auto, filled holes, no mask, {title}",
+                kind="retarget",
+                reads=_ALL,
+                holes="fill",
+                masked=False,
+                noise=noise,
+            )
+            for noise, title in NOISES.items()
+        ),
+        Variant(
+            name="auto_fill_labels",
+            title="auto, filled holes, no mask, labels of the views",
+            kind="retarget",
+            reads=_ALL,
+            holes="fill",
+            masked=False,
+            labels="views",
+        ),
+        Variant(
+            name="auto_fill_random",
+            title="RandomRig around B, auto, filled holes, no mask",
+            kind="retarget",
+            reads=_ALL,
+            holes="fill",
+            masked=False,
+            random=True,
+        ),
+        Variant(name="oracle_labels", title="B's own frames, A's labels", kind="oracle", labels="A"),
+        Variant(name="oracle_mixed", title="B's own frames, + raw", kind="oracle", mixed=True),
+        Variant(name="oracle_scaled", title="B's own frames, scaled and cropped", kind="oracle", augmented=True),
         Variant(name="oracle", title="B's own frames", kind="oracle"),
     )
 }

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug import Camera, RandomRig, Rig, RigRetarget
+from arbiview_aug import Camera, RandomRig, Rig, RigRetarget, visible_boxes
 from arbiview_aug.evaluate.baselines import row_split
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.temporal.fill import Reach
@@ -54,14 +54,14 @@ class ViewMaker:
             frame: ``images`` (N, 3, h, w) uint8 and the geometry that the variant reads.
 
         Returns:
-            ``images`` (M, 3, h, w), ``coverage`` (M, h, w / 8) packed bits, ``K``, ``cam2ego`` float32 and ``cpu_s``:
-            CPU seconds that the variant's work took.
+            ``images`` (M, 3, h, w), ``coverage`` (M, h, w / 8) packed bits, ``K``, ``cam2ego`` float32, ``cpu_s``: CPU
+            seconds that the variant's work took, and where the labels are the views', ``visible`` (B,) of the boxes.
         """
         for neighbour in frame.get(
             "neighbours", ()
         ):  # rendered when they are asked for: the world's time, not the variant's
             neighbour["images"]
-        start = time.process_time()
+        start, extra = time.process_time(), {}
         if self.variant.kind == "row_split":
             views = row_split(self.source, as_arrays(frame["images"]), self.target)
             images = np.stack([view.image for view in views]).astype(np.uint8).transpose(0, 3, 1, 2)
@@ -73,23 +73,16 @@ class ViewMaker:
             out = self.retarget(given, drawn)
             images, coverage = out["images"].numpy(), out["coverage"].numpy()
             K, cam2ego = out["K"].numpy(), out["cam2ego"].numpy()
+            if self.variant.labels == "views":
+                extra["visible"] = visible_boxes(out)
         seconds = time.process_time() - start
-        return {
+        return extra | {
             "images": images,
             "coverage": np.packbits(coverage, axis=-1),
             "K": K.astype(np.float32),
             "cam2ego": cam2ego.astype(np.float32),
             "cpu_s": np.array(seconds, np.float32),
         }
-
-
-def with_noise(depth_m: torch.Tensor, deviation: float, index: int) -> torch.Tensor:
-    """Depths (N, h, w) with relative errors that are alike within patches of 8 px, as a network makes them."""
-    n, h, w = depth_m.shape
-    generator = torch.Generator().manual_seed(index)
-    patches = torch.randn((1, n, -(-h // 8) + 1, -(-w // 8) + 1), generator=generator)
-    errors = torch.nn.functional.interpolate(patches, (h, w), mode="bicubic", align_corners=True)[0]
-    return depth_m / (1 + deviation * errors / errors.std()).clamp(min=0.1)
 
 
 def at_source_centres(source: Rig, target: Rig) -> Rig:

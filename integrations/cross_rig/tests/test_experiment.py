@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from integrations.cross_rig import __main__ as command
-from integrations.cross_rig import cache, experiment
+from integrations.cross_rig import cache, experiment, views
 from integrations.cross_rig.experiment import Run, load_results, run
+from integrations.cross_rig.labels import HIDDEN
 from integrations.cross_rig.report import markdown, write_report
 from integrations.cross_rig.settings import Settings, full, jobs, pilot, quick
 from integrations.cross_rig.training import Schedule
@@ -140,6 +141,20 @@ def test_report(done):
 
 
 @pytest.mark.slow
+def test_labels_are_those_that_the_variant_names(done, monkeypatch):
+    """Vehicles that nobody sees count for nothing: A's labels, B's, or those of the rendered views (here: none)."""
+    monkeypatch.setattr(views, "visible_boxes", lambda sample: np.zeros(len(sample["boxes_3d"]), bool))
+    names = ("auto_fill_labels", "oracle_labels", "oracle")
+    more = replace(done, settings=replace(TINY, changes=("up70",), variants=names))
+    assert list(run(more, 1, lambda line: None))[-1] == 0
+    by_name = {job.variant.name: more.training_set(job) for job in jobs(more.settings)}
+    of_a = more.source("train").store().stacked("state", TINY.train_frames)
+    np.testing.assert_array_equal(by_name["oracle_labels"].state, of_a)
+    np.testing.assert_array_equal(by_name["oracle"].state > 0, of_a > 0)
+    np.testing.assert_array_equal(by_name["auto_fill_labels"].state, np.where(of_a > 0, HIDDEN, 0))
+
+
+@pytest.mark.slow
 def test_families_have_tables_of_their_own(done):
     more = replace(done, settings=replace(TINY, variants=("raw", "oracle"), families=("depths", "queries", "voxels")))
     assert list(run(more, 1, lambda line: None)) == [4, 3, 2, 1, 0]
@@ -179,7 +194,7 @@ def test_presets():
     # Raw and scale/crop once for each seed, five variants for each change: 3 * (2 + 3 * 5).
     assert len(jobs(pilot())) == 51
     names = [job.name for job in jobs(full())]
-    assert len(names) == len(set(names)) == 3 * (2 + 6 * 26)
+    assert len(names) == len(set(names)) == 3 * (2 + 6 * 35)
 
 
 def test_keys_follow_what_matters(done):
