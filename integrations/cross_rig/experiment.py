@@ -208,6 +208,7 @@ def _result(job: Job, change: str, trained: dict[str, Any], tested: Tested) -> d
         "threshold": tested.threshold,
         "val_iou": tested.val_iou,
         "test_cpu_s": tested.cpu_s,
+        "fixed": tested.fixed.tolist(),
         "by_distance": tested.tally.by_distance.tolist(),
         "by_height": tested.tally.by_height.tolist(),
         # No NaN in JSON: -1 does not count.

@@ -69,6 +69,7 @@ def _of_change(variants: Results, rendering: Mapping[str, float]) -> dict[str, A
             "title": VARIANTS[name].title,
             **{"iou" if key == "value" else key: figure for key, figure in asdict(scores[name]).items()},
             "ap": asdict(precisions[name]),
+            "fixed_iou": float(iou(np.array([variants[name][s]["fixed"] for s in seeds]).sum((0, 1)))),
             "by_distance_iou": iou(cells[name].sum((0, 1))).tolist(),
             "by_height_recall": (heights[:, 0] / np.maximum(heights[:, 1], 1)).tolist(),
             "thresholds": [variants[name][s]["threshold"] for s in seeds],
@@ -98,7 +99,7 @@ def markdown(report: Mapping[str, Any]) -> str:
     distances = [f"{a:g}–{b:g} m" for a, b in pairwise(DISTANCES_M)]
     heights = [f"{a:g}–{b:g} m high" for a, b in pairwise(HEIGHTS_M)]
     scored = any("ap" in row for row in rows)
-    head = ["variant", "IoU", "over raw", "recovered %", *(["AP", "AP recovered %"] if scored else [])]
+    head = ["variant", "IoU", "over raw", "recovered %", *(["IoU at 0.3", "AP", "AP recovered %"] if scored else [])]
     head += [*(f"IoU {d}" for d in distances)]
     head += [*(f"recall {h}" for h in heights), "loading"]
     for name, change in report["changes"].items():
@@ -113,7 +114,7 @@ def markdown(report: Mapping[str, Any]) -> str:
             cells = [title, _text(row["iou"], 1), _text(row["over_raw"], 1, sign=True)]
             cells.append(_text(row["share"], 0))
             if scored:
-                cells += [_text(row["ap"]["value"], 1), _text(row["ap"]["share"], 0)]
+                cells += [f"{100 * row['fixed_iou']:.1f}", _text(row["ap"]["value"], 1), _text(row["ap"]["share"], 0)]
             cells += [f"{100 * value:.1f}" for value in (*row["by_distance_iou"], *row["by_height_recall"])]
             cells.append(f"{1000 * row['loading_cpu_s']:.1f}")
             lines.append("| " + " | ".join(cells) + " |")

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import t as student
 
 from integrations.cross_rig.boxes import average_precision
 from integrations.cross_rig.cell_counts import Counts, Floats, iou
@@ -71,6 +72,15 @@ def interval(value: float, draws: Floats) -> Interval:
     return Interval(value, float(low), float(high))
 
 
+def t_interval(differences: Floats) -> Interval | None:
+    """Of the mean of paired differences (S,), by Student's distribution; None of fewer than three."""
+    if len(differences) < 3:
+        return None
+    mean = float(np.mean(differences))
+    half = float(student.ppf(0.975, len(differences) - 1) * np.std(differences, ddof=1) / np.sqrt(len(differences)))
+    return Interval(mean, mean - half, mean + half)
+
+
 @dataclass(frozen=True)
 class VariantScore:
     """A variant under one change by one metric.
@@ -78,12 +88,14 @@ class VariantScore:
     Attributes:
         value: IoU of all seeds' frames together, or mean AP of the seeds.
         over_raw: Value minus raw's.
+        over_raw_t: The mean of the seeds' differences from raw and its t-interval; None of fewer than three seeds.
         share: (variant - raw) / (oracle - raw); None where the gap is below ``MIN_GAP`` or no oracle was trained.
         seeds: Value of each seed.
     """
 
     value: Interval
     over_raw: Interval | None
+    over_raw_t: Interval | None
     share: Interval | None
     seeds: list[float]
 
@@ -115,12 +127,15 @@ def _scores(
     raw, oracle = values.get("raw"), values.get("oracle")
     scores = {}
     for name, value in values.items():
-        over = share = None
+        over = paired = share = None
         if raw is not None and name != "raw":
             over = interval(value - raw, draws[name] - draws["raw"])
+            paired = t_interval(seeds[name] - seeds["raw"])
         if raw is not None and oracle is not None and oracle - raw >= MIN_GAP and name not in ("raw", "oracle"):
             # A draw whose gap is nil would make its share infinite: its place in the order is what counts.
             gaps = np.maximum(draws["oracle"] - draws["raw"], 1e-3)
             share = interval((value - raw) / (oracle - raw), (draws[name] - draws["raw"]) / gaps)
-        scores[name] = VariantScore(interval(value, draws[name]), over, share, [float(one) for one in seeds[name]])
+        scores[name] = VariantScore(
+            interval(value, draws[name]), over, paired, share, [float(one) for one in seeds[name]]
+        )
     return scores

@@ -15,13 +15,16 @@ from arbiview_aug import Rig
 from integrations.cross_rig.augmentation import scaled_and_cropped
 from integrations.cross_rig.boxes import box_loss, decode, match, real_boxes
 from integrations.cross_rig.cache import FrameStore
-from integrations.cross_rig.cell_counts import Tally, iou, tally
+from integrations.cross_rig.cell_counts import Counts, Tally, iou, tally
 from integrations.cross_rig.encoders import Backbone
 from integrations.cross_rig.families import Batch
 from integrations.cross_rig.labels import HIDDEN, VEHICLE, Grid
 from integrations.cross_rig.model import Answer, Detector
 
 THRESHOLDS = tuple(round(0.05 * k, 2) for k in range(1, 20))
+FIXED_THRESHOLD = 0.3
+"""Of those who have no frames of B to choose one on."""
+
 _EVAL_BATCH = 4
 _BOXES = 0.05
 """Share of the boxes' loss, which is some twenty times that of the cells."""
@@ -223,7 +226,8 @@ class Tested:
 
     Attributes:
         threshold, val_iou: Of validation.
-        tally: Of cells.
+        tally: Of cells, at that threshold.
+        fixed: (F, 3) counts at ``FIXED_THRESHOLD``.
         matched: (F, k, 5) of ``boxes.match``.
         positives: (F,) boxes that count.
     """
@@ -231,6 +235,7 @@ class Tested:
     threshold: float
     val_iou: float
     tally: Tally
+    fixed: Counts
     matched: npt.NDArray[np.floating]
     positives: npt.NDArray[np.integer]
     cpu_s: float
@@ -241,8 +246,10 @@ def evaluate(model: Detector, val: FrameSet, test_set: FrameSet, height_dm: np.n
     start = time.process_time()
     threshold, val_iou = best_threshold(answers(model, val, len(val.state), schedule)[0], val)
     probability, detections = answers(model, test_set, len(test_set.state), schedule)
-    counts = tally(probability > threshold, test_set.state, height_dm, test_set.counts)
+    counts, fixed = (
+        tally(probability > level, test_set.state, height_dm, test_set.counts) for level in (threshold, FIXED_THRESHOLD)
+    )
     frames = list(zip(detections, test_set.boxes, test_set.state, strict=True))
     matched = np.stack([match(*frame, test_set.counts) for frame in frames])
     positives = np.array([real_boxes(boxes, state, test_set.counts).sum() for _, boxes, state in frames])
-    return Tested(threshold, val_iou, counts, matched, positives, time.process_time() - start)
+    return Tested(threshold, val_iou, counts, fixed.by_distance.sum(1), matched, positives, time.process_time() - start)

@@ -65,6 +65,17 @@ def test_no_share_of_a_small_gap_or_without_an_oracle():
     assert iou_scores({name: frames(hits) for name, hits in variants.items()})["variant"].share is None
 
 
+def test_differences_of_seeds_have_a_t_interval():
+    seeds = [share(0.3, 100), share(0.32, 100), share(0.37, 100)]
+    variants = {"raw": share(0.2, 100, seeds=3), "variant": np.concatenate(seeds)}
+    paired = iou_scores({name: frames(hits) for name, hits in variants.items()})["variant"].over_raw_t
+    half = 4.3027 * np.std([0.1, 0.12, 0.17], ddof=1) / np.sqrt(3)
+    assert paired is not None
+    assert (paired.value, paired.low, paired.high) == pytest.approx((0.13, 0.13 - half, 0.13 + half), abs=1e-4)
+    two = {name: frames(hits[:2]) for name, hits in variants.items()}
+    assert iou_scores(two)["variant"].over_raw_t is None
+
+
 def test_ap_is_paired_and_averaged_over_seeds():
     """A detector that finds every other box, and one that finds all: 0.5 and 1, less what nuScenes leaves out."""
     frames = 40
