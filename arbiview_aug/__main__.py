@@ -14,7 +14,7 @@ COMMANDS = {
     "check": ("arbiview_aug.cli.check", "find silent mistakes in a data set, and draw its labels into its images"),
     "convert": ("arbiview_aug.cli.convert.command", "write a data set as another vehicle's cameras would have seen it"),
     "demo": ("arbiview_aug.cli.demo", "retarget a synthetic street or real frames, with numbers and a picture"),
-    "depth": ("arbiview_aug.cli.depth", "compute depth from motion of a drive's frames, for surface='motion'"),
+    "depth": ("arbiview_aug.cli.depth", "compute the depth of a drive's frames, from motion or by a network"),
     "evaluate": ("arbiview_aug.cli.evaluate", "measure the quality of rendered views: metrics, pictures, a report"),
     "inspect": ("arbiview_aug.cli.rigs", "show rigs: tables, differences, a picture"),
     "train": ("arbiview_aug.train", "train the generator that completes what no camera saw"),

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import HealthCheck, Phase, given, settings
 
 from arbiview_aug import Camera, Rig
@@ -65,6 +66,24 @@ def ring(
 def street_sample(size: tuple[int, int] = (64, 176), **settings: Any) -> dict[str, Any]:
     """One frame of the demo rig on a synthetic street; settings are those of ``SyntheticDrive``."""
     return SyntheticDrive(demo_source_rig(size), num_frames=1, **settings)[0]
+
+
+def saved_depth_model(folder: Path, kind: str = "DepthAnything", **changes: Any) -> Path:
+    """A tiny random depth model of transformers and its image processor."""
+    transformers = pytest.importorskip("transformers")
+    torch.manual_seed(0)
+    backbone = transformers.Dinov2Config(
+        **{"hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "mlp_ratio": 2, "image_size": 56},
+        **{"patch_size": 14, "out_features": ["stage1", "stage2"], "reshape_hidden_states": False},
+    )
+    sizes = {"reassemble_hidden_size": 16, "neck_hidden_sizes": [8, 8], "fusion_hidden_size": 8, "head_hidden_size": 8}
+    sizes |= {"reassemble_factors": [1, 0.5], "patch_size": 14}
+    config = getattr(transformers, f"{kind}Config")(backbone_config=backbone, **(sizes | changes))
+    getattr(transformers, f"{kind}ForDepthEstimation")(config).save_pretrained(folder)
+    processor = getattr(transformers, {"DepthAnything": "DPT"}.get(kind, kind) + "ImageProcessor")
+    size = {"height": 56, "width": 56}
+    processor(size=size, keep_aspect_ratio=True, ensure_multiple_of=14).save_pretrained(folder)
+    return folder
 
 
 def few_or_all(few: int, every: int, what: str = "streets") -> list[Any]:

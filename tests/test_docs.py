@@ -32,6 +32,7 @@ from arbiview_aug.render.requirements import HELPFUL_DATA
 from arbiview_aug.scene.surface import SurfaceName
 from tests.generator.training.small import frames as drawn_frames
 from tests.generator.training.test_command import SMALLER
+from tests.helpers import saved_depth_model
 from tests.studies import generator
 
 ROOT = Path(__file__).parents[1]
@@ -72,12 +73,15 @@ TINY = {
         *("--size", "24x40", "--reduce", "4", "--workers", "1", "--surface", "street", "--report", "0")
     ],
     "depth --data FOLDER": ["--output", "depth"],
+    "depth --model ID_OR_PATH --data FOLDER": ["--output", "depth"],
+    "depth --model ID_OR_PATH --data FOLDER --reference motion road": ["--output", "depth"],
+    "evaluate --data FOLDER --target waymo --surface learned street": ["--reduce", "4", "--surface", "street"],
     "bench ablation --data FOLDER": ["--reduce", "4", "--only", "street, not far"],
     "train --output output/tiny": ["--quiet", *SMALLER],
 }
 """Every command of the README and the pages, and options that make it quick."""
 
-SLOW = ("bench", "evaluate --paper", "evaluate --figure", "evaluate --data FOLDER --yaws")
+SLOW = ("bench", "depth --model", "evaluate --paper", "evaluate --figure", "evaluate --data FOLDER --yaws")
 
 
 @cache
@@ -200,6 +204,8 @@ def test_the_commands_run(
     if "FOLDER" in arguments:
         root = request.getfixturevalue("kitti_root" if "--displaced" in arguments else "nuscenes_root")
         arguments[arguments.index("FOLDER")] = str(root)
+    if "ID_OR_PATH" in arguments:
+        arguments[arguments.index("ID_OR_PATH")] = str(saved_depth_model(tmp_path / "model"))
     if "--paper" in arguments:  # whole, it takes long
         monkeypatch.delenv("ARBIVIEW_DATA", raising=False)
         monkeypatch.setattr(paper_study, "SETS", ("truck",))

@@ -39,6 +39,7 @@ HEAVY = (
     "PIL",
     "ray",
     "accelerate",
+    "transformers",
 )
 LIMIT_S = 0.4
 

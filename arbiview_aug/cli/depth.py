@@ -1,24 +1,35 @@
-"""``python -m arbiview_aug depth --data FOLDER``: depth from motion of every frame, into files beside the data set."""
+"""``python -m arbiview_aug depth --data FOLDER``: depth of every frame, into files beside the data set.
+
+From the motion of the vehicle, or with ``--model`` by a network.
+"""
 
 from __future__ import annotations
 
+import argparse
 import sys
-from collections.abc import Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from statistics import median
+from typing import Any, NamedTuple, get_args
 
+import numpy as np
 import torch
 from torch.utils.data import Dataset
 
 from arbiview_aug.atomic_io import inside
-from arbiview_aug.cli.arguments import add_data, command_parser, count, gathered_warnings, writable_folder
+from arbiview_aug.cli.arguments import add_data, command_parser, count, device_named, gathered_warnings, writable_folder
 from arbiview_aug.cli.parallel import results
-from arbiview_aug.datasets.motion_depth import FOLDER, WANTED, DepthFolder
+from arbiview_aug.datasets.depth_folder import FOLDER, LEARNED_FOLDER, WANTED, DepthFolder
 from arbiview_aug.datasets.registry import open_data, split_kind
 from arbiview_aug.errors import ArbiviewError, WarnOnce, described
-from arbiview_aug.sample.inputs import read_frames
+from arbiview_aug.sample.inputs import read_frames, read_scenes
 from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames, warn_lost
+from arbiview_aug.scene.scene import Scene
+from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, DepthModel, Reference, learned_depth
 from arbiview_aug.temporal.motion_depth import compile_matching, motion_depth
+from arbiview_aug.temporal.transformers_depth import TransformersDepth
 
 
 class Done(NamedTuple):
@@ -29,6 +40,7 @@ class Done(NamedTuple):
     message: str  # how depth was found, or why not
     failed: bool = False  # whether the frame could not be read
     existed: bool = False  # whether its file existed before
+    fits: Sequence[CameraFit] = ()  # of a network's depth
 
 
 class _Frames(Dataset[Done]):
@@ -71,30 +83,123 @@ class _Frames(Dataset[Done]):
         return Done(token, found.density, str(found))
 
 
+class _Loaded(NamedTuple):
+    """A frame for a network, and what its file will say of its origin."""
+
+    token: str
+    inputs: DepthInputs
+    origin: Sequence[str]
+
+
+class _Inputs(Dataset[_Loaded | Done]):
+    """Frames for a network, read on access in a DataLoader's workers; those that have their depth are done.
+
+    ``model`` is what a file says of the network; ``motion`` is the folder of depth from motion.
+    """
+
+    def __init__(
+        self, data: Any, depths: DepthFolder, motion: DepthFolder, model: Sequence[str], wanted: Sequence[Reference]
+    ) -> None:
+        self.data, self.depths, self.motion, self.model, self.wanted = data, depths, motion, model, wanted
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def __getitem__(self, index: int) -> _Loaded | Done:
+        token = self.data.tokens[index]
+        try:
+            return self._loaded(token, self.data[index])
+        except Exception as error:  # the other frames go on
+            return Done(token, 0.0, described(error), failed=True)
+
+    def _loaded(self, token: str, sample: dict[str, Any]) -> _Loaded | Done:
+        (frame,) = read_frames(sample, None)
+        (scene,) = read_scenes(sample, [frame], (), "auto") or [Scene()]
+        points = np.asarray(scene.points, float) if scene.points is not None and "LiDAR" in self.wanted else None
+        is_there = "motion" in self.wanted and self.motion.path(token).is_file()
+        motion = self.motion.read(token, sample["rig"]) if is_there else None
+        used = [name for name, value in (("LiDAR", points), ("motion", motion)) if value is not None]
+        origin = [*self.model, *used, *(["road"] if "road" in self.wanted else [])]
+        found = self.depths.find(token, sample["rig"], origin, "learned")
+        if found is not None:
+            return Done(token, found.density, "", existed=True)
+        return _Loaded(token, DepthInputs(frame.rig, frame.images, points, motion, scene.boxes), origin)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Compute and write the depth of every frame that has none yet; return 1 if a frame failed, else 0."""
     parser = command_parser(
         "depth",
-        "Compute depth from motion of every frame of a drive, for surface='motion'. Frames whose depth is there, from "
-        "the same neighbours, are left as they are: run it again to go on.",
+        "Compute the depth of every frame of a drive: from motion, for surface='motion', or with --model by a network, "
+        "for surface='learned'. Frames whose depth is there, of the same origin, are left as they are: run it again to "
+        "go on.",
         "--data nuscenes:ROOT --workers 4",
     )
     add_data(parser)
-    parser.add_argument("--output", metavar="FOLDER", help=f"where to write (default: {FOLDER} in the data's folder)")
+    parser.add_argument(
+        "--output",
+        metavar="FOLDER",
+        help=f"where to write (default: {FOLDER} or {LEARNED_FOLDER} beside the data)",
+    )
     parser.add_argument("--workers", type=count, default=1, metavar="N", help="processes")
+    parser.add_argument(
+        "--model", metavar="ID_OR_PATH", help="depth model of transformers: a folder, or a name on its Hub"
+    )
+    parser.add_argument("--device", metavar="NAME", help="cpu, cuda, cuda:1, ... (default: the GPU, if there is one)")
+    parser.add_argument("--batch", type=count, default=8, metavar="N", help="images that the model sees at once")
+    parser.add_argument(
+        "--reference",
+        nargs="+",
+        choices=get_args(Reference),
+        default=list(get_args(Reference)),
+        help="what scale and shift of the model are fitted to, the first that a camera has",
+    )
     arguments = parser.parse_args(argv)
-    data: Any = open_data(arguments.data, neighbours=WANTED)
+    data: Any = open_data(arguments.data, neighbours=None if arguments.model else WANTED)
     _, root = split_kind(arguments.data)
-    folder = Path(arguments.output) if arguments.output else inside(root, FOLDER, "depth from motion")
+    folder = Path(arguments.output or inside(root, LEARNED_FOLDER if arguments.model else FOLDER, "depth"))
     depths = DepthFolder(writable_folder(folder, str(folder)))
-    frames = _Frames(data, data.tokens, depths)
-    compile_matching()
     warned: list[str] = []
     with gathered_warnings(warned):
-        done = list(results(frames, arguments.workers, "depth from motion"))
+        if arguments.model:
+            model = TransformersDepth(arguments.model, device_named(arguments.device or _best_device()))
+            done = list(_learned(model, data, depths, DepthFolder(inside(root, FOLDER, "depth")), arguments))
+        else:
+            compile_matching()
+            frames = _Frames(data, data.tokens, depths)
+            done = list(results(frames, arguments.workers, "depth from motion"))
     for line in warned:
         print(line, file=sys.stderr)
     return _summary(done, depths)
+
+
+def _learned(
+    model: DepthModel, data: Any, depths: DepthFolder, motion: DepthFolder, arguments: argparse.Namespace
+) -> Iterator[Done]:
+    """Predict, fit and write the frames that have no depth of this model yet."""
+    facts = [f"model {model.name}", f"revision {model.revision}", f"licence {model.licence}"]
+    wanted = [name for name in get_args(Reference) if name in arguments.reference]
+    waiting: list[_Loaded] = []
+
+    def written() -> Iterator[Done]:
+        found = learned_depth(model, [one.inputs for one in waiting], arguments.batch, wanted)
+        for one, (depth, fits) in zip(waiting, found, strict=True):
+            depths.write(one.token, one.inputs.rig, depth, one.origin)
+            yield Done(one.token, depth.density, "; ".join(map(str, fits)), fits=fits)
+        waiting.clear()
+
+    for one in results(_Inputs(data, depths, motion, facts, wanted), arguments.workers, "learned depth"):
+        if isinstance(one, Done):
+            yield one
+            continue
+        waiting.append(one)
+        if sum(len(loaded.inputs.rig) for loaded in waiting) >= arguments.batch:
+            yield from written()
+    yield from written()
+
+
+def _best_device() -> str:
+    return "cuda" if torch.cuda.is_available() else "cpu"
 
 
 def _summary(done: Sequence[Done], depths: DepthFolder) -> int:
@@ -103,9 +208,26 @@ def _summary(done: Sequence[Done], depths: DepthFolder) -> int:
     known = [one.density for one in done if one.density > 0]
     share = f", {sum(known) / len(known):.0%} of their pixels on average" if known else ""
     print(f"{depths.root}: {len(known)} of {len(done)} frames have depth{share}; {len(existed)} were there before")
+    for line in _camera_lines(list(chain.from_iterable(one.fits for one in done))):
+        print(f"  {line}")
     for one in done:
         if one.failed:
             print(f"  {one.token}: failed: {one.message}", file=sys.stderr)
         elif one.density == 0 and not one.existed:
             print(f"  {one.token}: {one.message}")
     return 1 if failed else 0
+
+
+def _camera_lines(fits: Sequence[CameraFit]) -> Iterator[str]:
+    """How well each camera's depth fits, over all frames, and why some were declined."""
+    by_camera: dict[str, list[CameraFit]] = defaultdict(list)
+    for fit in fits:
+        by_camera[fit.camera].append(fit)
+    for camera, of_camera in by_camera.items():
+        used = [fit for fit in of_camera if not fit.declined]
+        residuals = [fit.residual for fit in used if fit.residual is not None]
+        to = ", ".join(sorted({fit.reference for fit in used if fit.reference is not None}))
+        fitted = f" to {to}, residual {median(residuals):.1%} (worst {max(residuals):.1%})" if residuals else ""
+        yield f"{camera}: {len(used)} of {len(of_camera)} frames fitted{fitted}"
+        for reason, frames in Counter(fit.declined for fit in of_camera if fit.declined).most_common(3):
+            yield f"  declined in {frames}: {reason}"

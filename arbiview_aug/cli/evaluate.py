@@ -16,6 +16,7 @@ from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
+from arbiview_aug.atomic_io import inside
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.arguments import (
     REAL_TARGET,
@@ -32,7 +33,8 @@ from arbiview_aug.cli.arguments import (
     writable_folder,
 )
 from arbiview_aug.datasets import FrameFolder, open_data
-from arbiview_aug.datasets.motion_depth import WANTED
+from arbiview_aug.datasets.depth_folder import LEARNED_FOLDER, WANTED, WithDepth
+from arbiview_aug.datasets.registry import split_kind
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.displaced import COPY, displaced_frames, surfaces_for
@@ -47,6 +49,7 @@ from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
 from arbiview_aug.evaluate.run import Evaluation, evaluate
 from arbiview_aug.evaluate.targets import named_targets, without_masks
 from arbiview_aug.generator import Generator
+from arbiview_aug.sample.inputs import LEARNED_KEY
 from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.surface import SurfaceName
 
@@ -138,11 +141,14 @@ def _yaws(text: str) -> str | list[float]:
 
 # --- frames and targets -----------------------------------------------------------------------------------------------
 def open_frames(arguments: argparse.Namespace, surfaces: Sequence[SurfaceName], *, lidar: bool = True) -> Any:
-    """Open ``--data``, or a synthetic drive; with neighbours where a surface needs them."""
+    """Open ``--data``, or a synthetic drive; with neighbours and learned depth where a surface needs them."""
     neighbours = WANTED if any("motion" in SURFACES[name].reads for name in surfaces) else None
     if arguments.data is not None:
         options = {name: getattr(arguments, name) for name in ("reduce", "clean_masks")}
-        return open_data(arguments.data, neighbours=neighbours, **options)
+        data = open_data(arguments.data, neighbours=neighbours, **options)
+        learned = inside(split_kind(arguments.data)[1], LEARNED_FOLDER, "learned depth")
+        reads = learned.is_dir() and any(LEARNED_KEY in SURFACES[name].reads for name in surfaces)
+        return WithDepth(data, learned) if reads else data
     source = demo_source_rig(**({} if arguments.size is None else {"size": arguments.size}))
     frames = arguments.frames or 1
     return SyntheticDrive(source, num_frames=frames, seed=arguments.seed, lidar=lidar, neighbours=neighbours)
@@ -245,7 +251,7 @@ def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> 
 
 def _displaced(arguments: argparse.Namespace, notes: list[str]) -> tuple[list[Method], Evaluation]:
     """Evaluate a copy and the surfaces on photographs; holes are not read from neighbours."""
-    data, given = open_frames(arguments, ["motion"]), arguments.displaced
+    data, given = open_frames(arguments, ["motion", *arguments.surface]), arguments.displaced
     with named_steps(notes) as tick:
         next_frame = FrameFolder(given, reduce=arguments.reduce)[0] if isinstance(given, str) else None
         count_of = min(arguments.frames or len(data), len(data))

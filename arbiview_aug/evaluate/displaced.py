@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets.depth_folder import WithDepth
 from arbiview_aug.datasets.frame_folder import FrameFolder
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.baselines import own_index
@@ -31,8 +32,9 @@ def displaced_frames(data: Any, count: int, next_frame: Mapping[str, Any] | None
         if count == 0:
             return
         sample, found = data[index], None
-        if next_frame is None and isinstance(data, FrameFolder):
-            found = data.truth(index)
+        recorded = data.dataset if isinstance(data, WithDepth) else data
+        if next_frame is None and isinstance(recorded, FrameFolder):
+            found = recorded.truth(index)
         if found is not None:
             photographs = _photographs(found["rig"], found["images"])
         else:

@@ -22,7 +22,10 @@ from arbiview_aug.scene.point_cloud import checked_points
 from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.surface import Points
 
-MOTION_KEY = "motion_depth_m"  # (N, h, w) z-depth computed offline, at the size of ``motion_camera``
+MOTION_KEY, LEARNED_KEY = "motion_depth_m", "learned_depth_m"
+"""(N, h, w) z-depth computed offline, at the size of ``motion_camera``."""
+
+LEARNED_WORDS_KEY = "learned_depth_words"  # the model and how it was fitted, for ``explain``
 
 CALIBRATION_KEYS = (
     "images",
@@ -36,6 +39,8 @@ CALIBRATION_KEYS = (
     "ignore",
     "neighbours",
     MOTION_KEY,
+    LEARNED_KEY,
+    LEARNED_WORDS_KEY,
     "retarget_params",
 )
 """Keys that describe the source's images; they are replaced by the target's or consumed."""
@@ -130,6 +135,7 @@ _EXPECTED = {
     "boxes": "'boxes_3d' (B, 7) in the sample, got none; pass an empty (0, 7) tensor if there are no objects",
     "points": "'points' (P, >= 3) in the ego frame, or 'depth_m' (N, H, W), z-depth of each camera in metres, in the "
     "sample, got neither",
+    LEARNED_KEY: f"{LEARNED_KEY!r} in the sample, got none; make it with depth --model, and read it with WithDepth",
 }
 _CHECKS: dict[str, Callable[[Points], Points]] = {"boxes_3d": checked_boxes, "points": checked_points}
 
@@ -143,7 +149,7 @@ def _geometry(
         value = sample.get(key)
         if value is None:
             continue
-        if key in ("depth_m", MOTION_KEY):
+        if key in ("depth_m", MOTION_KEY, LEARNED_KEY):
             parts.append(_points_of_maps(key, value, frames, lead))
             continue
         arrays = of_frames(key, value, len(frames), lead)
@@ -165,7 +171,7 @@ def _points_of_maps(key: str, depth_m: Any, frames: Sequence[Frame], lead: tuple
             of_cameras = list(numbers(key, of_cameras)) if of_cameras.ndim else ()
         if not isinstance(of_cameras, list | tuple) or len(of_cameras) != len(frame.rig):
             raise SampleError(f"{key}: expected {len(frame.rig)} maps (H, W), one for each image")
-        cameras = [motion_camera(camera) if key == MOTION_KEY else camera for camera in frame.rig]
+        cameras = [camera if key == "depth_m" else motion_camera(camera) for camera in frame.rig]
         points = [points_of_depth(c, numbers(key, depth), key) for c, depth in zip(cameras, of_cameras, strict=True)]
         found.append(np.concatenate(points))
     return found

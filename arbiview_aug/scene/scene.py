@@ -135,5 +135,10 @@ SURFACES: dict[str, SurfaceRow] = {
         lambda scene, z_m: _point_cloud(scene.points, scene, z_m), ("boxes", "points"), "points", on_device=True
     ),
     "motion": SurfaceRow(lambda scene, z_m: _point_cloud(scene.motion, scene, z_m), ("boxes", "motion"), "motion"),
+    "learned": SurfaceRow(
+        lambda scene, z_m: _point_cloud(scene.further["learned_depth_m"], scene, z_m),
+        ("boxes", "learned_depth_m"),
+        "learned_depth_m",
+    ),
 }
 """All surfaces by name. A new one is a class in this folder and a row here."""

@@ -29,6 +29,7 @@ class Explanation:
     harmonisation: PhotometricReport | None = None  # the sources' gains and why, if they are harmonised
     depth: OverlapDepth | None = None  # from overlap, if it was asked for and matters
     motion: MotionDepth | None = None  # depth from motion, if it was estimated
+    learned: str | None = None  # the model of learned depth and how it was fitted, if the surface is made of it
     fills: Fills | None = None  # how other frames of the drive fill holes, if there are any
     harm: str | None = None  # why a detector suffers, if cameras move over a static surface
 
@@ -67,6 +68,8 @@ class Explanation:
             lines += str(self.depth).splitlines()
         if self.motion is not None:
             lines.append(str(self.motion))
+        if self.learned is not None:
+            lines += self.learned.splitlines()
         if self.fills is not None:
             lines += self.fills.lines(self.plan)
         head = [_head(self.plan.source, self.plan.target), *(f"  {line}" for line in lines)]

@@ -21,7 +21,7 @@ from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.image_ops import nearest_resized, resized
 from arbiview_aug.sample.batching import is_readable, like, rewrapped
 from arbiview_aug.sample.check import PIXEL_BOUND_KEYS, check_other_keys
-from arbiview_aug.sample.inputs import MOTION_KEY, numbers, read_frames
+from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, numbers, read_frames
 
 _MAPS = ("coverage", "ignore", "source_camera", "source_frame", "confidence", "generated", "depth", "depth_m")
 """Keys of maps (..., N, H, W) over the images' pixels, which are resized by the nearest pixel."""
@@ -52,7 +52,7 @@ class _PixelTransform(torch.nn.Module, ABC):
         sizes = [tuple(image.shape[-2:]) for image in read_frames(sample, None)[0].images]
         labels = check_other_keys(sample, sizes, self.label_keys, self.pass_keys)
         out = dict(sample)
-        for key in (*PIXEL_BOUND_KEYS, MOTION_KEY, "neighbours"):
+        for key in (*PIXEL_BOUND_KEYS, MOTION_KEY, LEARNED_KEY, "neighbours"):
             if key in out and key not in (*_MAPS, *labels, *self.pass_keys):
                 del out[key]
                 self._warn(key, f"{type(self).__name__} drops {key}: it speaks of pixels that have moved")

@@ -30,7 +30,7 @@ from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.render.rendered import Execution, RenderedFrame, Renderer, as_rendered, resize_only
 from arbiview_aug.sample.batching import leading_shape
 from arbiview_aug.sample.check import check_other_keys, warn_of_misnamed, warn_of_rims
-from arbiview_aug.sample.inputs import Frame, read_frames
+from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, Frame, read_frames
 from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.temporal.fill import Reach, fill_from_neighbours
@@ -99,11 +99,11 @@ class RigRetarget(torch.nn.Module):
             its ``points`` (ego frame) or ``depth_m`` (..., N, H, W; z-depth in metres, 0 or NaN where unknown), with
             ``boxes_3d`` for objects of few points; ``motion``: depth estimated from its ``neighbours``
             (``arbiview_aug.motion``; seconds a frame), or ``motion_depth_m`` of the ``depth`` command, with its
-            ``boxes_3d``, or the street, with a warning, if the estimate is declined. ``auto``: for each pair of
-            cameras ``far`` where their centres coincide, else the best that the sample offers: ``lidar``, else
-            ``objects``, else ``street`` (``paper``: always ``far``). Cameras that move over the street alone harm a
-            detector: a warning says so once, unless ``p`` leaves half of the samples untouched. Points and boxes need a
-            new plan for every frame.
+            ``boxes_3d``, or the street, with a warning, if the estimate is declined; ``learned``: its
+            ``learned_depth_m`` (``depth --model``). ``auto``: for each pair of cameras ``far`` where their centres
+            coincide, else the best that the sample offers: ``lidar``, else ``objects``, else ``street`` (``paper``:
+            always ``far``). Cameras that move over the street alone harm a detector: a warning says so once, unless
+            ``p`` leaves half of the samples untouched. Points and boxes need a new plan for every frame.
         strict: Raise SampleError instead of that warning.
         harmonise: Bring the sources to one exposure (``arbiview_aug.render.harmonise``): True or a ``HarmoniseConfig``
             estimates a gain for each camera in every frame; numbers are used as gains. Off by default, and for samples
@@ -422,7 +422,9 @@ class RigRetarget(torch.nn.Module):
         if plan.plan is None:
             return PaperExplanation(self._published(plan, frames[0]))
         gains = self.harmonisation(sample) if self.planner.harmoniser.is_on else None
-        return Explanation(plan.plan, gains, plan.depth, plan.motion, plan.fills, plan.harm)
+        words = sample.get(LEARNED_WORDS_KEY) if LEARNED_KEY in SURFACES[self.planner.surface].reads else None
+        learned = words if isinstance(words, str) or words is None else words[0]  # a batch has one for each frame
+        return Explanation(plan.plan, gains, plan.depth, plan.motion, learned, plan.fills, plan.harm)
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
         """The gains that a sample's source images would get, and why; for a batch, its first frame's."""

@@ -10,9 +10,9 @@ import torch
 
 from arbiview_aug import DataError, RetargetedDataset, Rig, RigRetarget
 from arbiview_aug.__main__ import main
-from arbiview_aug.datasets import FrameFolder, Neighbours, WithMotionDepth
+from arbiview_aug.datasets import FrameFolder, Neighbours, WithDepth, WithMotionDepth
+from arbiview_aug.datasets.depth_folder import FOLDER, DepthFolder
 from arbiview_aug.datasets.frame_writer import write_frame
-from arbiview_aug.datasets.motion_depth import FOLDER, DepthFolder
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import SampleError
 
@@ -80,7 +80,8 @@ def test_what_cannot_be_read_is_named(recorded: Path, tmp_path: Path, capsys) ->
 
 
 def test_samples_carry_it(made: Path, recorded: Path) -> None:
-    data = WithMotionDepth(FrameFolder(recorded), made)
+    data = WithDepth(FrameFolder(recorded), made)
+    assert WithMotionDepth is WithDepth  # its former name
     sample = data[1]
     assert len(data) == 4 and sample["motion_depth_m"].shape == (2, 64, 176)
     assert sample["motion_depth_m"].dtype == torch.float32 and (sample["motion_depth_m"] > 0).float().mean() > 0.3
@@ -96,18 +97,18 @@ def test_samples_carry_it(made: Path, recorded: Path) -> None:
 
 def test_files_that_do_not_fit_are_named(made: Path, recorded: Path, tmp_path: Path) -> None:
     depths, rig = DepthFolder(made), FrameFolder(recorded)[0]["rig"]
-    with pytest.raises(DataError, match=r"missing\.npz: expected depth from motion of frame 'missing', found none"):
+    with pytest.raises(DataError, match=r"missing\.npz: expected depth of frame 'missing', found none"):
         depths.read("missing", rig)
     with pytest.raises(DataError, match=r"000\.npz: expected depth of this calibration"):
         depths.read("000", rig.turned(yaw_deg=1))
     with pytest.raises(DataError, match=r"000\.npz: expected depth of this calibration"):
         depths.read("000", Rig([rig[0]]))
     (tmp_path / "x.npz").write_bytes(b"nothing")
-    with pytest.raises(DataError, match=r"x\.npz: expected depth from motion, got "):
+    with pytest.raises(DataError, match=r"x\.npz: expected depth of a frame, got "):
         DepthFolder(tmp_path).read("x", rig)
     assert DepthFolder(tmp_path).path("a/b").parent == tmp_path
     with pytest.raises(SampleError, match="expected 'rig' and 'token'"):
-        WithMotionDepth([{"images": 0}], made)[0]
+        WithDepth([{"images": 0}], made)[0]
 
 
 def test_what_was_found_from_less_is_found_again(recorded: Path, tmp_path: Path, capsys) -> None:

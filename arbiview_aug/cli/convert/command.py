@@ -32,8 +32,8 @@ from arbiview_aug.cli.convert.ray_runner import ray_results
 from arbiview_aug.cli.convert.report import write_report
 from arbiview_aug.cli.convert.settings import FOLDER, RETARGET_OPTIONS, Settings, check_output
 from arbiview_aug.cli.parallel import results
+from arbiview_aug.datasets.depth_folder import FOLDERS
 from arbiview_aug.datasets.drive import Recording
-from arbiview_aug.datasets.motion_depth import FOLDER as DEPTH_FOLDER
 from arbiview_aug.datasets.registry import split_kind
 from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError
@@ -51,8 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     if arguments.shard_index >= arguments.num_shards:
         parser.error(f"argument --shard-index: expected less than {arguments.num_shards}, got {arguments.shard_index}")
-    if arguments.motion_depth is not None and "motion" not in SURFACES[arguments.surface].reads:
-        parser.error(f"argument --motion-depth: expected it with --surface motion, got {arguments.surface}")
+    if arguments.motion_depth is not None and not FOLDERS.keys() & SURFACES[arguments.surface].reads:
+        parser.error(f"argument --depth: expected it with --surface motion or learned, got {arguments.surface}")
     settings = _settings(arguments)
     check_output(settings)
     jobs, facts = _begin(settings, settings.open(), arguments)
@@ -114,10 +114,12 @@ def _parser() -> argparse.ArgumentParser:
         help="let N frames of the drive before and after each fill holes (default: none)",
     )
     parser.add_argument(
+        "--depth",
         "--motion-depth",
+        dest="motion_depth",
         type=Path,
         metavar="DIR",
-        help=f"what the depth command wrote, for --surface motion (default: {DEPTH_FOLDER} in the data, where it is)",
+        help="what the depth command wrote, for --surface motion or learned (default: its folder in the data)",
     )
     parser.add_argument("--images", choices=("jpg", "png"), default="jpg", help="jpg: quality 96, 4:4:4; png: lossless")
     parser.add_argument("--shard-index", type=seed, default=0, metavar="I", help="this shard, from 0")
@@ -141,14 +143,15 @@ def _settings(arguments: argparse.Namespace) -> Settings:
     kind, root = split_kind(arguments.data)
     root = root.absolute()  # Ray's actors have a working directory of their own
     depth = arguments.motion_depth
-    if depth is None and "motion" in SURFACES[arguments.surface].reads:
-        default = inside(root, DEPTH_FOLDER, "depth from motion")
+    needed = SURFACES[arguments.surface].needs
+    if depth is None and needed in FOLDERS:
+        default = inside(root, FOLDERS[needed], "depth")
         depth = default if default.is_dir() else None
-        if depth is None and not arguments.neighbours:
+        if depth is None and not (needed == "motion" and arguments.neighbours):
+            model, motion = (" --model MODEL", "") if needed != "motion" else ("", ", or estimate it (--neighbours 2)")
             raise DataError(
-                f"--surface motion: expected depth from motion in {default}, found none; make it with "
-                "python -m arbiview_aug depth --data DIR, or name its folder (--motion-depth), or estimate it from "
-                "other frames (--neighbours 2)"
+                f"--surface {arguments.surface}: expected depth in {default}, found none; make it with "
+                f"python -m arbiview_aug depth --data DIR{model}, or name its folder (--depth){motion}"
             )
     return Settings(
         root=root,

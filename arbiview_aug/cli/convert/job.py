@@ -18,8 +18,8 @@ from arbiview_aug.cli.convert.manifest import Manifest, Record
 from arbiview_aug.cli.convert.settings import Settings
 from arbiview_aug.cli.convert.views import encode_views, rig_of
 from arbiview_aug.cli.convert.writer import Converted, Writer
+from arbiview_aug.datasets.depth_folder import WithDepth
 from arbiview_aug.datasets.drive import Recording, WritableRecording
-from arbiview_aug.datasets.motion_depth import WithMotionDepth
 from arbiview_aug.datasets.registry import find_reader
 from arbiview_aug.environment import repeatable_opencv
 from arbiview_aug.errors import DataError, OutputError, described
@@ -54,7 +54,7 @@ class Jobs(Dataset[Done]):
             raise DataError(f"--data {settings.root}: expected a kind that can be written, got a {reader.description}")
         self.settings, self.data, self.indices, self.on_error = settings, data, indices, on_error
         depth = settings.motion_depth
-        self.samples = data if depth is None else WithMotionDepth(data, depth)
+        self.samples = data if depth is None else WithDepth(data, depth)
         module, _, name = reader.writer.partition(":")
         self.format: Writer = getattr(import_module(module), name)(settings, data)
         self.manifest = Manifest(settings.output)
@@ -156,8 +156,8 @@ class Jobs(Dataset[Done]):
 
     def _source_files(self, index: int) -> list[Path]:
         files = self.data.files(index)
-        if isinstance(self.samples, WithMotionDepth):
-            files.append(self.samples.depths.path(self.data.tokens[index]))
+        if isinstance(self.samples, WithDepth):
+            files += [folder.path(self.data.tokens[index]) for folder in self.samples.folders]
         return files
 
 

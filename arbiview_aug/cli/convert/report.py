@@ -12,6 +12,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.convert.manifest import Manifest
 from arbiview_aug.cli.convert.settings import FOLDER, Settings
 from arbiview_aug.cli.convert.views import coverage_of
+from arbiview_aug.datasets.depth_folder import FOLDERS
 from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.registry import open_data
 from arbiview_aug.evaluate.frames import make_frame
@@ -27,9 +28,9 @@ CONVERTED = "converted"  # name of the written views in tables
 
 def converted(settings: Settings) -> Method:
     """Wrap the written views as a method; for other rigs than the target it renders anew."""
-    # Scored frames hold their points back, and depth from motion is not read again.
+    # Scored frames hold their points back, and depth on disk is not read again.
     anew = retargeting(
-        settings.quality, "auto" if SURFACES[settings.surface].needs in ("points", "motion") else settings.surface
+        settings.quality, "auto" if SURFACES[settings.surface].needs in ("points", *FOLDERS) else settings.surface
     )
     manifest, target = Manifest(settings.output), settings.sized_target
     written = open_data(settings.output, kind=settings.kind, version=settings.version)

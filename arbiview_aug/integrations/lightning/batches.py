@@ -9,9 +9,9 @@ import torch
 
 from arbiview_aug.errors import SampleError
 from arbiview_aug.sample.batching import rewrapped
-from arbiview_aug.sample.inputs import MOTION_KEY
+from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
 
-_OF_PLANS = ("depth_m", MOTION_KEY)
+_OF_PLANS = ("depth_m", MOTION_KEY, LEARNED_KEY)
 """Maps that are geometry."""
 
 STACKED = ("images", "K", "cam2ego", "coverage", "ignore", "distortion", "ego2world", *_OF_PLANS)

@@ -17,8 +17,8 @@ from arbiview_aug import RigRetarget, load_rig
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.convert import command as command_module
 from arbiview_aug.cli.convert.views import coverage_of
-from arbiview_aug.datasets import FrameFolder, WithMotionDepth
-from arbiview_aug.datasets.motion_depth import DepthFolder
+from arbiview_aug.datasets import FrameFolder, WithDepth
+from arbiview_aug.datasets.depth_folder import DepthFolder
 from arbiview_aug.errors import DataError
 from arbiview_aug.temporal.motion_depth import MotionDepth
 from tests.cli.convert.drives import SIZE, command, tree, write_frames
@@ -131,7 +131,7 @@ def test_what_was_made_up_is_said(source: Path, tmp_path: Path) -> None:
 def test_depth_from_motion_is_read(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(source, tmp_path / "drive")
     asked = command(tmp_path / "drive", tmp_path / "new", "--images", "png", "--surface", "motion")
-    assert main(asked) == 2 and "expected depth from motion in" in capsys.readouterr().err
+    assert main(asked) == 2 and "--surface motion: expected depth in" in capsys.readouterr().err
     depths = DepthFolder(tmp_path / "drive" / "motion_depth")
     old = FrameFolder(tmp_path / "drive")
     for k, token in enumerate(old.tokens):
@@ -140,7 +140,7 @@ def test_depth_from_motion_is_read(source: Path, tmp_path: Path, capsys: pytest.
     assert main(asked) == 0
     retarget = RigRetarget(load_rig("argoverse2"), size=(24, 40), surface="motion", outputs=("confidence",))
     static = RigRetarget(load_rig("argoverse2"), size=(24, 40), surface="street")
-    new, samples = FrameFolder(tmp_path / "new"), WithMotionDepth(old, depths.root)
+    new, samples = FrameFolder(tmp_path / "new"), WithDepth(old, depths.root)
     for k in range(len(old)):
         assert torch.equal(new[k]["images"], retarget(samples[k])["images"])
         assert not torch.equal(new[k]["images"], static(old[k])["images"])
@@ -150,7 +150,7 @@ def test_depth_from_motion_is_read(source: Path, tmp_path: Path, capsys: pytest.
     (tmp_path / "drive" / "motion_depth").rename(tmp_path / "elsewhere")
     moved = command(tmp_path / "drive", tmp_path / "newer", "--surface", "motion")
     assert main([*moved, "--motion-depth", str(tmp_path / "elsewhere")]) == 1
-    assert "expected depth from motion of frame '0002', found none" in capsys.readouterr().err
+    assert "expected depth of frame '0002', found none" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(command(source, tmp_path / "other", "--motion-depth", str(tmp_path / "elsewhere")))
     assert "expected it with --surface motion" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Depth from motion on disk: one file a frame, and a dataset wrapper that adds it to samples."""
+"""Depth from motion and learned depth on disk: one file a frame, and a dataset wrapper that adds it to samples."""
 
 from __future__ import annotations
 
@@ -14,18 +14,23 @@ from arbiview_aug.atomic_io import BROKEN_ARRAY, file_name, inside, whole_file
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.drive import Neighbours
 from arbiview_aug.errors import DataError, SampleError
-from arbiview_aug.sample.inputs import MOTION_KEY
+from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY
 from arbiview_aug.scene.depth_maps import motion_camera
 from arbiview_aug.scene.panorama import Layer
+from arbiview_aug.temporal.learned_depth import LearnedDepth
 from arbiview_aug.temporal.motion_depth import BEST_TRAVEL_M, MotionDepth
 
-FOLDER = "motion_depth"
-"""Default name of the folder in a data set's root."""
+FOLDER, LEARNED_FOLDER = "motion_depth", "learned_depth"
+"""Default names of the folders in a data set's root."""
+
+FOLDERS = {"motion": FOLDER, LEARNED_KEY: LEARNED_FOLDER}
+"""The same, by what a surface needs (``SURFACES``)."""
 
 WANTED = Neighbours(count=2, step_m=BEST_TRAVEL_M / 2)
 """Neighbours to open a data set with: at half the best travel and at all of it."""
 
 _FORMAT = 2
+_KINDS: dict[str, type[MotionDepth]] = {"motion": MotionDepth, "learned": LearnedDepth}
 _SAME_PX, _SAME_POSE = 0.05, 1e-3
 """Tolerances of equal calibrations, wide enough for images decoded at half size."""
 
@@ -38,10 +43,10 @@ class DepthFolder:
 
     def path(self, token: str) -> Path:
         """Path of a frame's file, its token escaped; DataError for a link that leaves the folder."""
-        return inside(self.root, f"{file_name(token)}.npz", f"depth from motion of frame {token!r}")
+        return inside(self.root, f"{file_name(token)}.npz", f"depth of frame {token!r}")
 
-    def write(self, token: str, rig: Rig, depth: MotionDepth, neighbours: Sequence[str] = ()) -> None:
-        """Write a frame's depth atomically, with its rig and the names of the neighbours that it was estimated from.
+    def write(self, token: str, rig: Rig, depth: MotionDepth, origin: Sequence[str] = ()) -> None:
+        """Write a frame's depth atomically, with its rig and what it was estimated from: neighbours, or a model.
 
         Raises:
             OutputError: The file cannot be written.
@@ -51,33 +56,40 @@ class DepthFolder:
             np.savez_compressed(
                 file,
                 format=_FORMAT,
+                kind=np.array("learned" if isinstance(depth, LearnedDepth) else "motion"),
                 words=np.array(depth.words),
-                neighbours=np.array(list(neighbours), dtype=np.str_),
+                neighbours=np.array(list(origin), dtype=np.str_),
                 **_calibration(rig),
                 **maps,  # type: ignore[arg-type]
             )
 
     def read(self, token: str, rig: Rig) -> MotionDepth:
-        """Read a frame's depth.
+        """Read a frame's depth, of either kind.
 
         Raises:
             DataError: The file is missing, broken, or of another calibration than ``rig``.
         """
         return self._read(token, rig)[0]
 
-    def find(self, token: str, rig: Rig, neighbours: Sequence[str]) -> MotionDepth | None:
-        """Read a frame's depth if it exists, fits the rig, and was estimated from these neighbours."""
+    def find(self, token: str, rig: Rig, origin: Sequence[str], kind: str = "motion") -> MotionDepth | None:
+        """Read a frame's depth if it exists, fits the rig, and has this origin; None otherwise.
+
+        Raises:
+            DataError: The folder holds depth of the other kind.
+        """
         try:
-            depth, names = self._read(token, rig)
+            depth, found = self._read(token, rig)
         except DataError:
             return None
-        return depth if names == list(neighbours) else None
+        if type(depth) is not _KINDS[kind]:
+            raise DataError(f"{self.path(token)}: expected {kind} depth, got another kind; name another --output")
+        return depth if found == list(origin) else None
 
     def _read(self, token: str, rig: Rig) -> tuple[MotionDepth, list[str]]:
         path = self.path(token)
         if not path.is_file():
             raise DataError(
-                f"{path}: expected depth from motion of frame {token!r}, found none; make it with "
+                f"{path}: expected depth of frame {token!r}, found none; make it with "
                 "python -m arbiview_aug depth --data FOLDER"
             )
         try:
@@ -85,24 +97,26 @@ class DepthFolder:
                 arrays: dict[str, Any] = {name: file[name] for name in file.files}
             depth = tuple(arrays[f"depth_{k:02}"].astype(np.float32) for k in range(len(arrays["K"])))
             words, fits = str(arrays["words"]), int(arrays["format"]) == _FORMAT and _fits(arrays, rig, depth)
-            neighbours = arrays["neighbours"].tolist() if fits else []
+            kind, origin = _KINDS[str(arrays.get("kind", "motion"))], arrays["neighbours"].tolist() if fits else []
         except (*BROKEN_ARRAY, KeyError, TypeError) as error:
-            raise DataError(f"{path}: expected depth from motion, got {type(error).__name__}; delete it") from None
+            raise DataError(f"{path}: expected depth of a frame, got {type(error).__name__}; delete it") from None
         if not fits:
             raise DataError(
                 f"{path}: expected depth of this calibration, got another's; delete it and run the depth command again"
             )
-        return MotionDepth(depth, words), neighbours
+        return kind(depth, words), origin
 
 
-class WithMotionDepth(Dataset[dict[str, Any]]):
-    """A map-style dataset that adds the ``depth`` command's results as ``motion_depth_m``.
+class WithDepth(Dataset[dict[str, Any]]):
+    """A map-style dataset that adds the ``depth`` command's results to its samples.
 
-    For ``RigRetarget(surface="motion")``; samples need a ``token`` and a ``rig`` (or ``source_rig``).
+    Depth from motion becomes ``motion_depth_m``, for ``RigRetarget(surface="motion")``; learned depth becomes
+    ``learned_depth_m``, for ``surface="learned"``. Samples need a ``token`` and a ``rig`` (or ``source_rig``).
 
     Args:
         dataset: Map-style dataset of samples.
-        folder: Output folder of the command, by default ``motion_depth`` below the data set's root.
+        folder: An output folder of the command, or the data set's root with ``motion_depth``, ``learned_depth`` or both
+            in it.
         source_rig: Rig of samples without one.
 
     Raises:
@@ -111,7 +125,9 @@ class WithMotionDepth(Dataset[dict[str, Any]]):
     """
 
     def __init__(self, dataset: Any, folder: str | Path, *, source_rig: Rig | None = None) -> None:
-        self.dataset, self.depths, self.source_rig = dataset, DepthFolder(folder), source_rig
+        self.dataset, self.source_rig = dataset, source_rig
+        below = [inside(Path(folder), name, "depth") for name in FOLDERS.values()]
+        self.folders = [DepthFolder(one) for one in below if one.is_dir()] or [DepthFolder(folder)]
 
     def __len__(self) -> int:
         return len(self.dataset)
@@ -120,10 +136,20 @@ class WithMotionDepth(Dataset[dict[str, Any]]):
         sample: Mapping[str, Any] = self.dataset[index]
         rig, token = sample.get("rig", self.source_rig), sample.get("token")
         if rig is None or token is None:
-            raise SampleError("sample: expected 'rig' and 'token', to find depth from motion by; pass source_rig=")
-        maps = [torch.from_numpy(one) for one in self.depths.read(str(token), rig).depth_m]
-        same = len({one.shape for one in maps}) == 1
-        return {**sample, MOTION_KEY: torch.stack(maps) if same else maps}
+            raise SampleError("sample: expected 'rig' and 'token', to find its depth by; pass source_rig=")
+        found = dict(sample)
+        for folder in self.folders:
+            depth = folder.read(str(token), rig)
+            maps = [torch.from_numpy(one) for one in depth.depth_m]
+            same = len({one.shape for one in maps}) == 1
+            is_learned = isinstance(depth, LearnedDepth)
+            found[LEARNED_KEY if is_learned else MOTION_KEY] = torch.stack(maps) if same else maps
+            if is_learned:
+                found[LEARNED_WORDS_KEY] = str(depth)
+        return found
+
+
+WithMotionDepth = WithDepth  # deprecated: the former name
 
 
 def _calibration(rig: Rig) -> dict[str, Any]:

@@ -1,0 +1,355 @@
+"""Depth of a network, brought to metres by what is known of the frame.
+
+A network knows depth up to a scale and a shift, or assumes a focal length. Both are fitted for each camera, robustly
+and in inverse depth, to LiDAR points, else to depth from motion, else to the road below the camera. A camera whose fit
+fails stays without learned depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, Protocol, get_args
+
+import cv2
+import numpy as np
+import torch
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.scene.boxes import draw_boxes
+from arbiview_aug.scene.depth_maps import motion_camera
+from arbiview_aug.scene.panorama import Layer
+from arbiview_aug.temporal.motion_depth import FARTHEST_M, MotionDepth
+
+Reference = Literal["LiDAR", "motion", "road"]
+"""What predictions are fitted to, the best first."""
+
+LEAST_POINTS = 50
+"""Least number of pixels to fit a camera to."""
+
+MAX_RESIDUAL = 0.15
+"""Largest median error of a fit, relative to inverse depth."""
+
+MAX_OF_CONSTANT = 0.5
+"""Largest residual as a share of that of one depth for all pixels: beyond it, the network tells nothing."""
+
+_ROAD_M = 15.0  # the road is fitted up to this distance: farther on, slopes and traffic hide the plane
+_RELATIVE_M = 50.0  # errors are relative to inverse depth, but not to less than that of this depth
+_NEAREST_M = 0.5
+_CELL_PX = 4  # of several LiDAR points in a cell, the nearest counts: the camera may not see those behind it
+_OUTLIER, _HUBER = 0.2, 0.02  # relative errors: beyond the first a point has no weight, below the second all of it
+_PAIRS, _MOST_POINTS = 256, 4000
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedDepth(MotionDepth):
+    """Depth maps of a network, at the size of ``motion_camera``; ``words`` name the model and each camera's fit."""
+
+    def __str__(self) -> str:
+        return f"learned depth: {self.density:.0%} of the pixels, {self.words}"
+
+
+class Prediction(NamedTuple):
+    """A network's output for one image.
+
+    Attributes:
+        values: (h, w) over the whole image, of any size; not finite where unknown.
+        output: ``depth``, ``inverse`` depth, or None if only the fit tells which.
+        scale_px: Focal length of the image that the network saw, in its pixels. Networks that learned metres from one
+            focal length see things twice as near at twice the focal length. None for relative depth.
+    """
+
+    values: Layer
+    output: Literal["depth", "inverse"] | None
+    scale_px: float | None = None
+
+
+class DepthModel(Protocol):
+    """A depth network."""
+
+    name: str
+    revision: str
+    licence: str
+    takes_prompt: bool  # whether it predicts better from a depth map (h, w) of sparse measurements
+
+    def predict(
+        self, images: Sequence[torch.Tensor], focal_px: Sequence[float], prompts: Sequence[Layer] | None
+    ) -> list[Prediction]:
+        """Predict the depth of images (3, h, w) uint8 of one size, in one batch."""
+        ...
+
+
+class DepthInputs(NamedTuple):
+    """A frame, and what is known of its depth: (P, 3) LiDAR points, depth from motion, (B, 7) labelled objects."""
+
+    rig: Rig
+    images: Sequence[torch.Tensor]
+    points: FloatArray | None = None
+    motion: MotionDepth | None = None
+    boxes: FloatArray | None = None
+
+
+class CameraFit(NamedTuple):
+    """How a camera's prediction became metres, or why it was declined."""
+
+    camera: str
+    reference: Reference | None = None
+    points: int = 0
+    residual: float | None = None  # median error, relative to inverse depth
+    declined: str = ""
+
+    def __str__(self) -> str:
+        if self.declined:
+            by = (
+                ""
+                if self.residual is None
+                else f" (residual {self.residual:.1%}, {self.points} points of {self.reference})"
+            )
+            return f"{self.camera}: declined, {self.declined}{by}"
+        if self.residual is None:
+            return f"{self.camera}: scale of the other cameras, at its own focal length"
+        return f"{self.camera}: fitted to {self.points} points of {self.reference}, residual {self.residual:.1%}"
+
+
+def learned_depth(
+    model: DepthModel, frames: Sequence[DepthInputs], batch: int, wanted: Sequence[Reference] = get_args(Reference)
+) -> Iterator[tuple[LearnedDepth, list[CameraFit]]]:
+    """Predict the depth of frames, ``batch`` images at a time, and fit it to their geometry.
+
+    Args:
+        model: The network.
+        frames: Frames with what is known of them.
+        batch: Images predicted at once.
+        wanted: What to fit to, the first that a camera has enough points of.
+    """
+    views = {
+        (n, k): _View.of(frame, k, model.takes_prompt) for n, frame in enumerate(frames) for k in range(len(frame.rig))
+    }
+    alike: dict[Any, list[tuple[int, int]]] = {}
+    for key, view in views.items():
+        alike.setdefault((view.image.shape, view.prompt is None), []).append(key)
+    predictions: dict[tuple[int, int], Prediction] = {}
+    for keys in alike.values():
+        for part in (keys[start : start + batch] for start in range(0, len(keys), batch)):
+            prompts = [prompt for key in part if (prompt := views[key].prompt) is not None]
+            focal_px = [float(views[key].pinhole.K[0, 0]) for key in part]
+            found = model.predict([views[key].image for key in part], focal_px, prompts or None)
+            predictions |= zip(part, found, strict=True)
+    for n, frame in enumerate(frames):
+        of_frame = [(views[n, k], predictions[n, k]) for k in range(len(frame.rig))]
+        depth_m, fits = _fitted(frame, of_frame, wanted)
+        words = [f"{model.name}, revision {model.revision}, licence {model.licence}", *map(str, fits)]
+        yield LearnedDepth(tuple(depth_m), "\n  ".join(words)), fits
+
+
+# --- images that networks know ----------------------------------------------------------------------------------------
+class _View(NamedTuple):
+    """A camera's image as a pinhole camera would have taken it."""
+
+    camera: Camera  # at the size of its depth map
+    pinhole: Camera
+    image: torch.Tensor
+    prompt: Layer | None
+
+    @staticmethod
+    def of(frame: DepthInputs, k: int, takes_prompt: bool) -> _View:
+        camera, image = frame.rig[k], frame.images[k]
+        if image.dtype != torch.uint8:
+            image = (image * 255).round().to(torch.uint8)
+        pinhole = camera.undistorted()
+        if not camera.is_rectilinear:
+            uv = camera.project_cam(pinhole.unproject_cam(pinhole.pixel_grid()).directions).uv.astype(np.float32)
+            pixels: Any = cv2.remap(image.permute(1, 2, 0).numpy(), uv, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
+            image = torch.from_numpy(pixels).permute(2, 0, 1)
+        small = motion_camera(camera)
+        prompt = None
+        if takes_prompt and frame.points is not None:
+            prompt = _dense(motion_camera(pinhole), frame.points)
+        return _View(small, pinhole, image, prompt)
+
+    def sampled(self, values: Layer) -> tuple[Layer, BoolArray]:
+        """A prediction over the pinhole image at the pixels of the depth map, and where it has any."""
+        rays, valid = self.camera.unproject_cam(self.camera.pixel_grid())
+        uv, z, _ = self.pinhole.project_cam(np.where(valid[..., None], rays, [0.0, 0.0, 1.0]))
+        seen = valid & (z > 0) & self.pinhole.contains(uv, 0.5)
+        if self.camera.mask is not None:
+            seen &= self.camera.mask
+        scale = np.array(values.shape[::-1]) / self.pinhole.size[::-1]
+        at = ((uv + 0.5) * scale - 0.5).astype(np.float32)
+        layer: Any = cv2.remap(values, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+        return layer, seen & np.isfinite(layer)
+
+
+def _measured(camera: Camera, points: FloatArray) -> tuple[Any, FloatArray]:
+    """Pixels (rows, columns) of LiDAR points that a camera sees, and their z-depths."""
+    uv, z, valid = camera.project(points[:, :3])
+    seen = np.flatnonzero(valid & (z > _NEAREST_M) & (z < FARTHEST_M) & camera.contains(uv))
+    column, row = np.round(uv[seen]).astype(int).T
+    order = np.argsort(z[seen], kind="stable")
+    cell = (row // _CELL_PX * camera.width_px + column // _CELL_PX)[order]
+    nearest = order[np.unique(cell, return_index=True)[1]]
+    return (row[nearest], column[nearest]), z[seen][nearest]
+
+
+def _dense(camera: Camera, points: FloatArray) -> Layer | None:
+    """A depth map (h, w) with the depth of the nearest measured pixel everywhere; None if there are too few."""
+    pixels, depth_m = _measured(camera, points)
+    if len(depth_m) < LEAST_POINTS:
+        return None
+    unknown, known = np.ones(camera.size, np.uint8), np.zeros(camera.size, np.float32)
+    unknown[pixels], known[pixels] = 0, depth_m
+    _, label = cv2.distanceTransformWithLabels(unknown, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    by_label = np.zeros(int(label.max()) + 1, np.float32)
+    by_label[label[pixels]] = depth_m
+    return by_label[label]
+
+
+# --- what is known of the depth ---------------------------------------------------------------------------------------
+def _references(
+    frame: DepthInputs, k: int, view: _View, seen: BoolArray
+) -> Iterator[tuple[Reference, Any, FloatArray]]:
+    """What a camera may be fitted to: its name, pixels (rows, columns) and z-depths."""
+    camera = view.camera
+    if frame.points is not None:
+        pixels, depth_m = _measured(camera, frame.points)
+        ask = seen[pixels]
+        yield "LiDAR", tuple(index[ask] for index in pixels), depth_m[ask]
+    if frame.motion is not None:
+        pixels = np.nonzero(seen & (frame.motion.depth_m[k] > 0))
+        yield "motion", pixels, frame.motion.depth_m[k][pixels].astype(float)
+    pixels = np.nonzero(seen & _on_road(camera, frame.rig.ground_z_m, frame.boxes))
+    yield "road", pixels, _road_depth(camera, frame.rig.ground_z_m)[pixels]
+
+
+def _road_depth(camera: Camera, ground_z_m: float) -> FloatArray:
+    """z-depth (h, w) of the road's plane, inf above the horizon."""
+    rays, _ = camera.unproject(camera.pixel_grid())
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = (ground_z_m - camera.center_m[2]) / rays[..., 2]
+        return np.where(along > 0, along * (rays @ camera.cam2ego[:3, 2]), np.inf)
+
+
+def _on_road(camera: Camera, ground_z_m: float, boxes: FloatArray | None) -> BoolArray:
+    depth_m = _road_depth(camera, ground_z_m)
+    near = (depth_m > _NEAREST_M) & (depth_m < _ROAD_M)
+    if boxes is not None and len(boxes):
+        near &= draw_boxes(camera, boxes[:, :7])[1] < 0
+    return near
+
+
+# --- fits -------------------------------------------------------------------------------------------------------------
+_Form = Literal["inverse", "depth", "affine depth"]
+"""Inverse depth is affine in the output, or in its inverse; or depth is affine in the output."""
+
+_FORMS: Mapping[str | None, tuple[_Form, ...]] = {
+    "inverse": ("inverse",),
+    "depth": ("depth", "affine depth"),
+    None: ("inverse", "depth", "affine depth"),
+}
+
+
+class _Line(NamedTuple):
+    """A fit ``scale * x + shift`` of inverse depth, or for ``affine depth`` of depth."""
+
+    form: _Form
+    scale: float
+    shift: float
+
+    def depth(self, values: FloatArray) -> FloatArray:
+        """Metres of a network's output; inf where it is behind infinity, 0 where it is behind the camera."""
+        found = self.scale * _feature(self.form, values) + self.shift
+        with np.errstate(divide="ignore"):
+            return np.maximum(found, 0) if self.form == "affine depth" else np.where(found > 0, 1 / found, np.inf)
+
+
+def _feature(form: _Form, values: FloatArray) -> FloatArray:
+    return 1 / np.maximum(values, 1e-6) if form == "depth" else values
+
+
+def _fitted(
+    frame: DepthInputs, predicted: Sequence[tuple[_View, Prediction]], wanted: Sequence[Reference]
+) -> tuple[list[Layer], list[CameraFit]]:
+    """The depth map and the fit of each camera."""
+    fits: list[CameraFit] = []
+    lines: list[_Line | None] = []
+    samples = [_at_one_focal_length(view, one) for view, one in predicted]
+    ratios: list[float] = []  # true over predicted inverse depth
+    for k, ((view, one), (values, seen)) in enumerate(zip(predicted, samples, strict=True)):
+        fit, line, ratio = CameraFit(view.camera.name), None, []
+        for reference, pixels, depth_m in _references(frame, k, view, seen):
+            if reference in wanted and len(depth_m) >= LEAST_POINTS:
+                step = -(-len(depth_m) // _MOST_POINTS)
+                x, depth_m = values[pixels][::step].astype(float), depth_m[::step]
+                line, residual, declined = fit_depth(x, depth_m, one.output)
+                fit = CameraFit(view.camera.name, reference, len(depth_m), residual, declined)
+                ratio = [] if declined else [float(np.median(1 / depth_m / _feature(one.output or "inverse", x)))]
+                break
+        else:
+            words = f"fewer than {LEAST_POINTS} points of {', '.join(wanted)}"
+            fit = CameraFit(view.camera.name, declined=words)
+        fits.append(fit)
+        lines.append(None if fit.declined else line)
+        ratios += ratio if one.scale_px is not None else []
+    depth = []
+    for k, ((_, one), (values, seen)) in enumerate(zip(predicted, samples, strict=True)):
+        line = lines[k]
+        if fits[k].reference is None and one.scale_px is not None and one.output is not None and ratios:
+            line, fits[k] = _Line(one.output, float(np.median(ratios)), 0.0), CameraFit(fits[k].camera)
+        metres = np.zeros(values.shape) if line is None else line.depth(np.where(seen, values, 1.0).astype(float))
+        depth.append(np.where(seen & (metres > _NEAREST_M) & (metres < FARTHEST_M), metres, 0).astype(np.float32))
+    return depth, fits
+
+
+def _at_one_focal_length(view: _View, one: Prediction) -> tuple[Layer, BoolArray]:
+    """A prediction at the pixels of the depth map as if all cameras had one focal length, and where it is known."""
+    values, seen = view.sampled(one.values)
+    if one.scale_px is None:
+        return values, seen
+    focal = np.float32(one.scale_px / 1000)  # any common one: the fit finds the network's
+    return (values * focal if one.output == "depth" else values / focal), seen
+
+
+def fit_depth(
+    values: FloatArray, depth_m: FloatArray, output: Literal["depth", "inverse"] | None
+) -> tuple[_Line | None, float | None, str]:
+    """Fit a network's output (P,) to depths (P,): the fit, its residual, and why it is declined, or nothing."""
+    found: list[tuple[float, float, _Line]] = []
+    for form in _FORMS[output]:
+        x, y = _feature(form, values), depth_m if form == "affine depth" else 1 / depth_m
+        limit = np.minimum(y, _RELATIVE_M) if form == "affine depth" else np.maximum(y, 1 / _RELATIVE_M)
+        scale, shift = _robust_line(x, y, 1 / limit)
+        if scale > 0:
+            residual = float(np.median(np.abs(scale * x + shift - y) / limit))
+            found.append((residual, float(np.median(np.abs(np.median(y) - y) / limit)), _Line(form, scale, shift)))
+    if not found:
+        return None, None, "near and far are swapped: the scale is negative"
+    residual, constant, line = min(found)
+    if residual > MAX_RESIDUAL:
+        return line, residual, f"it errs by more than {MAX_RESIDUAL:.0%}"
+    if residual > MAX_OF_CONSTANT * constant:
+        return line, residual, "it is hardly better than one depth for all pixels"
+    return line, residual, ""
+
+
+def _robust_line(x: FloatArray, y: FloatArray, weight: FloatArray) -> tuple[float, float]:
+    """Scale and shift by RANSAC with a truncated cost, refined by Huber weights on what is no outlier."""
+    one, two = np.random.default_rng(0).integers(len(x), size=(2, _PAIRS))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = (y[two] - y[one]) / (x[two] - x[one])
+        shift = y[one] - scale * x[one]
+        cost = np.minimum(np.abs(scale[:, None] * x + shift[:, None] - y) * weight, _OUTLIER).mean(1)
+    if not np.isfinite(cost).any():  # the output is constant
+        return 0.0, float(np.median(y))
+    best = int(np.nanargmin(cost))
+    line = np.array([scale[best], shift[best]])
+    columns = np.stack([x, np.ones_like(x)], 1)
+    for _ in range(10):
+        error = np.abs(columns @ line - y) * weight
+        spread = float(np.median(error[error < _OUTLIER]))
+        # A sidewalk is a plane too, a tenth nearer than the road: exact predictions must not be drawn to it.
+        trusted = error < np.clip(4 * spread, _HUBER, _OUTLIER)
+        trust = weight * np.sqrt(np.where(trusted, np.minimum(1, _HUBER / np.maximum(error, 1e-9)), 0))
+        line = np.linalg.lstsq(columns * trust[:, None], y * trust, rcond=None)[0]
+    return float(line[0]), float(line[1])

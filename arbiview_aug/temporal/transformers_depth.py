@@ -1,0 +1,116 @@
+"""Depth networks of transformers: Depth Anything, Depth Pro, ZoeDepth, DPT, and Prompt Depth Anything with LiDAR."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from arbiview_aug.atomic_io import checksum
+from arbiview_aug.environment import optional_package
+from arbiview_aug.errors import DataError
+from arbiview_aug.scene.panorama import Layer
+from arbiview_aug.temporal.learned_depth import Prediction
+
+_OUTPUTS: dict[str, Literal["depth", "inverse"]] = {
+    "depth_pro": "inverse",
+    "glpn": "depth",
+    "prompt_depth_anything": "depth",
+    "zoedepth": "depth",
+}
+"""What networks put out, by ``model_type``; the configuration of others says it, or the fit tells."""
+
+_WEIGHTS = ("*.safetensors", "*.bin")
+
+
+class TransformersDepth:
+    """A model of ``AutoModelForDepthEstimation``, with its image processor.
+
+    Args:
+        name: A folder, or a name on the Hugging Face Hub.
+        device: Where it runs.
+
+    Raises:
+        DataError: transformers is not installed, there is no such model, or it does not estimate depth.
+    """
+
+    def __init__(self, name: str, device: torch.device | str = "cpu") -> None:
+        try:
+            transformers = optional_package("transformers", "depth")
+        except ImportError as error:
+            raise DataError(f"--model: {error}") from None
+        folder = Path(name)
+        config = _loaded(transformers.AutoConfig, name, "a folder with config.json, or a model of the Hugging Face Hub")
+        if type(config) not in transformers.MODEL_FOR_DEPTH_ESTIMATION_MAPPING:
+            raise DataError(
+                f"--model {name}: expected a model that estimates depth, such as "
+                f"depth-anything/Depth-Anything-V2-Metric-Outdoor-Small-hf, got {type(config).__name__}"
+            )
+        self._processor = _loaded(transformers.AutoImageProcessor, name, "preprocessor_config.json beside the model")
+        model = _loaded(transformers.AutoModelForDepthEstimation, name, "weights of the model")
+        self.model, self.device = model.float().eval().to(device), device
+        self.name = folder.resolve().name if folder.is_dir() else name
+        self.revision = _weights_of(folder) if folder.is_dir() else str(getattr(config, "_commit_hash", None))[:12]
+        self.licence = _licence(folder / "README.md" if folder.is_dir() else name)
+        self.kind = str(config.model_type)
+        self.takes_prompt = self.kind == "prompt_depth_anything"
+        stated = {"metric": "depth", "relative": "inverse"}.get(getattr(config, "depth_estimation_type", ""))
+        self._output: Any = _OUTPUTS.get(self.kind, stated)
+        self._is_metric = self.kind in _OUTPUTS or stated == "depth"
+
+    @torch.inference_mode()
+    def predict(
+        self, images: Sequence[torch.Tensor], focal_px: Sequence[float], prompts: Sequence[Layer] | None
+    ) -> list[Prediction]:
+        """Predict the depth of images (3, h, w) uint8 of one size, in one batch.
+
+        Raises:
+            DataError: The batch does not fit on the device.
+        """
+        prompted = {} if prompts is None else {"prompt_depth": list(prompts), "prompt_scale_to_meter": 1.0}
+        inputs = self._processor(images=list(images), return_tensors="pt", **prompted).to(self.device)
+        try:
+            out = self.model(**inputs)
+        except torch.OutOfMemoryError:
+            raise DataError(f"--batch: {len(images)} images do not fit on {self.device}; halve it") from None
+        size = tuple(images[0].shape[-2:])
+        predicted = out.predicted_depth
+        if self.kind == "zoedepth":  # it pads its images
+            done = self._processor.post_process_depth_estimation(out, source_sizes=[size] * len(images))
+            predicted = torch.stack([one["predicted_depth"] for one in done])
+        output, is_metric = self._output, self._is_metric
+        if self.takes_prompt and prompts is None:  # then it puts out something relative
+            output, is_metric = None, False
+        seen = inputs["pixel_values"].shape[-1] / size[1]  # pixels of the network's for one of the image's
+        return [
+            Prediction(values, output, focal * seen if is_metric else None)
+            for values, focal in zip(predicted.float().cpu().numpy(), focal_px, strict=True)
+        ]
+
+
+def _loaded(kind: Any, name: str, expected: str) -> Any:
+    """Load a part of a model; transformers raises errors of many types, some of many lines."""
+    try:
+        return kind.from_pretrained(name)
+    except Exception as error:
+        why = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+        raise DataError(f"--model {name}: expected {expected}: {why.strip()[:300]}") from None
+
+
+def _weights_of(folder: Path) -> str:
+    """The revision of a folder: a checksum of its weights."""
+    files = sorted(path for pattern in _WEIGHTS for path in folder.glob(pattern))
+    return hashlib.sha256("".join(map(checksum, files)).encode()).hexdigest()[:12]
+
+
+def _licence(card: str | Path) -> str:
+    """The licence that a model's card names."""
+    try:
+        logging.getLogger("huggingface_hub").setLevel(logging.ERROR)
+        return str(optional_package("huggingface_hub").ModelCard.load(card).data.license or "unknown")
+    except Exception:  # no card, no network, a card that cannot be read
+        return "unknown"
