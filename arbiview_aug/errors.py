@@ -1,11 +1,25 @@
 """Errors that this package raises on bad input, their base class, and warnings."""
 
+import reprlib
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 INTERRUPTED = 130
 """Exit status of a process that Ctrl-C ended: 128 + SIGINT, as shells report it."""
+
+
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 4, 100, 100, 100
+_SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = 12
+
+
+def shown(value: object) -> str:
+    """A value for a message: its repr, cut where it is long or nested."""
+    return _SHORT.repr(value)
 
 
 class ArbiviewError(Exception):
@@ -24,7 +38,7 @@ def exit_status(
     *,
     resumable: bool = False,
 ) -> int:
-    """Run a command; an error or Ctrl-C becomes one line on stderr.
+    """Run a command; an error, Ctrl-C, SIGTERM or SIGHUP becomes one line on stderr.
 
     Args:
         program: Starts that line.
@@ -33,10 +47,11 @@ def exit_status(
         resumable: Whether the command continues an interrupted run.
 
     Returns:
-        The command's exit status, 2 after an error, 130 after Ctrl-C.
+        The command's exit status, 2 after an error, 130 after Ctrl-C and the other signals.
     """
     try:
-        return int(command() or 0)
+        with _signals_as_interrupts():
+            return int(command() or 0)
     except KeyboardInterrupt:
         fix = "; run it again to go on" if resumable else ""
         print(f"{program}: interrupted{fix}", file=sys.stderr)
@@ -44,6 +59,25 @@ def exit_status(
     except errors as error:
         print(f"{program}: {error}", file=sys.stderr)
         return 2
+
+
+@contextmanager
+def _signals_as_interrupts() -> Iterator[None]:
+    """SIGTERM and SIGHUP raise KeyboardInterrupt, unless someone handles or ignores them (nohup)."""
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    in_main = threading.current_thread() is threading.main_thread()
+    taken = [number for number in numbers if in_main and signal.getsignal(number) == signal.SIG_DFL]
+    for number in taken:
+        signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
 
 
 class CalibrationError(ArbiviewError, ValueError):

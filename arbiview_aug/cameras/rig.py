@@ -13,6 +13,7 @@ import json
 import math
 import os
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -28,7 +29,11 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.key_names import hint, misnamed
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.errors import CalibrationError
+from arbiview_aug.cameras.plain_yaml import parse_yaml
+from arbiview_aug.errors import CalibrationError, shown
+
+MOST_CAMERAS = 128
+"""Of a rig file."""
 
 _CAMERA_KEYS = {"name", "width", "height", "K", "cam2ego", "distortion", "mask"}
 
@@ -58,16 +63,18 @@ class Rig:
         for camera in cameras:
             if not isinstance(camera, Camera):
                 raise CalibrationError(f"{where}: expected Camera objects, got {type(camera).__name__}")
-        names = [camera.name for camera in cameras]
-        twice = sorted({n for n in names if names.count(n) > 1})
+        twice = sorted(name for name, count in Counter(camera.name for camera in cameras).items() if count > 1)
         if twice:
-            raise CalibrationError(f"{where}: expected different camera names, got {', '.join(twice)} more than once")
+            got = ", ".join(name[:100] for name in twice[:5])
+            raise CalibrationError(f"{where}: expected different camera names, got {got} more than once")
         try:
-            ground = float(self.ground_z_m)
+            ground = math.nan if isinstance(self.ground_z_m, bool) else float(self.ground_z_m)
         except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: tensors of several heights
             ground = math.nan
         if not math.isfinite(ground):
-            raise CalibrationError(f"{where}: ground_z_m: expected a finite height in metres, got {self.ground_z_m!r}")
+            raise CalibrationError(
+                f"{where}: ground_z_m: expected a finite height in metres, got {shown(self.ground_z_m)}"
+            )
         object.__setattr__(self, "cameras", cameras)
         object.__setattr__(self, "ground_z_m", ground)
 
@@ -207,6 +214,8 @@ class Rig:
         """
         if not isinstance(data, Mapping) or not isinstance(data.get("cameras"), list):
             raise CalibrationError(f"{where}: expected a mapping with a list 'cameras', got {type(data).__name__}")
+        if len(data["cameras"]) > MOST_CAMERAS:
+            raise CalibrationError(f"{where}: expected at most {MOST_CAMERAS} cameras, got {len(data['cameras'])}")
         _refuse_misnamed(data, "ground_z_m", where)
         cameras = [_camera_from_dict(entry, k, folder, where) for k, entry in enumerate(data["cameras"])]
         name = data.get("name", data.get("dataset", ""))
@@ -253,7 +262,7 @@ def load_rig(name_or_path: str | Path) -> Rig:
         raise CalibrationError(f"rig: expected a shipped rig's name or the path of a rig file, got {got}")
     if isinstance(name_or_path, str) and name_or_path in shipped_rigs():
         text = (resources.files("arbiview_aug.cameras") / "rigs" / f"{name_or_path}.yaml").read_text()
-        return Rig.from_dict(yaml.safe_load(text), where=f"rig {name_or_path}")
+        return Rig.from_dict(parse_yaml(text), where=f"rig {name_or_path}")
     path = Path(name_or_path)
     where = f"rig file {path}"
     if not os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
@@ -262,8 +271,8 @@ def load_rig(name_or_path: str | Path) -> Rig:
         )
     try:
         text = path.read_text()
-        data = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
-    except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:  # ValueError: YAML's impossible dates too
+        data = json.loads(text) if path.suffix == ".json" else parse_yaml(text)
+    except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
         raise CalibrationError(f"{where}: expected plain YAML or JSON, got {' '.join(str(error).split())}") from None
     return Rig.from_dict(data, folder=path.parent, where=where)
 
@@ -271,7 +280,7 @@ def load_rig(name_or_path: str | Path) -> Rig:
 def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -> Camera:
     if not isinstance(entry, Mapping):
         raise CalibrationError(f"{where}: camera {index}: expected a mapping, got {type(entry).__name__}")
-    label = f"{where}: camera {entry.get('name', index)!r}"
+    label = f"{where}: camera {shown(entry.get('name', index))}"
     missing = [key for key in ("name", "width", "height", "K", "cam2ego") if entry.get(key) is None]
     if missing:
         expected = ", ".join(sorted(_CAMERA_KEYS))
@@ -281,7 +290,7 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
     distortion = entry.get("distortion")
     if distortion is not None:
         if not isinstance(distortion, Mapping) or not {"model", "coeffs"} <= distortion.keys():
-            raise CalibrationError(f"{label}: distortion: expected null or {{model, coeffs}}, got {distortion!r}")
+            raise CalibrationError(f"{label}: distortion: expected null or {{model, coeffs}}, got {shown(distortion)}")
         calibration |= {"lens": distortion["model"], "distortion": distortion["coeffs"]}
     mask = None if entry.get("mask") is None else read_mask(entry["mask"], folder, label)
     try:
@@ -305,7 +314,7 @@ def _refuse_misnamed(entries: Mapping[str, Any], key: str, label: str) -> None:
 def read_mask(file: Any, folder: Path | None, label: str) -> np.ndarray:
     """Read an (H, W) bool car-body mask from an image file: bright = scene."""
     if not isinstance(file, str) or folder is None:
-        raise CalibrationError(f"{label}: mask: expected a file name beside the rig file, got {file!r}")
+        raise CalibrationError(f"{label}: mask: expected a file name beside the rig file, got {shown(file)}")
     path = folder / file
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if os.path.isfile(path) else None
     if image is None:

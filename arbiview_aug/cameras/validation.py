@@ -6,13 +6,14 @@ All functions take the camera's name first, return read-only values and raise ``
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
 
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, LensName, canonical_name
 from arbiview_aug.cameras.rotations import CAMERA_AXES_IN_EGO, nearest_rotation
-from arbiview_aug.errors import CalibrationError
+from arbiview_aug.errors import CalibrationError, shown
 
 ROTATION_TOLERANCE = 1e-4
 """Largest entry of |R Rᵀ - I| accepted as a rotation: published calibrations carry 5 to 7 digits."""
@@ -27,7 +28,7 @@ MAX_SIZE_PX = 32766
 
 def checked_name(name: Any) -> str:
     if not isinstance(name, str) or not name:
-        raise CalibrationError(f"camera name: expected a non-empty string, got {name!r}")
+        raise CalibrationError(f"camera name: expected a non-empty string, got {shown(name)}")
     return name
 
 
@@ -35,11 +36,11 @@ def checked_pixels(name: str, field: str, value: Any, least: int = 1) -> int:
     """An integer number of pixels from ``least`` to ``MAX_SIZE_PX``."""
     try:
         pixels = int(value)
-        valid = pixels == value and least <= pixels <= MAX_SIZE_PX
+        valid = not isinstance(value, bool) and pixels == value and least <= pixels <= MAX_SIZE_PX
     except (TypeError, ValueError, OverflowError):
         valid = False
     if not valid:
-        raise _error(name, field, f"a whole number of pixels from {least} to {MAX_SIZE_PX}", repr(value))
+        raise _error(name, field, f"a whole number of pixels from {least} to {MAX_SIZE_PX}", shown(value))
     return pixels
 
 
@@ -47,7 +48,7 @@ def checked_size(name: str, value: Any) -> tuple[int, int]:
     try:
         h, w = value
     except (TypeError, ValueError):
-        raise _error(name, "size", "(h, w) in pixels", repr(value)) from None
+        raise _error(name, "size", "(h, w) in pixels", shown(value)) from None
     return checked_pixels(name, "height_px", h), checked_pixels(name, "width_px", w)
 
 
@@ -56,11 +57,11 @@ def checked_numbers(name: str, field: str, values: Any, count: int, expected: st
     try:
         numbers = tuple(float(v) for v in values)
         valid = len(numbers) == count and all(map(math.isfinite, numbers))
-        valid = valid and not any(isinstance(v, str | bytes) for v in values)  # float() parses strings
+        valid = valid and not any(isinstance(v, str | bytes | bool) for v in values)  # float() takes these
     except (TypeError, ValueError, OverflowError):
         valid = False
     if not valid:
-        raise _error(name, field, expected, repr(values))
+        raise _error(name, field, expected, shown(values))
     return numbers
 
 
@@ -69,9 +70,11 @@ def checked_array(name: str, field: str, value: Any, shape: tuple[int, ...]) -> 
     try:
         if np.iscomplexobj(value):
             raise TypeError("complex numbers")
+        if isinstance(value, list | tuple) and _holds_booleans(value):
+            raise TypeError("true or false")
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise _error(name, field, f"numbers of shape {shape}", f"{type(value).__name__} ({error})") from None
+        raise _error(name, field, f"numbers of shape {shape}", f"{type(value).__name__} ({str(error)[:200]})") from None
     if array.shape != shape:
         raise _error(name, field, f"shape {shape}", f"shape {array.shape}")
     if not np.isfinite(array).all():
@@ -79,6 +82,12 @@ def checked_array(name: str, field: str, value: Any, shape: tuple[int, ...]) -> 
     array += 0.0  # -0.0 becomes 0.0: equal calibrations have equal bytes (content_key)
     array.setflags(write=False)
     return array
+
+
+def _holds_booleans(value: Sequence[Any]) -> bool:
+    """Whether a list or one of its lists holds true or false, which numpy would read as 1 and 0."""
+    rows = [row for row in value if isinstance(row, list | tuple)]
+    return any(isinstance(one, bool) for row in (value, *rows) for one in row)
 
 
 def checked_intrinsics(name: str, value: Any) -> FloatArray:
@@ -121,7 +130,7 @@ def checked_lens(name: str, value: Any) -> LensName:
     """The name of a lens in ``LENSES``, also for its aliases."""
     value = canonical_name(value) if isinstance(value, str) else value
     if not isinstance(value, str) or value not in LENSES:
-        raise _error(name, "lens", f"one of {', '.join(LENSES)}", repr(value))
+        raise _error(name, "lens", f"one of {', '.join(LENSES)}", shown(value))
     return cast(LensName, value)
 
 
@@ -129,8 +138,10 @@ def checked_distortion(name: str, lens: str, value: Any) -> tuple[float, ...]:
     """As many coefficients as the lens takes, up to ``_MAX_COEFFICIENT``."""
     try:
         coefficients = tuple(float(k) + 0.0 for k in value)
+        if isinstance(value, list | tuple) and _holds_booleans(value):
+            raise TypeError
     except (TypeError, ValueError, OverflowError):
-        raise _error(name, "distortion", "a sequence of numbers", repr(value)) from None
+        raise _error(name, "distortion", "a sequence of numbers", shown(value)) from None
     counts = LENSES[lens].coefficient_counts
     if len(coefficients) not in counts:
         expected = " or ".join(map(str, counts)) + f" coefficients for a {lens} lens"
@@ -138,7 +149,7 @@ def checked_distortion(name: str, lens: str, value: Any) -> tuple[float, ...]:
         fix = f"name the lens: {others}" if counts == (0,) else ""
         raise _error(name, "distortion", expected, str(len(coefficients)), fix)
     if not all(abs(k) <= _MAX_COEFFICIENT for k in coefficients):  # also catches NaN
-        raise _error(name, "distortion", f"finite numbers up to {_MAX_COEFFICIENT:g}", repr(coefficients))
+        raise _error(name, "distortion", f"finite numbers up to {_MAX_COEFFICIENT:g}", shown(coefficients))
     return coefficients
 
 
@@ -196,4 +207,4 @@ def is_mounted(cam2ego: FloatArray, ground_z_m: float) -> BoolArray:
 
 def _error(name: str, field: str, expected: str, got: str, fix: str = "") -> CalibrationError:
     tail = f"; {fix}" if fix else ""
-    return CalibrationError(f"camera {name!r}: {field}: expected {expected}, got {got}{tail}")
+    return CalibrationError(f"camera {shown(name)}: {field}: expected {expected}, got {got}{tail}")

@@ -6,6 +6,7 @@ orientation, and may leave the output array untouched if decoding into it fails.
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -125,6 +126,8 @@ def read_header(path: Path, label: str) -> tuple[str, tuple[int, int]]:
     DataError for a missing, empty or truncated file, or one of another format.
     """
     try:
+        if not stat.S_ISREG(path.stat().st_mode):  # a pipe would be waited for
+            raise DataError(f"{label}: expected an image file, got a folder, pipe, socket or device")
         data = path.read_bytes()
     except FileNotFoundError:
         raise DataError(f"{label}: expected an image file, found none; check the path and the data root") from None

@@ -152,20 +152,22 @@ def test_an_interrupt_is_one_line_and_130(
         ),
     ],
 )
-def test_a_real_interrupt(code: str, expected: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_real_interrupt(code: str, expected: str, number: signal.Signals, tmp_path: Path) -> None:
     wait = "import sys, threading; wait = lambda *_, **__: (print('ready', flush=True), threading.Event().wait())\n"
     command = [sys.executable, "-c", wait + code, str(tmp_path)]
+    handler = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
     # A process that pytest was started from may ignore the signal, and so would its children.
     with subprocess.Popen(
         command,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=partial(signal.signal, signal.SIGINT, signal.default_int_handler),
+        preexec_fn=partial(signal.signal, number, handler),
     ) as process:
         assert process.stdout is not None and process.stderr is not None
         assert process.stdout.readline() == "ready\n"
-        os.kill(process.pid, signal.SIGINT)
+        os.kill(process.pid, number)
         _, said = process.communicate(timeout=300)
     assert process.returncode == 130 and said == expected
 

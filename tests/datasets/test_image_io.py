@@ -1,5 +1,6 @@
 """Decoding: layout, half pixels of the reduced decode, and files that must not pass as pictures."""
 
+import os
 from pathlib import Path
 
 import cv2
@@ -146,8 +147,15 @@ def test_missing_image(tmp_path: Path) -> None:
 
 
 def test_a_folder_is_no_image(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="expected a readable image file, got"):
+    with pytest.raises(DataError, match="expected an image file, got a folder"):
         decode_images([tmp_path])
+
+
+@pytest.mark.timeout(20)
+def test_a_pipe_is_no_image_and_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "front.jpg")
+    with pytest.raises(DataError, match=r"camera 'front': .* got a folder, pipe, socket or device"):
+        decode_images([tmp_path / "front.jpg"])
 
 
 def test_empty_file(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from arbiview_aug.generator.checkpoint import CONFIG_FILE, read_checkpoint, read
 from arbiview_aug.generator.config import from_plain
 from arbiview_aug.generator.training.config import TrainConfig
 
-STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
+STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 
 
 class Average:

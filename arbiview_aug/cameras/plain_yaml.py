@@ -1,0 +1,65 @@
+"""YAML files of strangers: plain data of bounded size, where a number is a number."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import yaml
+
+_MOST_VALUES = 200_000
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML 1.2's numbers and booleans: ``yes`` and ``1:30`` are text."""
+
+
+_Loader.yaml_implicit_resolvers = {"<": yaml.SafeLoader.yaml_implicit_resolvers["<"]}
+_Loader.add_implicit_resolver("tag:yaml.org,2002:null", re.compile(r"^(?:~|null|Null|NULL|)$"), ["~", "n", "N", ""])
+_Loader.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|false|False)$"), list("tTfF"))
+_Loader.add_implicit_resolver("tag:yaml.org,2002:int", re.compile(r"^[-+]?(?:0|[1-9][0-9]*)$"), list("-+0123456789"))
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^(?:[-+]?(?:[0-9]+\.[0-9]*|\.?[0-9]+)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf)|\.(?:nan|NaN))$"),
+    list("-+.0123456789"),
+)
+
+
+def parse_yaml(text: str) -> Any:
+    """Plain data of a YAML document.
+
+    Raises:
+        ValueError: A key that stands twice, aliases that lead back or multiply to too many values.
+        yaml.YAMLError: Anything else that is no plain YAML.
+    """
+    loader = _Loader(text)
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        if _size(node, {}) > _MOST_VALUES:
+            raise ValueError(f"more than {_MOST_VALUES} values once its aliases are written out")
+        return loader.construct_document(node)
+    finally:
+        loader.dispose()  # type: ignore[no-untyped-call]
+
+
+def _size(node: yaml.Node, known: dict[int, int]) -> int:
+    """Number of nodes below one, aliases written out."""
+    if not isinstance(node, yaml.CollectionNode):
+        return 1
+    if id(node) in known:
+        if known[id(node)] == 0:
+            raise ValueError("an alias within the value that it names")
+        return known[id(node)]
+    known[id(node)] = 0
+    parts = node.value
+    if isinstance(node, yaml.MappingNode):
+        keys: set[str] = set()
+        for key in (key.value for key, _ in parts if isinstance(key, yaml.ScalarNode)):
+            if key in keys:
+                raise ValueError(f"the key {key[:80]!r} stands twice")
+            keys.add(key)
+        parts = [one for pair in parts for one in pair]
+    known[id(node)] = 1 + sum(_size(part, known) for part in parts)
+    return known[id(node)]
