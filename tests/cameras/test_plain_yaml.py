@@ -1,0 +1,99 @@
+"""Rig files of strangers: bounded, and numbers only where numbers are written."""
+
+import math
+
+import pytest
+
+from arbiview_aug import load_rig
+from arbiview_aug.cameras.plain_yaml import parse_yaml
+from arbiview_aug.errors import CalibrationError
+
+CAMERA = """
+- name: front
+  width: 64
+  height: 32
+  K: [[40, 0, 31.5], [0, 40, 15.5], [0, 0, 1]]
+  cam2ego: [[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]]
+"""
+
+
+def bomb(levels: int) -> str:
+    lines = ["a0: &a0 [1, 2, 3, 4, 5, 6, 7, 8, 9]"]
+    lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, levels)]
+    return "\n".join([*lines, f"cameras: *a{levels - 1}"])
+
+
+MERGES = "\n".join(
+    ["a0: &a0 {b: 1}", *(f"a{k}: &a{k}\n  <<: [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 10)), "cameras: []"]
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (bomb(10), "more than 200000 values"),
+        (MERGES, "more than 200000 values"),
+        ("cameras: &a [1, *a]", "an alias within the value"),
+        ("cameras: []\ncameras: []", "the key 'cameras' stands twice"),
+        ("[" * 5000, "expected plain YAML"),
+    ],
+)
+@pytest.mark.timeout(20)
+def test_bombs_and_doubles_are_refused(tmp_path, text, message):
+    path = tmp_path / "rig.yaml"
+    path.write_text(text)
+    with pytest.raises(CalibrationError, match=message) as error:
+        load_rig(path)
+    assert len(str(error.value)) < 1000
+
+
+def test_aliases_of_a_real_file_stay(tmp_path):
+    path = tmp_path / "rig.yaml"
+    cameras = CAMERA.replace("width: 64\n  height: 32", "<<: *base")
+    path.write_text("base: &base {width: 64, height: 32}\ncameras:" + cameras)
+    assert load_rig(path)["front"].size == (32, 64)
+
+
+def test_numbers_are_numbers():
+    assert parse_yaml("[1, -2, 1e3, 1.5, .5, -1.5e-3, 1.]") == [1, -2, 1000.0, 1.5, 0.5, -0.0015, 1.0]
+    texts = ["1:30", "yes", "on", "0x10", "1_000", "2020-01-01"]
+    assert parse_yaml(f"[{', '.join(texts)}]") == texts
+    assert parse_yaml("[true, False, null, ~]") == [True, False, None, None]
+    assert math.isinf(parse_yaml(".inf")) and math.isnan(parse_yaml(".nan")) and parse_yaml("") is None
+
+
+@pytest.mark.parametrize(
+    ("given", "instead"),
+    [
+        ("[[40, 0, 31.5]", "[[true, 0, 31.5]"),
+        ("[[40, 0, 31.5]", "[[1:30, 0, 31.5]"),
+        ("[[40, 0, 31.5]", "[[yes, 0, 31.5]"),
+        ("width: 64", "width: true"),
+        ("height: 32", "height: 32\n  distortion: {model: fisheye, coeffs: [true, 0, 0, 0]}"),
+        ("name: front", "name: front\n  name: back"),
+    ],
+)
+def test_what_is_no_number_is_refused_by_camera(tmp_path, given, instead):
+    path = tmp_path / "rig.yaml"
+    assert given in CAMERA
+    path.write_text("cameras:" + CAMERA)
+    load_rig(path)
+    path.write_text("cameras:" + CAMERA.replace(given, instead, 1))
+    with pytest.raises(CalibrationError, match=r"front|stands twice"):
+        load_rig(path)
+
+
+@pytest.mark.timeout(20)
+def test_many_cameras_are_refused_at_once(tmp_path):
+    path = tmp_path / "rig.yaml"
+    path.write_text("cameras:" + "".join(CAMERA.replace("front", f"camera{k}") for k in range(129)))
+    with pytest.raises(CalibrationError, match="expected at most 128 cameras, got 129"):
+        load_rig(path)
+
+
+def test_long_values_are_cut_in_messages(tmp_path):
+    path = tmp_path / "rig.yaml"
+    path.write_text("cameras:" + CAMERA.replace("width: 64", f"width: {[list(range(50))] * 50}"))
+    with pytest.raises(CalibrationError, match="camera 'front': width_px") as error:
+        load_rig(path)
+    assert len(str(error.value)) < 1000
