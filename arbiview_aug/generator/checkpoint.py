@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,14 @@ from typing import Any
 import torch
 from torch import nn
 
-from arbiview_aug.atomic_io import write_whole
+from arbiview_aug.atomic_io import checksum, remove_parts, write_whole
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import GeneratorError
+from arbiview_aug.errors import GeneratorError, shown
 
 FORMAT = 1
 CONFIG_FILE = "config.json"
+_DIGITS = 12
+_NAME = re.compile(rf"weights-[0-9a-f]{{{_DIGITS}}}\.safetensors")
 _MAX_MESSAGE = 500  # characters of torch's message, which names every tensor
 
 
@@ -31,13 +34,14 @@ def write_checkpoint(folder: Path, config: Mapping[str, Any], tensors: Mapping[s
     """
     save = optional_package("safetensors.torch", "generator").save
     weights = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()})
-    named = folder / f"weights-{hashlib.sha256(weights).hexdigest()[:12]}.safetensors"
+    named = folder / f"weights-{hashlib.sha256(weights).hexdigest()[:_DIGITS]}.safetensors"
     text = json.dumps({"format": FORMAT, "weights": named.name, **config}, indent=1) + "\n"
     write_whole({named: weights})
     write_whole({folder / CONFIG_FILE: text.encode()})
+    remove_parts(folder, lambda owner: False)
     for old in folder.glob("weights-*.safetensors"):
-        if old != named:
-            old.unlink(missing_ok=True)
+        if old != named and _NAME.fullmatch(old.name) and checksum(old).startswith(old.stem[-_DIGITS:]):
+            old.unlink(missing_ok=True)  # of this folder's former checkpoints; no other file has such a name
 
 
 def read_checkpoint(folder: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
@@ -64,15 +68,24 @@ def read_config(folder: Path) -> tuple[dict[str, Any], str]:
     except (ValueError, KeyError, AttributeError, TypeError) as error:
         raise GeneratorError(f"{path}: expected a generator's configuration ({error!r})") from None
     if found != FORMAT:
-        raise GeneratorError(f"{path}: expected format {FORMAT}, got {found!r}")
-    return config, str(weights)
+        raise GeneratorError(f"{path}: expected format {FORMAT}, got {shown(found)}")
+    if not isinstance(weights, str) or not _NAME.fullmatch(weights):
+        expected = "expected the name of a file beside it, as it was saved"
+        raise GeneratorError(f"{path}: weights: {expected}, got {shown(weights)}")
+    return config, weights
 
 
 def load_weights(module: nn.Module, tensors: Mapping[str, torch.Tensor], folder: Path, assign: bool = False) -> None:
     """Load exactly the weights of a module; ``assign`` replaces its tensors instead of copying into them.
 
-    GeneratorError for names that are missing, extra or of another shape.
+    GeneratorError for names that are missing, extra or of another shape, and for values that are no finite numbers.
     """
+    for name, own in module.state_dict().items():
+        given = tensors.get(name)
+        if given is not None and given.is_floating_point() != own.is_floating_point():
+            raise GeneratorError(f"{folder}: {name}: expected {own.dtype} or alike, got {given.dtype}")
+        if given is not None and given.is_floating_point() and not bool(torch.isfinite(given).all()):
+            raise GeneratorError(f"{folder}: {name}: expected finite weights, got NaN or infinity: training diverged")
     try:
         module.load_state_dict(tensors, assign=assign)
     except RuntimeError as error:

@@ -6,8 +6,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, is_dataclass
 from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
-from arbiview_aug.errors import ArbiviewError, GeneratorError
+from arbiview_aug.errors import ArbiviewError, GeneratorError, shown
 from arbiview_aug.generator.correspondence import FACING_M
+
+_MOST_LEVELS, _MOST_LAYERS, _MOST_CHANNELS, _MOST_PIXELS = 8, 16, 8192, 8192
 
 Prediction = Literal["epsilon", "v_prediction"]
 
@@ -24,7 +26,17 @@ def check_fields(
     for name in names:
         value = getattr(config, name)
         if not valid(value):
-            raise error(f"{type(config).__name__}.{name}: expected {expected}, got {value!r}")
+            raise error(f"{type(config).__name__}.{name}: expected {expected}, got {shown(value)}")
+
+
+def check_sizes(config: Any, most: int, *names: str) -> None:
+    """Raise GeneratorError for a field that is not a whole number from 0 to ``most``, or several of them."""
+
+    def valid(value: Any) -> bool:
+        parts = value if isinstance(value, tuple) else (value,)
+        return len(parts) <= _MOST_LEVELS and all(type(part) is int and 0 <= part <= most for part in parts)
+
+    check_fields(config, f"whole numbers up to {most}, at most {_MOST_LEVELS} of them", valid, *names)
 
 
 _Config = TypeVar("_Config")
@@ -67,6 +79,8 @@ class UNetConfig:
     norm_groups: int = 32
 
     def __post_init__(self) -> None:
+        check_sizes(self, _MOST_CHANNELS, "widths", "context_width", "heads", "norm_groups")
+        check_sizes(self, _MOST_LAYERS, "layers")
         widths, count = self.widths, len(self.widths)
         check_fields(self, "multiples of 32", lambda w: bool(w) and all(n > 0 and n % 32 == 0 for n in w), "widths")
         check_fields(self, f"{count} values", lambda t: len(t) == count, "transformers")
@@ -100,6 +114,8 @@ class AutoencoderConfig:
     scale: float = 1.0  # factor that gives latents unit variance; set from the data after training
 
     def __post_init__(self) -> None:
+        check_sizes(self, _MOST_CHANNELS, "widths", "patch", "latent_channels", "norm_groups")
+        check_sizes(self, _MOST_LAYERS, "layers")
         widths, pixels = self.widths, 3 * self.patch**2
         check_fields(self, "1, or more without widths", lambda p: p == 1 or (p > 1 and not widths), "patch")
         check_fields(self, f"{pixels}, 3 patch²", lambda c: bool(widths) or c == pixels, "latent_channels")
@@ -146,6 +162,7 @@ class GeneratorConfig:
     temperature: float = 0.5  # deviation of the initial noise; at 1 a sample is 3 dB below the posterior's mean
 
     def __post_init__(self) -> None:
+        check_sizes(self, _MOST_PIXELS, "image_size", "prompt_tokens", "steps")
         factor, epsilon = self.autoencoder.factor, self.prediction == "epsilon"
         expected = f"multiples of {factor}"
         check_fields(self, expected, lambda size: all(n > 0 and n % factor == 0 for n in size), "image_size")

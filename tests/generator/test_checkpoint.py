@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import socket
+import zlib
 from copy import deepcopy
 from dataclasses import asdict
 from pathlib import Path
@@ -86,10 +89,18 @@ def test_a_full_disk_leaves_the_old_checkpoint(generator: Generator, tmp_path: P
 def test_a_process_killed_while_writing_leaves_the_old_checkpoint(generator: Generator, tmp_path: Path) -> None:
     """What it leaves behind is not looked at, and gone after the next save."""
     generator.save_pretrained(tmp_path)
-    (tmp_path / "weights-000000000000.safetensors").write_bytes(b"half")
+    host = f"{zlib.crc32(socket.gethostname().encode()):08x}"
+    part = tmp_path / f".weights-123456789abc.safetensors.-{host}-999999999-01234567.part"
+    orphan = tmp_path / f"weights-{hashlib.sha256(b'whole').hexdigest()[:12]}.safetensors"
+    part.write_bytes(b"half")
+    orphan.write_bytes(b"whole")
+    others = {tmp_path / "weights-best.safetensors", tmp_path / "weights-000000000000.safetensors"}
+    for other in others:
+        other.write_bytes(b"not ours")
     assert_same(generator, Generator.from_pretrained(tmp_path))
     generator.save_pretrained(tmp_path)
-    assert len(list(tmp_path.iterdir())) == 2
+    assert not part.exists() and not orphan.exists()
+    assert len(list(tmp_path.iterdir())) == 4 and all(other.exists() for other in others)
 
 
 def test_missing_extra_and_misshapen_weights_are_named(generator: Generator, tmp_path: Path) -> None:
@@ -111,6 +122,59 @@ def test_missing_extra_and_misshapen_weights_are_named(generator: Generator, tmp
         Generator.from_pretrained(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda t: t * torch.nan, "conv_in.weight: expected finite weights, got NaN or infinity"),
+        (lambda t: t / 0, "conv_in.weight: expected finite weights, got NaN or infinity"),
+        (lambda t: t.to(torch.int32), "conv_in.weight: expected torch.float32 or alike, got torch.int32"),
+        (lambda t: t.to(torch.complex64), "conv_in.weight: expected torch.float32 or alike, got torch.complex64"),
+    ],
+)
+def test_weights_that_are_no_numbers_are_refused(generator: Generator, tmp_path: Path, change, match: str) -> None:
+    generator.save_pretrained(tmp_path)
+    tensors = safetensors.torch.load_file(weights(tmp_path))
+    tensors["denoiser.unet.conv_in.weight"] = change(tensors["denoiser.unet.conv_in.weight"])
+    safetensors.torch.save_file(tensors, weights(tmp_path))
+    with pytest.raises(GeneratorError, match=match):
+        Generator.from_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../weights-0123456789ab.safetensors", "a/b.safetensors", 3, None])
+def test_weights_elsewhere_are_refused(generator: Generator, tmp_path: Path, name: object) -> None:
+    generator.save_pretrained(tmp_path)
+    config = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(config | {"weights": name}))
+    with pytest.raises(GeneratorError, match="weights: expected the name of a file beside it"):
+        Generator.from_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("part", "key", "value"),
+    [
+        ("unet", "layers", 10**9),
+        ("unet", "layers", 2.5),
+        ("unet", "widths", [32] * 1000),
+        ("unet", "widths", [2**40, 32, 32]),
+        ("unet", "context_width", 10**12),
+        ("autoencoder", "patch", 10**6),
+        (None, "image_size", [10**7, 10**7]),
+        (None, "prompt_tokens", -1),
+        (None, "steps", 10**9),
+    ],
+)
+def test_absurd_sizes_are_refused_before_they_are_built(
+    generator: Generator, tmp_path: Path, part: str | None, key: str, value: object
+) -> None:
+    generator.save_pretrained(tmp_path)
+    config = json.loads((tmp_path / "config.json").read_text())
+    (config["generator"] if part is None else config["generator"][part])[key] = value
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(GeneratorError, match=f"{key}: expected whole numbers up to") as error:
+        Generator.from_pretrained(tmp_path)
+    assert len(str(error.value)) < 300
+
+
 def test_broken_configurations_are_named(generator: Generator, tmp_path: Path) -> None:
     with pytest.raises(GeneratorError, match=r"expected a generator's folder with config.json"):
         Generator.from_pretrained(tmp_path / "nothing")
@@ -126,7 +190,7 @@ def test_broken_configurations_are_named(generator: Generator, tmp_path: Path) -
     refused("{", "expected a generator's configuration")
     refused("[1]", "expected a generator's configuration")
     refused(json.dumps({**good, "format": 9}), "expected format 1, got 9")
-    refused(json.dumps({**good, "weights": "elsewhere"}), "expected readable weights in elsewhere")
+    refused(json.dumps({**good, "weights": "elsewhere"}), "weights: expected the name of a file beside it")
     wide = {**good["generator"], "unet": {**good["generator"]["unet"], "context_width": 768}}
     refused(json.dumps({**good, "generator": wide}), r"size mismatch for denoiser.unet.*\[\d+, 768\]")
     refused(json.dumps({**good, "generator": {**good["generator"], "colour": 1}}), "expected keys among .*got colour")
