@@ -62,12 +62,13 @@ def retargeting(
     name: str = "",
     *,
     path: RenderPath = "favs",
-    harmonise: Harmonise = None,
+    harmonise: Harmonise = False,
     **settings: Any,
 ) -> Method:
     """Wrap ``RigRetarget`` as a method, with its arguments; holes stay black with ``path="favs"``.
 
-    The name is by default made of quality, surface and path. A source camera alone is never completed.
+    Exposures stay as recorded by default: metrics compare with them. The name is by default made of quality, surface
+    and path. A source camera alone is never completed.
     """
     completes, steps = path != "favs", settings.get("steps")
     if path == "diffusion" and settings.get("generator") is None:

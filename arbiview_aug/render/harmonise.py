@@ -1,5 +1,7 @@
 """Photometric harmonisation: one gain per source camera, so that neighbours agree where they overlap.
 
+A view keeps the exposure of its main source, the one that gives most of its pixels; the others are brought to it.
+
 The log-ratios of adjacent cameras in their half-way views, over the street surface, give one log-gain per camera:
 joint weighted least squares with a prior towards no change. Only the overlap's *even* chessboard tiles are read, since
 evaluation scores the odd ones. Half of each tile (a finer chessboard) is fitted; the other half decides whether the
@@ -10,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,12 +27,40 @@ from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import check_ranges
 from arbiview_aug.lru_cache import LRUCache
-from arbiview_aug.render.tone_curve import KNEE, ToneCurve
 from arbiview_aug.scene.static import Street
 
 _VIEW_SIZE, _TILE_PX = (225, 400), 16  # the evaluation's views and tiles at half resolution
 _STEP_PX = 4  # every fourth pixel of each fourth row is read: medians need no more
 _Pixels = npt.NDArray[np.float32]
+
+KNEE = 0.9
+"""Share of the scale from which a gain fades: higher is better by up to 0.5 dB against synthetic truth, but stretches
+the greys above it, which shows in clouds."""
+
+
+def tone_curves(gains: npt.ArrayLike, knee: float = KNEE) -> npt.NDArray[np.float64]:
+    """Curves of gains: x times the gain up to a knee, then a straight line to (1, 1): saturated pixels stay saturated.
+
+    The knee lies on the brighter axis (the output of a gain above 1, the input of one below), so the curves of g and
+    1 / g invert each other.
+
+    Args:
+        gains: (...,) gains.
+        knee: Where the fade begins, below 1.
+
+    Returns:
+        (..., 2) the slopes of both lines: the lower of them counts for a gain above 1, the higher below 1.
+    """
+    gain = np.asarray(gains, np.float64)
+    above, below = (1 - knee) / (1 - knee / np.maximum(gain, 1)), (1 - gain * knee) / (1 - knee)
+    return np.stack([gain, np.where(gain > 1, above, below)], -1)
+
+
+def toned(x: npt.NDArray[np.floating], curves: npt.NDArray[np.float64]) -> npt.NDArray[np.floating]:
+    """Values (...,) in [0, 1] after curves (..., 2)."""
+    gain, slope = curves[..., 0], curves[..., 1]
+    lower, upper = x * gain, x * slope + (1 - slope)
+    return np.where(gain > 1, np.minimum(lower, upper), np.maximum(lower, upper))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +77,7 @@ class HarmoniseConfig:
     """Error floor of a pair's log-ratio (lens shading, parallax); bounds the weight of a large overlap."""
 
     knee: float = KNEE
-    """Share of the scale from which a gain fades towards saturation; see ``ToneCurve``."""
+    """Share of the scale from which a gain fades towards saturation; see ``tone_curves``."""
 
     dark: float = 0.03
     """Pixels below this share of the scale are ignored: noise and black level."""
@@ -97,20 +127,14 @@ class PhotometricReport:
         return f"gains {', '.join(f'{gain:.2f}' for gain in self.gains)}: {self.reason}"
 
 
-class SharedPixels(NamedTuple):
-    """Pixels of their half-way view that two neighbours share."""
-
-    a: int  # index of one camera in content order
-    b: int  # and of the other
-    at: npt.NDArray[np.int64]  # (2, n) rows x width + columns in each of the two images, fitted pixels first
-    fitted: int  # number of pixels to fit; the rest are held out
-
-
 class Overlaps(NamedTuple):
-    """All overlaps of a rig."""
+    """All overlaps of a rig: results must not depend on the order of its cameras, which are in content order here."""
 
-    order: tuple[int, ...]  # camera indices in content order: results must not depend on the list's
-    pairs: tuple[SharedPixels, ...]  # adjacent pairs that share enough pixels
+    order: tuple[int, ...]  # index of each camera in the rig
+    pairs: npt.NDArray[np.int64]  # (2, P) adjacent cameras that share enough pixels
+    at: tuple[npt.NDArray[np.int64], ...]  # (2, k) rows and columns that are read of each camera's image
+    reads: npt.NDArray[np.int64]  # (2, 2, P, L) which of all cameras' readings each of a pair has of the pixels to fit
+    # and of those held out; padded by the number of readings
 
 
 def find_overlaps(rig: Rig, config: HarmoniseConfig | None = None) -> Overlaps:
@@ -121,23 +145,31 @@ def find_overlaps(rig: Rig, config: HarmoniseConfig | None = None) -> Overlaps:
     even = ~odd_tiles(_VIEW_SIZE, _TILE_PX)[::_STEP_PX, ::_STEP_PX]
     held_out = odd_tiles(_VIEW_SIZE, _TILE_PX // 2)[::_STEP_PX, ::_STEP_PX][even]
     surface = Street(ground_z_m=rig.ground_z_m)
-    pairs = []
-    for a, b in adjacent_pairs(rig):
-        view = half_way_view(rig[a], rig[b], _VIEW_SIZE)
+    pairs, shared = [], []
+    for pair in adjacent_pairs(rig):
+        view = half_way_view(rig[pair[0]], rig[pair[1]], _VIEW_SIZE)
         rays, valid = ego_rays(view, view.pixel_grid()[::_STEP_PX, ::_STEP_PX][even])
         q = surface.inverse_distance(view.center_m, rays)
-        both = np.flatnonzero(valid)
-        reads: list[npt.NDArray[np.int64]] = []
-        for k in (a, b):
-            uv, seen = project_halved(rig[k], 0, view.center_m, rays[both], q[both])
-            both = both[seen]
-            x, y = uv[seen].round().astype(np.int64).T
-            reads = [read[seen] for read in reads] + [y * rig[k].width_px + x]
-        fitted_first = np.argsort(held_out[both], kind="stable")
-        count = int((~held_out[both]).sum())
-        if _STEP_PX**2 * min(count, len(both) - count) >= config.min_pixels:
-            pairs.append(SharedPixels(a, b, np.stack(reads)[:, fitted_first], count))
-    return Overlaps(order, tuple(pairs))
+        uv, seen = zip(*(project_halved(rig[k], 0, view.center_m, rays, q) for k in pair), strict=True)
+        both = valid & seen[0] & seen[1]
+        kinds = both & ~held_out, both & held_out
+        if _STEP_PX**2 * min(kind.sum() for kind in kinds) >= config.min_pixels:
+            pairs.append(pair)
+            shared.append([[at[kind].round() for kind in kinds] for at in uv])
+    longest = max((len(at) for of_pair in shared for at in of_pair[0]), default=0)
+    count = sum(len(at) for of_pair in shared for of_camera in of_pair for at in of_camera)
+    reads, found, first = np.full((2, 2, len(pairs), longest), count), [], 0
+    for k in range(len(rig)):
+        own = [np.zeros((0, 2))]
+        for p, pair in enumerate(pairs):
+            for side, kind in np.ndindex(2, 2) if k in pair else ():
+                if pair[side] == k:
+                    at = shared[p][side][kind]
+                    reads[side, kind, p, : len(at)] = np.arange(first, first + len(at))
+                    own.append(at)
+                    first += len(at)
+        found.append(np.ascontiguousarray(np.concatenate(own).T[::-1], np.int64))
+    return Overlaps(order, np.array(pairs, np.int64).reshape(-1, 2).T, tuple(found), reads)
 
 
 def project_halved(
@@ -180,92 +212,93 @@ def estimate_gains(
     config = config or HarmoniseConfig()
     overlaps = find_overlaps(rig, config) if overlaps is None else overlaps
     none = (1.0,) * len(rig)
-    if not overlaps.pairs:
+    if not overlaps.pairs.size:
         return PhotometricReport(none, False, "no two cameras overlap enough")
-    ordered = [images[k] for k in overlaps.order]
-    read = [(pair, _read(ordered[pair.a], pair.at[0]), _read(ordered[pair.b], pair.at[1])) for pair in overlaps.pairs]
-    ratios = [_log_ratio(one[: pair.fitted], two[: pair.fitted], config) for pair, one, two in read]
-    if all(ratio is None for ratio in ratios):
+    read = _read([images[k] for k in overlaps.order], overlaps.at)
+    ratios = _log_ratios(read, overlaps, config)
+    if not len(ratios):
         return PhotometricReport(none, False, "too few pixels in the overlaps are neither dark nor saturated")
-    log_gains = np.zeros(len(rig))
-    solved = _solve(len(rig), overlaps.pairs, ratios, config)
-    log_gains[list(overlaps.order)] = np.clip(solved, -np.log(config.max_gain), np.log(config.max_gain))
+    limit = np.log(config.max_gain)
+    log_gains = np.clip(_solve(len(rig), ratios, config), -limit, limit)
     if np.abs(log_gains).max() < config.min_log_gain:
         return PhotometricReport(none, False, "the cameras agree already")
-    gains = tuple(float(gain) for gain in np.exp(log_gains))
-    curves = [ToneCurve(gains[k], config.knee) for k in overlaps.order]
-    before = _raw_db([(one[pair.fitted :], two[pair.fitted :]) for pair, one, two in read])
-    after = _raw_db(
-        [(curves[p.a].of_array(one[p.fitted :]), curves[p.b].of_array(two[p.fitted :])) for p, one, two in read]
-    )
+    gains = np.exp(log_gains)
+    curves = tone_curves(gains, config.knee).repeat([at.shape[1] for at in overlaps.at], axis=0)
+    before, after = _raw_db(read, overlaps), _raw_db(toned(read, curves), overlaps)
     reason = f"overlap {before:.1f} to {after:.1f} dB on held-out tiles"
     if after - before < config.min_rise_db:
         return PhotometricReport(none, False, f"gains would not help, {reason}", before, after)
-    return PhotometricReport(gains, True, reason, before, after)
+    return PhotometricReport(tuple(gains[np.argsort(overlaps.order)].tolist()), True, reason, before, after)
 
 
-def _read(image: torch.Tensor, at: npt.NDArray[np.int64]) -> _Pixels:
-    """The pixels (n, 3) of an image (3, H, W) at n places, float32 in [0, 1]."""
-    rows, columns = (torch.from_numpy(k).to(image.device) for k in np.divmod(at, image.shape[2]))
-    values = image.detach()[:, rows, columns].cpu()
-    top = np.float32(255 if image.dtype == torch.uint8 else 1)
-    return np.nan_to_num(values.float().numpy().T / top, copy=False)
+def _read(images: Sequence[torch.Tensor], at: Sequence[npt.NDArray[np.int64]]) -> _Pixels:
+    """The pixels (3, all k) of images (3, H, W) at (2, k) rows and columns of each, float32 in [0, 1]."""
+    from arbiview_aug.render.kernels import read_pixels
+
+    dtype = torch.uint8 if images[0].dtype == torch.uint8 else torch.float32
+    found, first = np.empty((3, sum(where.shape[1] for where in at)), np.float32), 0
+    for image, where in zip(images, at, strict=True):
+        last = first + where.shape[1]
+        if image.device.type == "cpu":
+            read_pixels(image.detach().to(dtype).numpy(), where, found[:, first:last])
+        else:
+            rows, columns = torch.from_numpy(where).to(image.device)
+            found[:, first:last] = image.detach()[:, rows, columns].float().cpu()
+        first = last
+    return np.nan_to_num(found / np.float32(255 if dtype == torch.uint8 else 1), copy=False)
 
 
-def _log_ratio(one: _Pixels, two: _Pixels, config: HarmoniseConfig) -> tuple[float, float] | None:
-    """Median log-ratio of brightness, one over two, and its variance; None from too few pixels."""
-    use: BoolArray = np.ones(len(one), bool)
-    light = []
-    for pixels in (one, two):
-        # By channel: reducing over so short an axis is ten times slower.
-        r, g, b = pixels.T
-        light.append((r + g + b).astype(np.float64))
-        use &= (light[-1] > 3 * config.dark) & (np.maximum(np.maximum(r, g), b) < config.bright)
-    if _STEP_PX**2 * use.sum() < config.min_pixels:
-        return None
-    ratio = np.log(light[0][use] / light[1][use])
-    middle = float(np.median(ratio))
-    spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
+def _log_ratios(read: _Pixels, overlaps: Overlaps, config: HarmoniseConfig) -> npt.NDArray[np.float64]:
+    """Pairs with enough pixels (n, 4): one, two, median log-ratio of brightness of one over two, and its variance."""
+    light = np.append(read.sum(0), 0)
+    usable = light > 3 * config.dark
+    usable[:-1] &= read.max(0) < config.bright
+    one, two = np.log(np.where(usable, light, np.nan), dtype=np.float64)[overlaps.reads[:, 0]]
+    ratio = one - two
+    count = (ratio == ratio).sum(1)
+    middle = _medians(ratio, count)
+    spread = 1.4826 * _medians(np.abs(ratio - middle[:, None]), count)
     # Neighbouring pixels err together: a fitted tile (8 x 8) counts once.
-    tiles = use.sum() * (2 * _STEP_PX / _TILE_PX) ** 2
-    return middle, spread**2 / tiles + config.pair_log_error**2
+    tiles = np.maximum(count, 1) * (2 * _STEP_PX / _TILE_PX) ** 2
+    found = np.stack([*overlaps.pairs, middle, spread**2 / tiles + config.pair_log_error**2], 1)
+    return found[_STEP_PX**2 * count >= config.min_pixels]
 
 
-def _solve(
-    count: int,
-    pairs: Sequence[SharedPixels],
-    ratios: Sequence[tuple[float, float] | None],
-    config: HarmoniseConfig,
-) -> npt.NDArray[np.float64]:
+def _medians(values: npt.NDArray[np.floating], count: npt.NDArray[np.int64]) -> npt.NDArray[np.floating]:
+    """Median of each row of (n, L) values, of which so many (n,) are numbers."""
+    ordered, row = np.sort(values, axis=1), np.arange(len(values))
+    return (ordered[row, (count - 1) // 2] + ordered[row, count // 2]) / 2
+
+
+def _solve(count: int, ratios: npt.NDArray[np.float64], config: HarmoniseConfig) -> npt.NDArray[np.float64]:
     """Least-squares log-gains with the prior; their median is 0 in every connected group of cameras.
 
     Ratios leave the common level open. With the median, one odd camera gives way and the others keep their exposure.
     """
-    normal = np.eye(count) / config.prior_log_gain**2
-    right = np.zeros(count)
+    one, two = ratios[:, :2].astype(np.int64).T
+    each = np.eye(count)
+    rows = each[one] - each[two]
+    weighted = rows.T / ratios[:, 3]
+    normal = each / config.prior_log_gain**2 + weighted @ rows
+    log_gains = np.linalg.solve(normal, -(weighted @ ratios[:, 2]))
     group = np.arange(count)
-    for pair, ratio in zip(pairs, ratios, strict=True):
-        if ratio is None:
-            continue
-        row = np.zeros(count)
-        row[pair.a], row[pair.b] = 1, -1
-        normal += np.outer(row, row) / ratio[1]
-        right -= row * ratio[0] / ratio[1]
-        group[group == group[pair.b]] = group[pair.a]
-    log_gains = np.asarray(np.linalg.solve(normal, right))
-    for name in np.unique(group):
+    for a, b in zip(one, two, strict=True):
+        group[group == group[b]] = group[a]
+    for name in set(group.tolist()):
         log_gains[group == name] -= np.median(log_gains[group == name])
     return log_gains
 
 
-def _raw_db(pairs: Sequence[tuple[npt.NDArray[np.floating], npt.NDArray[np.floating]]]) -> float:
-    """PSNR in dB between the two readings of each pair, mean over pairs."""
-    errors = [float(np.mean(np.square(one - two, dtype=np.float64))) for one, two in pairs]
-    return float(np.mean([-10 * np.log10(max(error, 1e-10)) for error in errors]))
+def _raw_db(read: npt.NDArray[np.floating], overlaps: Overlaps) -> float:
+    """PSNR in dB between the two readings of held-out pixels, mean over pairs."""
+    one, two = np.pad(read, ((0, 0), (0, 1)))[:, overlaps.reads[:, 1]].swapaxes(0, 1)
+    count = 3 * (overlaps.reads[0, 1] < read.shape[1]).sum(1)
+    errors = np.square(one - two, dtype=np.float64).sum((0, 2)) / count
+    return float(np.mean(-10 * np.log10(np.maximum(errors, 1e-10))))
 
 
 Harmonise = bool | HarmoniseConfig | Sequence[float] | None
-"""A user's choice: None or False for none, True or a config to estimate gains for every frame, or given gains."""
+"""A user's choice: None, True or a config to estimate gains for every frame, given gains, or False for none."""
 
 
 class Harmoniser:
@@ -280,8 +313,8 @@ class Harmoniser:
 
     def __init__(self, choice: Harmonise = None) -> None:
         self.config = choice if isinstance(choice, HarmoniseConfig) else HarmoniseConfig()
-        self.estimates = choice is True or isinstance(choice, HarmoniseConfig)
-        self.gains = None if self.estimates or choice is None or choice is False else _checked_gains(choice)
+        self.estimates = choice is None or choice is True or isinstance(choice, HarmoniseConfig)
+        self.gains = None if self.estimates or choice is False else _checked_gains(choice)
         self.is_on = self.estimates or self.gains is not None
         self._overlaps: LRUCache[bytes, Overlaps] = LRUCache(_CACHED_RIGS)
 
@@ -301,12 +334,23 @@ class Harmoniser:
         overlaps = self._overlaps.get(rig.content_key, lambda: find_overlaps(rig, self.config))
         return estimate_gains(rig, images, self.config, overlaps=overlaps)
 
-    def curves(self, rig: Rig, images: Sequence[torch.Tensor]) -> tuple[ToneCurve, ...] | None:
-        """A tone curve for each camera; None if the images stay as they are."""
-        if not self.is_on:
+    def curves(
+        self, rig: Rig, images: Sequence[torch.Tensor], views: Sequence[Sequence[Any]]
+    ) -> npt.NDArray[np.float64] | None:
+        """The tone curves (M, N, 2) of each camera in each view; None if the images stay as they are.
+
+        Args:
+            rig: The source rig.
+            images: Its N images (3, H, W).
+            views: What each view reads, with its ``source``, the main one first: estimated gains leave that as it is.
+        """
+        if self.estimates and all(len(uses) < 2 for uses in views):
             return None
         gains = self.report(rig, images).gains
-        return None if all(g == 1 for g in gains) else tuple(ToneCurve(g, self.config.knee) for g in gains)
+        if all(gain == 1 for gain in gains):
+            return None
+        mains = [gains[uses[0].source] if uses and self.estimates else 1.0 for uses in views]
+        return tone_curves(np.divide.outer(gains, mains).T, self.config.knee)
 
 
 _MAX_GIVEN_GAIN = 1e3  # ten stops

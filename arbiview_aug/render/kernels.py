@@ -700,6 +700,41 @@ def read_ahead(atlas: Any, pixel: int, packed: Any, winner: Any) -> int:
     return found  # else nothing would be read
 
 
+@compiled
+def read_pixels(image: Any, at: Any, pixels: Any) -> None:
+    """Read an image (3, h, w) at (2, n) rows and columns into (3, n) float32."""
+    for c in range(3):
+        for k in range(at.shape[1]):
+            pixels[c, k] = image[c, at[0, k], at[1, k]]
+
+
+@compiled
+def tone(values: Any, runs: Any, curves: Any, top: Any, rounding: Any) -> None:
+    """Put the pixels of a view through the tone curves of their sources.
+
+    Args:
+        values: (3 n,) uint8 or float32, changed.
+        runs: (r, 3) first pixel, end and source of each run of pixels.
+        curves: (s, 2) float32 of each source, as ``harmonise.tone_curves`` makes them.
+        top: Largest value.
+        rounding: Added before the fraction is cut off.
+    """
+    for r in range(len(runs)):
+        start, end, source = runs[r, 0], runs[r, 1], runs[r, 2]
+        gain, slope = curves[source, 0], curves[source, 1]
+        if gain == _ONE:
+            continue
+        part, offset = values[3 * start : 3 * end], top * (_ONE - slope)
+        if gain > _ONE:
+            for j in range(len(part)):
+                x = np.float32(part[j])
+                part[j] = min(x * gain, x * slope + offset) + rounding
+        else:
+            for j in range(len(part)):
+                x = np.float32(part[j])
+                part[j] = max(x * gain, x * slope + offset) + rounding
+
+
 # --- filling holes ----------------------------------------------------------------------------------------------------
 @compiled
 def sum_cells(view: Any, known: Any, cell: int, sums: Any) -> None:

@@ -12,10 +12,10 @@ import torch
 from arbiview_aug.image_ops import Scratch, interleaved, write_halved
 from arbiview_aug.render.atlas import AtlasLayout
 from arbiview_aug.render.plan import RenderPlan
-from arbiview_aug.render.tone_curve import STRIP_ROWS, ToneCurve
 from arbiview_aug.render.view_plan import BilinearFallback
 
 _REMAP_COLUMNS = 32000  # cv2.remap needs sizes below 32767
+_STRIP_ROWS = 32  # are read together: they stay in the CPU's cache
 _FLAGS = {"nearest": cv2.INTER_NEAREST, "linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC}
 
 
@@ -23,7 +23,7 @@ def render_opencv(
     plan: RenderPlan,
     images: Sequence[torch.Tensor],
     scratch: Scratch | None = None,
-    curves: Sequence[ToneCurve] | None = None,
+    curves: npt.NDArray[np.float64] | None = None,
     seams: list[torch.Tensor] | None = None,
 ) -> list[torch.Tensor]:
     """Render the target views of one frame with ``cv2.remap``; not differentiable.
@@ -32,7 +32,7 @@ def render_opencv(
         plan: The plan for these images' rig.
         images: N images (3, H, W) on the CPU: uint8, or float in [0, 1].
         scratch: Buffers to reuse between calls.
-        curves: A tone curve for each image, applied to the pixels that are read from it.
+        curves: (M, N, 2) tone curves of each view for the pixels of each image.
         seams: A list to append to, for each view, (h, w) float32: by how much blending a second source changed the
             winner's colour, mean over the channels, in the images' unit.
 
@@ -40,7 +40,7 @@ def render_opencv(
         M views (3, h, w) of the images' type, black where no source sees; slices of one (M, 3, h, w) block where all
         targets have one size.
     """
-    from arbiview_aug.render.kernels import read_ahead
+    from arbiview_aug.render.kernels import read_ahead, tone
 
     scratch = scratch or Scratch()
     dtype = images[0].dtype
@@ -48,9 +48,11 @@ def render_opencv(
     atlas = _fill_atlas(plan.layout, [image.detach().to(work) for image in images], scratch)
     rows_of_bytes = atlas.view(np.uint8).reshape(len(atlas), -1)
     views = _empty_views(plan, work)
+    scale = (np.float32(255), np.float32(0.5)) if work == torch.uint8 else (np.float32(1), np.float32(0))
     sizes = {target.source_camera.shape for target in plan.targets}
     buffers = {size: scratch.get(f"view {size}", (*size, 3), atlas.dtype) for size in sizes}
-    for target, view in zip(plan.targets, views, strict=True):
+    for number, (target, view) in enumerate(zip(plan.targets, views, strict=True)):
+        tones = None if curves is None else curves[number].astype(np.float32)
         h, w = target.source_camera.shape
         change = np.zeros((h, w), np.float32) if seams is not None else None
         if seams is not None:
@@ -59,24 +61,23 @@ def render_opencv(
             view.zero_()
             continue
         buffer = buffers[h, w]
-        for y in range(0, h, STRIP_ROWS):
-            rows = slice(y, y + STRIP_ROWS)
+        for y in range(0, h, _STRIP_ROWS):
+            rows = slice(y, y + _STRIP_ROWS)
             strip = buffer[rows]
             xy = target.at.xy[rows]
             read_ahead(rows_of_bytes, 3 * atlas.itemsize, xy.view(np.int32)[..., 0], target.source_camera[rows])
             _remap(atlas, xy, target.at.frac[rows], target.interpolation, dst=strip)
             if target.edge is not None:
-                _put_edge(target.edge.rows(y, y + STRIP_ROWS, w), atlas, strip)
-            # Tone the views, not the sources: these have more pixels, and would have to be copied.
-            if curves is not None:
-                for patch in target.patches[y // STRIP_ROWS]:
-                    curves[patch.source].apply(strip[:, patch.x], patch.mask)
+                _put_edge(target.edge.rows(y, y + _STRIP_ROWS, w), atlas, strip)
+        # Tone the views, not the sources: these have more pixels, and would have to be copied.
+        if tones is not None:
+            tone(buffer.reshape(-1), target.runs, tones, *scale)
         for band in target.bands:
             bh, bw = band.weight.shape
             part = buffer[band.y : band.y + bh, band.x : band.x + bw]
             second = _remap(atlas, band.at.xy, band.at.frac, target.seam_interpolation)
-            if curves is not None:
-                curves[band.source].apply(second)
+            if tones is not None and tones[band.source, 0] != 1:
+                tone(second.reshape(-1), np.array([[0, bh * bw, band.source]]), tones, *scale)
             if change is not None:
                 difference = np.abs(part.astype(np.float32) - second).mean(-1)
                 change[band.y : band.y + bh, band.x : band.x + bw] += difference * band.weight

@@ -116,6 +116,9 @@ def compile_kernels() -> None:
     kernels.complete(cells[0], 2, cells[1])
     kernels.continue_columns(cells[0], cells[0], 1.0, cells[1])
     for view in (np.zeros((3, 2, 2), np.uint8), np.zeros((3, 2, 2), np.float32)):
+        for layout in (view, view.transpose(0, 2, 1)):  # planes, and channels last
+            kernels.read_pixels(layout, np.zeros((2, 1), np.int64), cells[0, :3, 0, :1])
+        kernels.tone(view.reshape(-1), np.zeros((1, 3), np.int64), cells[0, 0], cells[0, 0, 0, 0], cells[0, 0, 0, 0])
         kernels.sum_cells(view, np.zeros((2, 2), np.uint8), 1, cells[0])
         kernels.put_cells(cells[0], 1, np.zeros((2, 2), np.uint8), 0.5, view)
         kernels.paint(pixel, pixel, pixel, colours, np.zeros(4, bool), view.reshape(3, 4))

@@ -20,7 +20,6 @@ from arbiview_aug.render.confidence import confidence
 from arbiview_aug.render.labels import render_labels
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import RenderPlan
-from arbiview_aug.render.tone_curve import ToneCurve
 from arbiview_aug.render.torch_backend import render_torch
 from arbiview_aug.render.view_plan import Paint
 from arbiview_aug.sample.batching import barred, covered, framed, stacked
@@ -114,7 +113,7 @@ class Renderer:
         self,
         plans: Sequence[RenderPlan],
         frames: Sequence[Frame],
-        curves: Sequence[Sequence[ToneCurve] | None],
+        curves: Sequence[npt.NDArray[np.float64] | None],
         outputs: Collection[str] = (),
     ) -> list[RenderedFrame]:
         """Render frames; torch renders those that share a plan in one batch.
@@ -122,7 +121,7 @@ class Renderer:
         Args:
             plans: One for each frame.
             frames: The frames.
-            curves: For each frame a tone curve for each source, or None.
+            curves: For each frame the tone curves (M, N, 2) of each view for each source, or None.
             outputs: The requested of ``source_camera``, ``source_frame`` and ``confidence``.
 
         Raises:
@@ -151,7 +150,7 @@ class Renderer:
         self,
         plan: RenderPlan,
         images: Sequence[torch.Tensor],
-        curves: Sequence[ToneCurve] | None,
+        curves: npt.NDArray[np.float64] | None,
         like: Sequence[torch.Tensor],
     ) -> list[torch.Tensor]:
         """The views (3, h, w) of one frame alone, executed as the images ``like`` would be."""

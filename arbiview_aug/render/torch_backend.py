@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,6 @@ import torch
 
 from arbiview_aug.render.atlas import AtlasLayout, Slot
 from arbiview_aug.render.plan import RenderPlan
-from arbiview_aug.render.tone_curve import ToneCurve
 from arbiview_aug.render.view_plan import Paint, ViewPlan
 
 
@@ -45,7 +44,7 @@ class ViewMaps:
     certainty: torch.Tensor | None  # (h, w) uint8
     layers: torch.Tensor | None  # (h, w) uint8
     paint: Callable[[], Paint | None]  # made when it is asked for: it is read back from the device
-    slots: tuple[Slot, ...]  # where its sources lie in the atlas
+    slots: tuple[Slot, ...]  # where its sources lie in the atlas, the one that wins most pixels first
     covered: float  # share of its pixels that some source sees
 
     @property
@@ -143,7 +142,7 @@ def _sample(atlas: torch.Tensor, grid: torch.Tensor, interpolation: str) -> torc
 def render_torch(
     plan: RenderPlan,
     images: Sequence[torch.Tensor],
-    curves: Sequence[Sequence[ToneCurve] | None] | None = None,
+    curves: Sequence[npt.NDArray[np.float64] | None] | None = None,
     seams: list[torch.Tensor] | None = None,
 ) -> list[torch.Tensor]:
     """Render the target views of a batch with ``grid_sample``.
@@ -151,7 +150,7 @@ def render_torch(
     Args:
         plan: The plan for these images' rig, shared by the batch.
         images: N images (B, 3, H, W): uint8, or float in [0, 1]; sampled in float32.
-        curves: For each frame of the batch None, or a tone curve for each image.
+        curves: For each frame of the batch None or (M, N, 2): see ``render_opencv``.
         seams: A list to append (B, h, w) float32 to for each view: see ``render_opencv``.
 
     Returns:
@@ -160,16 +159,22 @@ def render_torch(
     dtype, device = images[0].dtype, images[0].device
     top = 255 if dtype == torch.uint8 else 1
     atlas = _fill_atlas(plan.layout, images)
-    tones = _Tones.of(curves, len(images), device, top) if curves is not None and any(curves) else None
+    tones: Callable[..., torch.Tensor] | None = None
+    given = [] if curves is None else [of_frame for of_frame in curves if of_frame is not None]
+    if curves is not None and given:
+        of_frames = np.stack([np.ones_like(given[0]) if of_frame is None else of_frame for of_frame in curves])
+        of_views = torch.from_numpy(of_frames).float().to(device).unbind(1)
     views = []
-    for maps in maps_on(plan, device):
+    for number, maps in enumerate(maps_on(plan, device)):
+        if given:
+            tones = partial(_toned, curves=of_views[number], top=top)
         view = _sample(atlas, maps.grid, maps.interpolation)
         if maps.edge is not None:
             pixel, grid = maps.edge
             at_edge = _sample(atlas, grid, "linear")[:, :, 0]
             view = view.clamp(0, top).flatten(2).index_copy(2, pixel, at_edge).view_as(view)
         if tones is not None:
-            view = tones.applied(view, maps.source.long())
+            view = tones(view, maps.source.long())
         change = view.new_zeros(view.shape[0], *view.shape[2:])
         if maps.blend is not None:
             # Never by cubics: a mean of two sources is no sharper for it.
@@ -186,41 +191,26 @@ def _blended(
     atlas: torch.Tensor,
     blend: Blend,
     interpolation: str,
-    tones: _Tones | None,
+    tones: Callable[..., torch.Tensor] | None,
     change: torch.Tensor,
 ) -> torch.Tensor:
     """Blend the second sources into a view (B, 3, h, w), and write by how much they changed it to (B, h, w)."""
     second = _sample(atlas, blend.grid, interpolation)[:, :, 0]  # [B, 3, n]
     if tones is not None:
-        second = tones.applied(second, blend.source)
+        second = tones(second, blend.source)
     first = view.flatten(2)[:, :, blend.pixel]
     change.flatten(1)[:, blend.pixel] = (first - second).detach().abs().mean(1) * blend.weight
     mixed = torch.lerp(first, second, blend.weight.expand_as(second))
     return view.flatten(2).index_copy(2, blend.pixel, mixed).view_as(view)
 
 
-class _Tones(NamedTuple):
-    """The tone curves of all frames and sources, two straight lines each (see ``ToneCurve``)."""
-
-    gain: torch.Tensor  # (B, N) slope of the lower line, 1 for none
-    slope: torch.Tensor  # (B, N) slope of the upper line
-    offset: torch.Tensor  # (B, N) its value at 0
-    top: int  # 255 for uint8 images, else 1
-
-    @classmethod
-    def of(cls, curves: Sequence[Sequence[ToneCurve] | None], sources: int, device: torch.device, top: int) -> _Tones:
-        frames = [[ToneCurve(1.0)] * sources if of_frame is None else of_frame for of_frame in curves]
-        lines = [[(c.gain, c.upper_slope, top * (1 - c.upper_slope)) for c in of_frame] for of_frame in frames]
-        gain, slope, offset = torch.tensor(lines, dtype=torch.float32).to(device).unbind(-1)
-        return cls(gain, slope, offset, top)
-
-    def applied(self, view: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
-        """Views (B, 3, ...) read from sources (...,), -1 for none, after their curves."""
-        gain, slope, offset = (lines[:, source][:, None] for lines in self[:3])  # [B, 1, ...]
-        # Rounded before and after, like the OpenCV execution, which looks uint8 values up in a table.
-        read = torch.floor(view + 0.5) if self.top == 255 else view
-        lower, upper = read * gain, read * slope + offset
-        toned = torch.where(gain > 1, torch.minimum(lower, upper), torch.maximum(lower, upper))
-        if self.top == 255:
-            toned = torch.floor(toned + 0.5).clamp(0, 255)
-        return torch.where((gain != 1) & (source >= 0), toned, view)
+def _toned(view: torch.Tensor, source: torch.Tensor, curves: torch.Tensor, top: int) -> torch.Tensor:
+    """Views (B, 3, ...) read from sources (...,), -1 for none, after the sources' curves (B, N, 2)."""
+    gain, slope = curves[:, source][:, None].unbind(-1)  # [B, 1, ...]
+    # Rounded before and after, like the OpenCV execution.
+    read = torch.floor(view + 0.5) if top == 255 else view
+    lower, upper = read * gain, read * slope + top * (1 - slope)
+    toned = torch.where(gain > 1, torch.minimum(lower, upper), torch.maximum(lower, upper))
+    if top == 255:
+        toned = torch.floor(toned + 0.5).clamp(0, 255)
+    return torch.where((gain != 1) & (source >= 0), toned, view)

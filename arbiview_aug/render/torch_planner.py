@@ -501,8 +501,8 @@ class _ViewBatch:
         ]
         self.won_px, added_px = torch.stack(counts).cpu().numpy()
         self.read = [
-            [(int(row[k]), int(levels[k])) for k in np.flatnonzero(count)]
-            for row, levels, count in zip(self.numbers, self.levels, self.won_px + added_px, strict=True)
+            [(int(row[k]), int(levels[k])) for k in np.argsort(-won, kind="stable") if won[k] or added[k]]
+            for row, levels, won, added in zip(self.numbers, self.levels, self.won_px, added_px, strict=True)
         ]
         self.winner, self.second, self.at, self.at_second = winner, second, at, at_second
         self.share, self.certainty, self.layers = share, certainty, self._layers(in_image & (winner < 0))

@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.render.atlas import FixedMap
-from arbiview_aug.render.tone_curve import TonePatch, patches
 
 _SAMPLES = 64  # colours of objects are read so many times along a view's shorter side
 _INSIDE_PX = 2  # this far inside their faces: pixels at a border mix two colours
@@ -149,9 +148,12 @@ class ViewPlan:
         return "linear" if self.interpolation == "cubic" else self.interpolation
 
     @cached_property
-    def patches(self) -> list[list[TonePatch]]:
-        """The tone patches of each strip of rows."""
-        return patches(self.source_camera, [pair.source for pair in self.pairs])
+    def runs(self) -> npt.NDArray[np.int64]:
+        """(n, 3) runs of pixels of one source in the flattened view: first one, end and source."""
+        winner = self.source_camera.ravel()
+        start = np.flatnonzero(np.diff(winner, prepend=np.int8(-2)))
+        runs = np.stack([start, np.append(start[1:], winner.size), winner[start]], 1)
+        return runs[runs[:, 2] >= 0]
 
     @property
     def nbytes(self) -> int:

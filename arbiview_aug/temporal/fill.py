@@ -27,7 +27,6 @@ from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.render.plan import RenderPlan, build_plan
 from arbiview_aug.render.rendered import Maps, RenderedFrame, Renderer, confidence_of
-from arbiview_aug.render.tone_curve import ToneCurve
 from arbiview_aug.render.view_plan import ViewPlan
 from arbiview_aug.sample.neighbours import Neighbour, Warn, warn_lost
 from arbiview_aug.scene.boxes import BoxSurface
@@ -276,7 +275,7 @@ def fill_from_neighbours(
     rendered: RenderedFrame,
     fills: Fills | None,
     images: Sequence[torch.Tensor],
-    curves: Sequence[ToneCurve] | None,
+    curves: npt.NDArray[np.float64] | None,
     renderer: Renderer,
     warn: Warn,
 ) -> RenderedFrame:
@@ -286,18 +285,18 @@ def fill_from_neighbours(
         rendered: The frame; its maps, and its images where possible, are written into.
         fills: The planned fills; None for none.
         images: The current frame's source images.
-        curves: The current frame's tone curves, which serve the neighbours' cameras too: the holes overlap the current
+        curves: The current views' tone curves, which serve the neighbours' cameras too: the holes overlap the current
             views too little to estimate others.
         renderer: Renders the neighbours.
         warn: Called for neighbours that cannot be read.
     """
     if fills is None:
         return rendered
-    neighbours = []
+    neighbours, tones = [], None if curves is None else curves[[hole.target for hole in fills.holes]]
     for fill in fills.fills:
         sources = neighbour_images(fill.neighbour, images, warn)
         if sources is not None:
-            neighbours.append((fill, renderer.views(fill.plan, sources, curves, images)))
+            neighbours.append((fill, renderer.views(fill.plan, sources, tones, images)))
     if not neighbours:
         return rendered
     views, certain = list(rendered.images), [torch.as_tensor(one).clone() for one in rendered.certainty]  # a plan's

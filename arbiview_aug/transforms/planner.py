@@ -9,6 +9,7 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rays import CameraMaps
@@ -22,7 +23,6 @@ from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.render.plan import RenderPlan, build_plan, plan_key
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.render.requirements import harm_remedies, needs_geometry, static_harm
-from arbiview_aug.render.tone_curve import ToneCurve
 from arbiview_aug.sample.detections import OfCameras, detections_of_frames
 from arbiview_aug.sample.inputs import MOTION_KEY, Frame, names_of_frames, read_scenes, scenes_on_device
 from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames
@@ -47,7 +47,7 @@ class FramePlan:
     depth: OverlapDepth | None = None  # if it was asked for and matters
     motion: MotionDepth | None = None  # if it was estimated here and not offline
     fills: Fills | None = None  # holes that neighbouring frames fill
-    curves: tuple[ToneCurve, ...] | None = None  # one for each source, if they are harmonised
+    curves: npt.NDArray[np.float64] | None = None  # (M, N, 2) of the views for each source, if they are harmonised
     harm: str | None = None  # why a detector suffers, if cameras move over a static surface
 
 
@@ -182,7 +182,9 @@ class FramePlanner:
             surface = self._surface(scene)
             if neighbours and self.reach is not None:
                 fills = plan_fills(plan, neighbours, scene, surface, self.config, self.reach, self.maps)
-            curves = self.harmoniser.curves(frame.rig, frame.images) if self.harmoniser.is_on else None
+            on_device = plan.on_devices.get(frame.images[0].device, ())
+            views = [view.pairs + view.bands for view in plan.targets] or [maps.slots for maps in on_device]
+            curves = self.harmoniser.curves(frame.rig, frame.images, views) if self.harmoniser.is_on else None
             harm = pair.harm if SURFACES[surface].is_static else None
             plans.append(FramePlan(frame.rig, pair.target, plan, {}, depth, motion, fills, curves, harm))
         return plans

@@ -105,9 +105,10 @@ class RigRetarget(torch.nn.Module):
             always ``far``). Cameras that move over the street alone harm a detector: a warning says so once, unless
             ``p`` leaves half of the samples untouched. Points and boxes need a new plan for every frame.
         strict: Raise SampleError instead of that warning.
-        harmonise: Bring the sources to one exposure (``arbiview_aug.render.harmonise``): True or a ``HarmoniseConfig``
-            estimates a gain for each camera in every frame; numbers are used as gains. Off by default, and for samples
-            that ``p`` skips.
+        harmonise: Bring each view's sources to the exposure of its main one (``arbiview_aug.render.harmonise``). None:
+            gains are estimated from every frame's overlaps, and used where held-out pixels agree better (never with
+            ``paper``). True: the same; a ``HarmoniseConfig`` says how. Numbers: a gain for each camera, in all views.
+            False: exposures as recorded. Samples that ``p`` skips, and views of one source, keep theirs.
         refinement: Cache for the depth from overlap of ``quality="accurate"``, which depends on the images. None
             computes depth and plans for every frame; a ``RefinementCache`` reuses both where its key is the same.
         neighbours: What other frames of the drive (the sample's ``neighbours``, see ``arbiview_aug.sample.neighbours``)
@@ -225,7 +226,7 @@ class RigRetarget(torch.nn.Module):
         self.planner = FramePlanner(
             self.config,
             surface,
-            Harmoniser(harmonise),
+            Harmoniser(False if harmonise is None and isinstance(self.config, PaperConfig) else harmonise),
             refinement,
             cache_bytes=0 if drawn_anew else cache_bytes,
             reach=neighbours,

@@ -52,7 +52,7 @@ class Frame(ProtocolFrame):
     """Rendered and scored."""
 
     def render(self, target: Rig, quality: Quality) -> tuple[list[Image], BoolArray]:
-        retarget = RigRetarget(target, source_rig=self.rig, quality=quality, holes="black")
+        retarget = RigRetarget(target, source_rig=self.rig, quality=quality, harmonise=False, holes="black")
         out = retarget({"images": as_tensors(self.images)})
         return as_arrays(out["images"]), out["coverage"].numpy()
 

@@ -55,7 +55,9 @@ class Frame(ProtocolFrame):
         images = as_tensors(self.images)
 
         def render(target: Rig) -> list[Image]:
-            retarget = RigRetarget(target, source_rig=self.rig, surface=surface, quality="fast", holes="black")
+            retarget = RigRetarget(
+                target, source_rig=self.rig, surface=surface, quality="fast", harmonise=False, holes="black"
+            )
             return as_arrays(retarget({"images": images})["images"])
 
         found = {}

@@ -24,10 +24,10 @@ from arbiview_aug.favs.stage2_features import (
     optimise_transformation,
 )
 from arbiview_aug.favs.stage4_fusion import fuse
-from arbiview_aug.render.harmonise import HarmoniseConfig, estimate_gains
+from arbiview_aug.render.harmonise import HarmoniseConfig, estimate_gains, tone_curves, toned
+from arbiview_aug.render.kernels import tone
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import build_plan
-from arbiview_aug.render.tone_curve import ToneCurve
 from arbiview_aug.render.torch_backend import render_torch
 from tests.extremes import reference
 from tests.extremes.conftest import Worst
@@ -263,15 +263,15 @@ def test_gains_at_the_clamp(dtype: torch.dtype, execution: str, max_gain: float)
 @pytest.mark.parametrize("knee", [0.05, 0.9, 0.99])
 @pytest.mark.parametrize("gain", [1e-3, 1 / 16, 1 / 2.5, 2.5, 16.0, 1e3])
 def test_curves_stay_in_range_and_rise(gain: float, knee: float, worst: Worst) -> None:
-    curve = ToneCurve(gain, knee)
+    curve = tone_curves(gain, knee)
     x = np.linspace(0, 1, 4097)
     with no_numpy_warnings():
-        exact, single = curve.of_array(x), curve.of_array(x.astype(np.float32))
-        levels = np.arange(256, dtype=np.uint8).reshape(1, 256, 1).repeat(3, 2)
-        curve.apply(levels)
+        exact, single = toned(x, curve), toned(x.astype(np.float32), curve.astype(np.float32))
+        levels = np.arange(256, dtype=np.uint8).repeat(3)
+        tone(levels, np.array([[0, 256, 0]]), curve[None].astype(np.float32), np.float32(255), np.float32(0.5))
     for y in (exact, single):
         assert y[0] == 0 and y[-1] == pytest.approx(1, abs=1e-6) and (np.diff(y) >= -1e-6).all()
-    assert (np.diff(levels[0, :, 0].astype(int)) >= 0).all() and levels[0, 255, 0] == 255
+    assert (np.diff(levels.astype(int)) >= 0).all() and levels[-1] == 255
     error = 255 * np.abs(single - exact).max()
     worst("grey levels, tone curves in float32", error)
     assert error <= 1e-3

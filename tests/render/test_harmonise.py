@@ -15,11 +15,21 @@ from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.agreement import overlap_scores
-from arbiview_aug.render.harmonise import HarmoniseConfig, PhotometricReport, estimate_gains, find_overlaps
+from arbiview_aug.render.atlas import FixedMap
+from arbiview_aug.render.harmonise import (
+    KNEE,
+    HarmoniseConfig,
+    PhotometricReport,
+    estimate_gains,
+    find_overlaps,
+    tone_curves,
+    toned,
+)
+from arbiview_aug.render.kernels import tone
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import build_plan
-from arbiview_aug.render.tone_curve import STRIP_ROWS, ToneCurve, patches
 from arbiview_aug.render.torch_backend import render_torch
+from arbiview_aug.render.view_plan import ViewPlan
 
 SIZE = (180, 320)
 
@@ -55,7 +65,7 @@ def overlap_db(
 
     def render(view: Camera, source: int) -> tuple[np.ndarray, np.ndarray]:
         plan = build_plan(rig.with_cameras([rig[source]]), rig.with_cameras([view]), surface="street")
-        curves = None if gains is None else [ToneCurve(gains[source])]
+        curves = None if gains is None else tone_curves([[gains[source]]])
         image = render_opencv(plan, [images[source]], None, curves)[0]
         return image.permute(1, 2, 0).numpy(), plan.targets[0].coverage
 
@@ -95,7 +105,7 @@ def test_an_exposure_is_recovered_by_truth(gain: float, least: float, mean: floa
         images, truth = list(drive[0]["images"]), drive.render(0, target).images.float()
 
         def db(sources: list[torch.Tensor], gains: tuple[float, ...], truth: torch.Tensor = truth) -> float:
-            views = torch.stack(render_opencv(plan, sources, None, [ToneCurve(g) for g in gains]))
+            views = torch.stack(render_opencv(plan, sources, None, tone_curves([gains] * len(target))))
             return float(-10 * torch.log10((views - truth)[covered].square().mean()))
 
         none = (1.0,) * len(rig)
@@ -129,11 +139,11 @@ def retargeted(rig: Rig, images: list[torch.Tensor], **settings: object) -> torc
 def test_without_overlap_nothing_happens(street) -> None:
     rig, images = street
     apart = rig.with_cameras([rig[0], next(c for c in rig if c.name == "CAM_BACK")])
-    assert not find_overlaps(apart).pairs
+    assert not find_overlaps(apart).pairs.size
     report = estimate_gains(apart, [images[0], images[0] // 2])
     assert not report.accepted and "overlap" in report.reason and report.raw_db_before is None
     pair = [images[0], images[0] // 2]
-    assert torch.equal(retargeted(apart, pair, harmonise=True), retargeted(apart, pair))
+    assert torch.equal(retargeted(apart, pair, harmonise=True), retargeted(apart, pair, harmonise=False))
     one = rig.with_cameras([rig[0]])
     assert estimate_gains(one, images[:1]).gains == (1.0,)
 
@@ -148,13 +158,16 @@ def test_harmful_gains_are_declined(street) -> None:
     report = estimate_gains(rig, spoiled, strict, overlaps=overlaps)
     assert not report.accepted and report.gains == (1.0,) * 6 and "would not help" in report.reason
     assert report.raw_db_after > report.raw_db_before  # what it would have been
-    assert torch.equal(retargeted(rig, spoiled, harmonise=strict), retargeted(rig, spoiled))
+    assert torch.equal(retargeted(rig, spoiled, harmonise=strict), retargeted(rig, spoiled, harmonise=False))
     # Where fitted pixels lie, the first camera reads a brighter image: a lie that the others uncover.
-    lies = [image.clone() for image in images]
-    for pair in overlaps.pairs:
-        for side, k in enumerate((pair.a, pair.b)):
-            image = lies[overlaps.order[k]]
-            image.view(3, -1)[:, pair.at[side, : pair.fitted]] = 60 if side else 120
+    told = np.zeros(sum(at.shape[1] for at in overlaps.at) + 1, np.uint8)
+    told[overlaps.reads[0, 0]], told[overlaps.reads[1, 0]] = 120, 60
+    lies, first = [image.clone() for image in images], 0
+    for k, at in zip(overlaps.order, overlaps.at, strict=True):
+        part = told[first : first + at.shape[1]]
+        rows, columns = at[:, part > 0]
+        lies[k][:, rows, columns] = torch.from_numpy(part[part > 0])
+        first += at.shape[1]
     report = estimate_gains(rig, lies, overlaps=overlaps)
     assert not report.accepted and report.raw_db_after < report.raw_db_before
 
@@ -199,33 +212,34 @@ def test_order_of_cameras_and_repetition_change_nothing(street) -> None:
 
 
 def test_tone_curves() -> None:
-    values = np.arange(256, dtype=np.uint8).reshape(1, 256, 1).repeat(3, 2)
     for gain in (0.4, 0.7, 0.95, 1.0, 1.05, 1.3, 2.5):
-        curve, out = ToneCurve(gain), values.copy()
-        curve.apply(out)
-        line = out[0, :, 0].astype(int)
+        curve, values = tone_curves(gain), np.arange(768) // 3
+        levels, shares = values.astype(np.uint8), (values / 255).astype(np.float32)
+        runs, lines = np.array([[0, 256, 0]]), curve[None].astype(np.float32)
+        tone(levels, runs, lines, np.float32(255), np.float32(0.5))
+        tone(shares, runs, lines, np.float32(1), np.float32(0))
+        line = levels[::3].astype(int)
         assert line[0] == 0 and line[255] == 255 and (np.diff(line) >= 0).all(), "saturated stays saturated"
-        knee = int(255 * curve.knee / max(gain, 1))
+        knee = int(255 * KNEE / max(gain, 1))
         np.testing.assert_allclose(line[: knee + 1], gain * np.arange(knee + 1), atol=0.51)
+        np.testing.assert_allclose(line, 255 * toned(np.arange(256) / 255, curve), atol=0.501)
+        np.testing.assert_allclose(shares, toned(values / 255, curve), atol=1e-6)
         x = np.linspace(0, 1, 101)
-        np.testing.assert_allclose(ToneCurve(1 / gain).of_array(curve.of_array(x)), x, atol=1e-12)
+        np.testing.assert_allclose(toned(toned(x, curve), tone_curves(1 / gain)), x, atol=1e-12)
 
 
-def test_patches_hold_every_pixel_with_its_own_source() -> None:
-    """A slanted seam, a source within another, and a hole; 70 rows are three strips, the last one lower."""
+def test_runs_hold_every_pixel_with_its_own_source() -> None:
+    """A slanted seam, a source within another, and a hole."""
     winner = np.zeros((70, 90), np.int8)
     winner[np.add.outer(np.arange(70), 2 * np.arange(90)) > 120] = 3
     winner[20:30, 10:20] = 5
     winner[60:, 50:] = -1
-    seen = np.full(winner.shape, -1, np.int8)
-    for k, strip in enumerate(patches(winner, [3, 0, 5])):
-        for patch in strip:
-            part = seen[STRIP_ROWS * k : STRIP_ROWS * (k + 1), patch.x]
-            own = np.ones(part.shape, bool) if patch.mask is None else patch.mask > 0
-            assert (part[own] == -1).all(), "no pixel gets two curves"
-            part[own] = patch.source
-    assert np.array_equal(seen[winner >= 0], winner[winner >= 0])
-    assert patches(np.full((40, 8), -1, np.int8), []) == [[], []]
+    for one in (winner, np.full((40, 8), -1, np.int8), np.zeros((40, 8), np.int8)):
+        seen = np.full(one.size, -1, np.int8)
+        for start, end, source in ViewPlan(FixedMap.outside(one.shape), one, (), ()).runs:
+            assert (seen[start:end] == -1).all(), "no pixel gets two curves"
+            seen[start:end] = source
+        assert np.array_equal(seen, one.ravel())
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.45])
@@ -233,7 +247,8 @@ def test_executions_and_layouts_agree(street, scale: float) -> None:
     rig, images = street
     images = [image.contiguous() for image in images]
     kept = [image.clone() for image in images]
-    curves = [ToneCurve(g) for g in (0.7, 1.0, 1.3, 0.9, 1.6, 1.1)]
+    gains = (0.7, 1.0, 1.3, 0.9, 1.6, 1.1)
+    curves = tone_curves(np.divide.outer(gains, gains).T)  # every view has its own
     plan = build_plan(rig, rig.turned(yaw_deg=20).resized(scale))
     views = render_opencv(plan, images, None, curves)
     other = [image.flip(-1) for image in images]
@@ -255,7 +270,7 @@ def test_gradients_pass_through_curves(street) -> None:
     rig, images = street
     image = (images[0].float() / 255)[None].requires_grad_()
     one = rig.with_cameras([rig[0]])
-    render_torch(build_plan(one, one), [image], [[ToneCurve(1.3)]])[0].sum().backward()
+    render_torch(build_plan(one, one), [image], [tone_curves([[1.3]])])[0].sum().backward()
     assert image.grad is not None and image.grad.median() == pytest.approx(1.3, rel=1e-3)
 
 
@@ -263,25 +278,59 @@ def test_the_transform(street) -> None:
     rig, images = street
     spoiled = exposed(images, 0, 1.3)
     sample = {"images": torch.stack(spoiled), "rig": rig}
-    plain, estimating = RigRetarget(rig.turned(yaw_deg=20)), RigRetarget(rig.turned(yaw_deg=20), harmonise=True)
+    target = rig.turned(yaw_deg=20)
+    plain, estimating = RigRetarget(target, harmonise=False), RigRetarget(target)
     report = estimating.harmonisation(sample)
     assert isinstance(report, PhotometricReport) and report == estimate_gains(rig, spoiled)
     out = estimating(sample)["images"]
-    fixed = RigRetarget(rig.turned(yaw_deg=20), harmonise=report.gains)
-    assert torch.equal(fixed(sample)["images"], out) and not torch.equal(plain(sample)["images"], out)
+    assert torch.equal(RigRetarget(target, harmonise=True)(sample)["images"], out)
     again = pickle.loads(pickle.dumps(estimating))
     assert torch.equal(again(sample)["images"], out) and set(again(sample)) == set(plain(sample))
-    assert torch.equal(pickle.loads(pickle.dumps(fixed))(sample)["images"], out)
+    fixed = RigRetarget(target, harmonise=report.gains)
+    everywhere = render_opencv(build_plan(rig, target), spoiled, None, tone_curves([report.gains] * 6))
+    covered = fixed(sample)["coverage"]
+    assert torch.equal(fixed(sample)["images"].movedim(1, -1)[covered], torch.stack(everywhere).movedim(1, -1)[covered])
+    assert torch.equal(pickle.loads(pickle.dumps(fixed))(sample)["images"], fixed(sample)["images"])
     batch = {"images": torch.stack([torch.stack(spoiled), torch.stack(images)]), "K": torch.from_numpy(rig.K)}
     batch["K"], batch["cam2ego"] = (torch.from_numpy(np.stack([m, m])) for m in (rig.K, rig.cam2ego))
     for execution in ("opencv", "torch"):
-        both = RigRetarget(rig.turned(yaw_deg=20), harmonise=True, execution=execution)(batch)["images"]
+        both = RigRetarget(target, execution=execution)(batch)["images"]
         assert ((both[0].int() - out.int()).abs().float().mean()) <= 0.05
     words = str(estimating.explain(sample))
     assert f"gains {report.gains[0]:.2f}, " in words and "dB on held-out tiles" in words
     assert "gains" not in str(plain.explain(sample)) and plain.harmonisation(sample).reason == "harmonise is off"
     assert fixed.harmonisation(sample).reason == "given"
     assert "harmonise=off" in repr(plain) and "max_gain" in repr(estimating)
+    assert "harmonise=off" in repr(RigRetarget(rig, quality="paper"))
+
+
+@pytest.mark.parametrize("gain", [0.7, 1.3])
+@pytest.mark.parametrize("execution", ["opencv", "torch"])
+def test_each_view_keeps_the_exposure_of_its_main_source(street, execution: str, gain: float) -> None:
+    rig, images = street
+    sample = {"images": torch.stack(exposed(images, 0, gain)), "rig": rig}
+    target = rig.turned(yaw_deg=20)
+    settings = {"execution": execution, "outputs": ("source_camera",), "holes": "black"}
+    out, recorded = (RigRetarget(target, harmonise=choice, **settings)(sample) for choice in (None, False))
+    truth = RigRetarget(target, harmonise=False, **settings)({**sample, "images": torch.stack(images)})["images"]
+    for view, kept, true, winner, plan in zip(
+        out["images"], recorded["images"], truth, out["source_camera"], build_plan(rig, target).targets, strict=True
+    ):
+        main = winner[winner >= 0].mode().values
+        alone = winner == main
+        for band in plan.bands:
+            h, w = band.weight.shape
+            alone[band.y : band.y + h, band.x : band.x + w] &= torch.from_numpy(band.weight == 0)
+        assert torch.equal(view[:, alone], kept[:, alone])
+        others = (winner >= 0) & (winner != main) & ((winner == 0) | (main == 0))
+        if others.any():
+            true = (true.float() * (gain if main == 0 else 1)).clamp(0, 255)
+            errors = [(one.float() - true)[:, others].abs().mean() for one in (view, kept)]
+            assert errors[0] < 0.35 * errors[1], "others come to the main source's exposure"
+    # Nothing is to be harmonised where every view has one source.
+    for one in (rig, rig.resized((90, 160))):
+        views = [RigRetarget(one, harmonise=choice, **settings)(sample)["images"] for choice in (None, False)]
+        assert torch.equal(*views)
 
 
 def test_messages(street) -> None:
