@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import repeat
 from pathlib import Path
@@ -280,6 +282,15 @@ class RigRetarget(torch.nn.Module):
             SampleTypeError: Values of a type that is not supported.
             CalibrationError: Impossible K, cam2ego or lens.
         """
+        run = self._retargeted
+        if "torch._dynamo" in sys.modules:  # importing it takes a second; nothing here can be compiled
+            run = torch.compiler.disable(run)
+        # Under another default device, numbers of plans would be made there, or nowhere (meta).
+        is_cpu = torch.get_default_device().type == "cpu"
+        with nullcontext() if is_cpu else torch.device("cpu"):
+            return run(sample, params)
+
+    def _retargeted(self, sample: Mapping[str, Any], params: Mapping[str, float] | None) -> dict[str, Any]:
         self._limit_threads()
         frames, lead = read_frames(sample, self.source_rig), leading_shape(sample["images"])
         labels = self._check_keys(sample, frames)

@@ -15,6 +15,7 @@ import torch
 from torch.utils.data import default_collate
 
 from arbiview_aug import Camera, RandomRig, Rig, RigRetarget, SampleError, SampleTypeError, load_rig
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.favs.config import FavsConfig
 
 SIZE = (36, 64)
@@ -815,3 +816,29 @@ def test_a_shipped_rig_by_name() -> None:
     nuscenes = load_rig("nuscenes").resized(0.05)
     out = RigRetarget("waymo", size=(20, 30))({"images": pictures(nuscenes), "rig": nuscenes})
     assert out["images"].shape == (5, 3, 20, 30)
+
+
+# --- what surrounds a call --------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("how", ["context", "default"])
+def test_another_default_device_changes_nothing(how: str) -> None:
+    sample = SyntheticDrive(demo_source_rig((36, 64)), num_frames=1)[0]
+    expected = RigRetarget("waymo", size=(36, 64))(sample)
+    try:
+        if how == "default":
+            torch.set_default_device("meta")
+            found = RigRetarget("waymo", size=(36, 64))(sample)
+        else:
+            with torch.device("meta"):
+                found = RigRetarget("waymo", size=(36, 64))(sample)
+    finally:
+        torch.set_default_device(None)
+    for key in ("images", "coverage", "K", "cam2ego", "points", "boxes_3d"):
+        assert torch.equal(found[key], expected[key]), key
+
+
+@pytest.mark.slow
+def test_a_compiled_transform_runs_as_it_is() -> None:
+    sample = SyntheticDrive(demo_source_rig((36, 64)), num_frames=1)[0]
+    retarget = RigRetarget("waymo", size=(36, 64))
+    expected, found = retarget(sample), torch.compile(retarget)(sample)
+    assert torch.equal(found["images"], expected["images"]) and found.keys() == expected.keys()
