@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
@@ -25,12 +24,13 @@ REACH = 1 / 8
 the sources' images. Synthetic streets: 92 of 255 squared, 94 without fading, 110 without columns; Telea's method 97."""
 
 _WIDE = 2  # halvings of the columns alone: what is hidden looks like what is beside it, not above or below
-_SIDE_SHARE = 0.9
-"""Quantile of a side's colours that is nearest to its top's. Synthetic streets, mean signed error by object: +1 and +5
-levels; 0.7: -15 and -10; the median, of windows and tyres, is darker still."""
+_SWEEPS = 2
+"""Sweeps of smoothing at each size of the cells. Synthetic streets: 0 to 0.08 dB of whole views; 4 sweeps: +0.03."""
 
-_LEAST_COLOURS, _LEAST_OF_TOP = 4, 40  # samples from which a colour is taken
-_HUE = 0.25  # a "top" whose colours, over their mean, differ this much from its sides' shows something else
+_TOP_SHARE = 0.9
+"""Quantile of an object's colours that is nearest to its top's: windows, tyres and shadows are darker, and so is what
+sources see of tops at grazing angles. By pixel of 348 tops on synthetic streets, three sets: 1089, 1486 and 2720 of 255
+squared; the tops' medians, or the sides' times the frame's ratio of tops to sides: 4969, 1565 and 3550."""
 
 Cells = npt.NDArray[np.float32]
 """(4, ny, nx) colours of a view's cells times their known share, and that share."""
@@ -103,34 +103,22 @@ def mean_colour(views: Sequence[npt.NDArray[Any]], coverage: Sequence[npt.NDArra
 def object_colours(views: Sequence[npt.NDArray[Any]], paint: Sequence[Paint | None]) -> Colour:
     """Colours (P, 3) of the parts of objects by their numbers in ``Paint``; -1 where unknown.
 
-    It is the median of what sources see of it. A top of which they see little, or another hue, has its sides' colour
-    times the frame's ratio of tops to sides, which is 1 where no object shows both. Objects that no source sees have
-    none.
+    Sides take the median of what sources see of them; tops the brighter of what they see of tops and sides.
     """
     given = [(view.reshape(3, -1), p) for view, p in zip(views, paint, strict=True) if p is not None]
     if not any(len(p.pixel) for _, p in given):
         return np.zeros((0, 3), np.float32)
     colour = np.concatenate([view[:, p.sample] for view, p in given], 1).T.astype(np.float32)
     part = np.concatenate([p.sample_part for _, p in given])
-    order = np.argsort(part, kind="stable")
-    ends = np.bincount(part, minlength=2 * (part.max(initial=0) // 2 + 1)).cumsum().tolist()
+    ends = np.bincount(part, minlength=2 * (part.max(initial=0) // 2 + 1)).cumsum()
+    parts = np.split(colour[np.argsort(part, kind="stable")], ends[:-1])
     found = np.full((len(ends), 3), -1, np.float32)
-    bright = found[::2].copy()
-    for k, (first, last) in enumerate(itertools.pairwise([0, *ends])):
-        if last - first >= (_LEAST_OF_TOP if k % 2 else _LEAST_COLOURS):
-            own = np.sort(colour[order[first:last]], 0)
-            found[k] = own[len(own) // 2]
-            if k % 2 == 0:
-                bright[k // 2] = own[int(_SIDE_SHARE * len(own))]
-    hues = [colours / np.maximum(colours.mean(1, keepdims=True), 1e-6) for colours in (found[1::2], bright)]
-    shows_side = bright[:, 0] >= 0
-    found[1::2][shows_side & (np.abs(hues[0] - hues[1]).max(1) > _HUE)] = -1
-    shows_top = found[1::2, 0] >= 0
-    both, ratio = shows_top & shows_side, 1.0
-    if both.any():
-        ratio = float(np.median(found[1::2][both].mean(1) / bright[both].mean(1).clip(1e-6)))
-    guessed = shows_side & ~shows_top
-    found[1::2][guessed] = np.clip(ratio * bright[guessed], 0, 255 if views[0].dtype == np.uint8 else 1)
+    for k, own in enumerate(np.sort(one, 0) for one in parts):
+        if len(own):
+            top = k | 1
+            found[top] = np.maximum(found[top], own[int(_TOP_SHARE * len(own))])
+            if k < top:
+                found[k] = own[len(own) // 2]
     return found
 
 
@@ -154,7 +142,7 @@ def _fill(view: npt.NDArray[Any], seen: npt.NDArray[Any], layers: npt.NDArray[np
 
 def _completed(cells: Cells, mean: Colour, wide: int) -> None:
     """Complete cells in place, by the mean colour where nothing is known; the first ``wide`` steps keep the rows."""
-    from arbiview_aug.render.kernels import complete, halve
+    from arbiview_aug.render.kernels import complete, halve, smooth
 
     ny, nx = cells.shape[1:]
     if ny == nx == 1:
@@ -164,7 +152,9 @@ def _completed(cells: Cells, mean: Colour, wide: int) -> None:
     coarse = np.empty((4, -(-ny // tall), -(-nx // 2)), np.float32)
     halve(cells, tall, coarse)
     _completed(coarse, mean, max(wide - 1, 0))
+    known = cells.copy()
     complete(coarse, tall, cells)
+    smooth(known, _SWEEPS, cells)
 
 
 def _cell_px(size: tuple[int, ...]) -> int:

@@ -620,7 +620,7 @@ def find_paint(
         face: (h, w) int32 faces of objects, -1 elsewhere.
         part: (F,) int32 part of an object that a face belongs to.
         winner: (h, w) int8 source, -1 for none.
-        reach: Distance up to which seen pixels of the same part are looked for.
+        reach: Distance up to which seen pixels of the same part are looked for; those beside a top are its border.
         step: Distance of samples.
         margin: Distance at which pixels around a sample must be of its face.
         found: (5, h w) int32, written: the attributes of ``view_plan.Paint``.
@@ -634,7 +634,7 @@ def find_paint(
                 continue
             if winner[y, x] < 0:
                 own, beside = part[number], -1
-                for far in range(1, reach + 1):
+                for far in range(1, 1 if own & 1 else reach + 1):
                     for way in range(4):
                         yy, xx = y + (way == 2) * far - (way == 3) * far, x + (way == 0) * far - (way == 1) * far
                         if beside < 0 and 0 <= yy < h and 0 <= xx < w and winner[yy, xx] >= 0 and face[yy, xx] >= 0:
@@ -808,6 +808,29 @@ def complete(coarse: Any, tall: int, fine: Any) -> None:
                 above = coarse[c, j0, i0] + t * (coarse[c, j0, i1] - coarse[c, j0, i0])
                 below = coarse[c, j1, i0] + t * (coarse[c, j1, i1] - coarse[c, j1, i0])
                 fine[c, j, i] += missing * (above + s * (below - above))
+
+
+@compiled
+def smooth(known: Any, sweeps: int, cells: Any) -> None:
+    """Draw complete cells (4, ny, nx) towards the mean of their neighbours, as far as they are not ``known``.
+
+    It takes away the steps at the borders of what is known. Gauss-Seidel sweeps, forwards and backwards in turn.
+    """
+    ny, nx = known.shape[1:]
+    quarter = np.float32(0.25)
+    for sweep in range(sweeps):
+        back = sweep % 2
+        for y in range(ny):
+            j = ny - 1 - y if back else y
+            up, down = max(j - 1, 0), min(j + 1, ny - 1)
+            for x in range(nx):
+                i = nx - 1 - x if back else x
+                missing = _ONE - known[3, j, i]
+                if missing > _ZERO:
+                    left, right = max(i - 1, 0), min(i + 1, nx - 1)
+                    for c in range(3):
+                        around = (cells[c, up, i] + cells[c, down, i]) + (cells[c, j, left] + cells[c, j, right])
+                        cells[c, j, i] = known[c, j, i] + missing * quarter * around
 
 
 @compiled

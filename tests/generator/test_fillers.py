@@ -294,6 +294,17 @@ def test_the_nearer_side_is_never_smeared_into_what_it_hides() -> None:
     assert torch.equal(out[:, seen], view[:, seen]) and ((out[:, ~seen].int() - 120).abs() <= 1).all()
 
 
+def test_fills_change_evenly_away_from_what_is_known() -> None:
+    view = torch.full((3, 64, 64), 200, dtype=torch.uint8)
+    view[:, :30] = 100
+    layers = np.zeros((64, 64), np.uint8)
+    layers[30:40, 10:54], layers[40:, 10:54] = OCCLUDED, OBJECT
+    seen = torch.from_numpy(layers != OCCLUDED)
+    (out,) = fill_holes([view * seen], [seen], [layers], [None], "fill")
+    steps = np.diff(out[0, 29:40, 32].numpy().astype(int))  # from what is above to what is beside
+    assert steps[0] < 20 and (steps > 0).all() and (np.diff(steps) <= 1).all()
+
+
 def test_unlabelled_things_before_a_hole_are_found_by_their_distance() -> None:
     q = np.full((64, 64), 0.05, np.float32)
     q[:, 20:30] = 0.2  # a post, and the background that it hides to its right
@@ -311,22 +322,23 @@ PARTS = np.array([*[0] * 5, 1, *[2] * 5, 3], np.int32)  # of the faces of two bo
 
 
 def painted(top_seen: bool, scale: float = 1.0) -> tuple[torch.Tensor, Paint, torch.Tensor]:
-    """A view of two boxes: the first shows its top (80 on 40), the second shows it or not (100)."""
+    """A view of two boxes: the first shows its top (80 on 40), the second, with windows (30 in 100), some or none."""
     face = np.full((64, 64), -1, np.int32)
     face[10:20, 4:28], face[20:50, 4:28] = 5, 0
     face[10:20, 36:60], face[20:50, 36:60] = 11, 6
     view = torch.full((3, 64, 64), 200.0)
     for number, colour in ((5, 80), (0, 40), (11, 150), (6, 100)):
         view[:, torch.from_numpy(face == number)] = colour
+    view[:, 22:32, 36:60], view[:, 10:20, 53] = 30, 10  # the top's border mixes colours
     seen = torch.ones((64, 64), dtype=torch.bool)
-    seen[10:20, 36 if not top_seen else 48 : 60] = False
+    seen[10:20, 36 if not top_seen else 54 : 60] = False
     view = (view * seen * scale).to(torch.uint8 if scale == 1 else torch.float32)
     paint = Paint.of(face, np.where(seen.numpy(), 0, -1).astype(np.int8), PARTS)
     return view, paint, seen
 
 
-def test_tops_take_their_own_colour_or_that_of_their_sides_in_the_frames_light() -> None:
-    for top_seen, expected in ((True, 150), (False, 200)):
+def test_tops_take_the_brightest_colours_of_their_objects() -> None:
+    for top_seen, expected in ((True, 150), (False, 100)):
         view, paint, seen = painted(top_seen)
         colours = object_colours([view.numpy()], [paint])
         np.testing.assert_array_equal(colours[:, 0], [40, 80, 100, expected])
