@@ -8,6 +8,7 @@ from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, Samp
 from arbiview_aug.favs.config import FavsConfig, PaperConfig
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.sample.boxes_2d import ImageBoxes, project_boxes_3d
+from arbiview_aug.sample.collate import collate
 from arbiview_aug.sample.mistakes import CheckReport, Finding, check
 from arbiview_aug.sample.training import lift_mask, visible_boxes
 from arbiview_aug.transforms.resize import CropRig, ResizeRig
@@ -35,6 +36,7 @@ __all__ = [
     "SampleError",
     "SampleTypeError",
     "check",
+    "collate",
     "lift_mask",
     "load_rig",
     "project_boxes_3d",

@@ -87,7 +87,7 @@ class FrameFolder(WritableRecording):
     ground); ``K`` (N, 3, 3) and ``cam2ego`` (N, 4, 4) float64; ``token`` (the folder's name); and, if the frame has
     them, ``points`` (P, >=3) float32, ``boxes_3d`` (B, >=7) float32, ``ego2world`` (4, 4) float64 and ``time_s``.
     ``neighbours`` are frames of ``sequence.json`` with a pose. The numbers of points and boxes vary: batch with
-    ``batch_size=None`` or a ``collate_fn`` that keeps them as lists.
+    ``collate_fn=arbiview_aug.collate``.
 
     Args:
         root: The folder.

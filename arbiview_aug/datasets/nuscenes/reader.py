@@ -52,8 +52,7 @@ class NuScenesDataset(WritableRecording):
     ``time_s``; with ``load_points`` the ``points`` (P, 5) float32: x y z intensity ring; with ``load_boxes`` the
     ``boxes_3d`` (B, 9) float32: centre, length, width, height in metres, yaw in radians, velocity x y in m/s over the
     ground (NaN where unknown), with ``box_names`` (categories) and ``box_tokens``. The numbers of points and boxes
-    vary: batch with ``batch_size=None`` or a ``collate_fn`` that keeps them as lists. If no sample is annotated, they
-    have no boxes, with a warning.
+    vary: batch with ``collate_fn=arbiview_aug.collate``. If no sample is annotated, they have no boxes, with a warning.
 
     With ``neighbours`` a sample also has other frames of its scene, keyframes and sweeps, by the distance that the
     vehicle travelled between the images of the first of ``channels``. A sweep has its own time and ego pose, the image

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from arbiview_aug.integrations.lightning.batches import collate
+from arbiview_aug.sample.collate import collate
 
 if TYPE_CHECKING:
     from arbiview_aug.integrations.lightning.datamodule import RetargetDataModule

@@ -1,55 +1,13 @@
-"""Batches of samples for retargeting on the device: cameras stacked, points and boxes in lists."""
+"""Moving of collated batches to a device for retargeting there."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 
-from arbiview_aug.errors import SampleError
-from arbiview_aug.sample.batching import rewrapped
-from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
-
-_OF_PLANS = ("depth_m", MOTION_KEY, LEARNED_KEY)
-"""Maps that are geometry."""
-
-STACKED = ("images", "K", "cam2ego", "coverage", "ignore", "distortion", "ego2world", *_OF_PLANS)
-"""What has one shape in all frames of a rig, and so have maps over the images. All else is a list: of points and boxes
-each frame has its own number."""
-
-
-def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """A batch that ``RigRetarget`` takes, of samples that it takes.
-
-    Frames of one rig keep it. Where each has its own (nuScenes: cameras and LiDAR expose at different times), ``K`` and
-    ``cam2ego`` say so.
-
-    Args:
-        samples: At least one; with equal keys.
-
-    Raises:
-        SampleError: Different keys, or rigs that differ and have lenses or masks, which tensors do not carry.
-    """
-    first = samples[0]
-    if any(set(sample) != set(first) for sample in samples):
-        odd = sorted({str(key) for sample in samples for key in set(sample) ^ set(first)})
-        raise SampleError(f"collate: expected equal keys in all samples, got {', '.join(odd)} in some")
-    batch: dict[str, Any] = {}
-    for key in first:
-        values = [sample[key] for sample in samples]
-        if key == "rig":
-            batch |= _rigs(values)
-        elif key in STACKED or _are_maps(values, first["images"]):
-            batch[key] = _stacked(key, values)
-        elif key == "lens":  # a name for each camera, or one for each of its frames
-            batch[key] = [list(of_camera) for of_camera in zip(*values, strict=True)]
-        elif key == "ground_z_m":
-            batch[key] = torch.tensor([float(value) for value in values], dtype=torch.float64)
-        else:
-            batch[key] = values
-    return batch
-
+from arbiview_aug.sample.collate import OF_PLANS, are_maps
 
 ON_HOST = "on_host"
 """Key of what stays on the CPU while a batch is moved."""
@@ -69,7 +27,7 @@ class OnHost:
 def packed(batch: Mapping[str, Any]) -> dict[str, Any]:
     """A batch by ``collate``: images and maps over them in the open, for the device, all else ``OnHost``."""
     images = batch["images"]
-    moved = {key: value for key, value in batch.items() if key not in _OF_PLANS and _are_maps([value], images)}
+    moved = {key: value for key, value in batch.items() if key not in OF_PLANS and are_maps([value], images)}
     return {**moved, "images": images, ON_HOST: OnHost({k: v for k, v in batch.items() if k not in (*moved, "images")})}
 
 
@@ -89,41 +47,3 @@ def on_device(batch: Mapping[str, Any], device: torch.device) -> dict[str, Any]:
         return (value.float() if value.dtype == torch.float64 and device.type == "mps" else value).to(device)
 
     return {key: moved(value) for key, value in batch.items()}
-
-
-def _are_maps(values: Sequence[Any], images: Any) -> bool:
-    """Whether all values are maps over all images: label maps, masks; of a sample, or of a batch."""
-    sizes = [tuple(image.shape[-2:]) for image in images]
-    return all(
-        isinstance(value, torch.Tensor | list | tuple)
-        and [tuple(m.shape[-2:]) if isinstance(m, torch.Tensor) else None for m in value] == sizes
-        for value in values
-    )
-
-
-def _stacked(key: str, values: Sequence[Any]) -> Any:
-    """One tensor, or where cameras have tensors of their own a list of one for each camera; tv_tensors stay such."""
-    try:
-        if all(isinstance(value, torch.Tensor) for value in values):
-            return rewrapped(torch.stack(list(values)), values[0])
-        cameras = [torch.stack(list(of_camera)) for of_camera in zip(*values, strict=True)]
-        return rewrapped(cameras, values[0])
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise SampleError(f"collate: {key}: expected equal shapes in all samples: {error}") from None
-
-
-def _rigs(rigs: Sequence[Any]) -> dict[str, Any]:
-    if all(rig == rigs[0] for rig in rigs):
-        return {"rig": rigs[0]}
-    for rig in rigs:
-        for camera in rig:
-            if not camera.is_rectilinear or camera.mask is not None:
-                raise SampleError(
-                    f"collate: camera {camera.name!r}: rigs that differ within a batch must be of pinhole cameras "
-                    "without masks; retarget in the dataset (RetargetedDataset) instead"
-                )
-    return {
-        "K": torch.stack([torch.from_numpy(rig.K) for rig in rigs]),
-        "cam2ego": torch.stack([torch.from_numpy(rig.cam2ego) for rig in rigs]),
-        "ground_z_m": torch.tensor([rig.ground_z_m for rig in rigs], dtype=torch.float64),
-    }

@@ -10,7 +10,8 @@ from torchvision import tv_tensors
 
 from arbiview_aug import RigRetarget, SampleError
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.integrations.lightning.batches import ON_HOST, collate, on_device, packed, unpacked
+from arbiview_aug.integrations.lightning.batches import ON_HOST, on_device, packed, unpacked
+from arbiview_aug.sample.collate import collate
 
 RIG = demo_source_rig((48, 128))
 TARGET = RIG.turned(yaw_deg=15).shifted(z_m=0.2)

@@ -1,0 +1,90 @@
+"""Batches of samples: cameras stacked, points and boxes in lists."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+
+from arbiview_aug.errors import SampleError
+from arbiview_aug.sample.batching import rewrapped
+from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
+
+OF_PLANS = ("depth_m", MOTION_KEY, LEARNED_KEY)
+"""Maps that are geometry."""
+
+STACKED = ("images", "K", "cam2ego", "coverage", "ignore", "distortion", "ego2world", *OF_PLANS)
+"""What has one shape in all frames of a rig, and so have maps over the images. All else is a list: of points and boxes
+each frame has its own number."""
+
+
+def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """A batch of samples, before or after ``RigRetarget``: a ``collate_fn`` for frames with points and boxes.
+
+    Cameras and maps over their images are stacked; of points, boxes and all else there is a list, an entry a frame.
+    Frames of one rig keep it. Where each has its own (nuScenes: cameras and LiDAR expose at different times), ``K`` and
+    ``cam2ego`` say so.
+
+    Args:
+        samples: At least one; with equal keys.
+
+    Raises:
+        SampleError: Different keys, or rigs that differ and have lenses or masks, which tensors do not carry.
+    """
+    first = samples[0]
+    if any(set(sample) != set(first) for sample in samples):
+        odd = sorted({str(key) for sample in samples for key in set(sample) ^ set(first)})
+        raise SampleError(f"collate: expected equal keys in all samples, got {', '.join(odd)} in some")
+    batch: dict[str, Any] = {}
+    for key in first:
+        values = [sample[key] for sample in samples]
+        if key == "rig":
+            batch |= _rigs(values)
+        elif key in STACKED or are_maps(values, first["images"]):
+            batch[key] = _stacked(key, values)
+        elif key == "lens":  # a name for each camera, or one for each of its frames
+            batch[key] = [list(of_camera) for of_camera in zip(*values, strict=True)]
+        elif key == "ground_z_m":
+            batch[key] = torch.tensor([float(value) for value in values], dtype=torch.float64)
+        else:
+            batch[key] = values
+    return batch
+
+
+def are_maps(values: Sequence[Any], images: Any) -> bool:
+    """Whether all values are maps over all images: label maps, masks; of a sample, or of a batch."""
+    sizes = [tuple(image.shape[-2:]) for image in images]
+    return all(
+        isinstance(value, torch.Tensor | list | tuple)
+        and [tuple(m.shape[-2:]) if isinstance(m, torch.Tensor) else None for m in value] == sizes
+        for value in values
+    )
+
+
+def _stacked(key: str, values: Sequence[Any]) -> Any:
+    """One tensor, or where cameras have tensors of their own a list of one for each camera; tv_tensors stay such."""
+    try:
+        if all(isinstance(value, torch.Tensor) for value in values):
+            return rewrapped(torch.stack(list(values)), values[0])
+        cameras = [torch.stack(list(of_camera)) for of_camera in zip(*values, strict=True)]
+        return rewrapped(cameras, values[0])
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise SampleError(f"collate: {key}: expected equal shapes in all samples: {error}") from None
+
+
+def _rigs(rigs: Sequence[Any]) -> dict[str, Any]:
+    if all(rig == rigs[0] for rig in rigs):
+        return {"rig": rigs[0]}
+    for rig in rigs:
+        for camera in rig:
+            if not camera.is_rectilinear or camera.mask is not None:
+                raise SampleError(
+                    f"collate: camera {camera.name!r}: rigs that differ within a batch must be of pinhole cameras "
+                    "without masks; retarget in the dataset (RetargetedDataset) instead"
+                )
+    return {
+        "K": torch.stack([torch.from_numpy(rig.K) for rig in rigs]),
+        "cam2ego": torch.stack([torch.from_numpy(rig.cam2ego) for rig in rigs]),
+        "ground_z_m": torch.tensor([rig.ground_z_m for rig in rigs], dtype=torch.float64),
+    }
