@@ -30,6 +30,9 @@ BOX_ERROR = 0.08
 TOP = 0.9
 """Upward part of a face's normal, above which it is a top: windscreens have up to 0.87."""
 
+ROOF_M2 = 2.0
+"""Least footprint of objects whose tops have a colour of their own: heads, cones and barriers go on as their sides."""
+
 _ROUNDING = 1e-4  # of float32 images against float64
 
 
@@ -91,8 +94,9 @@ class BoxSurface(LayeredSurface):
 
     @property
     def face_is_top(self) -> BoolArray:
-        """Whether faces (n,) look upwards: roofs and bonnets."""
-        return np.asarray(self.solids[..., 2].reshape(-1) > TOP)
+        """Whether faces (n,) are roofs and bonnets, which look upwards."""
+        is_large = self.boxes[:, 3] * self.boxes[:, 4] > ROOF_M2
+        return np.asarray((self.solids[..., 2] > TOP) & is_large[:, None, None]).reshape(-1)
 
     @property
     def face_parts(self) -> npt.NDArray[np.int32]:

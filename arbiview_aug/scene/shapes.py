@@ -63,13 +63,23 @@ _CARS = tuple(
 _VANS = ((Piece(-0.5, 0.0, front_lean=0.02), Piece(0.0, 0.5, -0.5, 0.37, 0.5, 0.01, 0.08, 0.05)), _BOX)
 _LARGE = ((Piece(-0.5, 0.5, front_lean=0.015, rear_lean=0.005, side_lean=0.01),), _BOX)
 _PERSON = ((Piece(-0.5, 0.33, -0.35, 0.35, 0.38), Piece(0.33, 0.5, -0.25, 0.25, 0.2, 0.05, 0.05, 0.05)),)
+_LOOSE_PERSON = (
+    (Piece(-0.5, 0.33, -0.32, 0.32, 0.27, 0.12, 0.12, 0.04), Piece(0.33, 0.5, -0.16, 0.16, 0.16, 0.03, 0.03, 0.03)),
+)
+_BARRIER = ((Piece(-0.5, -0.2, -0.35, 0.35, 0.5, 0.17, 0.17), Piece(-0.2, 0.48, -0.18, 0.18, 0.5, 0.1, 0.1)),)
 _CONE = ((Piece(-0.5, 0.5, rear_lean=0.4, front_lean=0.4, side_lean=0.4),),)
-_KINDS = (_CARS, _VANS, _LARGE, _PERSON, _CONE, (_BOX,))
-_FROM_M = (3.0, 1.3, 1.1), (3.0, 1.3, 1.1), (3.0, 1.3, 1.95), (0.0, 0.0, 1.2), (0.0, 0.0, 0.3), (0.0, 0.0, 0.0)
-_TO_M = (5.6, 2.8, 1.95), (6.6, 2.8, 2.8), (30.0, 3.5, 5.0), (1.2, 1.2, 2.2), (0.7, 0.7, 1.2), (np.inf,) * 3
+_KINDS = (_CARS, _VANS, _LARGE, _PERSON, _LOOSE_PERSON, _BARRIER, _CONE, (_BOX,))
+_FROM_M = (
+    *((3.0, 1.3, 1.1), (3.0, 1.3, 1.1), (3.0, 1.3, 1.95)),
+    *((0.0, 0.0, 1.2), (0.0, 0.0, 1.2), (0.3, 1.2, 0.7), (0.0, 0.0, 0.3), (0.0, 0.0, 0.0)),
+)
+_TO_M = (
+    *((5.6, 2.8, 1.95), (6.6, 2.8, 2.8), (30.0, 3.5, 5.0)),
+    *((0.65, 0.65, 2.2), (1.2, 1.2, 2.2), (1.1, 2.6, 1.4), (0.7, 0.7, 1.2), (np.inf,) * 3),
+)
 KIND_M = np.array([_FROM_M, _TO_M])
-"""Least and largest length, width and height (2, kinds, 3) of cars, vans, lorries and buses, people, cones, and others.
-An object is of the first kind that it fits."""
+"""Least and largest length, width and height (2, kinds, 3) of cars, vans, lorries and buses, people in tight boxes and
+in loose ones, barriers, cones, and others. An object is of the first kind that it fits."""
 
 _NOTHING = Piece(0.5, 0.5, 0.0, 0.0, 0.0)
 PROFILES = np.array([[*one, _NOTHING][:PIECES] for kind in _KINDS for one in kind], np.float64)

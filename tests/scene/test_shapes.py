@@ -21,9 +21,11 @@ SIZES = {
     "car": (4.5, 1.8, 1.45),
     "van": (5.4, 2.0, 2.3),
     "lorry": (8.0, 2.5, 3.3),
-    "person": (0.7, 0.6, 1.75),
+    "person": (0.5, 0.6, 1.75),
+    "person in a loose box": (0.9, 0.8, 1.75),
+    "barrier": (0.7, 2.0, 1.1),
     "cone": (0.4, 0.4, 0.8),
-    "barrier": (0.6, 2.5, 1.0),
+    "trailer": (2.0, 1.5, 1.5),
 }
 CAR = np.array([[12.0, 0.5, 0.725, *SIZES["car"], np.pi]])
 
@@ -61,6 +63,23 @@ def test_objects_lie_within_their_boxes() -> None:
         assert np.isin(own, inside).all() and len(own) > 0.1 * len(inside)
 
 
+def test_people_in_loose_boxes_and_barriers_leave_room() -> None:
+    """Points at half their height and at the top, by the share of the box's length and width from its middle."""
+    boxes = boxes_of(SIZES)
+    boxes[:, 6] = 0
+    for name, height, along, across, inside in (
+        ("person in a loose box", 0.0, 0.2, 0.2, True),
+        ("person in a loose box", 0.0, 0.3, 0.0, False),
+        ("person in a loose box", 0.0, 0.0, 0.3, False),
+        ("barrier", -0.45, 0.3, 0.45, True),
+        ("barrier", 0.4, 0.08, 0.45, True),
+        ("barrier", 0.4, 0.2, 0.0, False),
+    ):
+        row = list(SIZES).index(name)
+        point = boxes[row, :3] + np.array([along, across, height]) * boxes[row, 3:6]
+        assert (beside(solids(boxes)[row], point[None])[0] <= 0) == inside
+
+
 def test_tensors_hold_the_same_shapes() -> None:
     boxes = boxes_of(SIZES)
     of_tensor = candidates(torch.from_numpy(boxes)).numpy()
@@ -84,12 +103,14 @@ def test_points_beside_an_object_are_the_background_s() -> None:
     assert len(among.street.points) == 2
 
 
-def test_faces_tell_their_object_and_whether_they_are_tops() -> None:
+def test_faces_tell_their_object_and_whether_they_are_roofs_or_bonnets() -> None:
     boxes = np.concatenate([CAR, boxes_of({"lorry": SIZES["lorry"]})])
     surface = BoxSurface(Street(), boxes, solids(boxes))
     assert surface.face_objects.tolist() == [0] * 12 + [1] * 12
     assert np.flatnonzero(surface.face_is_top).tolist() == [5, 11, 17, 23]  # bonnet, roof, the lorry's roof, nothing
     assert len(surface.before_faces(np.zeros(3))) == 24
+    small = boxes_of({name: SIZES[name] for name in ("person", "barrier", "cone")})
+    assert not BoxSurface(Street(), small, solids(small)).face_is_top.any()
 
 
 @pytest.mark.parametrize("surface", ["objects", "lidar"])
