@@ -11,8 +11,8 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.scene.panorama import CELL_RAD
 
-MOTION_WIDTH_PX = 400
-"""Images are halved until their width is nearest to this, by ratio."""
+MOTION_WIDTH_PX = 450
+"""Images are halved until their width is nearest to this, by ratio: to 318 to 636 px."""
 
 
 def motion_camera(camera: Camera) -> Camera:

@@ -16,9 +16,13 @@ from arbiview_aug.environment import compiled
 RADIUS_PX = 3  # of windows of 7 x 7 pixels
 LEVELS = 16  # steps of a grey level
 NOISE_LEVELS = 0.7  # standard deviation of a camera's noise after halving twice, in grey levels
-PER_CORRELATION = 2500  # the cost of one unit of correlation: the paths of both sides together fit into uint16
-INVALID = 2 * PER_CORRELATION  # the cost where the neighbour does not see the point
+PER_CORRELATION = 2500  # the cost of one unit of correlation: four paths together fit into uint16
+INVALID = PER_CORRELATION * 7 // 10  # the largest cost, that of points which the neighbour does not see
 STEP, JUMP = np.uint16(PER_CORRELATION // 10), np.uint16(PER_CORRELATION * 6 // 5)  # of a change by one wall, by more
+PEAK, CLEAR = 2, np.float32(1.5)
+"""The least cost must be so much less than those of walls farther from it than so many steps."""
+
+_UNSEEN = np.uint16(INVALID)
 _NOISE = np.float32(NOISE_LEVELS**2)
 _ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
 _MEAN = np.float32(1 / (2 * RADIUS_PX + 1) ** 2 / LEVELS)
@@ -176,10 +180,22 @@ def _follow(path: Any, least: Any, cost: Any, out: Any) -> Any:
 
 
 @compiled
-def find_least(total: Any, spacing: float) -> Any:
-    """The walls (h, w), ``spacing`` apart, of the least of costs (h, w, K), refined by a parabola."""
+def merge_costs(one: Any, two: Any, out: Any) -> None:
+    """Costs (n,) of a neighbour before and one after: three quarters of the better, as the other may be hidden."""
+    for x in range(out.shape[0]):
+        better, worse = min(one[x], two[x]), max(one[x], two[x])
+        worse = better if worse == _UNSEEN else worse
+        out[x] = np.uint16(better + np.uint16(np.uint16(worse - better) >> np.uint16(2)))
+
+
+@compiled
+def find_least(total: Any, spacing: float, road: Any) -> Any:
+    """The walls of the least of costs (h, w, K), refined by a parabola, and whether it is clearly the least.
+
+    Walls are ``spacing`` apart; those up to ``road`` (h, w) show the road.
+    """
     h, w, K = total.shape
-    wall = np.empty((h, w), np.float32)
+    wall, clear = np.empty((h, w), np.float32), np.empty((h, w), np.bool_)
     for y in range(h):
         for x in range(w):
             costs = total[y, x]
@@ -189,9 +205,17 @@ def find_least(total: Any, spacing: float) -> Any:
             while costs[best] != least:
                 best += 1
             wall[y, x] = best * spacing
+            touching = min(int(road[y, x] / spacing), K)
+            low, high = (0, touching) if best <= touching else (best - PEAK, best)
+            second = np.uint16(65535)
+            for k in range(low):
+                second = min(second, costs[k])
+            for k in range(high + PEAK + 1, K):
+                second = min(second, costs[k])
+            clear[y, x] = second > CLEAR * least
             if 0 < best < K - 1:
                 before, after = np.float32(costs[best - 1]), np.float32(costs[best + 1])
                 curvature = before + after - np.float32(least) - np.float32(least)
                 if curvature > _ZERO:
                     wall[y, x] += _HALF * (before - after) / curvature * spacing
-    return wall
+    return wall, clear

@@ -1,9 +1,9 @@
 """Depth of a frame's images from the frames before and after it.
 
-Each neighbour is matched by a plane sweep and aggregated. A pixel is kept where both sides agree on its distance, where
-that distance moves it far enough to be measured, and where enough of its neighbours are kept too. Labelled objects are
-masked in both frames. Unlabelled traffic that keeps pace or comes straight ahead cannot be told apart from the static
-scene. ``docs/drives.md`` (Constants) says how the constants were chosen.
+Each neighbour is matched by a plane sweep. The costs of both are merged and aggregated. A pixel is kept where one
+distance fits clearly better than all others, away from outlines, and where enough of its neighbours are kept too.
+Labelled objects are masked in both frames. Unlabelled traffic that keeps pace or comes straight ahead cannot be told
+apart from the static scene. ``docs/drives.md`` (Constants) says how the constants were chosen.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from arbiview_aug.temporal.pose_check import CORRECTED_PX, MAX_CORRECTIONS, MAX_
 BEST_TRAVEL_M, TRAVEL_M = 1.2, (0.4, 3.0)
 """Best travel to a neighbour, and the range allowed: shorter baselines measure nothing, longer ones hide too much."""
 
-AGREEMENT = 0.15
-"""Largest relative difference between the two sides' inverse distances."""
+STEP, _STEP_PER_M = 0.075, 1.5e-3
+"""Largest change of inverse distance within 3 x 3 pixels, as a share of it, and in 1/m on top."""
 
-_AGREEMENT_PER_M = 1e-3  # and the absolute one, 1/m: beyond 100 m distances do not matter
-
-FARTHEST_M = 80.0
-"""Largest depth kept: beyond it the static street's wall is half a pixel away at most, at 400 px and a 0.6 m offset."""
+FARTHEST_M = 300.0
+"""Distance of all that is farther."""
 
 LEAST_SHIFT_PX = 0.06
-"""Least motion of a pixel on all sides when its inverse distance grows by a tenth."""
+"""Least motion of a pixel that tells of a pose, when its inverse distance grows by a tenth."""
 
 _NEARER, _MORE = 1e-3, 10
 """Share of confirmed pixels at half the size that may be nearer than the nearest wall, and walls added to that one."""
 
-_SPECKLE_PX = 100
-"""Smallest patch of one distance, in images 400 px wide."""
+_SPECKLE_PX, _SPECKLE_STEP = 100, 0.15
+"""Smallest patch, and the largest relative change of inverse distance from pixel to pixel within it."""
+
+_AROUND = np.ones((3, 3), np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ def motion_depth(
         elif worst.error_px > MAX_ERROR_PX:
             return declined(f"the pose of frame {sides[measured.index(worst)].neighbour.name} errs by {worst}")
     fine = map(_match, swept, others, map(_walls, swept, coarse))
-    return MotionDepth(tuple(map(_depth_m, swept, others, fine)), words)
+    return MotionDepth(tuple(map(_depth_m, swept, fine)), words)
 
 
 def _by_side(neighbours: Sequence[Neighbour]) -> tuple[list[Neighbour], list[Neighbour]]:
@@ -187,33 +187,19 @@ def without_objects(camera: Camera, boxes: FloatArray | None) -> Camera:
 def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer) -> _Estimate:
     """Estimate the distances of one camera's pixels from the costs of all sides together.
 
-    Two sides must agree, each matched alone. A single side is confirmed by matching back from it.
+    Valid are clear matches away from the outlines of objects, which windows blur.
     """
-    q, alone = _search(image, others, walls)
-    if len(others) == 2:
-        agree = _agree(*alone)
-    else:
-        agree = _confirmed(image, q, others[0], _search(others[0], [image], walls)[0])
+    from arbiview_aug.temporal.kernels import aggregate, find_least, merge_costs
+
+    costs = [image.costs(other, walls) for other in others]
+    if len(costs) == 2:
+        merge_costs(costs[0].ravel(), costs[1].ravel(), costs[0].ravel())
+    total = aggregate(cv2.transpose(costs[0].reshape(len(walls), -1)).reshape(*image.camera.size, -1))
+    wall, clear = find_least(total, walls[1], image.road / np.maximum(image.horizontal, np.float32(1e-6)))
+    q = image.inverse_distance(wall)
+    step = cv2.dilate(q, _AROUND) - cv2.erode(q, _AROUND)
     visible = [cv2.remap(o.unmasked, image.positions(o.camera, q), None, cv2.INTER_NEAREST) for o in others]  # type: ignore[call-overload]
-    return _Estimate(q, agree & (np.max(visible, 0) > 0))
-
-
-def _search(image: SweptImage, others: Sequence[SweptImage], walls: Layer) -> tuple[Layer, list[Layer]]:
-    """Inverse distances (h, w) by all sides together, and by each side alone."""
-    from arbiview_aug.temporal.kernels import aggregate, find_least
-
-    totals = [aggregate(image.costs(other, walls)) for other in others]
-    alone = [image.inverse_distance(find_least(total, walls[1])) for total in totals]
-    together = sum(totals[1:], totals[0])
-    return image.inverse_distance(find_least(together, walls[1])), alone
-
-
-def _confirmed(image: SweptImage, q: Layer, other: SweptImage, back: Layer) -> BoolArray:
-    """(h, w) whether matching back from a neighbour's pixels gives the same distances."""
-    there: Any = cv2.remap(back, image.positions(other.camera, q), None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
-    offset = image.camera.center_m - other.camera.center_m
-    away = np.linalg.norm(offset * q[..., None] + image.directions, axis=-1)
-    return _agree(there, (q / np.maximum(away, 1e-9)).astype(np.float32))
+    return _Estimate(q, clear & (step <= STEP * q + _STEP_PER_M) & (np.max(visible, 0) > 0))
 
 
 @compilation_announced()
@@ -222,10 +208,6 @@ def compile_matching() -> None:
     camera = Camera.looking(name="small", azimuth_deg=0, width_px=16, height_px=16, horizontal_fov_deg=90)
     image = SweptImage(camera, np.zeros((16, 16), np.float32), 0.0)
     _match(image, [image], WALLS[:2])
-
-
-def _agree(one: Layer, two: Layer) -> BoolArray:
-    return np.asarray(np.abs(one - two) <= AGREEMENT * np.maximum(one, two) + _AGREEMENT_PER_M)
 
 
 def _coarse(image: SweptImage, others: Sequence[SweptImage]) -> _Estimate:
@@ -244,33 +226,25 @@ def _walls(image: SweptImage, coarse: _Estimate) -> Layer:
     return WALLS[: int(nearest / WALLS[1]) + _MORE]
 
 
-def _measurable(image: SweptImage, others: Sequence[SweptImage], q: Layer) -> BoolArray:
-    """(h, w) whether inverse distances are large enough, and move the pixels of all sides."""
-    shifts = [np.linalg.norm(image.shift(other.camera, q), axis=-1) for other in others]
-    return np.asarray((q > 1 / FARTHEST_M) & (np.min(shifts, 0) >= LEAST_SHIFT_PX))
-
-
 def _pose_samples(images: Sequence[SweptImage], estimates: Sequence[_Estimate], side: _Side) -> list[PoseSamples]:
     return [
-        PoseSamples(image, other, q, valid & _measurable(image, [other], q))
+        PoseSamples(image, other, q, valid & (np.linalg.norm(image.shift(other.camera, q), axis=-1) >= LEAST_SHIFT_PX))
         for image, other, (q, valid) in zip(images, side.images, estimates, strict=True)
     ]
 
 
-def _depth_m(image: SweptImage, others: Sequence[SweptImage], estimate: _Estimate) -> Layer:
+def _depth_m(image: SweptImage, estimate: _Estimate) -> Layer:
     """z-depth (h, w), 0 outside the mask, where invalid, and in small patches."""
     camera, (q, valid) = image.camera, estimate
-    valid = valid & _measurable(image, others, q)
-    if camera.mask is not None:
-        valid &= camera.mask
-    valid = _without_speckles(q, valid)
+    q = np.maximum(q, 1 / FARTHEST_M)
+    valid = _without_speckles(q, valid if camera.mask is None else valid & camera.mask)
     z = image.directions @ camera.cam2ego[:3, 2]
-    return np.where(valid & (z > 1e-6), z / np.maximum(q, 1e-9), 0).astype(np.float32)
+    return np.where(valid & (z > 1e-6), z / q, 0).astype(np.float32)
 
 
 def _without_speckles(q: Layer, valid: BoolArray) -> BoolArray:
-    """Drop small patches; within a patch, neighbouring inverse distances differ by less than ``AGREEMENT``."""
+    """Drop small patches; within a patch, neighbouring inverse distances differ by less than ``_SPECKLE_STEP``."""
     scale = 1000.0  # fits logarithms from 1 mm up into int16
     log_q: Any = np.where(valid, np.log(np.maximum(q, 1e-3) / 1e-3) * scale + 1, 0).astype(np.int16)
-    cv2.filterSpeckles(log_q, 0, _SPECKLE_PX, AGREEMENT * scale)
+    cv2.filterSpeckles(log_q, 0, _SPECKLE_PX, _SPECKLE_STEP * scale)
     return log_q > 0

@@ -110,7 +110,7 @@ class SweptImage:
         return np.pad(levels.astype(np.int32), ((0, 0), (RADIUS_PX, RADIUS_PX)), mode="edge"), mean, weight
 
     def costs(self, other: SweptImage, walls: Layer) -> npt.NDArray[np.uint16]:
-        """Costs (h, w, K) of surfaces by the correlation with another image over them.
+        """Costs (K, h, w) of surfaces by the correlation with another image over them.
 
         Args:
             other: The neighbour's image, in the same ego frame.
@@ -127,11 +127,11 @@ class SweptImage:
         pose, lens = relative_pose(self.camera, other.camera), (kind, camera_parameters(other.camera), given)
         costs = np.full((len(walls), h, w), INVALID, np.uint16)
         if min(other.camera.size) < 2:  # nothing lies between its pixels
-            return costs.transpose(1, 2, 0).copy()
+            return costs
         match_walls(
             self.rays, self.road, self.horizontal, self.windows, walls, pose, lens, other.grey, other.unmasked, costs
         )
-        return np.asarray(cv2.transpose(costs.reshape(len(walls), -1)).reshape(h, w, -1))
+        return costs
 
 
 def reduced_grey(camera: Camera, image: torch.Tensor) -> Layer:

@@ -90,7 +90,7 @@ def test_wrong_poses_are_corrected_or_declined(
 
 
 @pytest.mark.slow
-def test_one_side_is_confirmed_by_matching_back(drive: SyntheticDrive, sample: dict[str, Any]) -> None:
+def test_one_side_alone(drive: SyntheticDrive, sample: dict[str, Any]) -> None:
     density, share = right(drive, found({**sample, "neighbours": sample["neighbours"][:1]}))
     assert density > 0.4 and share > 0.85
 

@@ -10,7 +10,16 @@ import torch
 from arbiview_aug import Camera
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.scene.depth_maps import motion_camera
-from arbiview_aug.temporal.kernels import INVALID, JUMP, NOISE_LEVELS, PER_CORRELATION, STEP, aggregate, find_least
+from arbiview_aug.temporal.kernels import (
+    INVALID,
+    JUMP,
+    NOISE_LEVELS,
+    PER_CORRELATION,
+    STEP,
+    aggregate,
+    find_least,
+    merge_costs,
+)
 from arbiview_aug.temporal.plane_sweep import NEAREST_M, WALLS, SweptImage, reduced_grey
 from tests import helpers
 
@@ -85,10 +94,11 @@ def test_costs_are_correlations(lens: str) -> None:
     costs = image.costs(other, WALLS)
     for k in (0, 1, 7, 30, 60, 95):
         true = correlation(image, other, WALLS[k])
-        unseen = costs[..., k] == INVALID
+        unseen = costs[k] == INVALID
         assert 0.05 < unseen.mean() < 0.9 and (unseen != np.isnan(true)).mean() < 2e-3  # on a pixel's border
         both = ~unseen & ~np.isnan(true)
-        error = np.abs(costs[..., k][both] - (1 - true[both]) * PER_CORRELATION) / PER_CORRELATION
+        expected = np.minimum((1 - true[both]) * PER_CORRELATION, INVALID - 1)
+        error = np.abs(costs[k][both] - expected) / PER_CORRELATION
         assert error.max() < 0.02 and error.mean() < 1e-3
 
 
@@ -138,4 +148,22 @@ def test_aggregation_is_semi_global_matching_along_four_paths() -> None:
 
 def test_the_least_is_refined_by_a_parabola() -> None:
     total = np.array([[[9, 4, 1, 2, 7], [1, 4, 5, 6, 7], [5, 5, 5, 5, 5]]], np.uint16)
-    np.testing.assert_allclose(find_least(total, np.float32(0.5)), [[0.5 * 2.25, 0, 0]])
+    wall, _ = find_least(total, np.float32(0.5), np.zeros((1, 3), np.float32))
+    np.testing.assert_allclose(wall, [[0.5 * 2.25, 0, 0]])
+
+
+def test_a_least_is_clear_if_no_other_wall_is_nearly_as_good() -> None:
+    """Walls next to it do not count, nor those behind the road, which show the road too."""
+    total = np.array([[[30, 12, 10, 12, 30, 30], [30, 12, 10, 12, 30, 14], [14, 12, 10, 12, 30, 30]]] * 2, np.uint16)
+    total[1] = [10, 10, 10, 10, 20, 20]
+    road = np.array([[0, 0, 0], [3, 3, 0]], np.float32)
+    _, clear = find_least(total, np.float32(1), road)
+    assert clear.tolist() == [[True, False, True], [True, True, False]]
+
+
+def test_costs_of_two_sides_are_three_quarters_of_the_better() -> None:
+    one = np.array([100, 1000, INVALID, 400, INVALID], np.uint16)
+    two = np.array([1100, 200, 700, INVALID, INVALID], np.uint16)
+    out = np.empty_like(one)
+    merge_costs(one, two, out)
+    np.testing.assert_array_equal(out, [350, 400, 700, 400, INVALID])
