@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,6 +39,13 @@ KNEE = 0.9
 the greys above it, which shows in clouds."""
 
 
+LEVELS = np.float32(255), np.float32(0.5)
+"""The last two arguments of ``kernels.tone`` for uint8 images."""
+
+SHARES = np.float32(1), np.float32(0)
+"""Those for images in [0, 1]."""
+
+
 def tone_curves(gains: npt.ArrayLike, knee: float = KNEE) -> npt.NDArray[np.float64]:
     """Curves of gains: x times the gain up to a knee, then a straight line to (1, 1): saturated pixels stay saturated.
 
@@ -54,13 +62,6 @@ def tone_curves(gains: npt.ArrayLike, knee: float = KNEE) -> npt.NDArray[np.floa
     gain = np.asarray(gains, np.float64)
     above, below = (1 - knee) / (1 - knee / np.maximum(gain, 1)), (1 - gain * knee) / (1 - knee)
     return np.stack([gain, np.where(gain > 1, above, below)], -1)
-
-
-def toned(x: npt.NDArray[np.floating], curves: npt.NDArray[np.float64]) -> npt.NDArray[np.floating]:
-    """Values (...,) in [0, 1] after curves (..., 2)."""
-    gain, slope = curves[..., 0], curves[..., 1]
-    lower, upper = x * gain, x * slope + (1 - slope)
-    return np.where(gain > 1, np.minimum(lower, upper), np.maximum(lower, upper))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,9 +133,10 @@ class Overlaps(NamedTuple):
 
     order: tuple[int, ...]  # index of each camera in the rig
     pairs: npt.NDArray[np.int64]  # (2, P) adjacent cameras that share enough pixels
-    at: tuple[npt.NDArray[np.int64], ...]  # (2, k) rows and columns that are read of each camera's image
-    reads: npt.NDArray[np.int64]  # (2, 2, P, L) which of all cameras' readings each of a pair has of the pixels to fit
-    # and of those held out; padded by the number of readings
+    at: npt.NDArray[np.int64]  # (K, 2) rows and columns that are read
+    runs: npt.NDArray[np.int64]  # (N, 3) first reading, end and number of each camera
+    fitted: npt.NDArray[np.int64]  # (2, P, L) each pair's two readings of the pixels to fit; padded by K
+    held_out: npt.NDArray[np.int64]  # the same of those held out
 
 
 def find_overlaps(rig: Rig, config: HarmoniseConfig | None = None) -> Overlaps:
@@ -158,18 +160,18 @@ def find_overlaps(rig: Rig, config: HarmoniseConfig | None = None) -> Overlaps:
             shared.append([[at[kind].round() for kind in kinds] for at in uv])
     longest = max((len(at) for of_pair in shared for at in of_pair[0]), default=0)
     count = sum(len(at) for of_pair in shared for of_camera in of_pair for at in of_camera)
-    reads, found, first = np.full((2, 2, len(pairs), longest), count), [], 0
+    reads, at, runs = np.full((2, 2, len(pairs), longest), count), np.empty((count, 2), np.int64), []
+    end = 0
     for k in range(len(rig)):
-        own = [np.zeros((0, 2))]
-        for p, pair in enumerate(pairs):
-            for side, kind in np.ndindex(2, 2) if k in pair else ():
-                if pair[side] == k:
-                    at = shared[p][side][kind]
-                    reads[side, kind, p, : len(at)] = np.arange(first, first + len(at))
-                    own.append(at)
-                    first += len(at)
-        found.append(np.ascontiguousarray(np.concatenate(own).T[::-1], np.int64))
-    return Overlaps(order, np.array(pairs, np.int64).reshape(-1, 2).T, tuple(found), reads)
+        runs.append((end, end, k))
+        for p, side, kind in np.ndindex(len(pairs), 2, 2):
+            if pairs[p][side] == k:
+                xy = shared[p][side][kind]
+                first, end = end, end + len(xy)
+                reads[kind, side, p, : len(xy)] = np.arange(first, end)
+                at[first:end] = xy[:, ::-1]
+        runs[k] = (runs[k][0], end, k)
+    return Overlaps(order, np.array(pairs, np.int64).reshape(-1, 2).T, at, np.array(runs), *reads)
 
 
 def project_halved(
@@ -209,91 +211,80 @@ def estimate_gains(
     Returns:
         The gains, or gains of 1 and the reason.
     """
+    from arbiview_aug.render.kernels import pair_ratios, tone
+
     config = config or HarmoniseConfig()
     overlaps = find_overlaps(rig, config) if overlaps is None else overlaps
     none = (1.0,) * len(rig)
     if not overlaps.pairs.size:
         return PhotometricReport(none, False, "no two cameras overlap enough")
-    read = _read([images[k] for k in overlaps.order], overlaps.at)
-    ratios = _log_ratios(read, overlaps, config)
-    if not len(ratios):
+    pixels, found = _read([images[k] for k in overlaps.order], overlaps), np.empty((overlaps.pairs.shape[1], 3))
+    pair_ratios(pixels, overlaps.fitted, config.dark, config.bright, found)
+    enough = _STEP_PX**2 * found[:, 0] >= config.min_pixels
+    if not enough.any():
         return PhotometricReport(none, False, "too few pixels in the overlaps are neither dark nor saturated")
-    limit = np.log(config.max_gain)
-    log_gains = np.clip(_solve(len(rig), ratios, config), -limit, limit)
+    limit, (number, ratio, spread) = np.log(config.max_gain), found[enough].T
+    # Neighbouring pixels err together: a fitted tile (8 x 8) counts once.
+    tiles = number * (2 * _STEP_PX / _TILE_PX) ** 2
+    variance = spread**2 / tiles + config.pair_log_error**2
+    log_gains = np.clip(_solve(len(rig), overlaps.pairs[:, enough], ratio, variance, config), -limit, limit)
     if np.abs(log_gains).max() < config.min_log_gain:
         return PhotometricReport(none, False, "the cameras agree already")
     gains = np.exp(log_gains)
-    curves = tone_curves(gains, config.knee).repeat([at.shape[1] for at in overlaps.at], axis=0)
-    before, after = _raw_db(read, overlaps), _raw_db(toned(read, curves), overlaps)
+    before = _held_out_db(pixels, overlaps)
+    tone(pixels.reshape(-1), overlaps.runs, tone_curves(gains, config.knee).astype(np.float32), *SHARES)
+    after = _held_out_db(pixels, overlaps)
     reason = f"overlap {before:.1f} to {after:.1f} dB on held-out tiles"
     if after - before < config.min_rise_db:
         return PhotometricReport(none, False, f"gains would not help, {reason}", before, after)
     return PhotometricReport(tuple(gains[np.argsort(overlaps.order)].tolist()), True, reason, before, after)
 
 
-def _read(images: Sequence[torch.Tensor], at: Sequence[npt.NDArray[np.int64]]) -> _Pixels:
-    """The pixels (3, all k) of images (3, H, W) at (2, k) rows and columns of each, float32 in [0, 1]."""
+def _read(images: Sequence[torch.Tensor], overlaps: Overlaps) -> _Pixels:
+    """All readings (K, 3) of images (3, H, W), float32 in [0, 1]."""
     from arbiview_aug.render.kernels import read_pixels
 
-    dtype = torch.uint8 if images[0].dtype == torch.uint8 else torch.float32
-    found, first = np.empty((3, sum(where.shape[1] for where in at)), np.float32), 0
-    for image, where in zip(images, at, strict=True):
-        last = first + where.shape[1]
+    dtype, scale = (torch.uint8, 1 / 255) if images[0].dtype == torch.uint8 else (torch.float32, 1.0)
+    pixels = np.empty((len(overlaps.at), 3), np.float32)
+    for image, (first, end, _) in zip(images, overlaps.runs.tolist(), strict=True):
+        at, image = overlaps.at[first:end], image.detach()
         if image.device.type == "cpu":
-            read_pixels(image.detach().to(dtype).numpy(), where, found[:, first:last])
+            read_pixels(image.to(dtype).numpy(), at, np.float32(scale), pixels[first:end])
         else:
-            rows, columns = torch.from_numpy(where).to(image.device)
-            found[:, first:last] = image.detach()[:, rows, columns].float().cpu()
-        first = last
-    return np.nan_to_num(found / np.float32(255 if dtype == torch.uint8 else 1), copy=False)
+            rows, columns = torch.from_numpy(at).to(image.device).unbind(1)
+            pixels[first:end] = (image[:, rows, columns].T.float() * scale).nan_to_num(0, 0, 0).cpu()
+    return pixels
 
 
-def _log_ratios(read: _Pixels, overlaps: Overlaps, config: HarmoniseConfig) -> npt.NDArray[np.float64]:
-    """Pairs with enough pixels (n, 4): one, two, median log-ratio of brightness of one over two, and its variance."""
-    light = np.append(read.sum(0), 0)
-    usable = light > 3 * config.dark
-    usable[:-1] &= read.max(0) < config.bright
-    one, two = np.log(np.where(usable, light, np.nan), dtype=np.float64)[overlaps.reads[:, 0]]
-    ratio = one - two
-    count = (ratio == ratio).sum(1)
-    middle = _medians(ratio, count)
-    spread = 1.4826 * _medians(np.abs(ratio - middle[:, None]), count)
-    # Neighbouring pixels err together: a fitted tile (8 x 8) counts once.
-    tiles = np.maximum(count, 1) * (2 * _STEP_PX / _TILE_PX) ** 2
-    found = np.stack([*overlaps.pairs, middle, spread**2 / tiles + config.pair_log_error**2], 1)
-    return found[_STEP_PX**2 * count >= config.min_pixels]
-
-
-def _medians(values: npt.NDArray[np.floating], count: npt.NDArray[np.int64]) -> npt.NDArray[np.floating]:
-    """Median of each row of (n, L) values, of which so many (n,) are numbers."""
-    ordered, row = np.sort(values, axis=1), np.arange(len(values))
-    return (ordered[row, (count - 1) // 2] + ordered[row, count // 2]) / 2
-
-
-def _solve(count: int, ratios: npt.NDArray[np.float64], config: HarmoniseConfig) -> npt.NDArray[np.float64]:
+def _solve(
+    count: int,
+    pairs: npt.NDArray[np.int64],
+    ratio: npt.NDArray[np.float64],
+    variance: npt.NDArray[np.float64],
+    config: HarmoniseConfig,
+) -> npt.NDArray[np.float64]:
     """Least-squares log-gains with the prior; their median is 0 in every connected group of cameras.
 
     Ratios leave the common level open. With the median, one odd camera gives way and the others keep their exposure.
     """
-    one, two = ratios[:, :2].astype(np.int64).T
     each = np.eye(count)
-    rows = each[one] - each[two]
-    weighted = rows.T / ratios[:, 3]
-    normal = each / config.prior_log_gain**2 + weighted @ rows
-    log_gains = np.linalg.solve(normal, -(weighted @ ratios[:, 2]))
+    rows = each[pairs[0]] - each[pairs[1]]
+    weighted = rows.T / variance
+    log_gains = np.linalg.solve(each / config.prior_log_gain**2 + weighted @ rows, -(weighted @ ratio))
     group = np.arange(count)
-    for a, b in zip(one, two, strict=True):
+    for a, b in pairs.T.tolist():
         group[group == group[b]] = group[a]
     for name in set(group.tolist()):
-        log_gains[group == name] -= np.median(log_gains[group == name])
+        log_gains[group == name] -= median(log_gains[group == name].tolist())
     return log_gains
 
 
-def _raw_db(read: npt.NDArray[np.floating], overlaps: Overlaps) -> float:
+def _held_out_db(pixels: _Pixels, overlaps: Overlaps) -> float:
     """PSNR in dB between the two readings of held-out pixels, mean over pairs."""
-    one, two = np.pad(read, ((0, 0), (0, 1)))[:, overlaps.reads[:, 1]].swapaxes(0, 1)
-    count = 3 * (overlaps.reads[0, 1] < read.shape[1]).sum(1)
-    errors = np.square(one - two, dtype=np.float64).sum((0, 2)) / count
+    from arbiview_aug.render.kernels import pair_errors
+
+    errors = np.empty(overlaps.held_out.shape[1])
+    pair_errors(pixels, overlaps.held_out, errors)
     return float(np.mean(-10 * np.log10(np.maximum(errors, 1e-10))))
 
 

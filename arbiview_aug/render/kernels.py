@@ -700,12 +700,59 @@ def read_ahead(atlas: Any, pixel: int, packed: Any, winner: Any) -> int:
     return found  # else nothing would be read
 
 
+# --- exposures --------------------------------------------------------------------------------------------------------
 @compiled
-def read_pixels(image: Any, at: Any, pixels: Any) -> None:
-    """Read an image (3, h, w) at (2, n) rows and columns into (3, n) float32."""
-    for c in range(3):
-        for k in range(at.shape[1]):
-            pixels[c, k] = image[c, at[0, k], at[1, k]]
+def read_pixels(image: Any, at: Any, scale: Any, pixels: Any) -> None:
+    """Read an image (3, h, w) at (n, 2) rows and columns, times a scale, into (n, 3) float32; no number is 0."""
+    for k in range(len(at)):
+        for c in range(3):
+            value = np.float32(image[c, at[k, 0], at[k, 1]]) * scale
+            pixels[k, c] = value if np.isfinite(value) else _ZERO
+
+
+@compiled
+def pair_ratios(pixels: Any, reads: Any, dark: float, bright: float, found: Any) -> None:
+    """How much brighter one camera of each pair reads shared pixels than the other.
+
+    Args:
+        pixels: (K, 3) float32 readings.
+        reads: (2, P, L) two readings of each pixel; K after a pair's last one.
+        dark: Pixels count above this mean value,
+        bright: and below this value in every channel.
+        found: (P, 3) float64, written: number of pixels that count, median and spread of their log-ratios.
+    """
+    ratio = np.empty(reads.shape[2])
+    for p in range(reads.shape[1]):
+        n = 0
+        for j in range(reads.shape[2]):
+            if reads[0, p, j] == len(pixels):
+                break
+            one, two = pixels[reads[0, p, j]], pixels[reads[1, p, j]]
+            light, other = one[0] + one[1] + one[2], two[0] + two[1] + two[2]
+            most = max(one[0], one[1], one[2], two[0], two[1], two[2])
+            if min(light, other) > 3 * dark and most < bright:
+                ratio[n] = np.log(np.float64(light) / np.float64(other))
+                n += 1
+        found[p] = n
+        if n > 0:
+            ordered = np.sort(ratio[:n])
+            found[p, 1] = (ordered[(n - 1) // 2] + ordered[n // 2]) / 2
+            ordered = np.sort(np.abs(ordered - found[p, 1]))
+            found[p, 2] = 1.4826 * (ordered[(n - 1) // 2] + ordered[n // 2]) / 2
+
+
+@compiled
+def pair_errors(pixels: Any, reads: Any, errors: Any) -> None:
+    """Mean squared difference (P,) between the two readings of each pair's pixels; arguments as in ``pair_ratios``."""
+    for p in range(reads.shape[1]):
+        total, n = 0.0, 0
+        for j in range(reads.shape[2]):
+            if reads[0, p, j] == len(pixels):
+                break
+            for c in range(3):
+                total += np.float64(pixels[reads[0, p, j], c] - pixels[reads[1, p, j], c]) ** 2
+            n += 3
+        errors[p] = total / n
 
 
 @compiled

@@ -11,6 +11,7 @@ import torch
 
 from arbiview_aug.image_ops import Scratch, interleaved, write_halved
 from arbiview_aug.render.atlas import AtlasLayout
+from arbiview_aug.render.harmonise import LEVELS, SHARES
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.view_plan import BilinearFallback
 
@@ -48,7 +49,7 @@ def render_opencv(
     atlas = _fill_atlas(plan.layout, [image.detach().to(work) for image in images], scratch)
     rows_of_bytes = atlas.view(np.uint8).reshape(len(atlas), -1)
     views = _empty_views(plan, work)
-    scale = (np.float32(255), np.float32(0.5)) if work == torch.uint8 else (np.float32(1), np.float32(0))
+    scale = LEVELS if work == torch.uint8 else SHARES
     sizes = {target.source_camera.shape for target in plan.targets}
     buffers = {size: scratch.get(f"view {size}", (*size, 3), atlas.dtype) for size in sizes}
     for number, (target, view) in enumerate(zip(plan.targets, views, strict=True)):

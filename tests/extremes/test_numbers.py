@@ -24,7 +24,7 @@ from arbiview_aug.favs.stage2_features import (
     optimise_transformation,
 )
 from arbiview_aug.favs.stage4_fusion import fuse
-from arbiview_aug.render.harmonise import HarmoniseConfig, estimate_gains, tone_curves, toned
+from arbiview_aug.render.harmonise import LEVELS, SHARES, HarmoniseConfig, estimate_gains, tone_curves
 from arbiview_aug.render.kernels import tone
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import build_plan
@@ -264,11 +264,12 @@ def test_gains_at_the_clamp(dtype: torch.dtype, execution: str, max_gain: float)
 @pytest.mark.parametrize("gain", [1e-3, 1 / 16, 1 / 2.5, 2.5, 16.0, 1e3])
 def test_curves_stay_in_range_and_rise(gain: float, knee: float, worst: Worst) -> None:
     curve = tone_curves(gain, knee)
-    x = np.linspace(0, 1, 4097)
-    with no_numpy_warnings():
-        exact, single = toned(x, curve), toned(x.astype(np.float32), curve.astype(np.float32))
-        levels = np.arange(256, dtype=np.uint8).repeat(3)
-        tone(levels, np.array([[0, 256, 0]]), curve[None].astype(np.float32), np.float32(255), np.float32(0.5))
+    x, levels = np.linspace(0, 1, 4097), np.arange(256, dtype=np.uint8).repeat(3)
+    lines = x * curve[0], 1 - (1 - x) * curve[1]
+    exact, triple = np.minimum(*lines) if gain > 1 else np.maximum(*lines), x.astype(np.float32).repeat(3)
+    for values, scale in ((levels, LEVELS), (triple, SHARES)):
+        tone(values, np.array([[0, len(values) // 3, 0]]), curve[None].astype(np.float32), *scale)
+    single = triple[::3]
     for y in (exact, single):
         assert y[0] == 0 and y[-1] == pytest.approx(1, abs=1e-6) and (np.diff(y) >= -1e-6).all()
     assert (np.diff(levels.astype(int)) >= 0).all() and levels[-1] == 255

@@ -18,14 +18,15 @@ from arbiview_aug.evaluate.agreement import overlap_scores
 from arbiview_aug.render.atlas import FixedMap
 from arbiview_aug.render.harmonise import (
     KNEE,
+    LEVELS,
+    SHARES,
     HarmoniseConfig,
     PhotometricReport,
     estimate_gains,
     find_overlaps,
     tone_curves,
-    toned,
 )
-from arbiview_aug.render.kernels import tone
+from arbiview_aug.render.kernels import pair_errors, pair_ratios, tone
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import build_plan
 from arbiview_aug.render.torch_backend import render_torch
@@ -160,14 +161,12 @@ def test_harmful_gains_are_declined(street) -> None:
     assert report.raw_db_after > report.raw_db_before  # what it would have been
     assert torch.equal(retargeted(rig, spoiled, harmonise=strict), retargeted(rig, spoiled, harmonise=False))
     # Where fitted pixels lie, the first camera reads a brighter image: a lie that the others uncover.
-    told = np.zeros(sum(at.shape[1] for at in overlaps.at) + 1, np.uint8)
-    told[overlaps.reads[0, 0]], told[overlaps.reads[1, 0]] = 120, 60
-    lies, first = [image.clone() for image in images], 0
-    for k, at in zip(overlaps.order, overlaps.at, strict=True):
-        part = told[first : first + at.shape[1]]
-        rows, columns = at[:, part > 0]
-        lies[k][:, rows, columns] = torch.from_numpy(part[part > 0])
-        first += at.shape[1]
+    told = np.zeros(len(overlaps.at) + 1, np.uint8)
+    told[overlaps.fitted[0]], told[overlaps.fitted[1]] = 120, 60
+    lies = [image.clone() for image in images]
+    for first, end, k in overlaps.runs:
+        rows, columns = overlaps.at[first:end][told[first:end] > 0].T
+        lies[overlaps.order[k]][:, rows, columns] = torch.from_numpy(told[first:end][told[first:end] > 0])
     report = estimate_gains(rig, lies, overlaps=overlaps)
     assert not report.accepted and report.raw_db_after < report.raw_db_before
 
@@ -211,13 +210,40 @@ def test_order_of_cameras_and_repetition_change_nothing(street) -> None:
         np.testing.assert_allclose(estimate_gains(rig, same).gains, report.gains, rtol=5e-3)
 
 
+def toned(x: np.ndarray, curve: np.ndarray) -> np.ndarray:
+    """Values in [0, 1] after a curve."""
+    lower, upper = x * curve[0], 1 - (1 - x) * curve[1]
+    return np.minimum(lower, upper) if curve[0] > 1 else np.maximum(lower, upper)
+
+
+def test_pairs_are_compared_by_their_usable_pixels() -> None:
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform(0, 1, (200, 3)).astype(np.float32)
+    reads = np.full((2, 3, 80), 200)
+    for p, count in enumerate((80, 33, 2)):
+        reads[:, p, :count] = rng.integers(0, 200, (2, count))
+    pixels[reads[:, 2, :2]] = 0.001  # dark
+    found, errors = np.empty((3, 3)), np.empty(3)
+    pair_ratios(pixels, reads, 0.2, 0.9, found)
+    pair_errors(pixels, reads, errors)
+    for (number, middle, spread), error, (one, two) in zip(found, errors, reads.swapaxes(0, 1), strict=True):
+        one, two = (pixels[side[side < 200]].astype(np.float64) for side in (one, two))
+        assert error == pytest.approx(np.mean((one - two) ** 2), rel=1e-5)
+        use = np.all([(side.mean(1) > 0.2) & (side.max(1) < 0.9) for side in (one, two)], 0)
+        assert number == use.sum()
+        if number:
+            ratio = np.log(one.sum(1) / two.sum(1))[use]
+            assert middle == pytest.approx(np.median(ratio), abs=1e-6)
+            assert spread == pytest.approx(1.4826 * np.median(np.abs(ratio - np.median(ratio))), abs=1e-6)
+
+
 def test_tone_curves() -> None:
     for gain in (0.4, 0.7, 0.95, 1.0, 1.05, 1.3, 2.5):
         curve, values = tone_curves(gain), np.arange(768) // 3
         levels, shares = values.astype(np.uint8), (values / 255).astype(np.float32)
         runs, lines = np.array([[0, 256, 0]]), curve[None].astype(np.float32)
-        tone(levels, runs, lines, np.float32(255), np.float32(0.5))
-        tone(shares, runs, lines, np.float32(1), np.float32(0))
+        tone(levels, runs, lines, *LEVELS)
+        tone(shares, runs, lines, *SHARES)
         line = levels[::3].astype(int)
         assert line[0] == 0 and line[255] == 255 and (np.diff(line) >= 0).all(), "saturated stays saturated"
         knee = int(255 * KNEE / max(gain, 1))
