@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from statistics import median
 from typing import Any, NamedTuple
 
@@ -19,11 +20,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.overlap import adjacent_pairs, half_way_view, odd_tiles
 from arbiview_aug.cameras.projection import ego_rays, project_rays
-from arbiview_aug.cameras.rays import edge_distance
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import check_ranges
@@ -144,53 +143,47 @@ def find_overlaps(rig: Rig, config: HarmoniseConfig | None = None) -> Overlaps:
     config = config or HarmoniseConfig()
     order = tuple(content_order(rig.cameras))
     rig = rig.with_cameras([rig[k] for k in order])
-    even = ~odd_tiles(_VIEW_SIZE, _TILE_PX)[::_STEP_PX, ::_STEP_PX]
-    held_out = odd_tiles(_VIEW_SIZE, _TILE_PX // 2)[::_STEP_PX, ::_STEP_PX][even]
+    lattice, held_out = _lattice()
     surface = Street(ground_z_m=rig.ground_z_m)
     pairs, shared = [], []
     for pair in adjacent_pairs(rig):
         view = half_way_view(rig[pair[0]], rig[pair[1]], _VIEW_SIZE)
-        rays, valid = ego_rays(view, view.pixel_grid()[::_STEP_PX, ::_STEP_PX][even])
+        rays, valid = ego_rays(view, lattice)
         q = surface.inverse_distance(view.center_m, rays)
-        uv, seen = zip(*(project_halved(rig[k], 0, view.center_m, rays, q) for k in pair), strict=True)
-        both = valid & seen[0] & seen[1]
-        kinds = both & ~held_out, both & held_out
+        both, reads = np.flatnonzero(valid), list[npt.NDArray[np.int64]]()
+        for camera in (rig[k] for k in pair):
+            uv, seen = project_rays(camera, rays[both], q[both], view.center_m - camera.center_m)
+            at = np.where(seen, uv.T[::-1], 0).round().astype(np.int64).T
+            last = np.array(camera.size) - 1
+            seen &= ((at > 0) & (at < last)).all(1)
+            if camera.mask is not None:
+                seen &= camera.mask[tuple(at.clip(0, last).T)]
+            both, reads = both[seen], [one[seen] for one in (*reads, at)]
+        kinds = ~held_out[both], held_out[both]
         if _STEP_PX**2 * min(kind.sum() for kind in kinds) >= config.min_pixels:
             pairs.append(pair)
-            shared.append([[at[kind].round() for kind in kinds] for at in uv])
+            shared.append([[at[kind] for kind in kinds] for at in reads])
     longest = max((len(at) for of_pair in shared for at in of_pair[0]), default=0)
     count = sum(len(at) for of_pair in shared for of_camera in of_pair for at in of_camera)
-    reads, at, runs = np.full((2, 2, len(pairs), longest), count), np.empty((count, 2), np.int64), []
+    numbers, pixels, runs = np.full((2, 2, len(pairs), longest), count), np.empty((count, 2), np.int64), []
     end = 0
     for k in range(len(rig)):
         runs.append((end, end, k))
         for p, side, kind in np.ndindex(len(pairs), 2, 2):
             if pairs[p][side] == k:
-                xy = shared[p][side][kind]
-                first, end = end, end + len(xy)
-                reads[kind, side, p, : len(xy)] = np.arange(first, end)
-                at[first:end] = xy[:, ::-1]
+                first, end = end, end + len(shared[p][side][kind])
+                numbers[kind, side, p, : end - first] = np.arange(first, end)
+                pixels[first:end] = shared[p][side][kind]
         runs[k] = (runs[k][0], end, k)
-    return Overlaps(order, np.array(pairs, np.int64).reshape(-1, 2).T, at, np.array(runs), *reads)
+    return Overlaps(order, np.array(pairs, np.int64).reshape(-1, 2).T, pixels, np.array(runs), *numbers)
 
 
-def project_halved(
-    camera: Camera, level: int, center_m: FloatArray, rays: FloatArray, q: FloatArray
-) -> tuple[FloatArray, BoolArray]:
-    """Project surface points into a camera.
-
-    Args:
-        camera: The camera.
-        level: How many times its image is halved before it is read.
-        center_m: (3,) origin of the rays in the ego frame.
-        rays: (..., 3) directions.
-        q: (...,) inverse distances along them, 1/m.
-
-    Returns:
-        (..., 2) pixels, and (...,) whether they are visible and clear of border and mask: halved pixels mix neighbours.
-    """
-    uv, valid = project_rays(camera, rays, q, center_m - camera.center_m)
-    return uv, valid & (edge_distance(camera, uv) > 1.5 * 2**level)
+@cache
+def _lattice() -> tuple[FloatArray, BoolArray]:
+    """The pixels (n, 2) of a half-way view that are read, and whether each is held out."""
+    y, x = np.mgrid[: _VIEW_SIZE[0] : _STEP_PX, : _VIEW_SIZE[1] : _STEP_PX]
+    even = ~odd_tiles(_VIEW_SIZE, _TILE_PX)[y, x]
+    return np.stack([x, y], -1)[even].astype(np.float64), odd_tiles(_VIEW_SIZE, _TILE_PX // 2)[y, x][even]
 
 
 def estimate_gains(

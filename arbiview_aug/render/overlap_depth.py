@@ -25,10 +25,10 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.overlap import adjacent_pairs, half_way_view, odd_tiles
 from arbiview_aug.cameras.projection import ego_rays, project_rays
+from arbiview_aug.cameras.rays import edge_distance
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.image_ops import at_level, level_size, write_halved
 from arbiview_aug.render.dense_flow import dense_flow, why_ambiguous
-from arbiview_aug.render.harmonise import project_halved
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.corrected import Correction
 from arbiview_aug.scene.static import Street
@@ -182,7 +182,8 @@ def _seen_by_both(
     q = surface.inverse_distance(view.center_m, rays)
     for camera in (rig[a], rig[b]):
         level = source_level(camera, _SOURCE_WIDTH_PX)
-        seen = seen & project_halved(camera, level, view.center_m, rays, q)[1]
+        uv, valid = project_rays(camera, rays, q, view.center_m - camera.center_m)
+        seen = seen & valid & (edge_distance(camera, uv) > 1.5 * 2**level)  # halved pixels mix neighbours
     return rays, q, seen
 
 

@@ -169,7 +169,7 @@ def _own(sample: Sample, views: tuple[int, int]) -> Calls:
     return {
         "street, held, turned": _held(sample, turned),
         "street, held, turned, filled": _held(sample, turned, holes="fill"),
-        "street, held, turned, as recorded": _held(sample, turned, harmonise=False),
+        "street, held, turned, harmonised": _held(sample, turned, harmonise=True),
         "street, two neighbours": _anew(frame | {"neighbours": neighbours}, low, "street"),
         "75 boxes, two neighbours": _anew(with_boxes, low, "objects"),
     }
@@ -180,13 +180,14 @@ def _both_layouts(name: str, sample: Sample, target: Rig) -> Calls:
     return {name: _held(sample, target), f"{name}, contiguous": _held(contiguous, target)}
 
 
-def _held(sample: Sample, target: Rig, holes: Holes = "black", harmonise: Harmonise = None) -> Callable[[], Any]:
+def _held(sample: Sample, target: Rig, holes: Holes = "black", harmonise: Harmonise = False) -> Callable[[], Any]:
     return partial(RigRetarget(target, surface="street", holes=holes, harmonise=harmonise), sample)
 
 
 def _anew(sample: Sample, target: Rig, surface: SurfaceName) -> Callable[[], Any]:
     """Call with the geometry, over the street the rig, always a little elsewhere, so that no plan comes back."""
-    retarget, ways_m = RigRetarget(target, surface=surface, holes="black", cache_bytes=0), count(_STEP_M, _STEP_M)
+    retarget = RigRetarget(target, surface=surface, harmonise=False, holes="black", cache_bytes=0)
+    ways_m = count(_STEP_M, _STEP_M)
     rigs = cycle([sample["rig"].shifted(x_m=k * _STEP_M) for k in range(_STEPS if surface == "street" else 1)])
     return lambda: retarget(lifted({**sample, "rig": next(rigs)}, next(ways_m)))
 
