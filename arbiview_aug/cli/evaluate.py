@@ -142,7 +142,7 @@ def _yaws(text: str) -> str | list[float]:
 # --- frames and targets -----------------------------------------------------------------------------------------------
 def open_frames(arguments: argparse.Namespace, surfaces: Sequence[SurfaceName], *, lidar: bool = True) -> Any:
     """Open ``--data``, or a synthetic drive; with neighbours and learned depth where a surface needs them."""
-    neighbours = WANTED if any("motion" in SURFACES[name].reads for name in surfaces) else None
+    neighbours = WANTED if any(SURFACES[name].needs == "motion" for name in surfaces) else None
     if arguments.data is not None:
         options = {name: getattr(arguments, name) for name in ("reduce", "clean_masks")}
         data = open_data(arguments.data, neighbours=neighbours, **options)

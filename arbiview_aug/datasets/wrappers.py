@@ -10,6 +10,7 @@ from torch.utils.data import Dataset, IterableDataset
 
 from arbiview_aug.errors import DataError, SampleTypeError
 from arbiview_aug.render.plan import compile_kernels
+from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.temporal.motion_depth import compile_matching
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import is_number
@@ -134,6 +135,6 @@ def _checked_retarget(retarget: Any, name: str) -> Retarget:
         raise SampleTypeError(f"{name}: expected a callable such as RigRetarget, got {type(retarget).__name__}")
     if isinstance(retarget, RigRetarget):
         compile_kernels()  # here, once, and not in every worker
-        if retarget.planner.surface == "motion":
+        if SURFACES[retarget.planner.surface].needs == "motion":
             compile_matching()
     return retarget  # type: ignore[no-any-return]

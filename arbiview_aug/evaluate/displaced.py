@@ -88,5 +88,5 @@ def surfaces_for(sample: Mapping[str, Any]) -> list[SurfaceName]:
     """Surfaces that a sample has the geometry for, from the least to the most."""
     found: list[SurfaceName] = ["ground", "street"]
     found += ["objects"] if sample.get("boxes_3d") is not None else []
-    found += ["lidar"] if sample.get("points") is not None else []
-    return found + (["motion"] if sample.get("neighbours") else [])
+    measured: list[SurfaceName] = ["lidar"] if sample.get("points") is not None else []
+    return found + measured + ((["motion", "fused"] if measured else ["motion"]) if sample.get("neighbours") else [])

@@ -97,7 +97,8 @@ def read_scenes(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[
         arrays = _geometry(name, sample, frames, lead)
         if arrays is not None:
             found[name] = arrays
-        elif name == row.needs and name != "motion":  # neighbouring frames may still give depth from motion
+        elif name == row.needs and name != "motion" and (name != "points" or sample.get("depth_m") is None):
+            # Neighbouring frames may still give depth from motion.
             expected, keys = _EXPECTED.get(name, f"{name!r} in the sample, got none"), _SAMPLE_KEYS.get(name, (name,))
             raise SampleError(f"surface={surface!r}: expected {expected}{hint(sample, keys)}")
     if not found:
@@ -113,7 +114,8 @@ def read_scenes(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[
 def scenes_on_device(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...], surface: str) -> Any:
     """As ``read_scenes``, of boxes and points that lie on the images' device: neither copied nor checked; else None."""
     row, device, scenes = SURFACES[surface], frames[0].images[0].device, [Scene() for _ in frames]
-    if sample.get("depth_m") is not None and "points" in row.reads:
+    keys = {key for name in row.reads for key in _SAMPLE_KEYS.get(name, (name,))}
+    if any(sample.get(key) is not None for key in keys.intersection(_MAP_KEYS)):
         return None
     for name, key, width in (("boxes", "boxes_3d", 7), ("points", "points", 3)):
         value = sample.get(key)
@@ -128,7 +130,8 @@ def scenes_on_device(sample: Mapping[str, Any], frames: Sequence[Frame], lead: t
     return None if row.needs is not None and scenes[0].geometry(row.needs) is None else scenes
 
 
-_SAMPLE_KEYS = {"boxes": ("boxes_3d",), "points": ("points", "depth_m"), "motion": (MOTION_KEY,)}
+_MAP_KEYS = ("depth_m", MOTION_KEY, LEARNED_KEY)
+_SAMPLE_KEYS = {"boxes": ("boxes_3d",), "points": ("points",), "motion": (MOTION_KEY,)}
 """Sample keys of the geometry that has a field in ``Scene``; others are read under their own name."""
 
 _EXPECTED = {
@@ -149,7 +152,7 @@ def _geometry(
         value = sample.get(key)
         if value is None:
             continue
-        if key in ("depth_m", MOTION_KEY, LEARNED_KEY):
+        if key in _MAP_KEYS:
             parts.append(_points_of_maps(key, value, frames, lead))
             continue
         arrays = of_frames(key, value, len(frames), lead)

@@ -90,12 +90,13 @@ def nearest_points(points: Any, origin: Any, bounds: Any, place: Any, q: Any, nu
 
 
 @compiled
-def drop_hidden(q: Any, number: Any, points: Any, origin: Any, away: int, side: int) -> tuple[Any, Any]:
+def drop_hidden(q: Any, number: Any, points: Any, origin: Any, away: int, side: int, sparse: int) -> tuple[Any, Any]:
     """Drop points that shine through gaps of what is nearer on both sides of them.
 
     ``q`` and ``number`` are those of ``nearest_points``, ``away`` and ``side`` are ``SEE_THROUGH_RAD`` and ``SIDE_RAD``
-    in cells. Returns the flat indices (n,) of cells that keep their point,
-    and its ray (3, 1, n) in the ego frame, float32.
+    in cells. Points from number ``sparse`` on are of depth maps, which show gaps as they are: only cells next to them
+    count. Returns the flat indices (n,) of cells that keep their point, and its ray (3, 1, n) in the ego frame,
+    float32.
     """
     h, w = q.shape
     most, more = q.copy(), away - 1 - 2 * side  # windows are longer than wide
@@ -106,7 +107,12 @@ def drop_hidden(q: Any, number: Any, points: Any, origin: Any, away: int, side: 
         for x in range(w):
             if q[y, x] <= _ZERO:
                 continue
-            if inside and away <= x < w - away:
+            if number[y, x] >= sparse:
+                if 0 < y < h - 1 and 0 < x < w - 1:
+                    across, above = min(q[y, x - 1], q[y, x + 1]), min(q[y - 1, x], q[y + 1, x])
+                    if q[y, x] < _hidden_below(max(across, above)):
+                        continue
+            elif inside and away <= x < w - away:
                 row, left, right = most[y - side], x - away, x + 1
                 across = min(max(row[left], row[left + more]), max(row[right], row[right + more]))
                 column, up, down = x - side, y - away, y + 1

@@ -80,6 +80,9 @@ class Cells(NamedTuple):
 
 
 FINE, COARSE = Cells.of(CELL_RAD), Cells.of(2 * CELL_RAD)
+MAPPED = FINE._replace(smooth=1)
+"""Cells where there are depth maps: their outlines are seen, not guessed between scan lines, and rounding them costs
+1 dB on the synthetic street."""
 
 
 class Window(NamedTuple):
@@ -164,7 +167,13 @@ class Panorama:
     """
 
     def __init__(
-        self, window: Window, origin: FloatArray, points: Points, street: StaticSurface, memory: Memory = FRESH
+        self,
+        window: Window,
+        origin: FloatArray,
+        points: Points,
+        street: StaticSurface,
+        memory: Memory = FRESH,
+        mapped: int = 0,
     ) -> None:
         from arbiview_aug.scene.completion import complete, drop_hidden, nearest_points
 
@@ -172,7 +181,7 @@ class Panorama:
         shape, cells = window.shape, window.cells
         q, number = np.zeros(shape, np.float32), np.empty(shape, np.int32)
         nearest_points(points, origin, window.bounds, self._place, q, number)
-        found, rays = drop_hidden(q, number, points, origin, cells.see_through, cells.side)
+        found, rays = drop_hidden(q, number, points, origin, cells.see_through, cells.side, len(points) - mapped)
         own = q.reshape(-1)[found]
         residual = own - street.along(origin, rays)[0]
         # Windows differ by some rows from frame to frame: blocks of few sizes are found again.
@@ -212,24 +221,28 @@ class PointCloudSurface(DenseSurface):
     Attributes:
         street: What there is where nothing was measured.
         points: (P, 3) in the ego frame, finite, metres.
+        mapped: So many of the last points are of depth maps.
     """
 
     street: StaticSurface
     points: Points
+    mapped: int = 0
     _panoramas: dict[bytes, tuple[tuple[float, float], list[Panorama]]] = field(default_factory=dict, repr=False)
     _shadows: dict[Camera, OcclusionMap] = field(default_factory=dict, repr=False)
     _latest: dict[bytes, Panorama] = field(default_factory=dict, repr=False)
     _nodes: dict[tuple[Camera, Cells], tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "points", self.points[~own_car(self.points)])
+        kept = ~own_car(self.points)
+        object.__setattr__(self, "mapped", int(np.count_nonzero(kept[len(kept) - self.mapped :])))
+        object.__setattr__(self, "points", self.points[kept])
 
     def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> Layer:
         """The points' dense surface at all pixels, 1/m (h, w)."""
         from arbiview_aug.scene.completion import add_residuals
 
         q = self.street.image(camera, rays, memory)
-        view, *cells = self._located(camera, rays, Cells.for_camera(camera), memory)
+        view, *cells = self._located(camera, rays, MAPPED if self.mapped else Cells.for_camera(camera), memory)
         add_residuals(*cells, view.layers, q)
         return q
 
@@ -249,7 +262,7 @@ class PointCloudSurface(DenseSurface):
         """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart."""
         from arbiview_aug.scene.completion import interpolate_layer
 
-        cells = COARSE if coarse else Cells.for_camera(camera)
+        cells = MAPPED if self.mapped else COARSE if coarse else Cells.for_camera(camera)
         view, *nodes = self._located(camera, rays, cells, memory)
         hidden = memory.empty(camera.size, np.float32)
         interpolate_layer(*nodes, view.hidden_below, cells.apart(camera), hidden)
@@ -301,7 +314,8 @@ class PointCloudSurface(DenseSurface):
         suitable = (p for p in held if cells in (None, p.window.cells) and p.window.holds(around(p.window.cells)))
         found = next(suitable, None)
         if found is None:
-            found = Panorama(around(cells or FINE).roomy, origin, self.points, self.street, memory)
+            cells = cells or (MAPPED if self.mapped else FINE)
+            found = Panorama(around(cells).roomy, origin, self.points, self.street, memory, self.mapped)
             held.append(found)
         return found
 
@@ -333,10 +347,11 @@ class PointCloudWithBoxes(BoxSurface):
     street: PointCloudSurface
 
     @classmethod
-    def among(cls, street: StaticSurface, points: Points, boxes: FloatArray) -> PointCloudWithBoxes:
-        """Boxes (B, 7) among points (P, 3)."""
+    def among(cls, street: StaticSurface, points: Points, boxes: FloatArray, mapped: int = 0) -> PointCloudWithBoxes:
+        """Boxes (B, 7) among points (P, 3), of which the last ``mapped`` are of depth maps."""
         planes, is_own = solids_among(boxes, points)
-        return cls(PointCloudSurface(street, points[~is_own]), boxes, planes)
+        others = PointCloudSurface(street, points[~is_own], int(np.count_nonzero(~is_own[len(points) - mapped :])))
+        return cls(others, boxes, planes)
 
     def _hidden(self, camera: Camera, rays: PixelRays, memory: Memory, *, coarse: bool) -> Layer:
         return self.street.hidden(camera, rays, memory, coarse=coarse)

@@ -41,6 +41,8 @@ class Scene:
 
     def geometry(self, name: str) -> Points | None:
         """The array of a name in ``SurfaceRow.reads``; None if there is none."""
+        if name == "points" and self.points is None:
+            return self.further.get("depth_m")
         return getattr(self, name) if name in ("boxes", "points", "motion") else self.further.get(name)
 
     @cached_property
@@ -49,12 +51,25 @@ class Scene:
         arrays = self.boxes, self.points, self.motion
         return all(array is None for array in arrays) and not self.further and not self.corrections
 
+    @property
+    def words(self) -> str:
+        """How much of which geometry there is; empty without any."""
+        arrays = {"boxes": self.boxes, "points": self.points, "points of depth from motion": self.motion}
+        arrays |= {f"points of {key}": array for key, array in self.further.items() if array.ndim == 2}
+        return ", ".join(f"{len(array)} {name}" for name, array in arrays.items() if array is not None and len(array))
+
+    @property
+    def has_maps(self) -> bool:
+        """Whether any of the geometry comes from depth maps."""
+        return self.motion is not None or "depth_m" in self.further
+
     @cached_property
     def best(self) -> SurfaceName:
         """The surface that ``auto`` uses: made of the most accurate geometry."""
-        if self.points is not None and len(self.points):
-            return "lidar"
-        return "street" if self.boxes is None else "objects"
+        motion = self.motion is not None and len(self.motion) > 0
+        if any(array is not None and len(array) for array in (self.points, self.further.get("depth_m"))):
+            return "fused" if motion else "lidar"
+        return "motion" if motion else "street" if self.boxes is None else "objects"
 
     @property
     def key(self) -> bytes:
@@ -115,28 +130,44 @@ def _boxes(scene: Scene, ground_z_m: float) -> Surface:
     return BoxSurface(_street(scene, ground_z_m), scene.boxes, solids(scene.boxes))
 
 
-def _point_cloud(points: Points | None, scene: Scene, ground_z_m: float) -> Surface:
-    assert points is not None
+def _point_cloud(scene: Scene, ground_z_m: float, points: Points | None, *maps: Points | None) -> Surface:
+    """Points, and those of depth maps, with the scene's boxes."""
     boxes = scene.boxes if scene.boxes is not None and len(scene.boxes) else None
-    if len(points) == 0:
-        return scene.surface("street" if boxes is None else "objects", ground_z_m)
+    parts = [np.zeros((0, 3), np.float32) if part is None else part for part in (points, *maps)]
     # One type and layout: kernels are compiled for each.
-    street, points = _street(scene, ground_z_m), np.ascontiguousarray(points, np.float32)
-    return PointCloudSurface(street, points) if boxes is None else PointCloudWithBoxes.among(street, points, boxes)
+    street, together = _street(scene, ground_z_m), np.ascontiguousarray(np.concatenate(parts), np.float32)
+    if len(together) == 0:
+        return scene.surface("street" if boxes is None else "objects", ground_z_m)
+    mapped = len(together) - len(parts[0])
+    if boxes is None:
+        return PointCloudSurface(street, together, mapped)
+    return PointCloudWithBoxes.among(street, together, boxes, mapped)
 
 
 SURFACES: dict[str, SurfaceRow] = {
-    "auto": SurfaceRow(lambda scene, z_m: scene.surface(scene.best, z_m), ("boxes", "points"), overlap_depth=True),
+    "auto": SurfaceRow(
+        lambda scene, z_m: scene.surface(scene.best, z_m), ("boxes", "points", "depth_m", "motion"), overlap_depth=True
+    ),
     "far": SurfaceRow(lambda scene, z_m: Far(), on_device=True, has_wall=False),
     "ground": SurfaceRow(lambda scene, z_m: Ground(ground_z_m=z_m), on_device=True),
     "street": SurfaceRow(_street, overlap_depth=True, on_device=True),
     "objects": SurfaceRow(_boxes, ("boxes",), "boxes", overlap_depth=True, on_device=True),
     "lidar": SurfaceRow(
-        lambda scene, z_m: _point_cloud(scene.points, scene, z_m), ("boxes", "points"), "points", on_device=True
+        lambda scene, z_m: _point_cloud(scene, z_m, scene.points, scene.further.get("depth_m")),
+        ("boxes", "points", "depth_m"),
+        "points",
+        on_device=True,
     ),
-    "motion": SurfaceRow(lambda scene, z_m: _point_cloud(scene.motion, scene, z_m), ("boxes", "motion"), "motion"),
+    "motion": SurfaceRow(
+        lambda scene, z_m: _point_cloud(scene, z_m, None, scene.motion), ("boxes", "motion"), "motion"
+    ),
+    "fused": SurfaceRow(
+        lambda scene, z_m: _point_cloud(scene, z_m, scene.points, scene.further.get("depth_m"), scene.motion),
+        ("boxes", "points", "depth_m", "motion"),
+        "motion",
+    ),
     "learned": SurfaceRow(
-        lambda scene, z_m: _point_cloud(scene.further["learned_depth_m"], scene, z_m),
+        lambda scene, z_m: _point_cloud(scene, z_m, None, scene.further["learned_depth_m"]),
         ("boxes", "learned_depth_m"),
         "learned_depth_m",
     ),

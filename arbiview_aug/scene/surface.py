@@ -17,7 +17,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rays import PixelRays
 from arbiview_aug.image_ops import FRESH, Memory
 
-SurfaceName = Literal["auto", "far", "ground", "street", "objects", "lidar", "motion", "learned"]
+SurfaceName = Literal["auto", "far", "ground", "street", "objects", "lidar", "motion", "fused", "learned"]
 """Names in ``scene.SURFACES``. ``auto`` decides per pair of target and source camera."""
 
 Points = npt.NDArray[np.float32] | npt.NDArray[np.float64]

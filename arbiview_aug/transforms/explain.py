@@ -32,6 +32,7 @@ class Explanation:
     learned: str | None = None  # the model of learned depth and how it was fitted, if the surface is made of it
     fills: Fills | None = None  # how other frames of the drive fill holes, if there are any
     harm: str | None = None  # why a detector suffers, if cameras move over a static surface
+    geometry: str = ""  # what surfaces are made of: ``Scene.words``
 
     def as_dict(self) -> list[dict[str, Any]]:
         """One entry for each target camera: coverage, share to invent, and its sources with surface and reason.
@@ -66,6 +67,8 @@ class Explanation:
             lines += [self.harm, f"better: {harm_remedies(self.plan.source, self.plan.target)}"]
         if self.depth is not None:
             lines += str(self.depth).splitlines()
+        if self.geometry:
+            lines.append(f"geometry: {self.geometry}; the street elsewhere")
         if self.motion is not None:
             lines.append(str(self.motion))
         if self.learned is not None:

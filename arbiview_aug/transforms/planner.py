@@ -49,6 +49,7 @@ class FramePlan:
     fills: Fills | None = None  # holes that neighbouring frames fill
     curves: npt.NDArray[np.float64] | None = None  # (M, N, 2) of the views for each source, if they are harmonised
     harm: str | None = None  # why a detector suffers, if cameras move over a static surface
+    geometry: str = ""  # ``Scene.words``, if it is to be explained
 
 
 class _RigPair:
@@ -153,14 +154,15 @@ class FramePlanner:
             scenes = (on_device and scenes_on_device(sample, frames, lead, self.surface)) or ()
             if not all(SURFACES[self._surface(scene)].on_device for scene in scenes) or not scenes:
                 scenes = read_scenes(sample, frames, lead, self.surface)
+                on_device &= not any(scene.has_maps for scene in scenes)
         scenes = scenes or [pair.road for pair in pairs]
         names = self._names(sample, len(frames), lead)
-        uses_motion = "motion" in SURFACES[self.surface].reads
+        uses_motion = SURFACES[self.surface].needs == "motion"
         estimates_motion = uses_motion and is_needed and sample.get(MOTION_KEY) is None
         if estimates_motion and given is None:
             raise SampleError(
-                f"surface='motion': expected 'neighbours' in the sample, or {MOTION_KEY!r} from the depth command, got "
-                "neither"
+                f"surface={self.surface!r}: expected 'neighbours' in the sample, or {MOTION_KEY!r} from the depth "
+                "command, got neither"
             )
         neighbouring: list[list[Neighbour]] = [[] for _ in frames]
         if given is not None and (estimates_motion or self.reach is not None):
@@ -186,7 +188,8 @@ class FramePlanner:
             views = [view.pairs + view.bands for view in plan.targets] or [maps.slots for maps in on_device]
             curves = self.harmoniser.curves(frame.rig, frame.images, views) if self.harmoniser.is_on else None
             harm = pair.harm if SURFACES[surface].is_static else None
-            plans.append(FramePlan(frame.rig, pair.target, plan, {}, depth, motion, fills, curves, harm))
+            extras = depth, motion, fills, curves, harm, scene.words if explained else ""
+            plans.append(FramePlan(frame.rig, pair.target, plan, {}, *extras))
         return plans
 
     def render_plan(self, source: Rig, target: Rig, scene: Scene | None = None) -> RenderPlan:

@@ -124,14 +124,14 @@ def test_the_next_frame_as_truth(ddad_root: Path) -> None:
     cameras = [camera.moved(ego2ego) for camera in ahead["rig"]]
     target = Rig(cameras, ground_z_m=now["rig"].ground_z_m).resized(0.5)
     outs = {}
-    for surface in ("motion", "lidar", "street"):
+    for surface in ("motion", "lidar", "fused", "street"):
         sample = now | {"neighbours": [ahead]}
         outs[surface] = RigRetarget(target, surface=surface, neighbours=None, holes="black")(sample)
     then = [
         cv2.resize(image.numpy().transpose(1, 2, 0), camera.size[::-1], interpolation=cv2.INTER_AREA).astype(float)
         for camera, image in zip(target, ahead["images"], strict=True)
     ]
-    found = {}
+    found, cover = {}, {surface: float(out["coverage"].float().mean()) for surface, out in outs.items()}
     for surface, out in outs.items():
         rows = []
         for k, (camera, true) in enumerate(zip(target, then, strict=True)):
@@ -140,5 +140,6 @@ def test_the_next_frame_as_truth(ddad_root: Path) -> None:
             error = out["images"][k].numpy().transpose(1, 2, 0)[use] - true[use]
             rows.append(10 * np.log10(255**2 / np.mean(error**2)))
         found[surface] = float(np.mean(rows))
-    print(f"\nthe next frame as truth, dB: {found}")
+    print(f"\nthe next frame as truth, dB: {found}; covered: {cover}")
     assert found["motion"] >= found["street"] + 1.5
+    assert found["fused"] >= max(19.5, found["lidar"], found["motion"]) and cover["fused"] >= 0.97 * cover["street"]

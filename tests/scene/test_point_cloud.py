@@ -93,6 +93,28 @@ def test_what_shines_through_gaps_is_dropped() -> None:
     assert np.allclose(got, q, rtol=0.04)
 
 
+def test_depth_maps_show_gaps_as_they_are() -> None:
+    """A far wall through a gap of 1.1 degrees: of scan lines it might shine through, of depth maps it is seen."""
+    posts = np.concatenate([wall(12.0, (-2, -0.1), (0, 2)), wall(12.0, (0.1, 2), (0, 2))])
+    gap, q = towards(np.array([[32.0, 0.0, z] for z in (0.5, 1.5)]))
+    points = np.concatenate([posts, FAR])
+    lines, maps = (PointCloudSurface(Street(), points, mapped) for mapped in (0, len(points)))
+    assert np.allclose(inverse_distance(lines, EYE, gap), 3 * q, rtol=0.02)
+    assert np.allclose(inverse_distance(maps, EYE, gap), q, rtol=0.02)
+    # Points before those of maps are scan lines, and stay so where the own car's are left out.
+    bonnet = np.array([[3.0, y, 1.0] for y in np.arange(-0.8, 0.8, 0.05)])
+    mixed = PointCloudSurface(Street(), np.concatenate([bonnet, FAR, bonnet, posts]), len(bonnet) + len(posts))
+    assert mixed.mapped == len(posts)
+    assert np.allclose(inverse_distance(mixed, EYE, gap), 3 * q, rtol=0.02)
+
+
+def test_maps_among_boxes_are_counted_without_those_of_objects() -> None:
+    box = np.array([[13.0, 0.0, 1.0, 2.0, 3.0, 2.0, 0.0]])  # its back is x = 12, y within 1.5
+    own = wall(12.0, (-1.4, 1.4), (0.4, 1.8))
+    surface = PointCloudWithBoxes.among(Street(), np.concatenate([FAR, own, NEAR + 5]), box, len(own) + len(NEAR))
+    assert len(surface.street.points) == len(FAR) + len(NEAR) and surface.street.mapped == len(NEAR)
+
+
 def test_silence_is_the_street() -> None:
     surface, street = PointCloudSurface(Street(), NEAR), Street()
     beyond = 2 / 10 + np.tan(REACH_RAD) + 0.1

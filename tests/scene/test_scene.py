@@ -20,6 +20,38 @@ def test_names_of_the_type_are_those_of_the_table() -> None:
     assert get_args(SurfaceName) == tuple(SURFACES)
 
 
+def test_auto_takes_all_that_was_measured() -> None:
+    boxes, some, none = np.zeros((0, 7)), np.ones((1, 3)), np.zeros((0, 3))
+    maps = {"depth_m": some}
+    assert Scene(points=some, motion=some).best == Scene(motion=some, further=maps).best == "fused"
+    assert Scene(points=some, motion=none).best == Scene(boxes, further=maps).best == "lidar"
+    assert Scene(boxes, none, some).best == Scene(motion=some).best == "motion"
+    assert Scene(boxes, none, none).best == "objects" and Scene(motion=none).best == "street"
+
+
+@pytest.mark.parametrize("surface", ["auto", "fused", "lidar", "motion"])
+def test_points_and_depth_from_motion_are_fused(surface: SurfaceName) -> None:
+    """A near wall that only LiDAR saw, left, and one that only motion saw, right."""
+    camera = Camera.looking(name="front", azimuth_deg=0, width_px=96, height_px=64, horizontal_fov_deg=80)
+    target = Rig([camera.shifted(z_m=0.5)])
+    y, z = (grid.ravel() for grid in np.meshgrid(np.linspace(0.5, 4, 120), np.linspace(0.5, 2.5, 60)))
+    depth = torch.zeros(1, 64, 96)
+    depth[:, 24:40, 52:90] = 8.0
+    points = torch.from_numpy(np.stack([np.full_like(y, 8.0), y, z], -1))
+    sample = {"images": torch.rand(1, 3, 64, 96), "rig": Rig([camera]), "points": points, "motion_depth_m": depth}
+    explained = RigRetarget(target, surface=surface).explain(sample)
+    (plan,) = explained.plan.targets
+    away_px = np.arange(64)[:, None] - plan.at.to_float()[..., 1]
+    near_px = 0.5 / 8 * camera.K[1, 1]
+    measured = [abs(away_px[30, x] - near_px) < 0.5 for x in (32, 70)]
+    assert measured == [surface != "motion", surface != "lidar"]
+    assert f"geometry: {len(points)} points" in str(explained) or surface == "motion"
+    assert "points of depth from motion; the street elsewhere" in str(explained) or surface == "lidar"
+    lacking = {key: value for key, value in sample.items() if key != "motion_depth_m"}
+    with pytest.raises(SampleError, match="surface='fused': expected 'neighbours' in the sample, or 'motion_depth_m'"):
+        RigRetarget(target, surface="fused")(lacking)
+
+
 @dataclass(frozen=True)
 class Ramp(StaticSurface):
     """A toy surface: a road that rises ahead, with nothing on it or above it."""

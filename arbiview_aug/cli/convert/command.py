@@ -52,7 +52,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.shard_index >= arguments.num_shards:
         parser.error(f"argument --shard-index: expected less than {arguments.num_shards}, got {arguments.shard_index}")
     if arguments.motion_depth is not None and not FOLDERS.keys() & SURFACES[arguments.surface].reads:
-        parser.error(f"argument --depth: expected it with --surface motion or learned, got {arguments.surface}")
+        fitting = "auto, motion, fused or learned"
+        parser.error(f"argument --depth: expected it with --surface {fitting}, got {arguments.surface}")
     settings = _settings(arguments)
     check_output(settings)
     jobs, facts = _begin(settings, settings.open(), arguments)
