@@ -48,7 +48,7 @@ from arbiview_aug.evaluate.report.sheet import frame_sheet
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
 from arbiview_aug.evaluate.run import Evaluation, evaluate
 from arbiview_aug.evaluate.targets import named_targets, without_masks
-from arbiview_aug.generator import Generator
+from arbiview_aug.generator import Generator, load_generator
 from arbiview_aug.sample.inputs import LEARNED_KEY
 from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.surface import SurfaceName
@@ -103,7 +103,7 @@ def _parser() -> argparse.ArgumentParser:
         "degrees such as --yaws=-11,11",
     )
     add_rendering(parser, several=True)
-    parser.add_argument("--generator", metavar="DIR", help="generator of --path diffusion (default: the package's own)")
+    parser.add_argument("--generator", metavar="PATH", help="of --path diffusion, as in convert (default: the own)")
     parser.add_argument("--steps", nargs="+", type=count, default=[4], metavar="N", help="steps of the generator")
     add_frames(parser, None, "number of frames (default: 1; --paper: 3 synthetic ones; --displaced: all)")
     add_reduce(parser)
@@ -187,7 +187,7 @@ def _methods(arguments: argparse.Namespace, **settings: Any) -> list[Method]:
     generator = None
     if "diffusion" in arguments.path:
         folder = arguments.generator
-        generator = Generator.shipped() if folder is None else Generator.from_pretrained(folder)
+        generator = Generator.shipped() if folder is None else load_generator(folder)
     methods = []
     for quality, surface, path in product(arguments.quality, arguments.surface, arguments.path):
         outputs = () if quality == "paper" else ("confidence",)

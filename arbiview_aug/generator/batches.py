@@ -10,8 +10,9 @@ from typing import Any
 import torch
 
 from arbiview_aug.errors import SampleError
-from arbiview_aug.generator.completion import complete
+from arbiview_aug.generator.completion import Maps, check_device, complete, known_and_holes, seeded
 from arbiview_aug.generator.networks import GeneratorNetworks
+from arbiview_aug.generator.pretrained import HoleFiller
 from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
 from arbiview_aug.sample.batching import gathered, leading_shape, rewrapped, split, stacked
 from arbiview_aug.sample.inputs import Frame, names_of_frames, read_frames
@@ -23,23 +24,33 @@ SOURCES_KEY = "sources"  # holds the source sample of a retargeted one, for comp
 class Completion:
     """Settings of completion, as in ``completion.complete``; without a generator, holes are inpainted."""
 
-    generator: GeneratorNetworks | None = None
+    generator: GeneratorNetworks | HoleFiller | None = None
     steps: int | None = None
     guidance: float | None = None
     min_confidence: float = 0.0
     seed: int = 0
 
 
-def complete_frame(rendered: RenderedFrame, frame: Frame, name: str, how: Completion) -> RenderedFrame:
-    """Fill the pixels of a rendered ``frame`` that no camera saw, or saw with too little confidence.
+def complete_frames(
+    rendered: Sequence[RenderedFrame], frames: Sequence[Frame], names: Sequence[str], how: Completion
+) -> list[RenderedFrame]:
+    """Fill the pixels of rendered ``frames`` that no camera saw, or saw with too little confidence.
 
     Filled pixels are no longer covered: ``coverage`` False, ``confidence`` 0, ``source_camera`` and ``source_frame``
-    -1. Gradients of the others stay. ``name`` decides the noise.
+    -1. Gradients of the others stay. ``names`` decide the noise. A pretrained network sees all frames together.
     """
+    if isinstance(how.generator, HoleFiller):
+        return _filled(how.generator, rendered, names, how)
+    return [_completed(how.generator, *one, how) for one in zip(rendered, frames, names, strict=True)]
+
+
+def _completed(
+    generator: GeneratorNetworks | None, rendered: RenderedFrame, frame: Frame, name: str, how: Completion
+) -> RenderedFrame:
     # Noise by camera number: cameras have no names in a batch.
     cameras = [replace(camera, name=str(k)) for k, camera in enumerate(rendered.rig)]
     done = complete(
-        how.generator,
+        generator,
         rendered.images,
         rendered.coverage,
         rendered.rig.with_cameras(cameras),
@@ -52,14 +63,32 @@ def complete_frame(rendered: RenderedFrame, frame: Frame, name: str, how: Comple
         seed=how.seed,
         frame=name,
     )
-    holes = list(done.generated)
+    return _put(rendered, done.images, list(done.generated))
 
+
+def _filled(
+    filler: HoleFiller, rendered: Sequence[RenderedFrame], names: Sequence[str], how: Completion
+) -> list[RenderedFrame]:
+    check_device(filler)
+    holes, seeds = [], []
+    for frame, name in zip(rendered, names, strict=True):
+        trust = frame.coverage if frame.confidence is None else frame.confidence
+        holes.append(known_and_holes(frame.rig, frame.coverage, trust, how.min_confidence)[1])
+        seeds += [seeded(how.seed, name, str(k)).initial_seed() for k in range(len(frame.rig))]
+    views = [view for frame in rendered for view in frame.images]
+    done = iter(filler.fill(views, [hole for of_frame in holes for hole in of_frame], seeds, how.steps, how.guidance))
+    return [
+        _put(frame, [next(done) for _ in of_frame], of_frame) for frame, of_frame in zip(rendered, holes, strict=True)
+    ]
+
+
+def _put(rendered: RenderedFrame, images: Maps, holes: Sequence[torch.Tensor]) -> RenderedFrame:
     def without_holes(maps: Sequence[torch.Tensor], empty: int) -> torch.Tensor | list[torch.Tensor]:
         return stacked([m.masked_fill(hole, empty) for m, hole in zip(maps, holes, strict=True)])
 
-    pixels = zip(holes, done.images, rendered.images, strict=True)
-    images = [torch.where(hole, filled, view) for hole, filled, view in pixels]
-    return replace(rendered.with_maps(without_holes), images=images, generated=stacked(holes))
+    pixels = zip(holes, images, rendered.images, strict=True)
+    views = [torch.where(hole, filled, view) for hole, filled, view in pixels]
+    return replace(rendered.with_maps(without_holes), images=views, generated=stacked(list(holes)))
 
 
 def frame_names(
@@ -82,7 +111,7 @@ def _digest(images: Sequence[torch.Tensor]) -> str:
 
 @torch.no_grad()
 def complete_batch(
-    generator: GeneratorNetworks | None,
+    generator: GeneratorNetworks | HoleFiller | None,
     batch: Mapping[str, Any],
     *,
     steps: int | None = None,
@@ -106,7 +135,8 @@ def complete_batch(
         GeneratorError: Impossible settings.
     """
     how = Completion(generator=generator, steps=steps, guidance=guidance, min_confidence=min_confidence, seed=seed)
-    missing = [key for key in (SOURCES_KEY, "coverage", "confidence") if batch.get(key) is None]
+    needs = ("coverage", "confidence") if min_confidence or isinstance(generator, GeneratorNetworks) else ("coverage",)
+    missing = [key for key in (SOURCES_KEY, *needs) if batch.get(key) is None]
     if missing:
         raise SampleError(
             f"complete: expected {', '.join(missing)} in the batch: retarget with outputs=('sources', 'confidence')"
@@ -118,13 +148,14 @@ def complete_batch(
         raise SampleError(f"complete: expected sources of {len(views)} frames, got {len(sources)}")
     maps = {key: split(batch[key], lead) for key in MAP_KEYS if key in batch}
     filled = maps.pop("generated", None) is not None  # by ``holes`` of the transform
-    names, done = frame_names(batch, sources, lead, how), []
-    for b, (view, source) in enumerate(zip(views, sources, strict=True)):
+    rendered = []
+    for b, view in enumerate(views):
         images = list(view.images)
         if filled:
             images = [torch.where(seen, image, 0) for seen, image in zip(maps["coverage"][b], images, strict=True)]
         seen = {key: frames[b] for key, frames in maps.items()}
-        done.append(complete_frame(RenderedFrame(images, view.rig, **seen), source, names[b], how))
+        rendered.append(RenderedFrame(images, view.rig, **seen))
+    done = complete_frames(rendered, sources, frame_names(batch, sources, lead, how), how)
     out = {key: value for key, value in batch.items() if key != SOURCES_KEY}
     for key in (*maps, "generated"):
         out[key] = gathered([getattr(frame, key) for frame in done], lead)
@@ -140,7 +171,7 @@ class CompletedLoader:
     """
 
     def __init__(
-        self, loader: Iterable[Mapping[str, Any]], generator: GeneratorNetworks | None, **settings: Any
+        self, loader: Iterable[Mapping[str, Any]], generator: GeneratorNetworks | HoleFiller | None, **settings: Any
     ) -> None:
         self.loader, self.generator, self.settings = loader, generator, settings
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch.nn import functional
@@ -108,11 +108,7 @@ def complete(
     _check_sizes(views, coverage, targets)
     images = list(views)
     trust = coverage if confidence is None else confidence
-    known = [seen & (c >= min_confidence) for seen, c in zip(coverage, trust, strict=True)]
-    holes = [
-        ~k if camera.mask is None else ~k & torch.tensor(camera.mask, device=k.device)
-        for k, camera in zip(known, targets, strict=True)
-    ]
+    known, holes = known_and_holes(targets, coverage, trust, min_confidence)
     todo = []
     for m, hole in enumerate(holes):
         if generator is not None and float(hole.float().mean()) > 1 - ALMOST_COMPLETE:
@@ -146,12 +142,29 @@ def _settings(generator: GeneratorNetworks, steps: int | None, guidance: float |
             f"complete: expected steps >= 2, got 1: the one-step regression of generator {config.name!r} was not "
             "trained (loss.regression=0)"
         )
+    check_device(generator)
+    return config
+
+
+def check_device(generator: Any) -> None:
+    """Raise GeneratorError for a generator on a GPU in a DataLoader worker."""
     if generator.device.type == "cuda" and torch.utils.data.get_worker_info() is not None:
         raise GeneratorError(
             "a generator on a GPU cannot run in DataLoader workers: use num_workers=0, keep the generator on the "
             "CPU, or complete batches after they are collated"
         )
-    return config
+
+
+def known_and_holes(
+    targets: Rig, coverage: Maps, confidence: Maps, min_confidence: float
+) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """Pixels (h, w) of each view that are seen with enough confidence, and the others that are not the own car."""
+    known = [seen & (c >= min_confidence) for seen, c in zip(coverage, confidence, strict=True)]
+    masks = [camera.mask for camera in targets]
+    holes = [
+        ~k if mask is None else ~k & torch.tensor(mask, device=k.device) for k, mask in zip(known, masks, strict=True)
+    ]
+    return known, holes
 
 
 def denoised(

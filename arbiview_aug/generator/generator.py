@@ -18,6 +18,7 @@ from arbiview_aug.generator.conditioning import input_channels
 from arbiview_aug.generator.config import GeneratorConfig, from_plain, paper
 from arbiview_aug.generator.denoiser import Denoiser
 from arbiview_aug.generator.networks import GeneratorNetworks
+from arbiview_aug.generator.pretrained import HoleFiller, PipelineFiller, TorchScriptFiller
 from arbiview_aug.generator.sampler import noise_schedule
 from arbiview_aug.generator.stable_diffusion import PLAIN_UNET, load_part
 from arbiview_aug.generator.stable_diffusion import empty_prompt as embedded_empty_prompt
@@ -143,3 +144,17 @@ class Generator(GeneratorNetworks):
     # --- use ----------------------------------------------------------------------------------------------------------
     complete_views = complete
     complete_batch = complete_batch
+
+
+def load_generator(where: str | Path) -> Generator | HoleFiller:
+    """Load what completes views: a generator's folder, a TorchScript file, or an inpainting pipeline of diffusers.
+
+    Raises:
+        GeneratorError: None of these.
+    """
+    path = Path(where)
+    if path.is_file():
+        return TorchScriptFiller(path)
+    if (path / "model_index.json").is_file() or not path.exists():
+        return PipelineFiller.from_pretrained(where)
+    return Generator.from_pretrained(path)

@@ -43,6 +43,8 @@ def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             batch |= _rigs(values)
         elif key in STACKED or are_maps(values, first["images"]):
             batch[key] = _stacked(key, values)
+        elif isinstance(values[0], Mapping) and "images" in values[0]:  # the ``sources`` of a view
+            batch[key] = collate(values)
         elif key == "lens":  # a name for each camera, or one for each of its frames
             batch[key] = [list(of_camera) for of_camera in zip(*values, strict=True)]
         elif key == "ground_z_m":
@@ -56,7 +58,8 @@ def are_maps(values: Sequence[Any], images: Any) -> bool:
     """Whether all values are maps over all images: label maps, masks; of a sample, or of a batch."""
     sizes = [tuple(image.shape[-2:]) for image in images]
     return all(
-        isinstance(value, torch.Tensor | list | tuple)
+        isinstance(value, list | tuple | torch.Tensor)
+        and (not isinstance(value, torch.Tensor) or value.ndim > 0)
         and [tuple(m.shape[-2:]) if isinstance(m, torch.Tensor) else None for m in value] == sizes
         for value in values
     )

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from itertools import repeat
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -22,8 +21,8 @@ from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
 from arbiview_aug.favs.renderer import PaperRendering, check_settings, render_paper
 from arbiview_aug.favs.stage1_geometry import check_pinhole
-from arbiview_aug.generator import Generator
-from arbiview_aug.generator.batches import complete_frame, frame_names
+from arbiview_aug.generator import Generator, HoleFiller
+from arbiview_aug.generator.batches import complete_frames, frame_names
 from arbiview_aug.generator.fillers import Holes, fill_frame
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.harmonise import Harmonise, Harmoniser, PhotometricReport
@@ -86,10 +85,11 @@ class RigRetarget(torch.nn.Module):
             ``black``: they stay black. Filled pixels are True in ``generated`` (..., M, h, w) bool; their ``coverage``
             stays False, ``confidence`` 0, ``source_camera`` -1 and labels ``label_fill``. Covered pixels are not
             changed.
-        generator: For ``diffusion``: ``Generator.from_pretrained(DIR)``; None loads the shipped weights, trained on
-            synthetic streets alone. A generator on a GPU needs ``num_workers=0``, or ``generator.complete_batch`` after
-            collating.
-        steps: Denoising steps: 1 (regression), 4, 10 or 50; the generator's default if None.
+        generator: For ``diffusion``: ``Generator.from_pretrained(DIR)``, ``PipelineFiller.from_pretrained(DIR_OR_ID)``
+            (diffusers' inpainting pipelines) or ``TorchScriptFiller(FILE)`` (LaMa and its kind); None loads the shipped
+            weights, trained on synthetic streets alone. One on a GPU needs ``num_workers=0``, or
+            ``generator.complete_batch`` after collating.
+        steps: Denoising steps: 1 (regression), 4, 10 or 50; the generator's or pipeline's default if None.
         guidance: Classifier-free guidance, 1 for none; the generator's default if None.
         min_confidence: τ: pixels seen with less confidence are filled as well.
         seed: Seed of filled pixels, combined with the frame (its ``token``, else its images) and the camera.
@@ -151,7 +151,7 @@ class RigRetarget(torch.nn.Module):
         source_rig: Rig | str | Path | None = None,
         path: RenderPath = "favs",
         holes: Holes = "fill",
-        generator: Generator | None = None,
+        generator: Generator | HoleFiller | None = None,
         steps: int | None = None,
         guidance: float | None = None,
         min_confidence: float = 0.0,
@@ -351,7 +351,7 @@ class RigRetarget(torch.nn.Module):
         if self.completion is None:
             return list(rendered)
         names = frame_names(sample, frames, lead, self.completion)
-        return list(map(complete_frame, rendered, frames, names, repeat(self.completion)))
+        return complete_frames(rendered, frames, names, self.completion)
 
     def _make_params(
         self, sample: Mapping[str, Any], frames: Sequence[Frame], params: Mapping[str, float] | None

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.errors import SampleError
-from arbiview_aug.generator import Generator
+from arbiview_aug.generator import Generator, HoleFiller
 from arbiview_aug.generator.batches import SOURCES_KEY, Completion
 
 RenderPath = Literal["favs", "inpaint", "diffusion"]
@@ -19,7 +19,7 @@ OUTPUTS = ("source_camera", "source_frame", "confidence", SOURCES_KEY)  # furthe
 
 def completion_of(
     path: str,
-    generator: Generator | None,
+    generator: Generator | HoleFiller | None,
     steps: int | None,
     guidance: float | None,
     min_confidence: float,
@@ -32,8 +32,9 @@ def completion_of(
         if min_confidence or seed:
             raise ValueError("min_confidence, seed: they are for path='inpaint' or 'diffusion', got path='favs'")
         return None
-    if generator is not None and not isinstance(generator, Generator):
-        raise ValueError(f"generator: expected Generator.from_pretrained(DIR), got {type(generator).__name__}")
+    if generator is not None and not isinstance(generator, Generator | HoleFiller):
+        expected = "Generator.from_pretrained(DIR), a PipelineFiller or a TorchScriptFiller"
+        raise ValueError(f"generator: expected {expected}, got {type(generator).__name__}")
     if steps is not None and (not isinstance(steps, int) or isinstance(steps, bool) or steps < 1):
         raise ValueError(f"steps: expected a whole number from 1, got {steps!r}")
     if guidance is not None and not is_number(guidance):

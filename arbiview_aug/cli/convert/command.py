@@ -94,7 +94,10 @@ def _parser() -> argparse.ArgumentParser:
         help="what no camera saw, with --path favs: continued from its borders (default), the mean colour, or black",
     )
     parser.add_argument(
-        "--generator", type=Path, metavar="DIR", help="generator of --path diffusion (default: the package's own)"
+        "--generator",
+        type=Path,
+        metavar="PATH",
+        help="of --path diffusion: a generator's folder, a folder of diffusers, a TorchScript file (default: the own)",
     )
     parser.add_argument("--steps", type=count, metavar="N", help="steps of the generator (default: its own)")
     parser.add_argument(

@@ -14,7 +14,7 @@ from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.datasets.registry import open_data
 from arbiview_aug.errors import DataError
 from arbiview_aug.favs.config import Quality
-from arbiview_aug.generator import Generator
+from arbiview_aug.generator import load_generator
 from arbiview_aug.generator.fillers import Holes
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
@@ -65,7 +65,7 @@ class Settings:
         """The transform; each process or actor makes one."""
         return RigRetarget(
             self.target,
-            generator=None if self.generator is None else Generator.from_pretrained(self.generator),
+            generator=None if self.generator is None else load_generator(self.generator),
             outputs=() if self.quality == "paper" else ("confidence",),
             **{name: getattr(self, name) for name in RETARGET_OPTIONS},
         )
@@ -76,13 +76,16 @@ class Settings:
         for entry, camera in zip(target["cameras"], self.target, strict=True):
             entry["content"] = camera.content_key.hex()  # of its mask too
         names = ("path", "holes", "steps", "quality", "surface", "size", "reduce", "neighbours", "suffix")
-        files = [] if self.generator is None else sorted(path for path in self.generator.iterdir() if path.is_file())
+        of = self.generator or Path()
+        files = [] if self.generator is None else [of] if of.is_file() else sorted(filter(Path.is_file, of.rglob("*")))
         return {
             **{name: getattr(self, name) for name in names},
             **({} if self.size is None else {"fit": self.fit}),
             **({"clean_masks": True} if self.clean_masks else {}),
             "motion_depth": self.motion_depth is not None,
-            "generator": {path.name: checksum(path) for path in files},
+            "generator": {
+                path.name if path == of else path.relative_to(of).as_posix(): checksum(path) for path in files
+            },
             "target": target,
         }
 

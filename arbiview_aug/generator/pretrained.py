@@ -1,0 +1,204 @@
+"""Inpainting networks that others trained, in the place of a generator: diffusers' pipelines and TorchScript files.
+
+They see windows around the holes alone (``crops``); seen pixels stay as they are.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from arbiview_aug.environment import optional_package
+from arbiview_aug.errors import GeneratorError
+from arbiview_aug.generator.crops import Canvas, drawn, packed, windows
+
+_SEED = 2**31
+
+
+class HoleFiller(torch.nn.Module, ABC):
+    """A network that inpaints images.
+
+    Args:
+        network: Moves with this module.
+        size: Longest side of an image that it sees, pixels; a multiple of ``multiple``.
+        multiple: Sides that it sees are multiples of it.
+        batch: Images that it sees at once.
+
+    Attributes:
+        calls, pixels: How often it ran, and on how many pixels in all.
+    """
+
+    def __init__(self, network: torch.nn.Module, size: int, multiple: int, batch: int) -> None:
+        super().__init__()
+        if size < multiple or size % multiple or batch < 1:
+            raise ValueError(f"size, batch: expected a multiple of {multiple}, and 1 or more, got {size} and {batch}")
+        self.network = network.eval()
+        for parameter in network.parameters():  # a script's module has no requires_grad_
+            parameter.requires_grad_(False)
+        self.size, self.multiple, self.batch = size, multiple, batch
+        self.calls = self.pixels = 0
+
+    @property
+    def device(self) -> torch.device:
+        """Of the network's weights."""
+        return next((tensor.device for tensor in self.network.state_dict().values()), torch.device("cpu"))
+
+    @abstractmethod
+    def inpaint(
+        self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int], steps: int | None, guidance: float | None
+    ) -> torch.Tensor:
+        """Inpaint images (B, 3, h, w) in [0, 1], black in their holes (B, h, w) bool; the same shape comes back."""
+
+    @torch.no_grad()
+    def fill(
+        self,
+        views: Sequence[torch.Tensor],
+        holes: Sequence[torch.Tensor],
+        seeds: Sequence[int],
+        steps: int | None = None,
+        guidance: float | None = None,
+    ) -> list[torch.Tensor]:
+        """Fill the holes (h, w) of views (3, h, w), uint8 or float in [0, 1], of any frames together.
+
+        Args:
+            views: Views.
+            holes: bool; other pixels do not change.
+            seeds: A seed for each view.
+            steps: Steps of a pipeline; None: its own.
+            guidance: Guidance of a pipeline; None: its own.
+        """
+        tops = [255.0 if view.dtype == torch.uint8 else 1.0 for view in views]
+        pixels = [view.float().cpu().numpy() / top for view, top in zip(views, tops, strict=True)]
+        left = [hole.cpu().numpy().copy() for hole in holes]
+        for found in windows(left, self.size):
+            alike: dict[tuple[int, int], list[Canvas]] = defaultdict(list)
+            for canvas in packed(found, self.size, self.multiple):
+                alike[canvas.size].append(canvas)
+            for canvases in alike.values():
+                for start in range(0, len(canvases), self.batch):
+                    self._fill(canvases[start : start + self.batch], pixels, left, seeds, steps, guidance)
+        filled = []
+        for view, hole, own, top in zip(views, holes, pixels, tops, strict=True):
+            values = torch.from_numpy(own * top).to(view.device)
+            values = values.round() if view.dtype == torch.uint8 else values
+            filled.append(torch.where(hole, values.to(view.dtype), view))
+        return filled
+
+    def _fill(
+        self,
+        canvases: Sequence[Canvas],
+        pixels: Sequence[np.ndarray],
+        left: Sequence[np.ndarray],
+        seeds: Sequence[int],
+        steps: int | None,
+        guidance: float | None,
+    ) -> None:
+        """Inpaint canvases of one size, and put their pixels where they belong; their holes are no longer left."""
+        images, holes = zip(*(drawn(canvas, pixels, left) for canvas in canvases), strict=True)
+        given = torch.from_numpy(np.stack(images)).to(self.device), torch.from_numpy(np.stack(holes)).to(self.device)
+        own = [seeds[canvas.windows[0][0].view] for canvas in canvases]
+        found = self.inpaint(*given, own, steps, guidance)
+        if found.shape != given[0].shape:
+            raise GeneratorError(f"inpainting: expected images {tuple(given[0].shape)}, got {tuple(found.shape)}")
+        if not bool(torch.isfinite(found).all()):
+            raise GeneratorError("inpainting: expected finite images, got NaN or infinity; try float32")
+        self.calls += 1
+        self.pixels += given[1].numel()
+        painted = found.float().clamp(0, 1).cpu().numpy()
+        for canvas, image in zip(canvases, painted, strict=True):
+            for window, top, at in canvas.windows:
+                h, w = window.fills.shape
+                window.of(pixels[window.view])[:, window.fills] = image[:, top : top + h, at : at + w][:, window.fills]
+                window.of(left[window.view])[window.fills] = False
+
+
+class PipelineFiller(HoleFiller):
+    """One of diffusers' inpainting pipelines, by ``from_pretrained``."""
+
+    def __init__(self, pipeline: Any, size: int, multiple: int, batch: int, prompt: str) -> None:
+        parts = {name: part for name, part in pipeline.components.items() if isinstance(part, torch.nn.Module)}
+        super().__init__(torch.nn.ModuleDict(parts), size, multiple, batch)
+        self.pipeline, self.prompt = pipeline, prompt
+        pipeline.set_progress_bar_config(disable=True)
+
+    @classmethod
+    def from_pretrained(
+        cls, where: str | Path, *, size: int | None = None, batch: int = 4, prompt: str = "", **settings: Any
+    ) -> PipelineFiller:
+        """Load what ``AutoPipelineForInpainting`` knows: Stable Diffusion, SDXL, Flux and others.
+
+        Args:
+            where: A folder or hub id in diffusers' layout.
+            size: Longest side of an image that it sees; None: the pipeline's own.
+            batch: Images that it sees at once.
+            prompt: What fills the holes.
+            settings: Of diffusers' ``from_pretrained``, such as ``torch_dtype`` or ``revision``.
+
+        Raises:
+            ImportError: diffusers or transformers are missing.
+            GeneratorError: No such pipeline.
+        """
+        diffusers = optional_package("diffusers", "generator")
+        optional_package("transformers", "generator")
+        try:
+            pipeline = diffusers.AutoPipelineForInpainting.from_pretrained(where, **settings)
+        except (OSError, ValueError, RuntimeError, AttributeError) as error:
+            text = " ".join(str(error).split())[:300]
+            raise GeneratorError(f"{where}: expected an inpainting pipeline of diffusers: {text}") from None
+        multiple = int(pipeline.vae_scale_factor)
+        core = getattr(pipeline, "unet", None) or pipeline.transformer
+        own = int(getattr(core.config, "sample_size", None) or 64) * multiple
+        return cls(pipeline, own if size is None else size, multiple, batch, prompt)
+
+    def inpaint(
+        self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int], steps: int | None, guidance: float | None
+    ) -> torch.Tensor:
+        h, w = images.shape[-2:]
+        settings = {"num_inference_steps": steps, "guidance_scale": guidance}
+        done = self.pipeline(
+            prompt=[self.prompt] * len(images),
+            image=images,
+            mask_image=holes[:, None].float(),
+            height=h,
+            width=w,
+            generator=[torch.Generator().manual_seed(seed % _SEED) for seed in seeds],
+            output_type="pt",
+            **{name: value for name, value in settings.items() if value is not None},
+        )
+        return done.images
+
+
+class TorchScriptFiller(HoleFiller):
+    """A TorchScript file of LaMa's kind.
+
+    It takes images (B, 3, h, w) in [0, 1] and masks (B, 1, h, w), 1 in holes, and returns images.
+
+    Args:
+        path: The file. TorchScript runs code: load files that you trust.
+        size: Longest side of an image that it sees.
+        multiple: Of which sides are multiples.
+        batch: Images that it sees at once.
+
+    Raises:
+        GeneratorError: No such file, or no TorchScript.
+    """
+
+    def __init__(self, path: str | Path, *, size: int = 512, multiple: int = 8, batch: int = 4) -> None:
+        try:
+            network = torch.jit.load(str(path), map_location="cpu")
+        except (RuntimeError, ValueError, OSError) as error:
+            text = " ".join(str(error).split())[:300]
+            raise GeneratorError(f"{path}: expected a TorchScript file: {text}") from None
+        super().__init__(network, size, multiple, batch)
+
+    def inpaint(
+        self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int], steps: int | None, guidance: float | None
+    ) -> torch.Tensor:
+        done: torch.Tensor = self.network(images, holes[:, None].to(images.dtype))
+        return done

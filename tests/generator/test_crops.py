@@ -1,0 +1,78 @@
+"""Windows cover every hole once, with context, at the view's own resolution."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from arbiview_aug.generator.crops import drawn, packed, windows
+
+
+def holes(seed: int, shape: tuple[int, int], kind: str) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    hole = np.zeros(shape, bool)
+    if kind == "specks":
+        hole[rng.integers(0, shape[0], 40), rng.integers(0, shape[1], 40)] = True
+    elif kind == "wedge":
+        hole[:, : shape[1] // 3] = True
+    elif kind == "boxes":
+        for _ in range(4):
+            top, left = rng.integers(0, shape[0] - 20), rng.integers(0, shape[1] - 40)
+            hole[top : top + 15, left : left + 35] = True
+    elif kind == "all":
+        hole[:] = True
+    return hole
+
+
+@pytest.mark.parametrize("size", [64, 128, 512])
+@pytest.mark.parametrize("shape", [(90, 200), (200, 90), (48, 60), (256, 704)])
+def test_every_hole_is_filled_once(size: int, shape: tuple[int, int]) -> None:
+    views = [holes(k, shape, kind) for k, kind in enumerate(("specks", "none", "wedge", "boxes", "all"))]
+    filled = [np.zeros(shape, int) for _ in views]
+    for found in windows(views, size):
+        for window in found:
+            h, w = window.fills.shape
+            assert h <= size and w <= size and window.top >= 0 and window.left >= 0
+            assert window.top + h <= shape[0] and window.left + w <= shape[1]
+            window.of(filled[window.view])[...] += window.fills
+    for view, count in zip(views, filled, strict=True):
+        np.testing.assert_array_equal(count, view)
+
+
+def test_a_hole_has_context_and_a_whole_view_no_window() -> None:
+    hole = np.zeros((100, 300), bool)
+    hole[40:60, 100:140] = True
+    (found,) = windows([np.zeros_like(hole), hole], 256)
+    (window,) = found
+    assert window.view == 1 and window.top <= 40 - 12 and window.left <= 100 - 12
+    assert window.fills.shape[0] >= 20 + 2 * 12 and window.fills.shape[1] >= 40 + 2 * 12
+
+
+def test_tiles_of_one_hole_come_one_after_the_other() -> None:
+    rounds = windows([np.ones((64, 300), bool), np.ones((64, 64), bool)], 64)
+    assert len(rounds[0]) == 2 and all(len(found) == 1 for found in rounds[1:])
+    lefts = [found[0].left for found in rounds]
+    assert lefts == sorted(lefts) and all(b - a <= 64 - 2 * 12 for a, b in pairwise(lefts))
+
+
+def test_small_windows_share_a_canvas_and_do_not_overlap() -> None:
+    view = np.zeros((256, 704), bool)
+    view[30:200:60, 30:600:120] = True
+    (found,) = windows([view], 256)
+    canvases = packed(found, 256, 8)
+    assert len(canvases) < len(found) / 4
+    for canvas in canvases:
+        taken = np.zeros(canvas.size, int)
+        assert not any(side % 8 or side > 256 for side in canvas.size)
+        for window, top, left in canvas.windows:
+            h, w = window.fills.shape
+            taken[top : top + h, left : left + w] += 1
+        assert taken.max() == 1
+        pixels, marks = drawn(canvas, [np.full((3, *view.shape), 0.5, np.float32)], [view])
+        np.testing.assert_array_equal(pixels[0], np.where(marks, 0, 0.5))
+        for window, top, left in canvas.windows:
+            h, w = window.fills.shape
+            assert marks[top : top + h, left : left + w][window.fills].all()
+    assert sum(window.fills.sum() for canvas in canvases for window, _, _ in canvas.windows) == view.sum()
