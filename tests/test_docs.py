@@ -75,13 +75,21 @@ TINY = {
     "depth --data FOLDER": ["--output", "depth"],
     "depth --model ID_OR_PATH --data FOLDER": ["--output", "depth"],
     "depth --model ID_OR_PATH --data FOLDER --reference motion road": ["--output", "depth"],
+    "depth --fit --data FOLDER": ["--output", "depth", "--fit", "2"],
     "evaluate --data FOLDER --target waymo --surface learned street": ["--reduce", "4", "--surface", "street"],
     "bench ablation --data FOLDER": ["--reduce", "4", "--only", "street, not far"],
     "train --output output/tiny": ["--quiet", *SMALLER],
 }
 """Every command of the README and the pages, and options that make it quick."""
 
-SLOW = ("bench", "depth --model", "evaluate --paper", "evaluate --figure", "evaluate --data FOLDER --yaws")
+SLOW = (
+    "bench",
+    "depth --model",
+    "depth --fit",
+    "evaluate --paper",
+    "evaluate --figure",
+    "evaluate --data FOLDER --yaws",
+)
 
 
 @cache
@@ -202,7 +210,7 @@ def test_the_commands_run(
 ) -> None:
     arguments = shlex.split(command)
     if "FOLDER" in arguments:
-        root = request.getfixturevalue("kitti_root" if "--displaced" in arguments else "nuscenes_root")
+        root = request.getfixturevalue("kitti_root" if {"--displaced", "--fit"} & {*arguments} else "nuscenes_root")
         arguments[arguments.index("FOLDER")] = str(root)
     if "ID_OR_PATH" in arguments:
         arguments[arguments.index("ID_OR_PATH")] = str(saved_depth_model(tmp_path / "model"))

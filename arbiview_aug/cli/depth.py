@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 import torch
 from torch.utils.data import Dataset
+from tqdm import tqdm
 
 from arbiview_aug.atomic_io import inside
 from arbiview_aug.cli.arguments import add_data, command_parser, count, device_named, gathered_warnings, writable_folder
@@ -29,7 +30,11 @@ from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames, warn
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, DepthModel, Reference, learned_depth
 from arbiview_aug.temporal.motion_depth import compile_matching, motion_depth
+from arbiview_aug.temporal.self_supervised import FittedDepth, fit_to_drive, size_for
 from arbiview_aug.temporal.transformers_depth import TransformersDepth
+
+FITTED_FILE = "fitted.pt"
+"""The network of ``--fit``, in the output's folder."""
 
 
 class Done(NamedTuple):
@@ -115,7 +120,8 @@ class _Inputs(Dataset[_Loaded | Done]):
     def _loaded(self, token: str, sample: dict[str, Any]) -> _Loaded | Done:
         (frame,) = read_frames(sample, None)
         (scene,) = read_scenes(sample, [frame], (), "auto") or [Scene()]
-        points = np.asarray(scene.points, float) if scene.points is not None and "LiDAR" in self.wanted else None
+        measured = [one for one in (scene.points, scene.further.get("depth_m")) if one is not None]
+        points = np.concatenate(measured).astype(float) if measured and "LiDAR" in self.wanted else None
         is_there = "motion" in self.wanted and self.motion.path(token).is_file()
         motion = self.motion.read(token, sample["rig"]) if is_there else None
         used = [name for name, value in (("LiDAR", points), ("motion", motion)) if value is not None]
@@ -145,6 +151,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--model", metavar="ID_OR_PATH", help="depth model of transformers: a folder, or a name on its Hub"
     )
+    parser.add_argument(
+        "--fit",
+        type=count,
+        nargs="?",
+        const=2000,
+        metavar="STEPS",
+        help="instead of --model: a small network that learns from this drive alone (2000 steps without a number)",
+    )
     parser.add_argument("--device", metavar="NAME", help="cpu, cuda, cuda:1, ... (default: the GPU, if there is one)")
     parser.add_argument("--batch", type=count, default=8, metavar="N", help="images that the model sees at once")
     parser.add_argument(
@@ -155,14 +169,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="what scale and shift of the model are fitted to, the first that a camera has",
     )
     arguments = parser.parse_args(argv)
+    if arguments.model and arguments.fit:
+        parser.error("argument --fit: expected it without --model")
+    is_learned = arguments.model is not None or arguments.fit is not None
     data: Any = open_data(arguments.data, neighbours=None if arguments.model else WANTED)
     _, root = split_kind(arguments.data)
-    folder = Path(arguments.output or inside(root, LEARNED_FOLDER if arguments.model else FOLDER, "depth"))
+    folder = Path(arguments.output or inside(root, LEARNED_FOLDER if is_learned else FOLDER, "depth"))
     depths = DepthFolder(writable_folder(folder, str(folder)))
     warned: list[str] = []
     with gathered_warnings(warned):
-        if arguments.model:
-            model = TransformersDepth(arguments.model, device_named(arguments.device or _best_device()))
+        if is_learned:
+            device = device_named(arguments.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+            model: DepthModel
+            if arguments.model:
+                model = TransformersDepth(arguments.model, device)
+            else:
+                model = _fitted_network(data, depths.root / FITTED_FILE, arguments.fit, device, arguments.workers)
             done = list(_learned(model, data, depths, DepthFolder(inside(root, FOLDER, "depth")), arguments))
         else:
             compile_matching()
@@ -198,8 +220,20 @@ def _learned(
     yield from written()
 
 
-def _best_device() -> str:
-    return "cuda" if torch.cuda.is_available() else "cpu"
+def _fitted_network(data: Any, path: Path, steps: int, device: torch.device, workers: int) -> FittedDepth:
+    """The network that was fitted to this drive before, else one that is fitted now."""
+    torch.manual_seed(0)
+    model = FittedDepth(size_for(data[0]["rig"][0]), device)
+    if path.is_file():
+        print(f"{path}: fitted before; delete it to fit anew")
+        model.load(path)
+        return model
+    with tqdm(total=steps, unit="step", desc="fit") as bar:
+        for loss in fit_to_drive(model, data, steps, workers if workers > 1 else 0):
+            bar.set_postfix_str(f"loss {loss:.4f}", refresh=False)
+            bar.update()
+    model.save(path)
+    return model
 
 
 def _summary(done: Sequence[Done], depths: DepthFolder) -> int:

@@ -51,18 +51,22 @@ class LearnedDepth(MotionDepth):
         return f"learned depth: {self.density:.0%} of the pixels, {self.words}"
 
 
+Output = Literal["depth", "inverse", "metres"] | None
+
+
 class Prediction(NamedTuple):
     """A network's output for one image.
 
     Attributes:
         values: (h, w) over the whole image, of any size; not finite where unknown.
-        output: ``depth``, ``inverse`` depth, or None if only the fit tells which.
+        output: ``depth``, ``inverse`` depth, or None if only the fit tells which; ``metres``: inverse depth in 1/m,
+            which is checked and not fitted.
         scale_px: Focal length of the image that the network saw, in its pixels. Networks that learned metres from one
             focal length see things twice as near at twice the focal length. None for relative depth.
     """
 
     values: Layer
-    output: Literal["depth", "inverse"] | None
+    output: Output
     scale_px: float | None = None
 
 
@@ -74,10 +78,8 @@ class DepthModel(Protocol):
     licence: str
     takes_prompt: bool  # whether it predicts better from a depth map (h, w) of sparse measurements
 
-    def predict(
-        self, images: Sequence[torch.Tensor], focal_px: Sequence[float], prompts: Sequence[Layer] | None
-    ) -> list[Prediction]:
-        """Predict the depth of images (3, h, w) uint8 of one size, in one batch."""
+    def predict(self, views: Sequence[View]) -> list[Prediction]:
+        """Predict the depth of images of one size in one batch, all with a prompt or all without."""
         ...
 
 
@@ -125,7 +127,7 @@ def learned_depth(
         wanted: What to fit to, the first that a camera has enough points of.
     """
     views = {
-        (n, k): _View.of(frame, k, model.takes_prompt) for n, frame in enumerate(frames) for k in range(len(frame.rig))
+        (n, k): View.of(frame, k, model.takes_prompt) for n, frame in enumerate(frames) for k in range(len(frame.rig))
     }
     alike: dict[Any, list[tuple[int, int]]] = {}
     for key, view in views.items():
@@ -133,10 +135,7 @@ def learned_depth(
     predictions: dict[tuple[int, int], Prediction] = {}
     for keys in alike.values():
         for part in (keys[start : start + batch] for start in range(0, len(keys), batch)):
-            prompts = [prompt for key in part if (prompt := views[key].prompt) is not None]
-            focal_px = [float(views[key].pinhole.K[0, 0]) for key in part]
-            found = model.predict([views[key].image for key in part], focal_px, prompts or None)
-            predictions |= zip(part, found, strict=True)
+            predictions |= zip(part, model.predict([views[key] for key in part]), strict=True)
     for n, frame in enumerate(frames):
         of_frame = [(views[n, k], predictions[n, k]) for k in range(len(frame.rig))]
         depth_m, fits = _fitted(frame, of_frame, wanted)
@@ -145,16 +144,31 @@ def learned_depth(
 
 
 # --- images that networks know ----------------------------------------------------------------------------------------
-class _View(NamedTuple):
-    """A camera's image as a pinhole camera would have taken it."""
+class View(NamedTuple):
+    """A camera's image as a pinhole camera would have taken it.
 
-    camera: Camera  # at the size of its depth map
+    Attributes:
+        camera: The camera at the size of its depth map.
+        pinhole: The pinhole camera.
+        ground_z_m: Height of the road in their ego frame.
+        image: (3, h, w) uint8.
+        prompt: (h, w) depth of sparse measurements, made dense; None if there are none.
+    """
+
+    camera: Camera
     pinhole: Camera
+    ground_z_m: float
     image: torch.Tensor
-    prompt: Layer | None
+    prompt: Layer | None = None
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length along the rows."""
+        return float(self.pinhole.K[0, 0])
 
     @staticmethod
-    def of(frame: DepthInputs, k: int, takes_prompt: bool) -> _View:
+    def of(frame: DepthInputs, k: int, takes_prompt: bool = False) -> View:
+        """The image of a frame's camera, its lens taken out."""
         camera, image = frame.rig[k], frame.images[k]
         if image.dtype != torch.uint8:
             image = (image * 255).round().to(torch.uint8)
@@ -167,7 +181,7 @@ class _View(NamedTuple):
         prompt = None
         if takes_prompt and frame.points is not None:
             prompt = _dense(motion_camera(pinhole), frame.points)
-        return _View(small, pinhole, image, prompt)
+        return View(small, pinhole, frame.rig.ground_z_m, image, prompt)
 
     def sampled(self, values: Layer) -> tuple[Layer, BoolArray]:
         """A prediction over the pinhole image at the pixels of the depth map, and where it has any."""
@@ -207,9 +221,7 @@ def _dense(camera: Camera, points: FloatArray) -> Layer | None:
 
 
 # --- what is known of the depth ---------------------------------------------------------------------------------------
-def _references(
-    frame: DepthInputs, k: int, view: _View, seen: BoolArray
-) -> Iterator[tuple[Reference, Any, FloatArray]]:
+def _references(frame: DepthInputs, k: int, view: View, seen: BoolArray) -> Iterator[tuple[Reference, Any, FloatArray]]:
     """What a camera may be fitted to: its name, pixels (rows, columns) and z-depths."""
     camera = view.camera
     if frame.points is not None:
@@ -240,11 +252,12 @@ def _on_road(camera: Camera, ground_z_m: float, boxes: FloatArray | None) -> Boo
 
 
 # --- fits -------------------------------------------------------------------------------------------------------------
-_Form = Literal["inverse", "depth", "affine depth"]
-"""Inverse depth is affine in the output, or in its inverse; or depth is affine in the output."""
+_Form = Literal["inverse", "metres", "depth", "affine depth"]
+"""Inverse depth is affine in the output, is the output, or is affine in its inverse; or depth is affine in it."""
 
 _FORMS: Mapping[str | None, tuple[_Form, ...]] = {
     "inverse": ("inverse",),
+    "metres": ("metres",),
     "depth": ("depth", "affine depth"),
     None: ("inverse", "depth", "affine depth"),
 }
@@ -269,40 +282,40 @@ def _feature(form: _Form, values: FloatArray) -> FloatArray:
 
 
 def _fitted(
-    frame: DepthInputs, predicted: Sequence[tuple[_View, Prediction]], wanted: Sequence[Reference]
+    frame: DepthInputs, predicted: Sequence[tuple[View, Prediction]], wanted: Sequence[Reference]
 ) -> tuple[list[Layer], list[CameraFit]]:
     """The depth map and the fit of each camera."""
     fits: list[CameraFit] = []
     lines: list[_Line | None] = []
+    ratios: list[float] = []  # true over predicted inverse depth, of metric networks
     samples = [_at_one_focal_length(view, one) for view, one in predicted]
-    ratios: list[float] = []  # true over predicted inverse depth
     for k, ((view, one), (values, seen)) in enumerate(zip(predicted, samples, strict=True)):
-        fit, line, ratio = CameraFit(view.camera.name), None, []
-        for reference, pixels, depth_m in _references(frame, k, view, seen):
-            if reference in wanted and len(depth_m) >= LEAST_POINTS:
-                step = -(-len(depth_m) // _MOST_POINTS)
-                x, depth_m = values[pixels][::step].astype(float), depth_m[::step]
-                line, residual, declined = fit_depth(x, depth_m, one.output)
-                fit = CameraFit(view.camera.name, reference, len(depth_m), residual, declined)
-                ratio = [] if declined else [float(np.median(1 / depth_m / _feature(one.output or "inverse", x)))]
-                break
-        else:
-            words = f"fewer than {LEAST_POINTS} points of {', '.join(wanted)}"
-            fit = CameraFit(view.camera.name, declined=words)
-        fits.append(fit)
-        lines.append(None if fit.declined else line)
-        ratios += ratio if one.scale_px is not None else []
+        known = (of for of in _references(frame, k, view, seen) if of[0] in wanted and len(of[2]) >= LEAST_POINTS)
+        reference, pixels, depth_m = next(known, (None, (), np.zeros(0)))
+        if reference is None:
+            fits.append(
+                CameraFit(view.camera.name, declined=f"fewer than {LEAST_POINTS} points of {', '.join(wanted)}")
+            )
+            lines.append(None)
+            continue
+        step = -(-len(depth_m) // _MOST_POINTS)
+        x, depth_m = values[pixels][::step].astype(float), depth_m[::step]
+        line, residual, declined = fit_depth(x, depth_m, one.output)
+        fits.append(CameraFit(view.camera.name, reference, len(depth_m), residual, declined))
+        lines.append(None if declined else line)
+        if one.scale_px is not None and one.output is not None and not declined:
+            ratios.append(float(np.median(1 / depth_m / _feature(one.output, x))))
     depth = []
     for k, ((_, one), (values, seen)) in enumerate(zip(predicted, samples, strict=True)):
         line = lines[k]
         if fits[k].reference is None and one.scale_px is not None and one.output is not None and ratios:
             line, fits[k] = _Line(one.output, float(np.median(ratios)), 0.0), CameraFit(fits[k].camera)
         metres = np.zeros(values.shape) if line is None else line.depth(np.where(seen, values, 1.0).astype(float))
-        depth.append(np.where(seen & (metres > _NEAREST_M) & (metres < FARTHEST_M), metres, 0).astype(np.float32))
+        depth.append(np.where(seen & (metres > _NEAREST_M), metres.clip(max=FARTHEST_M), 0).astype(np.float32))
     return depth, fits
 
 
-def _at_one_focal_length(view: _View, one: Prediction) -> tuple[Layer, BoolArray]:
+def _at_one_focal_length(view: View, one: Prediction) -> tuple[Layer, BoolArray]:
     """A prediction at the pixels of the depth map as if all cameras had one focal length, and where it is known."""
     values, seen = view.sampled(one.values)
     if one.scale_px is None:
@@ -311,15 +324,13 @@ def _at_one_focal_length(view: _View, one: Prediction) -> tuple[Layer, BoolArray
     return (values * focal if one.output == "depth" else values / focal), seen
 
 
-def fit_depth(
-    values: FloatArray, depth_m: FloatArray, output: Literal["depth", "inverse"] | None
-) -> tuple[_Line | None, float | None, str]:
+def fit_depth(values: FloatArray, depth_m: FloatArray, output: Output) -> tuple[_Line | None, float | None, str]:
     """Fit a network's output (P,) to depths (P,): the fit, its residual, and why it is declined, or nothing."""
     found: list[tuple[float, float, _Line]] = []
     for form in _FORMS[output]:
         x, y = _feature(form, values), depth_m if form == "affine depth" else 1 / depth_m
         limit = np.minimum(y, _RELATIVE_M) if form == "affine depth" else np.maximum(y, 1 / _RELATIVE_M)
-        scale, shift = _robust_line(x, y, 1 / limit)
+        scale, shift = (1.0, 0.0) if form == "metres" else _robust_line(x, y, 1 / limit)
         if scale > 0:
             residual = float(np.median(np.abs(scale * x + shift - y) / limit))
             found.append((residual, float(np.median(np.abs(np.median(y) - y) / limit)), _Line(form, scale, shift)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -13,8 +12,7 @@ import torch
 from arbiview_aug.atomic_io import checksum
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import DataError
-from arbiview_aug.scene.panorama import Layer
-from arbiview_aug.temporal.learned_depth import Prediction
+from arbiview_aug.temporal.learned_depth import Prediction, View
 
 _OUTPUTS: dict[str, Literal["depth", "inverse"]] = {
     "depth_pro": "inverse",
@@ -54,7 +52,9 @@ class TransformersDepth:
         model = _loaded(transformers.AutoModelForDepthEstimation, name, "weights of the model")
         self.model, self.device = model.float().eval().to(device), device
         self.name = folder.resolve().name if folder.is_dir() else name
-        self.revision = _weights_of(folder) if folder.is_dir() else str(getattr(config, "_commit_hash", None))[:12]
+        self.revision = (
+            _weights_of(folder) if folder.is_dir() else str(getattr(config, "_commit_hash", None) or "unknown")[:12]
+        )
         self.licence = _licence(folder / "README.md" if folder.is_dir() else name)
         self.kind = str(config.model_type)
         self.takes_prompt = self.kind == "prompt_depth_anything"
@@ -63,16 +63,15 @@ class TransformersDepth:
         self._is_metric = self.kind in _OUTPUTS or stated == "depth"
 
     @torch.inference_mode()
-    def predict(
-        self, images: Sequence[torch.Tensor], focal_px: Sequence[float], prompts: Sequence[Layer] | None
-    ) -> list[Prediction]:
-        """Predict the depth of images (3, h, w) uint8 of one size, in one batch.
+    def predict(self, views: Sequence[View]) -> list[Prediction]:
+        """Predict the depth of images of one size in one batch, all with a prompt or all without.
 
         Raises:
             DataError: The batch does not fit on the device.
         """
-        prompted = {} if prompts is None else {"prompt_depth": list(prompts), "prompt_scale_to_meter": 1.0}
-        inputs = self._processor(images=list(images), return_tensors="pt", **prompted).to(self.device)
+        images, prompts = [view.image for view in views], [view.prompt for view in views if view.prompt is not None]
+        prompted: dict[str, Any] = {"prompt_depth": prompts, "prompt_scale_to_meter": 1.0} if prompts else {}
+        inputs = self._processor(images=images, return_tensors="pt", **prompted).to(self.device)
         try:
             out = self.model(**inputs)
         except torch.OutOfMemoryError:
@@ -83,12 +82,12 @@ class TransformersDepth:
             done = self._processor.post_process_depth_estimation(out, source_sizes=[size] * len(images))
             predicted = torch.stack([one["predicted_depth"] for one in done])
         output, is_metric = self._output, self._is_metric
-        if self.takes_prompt and prompts is None:  # then it puts out something relative
+        if self.takes_prompt and not prompts:  # then it puts out something relative
             output, is_metric = None, False
         seen = inputs["pixel_values"].shape[-1] / size[1]  # pixels of the network's for one of the image's
         return [
-            Prediction(values, output, focal * seen if is_metric else None)
-            for values, focal in zip(predicted.float().cpu().numpy(), focal_px, strict=True)
+            Prediction(values, output, view.focal_px * seen if is_metric else None)
+            for values, view in zip(predicted.float().cpu().numpy(), views, strict=True)
         ]
 
 
@@ -110,7 +109,6 @@ def _weights_of(folder: Path) -> str:
 def _licence(card: str | Path) -> str:
     """The licence that a model's card names."""
     try:
-        logging.getLogger("huggingface_hub").setLevel(logging.ERROR)
         return str(optional_package("huggingface_hub").ModelCard.load(card).data.license or "unknown")
     except Exception:  # no card, no network, a card that cannot be read
         return "unknown"
