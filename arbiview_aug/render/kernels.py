@@ -820,15 +820,17 @@ def sum_cells(view: Any, known: Any, cell: int, sums: Any) -> None:
 def halve(fine: Any, tall: int, coarse: Any) -> None:
     """Add up cells (4, ny, nx) by ``tall`` (1 or 2) rows and 2 columns, at most to full cells."""
     ny, nx = fine.shape[1:]
-    share = _ONE / np.float32(2 // tall)
+    share, whole = _ONE / np.float32(2 // tall), nx // 2
     for j in range(coarse.shape[1]):
+        y, below = j * tall, min(j * tall + tall, ny) - 1
+        lower = _ONE if below > y else _ZERO
+        for c in range(4):
+            one, two, out = fine[c, y], fine[c, below], coarse[c, j]
+            for i in range(whole):
+                out[i] = share * ((one[2 * i] + one[2 * i + 1]) + lower * (two[2 * i] + two[2 * i + 1]))
+            if nx % 2:
+                out[whole] = share * (one[nx - 1] + lower * two[nx - 1])
         for i in range(coarse.shape[2]):
-            for c in range(4):
-                total = _ZERO
-                for y in range(j * tall, min(j * tall + tall, ny)):
-                    for x in range(2 * i, min(2 * i + 2, nx)):
-                        total += fine[c, y, x]
-                coarse[c, j, i] = total * share
             known = coarse[3, j, i]
             if known > _ONE:
                 for c in range(4):
