@@ -339,7 +339,7 @@ def fit_depth(values: FloatArray, depth_m: FloatArray, output: Output) -> tuple[
     residual, constant, line = min(found)
     if residual > MAX_RESIDUAL:
         return line, residual, f"it errs by more than {MAX_RESIDUAL:.0%}"
-    if residual > MAX_OF_CONSTANT * constant:
+    if line.form != "metres" and residual > MAX_OF_CONSTANT * constant:  # a fit may turn noise into a constant
         return line, residual, "it is hardly better than one depth for all pixels"
     return line, residual, ""
 
