@@ -94,7 +94,7 @@ def read_scenes(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[
     row = SURFACES[surface]
     found: dict[str, list[Points]] = {}
     for name in row.reads:
-        arrays = _geometry(name, sample, frames, lead)
+        arrays = _geometry(name, sample, frames, lead, found)
         if arrays is not None:
             found[name] = arrays
         elif name == row.needs and name != "motion" and (name != "points" or sample.get("depth_m") is None):
@@ -144,16 +144,23 @@ _CHECKS: dict[str, Callable[[Points], Points]] = {"boxes_3d": checked_boxes, "po
 
 
 def _geometry(
-    name: str, sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...]
+    name: str,
+    sample: Mapping[str, Any],
+    frames: Sequence[Frame],
+    lead: tuple[int, ...],
+    found: Mapping[str, Sequence[Points]],
 ) -> list[Points] | None:
-    """The array of each frame for a name in ``SurfaceRow.reads``; None if the sample has none."""
+    """The array of each frame for a name in ``SurfaceRow.reads``, beside those ``found`` before; None without any."""
     parts: list[list[Points]] = []
     for key in _SAMPLE_KEYS.get(name, (name,)):
         value = sample.get(key)
         if value is None:
             continue
         if key in _MAP_KEYS:
-            parts.append(_points_of_maps(key, value, frames, lead))
+            measured = [found[one] for one in ("points", "depth_m", "motion") if one in found and key != "depth_m"]
+            none = [np.zeros((0, 3))] * len(frames)
+            anchors = [np.concatenate(arrays) for arrays in zip(none, *measured, strict=True)]
+            parts.append(_points_of_maps(key, value, frames, lead, anchors))
             continue
         arrays = of_frames(key, value, len(frames), lead)
         parts.append([_CHECKS[key](array) for array in arrays] if key in _CHECKS else arrays)
@@ -162,21 +169,23 @@ def _geometry(
     return [arrays[0] if len(arrays) == 1 else np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
 
 
-def _points_of_maps(key: str, depth_m: Any, frames: Sequence[Frame], lead: tuple[int, ...]) -> list[Points]:
-    """(P, 3) points of each frame's depth maps."""
+def _points_of_maps(
+    key: str, depth_m: Any, frames: Sequence[Frame], lead: tuple[int, ...], anchors: Sequence[Points]
+) -> list[Points]:
+    """(P, 3) points of each frame's depth maps, brought to ``anchors`` (P, 3) if there are any."""
     try:
         maps = split(depth_m, lead)
     except (AttributeError, TypeError, ValueError, RuntimeError) as error:
         raise SampleError(f"{key}: expected one map (H, W) for each image ({error})") from None
     found: list[Points] = []
-    for frame, of_cameras in zip(frames, maps, strict=True):
+    for frame, of_cameras, anchor in zip(frames, maps, anchors, strict=True):
         if isinstance(of_cameras, torch.Tensor | np.ndarray):
             of_cameras = list(numbers(key, of_cameras)) if of_cameras.ndim else ()
         if not isinstance(of_cameras, list | tuple) or len(of_cameras) != len(frame.rig):
             raise SampleError(f"{key}: expected {len(frame.rig)} maps (H, W), one for each image")
         cameras = [camera if key == "depth_m" else motion_camera(camera) for camera in frame.rig]
-        points = [points_of_depth(c, numbers(key, depth), key) for c, depth in zip(cameras, of_cameras, strict=True)]
-        found.append(np.concatenate(points))
+        pairs = zip(cameras, of_cameras, strict=True)
+        found.append(np.concatenate([points_of_depth(c, numbers(key, depth), key, anchor) for c, depth in pairs]))
     return found
 
 

@@ -41,8 +41,9 @@ class Scene:
 
     def geometry(self, name: str) -> Points | None:
         """The array of a name in ``SurfaceRow.reads``; None if there is none."""
-        if name == "points" and self.points is None:
-            return self.further.get("depth_m")
+        other = {"points": "depth_m", "motion": "learned_depth_m"}.get(name)  # what may stand in its place
+        if other is not None and getattr(self, name) is None:
+            return self.further.get(other)
         return getattr(self, name) if name in ("boxes", "points", "motion") else self.further.get(name)
 
     @cached_property
@@ -61,7 +62,7 @@ class Scene:
     @property
     def has_maps(self) -> bool:
         """Whether any of the geometry comes from depth maps."""
-        return self.motion is not None or "depth_m" in self.further
+        return self.motion is not None or not self.further.keys().isdisjoint(("depth_m", "learned_depth_m"))
 
     @cached_property
     def best(self) -> SurfaceName:
@@ -162,8 +163,10 @@ SURFACES: dict[str, SurfaceRow] = {
         lambda scene, z_m: _point_cloud(scene, z_m, None, scene.motion), ("boxes", "motion"), "motion"
     ),
     "fused": SurfaceRow(
-        lambda scene, z_m: _point_cloud(scene, z_m, scene.points, scene.further.get("depth_m"), scene.motion),
-        ("boxes", "points", "depth_m", "motion"),
+        lambda scene, z_m: _point_cloud(
+            scene, z_m, scene.points, *map(scene.further.get, ("depth_m", "learned_depth_m")), scene.motion
+        ),
+        ("boxes", "points", "depth_m", "motion", "learned_depth_m"),
         "motion",
     ),
     "learned": SurfaceRow(

@@ -24,6 +24,7 @@ from arbiview_aug.sample.neighbours import Neighbour
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.depth_maps import motion_camera, points_of_depth
 from arbiview_aug.scene.panorama import Layer
+from arbiview_aug.scene.surface import Points
 from arbiview_aug.temporal.change import BOX_MARGIN_M
 from arbiview_aug.temporal.plane_sweep import WALLS, SweptImage, reduced_grey
 from arbiview_aug.temporal.pose_check import CORRECTED_PX, MAX_CORRECTIONS, MAX_ERROR_PX, PoseSamples, pose_error
@@ -66,10 +67,10 @@ class MotionDepth:
         """Share of all pixels with a depth; 0 if declined."""
         return float(np.mean([np.mean(depth > 0) for depth in self.depth_m]))
 
-    def points(self, rig: Rig) -> FloatArray:
-        """(P, 3) points in the ego frame, metres, seen by the frame's rig."""
+    def points(self, rig: Rig, anchors: Points | None = None) -> FloatArray:
+        """(P, 3) points in the ego frame, metres, seen by the frame's rig; fused with ``anchors`` (P, 3) if given."""
         pairs = zip(map(motion_camera, rig), self.depth_m, strict=True)
-        return np.concatenate([points_of_depth(camera, depth.astype(np.float64)) for camera, depth in pairs])
+        return np.concatenate([points_of_depth(c, z.astype(np.float64), anchors=anchors) for c, z in pairs])
 
     def __str__(self) -> str:
         if self.density == 0:

@@ -24,7 +24,7 @@ from arbiview_aug.render.plan import RenderPlan, build_plan, plan_key
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.render.requirements import harm_remedies, needs_geometry, static_harm
 from arbiview_aug.sample.detections import OfCameras, detections_of_frames
-from arbiview_aug.sample.inputs import MOTION_KEY, Frame, names_of_frames, read_scenes, scenes_on_device
+from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, Frame, names_of_frames, read_scenes, scenes_on_device
 from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames
 from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.surface import SurfaceName
@@ -158,7 +158,8 @@ class FramePlanner:
         scenes = scenes or [pair.road for pair in pairs]
         names = self._names(sample, len(frames), lead)
         uses_motion = SURFACES[self.surface].needs == "motion"
-        estimates_motion = uses_motion and is_needed and sample.get(MOTION_KEY) is None
+        maps = [key for key in (MOTION_KEY, LEARNED_KEY) if key == MOTION_KEY or key in SURFACES[self.surface].reads]
+        estimates_motion = uses_motion and is_needed and all(sample.get(key) is None for key in maps)
         if estimates_motion and given is None:
             raise SampleError(
                 f"surface={self.surface!r}: expected 'neighbours' in the sample, or {MOTION_KEY!r} from the depth "
@@ -179,7 +180,8 @@ class FramePlanner:
             if depth is not None:
                 scene = replace(scene, corrections=depth.corrections)
             if uses_motion and scene.motion is None:
-                scene = replace(scene, motion=np.zeros((0, 3)) if motion is None else motion.points(frame.rig))
+                points = motion.points(frame.rig, scene.geometry("points")) if motion else np.zeros((0, 3))
+                scene = replace(scene, motion=points)
             plan = made.get(number) or self._plan_of_pair(pair, frame.rig, scene, self.config)
             surface = self._surface(scene)
             if neighbours and self.reach is not None:

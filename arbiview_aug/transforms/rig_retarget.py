@@ -101,12 +101,12 @@ class RigRetarget(torch.nn.Module):
             its ``points`` (ego frame) or ``depth_m`` (..., N, H, W; z-depth in metres, 0 or NaN where unknown), with
             ``boxes_3d`` for objects of few points; ``motion``: depth estimated from its ``neighbours``
             (``arbiview_aug.motion``; seconds a frame), or ``motion_depth_m`` of the ``depth`` command, with its
-            ``boxes_3d``, or the street, with a warning, if the estimate is declined; ``fused``: ``lidar`` and
-            ``motion`` together; ``learned``: its ``learned_depth_m`` (``depth --model``). ``auto``: for each pair of
-            cameras ``far`` where their centres coincide, else the best that the sample offers: ``fused`` or ``motion``
-            (with ``motion_depth_m``), ``lidar``, else ``objects``, else ``street`` (``paper``: always ``far``). Cameras
-            that move over the street alone harm a detector: a warning says so once, unless ``p`` leaves half of the
-            samples untouched. Points and boxes need a new plan for every frame.
+            ``boxes_3d``, or the street, with a warning, if the estimate is declined; ``fused``: ``lidar`` with
+            ``motion``, ``learned`` or both; ``learned``: its ``learned_depth_m`` (``depth --model``). ``auto``: for
+            each pair of cameras ``far`` where their centres coincide, else the best that the sample offers: ``fused``
+            or ``motion`` (with ``motion_depth_m``), ``lidar``, else ``objects``, else ``street`` (``paper``: always
+            ``far``). Cameras that move over the street alone harm a detector: a warning says so once, unless ``p``
+            leaves half of the samples untouched. Points and boxes need a new plan for every frame.
         strict: Raise SampleError instead of that warning.
         harmonise: Bring each view's sources to the exposure of its main one (``arbiview_aug.render.harmonise``). None:
             gains are estimated from every frame's overlaps, and used where held-out pixels agree better (never with

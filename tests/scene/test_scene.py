@@ -12,6 +12,7 @@ import torch
 from arbiview_aug import Camera, Rig, RigRetarget
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import SampleError
+from arbiview_aug.scene.depth_maps import anchored
 from arbiview_aug.scene.scene import SURFACES, Scene, SurfaceRow
 from arbiview_aug.scene.surface import StaticSurface, SurfaceName
 
@@ -50,6 +51,29 @@ def test_points_and_depth_from_motion_are_fused(surface: SurfaceName) -> None:
     lacking = {key: value for key, value in sample.items() if key != "motion_depth_m"}
     with pytest.raises(SampleError, match="surface='fused': expected 'neighbours' in the sample, or 'motion_depth_m'"):
         RigRetarget(target, surface="fused")(lacking)
+
+
+def test_learned_depth_follows_what_was_measured() -> None:
+    """A wall at 8 m that a network puts 8 % too far: it keeps its outline, and comes to where scan lines meet it."""
+    camera = Camera.looking(name="front", azimuth_deg=0, width_px=96, height_px=64, horizontal_fov_deg=80)
+    depth = torch.full((64, 96), 40.0)
+    depth[16:52, 20:76] = 8.0 * 1.08
+    y, z = (grid.ravel() for grid in np.meshgrid(np.linspace(-3, 3, 300), np.arange(0.2, 3, 0.18)))
+    points = np.stack([np.full_like(y, 8.0), y, z], -1)
+    points = np.concatenate([points, 2 * points - camera.center_m])  # some of another wall behind it
+    fixed = anchored(camera, depth.numpy().astype(float), points)
+    assert np.allclose(fixed[22:44, 26:70], 8.0, rtol=0.01)
+    assert np.array_equal(fixed[:, :8], depth[:, :8]) and (fixed[16:52, 19] != fixed[16:52, 20]).all()
+    wrong = depth.numpy().astype(float)
+    wrong[24:40, 30:60] = 5.0  # against all points
+    assert (anchored(camera, wrong, points)[26:38, 32:58] == 0).all()
+    rig, target = Rig([camera]), Rig([camera.shifted(z_m=0.5)])
+    sample = {"images": torch.rand(1, 3, 64, 96), "rig": rig, "points": torch.from_numpy(points)}
+    sample["learned_depth_m"] = depth[None]
+    (plan,) = RigRetarget(target, surface="fused").explain(sample).plan.targets
+    away_px = np.arange(64)[:, None] - plan.at.to_float()[..., 1]
+    assert np.allclose(away_px[30, 26:70], 0.5 / 8 * camera.K[1, 1], atol=0.1)
+    assert (away_px[30, [12, 16, 80, 84]] < 1).all()
 
 
 @dataclass(frozen=True)
