@@ -19,7 +19,7 @@ NOISE_LEVELS = 0.7  # standard deviation of a camera's noise after halving twice
 PER_CORRELATION = 2500  # the cost of one unit of correlation: four paths together fit into uint16
 INVALID = PER_CORRELATION * 7 // 10  # the largest cost, that of points which the neighbour does not see
 STEP, JUMP = np.uint16(PER_CORRELATION // 10), np.uint16(PER_CORRELATION * 6 // 5)  # of a change by one wall, by more
-PEAK, CLEAR = 2, np.float32(1.5)
+PEAK, CLEAR = 2, np.float32(1.3)
 """The least cost must be so much less than those of walls farther from it than so many steps."""
 
 _UNSEEN = np.uint16(INVALID)

@@ -86,16 +86,16 @@ def gain_db(index: int, move: str, sample: dict[str, Any], depth: MotionDepth) -
 @pytest.mark.parametrize(
     ("standing", "labels", "turned_deg", "density", "share", "least_db"),
     [
-        pytest.param(True, False, 0.0, 0.6, 0.9, 3.0, id="nothing else moves", marks=pytest.mark.slow),
-        pytest.param(False, True, 0.0, 0.0, 0.9, 2.7, id="traffic, labelled", marks=pytest.mark.release),
-        pytest.param(False, False, 0.0, 0.6, 0.9, 2.0, id="traffic, no labels", marks=pytest.mark.release),
-        pytest.param(True, False, 0.2, 0.6, 0.9, 3.0, id="poses 0.2 degrees wrong", marks=pytest.mark.release),
+        pytest.param(True, False, 0.0, 0.65, 0.9, 3.5, id="nothing else moves", marks=pytest.mark.slow),
+        pytest.param(False, True, 0.0, 0.0, 0.9, 4.0, id="traffic, labelled", marks=pytest.mark.release),
+        pytest.param(False, False, 0.0, 0.65, 0.9, 2.7, id="traffic, no labels", marks=pytest.mark.release),
+        pytest.param(True, False, 0.2, 0.65, 0.9, 3.5, id="poses 0.2 degrees wrong", marks=pytest.mark.release),
     ],
 )
 def test_depth_is_right_and_renders_better_than_the_street(
     standing: bool, labels: bool, turned_deg: float, density: float, share: float, least_db: float
 ) -> None:
-    """With traffic the 3 dB are not reached from above: unlabelled it is at wrong distances, labelled it is boxes."""
+    """Less is asked with unlabelled traffic: it is put at wrong distances."""
     counts, gains = np.zeros(3), {move: [] for move in MOVES}
     for index in STREETS:
         sample = sample_of(index, standing, labels, turned_deg)
@@ -141,5 +141,5 @@ def test_the_next_frame_as_truth(ddad_root: Path) -> None:
             rows.append(10 * np.log10(255**2 / np.mean(error**2)))
         found[surface] = float(np.mean(rows))
     print(f"\nthe next frame as truth, dB: {found}; covered: {cover}")
-    assert found["motion"] >= found["street"] + 1.5
+    assert found["motion"] >= found["street"] + 3.0
     assert found["fused"] >= max(19.5, found["lidar"] + 1.0) and cover["fused"] >= 0.97 * cover["street"]

@@ -100,7 +100,7 @@ def test_real_stereo_pairs(kitti_root: Path, referee: ModuleType, tmp_path: Path
     psnr = {name: row["true_covered_psnr_db"] for name, row in found["means"].items()}
     assert len(found["views"]) == 11 * len(psnr)
     assert psnr["copy"] == pytest.approx(15.10, abs=0.02) and psnr["fast, street"] > psnr["copy"] + 2.2
-    assert psnr["fast, motion"] > psnr["fast, street"] + 3.3
+    assert psnr["fast, motion"] > psnr["fast, street"] + 5.0
     *_, truth = referee.load_displaced(str(kitti_root / "frame_010"))
     frames = FrameFolder(kitti_root)
     out = RigRetarget(frames.truth(0)["rig"], surface="street", holes="black")(frames[0])

@@ -154,7 +154,7 @@ def test_the_least_is_refined_by_a_parabola() -> None:
 
 def test_a_least_is_clear_if_no_other_wall_is_nearly_as_good() -> None:
     """Walls next to it do not count, nor those behind the road, which show the road too."""
-    total = np.array([[[30, 12, 10, 12, 30, 30], [30, 12, 10, 12, 30, 14], [14, 12, 10, 12, 30, 30]]] * 2, np.uint16)
+    total = np.array([[[30, 12, 10, 12, 30, 30], [30, 12, 10, 12, 30, 12], [14, 12, 10, 12, 30, 30]]] * 2, np.uint16)
     total[1] = [10, 10, 10, 10, 20, 20]
     road = np.array([[0, 0, 0], [3, 3, 0]], np.float32)
     _, clear = find_least(total, np.float32(1), road)
