@@ -9,12 +9,9 @@ import torch
 
 from arbiview_aug.errors import SampleError
 from arbiview_aug.sample.batching import rewrapped
-from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
+from arbiview_aug.sample.inputs import DEPTH_KEYS
 
-OF_PLANS = ("depth_m", MOTION_KEY, LEARNED_KEY)
-"""Maps that are geometry."""
-
-STACKED = ("images", "K", "cam2ego", "coverage", "ignore", "distortion", "ego2world", *OF_PLANS)
+STACKED = ("images", "K", "cam2ego", "coverage", "ignore", "distortion", "ego2world", *DEPTH_KEYS)
 """What has one shape in all frames of a rig, and so have maps over the images. All else is a list: of points and boxes
 each frame has its own number."""
 

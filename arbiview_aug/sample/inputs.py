@@ -115,7 +115,7 @@ def scenes_on_device(sample: Mapping[str, Any], frames: Sequence[Frame], lead: t
     """As ``read_scenes``, of boxes and points that lie on the images' device: neither copied nor checked; else None."""
     row, device, scenes = SURFACES[surface], frames[0].images[0].device, [Scene() for _ in frames]
     keys = {key for name in row.reads for key in _SAMPLE_KEYS.get(name, (name,))}
-    if any(sample.get(key) is not None for key in keys.intersection(_MAP_KEYS)):
+    if any(sample.get(key) is not None for key in keys.intersection(DEPTH_KEYS)):
         return None
     for name, key, width in (("boxes", "boxes_3d", 7), ("points", "points", 3)):
         value = sample.get(key)
@@ -130,7 +130,7 @@ def scenes_on_device(sample: Mapping[str, Any], frames: Sequence[Frame], lead: t
     return None if row.needs is not None and scenes[0].geometry(row.needs) is None else scenes
 
 
-_MAP_KEYS = ("depth_m", MOTION_KEY, LEARNED_KEY)
+DEPTH_KEYS = ("depth_m", MOTION_KEY, LEARNED_KEY)
 _SAMPLE_KEYS = {"boxes": ("boxes_3d",), "points": ("points",), "motion": (MOTION_KEY,)}
 """Sample keys of the geometry that has a field in ``Scene``; others are read under their own name."""
 
@@ -156,7 +156,7 @@ def _geometry(
         value = sample.get(key)
         if value is None:
             continue
-        if key in _MAP_KEYS:
+        if key in DEPTH_KEYS:
             measured = [found[one] for one in ("points", "depth_m", "motion") if one in found and key != "depth_m"]
             none = [np.zeros((0, 3))] * len(frames)
             anchors = [np.concatenate(arrays) for arrays in zip(none, *measured, strict=True)]

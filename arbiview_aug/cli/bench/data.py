@@ -22,6 +22,7 @@ from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.frames import LidarReference, ScoredFrame, make_frame
 from arbiview_aug.evaluate.targets import without_masks
+from arbiview_aug.sample.inputs import DEPTH_KEYS
 
 REDUCES: tuple[Reduce, ...] = get_args(Reduce)
 
@@ -109,6 +110,8 @@ def as_of_another_frame(sample: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def lifted(sample: Mapping[str, Any], up_m: float) -> dict[str, Any]:
-    """Move points and boxes, so that no plan of other heights fits."""
+    """Move points and boxes, and scale depth maps by as little, so that no plan of other heights fits."""
     known = [key for key in ("points", "boxes_3d") if key in sample]
-    return {**sample, **{key: sample[key] + up_m * (torch.arange(sample[key].shape[-1]) == 2) for key in known}}
+    moved = {key: sample[key] + up_m * (torch.arange(sample[key].shape[-1]) == 2) for key in known}
+    maps = [key for key in DEPTH_KEYS if isinstance(sample.get(key), torch.Tensor)]
+    return {**sample, **moved, **{key: sample[key] * (1 + up_m) for key in maps}}

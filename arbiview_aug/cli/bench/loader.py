@@ -22,7 +22,9 @@ from arbiview_aug.cli.arguments import add_target, count, seed
 from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, lifted, recorded
 from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
 from arbiview_aug.cli.bench.timing import machine_line, memory_mib, quartiles, show
-from arbiview_aug.datasets import RetargetedDataset, open_data
+from arbiview_aug.datasets import RetargetedDataset, WithDepth, open_data
+from arbiview_aug.datasets.depth_folder import FOLDERS
+from arbiview_aug.datasets.registry import split_kind
 from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.scene.scene import SURFACES
@@ -74,14 +76,19 @@ def main(argv: Sequence[str] | None = None) -> int:
 def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     """Measure the rates of reading alone and of retargeting over each surface."""
     target = data.target(arguments.target, arguments.size)
-    plain: Dataset[Any] = Repeated(open_data(data.root, reduce=arguments.reduce), arguments.frames)
+    opened = open_data(data.root, reduce=arguments.reduce)
+    plain: Dataset[Any] = Repeated(opened, arguments.frames)
     datasets: dict[str, Dataset[Any]] = {PLAIN: plain}
     rig: Rig = data.sample(0, arguments.reduce)["rig"]
     for surface in arguments.surface:
-        retarget = RigRetarget(target, surface=surface)
+        retarget, source = RigRetarget(target, surface=surface), plain
+        if surface != "auto" and FOLDERS.keys() & SURFACES[surface].reads:
+            source = Repeated(
+                WithDepth(opened, split_kind(data.root)[1]), arguments.frames
+            )  # what the depth command wrote
         if SURFACES[surface].needs is None:
             retarget.prepare(rig)  # workers share static plans
-        datasets[f"retargeted, {surface}"] = RetargetedDataset(plain, retarget)
+        datasets[f"retargeted, {surface}"] = RetargetedDataset(source, retarget)
     return {
         "clock": "on the wall",
         "data": data.name,

@@ -7,7 +7,8 @@ from typing import Any
 
 import torch
 
-from arbiview_aug.sample.collate import OF_PLANS, are_maps
+from arbiview_aug.sample.collate import are_maps
+from arbiview_aug.sample.inputs import DEPTH_KEYS
 
 ON_HOST = "on_host"
 """Key of what stays on the CPU while a batch is moved."""
@@ -27,7 +28,7 @@ class OnHost:
 def packed(batch: Mapping[str, Any]) -> dict[str, Any]:
     """A batch by ``collate``: images and maps over them in the open, for the device, all else ``OnHost``."""
     images = batch["images"]
-    moved = {key: value for key, value in batch.items() if key not in OF_PLANS and are_maps([value], images)}
+    moved = {key: value for key, value in batch.items() if key not in DEPTH_KEYS and are_maps([value], images)}
     return {**moved, "images": images, ON_HOST: OnHost({k: v for k, v in batch.items() if k not in (*moved, "images")})}
 
 

@@ -21,7 +21,9 @@ from arbiview_aug import RetargetedDataset, RigRetarget
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.bench.loader import PLAIN, Repeated, loader_rates
 from arbiview_aug.cli.bench.timing import memory_mib
-from arbiview_aug.datasets.synthetic import demo_target_rig
+from arbiview_aug.datasets import Neighbours
+from arbiview_aug.datasets.frame_writer import write_drive
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from tests.helpers import street_sample
 
 EXPECTED = 1.7
@@ -90,6 +92,35 @@ def test_command(tmp_path: Path, nuscenes_root: Path, capsys: pytest.CaptureFixt
     assert "frames/s" in printed and "load" in printed and f"report: {path}" in printed
     with pytest.raises(SystemExit, match="2"):
         main([*arguments, "--workers", "-1"])
+
+
+@pytest.mark.slow
+def test_depth_on_disk_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    drive = SyntheticDrive(demo_source_rig((48, 96)), num_frames=3, neighbours=Neighbours())
+    root = tmp_path / "drive"
+    sample = drive[0]
+    write_drive(root, [sample, *sample["neighbours"]])
+    tiny = [
+        "--size",
+        "24x48",
+        "--reduce",
+        "1",
+        "--workers",
+        "0",
+        "--frames",
+        "3",
+        "--epochs",
+        "1",
+        "--output",
+        str(tmp_path / "a.json"),
+    ]
+    arguments = ["bench", "loader", "--data", str(root), "--surface", "motion", "fused", *tiny]
+    assert main(arguments) == 2
+    assert "depth" in capsys.readouterr().err
+    assert main(["depth", "--data", str(root)]) == 0
+    assert main(arguments) == 0
+    names = [rate["name"] for rate in json.loads((tmp_path / "a.json").read_text())["rates"]]
+    assert names == [PLAIN, "retargeted, motion", "retargeted, fused"]
 
 
 @pytest.mark.release
