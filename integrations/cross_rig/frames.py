@@ -82,7 +82,7 @@ class Source:
         }
         if self.variant is not None:
             variant = self.variant
-            renderer = "transforms" if variant.kind == "retarget" else "evaluate.baselines"
+            renderer = "transforms.rig_retarget" if variant.kind == "retarget" else "evaluate.baselines"
             spec |= {
                 "source": source_rig(self.size).content_key.hex(),
                 "arm": variant.views_spec(),  # the key that names existing frame stores

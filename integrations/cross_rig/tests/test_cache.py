@@ -7,6 +7,8 @@ import pytest
 
 from integrations.cross_rig import cache
 from integrations.cross_rig.cache import FrameStore, code_hash, content_hash, fill
+from integrations.cross_rig.frames import Source
+from integrations.cross_rig.variants import VARIANTS
 
 
 @pytest.fixture(autouse=True)
@@ -84,3 +86,18 @@ def test_code_hash_follows_imports_and_ignores_words(tmp_path, monkeypatch):
     code_hash.cache_clear()
     assert code_hash("hashed_package.top", within="hashed_package.top") == alone
     code_hash.cache_clear()
+
+
+def test_frames_are_made_anew_when_the_renderer_changes(tmp_path, monkeypatch):
+    """Kernels, shapes and fills are part of what names a variant's frames."""
+    read = set()
+    source = cache._source
+    monkeypatch.setattr(cache, "_source", lambda name: (read.add(name), source(name))[1])
+    code_hash.cache_clear()
+    for name in ("auto", "auto_fill", "row_split"):
+        read.clear()
+        Source(root=tmp_path, size=(24, 64), split="train", change="up70", variant=VARIANTS[name]).store()
+        rendering = {"arbiview_aug.render.kernels", "arbiview_aug.scene.shapes", "arbiview_aug.transforms.planner"}
+        assert (rendering <= read) == (name != "row_split") and "arbiview_aug.datasets.synthetic.street" in read
+        assert ("arbiview_aug.generator.fillers" in read) == (name == "auto_fill")
+        code_hash.cache_clear()
