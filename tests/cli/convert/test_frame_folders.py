@@ -153,7 +153,7 @@ def test_depth_from_motion_is_read(source: Path, tmp_path: Path, capsys: pytest.
     assert "expected depth of frame '0002', found none" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(command(source, tmp_path / "other", "--motion-depth", str(tmp_path / "elsewhere")))
-    assert "expected it with --surface motion" in capsys.readouterr().err
+    assert "expected it with --surface auto, motion, fused or learned" in capsys.readouterr().err
 
 
 def test_impossible_settings(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
