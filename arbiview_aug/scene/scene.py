@@ -134,7 +134,7 @@ def _boxes(scene: Scene, ground_z_m: float) -> Surface:
 def _point_cloud(scene: Scene, ground_z_m: float, points: Points | None, *maps: Points | None) -> Surface:
     """Points, and those of depth maps, with the scene's boxes."""
     boxes = scene.boxes if scene.boxes is not None and len(scene.boxes) else None
-    parts = [np.zeros((0, 3), np.float32) if part is None else part for part in (points, *maps)]
+    parts = [np.zeros((0, 3), np.float32) if part is None else part[:, :3] for part in (points, *maps)]
     # One type and layout: kernels are compiled for each.
     street, together = _street(scene, ground_z_m), np.ascontiguousarray(np.concatenate(parts), np.float32)
     if len(together) == 0:
