@@ -88,6 +88,7 @@ SLOW = (
     "depth --fit",
     "evaluate --paper",
     "evaluate --figure",
+    "evaluate --data FOLDER --target waymo --surface learned",
     "evaluate --data FOLDER --yaws",
 )
 

@@ -8,9 +8,11 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 
 
 def test_retargeted_samples_of_differing_numbers_of_objects() -> None:
-    drive = SyntheticDrive(demo_source_rig((36, 64)), num_frames=3, seed=2)
-    assert len({len(drive[k]["boxes_3d"]) for k in range(3)}) > 1
-    data = RetargetedDataset(drive, RigRetarget(drive.rig.shifted(z_m=0.2), size=(36, 64), p=0.5))
+    rig = demo_source_rig((36, 64))
+    drive = SyntheticDrive(rig, num_frames=3, seed=2)
+    samples = [drive[k] for k in range(3)]
+    assert len({len(sample["boxes_3d"]) for sample in samples}) > 1
+    data = RetargetedDataset(samples, RigRetarget(rig.shifted(z_m=0.2), size=(36, 64), p=0.5))
     torch.manual_seed(1)
     (batch,) = DataLoader(data, batch_size=3, collate_fn=collate)
     torch.manual_seed(1)
