@@ -46,7 +46,7 @@ class Canvas(NamedTuple):
 
     Attributes:
         size: (h, w) in pixels, multiples of the network's.
-        windows: With the row and the column of each on the canvas.
+        windows: With the row and the column of each on the canvas, in order of these.
     """
 
     size: tuple[int, int]
@@ -115,7 +115,8 @@ def packed(found: Sequence[Window], size: int, multiple: int) -> list[Canvas]:
     canvases = []
     for taken, on_canvas in zip(rows, placed, strict=True):
         wide = max(left + window.fills.shape[1] for window, _, left in on_canvas)
-        canvases.append(Canvas((-(-taken // multiple) * multiple, -(-wide // multiple) * multiple), on_canvas))
+        size_px = -(-taken // multiple) * multiple, -(-wide // multiple) * multiple
+        canvases.append(Canvas(size_px, sorted(on_canvas, key=lambda one: one[1:])))
     return canvases
 
 

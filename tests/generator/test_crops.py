@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from arbiview_aug.generator.crops import drawn, packed, windows
+from arbiview_aug.generator.crops import Window, drawn, packed, windows
 
 
 def holes(seed: int, shape: tuple[int, int], kind: str) -> np.ndarray:
@@ -76,3 +76,18 @@ def test_small_windows_share_a_canvas_and_do_not_overlap() -> None:
             h, w = window.fills.shape
             assert marks[top : top + h, left : left + w][window.fills].all()
     assert sum(window.fills.sum() for canvas in canvases for window, _, _ in canvas.windows) == view.sum()
+
+
+def test_windows_of_all_sizes_are_drawn_whole() -> None:
+    """Also where a narrow one is placed on the upper shelf after a wide one below."""
+    view = np.random.default_rng(0).random((3, 256, 704), np.float32)
+    hole = holes(0, (256, 704), "specks")
+    found = [Window(0, 0, 0, hole[:100, :200]), Window(0, 100, 0, hole[100:190, :250])]
+    found += [Window(0, 0, 300, hole[:80, 300:350]), Window(0, 150, 400, hole[150:200, 400:420])]
+    (canvas,) = packed(found, 256, 8)
+    pixels, marks = drawn(canvas, [view], [hole])
+    for window, top, left in canvas.windows:
+        h, w = window.fills.shape
+        at = np.s_[..., top : top + h, left : left + w]
+        np.testing.assert_array_equal(marks[at], window.fills)
+        np.testing.assert_array_equal(pixels[at], window.of(view) * ~window.fills)
