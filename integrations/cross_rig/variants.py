@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from integrations.cross_rig.variant import Geometry, Noise, Variant
 
 NOISES: dict[Noise, str] = {
@@ -11,6 +13,9 @@ NOISES: dict[Noise, str] = {
     "calibration": "cameras turned by 0.2°",
 }
 _ALL: tuple[Geometry, ...] = ("points", "boxes_3d")
+_filled = partial(Variant, kind="retarget", reads=_ALL, holes="fill", masked=False)
+"""``auto`` for a network that lifts every pixel."""
+
 VARIANTS: dict[str, Variant] = {
     variant.name: variant
     for variant in (
@@ -53,23 +58,8 @@ VARIANTS: dict[str, Variant] = {
         ),
         Variant(name="auto_mixed", title="auto + raw", kind="retarget", reads=_ALL, mixed=True),
         Variant(name="auto_black", title="auto, black holes, no mask", kind="retarget", reads=_ALL, masked=False),
-        Variant(
-            name="auto_fill",
-            title="auto, filled holes, no mask",
-            kind="retarget",
-            reads=_ALL,
-            holes="fill",
-            masked=False,
-        ),
-        Variant(
-            name="auto_fill_mixed",
-            title="auto, filled holes, no mask, + raw",
-            kind="retarget",
-            reads=_ALL,
-            holes="fill",
-            masked=False,
-            mixed=True,
-        ),
+        _filled(name="auto_fill", title="auto, filled holes, no mask"),
+        _filled(name="auto_fill_mixed", title="auto, filled holes, no mask, + raw", mixed=True),
         Variant(
             name="auto_generated",
             title="auto, generator, no mask",
@@ -101,35 +91,11 @@ VARIANTS: dict[str, Variant] = {
         ),
         Variant(name="random", title="RandomRig around B, auto", kind="retarget", reads=_ALL, random=True),
         *(
-            Variant(
-                name=f"auto_fill_{noise}",
-                title=f"auto, filled holes, no mask, {title}",
-                kind="retarget",
-                reads=_ALL,
-                holes="fill",
-                masked=False,
-                noise=noise,
-            )
+            _filled(name=f"auto_fill_{noise}", title=f"auto, filled holes, no mask, {title}", noise=noise)
             for noise, title in NOISES.items()
         ),
-        Variant(
-            name="auto_fill_labels",
-            title="auto, filled holes, no mask, labels of the views",
-            kind="retarget",
-            reads=_ALL,
-            holes="fill",
-            masked=False,
-            labels="views",
-        ),
-        Variant(
-            name="auto_fill_random",
-            title="RandomRig around B, auto, filled holes, no mask",
-            kind="retarget",
-            reads=_ALL,
-            holes="fill",
-            masked=False,
-            random=True,
-        ),
+        _filled(name="auto_fill_labels", title="auto, filled holes, no mask, labels of the views", labels="views"),
+        _filled(name="auto_fill_random", title="RandomRig around B, auto, filled holes, no mask", random=True),
         Variant(name="oracle_labels", title="B's own frames, A's labels", kind="oracle", labels="A"),
         Variant(name="oracle_mixed", title="B's own frames, + raw", kind="oracle", mixed=True),
         Variant(name="oracle_scaled", title="B's own frames, scaled and cropped", kind="oracle", augmented=True),
