@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from integrations.cross_rig.cache import code_hash, content_hash
+from integrations.cross_rig.cache import FrameStore, code_hash, content_hash
 from integrations.cross_rig.frames import Source, box_store, make_boxes, make_frames, one_thread
 from integrations.cross_rig.labels import Grid, covered_cells
 from integrations.cross_rig.model import Detector
@@ -39,7 +39,10 @@ class Run:
     # --- frames -----------------------------------------------------------------------------------------------------
     def source(self, split: Split, change: str | None = None, variant: Variant | None = None) -> Source:
         """A set of frames of this run."""
-        return Source(root=self.output / "frames", size=self.settings.size, split=split, change=change, variant=variant)
+        s = self.settings
+        return Source(
+            root=self.output / "frames", size=s.size, split=split, change=change, variant=variant, streets=s.streets
+        )
 
     def sources(self) -> list[tuple[Source, int]]:
         """Every set that the run needs and its length, in the order in which they can be made."""
@@ -81,7 +84,10 @@ class Run:
 
     def boxes(self, split: Split, num_frames: int) -> npt.NDArray[np.float32]:
         """(F, n, 7) vehicles of a split's streets."""
-        return box_store(self.output / "frames", split).stacked("boxes", num_frames)
+        return self._box_store(split).stacked("boxes", num_frames)
+
+    def _box_store(self, split: Split) -> FrameStore:
+        return box_store(self.output / "frames", split, self.settings.streets)
 
     def schedule(self, job: Job) -> Schedule:
         """Of a job's training."""
@@ -119,7 +125,7 @@ class Run:
                 "augmented": job.variant.augmented,
                 "count": count,
                 "schedule": asdict(self.schedule(job)),
-                "boxes": box_store(self.output / "frames", "train").key,
+                "boxes": self._box_store("train").key,
                 "seed": job.seed,
                 "code": code_hash("integrations.cross_rig.training"),
             }
@@ -228,7 +234,7 @@ def _write(path: Path, write: Callable[[Path], object]) -> None:
 def run(setup: Run, workers: int, log: Log) -> Iterator[int]:
     """Make everything that is missing; yields the number of missing trainings, before the first and after each."""
     for split in SPLITS:
-        make_boxes(setup.output / "frames", split, getattr(setup.settings, f"{split}_frames"))
+        make_boxes(setup.output / "frames", split, getattr(setup.settings, f"{split}_frames"), setup.settings.streets)
     for source, count in setup.sources():
         start = time.monotonic()
         for done, todo in make_frames(source, count, workers):

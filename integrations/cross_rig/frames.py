@@ -26,7 +26,7 @@ from integrations.cross_rig.labels import Grid, box_cells, visible_objects
 from integrations.cross_rig.noise import LATE_S, noisy_boxes, noisy_depth, thinned, turned
 from integrations.cross_rig.variant import Variant
 from integrations.cross_rig.views import ViewMaker
-from integrations.cross_rig.worlds import CHANGES, STREET_SEEDS, Size, Split, source_rig
+from integrations.cross_rig.worlds import CHANGES, STREETS, Size, Split, source_rig, street_seed
 
 _WORLD = "arbiview_aug.datasets.synthetic"
 _FORMAT = 1
@@ -56,6 +56,7 @@ class Source:
         split: Streets.
         change: Vehicle B by its change; None: vehicle A.
         variant: Whose training set; None: the rig's own true frames. Variants that only draw differently share one.
+        streets: The world, by ``worlds.street_seed``.
     """
 
     root: Path
@@ -63,6 +64,12 @@ class Source:
     split: Split
     change: str | None = None
     variant: Variant | None = None
+    streets: int = STREETS
+
+    @property
+    def street_seed(self) -> int:
+        """Of the streets' dataset."""
+        return street_seed(self.split, self.streets)
 
     @property
     def rig(self) -> Rig:
@@ -74,7 +81,7 @@ class Source:
         spec: dict[str, Any] = {
             "format": _FORMAT,
             "rig": self.rig.content_key.hex(),
-            "streets": STREET_SEEDS[self.split],
+            "streets": self.street_seed,
             "grid": vars(Grid()),
             # Not the cameras' code: theirs is pinned by tests, and a change there must not cost hours of rendering.
             "world": code_hash(_WORLD, within=_WORLD),
@@ -99,7 +106,7 @@ class Source:
 
     def original(self) -> Source:
         """A's true frames of the same streets."""
-        return Source(root=self.root, size=self.size, split=self.split)
+        return Source(root=self.root, size=self.size, split=self.split, streets=self.streets)
 
     def rendered(self) -> Source:
         """The same views as ``RigRetarget`` renders them: without the generator's pixels, or the truth's."""
@@ -123,21 +130,22 @@ class Source:
         return replace(self, variant=None)
 
 
-def box_store(root: Path, split: Split) -> FrameStore:
+def box_store(root: Path, split: Split, streets: int) -> FrameStore:
     """Boxes of a split's vehicles, in A's ego frame; of no rendering."""
     spec = {
         "format": _FORMAT,
         "boxes": code_hash("integrations.cross_rig.boxes"),
-        "streets": STREET_SEEDS[split],
+        "streets": street_seed(split, streets),
         "world": code_hash(_WORLD, within=_WORLD),
     }
     return FrameStore(root, spec)
 
 
-def make_boxes(root: Path, split: Split, num_frames: int) -> None:
+def make_boxes(root: Path, split: Split, num_frames: int, streets: int = STREETS) -> None:
     """Make what is missing."""
-    store = box_store(root, split)
-    drive = SyntheticDrive(source_rig((96, 256)), num_frames=_MAX_FRAMES, seed=STREET_SEEDS[split], lidar=False)
+    store = box_store(root, split, streets)
+    seed = street_seed(split, streets)
+    drive = SyntheticDrive(source_rig((96, 256)), num_frames=_MAX_FRAMES, seed=seed, lidar=False)
     for chunk in store.missing(num_frames):
         fill(store, lambda k: {"boxes": vehicle_boxes(Grid(), drive.scene(k), drive.rig.ground_z_m)}, chunk)
 
@@ -185,7 +193,7 @@ class _TrueFrames:
 
     def __init__(self, source: Source) -> None:
         self.source, self.rig = source, source.rig
-        self.drive = SyntheticDrive(self.rig, num_frames=_MAX_FRAMES, seed=STREET_SEEDS[source.split], lidar=False)
+        self.drive = SyntheticDrive(self.rig, num_frames=_MAX_FRAMES, seed=source.street_seed, lidar=False)
 
     def __call__(self, index: int) -> Arrays:
         start = time.process_time()
@@ -209,7 +217,7 @@ class _VariantFrames:
         assert source.variant is not None
         self.variant, self.original = source.variant, source.original()
         self.store = self.original.store()
-        rig, noise, seed = self.original.rig, self.variant.noise, STREET_SEEDS[source.split]
+        rig, noise, seed = self.original.rig, self.variant.noise, source.street_seed
         self.views = ViewMaker(self.variant, turned(rig) if noise == "calibration" else rig, source.rig)
         self.drive = SyntheticDrive(rig, num_frames=_MAX_FRAMES, seed=seed, lidar=False)
         self.measured = _Later(self.drive, LATE_S) if noise == "late" else self.drive

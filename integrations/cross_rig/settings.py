@@ -12,7 +12,7 @@ from integrations.cross_rig.families import FAMILIES
 from integrations.cross_rig.training import Schedule
 from integrations.cross_rig.variant import Variant
 from integrations.cross_rig.variants import VARIANTS
-from integrations.cross_rig.worlds import CHANGES, Size
+from integrations.cross_rig.worlds import CHANGES, STREETS, Size
 
 T = TypeVar("T")
 
@@ -36,6 +36,7 @@ class Settings:
     Attributes:
         size: (h, w) of every image.
         train_frames, val_frames, test_frames: Of the three sets of streets.
+        streets: The world that all three come from, a whole hundred: ``worlds.street_seed``.
         seeds: Of the trainings; each variant is trained once with each.
         changes: Names of ``worlds.CHANGES``.
         variants: Names of ``variants.VARIANTS``.
@@ -50,6 +51,7 @@ class Settings:
     train_frames: int = 1000
     val_frames: int = 200
     test_frames: int = 1000
+    streets: int = STREETS
     seeds: tuple[int, ...] = (0, 1, 2)
     changes: tuple[str, ...] = tuple(CHANGES)
     variants: tuple[str, ...] = tuple(VARIANTS)
@@ -60,6 +62,8 @@ class Settings:
         named_rows("variants", self.variants, VARIANTS)
         named_rows("changes", self.changes, CHANGES)
         named_rows("families", self.families, FAMILIES)
+        if self.streets % 100 or self.streets < STREETS:
+            raise ValueError(f"streets: expected a whole hundred from {STREETS} on, got {self.streets}")
         for name in ("train_frames", "val_frames", "test_frames"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected a whole number above 0, got {getattr(self, name)}")

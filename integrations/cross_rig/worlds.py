@@ -19,8 +19,14 @@ Split = Literal["train", "val", "test"]
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
-STREET_SEEDS: dict[Split, int] = {"train": 101, "val": 102, "test": 103}
-"""Seeds of ``SyntheticDrive``: datasets with different seeds share no street."""
+STREETS = 100
+"""The world that constants of the renderer were chosen on; another hundred is another world."""
+
+
+def street_seed(split: Split, streets: int = STREETS) -> int:
+    """Seed of ``SyntheticDrive`` for a split of a world: datasets with different seeds share no street."""
+    return streets + 1 + SPLITS.index(split)
+
 
 _AZIMUTHS_DEG = (0.0, 55.0, -55.0, 110.0, -110.0, 180.0)
 """nuScenes' six cameras."""

@@ -12,7 +12,7 @@ from integrations.cross_rig.frames import NEIGHBOURS, Source, _VariantFrames
 from integrations.cross_rig.settings import Settings
 from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.views import ViewMaker
-from integrations.cross_rig.worlds import CHANGES, STREET_SEEDS, source_rig
+from integrations.cross_rig.worlds import CHANGES, SPLITS, source_rig, street_seed
 
 SIZE = (24, 64)
 
@@ -58,7 +58,7 @@ def test_variants_are_given_the_frames_before_and_after(tmp_path, frame):
     source = Source(root=tmp_path, size=SIZE, split="train", change="up70", variant=VARIANTS["auto_neighbours"])
     given = _VariantFrames(source)._neighbours(3)
     drive = SyntheticDrive(
-        source_rig(SIZE), num_frames=4, seed=STREET_SEEDS["train"], lidar=False, neighbours=NEIGHBOURS
+        source_rig(SIZE), num_frames=4, seed=street_seed("train"), lidar=False, neighbours=NEIGHBOURS
     )
     expected = drive[3]
     assert torch.equal(given["ego2world"], expected["ego2world"]) and len(given["neighbours"]) == 2
@@ -104,7 +104,7 @@ def test_scaled_and_cropped_keeps_pixels_and_calibration_together():
 
 
 def test_streets_are_disjoint_and_rigs_stand_on_one_road():
-    assert len(set(STREET_SEEDS.values())) == 3
+    assert len({street_seed(split, streets) for split in SPLITS for streets in (100, 200)}) == 6
     for change in CHANGES.values():
         rig = change.target((96, 256))
         assert rig.ground_z_m == 0 and set(rig.sizes) == {(96, 256)}
