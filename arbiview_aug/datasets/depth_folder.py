@@ -46,7 +46,7 @@ class DepthFolder:
         return inside(self.root, f"{file_name(token)}.npz", f"depth of frame {token!r}")
 
     def write(self, token: str, rig: Rig, depth: MotionDepth, origin: Sequence[str] = ()) -> None:
-        """Write a frame's depth atomically, with its rig and what it was estimated from: neighbours, or a model.
+        """Write a frame's depth atomically, with its token, rig and origin: its neighbours, or a model.
 
         Raises:
             OutputError: The file cannot be written.
@@ -56,6 +56,7 @@ class DepthFolder:
             np.savez_compressed(
                 file,
                 format=_FORMAT,
+                token=np.array(token),
                 kind=np.array("learned" if isinstance(depth, LearnedDepth) else "motion"),
                 words=np.array(depth.words),
                 neighbours=np.array(list(origin), dtype=np.str_),
@@ -67,7 +68,7 @@ class DepthFolder:
         """Read a frame's depth, of either kind.
 
         Raises:
-            DataError: The file is missing, broken, or of another calibration than ``rig``.
+            DataError: The file is missing, broken, or of another frame or calibration.
         """
         return self._read(token, rig)[0]
 
@@ -96,13 +97,16 @@ class DepthFolder:
             with np.load(path, allow_pickle=False) as file:
                 arrays: dict[str, Any] = {name: file[name] for name in file.files}
             depth = tuple(arrays[f"depth_{k:02}"].astype(np.float32) for k in range(len(arrays["K"])))
-            words, fits = str(arrays["words"]), int(arrays["format"]) == _FORMAT and _fits(arrays, rig, depth)
-            kind, origin = _KINDS[str(arrays.get("kind", "motion"))], arrays["neighbours"].tolist() if fits else []
+            words, of = str(arrays["words"]), str(arrays.get("token", token))  # older files name no token
+            misfit = None if of == token else (f"frame {token!r}", f"that of frame {of!r}")
+            misfit = misfit or _misfit(arrays, rig, depth)
+            kind, origin = _KINDS[str(arrays.get("kind", "motion"))], arrays["neighbours"].tolist()
         except (*BROKEN_ARRAY, KeyError, TypeError) as error:
             raise DataError(f"{path}: expected depth of a frame, got {type(error).__name__}; delete it") from None
-        if not fits:
+        if misfit is not None:
+            expected, got = misfit
             raise DataError(
-                f"{path}: expected depth of this calibration, got another's; delete it and run the depth command again"
+                f"{path}: expected depth of {expected}, got {got}; delete it and run the depth command again"
             )
         return kind(depth, words), origin
 
@@ -157,10 +161,17 @@ def _calibration(rig: Rig) -> dict[str, Any]:
     return {"K": np.stack([camera.K for camera in cameras]), "cam2ego": np.stack([c.cam2ego for c in cameras])}
 
 
-def _fits(arrays: Mapping[str, Any], rig: Rig, depth: tuple[Layer, ...]) -> bool:
-    calibration = _calibration(rig)
-    return (
-        [layer.shape for layer in depth] == [motion_camera(camera).size for camera in rig]
-        and np.allclose(arrays["K"], calibration["K"], rtol=0, atol=_SAME_PX)
-        and np.allclose(arrays["cam2ego"], calibration["cam2ego"], rtol=0, atol=_SAME_POSE)
-    )
+def _misfit(arrays: Mapping[str, Any], rig: Rig, depth: tuple[Layer, ...]) -> tuple[str, str] | None:
+    """Expected and found, where the depth is of another format, rig, image size or calibration."""
+    if int(arrays["format"]) != _FORMAT:
+        return f"format {_FORMAT}", f"format {int(arrays['format'])}"
+    if len(depth) != len(rig):
+        return f"{len(rig)} cameras", f"{len(depth)}"
+    for camera, layer in zip(rig, depth, strict=True):
+        if layer.shape != (size := motion_camera(camera).size):
+            return f"camera {camera.name!r} of shape {size}", f"{layer.shape}"
+    for key, atol in (("K", _SAME_PX), ("cam2ego", _SAME_POSE)):
+        for camera, found, own in zip(rig, arrays[key], _calibration(rig)[key], strict=True):
+            if not np.allclose(found, own, rtol=0, atol=atol):
+                return "this calibration", f"another's: {key} of camera {camera.name!r} differs"
+    return None

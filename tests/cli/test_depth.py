@@ -101,8 +101,15 @@ def test_files_that_do_not_fit_are_named(made: Path, recorded: Path, tmp_path: P
         depths.read("missing", rig)
     with pytest.raises(DataError, match=r"000\.npz: expected depth of this calibration"):
         depths.read("000", rig.turned(yaw_deg=1))
-    with pytest.raises(DataError, match=r"000\.npz: expected depth of this calibration"):
+    with pytest.raises(DataError, match=r"000\.npz: expected depth of 1 cameras, got 2"):
         depths.read("000", Rig([rig[0]]))
+    with pytest.raises(
+        DataError, match=r"000\.npz: expected depth of camera '.*' of shape \(32, 88\), got \(64, 176\)"
+    ):
+        depths.read("000", rig.resized((32, 88), "stretch"))
+    shutil.copy(depths.path("000"), tmp_path / "001.npz")
+    with pytest.raises(DataError, match=r"001\.npz: expected depth of frame '001', got that of frame '000'; delete it"):
+        DepthFolder(tmp_path).read("001", rig)
     (tmp_path / "x.npz").write_bytes(b"nothing")
     with pytest.raises(DataError, match=r"x\.npz: expected depth of a frame, got "):
         DepthFolder(tmp_path).read("x", rig)

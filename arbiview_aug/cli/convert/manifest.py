@@ -13,12 +13,15 @@ from typing import Any
 
 from arbiview_aug.atomic_io import file_name, write_whole
 from arbiview_aug.cli.convert.settings import FOLDER
-from arbiview_aug.errors import DataError
+from arbiview_aug.errors import DataError, shown
 
 Record = Mapping[str, Any]
 """``token``; for a converted sample ``cameras``, ``ground_z_m``, ``files`` (bytes by path), ``sources`` (SHA-256 by
 path), ``source_bytes``, ``coverage``, ``without`` (unreadable neighbours, if any) and entries of the format; or, if
 left out, ``skipped``: the reason."""
+
+
+_ENTRIES = {"cameras": list, "files": dict, "sources": dict, "source_bytes": int, "coverage": list}
 
 
 class Manifest:
@@ -42,8 +45,20 @@ class Manifest:
         return self.folder / "samples" / f"{file_name(token)}.json"
 
     def record(self, token: str) -> Record | None:
+        """A sample's record, None without one; DataError for one of another sample, or of another form."""
         path = self.path(token)
-        return _read(path) if path.is_file() else None
+        if not path.is_file():
+            return None
+        record = _read(path)
+        if record.get("token") != token:
+            got = shown(record.get("token"))
+            raise DataError(f"{path}: expected the record of sample {token!r}, got that of {got}; remove this file")
+        entries = {"skipped": str} if "skipped" in record else _ENTRIES
+        for key, kind in entries.items():
+            if not isinstance(value := record.get(key), kind):
+                got = f"{type(value).__name__} in {key!r}" if key in record else f"no {key!r}"
+                raise DataError(f"{path}: expected what the conversion wrote, got {got}; remove this file")
+        return record
 
     def records(self, tokens: Sequence[str]) -> Iterator[Record]:
         """Yield the existing records in this order; 40,000 at once would take a gigabyte."""
@@ -77,9 +92,13 @@ def _text(data: Mapping[str, Any]) -> bytes:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: expected what the conversion wrote, got {error}; remove this file") from None
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(found, dict):
+            return found
+        got = type(found).__name__
+    except (OSError, ValueError, RecursionError) as error:
+        got = str(error)
+    raise DataError(f"{path}: expected what the conversion wrote, got {got}; remove this file")
 
 
 def _differences(found: Any, asked: Any, where: str = "") -> Iterator[str]:

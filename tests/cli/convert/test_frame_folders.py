@@ -306,3 +306,23 @@ def test_records_that_nobody_wrote_here(
     monkeypatch.setattr(command_module, "_run", lambda *_: iter(()))
     assert main(command(source, tmp_path / "new")) == 2
     assert "expected the records of all 3 samples, found 3 missing" in capsys.readouterr().err
+
+
+def test_records_of_other_samples_and_forms(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = command(source, tmp_path / "new")
+    assert main(asked) == 0
+    record = tmp_path / "new" / "conversion" / "samples" / "0000.json"
+    wrote = "expected what the conversion wrote, got"
+    for content, message in (
+        (record.with_name("0001.json").read_text(), "expected the record of sample '0000', got that of '0001'; remove"),
+        ("[]", f"{wrote} list; remove this file"),
+        ("[" * 100_000, f"{wrote} maximum recursion depth exceeded"),
+        ('{"token": "0000", "files": {}}', f"{wrote} no 'cameras'; remove this file"),
+        ('{"token": "0000", "skipped": 3}', f"{wrote} int in 'skipped'; remove"),
+    ):
+        record.write_text(content)
+        assert main(asked) == 1
+        said = capsys.readouterr().err
+        assert f"0000: failed: {record}: {message}" in said and "0001: failed" not in said
+    (tmp_path / "new" / "conversion" / "settings.json").write_text("[]")
+    assert main(asked) == 2 and f"settings.json: {wrote} list" in capsys.readouterr().err
