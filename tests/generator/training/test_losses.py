@@ -123,6 +123,23 @@ def test_perceptual_is_zero_for_the_same_and_has_finite_gradients_there() -> Non
     assert not any(parameter.requires_grad for parameter in vgg.parameters())
 
 
+def test_perceptual_reads_four_layers() -> None:
+    """The mean over relu1_2, 2_2, 3_3 and 4_3 of the features' RMS difference, by VGG16 itself."""
+    torch.manual_seed(0)
+    layers = features()
+    for parameter in layers.parameters():
+        parameter.data.abs_()  # no layer dies
+    one, two = torch.rand(2, 2, 3, 32, 32)
+    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+    expected = torch.zeros(2)
+    for last in (3, 8, 15, 22):
+        a, b = (layers[: last + 1]((x - mean.view(3, 1, 1)) / std.view(3, 1, 1)) for x in (one, two))
+        distance = (a - b).square().mean((1, 2, 3)).sqrt() / 4
+        assert float(distance.detach().min()) > 1e-6
+        expected += distance.detach()
+    assert torch.allclose(Perceptual(layers)(one, two), expected, rtol=1e-4)
+
+
 def test_vgg_weights_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(
         TrainingError, match=r"--vgg-weights .*nothing.pth: expected weights of torchvision.*--set loss"

@@ -79,6 +79,16 @@ def test_as_written_the_pair_holds_nearly_all_of_the_real_view() -> None:
     assert float(error) < 0.05  # warped twice; where cameras overlap, their pictures differ
 
 
+def test_the_condition_is_made_of_the_pair_alone() -> None:
+    """All cameras at the target pose would be the answer: what the pair does not show must be unknown."""
+    made = items(yaw_deg=(35.0, 35.0), pitch_deg=0.0, focal=(3.0, 3.0))  # a narrow pair, turned away: 19 to 51 degrees
+    batch = collate([made[k] for k in range(4)])
+    middle = slice(SIZE[1] // 2 - 4, SIZE[1] // 2 + 4)
+    assert not bool(batch.known[..., middle].any())
+    assert bool((batch.favs[..., middle] == 0).all())
+    assert bool(batch.known.flatten(1).any(1).all())
+
+
 def test_k_pairs_share_their_real_view() -> None:
     made = items(pairs=2)
     a, b, c = made[0], made[1], made[2]

@@ -141,12 +141,19 @@ def test_a_state_that_is_no_state_is_refused(tmp_path: Path) -> None:
         run(tmp_path, steps=2)
 
 
-def test_the_average_is_kept_apart_from_what_is_trained(tmp_path: Path) -> None:
+def test_the_average_follows_what_is_trained(tmp_path: Path) -> None:
+    """Decay 1/10 after the first step and 2/11 after the second, which is below that of the settings."""
     made = run(tmp_path, steps=3)
-    made.train()
-    name, value = next(iter(made.average.values.items()))
-    parameter = dict(made.generator.denoiser.named_parameters())[name]
-    assert not torch.equal(parameter, value)
+    parameters = dict(made.generator.denoiser.named_parameters())
+    expected = {name: value.detach().clone() for name, value in parameters.items()}
+    for step, batch in zip(range(2), made._batches(), strict=False):
+        made.train_step(batch)
+        made.done += 1
+        for name, value in parameters.items():
+            expected[name] = torch.lerp(value.detach(), expected[name], (1 + step) / (10 + step))
+    moved = [name for name, value in parameters.items() if not torch.equal(value, expected[name])]
+    assert moved and all(torch.allclose(made.average.values[name], expected[name], atol=1e-6) for name in expected)
+    assert any(not torch.allclose(made.average.values[name], parameters[name], atol=1e-6) for name in moved)
 
 
 def test_the_learning_rate_warms_up_and_falls_to_nothing() -> None:
