@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns 0 if done or stopped while training, 2 after an error, 130 after any other Ctrl-C."""
     arguments = parser().parse_args(argv)
     program = "python -m arbiview_aug.train"
-    return exit_status(program, lambda: run(arguments), (ArbiviewError, OSError), resumable=True)
+    return exit_status(program, lambda: run(arguments), (ArbiviewError, OSError, ImportError), resumable=True)
 
 
 if __name__ == "__main__":

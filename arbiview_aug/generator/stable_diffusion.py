@@ -49,6 +49,12 @@ def load_part(kind: str, where: str | Path, subfolder: str, expected: Mapping[st
         )
     except (OSError, ValueError, RuntimeError) as error:  # no safetensors; shapes that do not fit
         raise GeneratorError(f"{label}: expected the weights of this {kind} as safetensors: {error}") from None
+    _check_complete(report, label, kind)
+    return model
+
+
+def _check_complete(report: Mapping[str, Any], label: str, kind: str) -> None:
+    """Raise GeneratorError for weights that are missing or extra in a library's loading report."""
     wrong = [
         f"{len(names)} {what}: {', '.join(sorted(map(str, names))[:4])}"
         for what, names in (("missing", report["missing_keys"]), ("that do not belong", report["unexpected_keys"]))
@@ -56,22 +62,22 @@ def load_part(kind: str, where: str | Path, subfolder: str, expected: Mapping[st
     ]
     if wrong:
         raise GeneratorError(f"{label}: expected exactly the weights of this {kind}; {'; '.join(wrong)}")
-    return model
 
 
 def empty_prompt(where: str | Path) -> torch.Tensor:
-    """(77, width) CLIP's embedding of the empty prompt, by transformers; a generator's own folder contains it."""
+    """(77, width) CLIP's embedding of the empty prompt, by transformers; a generator's own folder contains it.
+
+    GeneratorError for weights that are missing, extra or of another shape.
+    """
+    kind, label = "CLIPTextModel", f"{where}/text_encoder"
+    encoder_class = getattr(optional_package("transformers", "generator"), kind)
     try:
-        transformers = optional_package("transformers", "generator")
-    except ImportError:
-        raise ImportError(
-            "the empty prompt's embedding needs transformers, once: pip install transformers. "
-            "Or pass empty_prompt=, a (77, width) tensor of the text encoder's last hidden state"
-        ) from None
-    try:
-        encoder = transformers.CLIPTextModel.from_pretrained(where, subfolder="text_encoder", use_safetensors=True)
-    except (OSError, ValueError) as error:
-        raise GeneratorError(f"{where}/text_encoder: expected CLIP's text encoder: {error}") from None
+        encoder, report = encoder_class.from_pretrained(
+            where, subfolder="text_encoder", use_safetensors=True, output_loading_info=True
+        )
+    except (OSError, ValueError, RuntimeError) as error:
+        raise GeneratorError(f"{label}: expected the weights of a {kind} as safetensors: {error}") from None
+    _check_complete(report, label, kind)
     with torch.no_grad():
         return encoder(torch.tensor([_EMPTY_PROMPT])).last_hidden_state[0]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator import Generator, GeneratorConfig, paper
 from arbiview_aug.generator.config import AutoencoderConfig, UNetConfig
 from arbiview_aug.generator.denoiser import Denoiser
+from arbiview_aug.generator.stable_diffusion import empty_prompt
 from tests.generator.small import small_config
 
 UNET_15 = {
@@ -161,11 +163,38 @@ def test_missing_folders_and_prompts_are_named(folder: Path, tmp_path: Path) -> 
     refused(tmp_path / "nothing", "expected a diffusers folder or hub id with a UNet2DConditionModel")
     with pytest.raises(GeneratorError, match=r"empty_prompt: expected shape \(5, 24\), got \(77, 24\)"):
         Generator.from_stable_diffusion(folder, config(), empty_prompt=torch.zeros(77, 24))
-    try:
-        import transformers  # noqa: F401
-    except ImportError:
-        with pytest.raises(ImportError, match="pip install transformers"):
-            Generator.from_stable_diffusion(folder, config())
+
+
+def test_the_text_encoder_is_loaded_completely_or_not_at_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    transformers = pytest.importorskip("transformers")
+    size = {"hidden_size": 24, "intermediate_size": 32, "num_attention_heads": 2, "num_hidden_layers": 2}
+    encoder = transformers.CLIPTextModel(transformers.CLIPTextConfig(**size, vocab_size=49408))
+    encoder.save_pretrained(folder / "text_encoder")
+    file = folder / "text_encoder" / "model.safetensors"
+    good = safetensors.torch.load_file(file)
+
+    def save(tensors: dict[str, torch.Tensor]) -> None:
+        safetensors.torch.save_file(tensors, file, metadata={"format": "pt"})
+
+    published = {f"text_model.{name}": value for name, value in good.items()}
+    save({**published, "text_model.embeddings.position_ids": torch.arange(77)[None]})  # as in Stable Diffusion 1.5
+    tokens = torch.tensor([[49406, *[49407] * 76]])
+    with torch.no_grad():
+        assert torch.equal(empty_prompt(folder), encoder.eval()(tokens).last_hidden_state[0])
+    layer = {name: value for name, value in good.items() if "layers.1." in name}
+    save({name: value for name, value in good.items() if name not in layer})
+    expected = r"text_encoder: expected exactly the weights of this CLIPTextModel; "
+    with pytest.raises(GeneratorError, match=rf"{expected}{len(layer)} missing: encoder.layers.1"):
+        empty_prompt(folder)
+    save({**good, "lora.up": torch.zeros(2)})
+    with pytest.raises(GeneratorError, match=f"{expected}1 that do not belong: lora.up"):
+        empty_prompt(folder)
+    save({**good, next(iter(layer)): torch.zeros(7)})
+    with pytest.raises(GeneratorError, match="text_encoder: expected the weights of a CLIPTextModel as safetensors"):
+        empty_prompt(folder)
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(ImportError, match=r"^transformers is not installed: pip install 'arbiview_aug\[generator\]'$"):
+        empty_prompt(folder)
 
 
 def test_half_precision_is_refused_by_the_autoencoder(folder: Path) -> None:

@@ -20,7 +20,7 @@ from arbiview_aug.generator.training.checkpointing import saved_config
 from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden
 from arbiview_aug.generator.training.data import open_frames
 from arbiview_aug.generator.training.held_out import held_out_scores, report
-from arbiview_aug.generator.training.losses import Perceptual, load_perceptual
+from arbiview_aug.generator.training.losses import load_perceptual
 from arbiview_aug.generator.training.trainer import Trainer
 
 COMMANDS = ("train", "evaluate")
@@ -52,6 +52,7 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
     if arguments.stage == "autoencoder" and config.autoencoder is None:
         raise TrainingError(f"--stage autoencoder: --config {arguments.config} has none of its own")
     check_weights(config, arguments.weights)
+    perceptual = load_perceptual(arguments.vgg_weights) if config.loss.perceptual else None
     if arguments.data == "synthetic":
         used = [*split.training, *split.validation]
         if device.type != "cpu" and config.workers:
@@ -59,11 +60,7 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
         # Each process takes a second to start, a street half a second to render.
         readers = min(8, os.cpu_count() or 1) if device.type == "cpu" and len(used) >= 16 else 0
         frames.prepare(used, workers=readers, show=show)
-    options: dict[str, Any] = {
-        "perceptual": _perceptual(config, arguments.vgg_weights, say),
-        "show": show,
-        "say": say,
-    }
+    options: dict[str, Any] = {"perceptual": perceptual, "show": show, "say": say}
     generator = fresh(config, arguments.weights).to(device)
     with processes.main_process_first():  # the others load the autoencoder that it saved
         train_autoencoder(config, frames, generator, output, **options)
@@ -96,16 +93,3 @@ def fresh(config: TrainConfig, weights: str | None) -> Generator:
     if weights is not None:
         return Generator.from_stable_diffusion(weights, config.generator)
     return Generator.from_config(config.generator)
-
-
-def _perceptual(config: TrainConfig, weights: str | None, say: Callable[[str], None]) -> Perceptual | None:
-    """Load VGG16; None if the term is off, or the download failed without a named file."""
-    if not config.loss.perceptual:
-        return None
-    try:
-        return load_perceptual(weights)
-    except TrainingError as error:
-        if weights is not None:
-            raise
-        say(f"L_perceptual is off: {error}")
-        return None

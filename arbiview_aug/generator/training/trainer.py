@@ -42,12 +42,13 @@ class Trainer:
     Args:
         generator: Trained in place on the ``frames``; its autoencoder is frozen.
         output: Folder; the run resumes from a state that it holds.
-        perceptual: None switches L_perceptual off.
+        perceptual: VGG16 for L_perceptual; None only with ``loss.perceptual=0``.
         show: Show a progress bar.
         say: Called with messages.
 
     Raises:
-        TrainingError: The output holds a run with other settings, or the generator has another configuration.
+        TrainingError: The output holds a run with other settings, the generator has another configuration, or VGG16 is
+            missing.
         ImportError: accelerate or tensorboard is not installed.
     """
 
@@ -71,12 +72,14 @@ class Trainer:
         scaled = replace(config.generator.autoencoder, scale=generator.config.autoencoder.scale)
         if generator.config != replace(config.generator, autoencoder=scaled, one_step=generator.config.one_step):
             raise TrainingError("Trainer: expected a generator with the run's settings, got others")
+        if config.loss.perceptual and perceptual is None:
+            raise TrainingError("Trainer: expected VGG16 for the perceptual term, or loss.perceptual=0")
         self.generator = generator.to(self.device)
         generator.config = replace(generator.config, one_step=config.loss.regression > 0)
         generator.autoencoder.requires_grad_(False)
         generator.denoiser.gradient_checkpointing = config.checkpointing
         self.split = frames.split(config.seed)
-        self.perceptual = None if perceptual is None or not config.loss.perceptual else perceptual.to(self.device)
+        self.perceptual = perceptual.to(self.device) if config.loss.perceptual and perceptual is not None else None
         step = Step(config, generator.denoiser, generator.autoencoder, self.perceptual)
         self.optimiser = torch.optim.AdamW(
             [p for p in step.parameters() if p.requires_grad], lr=config.lr, weight_decay=config.weight_decay

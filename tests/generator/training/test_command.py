@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -106,3 +107,29 @@ def test_what_cannot_be_used_is_said_in_one_line(
     assert main([*arguments, *few, *no_vgg]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
+
+
+def test_missing_vgg_weights_stop_the_run(
+    drawn_frames: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As without a network; they are asked for before any work."""
+
+    def offline(*_: object, **__: object) -> None:
+        raise OSError("no network")
+
+    monkeypatch.setattr("torchvision.models.VGG16_Weights.get_state_dict", offline)
+    arguments = ["--output", str(tmp_path), "--quiet", *SMALLER, "--set=loss.perceptual=0.01"]
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert "--vgg-weights FILE, or switch the term off: --set loss.perceptual=0" in error and error.count("\n") == 1
+    assert not (tmp_path / "state").exists()
+
+
+def test_a_missing_package_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "accelerate", None)
+    assert main(["--output", str(tmp_path), "--quiet"]) == 2
+    error = capsys.readouterr().err
+    assert error.endswith("accelerate is not installed: pip install 'arbiview_aug[generator]'\n")
+    assert error.count("\n") == 1

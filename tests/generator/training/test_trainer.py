@@ -129,6 +129,8 @@ def test_a_state_of_other_settings_is_refused(tmp_path: Path) -> None:
     run(tmp_path, steps=2).train()
     with pytest.raises(TrainingError, match="other settings of steps, lr"):
         run(tmp_path, lr=0.5)
+    with pytest.raises(TrainingError, match="other settings of loss"):
+        run(tmp_path, steps=2, loss=replace(config().loss, known=0.5))
     run(tmp_path, steps=2, workers=1, save_every=7)  # those may change
 
 
@@ -239,6 +241,12 @@ def test_a_generator_of_other_settings_is_refused(tmp_path: Path) -> None:
     other = Generator.from_config(replace(settings.generator, prefilled=False))
     with pytest.raises(TrainingError, match="expected a generator with the run's settings"):
         Trainer(settings, frames(), other, tmp_path, show=False)
+
+
+def test_a_perceptual_term_needs_its_network(tmp_path: Path) -> None:
+    """Else a resumed run would train without a term that its settings have."""
+    with pytest.raises(TrainingError, match=r"expected VGG16 for the perceptual term, or loss.perceptual=0"):
+        run(tmp_path, loss=LossConfig(perceptual=0.01))
 
 
 def test_the_settings_of_a_run_are_found_again(tmp_path: Path) -> None:
