@@ -71,8 +71,8 @@ def source_rig(size: Size, *, fov_deg: float = _FOV_DEG, height_m: float = _HEIG
     return Rig(cameras, name="A")
 
 
-def _narrow(size: Size) -> Rig:
-    return source_rig(size, fov_deg=50.0)
+def _zoomed(fov_deg: float) -> Callable[[Size], Rig]:
+    return lambda size: source_rig(size, fov_deg=fov_deg)
 
 
 def _lifted(by_m: float) -> Callable[[Size], Rig]:
@@ -93,12 +93,15 @@ def _argoverse2(size: Size) -> Rig:
 CHANGES: dict[str, Change] = {
     change.name: change
     for change in (
-        Change(name="fov50", title="FOV 65° → 50°", target=_narrow),
+        Change(name="fov50", title="FOV 65° → 50°", target=_zoomed(50.0)),
         Change(name="up70", title="+0.7 m", target=_lifted(0.7)),
         Change(name="up35", title="+0.35 m", target=_lifted(0.35)),
         Change(name="down35", title="−0.35 m", target=_lifted(-0.35)),
         Change(name="waymo", title="Waymo-like, 5 at 2.1 m", target=demo_target_rig),
         Change(name="av2", title="Argoverse-2-like, 7 cameras", target=_argoverse2),
+        Change(name="fov80", title="FOV 65° → 80°", target=_zoomed(80.0)),
+        Change(name="turned", title="turned by 30°", target=lambda size: source_rig(size).turned(yaw_deg=30.0)),
+        Change(name="pitched", title="5° down", target=lambda size: source_rig(size).turned(pitch_deg=-5.0)),
     )
 }
 """By name. ``waymo``: Waymo's azimuths and height at A's field of view, so that it stays a change of the layout."""

@@ -110,9 +110,12 @@ def test_streets_are_disjoint_and_rigs_stand_on_one_road():
         assert rig.ground_z_m == 0 and set(rig.sizes) == {(96, 256)}
     heights = {name: float(np.median(change.target(SIZE).cam2ego[:, 2, 3])) for name, change in CHANGES.items()}
     assert heights == pytest.approx(
-        {"fov50": 1.5, "up70": 2.2, "up35": 1.85, "down35": 1.15, "waymo": 2.1, "av2": 1.73}, abs=0.02
+        {"fov50": 1.5, "up70": 2.2, "up35": 1.85, "down35": 1.15, "waymo": 2.1, "av2": 1.73}
+        | dict.fromkeys(("fov80", "turned", "pitched"), 1.5),
+        abs=0.02,
     )
     assert CHANGES["fov50"].target(SIZE)[0].fov_deg[0] == pytest.approx(50)
+    assert CHANGES["pitched"].target(SIZE)[0].elevation_deg == pytest.approx(-5)
 
 
 def test_unknown_names_are_refused():
