@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from arbiview_aug.cli.arguments import device_named
-from arbiview_aug.errors import DataError
+from arbiview_aug.errors import ArbiviewError
 from integrations.cross_rig.experiment import Run, run
 from integrations.cross_rig.families import FAMILIES
+from integrations.cross_rig.real import recorded_run
 from integrations.cross_rig.report import markdown, write_report
-from integrations.cross_rig.settings import Settings, full, jobs, large, pilot, quick
+from integrations.cross_rig.settings import Settings, full, jobs, large, pilot, quick, real
 from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.worlds import CHANGES
 
@@ -27,18 +28,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Make what is missing and write the report; killed, the same command goes on where it was."""
     arguments = _parser().parse_args(argv)
     settings = _settings(arguments)
-    setup = Run(settings=settings, output=arguments.output)
+    try:
+        device_named(settings.schedule.device)  # before hours of rendering
+        setup = _run(arguments, settings)
+    except (ValueError, ArbiviewError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    settings = setup.settings
     missing = setup.missing()
     if arguments.list:
         waiting = {job.name for job in missing}
         for job in jobs(settings):
             print(f"{'missing' if job.name in waiting else 'done   '}  {job.name}")
         return 0
-    try:
-        device_named(settings.schedule.device)  # before hours of rendering
-    except DataError as error:
-        print(error, file=sys.stderr)
-        return 2
     began = time.monotonic()
 
     def log(line: str) -> None:
@@ -68,6 +70,12 @@ def _parser() -> argparse.ArgumentParser:
         "--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes of one thread (%(default)s)"
     )
     parser.add_argument("--list", action="store_true", help="only say which trainings are done")
+    parser.add_argument(
+        "--real",
+        nargs=2,
+        metavar=("A", "B"),
+        help="two data sets as --data of other commands takes them, with named boxes and drives, instead of streets",
+    )
     change = parser.add_argument_group("instead of the preset's")
     change.add_argument("--changes", nargs="+", choices=CHANGES, metavar="CHANGE", help=", ".join(CHANGES))
     change.add_argument(
@@ -85,8 +93,17 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _run(arguments: argparse.Namespace, settings: Settings) -> Run:
+    return (
+        recorded_run(arguments.real[0], arguments.real[1], settings, arguments.output)
+        if arguments.real
+        else Run(settings=settings, output=arguments.output)
+    )
+
+
 def _settings(arguments: argparse.Namespace) -> Settings:
     settings = PRESETS[arguments.preset]()
+    settings = real(settings) if arguments.real else settings
     names = ("changes", "variants", "families", "seeds", "streets", "train_frames", "val_frames", "test_frames")
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}

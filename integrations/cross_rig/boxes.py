@@ -30,8 +30,12 @@ _ALPHA, _BETA = 2.0, 4.0  # of the focal loss of centres (CenterNet)
 
 
 def vehicle_boxes(grid: Grid, scene: Scene, ground_z_m: float) -> Floats:
-    """(MAX_BOXES, 7) float32 vehicles with centres on the grid, padded with NaN."""
-    boxes = scene.boxes_ego(ground_z_m)[np.isin(scene.box_classes, VEHICLES)]
+    """``boxes_on_grid`` of a street's vehicles."""
+    return boxes_on_grid(grid, scene.boxes_ego(ground_z_m)[np.isin(scene.box_classes, VEHICLES)])
+
+
+def boxes_on_grid(grid: Grid, boxes: Floats) -> Floats:
+    """(MAX_BOXES, 7) float32 of boxes (B, 7) with centres on the grid, padded with NaN."""
     boxes = boxes[(np.abs(boxes[:, :2]) < grid.side_m / 2).all(-1)][:MAX_BOXES]
     return np.pad(boxes, ((0, MAX_BOXES - len(boxes)), (0, 0)), constant_values=np.nan).astype(np.float32)
 

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from integrations.cross_rig.cache import FrameStore, code_hash, content_hash
@@ -24,7 +23,7 @@ from integrations.cross_rig.model import Detector
 from integrations.cross_rig.settings import Job, Settings, jobs
 from integrations.cross_rig.training import Draws, FrameSet, Schedule, Tested, evaluate, train
 from integrations.cross_rig.variant import Variant
-from integrations.cross_rig.worlds import SPLITS, Split
+from integrations.cross_rig.worlds import CHANGES, SPLITS, Split
 
 Log = Callable[[str], None]
 
@@ -63,31 +62,35 @@ class Run:
         """A job's frames. What counts: objects that the rig of the recording sees, in the cells that B covers."""
         images = self.images(job)
         labels = self.source("train") if job.variant.labels_of_a else images
-        state = labels.store().stacked("state", self.settings.train_frames)
-        counts = covered_cells(Grid(), images.rig)
-        return FrameSet(
-            images.store(),
-            images.rig,
-            state,
-            counts,
-            self.boxes("train", self.settings.train_frames),
-            retargeted=job.variant.renders,
-            masked=job.variant.masked,
-        )
+        own = job.variant.renders
+        return self._frames(images, labels, self.settings.train_frames, own=own, masked=job.variant.masked)
 
     def true_set(self, split: Split, change: str | None, num_frames: int) -> FrameSet:
         """Frames as a rig really sees them."""
         source = self.source(split, change)
-        state = source.store().stacked("state", num_frames)
-        boxes = self.boxes(split, num_frames)
-        return FrameSet(source.store(), source.rig, state, covered_cells(Grid(), source.rig), boxes)
+        return self._frames(source, source, num_frames, own=False, masked=True)
 
-    def boxes(self, split: Split, num_frames: int) -> npt.NDArray[np.float32]:
-        """(F, n, 7) vehicles of a split's streets."""
-        return self._box_store(split).stacked("boxes", num_frames)
+    def _frames(self, images: Source, labels: Source, count: int, *, own: bool, masked: bool) -> FrameSet:
+        state, boxes = labels.store().stacked("state", count), self.box_store(labels).stacked("boxes", count)
+        counts = covered_cells(Grid(), images.rig)
+        return FrameSet(images.store(), images.rig, state, counts, boxes, retargeted=own, masked=masked)
 
-    def _box_store(self, split: Split) -> FrameStore:
-        return box_store(self.output / "frames", split, self.settings.streets)
+    def box_store(self, source: Source) -> FrameStore:
+        """Where the boxes of a source's vehicles lie."""
+        return box_store(source)
+
+    def prepare(self) -> None:
+        """Make what all frames need."""
+        for split in SPLITS:
+            make_boxes(self.source(split), getattr(self.settings, f"{split}_frames"))
+
+    def title(self, change: str) -> str:
+        """Of a change, in tables."""
+        return CHANGES[change].title
+
+    def drives(self, change: str) -> list[int] | None:
+        """The drive of each test frame, in order; None: every frame is one of its own."""
+        return None
 
     def schedule(self, job: Job) -> Schedule:
         """Of a job's training."""
@@ -125,7 +128,7 @@ class Run:
                 "augmented": job.variant.augmented,
                 "count": count,
                 "schedule": asdict(self.schedule(job)),
-                "boxes": self._box_store("train").key,
+                "boxes": self.box_store(self.source("train")).key,
                 "seed": job.seed,
                 "code": code_hash("integrations.cross_rig.training"),
             }
@@ -233,8 +236,7 @@ def _write(path: Path, write: Callable[[Path], object]) -> None:
 
 def run(setup: Run, workers: int, log: Log) -> Iterator[int]:
     """Make everything that is missing; yields the number of missing trainings, before the first and after each."""
-    for split in SPLITS:
-        make_boxes(setup.output / "frames", split, getattr(setup.settings, f"{split}_frames"), setup.settings.streets)
+    setup.prepare()
     for source, count in setup.sources():
         start = time.monotonic()
         for done, todo in make_frames(source, count, workers):

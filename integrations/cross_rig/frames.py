@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -106,7 +106,7 @@ class Source:
 
     def original(self) -> Source:
         """A's true frames of the same streets."""
-        return Source(root=self.root, size=self.size, split=self.split, streets=self.streets)
+        return replace(self, change=None, variant=None)
 
     def rendered(self) -> Source:
         """The same views as ``RigRetarget`` renders them: without the generator's pixels, or the truth's."""
@@ -129,23 +129,28 @@ class Source:
         """The same streets as the rig of these images really sees them."""
         return replace(self, variant=None)
 
+    def maker(self) -> Callable[[int], Arrays]:
+        """What makes a frame of this set from its index."""
+        if self.variant is None:
+            return _TrueFrames(self)
+        return _VariantFrames(self) if self.rendered() == self else _ChangedFrames(self)
 
-def box_store(root: Path, split: Split, streets: int) -> FrameStore:
+
+def box_store(source: Source) -> FrameStore:
     """Boxes of a split's vehicles, in A's ego frame; of no rendering."""
     spec = {
         "format": _FORMAT,
         "boxes": code_hash("integrations.cross_rig.boxes"),
-        "streets": street_seed(split, streets),
+        "streets": source.street_seed,
         "world": code_hash(_WORLD, within=_WORLD),
     }
-    return FrameStore(root, spec)
+    return FrameStore(source.root, spec)
 
 
-def make_boxes(root: Path, split: Split, num_frames: int, streets: int = STREETS) -> None:
+def make_boxes(source: Source, num_frames: int) -> None:
     """Make what is missing."""
-    store = box_store(root, split, streets)
-    seed = street_seed(split, streets)
-    drive = SyntheticDrive(source_rig((96, 256)), num_frames=_MAX_FRAMES, seed=seed, lidar=False)
+    store = box_store(source)
+    drive = SyntheticDrive(source_rig((96, 256)), num_frames=_MAX_FRAMES, seed=source.street_seed, lidar=False)
     for chunk in store.missing(num_frames):
         fill(store, lambda k: {"boxes": vehicle_boxes(Grid(), drive.scene(k), drive.rig.ground_z_m)}, chunk)
 
@@ -176,10 +181,8 @@ def _make_chunk(source: Source, chunk: int) -> None:
 
 
 @lru_cache(maxsize=2)  # a worker goes from chunk to chunk of one source
-def _maker(source: Source) -> _TrueFrames | _VariantFrames | _ChangedFrames:
-    if source.variant is None:
-        return _TrueFrames(source)
-    return _VariantFrames(source) if source.rendered() == source else _ChangedFrames(source)
+def _maker(source: Source) -> Callable[[int], Arrays]:
+    return source.maker()
 
 
 def one_thread() -> None:

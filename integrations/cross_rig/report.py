@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
@@ -30,8 +30,8 @@ def write_report(setup: Run) -> dict[str, Any]:
         there += sum(len(seeds) for variants in results.values() for seeds in variants.values())
         for name in (name for name in setup.settings.changes if name in results):
             changes[name if family == "voxels" else f"{name}-{family}"] = {
-                "title": CHANGES[name].title + ("" if family == "voxels" else f", {family}"),
-                **_of_change(results[name], rendering_seconds(setup, name)),
+                "title": setup.title(name) + ("" if family == "voxels" else f", {family}"),
+                **_of_change(results[name], rendering_seconds(setup, name), setup.drives(name)),
                 "same_frames": same_frames(setup, name, family),
             }
     total = sum(len(setup.tested_on(job)) for job in jobs(setup.settings))
@@ -49,18 +49,20 @@ def write_report(setup: Run) -> dict[str, Any]:
     return report
 
 
-def _of_change(variants: Results, rendering: Mapping[str, float]) -> dict[str, Any]:
-    """Scores over the seeds that every variant has."""
+def _of_change(variants: Results, rendering: Mapping[str, float], drives: Sequence[int] | None) -> dict[str, Any]:
+    """Scores over the seeds that every variant has; frames of one drive are drawn together."""
     seeds = sorted(set.intersection(*(set(by_seed) for by_seed in variants.values())))
     if not seeds:
         return {"seeds": [], "variants": {}}
     cells = {name: np.array([variants[name][s]["by_distance"] for s in seeds]) for name in variants}  # [S, F, bins, 3]
-    scores = iou_scores({name: array.sum(2) for name, array in cells.items()})
+    scores = iou_scores({name: array.sum(2) for name, array in cells.items()}, drives)
     told = {
         name: tuple(np.array([variants[name][s][key] for s in seeds], float) for key in ("matched", "positives"))
         for name in variants
     }
-    precisions = ap_scores({name: (np.where(m < 0, np.nan, m), positives) for name, (m, positives) in told.items()})
+    precisions = ap_scores(
+        {name: (np.where(m < 0, np.nan, m), positives) for name, (m, positives) in told.items()}, drives
+    )
     rows = {}
     for name in (n for n in VARIANTS if n in variants):
         heights = np.array([variants[name][s]["by_height"] for s in seeds]).sum((0, 1))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -51,11 +51,22 @@ def resampled(num_seeds: int, num_frames: int, draws: int, seed: int = 0) -> Res
     return Resampled(*alike)
 
 
-def bootstrap_ious(counts: Mapping[str, Counts], *, draws: int = _DRAWS) -> dict[str, Floats]:
+def bootstrap_ious(
+    counts: Mapping[str, Counts], drives: Sequence[int] | None = None, *, draws: int = _DRAWS
+) -> dict[str, Floats]:
     """IoUs (draws,) of resampled experiments by variant, from (S, F, 3) counts; the same S and F throughout."""
-    seeds, frames = resampled(*_one_shape(counts), draws)
+    seeds, frames = _drawn(*_one_shape(counts), draws, drives)
     of_seeds = {name: np.einsum("rf,sfc->rsc", frames, array, optimize=True) for name, array in counts.items()}
     return {name: iou(np.einsum("rs,rsc->rc", seeds, sums)) for name, sums in of_seeds.items()}
+
+
+def _drawn(num_seeds: int, num_frames: int, draws: int, drives: Sequence[int] | None) -> Resampled:
+    """As ``resampled``; where ``drives`` names the drive of each frame, drives are drawn instead of frames."""
+    if drives is None:
+        return resampled(num_seeds, num_frames, draws)
+    names, drive = np.unique(drives, return_inverse=True)
+    seeds, weights = resampled(num_seeds, len(names), draws)
+    return Resampled(seeds, weights[:, drive])
 
 
 def _one_shape(counts: Mapping[str, npt.NDArray[Any]]) -> tuple[int, int]:
@@ -100,17 +111,19 @@ class VariantScore:
     seeds: list[float]
 
 
-def iou_scores(counts: Mapping[str, Counts]) -> dict[str, VariantScore]:
-    """Scores of the variants of one change, from (S, F, 3) counts by variant."""
+def iou_scores(counts: Mapping[str, Counts], drives: Sequence[int] | None = None) -> dict[str, VariantScore]:
+    """Scores of the variants of one change, from (S, F, 3) counts by variant and the drive (F) of each frame."""
     values = {name: float(iou(array.sum((0, 1)))) for name, array in counts.items()}
     seeds = {name: iou(array.sum(1)) for name, array in counts.items()}
-    return _scores(values, seeds, bootstrap_ious(counts))
+    return _scores(values, seeds, bootstrap_ious(counts, drives))
 
 
-def ap_scores(detections: Mapping[str, tuple[Floats, Floats]]) -> dict[str, VariantScore]:
+def ap_scores(
+    detections: Mapping[str, tuple[Floats, Floats]], drives: Sequence[int] | None = None
+) -> dict[str, VariantScore]:
     """Scores of the variants of one change, from ``boxes.match`` (S, F, k, 5) and boxes that count (S, F)."""
     num_seeds, num_frames = _one_shape({name: matched for name, (matched, _) in detections.items()})
-    draws = resampled(num_seeds, num_frames, _DRAWS_OF_AP)
+    draws = _drawn(num_seeds, num_frames, _DRAWS_OF_AP, drives)
     weights = np.concatenate([np.ones((1, num_frames)), draws.frames])
     of_seeds = {
         name: np.stack([average_precision(*seed, weights) for seed in zip(*arrays, strict=True)], -1)

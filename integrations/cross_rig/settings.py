@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 from typing import TypeVar
@@ -15,6 +15,9 @@ from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.worlds import CHANGES, STREETS, Size
 
 T = TypeVar("T")
+
+REAL = "real"
+"""The change from one recorded data set to another."""
 
 
 def named_rows(kind: str, names: Sequence[str], table: Mapping[str, T]) -> list[T]:
@@ -38,7 +41,7 @@ class Settings:
         train_frames, val_frames, test_frames: Of the three sets of streets.
         streets: The world that all three come from, a whole hundred: ``worlds.street_seed``.
         seeds: Of the trainings; each variant is trained once with each.
-        changes: Names of ``worlds.CHANGES``.
+        changes: Names of ``worlds.CHANGES``, or ``REAL`` alone.
         variants: Names of ``variants.VARIANTS``.
         families: Names of ``families.FAMILIES``.
         schedule: Of every training; each job's family replaces its own.
@@ -60,7 +63,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         named_rows("variants", self.variants, VARIANTS)
-        named_rows("changes", self.changes, CHANGES)
+        if self.changes != (REAL,):
+            named_rows("changes", self.changes, CHANGES)
         named_rows("families", self.families, FAMILIES)
         if self.streets % 100 or self.streets < STREETS:
             raise ValueError(f"streets: expected a whole hundred from {STREETS} on, got {self.streets}")
@@ -127,6 +131,12 @@ def pilot() -> Settings:
 def full() -> Settings:
     """Everything at the pilot's size."""
     return Settings()
+
+
+def real(base: Settings) -> Settings:
+    """A preset on recorded data: the variants that need nothing but points and boxes."""
+    variants = ("raw", "scale_crop", "auto_fill", "auto_fill_mixed", "auto_fill_random", "oracle")
+    return replace(base, changes=(REAL,), variants=variants)
 
 
 def large() -> Settings:

@@ -25,7 +25,7 @@ class ViewMaker:
 
     Args:
         variant: One that renders.
-        source: Vehicle A.
+        source: Vehicle A, of frames that bring no rig of their own.
         target: Vehicle B, in A's ego frame.
     """
 
@@ -51,7 +51,7 @@ class ViewMaker:
 
         Args:
             index: Of the frame: its draw depends on it alone.
-            frame: ``images`` (N, 3, h, w) uint8 and the geometry that the variant reads.
+            frame: ``images`` (N, 3, h, w) uint8, the geometry that the variant reads, and perhaps ``rig``.
 
         Returns:
             ``images`` (M, 3, h, w), ``coverage`` (M, h, w / 8) packed bits, ``K``, ``cam2ego`` float32, ``cpu_s``: CPU
@@ -68,7 +68,7 @@ class ViewMaker:
             coverage = np.stack([view.coverage for view in views])
             K, cam2ego = self.target.K, self.target.cam2ego
         else:
-            given = {key: frame[key] for key in ("images", *self.variant.reads, *_POSE) if key in frame}
+            given = {key: frame[key] for key in ("images", "rig", *self.variant.reads, *_POSE) if key in frame}
             drawn = None if self.random is None else self.random.draw(torch.Generator().manual_seed(index))
             out = self.retarget(given, drawn)
             images, coverage = out["images"].numpy(), out["coverage"].numpy()

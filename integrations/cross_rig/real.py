@@ -1,0 +1,253 @@
+"""The protocol on two recorded data sets: A's samples are retargeted to B's cameras, and B's own samples judge.
+
+Both are read as the package reads them (``open_data``), made small, and moved to a road at z = 0, so that the grid and
+the detectors are those of the streets. Drives are split, never frames. Vehicles with fewer than 5 LiDAR points count
+for nothing.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from arbiview_aug import Rig, RigRetarget
+from arbiview_aug.datasets import open_data
+from arbiview_aug.datasets.drive import Recording
+from arbiview_aug.datasets.synthetic import BoxClass
+from arbiview_aug.errors import DataError
+from arbiview_aug.scene.boxes import points_in
+from integrations.cross_rig.boxes import boxes_on_grid
+from integrations.cross_rig.cache import Arrays, FrameStore, code_hash
+from integrations.cross_rig.experiment import Run
+from integrations.cross_rig.frames import Source
+from integrations.cross_rig.labels import Grid, box_cells
+from integrations.cross_rig.settings import Settings, named_rows
+from integrations.cross_rig.training import FrameSet
+from integrations.cross_rig.variant import Variant
+from integrations.cross_rig.variants import VARIANTS
+from integrations.cross_rig.views import ViewMaker
+from integrations.cross_rig.worlds import SPLITS, Split
+
+_VEHICLES = {"vehicle", "car", "van", "truck", "bus", "trailer"}
+_NO_VEHICLES = {"bicycle", "motorcycle", "cyclist", "human", "pedestrian", "static", "movable"}
+"""A box is a vehicle if its category (``vehicle.bus.rigid``, ``SCHOOL_BUS``) has a word of the first set, and none of
+the second."""
+
+LEAST_POINTS = 5
+"""nuScenes and Waymo leave out boxes with fewer LiDAR points, or mark them as hard."""
+
+_SHARES = {"val": 0.15, "test": 0.35}
+"""Of B's drives, at least one each; the others and all of A's are for training."""
+
+
+@lru_cache(maxsize=4)
+def recording(data: str) -> Recording:
+    """The data set, opened once in each process.
+
+    Raises:
+        DataError: It cannot be read, or has no drives.
+    """
+    opened = open_data(data)
+    if not getattr(opened, "scene_tokens", None):
+        raise DataError(f"data {data}: expected the drive of each sample (nuScenes layout), found none")
+    return opened
+
+
+def drives_of(data: str) -> list[str]:
+    """The drive of each sample."""
+    return list(recording(data).scene_tokens)  # type: ignore[attr-defined]
+
+
+def frames_of(data: str, split: Split | None) -> list[int]:
+    """Samples of a split in the order of their drives; None: of all drives."""
+    drives = drives_of(data)
+    names = sorted(set(drives))
+    if split is not None:
+        if len(names) < len(SPLITS):
+            raise DataError(f"data {data}: expected {len(SPLITS)} drives or more to split, found {len(names)}")
+        shuffled = np.random.default_rng(0).permutation(names).tolist()
+        val, test = (max(1, round(_SHARES[s] * len(names))) for s in ("val", "test"))
+        names = {"val": shuffled[:val], "test": shuffled[val : val + test], "train": shuffled[val + test :]}[split]
+    return [k for name in names for k, drive in enumerate(drives) if drive == name]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedSource(Source):
+    """As ``Source``, of recorded frames.
+
+    Attributes:
+        a, b: ``open_data``'s names of both data sets.
+    """
+
+    a: str
+    b: str
+
+    @property
+    def data(self) -> str:
+        """The data set whose frames these are."""
+        return self.a if self.change is None or self.variant is not None else self.b
+
+    @cached_property
+    def frames(self) -> list[int]:
+        """Its samples."""
+        return frames_of(self.data, None if self.data == self.a else self.split)
+
+    @cached_property
+    def rig(self) -> Rig:
+        """The cameras of the first frame, small and without lenses, over a road at z = 0."""
+        data = self.a if self.change is None else self.b
+        return small_rig(recording(data)[frames_of(data, None)[0]]["rig"], self.size)
+
+    def store(self) -> FrameStore:
+        """Where they lie: named after the data set, its samples, the code, and the variant."""
+        spec: dict[str, Any] = {
+            "data": str(Path(self.data).resolve()),
+            "samples": [recording(self.data).tokens[k] for k in self.frames],
+            "size": list(self.size),
+            "grid": vars(Grid()),
+            "real": code_hash("integrations.cross_rig.real"),
+            "renderer": code_hash("arbiview_aug.transforms.rig_retarget"),
+        }
+        if self.variant is not None:
+            spec |= {"target": self.rig.content_key.hex(), "variant": self.variant.views_spec()}
+        return FrameStore(self.root, spec)
+
+    def maker(self) -> Callable[[int], Arrays]:
+        """What makes a frame of this set; indices past its end begin anew, to fill the last chunk."""
+        make = (
+            self._recorded
+            if self.variant is None
+            else self._retargeted(ViewMaker(self.variant, self.original().rig, self.rig))
+        )
+        return lambda index: make(self.frames[index % len(self.frames)])
+
+    def _recorded(self, index: int) -> Arrays:
+        start = time.process_time()
+        sample = recording(self.data)[index]
+        rig = sample["rig"]
+        shrink = RigRetarget(small_rig(rig, self.size, road=rig.ground_z_m), surface="far", holes="black")
+        out = shrink({"images": sample["images"], "rig": rig})
+        boxes, points = vehicles_of(sample, self.data)
+        boxes[:, 2] -= rig.ground_z_m
+        cells = box_cells(Grid(), boxes, np.full(len(boxes), BoxClass.CAR), points >= LEAST_POINTS)
+        return _arrays(out, rig.ground_z_m) | {
+            "state": cells.state,
+            "height_dm": cells.height_dm,
+            "boxes": boxes_on_grid(Grid(), boxes),
+            "cpu_s": np.array(time.process_time() - start, np.float32),
+        }
+
+    def _retargeted(self, views: ViewMaker) -> Callable[[int], Arrays]:
+        def make(index: int) -> Arrays:
+            sample = recording(self.data)[index]
+            arrays = views(index, sample)
+            arrays["cam2ego"][:, 2, 3] -= np.float32(sample["rig"].ground_z_m)
+            return arrays
+
+        return make
+
+
+def _arrays(out: dict[str, Any], ground_z_m: float) -> Arrays:
+    cam2ego = out["cam2ego"].numpy().astype(np.float32)
+    cam2ego[:, 2, 3] -= np.float32(ground_z_m)
+    return {
+        "images": out["images"].numpy(),
+        "coverage": np.packbits(out["coverage"].numpy(), axis=-1),
+        "K": out["K"].numpy().astype(np.float32),
+        "cam2ego": cam2ego,
+    }
+
+
+def small_rig(rig: Rig, size: tuple[int, int], *, road: float = 0.0) -> Rig:
+    """Pinhole cameras of one size, cut to its aspect, with the road at z = ``road``."""
+    small = rig.undistorted().resized(size, fit="crop").shifted(z_m=road - rig.ground_z_m)
+    return Rig(list(small), ground_z_m=road, name=rig.name)
+
+
+def vehicles_of(sample: dict[str, Any], data: str) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes (B, 7) of a sample's vehicles, and the number of LiDAR points in each (many where there is no LiDAR).
+
+    Raises:
+        DataError: The sample has no boxes, or these have no names.
+    """
+    if "boxes_3d" not in sample or "box_names" not in sample:
+        raise DataError(f"data {data}: sample {sample['token']}: expected boxes_3d and box_names, found no labels")
+    words = [set(re.split(r"[^a-z]+", name.lower())) for name in sample["box_names"]]
+    chosen = np.array([bool(found & _VEHICLES) and not found & _NO_VEHICLES for found in words], bool)
+    boxes = np.asarray(sample["boxes_3d"], np.float64)[chosen, :7]
+    if "points" not in sample:
+        return boxes, np.full(len(boxes), LEAST_POINTS)
+    inside = points_in(boxes, np.asarray(sample["points"], np.float64)[:, :3])
+    return boxes, np.array([len(found) for found in inside], int)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedRun(Run):
+    """As ``Run``, from one recorded data set to another.
+
+    Attributes:
+        a, b: ``open_data``'s names of the data sets of both vehicles.
+    """
+
+    a: str
+    b: str
+
+    def source(self, split: Split, change: str | None = None, variant: Variant | None = None) -> RecordedSource:
+        return RecordedSource(
+            root=self.output / "frames",
+            size=self.settings.size,
+            split=split,
+            change=change,
+            variant=variant,
+            a=self.a,
+            b=self.b,
+        )
+
+    def _frames(self, images: Source, labels: Source, count: int, *, own: bool, masked: bool) -> FrameSet:
+        # Every frame has a calibration of its own.
+        return super()._frames(images, labels, count, own=True, masked=own and masked)
+
+    def box_store(self, source: Source) -> FrameStore:
+        """Where the boxes lie: beside the images."""
+        return source.store()
+
+    def prepare(self) -> None:
+        """Nothing: the data sets are there."""
+
+    def title(self, change: str) -> str:
+        return f"{Path(self.a).name} to {Path(self.b).name}"
+
+    def drives(self, change: str) -> list[int]:
+        """The drive of each test frame, in order."""
+        names = drives_of(self.b)
+        chosen = [names[k] for k in self.source("test", change).frames[: self.settings.test_frames]]
+        return [sorted(set(chosen)).index(name) for name in chosen]
+
+
+def recorded_run(a: str, b: str, settings: Settings, output: Path) -> RecordedRun:
+    """The run, of as many frames as there are: B's own training frames are no more than A's.
+
+    Raises:
+        DataError: A data set cannot be read, has no labels, or too few drives.
+    """
+    check_variants(named_rows("variants", settings.variants, VARIANTS))
+    train = min(len(frames_of(a, None)), len(frames_of(b, "train")), settings.train_frames)
+    counts = {f"{s}_frames": min(len(frames_of(b, s)), getattr(settings, f"{s}_frames")) for s in ("val", "test")}
+    for data in (a, b):
+        vehicles_of(recording(data)[0], data)
+    return RecordedRun(a=a, b=b, settings=replace(settings, train_frames=train, **counts), output=output)
+
+
+def check_variants(variants: Sequence[Variant]) -> None:
+    """ValueError for variants that need a synthetic world."""
+    for variant in variants:
+        reads = set(variant.reads) <= {"points", "boxes_3d"}
+        if variant.kind == "row_split" or variant.noise or variant.truth or variant.labels or not reads:
+            raise ValueError(f"variants: {variant.name} needs the streets' truth: leave it out of --real")
