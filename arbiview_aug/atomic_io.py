@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 from urllib.parse import quote
 
 from arbiview_aug.errors import DataError, OutputError
@@ -27,6 +27,9 @@ BROKEN_ARRAY = (
     *(tokenize.TokenError, zipfile.BadZipFile, zlib.error),
 )
 """Errors that ``numpy.load`` raises for damaged files."""
+
+Link = Literal["hard", "copy", "symlink"]
+"""Kinds of links to kept files."""
 
 _SEPARATOR = re.compile(r"[/\\]")
 _LONGEST_NAME = 255  # bytes of a name in all common file systems
@@ -145,10 +148,10 @@ def write_whole(files: Mapping[Path, bytes], owner: str = "") -> None:
             part.unlink(missing_ok=True)
 
 
-def link_whole(source: Path, path: Path, owner: str = "") -> None:
-    """Hard-link a file, or copy it to another file system; symbolic links are followed.
+def link_whole(source: Path, path: Path, owner: str = "", how: Link = "hard") -> None:
+    """Link a file, or copy it, also where its disk allows no such links; a source that is a link is followed.
 
-    An existing file of the same size stays.
+    An existing file of the same size stays, unless it is of another kind: a link instead of a copy.
 
     Raises:
         FileNotFoundError: There is no such source.
@@ -164,13 +167,16 @@ def link_whole(source: Path, path: Path, owner: str = "") -> None:
     if not stat.S_ISREG(status.st_mode):
         raise DataError(f"{source}: expected a regular file, got none: remove its row, or put the file there")
     if path.is_file() and path.stat().st_size == status.st_size:
-        return
+        same, is_symlink = path.samefile(source), path.is_symlink()
+        if (same and is_symlink) if how == "symlink" else not (is_symlink or (same and how == "copy")):
+            return
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
         try:
-            os.link(source.resolve() if source.is_symlink() else source, path)
-            return
+            if how != "copy":
+                (os.symlink if how == "symlink" else os.link)(source.resolve(), path)
+                return
         except FileExistsError:  # another process was faster
             return
         except OSError as error:
@@ -234,7 +240,7 @@ def _runs(pid: int) -> bool:
         os.kill(pid, 0)
     except PermissionError:  # another user's
         return True
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):  # OverflowError: no process has such a number
         return False
     return True
 

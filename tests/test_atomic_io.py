@@ -59,7 +59,8 @@ def test_only_what_nobody_writes_is_removed(tmp_path: Path) -> None:
     mine, others, shared = (f".x.{owner}-{host}-{os.getpid()}-01234567.part" for owner in ("4", "5", ""))
     left = f".x.-{host}-{dead.pid}-01234567.part"
     elsewhere = f".x.5-ffffffff-{dead.pid}-01234567.part"
-    for name in (mine, others, shared, left, elsewhere, ".hidden.part", "x"):
+    impossible = f".x.-{host}-{10**30}-01234567.part"
+    for name in (mine, others, shared, left, impossible, elsewhere, ".hidden.part", "x"):
         (tmp_path / name).write_bytes(b"")
     remove_parts(tmp_path, lambda owner: int(owner) % 2 == 0)
     assert set(names(tmp_path)) == {others, shared, elsewhere, ".hidden.part", "x"}

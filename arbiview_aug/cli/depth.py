@@ -19,7 +19,7 @@ import torch
 from torch.utils.data import Dataset
 from tqdm import tqdm
 
-from arbiview_aug.atomic_io import inside
+from arbiview_aug.atomic_io import inside, remove_parts
 from arbiview_aug.cli.arguments import add_data, command_parser, count, device_named, gathered_warnings, writable_folder
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.depth_folder import FOLDER, LEARNED_FOLDER, WANTED, DepthFolder
@@ -176,6 +176,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     _, root = split_kind(arguments.data)
     folder = Path(arguments.output or inside(root, LEARNED_FOLDER if is_learned else FOLDER, "depth"))
     depths = DepthFolder(writable_folder(folder, str(folder)))
+    remove_parts(folder, lambda owner: False)
     warned: list[str] = []
     with gathered_warnings(warned):
         if is_learned:

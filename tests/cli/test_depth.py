@@ -10,6 +10,7 @@ import torch
 
 from arbiview_aug import DataError, RetargetedDataset, Rig, RigRetarget
 from arbiview_aug.__main__ import main
+from arbiview_aug.atomic_io import _host
 from arbiview_aug.datasets import FrameFolder, Neighbours, WithDepth, WithMotionDepth
 from arbiview_aug.datasets.depth_folder import FOLDER, DepthFolder
 from arbiview_aug.datasets.frame_writer import write_frame
@@ -125,7 +126,10 @@ def test_what_was_found_from_less_is_found_again(recorded: Path, tmp_path: Path,
     sequence = (root / "sequence.json").read_text()
     (root / "sequence.json").unlink()
     asked = ["depth", "--data", str(root)]
-    assert main(asked) == 0 and "0 of 4 frames have depth" in capsys.readouterr().out
+    leftover = root / "motion_depth" / f".000.npz.-{_host()}-{10**9}-01234567.part"
+    leftover.parent.mkdir()
+    leftover.write_bytes(b"of a killed run")
+    assert main(asked) == 0 and "0 of 4 frames have depth" in capsys.readouterr().out and not leftover.exists()
     (root / "sequence.json").write_text(sequence)
     image = sorted((root / "002").glob("*.jpg"))[0]
     sound = image.read_bytes()

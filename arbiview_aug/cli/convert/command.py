@@ -13,7 +13,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from arbiview_aug.atomic_io import inside, remove_parts
+from arbiview_aug.atomic_io import Link, inside, remove_parts
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.cli.arguments import (
@@ -31,6 +31,7 @@ from arbiview_aug.cli.convert.job import Done, Jobs, OnError, State
 from arbiview_aug.cli.convert.ray_runner import ray_results
 from arbiview_aug.cli.convert.report import write_report
 from arbiview_aug.cli.convert.settings import FOLDER, RETARGET_OPTIONS, Settings, check_output
+from arbiview_aug.cli.convert.verify import Verification, differences_of_all
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.depth_folder import FOLDERS
 from arbiview_aug.datasets.drive import Recording
@@ -56,6 +57,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"argument --depth: expected it with --surface {fitting}, got {arguments.surface}")
     settings = _settings(arguments)
     check_output(settings)
+    if arguments.verify:
+        return _verify(_jobs(settings, settings.open(), arguments), arguments)
     jobs, facts = _begin(settings, settings.open(), arguments)
     found: list[Done] = []
     started_s = time.perf_counter()
@@ -139,6 +142,18 @@ def _parser() -> argparse.ArgumentParser:
         default="report",
         help="samples that cannot be converted: report them and do not finish (default), leave them out, or stop",
     )
+    parser.add_argument(
+        "--link",
+        choices=get_args(Link),
+        default="hard",
+        help="how points, maps and other kept files come along: hard links where the disk allows them (default), "
+        "copies, or symbolic links, which readers of this package refuse",
+    )
+    parser.add_argument(
+        "--verify",
+        action="store_true",
+        help="write nothing: compare sources and outputs with the checksums that were recorded",
+    )
     parser.add_argument("--report", type=seed, default=2, metavar="N", help="number of frames in report.html")
     return parser
 
@@ -165,6 +180,7 @@ def _settings(arguments: argparse.Namespace) -> Settings:
         generator=None if arguments.generator is None else arguments.generator.absolute(),
         motion_depth=None if depth is None else depth.absolute(),
         suffix=f".{arguments.images}",  # type: ignore[arg-type]
+        link=arguments.link,
         **{
             name: getattr(arguments, name)
             for name in ("version", *RETARGET_OPTIONS, "reduce", "clean_masks", "neighbours")
@@ -174,21 +190,36 @@ def _settings(arguments: argparse.Namespace) -> Settings:
 
 def _begin(settings: Settings, data: Recording, arguments: argparse.Namespace) -> tuple[Jobs, Mapping[str, Any]]:
     """Make this shard's jobs, and write the output's facts or check them."""
-    shard, shards = arguments.shard_index, arguments.num_shards
     try:
         settings.retarget()
     except ArbiviewError:
         raise
     except ValueError as error:
         raise DataError(str(error)) from None
-    jobs = Jobs(settings, data, range(shard, len(data), shards), arguments.on_error)
+    jobs, shard, shards = _jobs(settings, data, arguments), arguments.shard_index, arguments.num_shards
     facts = {"versions": versions(), "settings": settings.rendering(), "source": jobs.format.facts()}
     if not (settings.output / FOLDER / "settings.json").is_file():
         jobs.format.check()
         writable_folder(settings.output, str(settings.output))
     jobs.manifest.begin(facts)
-    remove_parts(settings.output, lambda owner: int(owner) % shards == shard)
+    remove_parts(settings.output, lambda owner: owner.isdecimal() and int(owner) % shards == shard)
     return jobs, facts
+
+
+def _jobs(settings: Settings, data: Recording, arguments: argparse.Namespace) -> Jobs:
+    """The jobs of this shard."""
+    return Jobs(settings, data, range(arguments.shard_index, len(data), arguments.num_shards), arguments.on_error)
+
+
+def _verify(jobs: Jobs, arguments: argparse.Namespace) -> int:
+    """Print what differs from the recorded checksums, and return the exit status; the first shard checks tables."""
+    done = list(results(Verification(jobs), min(arguments.workers, len(jobs)), "verify"))
+    differ = [line for one in done for line in one.messages]
+    differ += differences_of_all(jobs) if arguments.shard_index == 0 else ()
+    for line in differ:
+        print(line, file=sys.stderr)
+    print(f"{jobs.settings.output}: {len(done)} samples verified, {len(differ)} differences")
+    return int(bool(differ))
 
 
 def _run(jobs: Jobs, arguments: argparse.Namespace) -> Iterator[Done]:
@@ -242,7 +273,7 @@ def _finish(jobs: Jobs, facts: Mapping[str, Any], report_frames: int, shards: in
         raise DataError(f"{settings.output}: expected at least one sample that can be converted, got none")
     for note in jobs.format.finish(jobs.manifest.records(converted), left_out):
         print(f"note: {note}", file=sys.stderr)
-    jobs.manifest.write_provenance(facts, tokens)
+    jobs.manifest.write_provenance(facts, tokens, jobs.format.finished())
     if report_frames:
         write_report(settings, jobs.data, converted, report_frames)
         print(f"report: {settings.output / FOLDER / 'report.html'}")

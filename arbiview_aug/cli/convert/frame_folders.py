@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from arbiview_aug.atomic_io import inside, link_whole, write_whole
+from arbiview_aug.atomic_io import file_name, write_whole
 from arbiview_aug.cli.convert.manifest import Record
 from arbiview_aug.cli.convert.settings import FOLDER, Settings
 from arbiview_aug.cli.convert.writer import Converted, Writer
@@ -29,10 +29,11 @@ class FrameFolders(Writer):
             raise DataError(f"{self.data.root}: expected frames of other names than {FOLDER!r}; rename that folder")
 
     def stem(self, index: int, camera: int, name: str) -> str:
-        return f"{self.data.tokens[index]}/{camera:02}"
+        """``name`` without dots: no image has the name of another camera's mask."""
+        return f"{self.data.tokens[index]}/{file_name(name).replace('.', '%2E')}"
 
-    def rest(self, converted: Converted) -> tuple[dict[str, bytes], dict[str, Any]]:
-        """Link the points and write the calibration, last: it makes the folder a frame."""
+    def rest(self, converted: Converted) -> tuple[dict[str, bytes], dict[str, Path], dict[str, Any]]:
+        """The calibration, which is written last and makes the folder a frame; the points are kept."""
         calibration, *_ = files = self.data.files(converted.index)
         source = json.loads(calibration.read_text(encoding="utf-8"))
         calib = converted.rig.to_dict()
@@ -42,12 +43,11 @@ class FrameFolders(Writer):
                 entry[key] = Path(name).name
         kept = {key: value for key, value in source.items() if key not in (*calib, "dataset", "lidar")}
         folder = calibration.parent.name
-        if "points" in converted.sample:
-            points = inside(self.output, f"{folder}/{POINTS_FILE}", f"--output {self.output}")
-            link_whole(files[-1], points, owner=str(converted.index))
+        points = {f"{folder}/{POINTS_FILE}": files[-1]} if "points" in converted.sample else {}
+        if points:
             kept["lidar"] = {"file": POINTS_FILE}
         text = json.dumps({**calib, **kept}, indent=1).encode()
-        return {f"{folder}/{CALIBRATION_FILE}": text}, {}
+        return {f"{folder}/{CALIBRATION_FILE}": text}, points, {}
 
     def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
         """Write the frames' sequence, without those that were left out."""
@@ -59,3 +59,6 @@ class FrameFolders(Writer):
             sequence["frames"] = [frame for frame, name in zip(frames, names, strict=True) if name not in left_out]
             write_whole({self.output / SEQUENCE_FILE: json.dumps(sequence, indent=1).encode()})
         return []
+
+    def finished(self) -> list[str]:
+        return [SEQUENCE_FILE] if (self.data.root / SEQUENCE_FILE).is_file() else []

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from torch.utils.data import Dataset
 
-from arbiview_aug.atomic_io import checksum, inside, write_whole
+from arbiview_aug.atomic_io import checksum, inside, link_whole, write_whole
 from arbiview_aug.cli.arguments import gathered_warnings
 from arbiview_aug.cli.convert.manifest import Manifest, Record
 from arbiview_aug.cli.convert.settings import Settings
@@ -113,22 +114,32 @@ class Jobs(Dataset[Done]):
             stem = self.format.stem(index, k, camera.name)
             names.append({suffix: stem + suffix for suffix in view})
             files |= {stem + suffix: coded for suffix, coded in view.items()}
-        rest, facts = self.format.rest(Converted(index, sample, out, rig, names))
+        rest, kept, facts = self.format.rest(Converted(index, sample, out, rig, names))
         files |= rest
         paths = {inside(output, name, f"--output {output}"): content for name, content in files.items()}
+        for name, source in kept.items():
+            link_whole(source, self.format.kept_path(name), owner=str(index), how=self.settings.link)
         write_whole(paths, owner=str(index))
         images = [view[self.settings.suffix] for view in names]
         cameras = rig.to_dict()["cameras"]
         coverage = [round(float(mask.float().mean()), 6) for mask in out["coverage"]]
-        sources = self._source_files(index)
+        sources = self.source_files(index)
+        sums = {path: checksum(path) for path in sources.values()}
         record: dict[str, Any] = {
             "token": self.data.tokens[index],
             "ground_z_m": rig.ground_z_m,
             "cameras": [{**camera, "file": image} for camera, image in zip(cameras, images, strict=True)],
             "coverage": coverage,
-            "files": {name: len(content) for name, content in files.items()},
-            "sources": {_below(path, self.data.root): checksum(path) for path in sources},
-            "source_bytes": _total_bytes(sources),
+            "files": {
+                **{name: len(content) for name, content in files.items()},
+                **{name: source.stat().st_size for name, source in kept.items()},
+            },
+            "checksums": {
+                **{name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
+                **{name: sums[source] for name, source in kept.items()},
+            },
+            "sources": {name: sums[path] for name, path in sources.items()},
+            "source_bytes": _total_bytes(sources.values()),
             **facts,
         }
         without = [frame["token"] for frame in sample.get("neighbours", ()) if frame.is_broken]
@@ -143,25 +154,25 @@ class Jobs(Dataset[Done]):
         A sample without one of its neighbours is converted again: the neighbour may be readable by now.
         """
         try:
-            files = self._source_files(index)
-            sources = {_below(path, self.data.root): path for path in files}
+            sources = self.source_files(index)
             return (
                 not record.get("without")
                 and sources.keys() == record["sources"].keys()
-                and _total_bytes(files) == record["source_bytes"]
+                and _total_bytes(sources.values()) == record["source_bytes"]
                 and all(checksum(path) == record["sources"][n] for n, path in sources.items() if path.suffix == ".json")
             )
         except Exception:  # reported when the sample is read
             return False
 
-    def _source_files(self, index: int) -> list[Path]:
+    def source_files(self, index: int) -> dict[str, Path]:
+        """Files that a sample is read from, by the names that records have."""
         files = self.data.files(index)
         if isinstance(self.samples, WithDepth):
             files += [folder.path(self.data.tokens[index]) for folder in self.samples.folders]
-        return files
+        return {_below(path, self.data.root): path for path in files}
 
 
-def _total_bytes(files: Sequence[Path]) -> int:
+def _total_bytes(files: Iterable[Path]) -> int:
     return sum(path.stat().st_size for path in files)
 
 

@@ -11,14 +11,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from arbiview_aug.atomic_io import file_name, write_whole
+from arbiview_aug.atomic_io import checksum, file_name, write_whole
 from arbiview_aug.cli.convert.settings import FOLDER
 from arbiview_aug.errors import DataError, shown
 
 Record = Mapping[str, Any]
-"""``token``; for a converted sample ``cameras``, ``ground_z_m``, ``files`` (bytes by path), ``sources`` (SHA-256 by
-path), ``source_bytes``, ``coverage``, ``without`` (unreadable neighbours, if any) and entries of the format; or, if
-left out, ``skipped``: the reason."""
+"""``token``; for a converted sample ``cameras``, ``ground_z_m``, ``files`` (bytes by path), ``checksums`` and
+``sources`` (SHA-256 by path), ``source_bytes``, ``coverage``, ``without`` (unreadable neighbours, if any) and entries
+of the format; or, if left out, ``skipped``: the reason."""
 
 
 _ENTRIES = {"cameras": list, "files": dict, "sources": dict, "source_bytes": int, "coverage": list}
@@ -67,7 +67,7 @@ class Manifest:
     def complete_record(self, token: str) -> Record | None:
         """The record of a converted sample if all of its files are in place."""
         record = self.record(token)
-        if record is None or "skipped" in record:
+        if record is None or "skipped" in record or "checksums" not in record:
             return None
         files = {self.output / name: size for name, size in record["files"].items()}
         return record if all(file.is_file() and file.stat().st_size == files[file] for file in files) else None
@@ -75,15 +75,22 @@ class Manifest:
     def write(self, record: Record, owner: str) -> None:
         write_whole({self.path(record["token"]): _text(record)}, owner)
 
-    def write_provenance(self, facts: Mapping[str, Any], tokens: Sequence[str]) -> None:
-        """Write versions, settings and the source's checksums to one file."""
+    def write_provenance(self, facts: Mapping[str, Any], tokens: Sequence[str], finished: Sequence[str]) -> None:
+        """Write versions, settings, and checksums of the source and of ``finished`` files to one file."""
         sources, skipped = {}, {}
         for record in self.records(tokens):
             if "skipped" in record:
                 skipped[record["token"]] = record["skipped"]
             else:
                 sources[record["token"]] = record["sources"]
-        write_whole({self.folder / "provenance.json": _text({**facts, "sources": sources, "skipped": skipped})})
+        files = {name: checksum(self.output / name) for name in finished}
+        said = {**facts, "sources": sources, "skipped": skipped, "files": files}
+        write_whole({self.folder / "provenance.json": _text(said)})
+
+    def provenance(self) -> dict[str, Any] | None:
+        """Read what ``write_provenance`` wrote; None if the conversion is not finished."""
+        path = self.folder / "provenance.json"
+        return _read(path) if path.is_file() else None
 
 
 def _text(data: Mapping[str, Any]) -> bytes:

@@ -82,7 +82,7 @@ class NuScenes(Writer):
     """Tables, images and masks of the new cameras; CalibrationError for lenses, and names of other sensors."""
 
     def __init__(self, settings: Settings, data: NuScenesDataset) -> None:
-        self.output, self.data, self.suffix = settings.output, data, settings.suffix
+        self.output, self.data, self.suffix, self.how = settings.output, data, settings.suffix, settings.link
         self.target = settings.target
         self.tables = Tables(data.root, data.version, None)
         self.there = [name for name in _TABLES if self.tables.path(name).is_file()]  # in writing order
@@ -160,7 +160,8 @@ class NuScenes(Writer):
                 raise tables.error(table, f"{key} that lead to an end", got, f"empty one row's {key}")
         own_folders = (FOLDER, self.data.version, *(view_stem("", c.name).rpartition("/")[0] for c in self.target))
         for folder, where in folders.items():
-            self._kept(folder or ".", where)
+            for root, what in ((self.data.root, where), (self.output, f"--output {self.output}: {where}")):
+                inside(root, folder or ".", what)
             parts = PurePosixPath(folder).parts
             if parts and (parts[0] in own_folders or "/".join(parts[:2]) in own_folders):
                 raise DataError(f"{where}: expected a file outside of {', '.join(own_folders)}, got one in {folder}")
@@ -168,14 +169,14 @@ class NuScenes(Writer):
     def stem(self, index: int, camera: int, name: str) -> str:
         return view_stem(self.data.files(index)[-1].name, name)
 
-    def rest(self, converted: Converted) -> tuple[dict[str, bytes], dict[str, Any]]:
+    def rest(self, converted: Converted) -> tuple[dict[str, bytes], dict[str, Path], dict[str, Any]]:
         """No files, but the visible share of each annotation's box in the new cameras."""
         sample = converted.sample
         if "boxes_3d" not in sample:
-            return {}, {"visible": {}}
+            return {}, {}, {"visible": {}}
         coverage = [mask.numpy() for mask in converted.out["coverage"]]
         shares = np.round(visible_shares(converted.rig, coverage, sample["boxes_3d"].numpy()), 3).tolist()
-        return {}, {"visible": dict(zip(sample["box_tokens"], shares, strict=True))}
+        return {}, {}, {"visible": dict(zip(sample["box_tokens"], shares, strict=True))}
 
     def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
         """Write the tables and link the files of the remaining sensors."""
@@ -199,7 +200,7 @@ class NuScenes(Writer):
             "sample": remaining.sample,
         }
         for path in self._maps():
-            link_whole(*self._kept(path.relative_to(self.data.root).as_posix(), "maps"))
+            link_whole(*self._kept(path.relative_to(self.data.root).as_posix(), "maps"), how=self.how)
         for name in self.there:
             _write_table(self.output / self.data.version / f"{name}.json", rows.get(name, partial(source.rows, name))())
         notes = []
@@ -210,17 +211,29 @@ class NuScenes(Writer):
             notes.append(f"left out, since they may describe the source's images: tables {', '.join(unknown)}")
         return notes
 
+    def finished(self) -> list[str]:
+        return [f"{self.data.version}/{name}.json" for name in self.there]
+
+    def kept(self, left_out: set[str]) -> Iterator[tuple[Path, Path]]:
+        for path in self._maps():
+            yield self._kept(path.relative_to(self.data.root).as_posix(), "maps")
+        tables: dict[str, Iterable[Row]] = {"sample_data": Remaining(self.tables, left_out).sample_data()}
+        tables |= {name: self.tables.rows(name) for name in ("lidarseg", "panoptic") if name in self.there}
+        for table, rows in tables.items():
+            for row in rows:
+                yield self._kept(row["filename"], self._where(table, row))
+
     def _linked(self, table: str, rows: Iterable[Row]) -> Iterator[Row]:
         for row in rows:
             try:
-                link_whole(*self._kept(row["filename"], self._where(table, row)))
+                link_whole(*self._kept(row["filename"], self._where(table, row)), how=self.how)
             except FileNotFoundError:
                 self._missing += 1
             yield row
 
     def _kept(self, name: str, where: str) -> tuple[Path, Path]:
         """Paths of a kept file in the source and in the output; links must not leave either."""
-        return inside(self.data.root, name, where), inside(self.output, name, f"--output {self.output}: {where}")
+        return inside(self.data.root, name, where), self.kept_path(name, where)
 
     def _maps(self) -> list[Path]:
         return sorted(path for path in (self.data.root / "maps").rglob("*") if not path.is_dir())

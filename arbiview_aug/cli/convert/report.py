@@ -34,6 +34,7 @@ def converted(settings: Settings) -> Method:
     )
     manifest, target = Manifest(settings.output), settings.sized_target
     written = open_data(settings.output, kind=settings.kind, version=settings.version)
+    written.load_points = False  # they may be links that leave the output
 
     def render(sample: Mapping[str, Any], rig: Rig) -> list[RenderedView]:
         record = manifest.record(sample["token"])

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from arbiview_aug.atomic_io import checksum, is_part
+from arbiview_aug.atomic_io import Link, checksum, is_part
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.drive import Neighbours, Recording
@@ -26,10 +26,11 @@ FOLDER = "conversion"  # subfolder of an output with manifest, provenance and re
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Source, output and everything that decides the output's bytes; ``convert --help`` explains each.
+    """Source, output and what decides the output's bytes; ``convert --help`` explains each.
 
     ``root``, ``kind``, ``version``, ``reduce`` and ``clean_masks`` are those of ``open_data``, ``RETARGET_OPTIONS``
-    those of ``RigRetarget``. ``motion_depth`` is None where depth is estimated from the neighbours.
+    those of ``RigRetarget``. ``motion_depth`` is None where depth is estimated from the neighbours. Only
+    ``link`` does not decide bytes.
     """
 
     root: Path
@@ -50,6 +51,7 @@ class Settings:
     neighbours: int = 0
     motion_depth: Path | None = None
     suffix: Literal[".jpg", ".png"] = ".jpg"
+    link: Link = "hard"
 
     @property
     def sized_target(self) -> Rig:

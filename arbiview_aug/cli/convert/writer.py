@@ -5,8 +5,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from arbiview_aug.atomic_io import check_name, inside
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.convert.manifest import Record
 from arbiview_aug.cli.convert.settings import Settings
@@ -27,6 +29,8 @@ class Writer(ABC):
     ArbiviewError if the format cannot hold the target's cameras.
     """
 
+    output: Path
+
     @abstractmethod
     def __init__(self, settings: Settings, data: Any) -> None: ...
 
@@ -43,9 +47,24 @@ class Writer(ABC):
         """Path of a view below the output, without its suffix."""
 
     @abstractmethod
-    def rest(self, converted: Converted) -> tuple[dict[str, bytes], dict[str, Any]]:
-        """Files of a sample besides its views, and further entries of its record."""
+    def rest(self, converted: Converted) -> tuple[dict[str, bytes], dict[str, Path], dict[str, Any]]:
+        """Files of a sample besides its views, its files that are kept, and further entries of its record."""
 
     @abstractmethod
     def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
         """Write what belongs to all samples: ``records`` of the converted ones, tokens of those ``left_out``; notes."""
+
+    @abstractmethod
+    def finished(self) -> list[str]:
+        """Names of the files that ``finish`` wrote."""
+
+    def kept(self, left_out: set[str]) -> Iterable[tuple[Path, Path]]:
+        """Source and output of each file that ``finish`` keeps, if the source has it."""
+        return ()
+
+    def kept_path(self, name: str, where: str = "") -> Path:
+        """Path of a kept file in the output: it may be a link that leaves the output, its folder may not."""
+        what = f"--output {self.output}: {where}"
+        check_name(name, what)
+        folder, _, file = name.rpartition("/")
+        return inside(self.output, folder or ".", what) / file

@@ -157,7 +157,10 @@ def test_shards_write_the_same_bytes(
         assert main([*asked, "--num-shards", "3", "--shard-index", shard]) == 0
         assert "samples of other shards are missing so far" in capsys.readouterr().out
     (tmp_path / "new" / "conversion" / "samples" / ".x.json.1-01234567-1-89abcdef.part").write_bytes(b"{")
+    others = tmp_path / "new" / ".x.json.other-01234567-1-89abcdef.part"
+    others.write_bytes(b"another program's")
     assert main([*asked, "--num-shards", "3", "--shard-index", "1"]) == 0
+    others.unlink()
     assert tree(tmp_path / "new") == undisturbed[kind]
     with pytest.raises(SystemExit):
         main([*asked, "--num-shards", "3", "--shard-index", "3"])

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import RigRetarget, load_rig
+from arbiview_aug import Rig, RigRetarget, load_rig
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.convert import command as command_module
 from arbiview_aug.cli.convert.views import coverage_of
@@ -55,6 +55,7 @@ def test_the_reader_finds_what_was_rendered(source: Path, output: Path) -> None:
         calib = json.loads((output / after["token"] / "calib.json").read_text())
         assert calib["license"] == "as you like"
         for k, camera in enumerate(calib["cameras"]):
+            assert camera["file"] == f"{camera['name']}.png"
             image = output / after["token"] / camera["file"]
             assert np.array_equal(coverage_of(image), out["coverage"][k].numpy())
             assert (image.parent / camera["confidence"]).is_file()
@@ -173,7 +174,7 @@ def test_neighbours_fill_by_a_switch(source: Path, tmp_path: Path) -> None:
         assert main(command(source, tmp_path / str(n), "--neighbours", str(n))) == 0
     alone, filled = (FrameFolder(tmp_path / str(n))[1] for n in (0, 1))
     paths = [tmp_path / str(n) / "0001" for n in (0, 1)]
-    covered = [sum(coverage_of(file).sum() for file in sorted(path.glob("??.jpg"))) for path in paths]
+    covered = [sum(coverage_of(file).sum() for file in sorted(path.glob("*.jpg"))) for path in paths]
     assert covered[1] > covered[0] and not torch.equal(alone["images"], filled["images"])
 
 
@@ -188,8 +189,9 @@ def test_a_second_run_changes_nothing(source: Path, tmp_path: Path, capsys: pyte
 def test_what_was_broken_is_made_again(source: Path, tmp_path: Path) -> None:
     assert main(command(source, tmp_path / "new")) == 0
     before = tree(tmp_path / "new")
-    (tmp_path / "new" / "0000" / "00.jpg").write_bytes(b"cut")
-    (tmp_path / "new" / "0001" / "01.coverage.png").unlink()
+    (tmp_path / "new" / "0000" / "ring_front_left.jpg").write_bytes(b"cut")
+    (tmp_path / "new" / "0001" / "ring_front_center.coverage.png").unlink()
+    (tmp_path / "new" / "0001" / "lidar.npy").unlink()
     (tmp_path / "new" / "0002" / ".00.jpg.2-01234567-1-89abcdef.part").write_bytes(b"left behind")
     assert main(command(source, tmp_path / "new")) == 0
     assert tree(tmp_path / "new") == before
@@ -326,3 +328,60 @@ def test_records_of_other_samples_and_forms(source: Path, tmp_path: Path, capsys
         assert f"0000: failed: {record}: {message}" in said and "0001: failed" not in said
     (tmp_path / "new" / "conversion" / "settings.json").write_text("[]")
     assert main(asked) == 2 and f"settings.json: {wrote} list" in capsys.readouterr().err
+
+
+def test_kept_files_come_along_as_asked(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points = source / "0001" / "lidar.npy"
+    for how in ("copy", "hard", "symlink", "hard"):
+        assert main(command(source / "0001", tmp_path / "new", "--link", how, "--report", "1")) == 0
+        kept = tmp_path / "new" / "0001" / "lidar.npy"
+        assert kept.read_bytes() == points.read_bytes()
+        assert (kept.is_symlink(), kept.samefile(points)) == (how == "symlink", how != "copy")
+        assert main(command(source / "0001", tmp_path / "new", "--link", how, "--verify")) == 0
+        if how == "symlink":
+            with pytest.raises(DataError, match="links must not leave the folder"):
+                FrameFolder(tmp_path / "new")[0]
+        shutil.rmtree(tmp_path / "new")
+
+
+def test_images_are_not_named_as_masks(source: Path, tmp_path: Path) -> None:
+    rig = FrameFolder(source)[0]["rig"]
+    names = ("a", "a.coverage", "up / down")
+    Rig([replace(rig[0], name=name) for name in names]).save(tmp_path / "rig.json")
+    asked = command(source / "0001", tmp_path / "new", "--images", "png")
+    asked[asked.index("argoverse2")] = str(tmp_path / "rig.json")
+    assert main(asked) == 0
+    calib = json.loads((tmp_path / "new" / "0001" / "calib.json").read_text())
+    files = [camera["file"] for camera in calib["cameras"]]
+    assert files == ["a.png", "a%2Ecoverage.png", "up%20%2F%20down.png"]
+    assert FrameFolder(tmp_path / "new")[0]["images"].shape[0] == 3
+
+
+def test_what_differs_is_named(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By sources and outputs of the same size, which a second run takes as they are."""
+    shutil.copytree(source, tmp_path / "drive")
+    asked = command(tmp_path / "drive", tmp_path / "new", "--link", "copy")
+    assert main([*asked, "--verify"]) == 1
+    said = capsys.readouterr()
+    assert "expected the record of a conversion, found none" in said.err and "4 differences" in said.out
+    assert not (tmp_path / "new").exists()
+    assert main(asked) == 0
+    before = tree(tmp_path / "new")
+    assert main([*asked, "--verify"]) == 0
+    assert "3 samples verified, 0 differences" in capsys.readouterr().out
+    changed = [tmp_path / "drive" / "0000" / "00.jpg", tmp_path / "new" / "0001" / "lidar.npy"]
+    changed += [tmp_path / "new" / "0002" / "ring_front_left.jpg", tmp_path / "new" / "sequence.json"]
+    for path in changed:
+        path.write_bytes(path.read_bytes()[:-1] + b"?")
+    missing = tmp_path / "new" / "0002" / "calib.json"
+    missing.unlink()
+    assert main([*asked, "--verify"]) == 1
+    lines = [line for line in capsys.readouterr().err.splitlines() if "SHA-256" in line]
+    assert len(lines) == 5 and all(any(line.startswith(f"{path}: ") for line in lines) for path in [*changed, missing])
+    assert f"got No such file or directory; remove {tmp_path / 'new' / 'conversion' / 'samples'}" in "".join(lines)
+    for token in ("0000", "0001", "0002"):
+        (tmp_path / "new" / "conversion" / "samples" / f"{token}.json").unlink()
+    shutil.copy(source / "0000" / "00.jpg", changed[0])
+    changed[1].unlink()
+    assert main(asked) == 0 and main([*asked, "--verify"]) == 0
+    assert tree(tmp_path / "new") == before

@@ -92,6 +92,19 @@ def test_other_sensors_are_linked(source: Path, output: Path) -> None:
     assert (output / "maps" / "map.png").samefile(source / "maps" / "map.png")
 
 
+def test_kept_files_are_verified(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = command(source, tmp_path / "new", "--link", "copy")
+    assert main(asked) == 0 and main([*asked, "--verify"]) == 0
+    capsys.readouterr()
+    sweep = next((tmp_path / "new" / "sweeps" / "RADAR_FRONT").iterdir())
+    for path in (sweep, tmp_path / "new" / "v1.0-mini" / "ego_pose.json"):
+        assert path.stat().st_nlink == 1
+        path.write_bytes(path.read_bytes()[:-1] + b"!")
+    assert main([*asked, "--verify"]) == 1
+    said = capsys.readouterr()
+    assert "2 differences" in said.out and f"{sweep}: expected the SHA-256" in said.err and "ego_pose.json" in said.err
+
+
 def test_visibility_is_at_most_what_people_saw(source: Path, output: Path) -> None:
     old, new = (read_tables(root)["sample_annotation"] for root in (source, output))
     levels = [(a["visibility_token"], b["visibility_token"]) for a, b in zip(old, new, strict=True)]
