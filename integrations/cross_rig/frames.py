@@ -20,6 +20,7 @@ from arbiview_aug.datasets import LazyFrame, Neighbours
 from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.generator import shipped_weights
+from arbiview_aug.scene.depth_maps import motion_camera
 from integrations.cross_rig.boxes import vehicle_boxes
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, fill
 from integrations.cross_rig.labels import Grid, box_cells, visible_objects
@@ -235,9 +236,12 @@ class _VariantFrames:
                 frame["boxes_3d"] = change(frame["boxes_3d"], index)
         if "points" in self.variant.reads:
             frame["points"] = self.measured.points(index)
-        if "depth_m" in self.variant.reads:
+        for key in {"depth_m", "learned_depth_m"}.intersection(self.variant.reads):
             depth = torch.from_numpy(self.store.read(index, "depth_m").astype(np.float32))
-            frame["depth_m"] = noisy_depth(depth, index) if self.variant.noise == "depth" else depth
+            if key == "learned_depth_m":
+                size = motion_camera(self.original.rig[0]).size
+                depth = torch.nn.functional.interpolate(depth[None], size, mode="nearest-exact")[0]
+            frame[key] = noisy_depth(depth, index) if self.variant.noise == "depth" else depth
         if "neighbours" in self.variant.reads:
             frame |= self._neighbours(index)
         arrays = self.views(index, frame)

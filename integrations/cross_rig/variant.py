@@ -8,7 +8,7 @@ from typing import Any, Literal
 from arbiview_aug.scene.surface import SurfaceName
 
 Kind = Literal["raw", "oracle", "row_split", "retarget"]
-Geometry = Literal["points", "boxes_3d", "depth_m", "neighbours"]
+Geometry = Literal["points", "boxes_3d", "depth_m", "learned_depth_m", "neighbours"]
 Noise = Literal["depth", "boxes", "missed", "late", "calibration"]
 
 
@@ -26,7 +26,8 @@ class Variant:
         kind: Where its images come from: A's as they are, B's own, or A's re-rendered.
         surface: Of ``RigRetarget``.
         reads: Which of the frame's geometry it is given, besides the images; ``neighbours``: the frames 1.2 m before
-            and after it, with boxes where it reads boxes.
+            and after it, with boxes where it reads boxes; ``learned_depth_m``: the true depth, at the size of the
+            ``depth`` command's.
         mixed: Half of the frames drawn are raw ones.
         augmented: Frames are scaled and cropped at random as they are drawn.
         holes: Pixels that no camera saw are black, filled as ``RigRetarget`` does by default, or completed by the

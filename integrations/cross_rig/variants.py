@@ -89,6 +89,14 @@ VARIANTS: dict[str, Variant] = {
             reads=("neighbours",),
             mixed=True,
         ),
+        Variant(
+            name="motion_learned",
+            title="depth from motion, and true depth with 5 % noise",
+            kind="retarget",
+            surface="fused",
+            reads=("neighbours", "learned_depth_m"),
+            noise="depth",
+        ),
         Variant(name="random", title="RandomRig around B, auto", kind="retarget", reads=_ALL, random=True),
         *(
             _filled(name=f"auto_fill_{noise}", title=f"auto, filled holes, no mask, {title}", noise=noise)

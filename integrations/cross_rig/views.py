@@ -12,7 +12,10 @@ import torch
 from arbiview_aug import Camera, RandomRig, Rig, RigRetarget, visible_boxes
 from arbiview_aug.evaluate.baselines import row_split
 from arbiview_aug.evaluate.images import as_arrays
+from arbiview_aug.sample.inputs import read_frames
+from arbiview_aug.sample.neighbours import neighbours_of_frames
 from arbiview_aug.temporal.fill import Reach
+from arbiview_aug.temporal.motion_depth import motion_depth
 from integrations.cross_rig.cache import Arrays
 from integrations.cross_rig.variant import RANDOM, Variant
 
@@ -37,7 +40,7 @@ class ViewMaker:
         self.variant, self.source, self.target = variant, source, target
         self.random = RandomRig(target, **RANDOM) if variant.random else None
         # Motion is asked for distances alone, so that the variant shows what these do.
-        reach: Reach | None = None if variant.surface == "motion" else "ground"
+        reach: Reach | None = None if variant.surface in ("motion", "fused") else "ground"
         self.retarget = RigRetarget(
             self.random or target,
             source_rig=source,
@@ -69,6 +72,8 @@ class ViewMaker:
             K, cam2ego = self.target.K, self.target.cam2ego
         else:
             given = {key: frame[key] for key in ("images", "rig", *self.variant.reads, *_POSE) if key in frame}
+            if self.variant.surface == "fused":
+                given["motion_depth_m"] = self._motion(given)
             drawn = None if self.random is None else self.random.draw(torch.Generator().manual_seed(index))
             out = self.retarget(given, drawn)
             images, coverage = out["images"].numpy(), out["coverage"].numpy()
@@ -83,6 +88,13 @@ class ViewMaker:
             "cam2ego": cam2ego.astype(np.float32),
             "cpu_s": np.array(seconds, np.float32),
         }
+
+    def _motion(self, given: Mapping[str, Any]) -> list[torch.Tensor]:
+        """Depth from motion, as the ``depth`` command finds it: beside learned depth, no call finds it anew."""
+        (frame,) = read_frames(given, self.source)
+        (neighbours,) = neighbours_of_frames(given, [frame], (), lambda _, __: None)
+        found = motion_depth(frame.rig, frame.images, neighbours, None, lambda one: one.images(frame.images))
+        return [torch.from_numpy(depth_m) for depth_m in found.depth_m]
 
 
 def at_source_centres(source: Rig, target: Rig) -> Rig:

@@ -1,12 +1,15 @@
 """What the variants make of A's frames."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from arbiview_aug.datasets.synthetic import SyntheticDrive
+from arbiview_aug.temporal.motion_depth import MotionDepth
+from integrations.cross_rig import views
 from integrations.cross_rig.augmentation import SCALE, scaled_and_cropped
 from integrations.cross_rig.frames import NEIGHBOURS, Source, _VariantFrames
 from integrations.cross_rig.settings import Settings
@@ -20,11 +23,12 @@ SIZE = (24, 64)
 @pytest.fixture(scope="module")
 def frame() -> dict:
     drive = SyntheticDrive(source_rig(SIZE), num_frames=1, seed=9, neighbours=NEIGHBOURS)
-    views, sample = drive.render(0), drive[0]
+    true, sample = drive.render(0), drive[0]
     return {
         **{key: sample[key] for key in ("neighbours", "ego2world", "time_s")},
-        "images": views.images,
-        "depth_m": torch.where(torch.isfinite(views.depth_m), views.depth_m, 0),
+        "images": true.images,
+        "depth_m": torch.where(torch.isfinite(true.depth_m), true.depth_m, 0),
+        "learned_depth_m": torch.where(torch.isfinite(true.depth_m), true.depth_m, 0),
         "points": drive.points(0),
         "boxes_3d": torch.from_numpy(drive.scene(0).boxes_ego(0.0)).float(),
     }
@@ -51,6 +55,34 @@ def test_every_arm_renders(frame, name):
         away = views["cam2ego"][:, :3, 3] - target.cam2ego[:, :3, 3]
         np.testing.assert_allclose(away[:, 2], -0.6 if VARIANTS[name].stays else 0, atol=1e-6)
         assert (np.abs(away[:, :2]).max() > 0.01) == (VARIANTS[name].stays == "centre")
+
+
+def test_motion_and_learned_depth_are_both_used(frame, monkeypatch):
+    """Views change without the one or the other. At this size little matches: motion is what is said here."""
+    left = (np.arange(SIZE[1]) < SIZE[1] // 2) * np.ones(SIZE, np.float32)
+    maps = [[depth_m * left] * 6 for depth_m in (5.0, 0.0, 5.0)]
+    unknown = frame | {"learned_depth_m": torch.zeros_like(frame["learned_depth_m"])}
+    asked = []
+    monkeypatch.setattr(
+        views, "motion_depth", lambda *given: asked.append(given) or MotionDepth(maps[len(asked) - 1], "")
+    )
+    render = ViewMaker(VARIANTS["motion_learned"], source_rig(SIZE), CHANGES["up70"].target(SIZE))
+    both, learned, motion = (render(0, given)["images"] for given in (frame, frame, unknown))
+    assert (both != learned).mean() > 0.05 < (both != motion).mean()
+    (_, images, neighbours, boxes, _) = asked[0]
+    assert len(images) == 6 and len(neighbours) == 2 and boxes is None
+
+
+def test_learned_depth_has_the_size_of_the_depth_commands(tmp_path, monkeypatch):
+    size, variant = (64, 704), replace(VARIANTS["motion_learned"], reads=("learned_depth_m",))
+    source = Source(root=tmp_path, size=size, split="train", change="up70", variant=variant)
+    frames, given = _VariantFrames(source), []
+    stored = {"images": np.zeros((6, 3, *size), np.uint8), "depth_m": np.full((6, *size), 8, np.float16)}
+    monkeypatch.setattr(frames, "store", SimpleNamespace(read=lambda _, key: stored[key]))
+    monkeypatch.setattr(frames, "views", lambda _, frame: given.append(frame) or {})
+    frames(3)
+    depth = given[0]["learned_depth_m"]
+    assert depth.shape == (6, 32, 352) and 0.02 < float((8 / depth).std()) < 0.08
 
 
 @pytest.mark.slow
