@@ -31,7 +31,11 @@ def parser() -> argparse.ArgumentParser:
     add_output(found, "folder of the run")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting, such as steps=100 or loss.geo=0")
     add("--stage", choices=("all", "autoencoder"), default="all", help="autoencoder: that alone, if the config has one")
-    add("--weights", metavar="DIR", help="config paper: Stable Diffusion 1.5, a folder or hub id")
+    add(
+        "--weights",
+        metavar="DIR",
+        help="config paper or inpaint: Stable Diffusion 1.5, or its inpainting model: a folder or hub id",
+    )
     add("--vgg-weights", metavar="FILE", help="torchvision's vgg16 weights (default: cache or download)")
     add("--views", type=count, default=64, metavar="N", help="number of held-out views to score")
     add("--seeds", type=count, default=1, metavar="N", help="evaluate: targets a scene")

@@ -12,7 +12,7 @@ Needs diffusers and safetensors, imported where they are used: ``pip install arb
 
 from arbiview_aug.generator.batches import CompletedLoader
 from arbiview_aug.generator.completion import Completed
-from arbiview_aug.generator.config import GeneratorConfig, compact, paper, small, tiny
+from arbiview_aug.generator.config import GeneratorConfig, compact, inpaint, paper, small, tiny
 from arbiview_aug.generator.generator import Generator, load_generator
 from arbiview_aug.generator.pretrained import HoleFiller, PipelineFiller, TorchScriptFiller
 
@@ -25,6 +25,7 @@ __all__ = [
     "PipelineFiller",
     "TorchScriptFiller",
     "compact",
+    "inpaint",
     "load_generator",
     "paper",
     "small",

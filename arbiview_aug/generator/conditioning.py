@@ -26,6 +26,7 @@ from arbiview_aug.cameras.lens import FloatArray
 
 RAY_CHANNELS = 6
 POSE_WIDTH = 16  # numbers of a pose: R (9), t (3), K (4)
+_KNOWN_SHARE = 0.99  # known share of a latent pixel from which it is no hole
 _OCTAVES = 4  # number of Fourier frequencies π, 2π, 4π, 8π
 
 
@@ -42,9 +43,15 @@ class Views(NamedTuple):
         """Zero the conditions of the frames ``drop`` (B,) bool, for classifier-free guidance."""
         return Views(*(value * ~drop.view(-1, *(1,) * (value.dim() - 1)) for value in self))
 
-    def channels(self, noisy: torch.Tensor) -> torch.Tensor:
-        """(B, N, 2 C + 8, h, w) the U-Net's input: noisy latent, condition latent, mask, confidence, rays."""
-        return torch.cat([noisy, self.latent, self.mask, self.confidence, self.rays], 2)
+    def channels(self, noisy: torch.Tensor, inpainting: bool = False) -> torch.Tensor:
+        """(B, N, 2 C + 8, h, w) the U-Net's input: noisy latent, condition latent, mask, confidence, rays.
+
+        For ``inpainting`` it begins as Stable Diffusion's: noisy latent, binary mask of the holes, condition latent.
+        """
+        if not inpainting:
+            return torch.cat([noisy, self.latent, self.mask, self.confidence, self.rays], 2)
+        holes = (self.mask < _KNOWN_SHARE).to(self.mask.dtype)
+        return torch.cat([noisy, holes, self.latent, self.confidence, self.rays], 2)
 
 
 def input_channels(latent_channels: int) -> int:

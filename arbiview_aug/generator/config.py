@@ -1,9 +1,9 @@
-"""Settings of a generator: frozen dataclasses, and the four configurations as functions."""
+"""Settings of a generator: frozen dataclasses, and the configurations as functions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, is_dataclass
+from dataclasses import dataclass, field, is_dataclass, replace
 from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
 from arbiview_aug.errors import ArbiviewError, GeneratorError, shown
@@ -152,7 +152,11 @@ class GeneratorConfig:
     residual: bool = True  # diffuse the difference between image and pre-filled condition; never with ε
     prefilled: bool = True  # inpaint the condition's holes by Telea's method; else mid-grey, as in Algorithm 1
     one_step: bool = True  # whether the one-step regression was trained
-    frozen_unet: bool = False  # train only attention, pose, the one-step head and the widened conv_in
+    frozen_unet: bool = False  # train only attention, pose, LoRA, the one-step head and the widened conv_in
+    inpainting: bool = (
+        False  # the U-Net reads [noisy, hole, masked latent] first, as Stable Diffusion's inpainting does
+    )
+    lora_rank: int = 0  # rank of the changes to the U-Net's own attention (Hu et al. 2022); 0 for none
     prompt_tokens: int = 0  # tokens of the empty prompt's embedding
     facing_m: float = FACING_M  # distance of the depth level that faces the camera
     steps: int = 4  # denoising steps; 1 is the one-step regression
@@ -162,7 +166,7 @@ class GeneratorConfig:
     temperature: float = 0.5  # deviation of the initial noise; at 1 a sample is 3 dB below the posterior's mean
 
     def __post_init__(self) -> None:
-        check_sizes(self, _MOST_PIXELS, "image_size", "prompt_tokens", "steps")
+        check_sizes(self, _MOST_PIXELS, "image_size", "prompt_tokens", "steps", "lora_rank")
         factor, epsilon = self.autoencoder.factor, self.prediction == "epsilon"
         expected = f"multiples of {factor}"
         check_fields(self, expected, lambda size: all(n > 0 and n % factor == 0 for n in size), "image_size")
@@ -171,6 +175,12 @@ class GeneratorConfig:
         check_fields(self, "at least 1", lambda n: n >= 1, "steps")
         check_fields(self, "a value in (0, 1]", lambda s: 0 < s <= 1, "strength")
         check_fields(self, "a value in [0, 1]", lambda t: 0 <= t <= 1, "temperature")
+
+    @property
+    def unet_channels(self) -> int:
+        """Input channels of the pretrained U-Net: the noisy latent, and an inpainting one's mask and masked latent."""
+        latent = self.autoencoder.latent_channels
+        return 2 * latent + 1 if self.inpainting else latent
 
     @property
     def latent_size(self) -> tuple[int, int]:
@@ -204,6 +214,11 @@ def paper() -> GeneratorConfig:
         steps=50,
         guidance=7.5,
     )
+
+
+def inpaint() -> GeneratorConfig:
+    """Stable Diffusion 1.5's inpainting U-Net of 9 channels, frozen, with cross-view attention and LoRA."""
+    return replace(paper(), name="inpaint", inpainting=True, lora_rank=16, strength=1.0, steps=20, guidance=1.0)
 
 
 def small() -> GeneratorConfig:

@@ -18,11 +18,13 @@ import torch
 from torch import nn
 from torch.utils.checkpoint import checkpoint
 
+from arbiview_aug.environment import optional_package
 from arbiview_aug.generator.attention import CrossViewAttention
 from arbiview_aug.generator.conditioning import PoseContext, Views, input_channels
 from arbiview_aug.generator.correspondence import LEVELS, TokenWindow
 
 TIMESTEPS = 1000  # diffusion steps in training (Sec. Training Parameters)
+_LORA_LAYERS = ("to_q", "to_k", "to_v", "to_out.0")  # of the U-Net's self- and cross-attention
 REGRESSION = TIMESTEPS  # predicts x0 in one step, from the pre-filled latent instead of a noisy one
 
 KeysValues = tuple[torch.Tensor, torch.Tensor]
@@ -47,6 +49,8 @@ class Denoiser(nn.Module):
         cross_view: Whether views read each other at each level, the finest first; empty: at all.
         signal: (T,) √ᾱ_t of the schedule: the network then predicts the residual between image and condition. None
             leaves its output as it is, for Stable Diffusion's weights.
+        inpainting: Whether the U-Net's input begins as that of Stable Diffusion's inpainting.
+        lora_rank: Rank of LoRA on the U-Net's own attention, by peft; 0 for none.
     """
 
     deviation: torch.Tensor  # (2,) of the residual inside holes and outside; measured before training
@@ -57,11 +61,16 @@ class Denoiser(nn.Module):
         prompt_tokens: int = 0,
         cross_view: Sequence[bool] = (),
         signal: torch.Tensor | None = None,
+        inpainting: bool = False,
+        lora_rank: int = 0,
     ) -> None:
         super().__init__()
         self.latent_channels = int(unet.config.out_channels)
         widen(unet, input_channels(self.latent_channels))
-        self.unet = unet
+        if lora_rank:
+            lora = optional_package("peft", "generator").LoraConfig
+            unet.add_adapter(lora(r=lora_rank, lora_alpha=lora_rank, target_modules=list(_LORA_LAYERS)))
+        self.unet, self.inpainting = unet, inpainting
         widths = tuple(unet.config.block_out_channels)
         used = tuple(cross_view) or (True,) * len(widths)
         of_blocks = zip((*widths, widths[-1], *widths[::-1]), (*used, used[-1], *used[::-1]), strict=True)
@@ -84,9 +93,10 @@ class Denoiser(nn.Module):
         return self.unet.conv_in.weight.dtype
 
     def own_parameters(self) -> list[nn.Parameter]:
-        """Parameters trained beside a frozen U-Net: attention, pose, the one-step head, the widened ``conv_in``."""
+        """Parameters trained beside a frozen U-Net: attention, pose, one-step head, widened ``conv_in``, LoRA."""
         parts = (self.cross_view, self.context, self.regression, self.unet.conv_in)
-        return [parameter for part in parts for parameter in part.parameters()]
+        lora = [parameter for name, parameter in self.unet.named_parameters() if ".lora_" in name]
+        return [parameter for part in parts for parameter in part.parameters()] + lora
 
     def read_sources(self, sources: Views, windows: Sequence[TokenWindow]) -> Sources:
         """Run the source branches, which read sources only; ``windows``: one for each token grid, the finest first."""
@@ -179,7 +189,7 @@ class Denoiser(nn.Module):
     ) -> torch.Tensor:
         """Run all blocks of the U-Net; a source run appends its keys and values to ``outputs``."""
         unet, count = self.unet, noisy.shape[:2]
-        x = views.channels(noisy).flatten(0, 1).to(self.dtype)
+        x = views.channels(noisy, self.inpainting).flatten(0, 1).to(self.dtype)
         emb = unet.time_embedding(unet.time_proj(t.repeat_interleave(count[1])).to(self.dtype))
         context = self.context(views.pose.flatten(0, 1))
         blocks, attended = 0, 0  # blocks of the U-Net so far, and cross-view blocks

@@ -62,7 +62,9 @@ class Generator(GeneratorNetworks):
             with torch.device("cpu"):  # also where the weights are on meta
                 schedule = noise_schedule(prediction=config.prediction, zero_snr=config.zero_snr)
             signal = schedule.alphas_cumprod.double().sqrt().float()
-        denoiser = Denoiser(unet, config.prompt_tokens, config.unet.cross_view, signal)
+        denoiser = Denoiser(
+            unet, config.prompt_tokens, config.unet.cross_view, signal, config.inpainting, config.lora_rank
+        )
         return cls(config, denoiser, Autoencoder(vae, config.autoencoder.scale, config.autoencoder.patch))
 
     @classmethod
@@ -77,7 +79,7 @@ class Generator(GeneratorNetworks):
 
         Args:
             where: A folder or hub id in diffusers' layout.
-            config: Settings, ``paper()`` by default; the weights must fit its networks.
+            config: Settings, ``paper()`` by default, ``inpaint()`` for an inpainting model; the weights must fit.
             empty_prompt: (prompt tokens, width) the text encoder's last hidden state for ""; by default computed by the
                 folder's text encoder, which needs transformers.
 
@@ -88,14 +90,16 @@ class Generator(GeneratorNetworks):
         latent = config.autoencoder.latent_channels
         if not config.autoencoder.widths:
             raise GeneratorError("from_stable_diffusion: expected a config with an autoencoder, got one on pixels")
-        unet = load_part("UNet2DConditionModel", where, "unet", config.unet.arguments(latent, latent) | PLAIN_UNET)
+        expected_unet = config.unet.arguments(config.unet_channels, latent) | PLAIN_UNET
+        unet = load_part("UNet2DConditionModel", where, "unet", expected_unet)
         shape = config.autoencoder.arguments()
         del shape["scaling_factor"]  # the file's own is used
         vae = load_part("AutoencoderKL", where, "vae", shape)
         config = replace(config, autoencoder=replace(config.autoencoder, scale=float(vae.config.scaling_factor)))
         if empty_prompt is None and config.prompt_tokens:
             empty_prompt = embedded_empty_prompt(where)
-        denoiser = Denoiser(unet, config.prompt_tokens, config.unet.cross_view)
+        lora = config.lora_rank
+        denoiser = Denoiser(unet, config.prompt_tokens, config.unet.cross_view, None, config.inpainting, lora)
         if empty_prompt is not None:
             expected = tuple(denoiser.context.empty_prompt.shape)
             if tuple(empty_prompt.shape) != expected:

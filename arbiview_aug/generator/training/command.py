@@ -79,9 +79,10 @@ def check_weights(config: TrainConfig, weights: str | None) -> None:
     """Check, before any work, that weights are given exactly if ``fresh`` needs them; TrainingError otherwise."""
     name = config.generator.name
     if config.generator.frozen_unet and weights is None:
+        model = f"Stable Diffusion 1.5{' inpainting' if config.generator.inpainting else ''}"
         raise TrainingError(
-            f"--config {name}: expected --weights, a folder or hub id of Stable Diffusion 1.5 in diffusers' layout, "
-            "for its frozen U-Net"
+            f"--config {name}: expected --weights, a folder or hub id of {model} in diffusers' layout, for its frozen "
+            "U-Net"
         )
     if not config.generator.frozen_unet and weights is not None:
         raise TrainingError(f"--weights: expected none for --config {name}, which is trained from scratch")

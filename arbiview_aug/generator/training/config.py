@@ -1,4 +1,4 @@
-"""Settings of a training run: frozen dataclasses, the four configurations as functions, overrides by name."""
+"""Settings of a training run: frozen dataclasses, the configurations as functions, overrides by name."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ _check = partial(check_fields, error=TrainingError)
 class PseudoViewConfig:
     """Pseudo views (Algorithm 1) and what is added to them; probabilities are per training item."""
 
+    targets: int = 1  # real views to reconstruct together, of neighbouring cameras: each reads the others
     pairs: int = 1  # K of Algorithm 1: pairs of pseudo poses per draw of a real view; each is an item of its own
     yaw_deg: tuple[float, float] = (5.0, 35.0)  # range of a pseudo pose's turn to its side
     pitch_deg: float = 8.0  # half-widths of the other turns and moves
@@ -38,7 +39,7 @@ class PseudoViewConfig:
     def __post_init__(self) -> None:
         shares = ("moved", "transplanted", "hidden", "leave_one_out", "virtual", "real_sources")
         _check(self, "a probability", lambda p: 0 <= p <= 1, *shares)
-        _check(self, "at least 1", lambda n: n >= 1, "pairs", "mask_bank")
+        _check(self, "at least 1", lambda n: n >= 1, "targets", "pairs", "mask_bank")
         _check(self, "0 <= low <= high <= 90", lambda yaw: 0 <= yaw[0] <= yaw[1] <= 90, "yaw_deg")
         _check(self, "0 < low <= high", lambda factor: 0 < factor[0] <= factor[1], "focal")
 
@@ -170,6 +171,19 @@ def paper() -> TrainConfig:
     )
 
 
+def inpaint() -> TrainConfig:
+    """Cross-view attention and LoRA on Stable Diffusion's frozen inpainting U-Net, two neighbouring targets an item."""
+    return replace(
+        paper(),
+        generator=generators.inpaint(),
+        pseudo_views=PseudoViewConfig(targets=2),
+        loss=LossConfig(regression=0.0),
+        steps=20_000,
+        batch=4,
+        checkpointing=False,
+    )
+
+
 def small() -> TrainConfig:
     """Minutes on a GPU."""
     return TrainConfig(
@@ -220,4 +234,4 @@ def tiny() -> TrainConfig:
     )
 
 
-CONFIGS = {"paper": paper, "small": small, "compact": compact, "tiny": tiny}
+CONFIGS = {"paper": paper, "inpaint": inpaint, "small": small, "compact": compact, "tiny": tiny}

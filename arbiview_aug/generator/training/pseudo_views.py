@@ -2,7 +2,8 @@
 
 For a real view, pseudo poses are drawn to its left and right, and FAVS renders the frame's cameras there. The pair is
 the model's source branches and, warped to the target pose, its condition. FAVS of all cameras at the target pose would
-be the answer itself. Additions, each with its own probability:
+be the answer itself. An item may have several targets, of neighbouring cameras, each with its pair. Additions, each
+with its own probability:
 
 - *transplanted masks*: holes of real targets, imposed on the real view before FAVS, which hides them from the branches
   too, or on the condition alone;
@@ -42,10 +43,10 @@ _FAVS = FavsConfig(certainty=True)
 
 
 class Batch(NamedTuple):
-    """B items, each with N = 1 target view and S = 2 source branches; images in [0, 1], float32."""
+    """B items, each with N target views and S = 2 N source branches; images in [0, 1], float32."""
 
-    truth: torch.Tensor  # (B, N, 3, H, W) the real view
-    valid: torch.Tensor  # (B, N, H, W) bool, its valid pixels
+    truth: torch.Tensor  # (B, N, 3, H, W) the real views
+    valid: torch.Tensor  # (B, N, H, W) bool, their valid pixels
     favs: torch.Tensor  # (B, N, 3, H, W) FAVS of the pair at the target pose, black in holes
     condition: torch.Tensor  # (B, N, 3, H, W) the same, with holes inpainted
     known: torch.Tensor  # (B, N, H, W) bool, coverage of ``favs``
@@ -54,9 +55,10 @@ class Batch(NamedTuple):
     seen: torch.Tensor  # (B, S, H, W) bool, valid pixels of the sources
     geometry: FrameGeometry  # of their cameras
     tokens: tuple[str, ...]  # names of the items
+    views: tuple[tuple[tuple[int, int] | None, ...], ...]  # (B, N) frame and camera of the truth; None: a virtual view
 
     def to(self, device: torch.device | str) -> Batch:
-        return Batch._make([*(value.to(device) for value in self[:-1]), self.tokens])
+        return Batch._make([*(value.to(device) for value in self[:-2]), *self[-2:]])
 
     @property
     def conditions(self) -> Conditions:
@@ -69,8 +71,9 @@ class Batch(NamedTuple):
 
 
 def collate(items: Sequence[Batch]) -> Batch:
-    *tensors, geometries, tokens = zip(*items, strict=True)
-    return Batch._make([*map(torch.cat, tensors), batched(geometries), tuple(itertools.chain(*tokens))])
+    *tensors, geometries, tokens, views = zip(*items, strict=True)
+    names = (tuple(itertools.chain(*of_items)) for of_items in (tokens, views))
+    return Batch._make([*map(torch.cat, tensors), batched(geometries), *names])
 
 
 class Rendered(NamedTuple):
@@ -97,6 +100,12 @@ def favs(images: Sequence[torch.Tensor], rig: Rig, targets: Sequence[Camera]) ->
     return Rendered(unit.clamp(0, 1), rendered.coverage, rendered.confidence)
 
 
+def neighbours(rig: Rig, camera: int) -> list[int]:
+    """Indices of a rig's cameras, this one first, the others by the angle between the optical axes."""
+    axes = [c.cam2ego[:3, 2] for c in rig]
+    return sorted(range(len(rig)), key=lambda k: (k != camera, -float(axes[k] @ axes[camera])))
+
+
 class PseudoViews(Dataset[Batch]):
     """Items 0, 1, 2, …, without end, drawn from the frames ``indices``.
 
@@ -120,53 +129,66 @@ class PseudoViews(Dataset[Batch]):
     def __getitem__(self, k: int) -> Batch:
         config, view = self.config, k // self.config.pairs
         rng = seeded(self.seed, "view", view)
-        frame = self.frames[self.indices[one_of(rng, len(self.indices))]]
+        index = self.indices[one_of(rng, len(self.indices))]
+        frame = self.frames[index]
         frame = frame._replace(images=[image.to(self.device) for image in frame.images])
-        i = one_of(rng, len(frame.rig))
-        target, truth, valid = self._target(frame.images[i], frame.rig[i], rng)
+        first = one_of(rng, len(frame.rig))
+        places = neighbours(frame.rig, first)[: config.targets]
+        drawn = [self._target(frame.images[i], frame.rig[i], rng) for i in places]
+        targets, truths, valids = zip(*drawn, strict=True)
         rng = seeded(self.seed, "pair", k)
         # --- FAVS's sources
         is_transplanted = uniform(rng, 0, 1) < config.transplanted
         is_hidden = uniform(rng, 0, 1) < config.hidden
-        mask = self.masks[one_of(rng, len(self.masks))]
-        left_out = uniform(rng, 0, 1) < config.leave_one_out and len(frame.rig) > 1
+        masks = [self.masks[one_of(rng, len(self.masks))] for _ in places]
+        left_out = uniform(rng, 0, 1) < config.leave_one_out and len(frame.rig) > len(places)
         images, cameras = list(frame.images), list(frame.rig)
-        if left_out:
-            del images[i], cameras[i]
-        elif is_transplanted and is_hidden:
-            own = cameras[i].mask
-            cameras[i] = replace(cameras[i], mask=mask.numpy() if own is None else own & mask.numpy())
+        for i, mask in sorted(zip(places, masks, strict=True), key=lambda pair: -pair[0]):
+            if left_out:
+                del images[i], cameras[i]
+            elif is_transplanted and is_hidden:
+                own = cameras[i].mask
+                cameras[i] = replace(cameras[i], mask=mask.numpy() if own is None else own & mask.numpy())
         rig = frame.rig.with_cameras(cameras)
-        # --- the pair, and its view at the target pose
-        pair = self._pair(target, rng)
-        pseudo = favs(images, rig, pair)
-        masked = [replace(c, mask=seen.cpu().numpy()) for c, seen in zip(pair, pseudo.covered, strict=True)]
-        at_target = favs(list(pseudo.images), Rig(masked, ground_z_m=rig.ground_z_m), [target])
-        known, confidence = at_target.covered[0], at_target.confidence[0]
-        if is_transplanted and not is_hidden:
-            known = known & mask.to(known.device)
-        shown = at_target.images[0] * known
+        # --- the pairs, and their views at the target poses
+        branches: list[Camera] = []
+        shown, pseudo = [], []
+        for target, mask in zip(targets, masks, strict=True):
+            pair = self._pair(target, rng)
+            made = favs(images, rig, pair)
+            masked = [replace(c, mask=seen.cpu().numpy()) for c, seen in zip(pair, made.covered, strict=True)]
+            at_target = favs(list(made.images), Rig(masked, ground_z_m=rig.ground_z_m), [target])
+            if is_transplanted and not is_hidden:
+                at_target = at_target._replace(covered=at_target.covered & mask.to(at_target.covered.device))
+            shown.append(at_target)
+            pseudo.append(made)
+            branches += pair
+        view_at, known, confidence = (torch.cat(maps) for maps in zip(*shown, strict=True))
+        view_at = view_at * known[:, None]
         # --- the source branches
-        sources, seen, branches = pseudo.images, pseudo.covered, list(pair)
-        if uniform(rng, 0, 1) < config.real_sources and len(cameras) > 2:
-            shows_answer = not (left_out or (is_transplanted and is_hidden))
-            others = [n for n in range(len(cameras)) if not (shows_answer and n == i)]
-            used = [others[n] for n in nearest_sources(target, rig.with_cameras([cameras[n] for n in others]))]
+        sources, seen, _ = (torch.cat(maps) for maps in zip(*pseudo, strict=True))
+        shows_answer = not (left_out or (is_transplanted and is_hidden))
+        others = [n for n in range(len(cameras)) if not (shows_answer and n in places)]
+        if uniform(rng, 0, 1) < config.real_sources and len(others) >= len(branches):
+            candidates = rig.with_cameras([cameras[n] for n in others])
+            near = [n for target in targets for n in nearest_sources(target, candidates)]
+            used = [others[n] for n in dict.fromkeys((*near, *range(len(others))))][: len(branches)]
             branches = [cameras[n] for n in used]
             seen = torch.stack([valid_pixels(camera).to(known.device) for camera in branches])
             sources = torch.stack([images[n].float() / 255 for n in used])
-        geometry = frame_geometry([target], branches, rig.ground_z_m, self.generator)
+        geometry = frame_geometry(targets, branches, rig.ground_z_m, self.generator)
         return Batch(
-            truth[None, None],
-            valid[None, None],
-            shown[None, None],
-            telea(shown, ~known)[None, None],
-            known[None, None],
-            (confidence * known)[None, None],
+            torch.stack(truths)[None],
+            torch.stack(valids)[None],
+            view_at[None],
+            torch.stack([telea(image, ~is_known) for image, is_known in zip(view_at, known, strict=True)])[None],
+            known[None],
+            (confidence * known)[None],
             (sources * seen[:, None])[None],
             seen[None],
             geometry,
-            (f"{frame.token}/{frame.rig[i].name}/{k}",),
+            (f"{frame.token}/{frame.rig[first].name}/{k}",),
+            (tuple((index, i) if target is frame.rig[i] else None for i, target in zip(places, targets, strict=True)),),
         )
 
     # --- draws --------------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import torch
@@ -15,6 +16,8 @@ from arbiview_aug.generator.sampler import noise_schedule
 from arbiview_aug.generator.training.config import TrainConfig
 from arbiview_aug.generator.training.losses import Diffusion, Perceptual, crop, geometric_loss, masked_mse
 from arbiview_aug.generator.training.pseudo_views import Batch
+
+LATENT_BYTES = 4 * 2**30  # memory for latents of real views: 190,000 of 224 x 400 pixels
 
 
 class Draws(NamedTuple):
@@ -51,6 +54,7 @@ class Step(nn.Module):
         super().__init__()
         self.config, self.denoiser = config, denoiser
         self._frozen = (autoencoder, perceptual)  # a tuple: not among this module's parameters
+        self._cache: dict[tuple[int, int], torch.Tensor] = {}  # x0 of real views, by frame and camera
         schedule = noise_schedule(prediction=config.generator.prediction, zero_snr=config.generator.zero_snr)
         self.diffusion = Diffusion(schedule.alphas_cumprod, config.generator.prediction)
 
@@ -60,7 +64,7 @@ class Step(nn.Module):
         autoencoder, vgg = self._frozen
         geometry = batch.geometry if config.attention else without_attention(batch.geometry)
         with torch.no_grad():
-            x0 = autoencoder.encode(batch.truth).float()
+            x0 = self._latents(batch)
             views, source_views = batch.conditions.encoded(config.generator, autoencoder, geometry)
         size = (x0.shape[-2], x0.shape[-1])
         valid = (pooled(batch.valid, size) > 0.99).float()[:, :, None]
@@ -92,6 +96,21 @@ class Step(nn.Module):
             image, truth, known = (value[square].flatten(0, 1) for value in (image, truth, known))
             terms["perceptual"] = vgg(torch.where(known, image, truth), truth).sum() / len(t)
         return terms
+
+    def _latents(self, batch: Batch) -> torch.Tensor:
+        """x0 (B, N, C, h, w) of the truth; a VAE encodes each real view once, and alone: the same bits in any batch."""
+        autoencoder, _ = self._frozen
+        if autoencoder.vae is None:
+            return autoencoder.encode(batch.truth).float()
+        latents = []
+        for image, view in zip(batch.truth.flatten(0, 1), itertools.chain(*batch.views), strict=True):
+            latent = None if view is None else self._cache.get(view)
+            if latent is None:
+                latent = autoencoder.encode(image[None])[0].float().cpu()
+                if view is not None and len(self._cache) * latent.nbytes < LATENT_BYTES:
+                    self._cache[view] = latent
+            latents.append(latent)
+        return torch.stack(latents).unflatten(0, batch.truth.shape[:2]).to(batch.truth.device)
 
     def total(self, terms: dict[str, torch.Tensor]) -> torch.Tensor:
         """L_total = L_main + α L_geo + β L_perceptual; the one-step head's loss counts as L_main."""

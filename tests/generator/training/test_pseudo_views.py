@@ -98,15 +98,14 @@ def test_k_pairs_share_their_real_view() -> None:
 
 
 def answer_is_shown(k: int, **changes: Any) -> tuple[bool, bool]:
-    """Whether another content of the hole of the real view changes the condition, and the source branches."""
+    """Whether another content of the holes of the real views changes the condition, and the source branches."""
     made = items(**changes)
     plain = made[k]
-    name = plain.tokens[0].split("/")[1]
     for frame in made.frames._cache._values.values():
-        place = frame.rig.names.index(name)
-        image = frame.images[place].clone()
-        image[:, ~HOLE[0]] = 255 - image[:, ~HOLE[0]]
-        frame.images[place] = image
+        for _, place in filter(None, plain.views[0]):
+            image = frame.images[place].clone()
+            image[:, ~HOLE[0]] = 255 - image[:, ~HOLE[0]]
+            frame.images[place] = image
     changed = made[k]
     assert not torch.equal(plain.truth, changed.truth)
     return not torch.equal(plain.condition, changed.condition), not torch.equal(plain.sources, changed.sources)
@@ -117,6 +116,33 @@ def test_hidden_holes_are_shown_nowhere(k: int) -> None:
     assert answer_is_shown(k, transplanted=1.0, hidden=1.0) == (False, False)
     assert answer_is_shown(k, transplanted=1.0, hidden=1.0, real_sources=1.0) == (False, False)
     assert answer_is_shown(k, leave_one_out=1.0) == (False, False)
+
+
+@pytest.mark.parametrize("k", range(2))
+def test_no_target_shows_the_answer_of_another(k: int) -> None:
+    two = {"targets": 2, "transplanted": 1.0}
+    assert answer_is_shown(k, **two, hidden=1.0) == (False, False)
+    assert answer_is_shown(k, **two, hidden=1.0, real_sources=1.0) == (False, False)
+    assert answer_is_shown(k, **two, hidden=0.0, real_sources=1.0)[1] is False
+    assert answer_is_shown(k, targets=2, leave_one_out=1.0) == (False, False)
+
+
+@pytest.mark.parametrize("real_sources", [0.0, 1.0])
+def test_several_targets_are_neighbours_that_read_each_other(real_sources: float) -> None:
+    made = items(targets=2, virtual=0.5, real_sources=real_sources)
+    batch, (h, w) = collate([made[k] for k in range(6)]), SIZE
+    assert batch.truth.shape == (6, 2, 3, h, w) and batch.sources.shape == (6, 4, 3, h, w)
+    views = [view for of_item in batch.views for view in of_item]
+    assert None in views and any(views)  # virtual ones, which no real view is
+    for k, (one, other) in enumerate(batch.views):
+        if one and other:
+            assert one[0] == other[0] and (one[1] - other[1]) % 6 in (1, 5)
+            assert torch.equal(batch.truth[k, 1], made.frames[other[0]].images[other[1]].float() / 255)
+    finest = batch.geometry.target_reads[0]
+    of_targets = finest.neighbour >= 4  # four sources, then the two targets
+    assert bool((of_targets & finest.valid.flatten(3).any(3)).flatten(1).any(1).float().mean() > 0.5)
+    alone = items(virtual=0.5)[0]
+    assert torch.equal(alone.truth[0, 0], batch.truth[0, 0])  # further targets change nothing of the first
 
 
 def test_holes_that_are_not_hidden_are_shown_by_the_sources() -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 
 from arbiview_aug.generator import Generator
+from arbiview_aug.generator.config import AutoencoderConfig
 from arbiview_aug.generator.denoiser import REGRESSION
 from arbiview_aug.generator.sampler import noise_schedule
 from arbiview_aug.generator.training.config import LossConfig, TrainConfig
@@ -61,3 +63,31 @@ def test_the_perceptual_term_compares_the_prediction_with_the_truth() -> None:
     term.backward()
     head = step.denoiser.unet.conv_out.weight.grad
     assert float(term.detach()) > 0.01 and head is not None and float(head.abs().max()) > 0
+
+
+def test_a_vae_encodes_each_real_view_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And alone, so that a resumed run, whose batches are others, has the same bits; virtual views each time."""
+    shape = AutoencoderConfig(widths=(16, 16), latent_channels=4, layers=1)
+    settings = config(
+        generator=replace(config().generator, autoencoder=shape),
+        pseudo_views=replace(config().pseudo_views, virtual=0.4),
+        loss=LossConfig(geo=0.0, perceptual=0.0, regression=0.0),
+    )
+    step, batch, _ = step_of(settings, [300] * 4)
+    autoencoder, _ = step._frozen
+    encoded: list[int] = []
+    plain = autoencoder.encode
+
+    def encode(images: torch.Tensor) -> torch.Tensor:
+        encoded.append(len(images))
+        return plain(images)
+
+    monkeypatch.setattr(autoencoder, "encode", encode)
+    virtual = sum(view is None for of_item in batch.views for view in of_item)
+    real = {view for of_item in batch.views for view in of_item if view is not None}
+    assert virtual and real
+    with torch.no_grad():
+        first = step._latents(batch)
+        assert len(encoded) == virtual + len(real)
+        assert torch.equal(step._latents(batch), first) and len(encoded) == 2 * virtual + len(real)
+        assert all(torch.equal(first[b, 0], plain(batch.truth[b])[0]) for b in range(4))
