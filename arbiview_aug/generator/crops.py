@@ -1,13 +1,12 @@
 """What an inpainting network must see of a frame: windows around holes, put together on canvases.
 
-Windows keep the view's resolution and aspect. Small ones share a canvas; holes larger than a canvas are tiled, and each
-tile sees what the tiles before it filled.
+Windows keep the view's resolution and aspect. Small ones share a canvas; large and bent holes are cut into parts, and
+each part sees what the parts before it filled.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import product
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import cv2
@@ -18,7 +17,9 @@ from arbiview_aug.cameras.lens import BoolArray
 
 _JOINED_PX = 8  # holes nearer than this to each other are one
 _CONTEXT_PX = (12, 64)
-"""Least and most context around a hole; in between, a quarter of its longer side."""
+"""Least and most context around a hole; in between, half of its shorter side."""
+
+_WORTH = 0.8  # a hole is cut where the windows of both parts have at most this share of the pixels
 
 
 class Window(NamedTuple):
@@ -56,7 +57,7 @@ class Canvas(NamedTuple):
 def windows(holes: Sequence[BoolArray], size: int) -> list[list[Window]]:
     """Windows of sides up to ``size`` that cover all holes (h, w) of the views, in rounds.
 
-    Tiles of one hole come in different rounds, so that a later one can see an earlier one's pixels. No pixel is filled
+    Parts of one hole come in different rounds, so that a later one can see an earlier one's pixels. No pixel is filled
     twice.
     """
     rounds: list[list[Window]] = []
@@ -65,33 +66,53 @@ def windows(holes: Sequence[BoolArray], size: int) -> list[list[Window]]:
         count, labels, boxes, _ = cv2.connectedComponentsWithStats(joined)
         for label in range(1, count):
             x, y, w, h, _ = boxes[label].tolist()
-            context = int(np.clip(max(h, w) // 4, *_CONTEXT_PX))
-            rows, columns = (
-                _spans(low, low + length, context, size, side)
-                for low, length, side in zip((y, x), (h, w), hole.shape, strict=True)
-            )
-            number = 0
-            for (top, bottom), (left, right) in product(rows, columns):
-                own = labels[top:bottom, left:right]
-                fills = (own == label) & hole[top:bottom, left:right]
-                own[fills] = 0  # where tiles overlap, the first one fills
-                if fills.any():
-                    if number == len(rounds):
-                        rounds.append([])
-                    rounds[number].append(Window(view, top, left, fills))
-                    number += 1
+            own = (labels[y : y + h, x : x + w] == label) & hole[y : y + h, x : x + w]
+            for number, window in enumerate(_parts(Window(view, y, x, own), hole.shape, size)):
+                if number == len(rounds):
+                    rounds.append([])
+                rounds[number].append(window)
     return rounds
 
 
-def _spans(low: int, high: int, context: int, size: int, side: int) -> list[tuple[int, int]]:
-    """Spans of at most ``size`` that cover [low, high) with context on both sides, within [0, side)."""
-    first, last = max(0, low - context), min(side, high + context)
-    if last - first <= size:
-        return [(first, last)]
-    context = min(context, size // 4)
-    count = -(-(last - first - 2 * context) // (size - 2 * context))
-    starts = np.linspace(first, last - size, count).round().astype(int)
-    return [(int(start), int(start) + size) for start in starts]
+def _parts(hole: Window, shape: tuple[int, ...], size: int) -> Iterator[Window]:
+    """Cut a hole of a view (h, w) into parts whose windows fit, and are small together."""
+    rows, columns = (np.flatnonzero(hole.fills.any(1 - axis)) for axis in (0, 1))
+    own = hole.fills[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    top, left = hole.top + int(rows[0]), hole.left + int(columns[0])
+    context = min(int(np.clip(min(own.shape) // 2, *_CONTEXT_PX)), size // 4)
+    margins = [
+        (min(context, low), min(context, side - low - length))
+        for low, length, side in zip((top, left), own.shape, shape, strict=True)
+    ]
+    axis, at = _cut(own, context)
+    sides = [length + sum(margin) for length, margin in zip(own.shape, margins, strict=True)]
+    if max(sides) > size:
+        axis = int(np.argmax(sides))
+        at = own.shape[axis] // 2
+    if at:
+        first, second = np.split(own, [at], axis)
+        yield from _parts(Window(hole.view, top, left, first), shape, size)
+        yield from _parts(Window(hole.view, top + at * (axis == 0), left + at * axis, second), shape, size)
+    else:
+        yield Window(hole.view, top - margins[0][0], left - margins[1][0], np.pad(own, margins))
+
+
+def _cut(own: BoolArray, context: int) -> tuple[int, int]:
+    """The axis, and the row or column there, at which cutting a hole saves most pixels; 0 where it saves too few."""
+    best, found = _WORTH * (own.shape[0] + 2 * context) * (own.shape[1] + 2 * context), (0, 0)
+    for axis, lines in enumerate((own, own.T)):
+        both = _areas(lines, context)[:-1] + _areas(lines[::-1], context)[-2::-1]
+        if len(both) and both.min() < best:
+            best, found = both.min(), (axis, int(both.argmin()) + 1)
+    return found
+
+
+def _areas(lines: BoolArray, context: int) -> npt.NDArray[np.int64]:
+    """Pixels of the windows of a hole's first row, its first two rows, and so on."""
+    width, some = lines.shape[1], lines.any(1)
+    first = np.minimum.accumulate(np.where(some, lines.argmax(1), width))
+    last = np.maximum.accumulate(np.where(some, width - lines[:, ::-1].argmax(1), 0))
+    return (np.arange(1, len(lines) + 1) + 2 * context) * (last - first + 2 * context)
 
 
 def packed(found: Sequence[Window], size: int, multiple: int) -> list[Canvas]:

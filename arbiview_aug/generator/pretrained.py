@@ -1,6 +1,6 @@
 """Inpainting networks that others trained, in the place of a generator: diffusers' pipelines and TorchScript files.
 
-They see windows around the holes alone (``crops``); seen pixels stay as they are.
+They see windows around the holes alone (``crops``); seen pixels stay as they are. Cracks are inpainted without them.
 """
 
 from __future__ import annotations
@@ -11,13 +11,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 
+from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator.crops import Canvas, drawn, packed, windows
+from arbiview_aug.generator.inpainting import telea
 
+NARROW_PX = 5  # holes narrower than this are inpainted by Telea's method: half of the pixels around objects
 _SEED = 2**31
 
 
@@ -74,8 +78,9 @@ class HoleFiller(torch.nn.Module, ABC):
             guidance: Guidance of a pipeline; None: its own.
         """
         tops = [255.0 if view.dtype == torch.uint8 else 1.0 for view in views]
-        pixels = [view.float().cpu().numpy() / top for view, top in zip(views, tops, strict=True)]
-        left = [hole.cpu().numpy().copy() for hole in holes]
+        # The network sees narrow holes inpainted, and they stay so.
+        pixels = [telea(v, hole).float().cpu().numpy() / top for v, hole, top in zip(views, holes, tops, strict=True)]
+        left = [_wide(hole.cpu().numpy()) for hole in holes]
         for found in windows(left, self.size):
             alike: dict[tuple[int, int], list[Canvas]] = defaultdict(list)
             for canvas in packed(found, self.size, self.multiple):
@@ -116,6 +121,11 @@ class HoleFiller(torch.nn.Module, ABC):
                 h, w = window.fills.shape
                 window.of(pixels[window.view])[:, window.fills] = image[:, top : top + h, at : at + w][:, window.fills]
                 window.of(left[window.view])[window.fills] = False
+
+
+def _wide(hole: BoolArray) -> BoolArray:
+    """The parts of a hole (h, w) that a square of ``NARROW_PX`` fits into; the others are cracks and edges."""
+    return cv2.morphologyEx(hole.astype(np.uint8), cv2.MORPH_OPEN, np.ones((NARROW_PX,) * 2, np.uint8)).astype(bool)
 
 
 class PipelineFiller(HoleFiller):

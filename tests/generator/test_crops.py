@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
@@ -50,11 +48,25 @@ def test_a_hole_has_context_and_a_whole_view_no_window() -> None:
     assert window.fills.shape[0] >= 20 + 2 * 12 and window.fills.shape[1] >= 40 + 2 * 12
 
 
-def test_tiles_of_one_hole_come_one_after_the_other() -> None:
+def test_parts_of_one_hole_come_one_after_the_other() -> None:
     rounds = windows([np.ones((64, 300), bool), np.ones((64, 64), bool)], 64)
-    assert len(rounds[0]) == 2 and all(len(found) == 1 for found in rounds[1:])
-    lefts = [found[0].left for found in rounds]
-    assert lefts == sorted(lefts) and all(b - a <= 64 - 2 * 12 for a, b in pairwise(lefts))
+    assert len(rounds) > 4 and [len(found) for found in rounds] == [2, *[1] * (len(rounds) - 1)]
+    filled = np.zeros((64, 300), bool)
+    for found in rounds:
+        window = next(one for one in found if one.view == 0)
+        seen = window.of(filled)
+        assert seen.any() or window is rounds[0][0], "each part sees the part before it"
+        seen |= window.fills
+
+
+def test_a_bent_hole_is_cut_where_that_saves_pixels() -> None:
+    frame = np.zeros((256, 704), bool)
+    frame[:20], frame[:, :20] = True, True
+    found = [window for of_round in windows([frame], 704) for window in of_round]
+    assert len(found) == 2 and sum(window.fills.size for window in found) < 0.25 * frame.size
+    whole = np.zeros((256, 704), bool)
+    whole[100:200, 100:500] = True
+    assert [len(of_round) for of_round in windows([whole], 704)] == [1]
 
 
 def test_small_windows_share_a_canvas_and_do_not_overlap() -> None:
