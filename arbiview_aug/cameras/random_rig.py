@@ -19,6 +19,23 @@ Range = float | tuple[float, float]
 """A half-width about the neutral value (0, or 1 for scales: 0.2 means 0.8 to 1.2), or (low, high)."""
 
 
+def sequence_rng(name: object, epoch: int = 0, rng: torch.Generator | None = None) -> torch.Generator:
+    """A generator that is the same for all frames of a sequence, in all workers of a DataLoader's epoch.
+
+    Args:
+        name: Of the sequence.
+        epoch: A number to change the draws by.
+        rng: Takes the place of torch's global generator outside workers: its initial seed counts.
+    """
+    worker = torch.utils.data.get_worker_info()
+    if worker is not None:
+        seed = worker.seed - worker.id  # the base seed that all workers of an epoch share
+    else:
+        seed = torch.initial_seed() if rng is None else rng.initial_seed()
+    digest = hashlib.sha256(f"{seed} {epoch} {name}".encode()).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1)
+
+
 class RandomRig:
     """Target rigs around ``base``: the whole rig turned, moved and zoomed by random amounts.
 
@@ -81,6 +98,11 @@ class RandomRig:
         """Change the draws of ``per="sequence"``, also in running workers."""
         self._epoch.fill_(epoch)
 
+    @property
+    def epoch(self) -> int:
+        """The epoch that was set last, 0 before."""
+        return int(self._epoch)
+
     def draw_for(self, sample: Mapping[str, Any], rng: torch.Generator | None = None) -> dict[str, float]:
         """Parameters for a sample, following ``per``.
 
@@ -89,11 +111,6 @@ class RandomRig:
         """
         if self.per == "sample":
             return self.draw(rng)
-        worker = torch.utils.data.get_worker_info()
-        if worker is not None:
-            seed = worker.seed - worker.id  # the base seed that all workers of an epoch share
-        else:
-            seed = torch.initial_seed() if rng is None else rng.initial_seed()
         key = self.sequence_key
         if key not in sample:
             keys = ", ".join(map(str, sample))
@@ -101,8 +118,7 @@ class RandomRig:
         names = set(_leaves(sample[key]))
         if len(names) != 1:
             raise SampleError(f"RandomRig(per='sequence'): {key}: expected one sequence a batch, got {len(names)}")
-        digest = hashlib.sha256(f"{seed} {int(self._epoch)} {names.pop()}".encode()).digest()
-        return self.draw(torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1))
+        return self.draw(sequence_rng(names.pop(), self.epoch, rng))
 
     def rig(self, params: Mapping[str, float]) -> Rig:
         """The rig of drawn parameters.

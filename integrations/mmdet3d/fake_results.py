@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -52,10 +52,12 @@ class Recording:
     Attributes:
         sample: Its ``rig`` has each camera where it was when it exposed.
         moved: (N, 4, 4) the ego then, in the ego frame at the LiDAR's time.
+        ego2global: (4, 4) the ego at the LiDAR's time.
     """
 
     sample: dict[str, Any]
     moved: FloatArray
+    ego2global: FloatArray = field(default_factory=EGO2GLOBAL.copy)
 
     @property
     def rig(self) -> Rig:
@@ -102,6 +104,16 @@ def recording(sample: dict[str, Any]) -> Recording:
     return Recording(sample, moved)
 
 
+def recorded_drive(samples: Sequence[dict[str, Any]], step_s: float = 0.5) -> list[Recording]:
+    """Frames of one drive, the current one last, straight ahead at ``SPEED_MPS``."""
+    drive = []
+    for t, sample in enumerate(samples):
+        ahead = np.eye(4)
+        ahead[0, 3] = SPEED_MPS * step_s * t
+        drive.append(replace(recording(sample), ego2global=EGO2GLOBAL @ ahead))
+    return drive
+
+
 def mmdet3d(given: Recording) -> dict[str, Any]:
     """After mmdet3d's ``LoadMultiViewImageFromFiles`` on version 1.1 infos of nuScenes."""
     infos = {
@@ -122,7 +134,7 @@ def mmdet3d(given: Recording) -> dict[str, Any]:
         "lidar2cam": [info["lidar2cam"] for info in infos.values()],
         "ori_cam2img": [info["cam2img"] for info in infos.values()],
         "lidar2img": list(given.K @ given.lidar2cam),
-        "cam2global": list(EGO2GLOBAL @ given.rig.cam2ego),
+        "cam2global": list(given.ego2global @ given.rig.cam2ego),
         "cam_instances": {name: [] for name in infos},
         "img": given.arrays,
         **{key: shape for key in ("img_shape", "ori_shape", "pad_shape")},
@@ -217,7 +229,7 @@ def bevdet(given: Recording) -> dict[str, Any]:
     entries = (
         torch.stack(images),
         torch.from_numpy(given.mounted).float(),
-        torch.from_numpy(EGO2GLOBAL @ given.moved).double(),
+        torch.from_numpy(given.ego2global @ given.moved).double(),
         torch.from_numpy(given.rig.K).float(),
         torch.stack(rotations),
         torch.stack(shifts),
@@ -233,6 +245,130 @@ def bevdet(given: Recording) -> dict[str, Any]:
     }
 
 
+def sparse4d(given: Recording) -> dict[str, Any]:
+    """After Sparse4D's ``LoadMultiViewImageFromFiles`` and ``LoadPointsFromFile``, in training."""
+    quaternion = [np.cos(np.pi / 4), 0.0, 0.0, -np.sin(np.pi / 4)]  # LIDAR2EGO's
+    boxes = given.sample["boxes_3d"].double().numpy()
+    ego2lidar = np.linalg.inv(LIDAR2EGO)
+    boxes[:, :3] = boxes[:, :3] @ ego2lidar[:3, :3].T + ego2lidar[:3, 3]
+    boxes[:, 6] += np.pi / 2
+    return {
+        "img_filename": [f"{name}.jpg" for name in given.rig.names],
+        "img": [image.astype(np.float32) for image in given.arrays],
+        "lidar2img": list(given.K @ given.lidar2cam),
+        "cam_intrinsic": list(given.K[:, :3, :3]),
+        "lidar2ego_rotation": quaternion,
+        "lidar2ego_translation": LIDAR2EGO[:3, 3].tolist(),
+        "lidar2global": given.ego2global @ LIDAR2EGO,
+        "img_shape": [(*size, 3) for size in given.rig.sizes],
+        "aug_config": {"resize": 1.0, "flip": False, "rotate": 0, "rotate_3d": 0.0},
+        "timestamp": 1.5,
+        "points": given.labels["points"].numpy(),
+        "gt_bboxes_3d": boxes,
+    }
+
+
+def sparse4d_adapted(given: Recording) -> dict[str, Any]:
+    """The same after ``NormalizeMultiviewImage`` and ``NuScenesSparse4DAdaptor``."""
+    results = sparse4d(given)
+    K = np.array(results["cam_intrinsic"], np.float32)
+    return results | {
+        "img": _normalised(given.arrays)[0],
+        "img_norm_cfg": _NORM,
+        "projection_mat": np.array(results["lidar2img"], np.float32),
+        "image_wh": np.array([size[::-1] for size in given.rig.sizes], np.float32),
+        "T_global": results["lidar2global"],
+        "T_global_inv": np.linalg.inv(results["lidar2global"]),
+        "cam_intrinsic": K,
+        "focal": np.sqrt(np.abs(np.linalg.det(K[:, :2, :2]))),
+    }
+
+
+_NORM: dict[str, Any] = {
+    "mean": np.array([103.53, 116.28, 123.675], np.float32),
+    "std": np.array([57.375, 57.12, 58.395], np.float32),
+    "to_rgb": False,
+}
+"""``img_norm_cfg`` of BGR images."""
+
+
+def _normalised(arrays: Sequence[np.ndarray], divisor: int = 1) -> tuple[torch.Tensor, list[tuple[int, int, int]]]:
+    """``NormalizeMultiviewImage`` and ``PadMultiViewImage``: (N, 3, h, w), and the shapes before padding."""
+    images = np.stack([(array.astype(np.float32) - _NORM["mean"]) / _NORM["std"] for array in arrays])
+    rims = [(0, -side % divisor) for side in images.shape[1:3]]
+    padded = np.pad(images, [(0, 0), *rims, (0, 0)])
+    return torch.from_numpy(padded.transpose(0, 3, 1, 2).copy()), [array.shape for array in arrays]
+
+
+def bevdet4d(drive: Sequence[Recording]) -> dict[str, Any]:
+    """After BEVDet's ``PrepareImageInputs(sequential=True)``: the current frame and those before, latest first."""
+    frames = [bevdet(given) for given in reversed(drive)]
+    entries = [frame["img_inputs"] for frame in frames]
+    images = torch.stack([of_frame[0] for of_frame in entries], dim=1).flatten(0, 1)  # by camera, then by frame
+    rest = [torch.cat([of_frame[k] for of_frame in entries]) for k in range(1, 6)]
+    infos = [{"cams": {}, "ann_infos": frame["ann_infos"], "scene_token": "drive"} for frame in frames]
+    return frames[0] | {
+        "img_inputs": (images, *rest, torch.eye(3)),
+        "curr": infos[0],
+        "adjacent": infos[1:],
+    }
+
+
+def streampetr(drive: Sequence[Recording]) -> dict[str, Any]:
+    """What StreamPETR's ``CustomNuScenesDataset.union2one`` collects, without ``DataContainer``."""
+    pictures = [_normalised(given.arrays) for given in drive]
+    poses = np.stack([given.ego2global @ LIDAR2EGO for given in drive])
+    seconds = 1.5 + 0.5 * np.arange(len(drive))
+
+    def tensors(arrays: Sequence[np.ndarray]) -> torch.Tensor:
+        return torch.from_numpy(np.stack(arrays)).float()
+
+    return {
+        "img": torch.stack([images for images, _ in pictures]),
+        "lidar2img": tensors([given.K @ given.lidar2cam for given in drive]),
+        "intrinsics": tensors([given.K for given in drive]),
+        "extrinsics": tensors([given.lidar2cam for given in drive]),
+        "timestamp": torch.from_numpy(seconds),
+        "img_timestamp": torch.from_numpy(seconds[:, None] - 0.01 * np.arange(len(drive[0].rig))),
+        "ego_pose": torch.from_numpy(poses).float(),
+        "ego_pose_inv": torch.from_numpy(np.linalg.inv(poses)).float(),
+        "prev_exists": torch.tensor([0.0] + [1.0] * (len(drive) - 1)),
+        "gt_bboxes_3d": [given.labels["gt_bboxes_3d"] for given in drive],
+        "img_metas": [_meta(given, shapes, images) for given, (images, shapes) in zip(drive, pictures, strict=True)],
+    }
+
+
+def bevformer(drive: Sequence[Recording]) -> dict[str, Any]:
+    """What BEVFormer's ``CustomNuScenesDataset.union2one`` collects, without ``DataContainer``; images are padded."""
+    pictures = [_normalised(given.arrays, divisor=32) for given in drive]
+    metas = {}
+    for t, (given, (images, shapes)) in enumerate(zip(drive, pictures, strict=True)):
+        can_bus = np.zeros(18)
+        can_bus[0] = SPEED_MPS * 0.5 * (t > 0)  # since the frame before
+        metas[t] = _meta(given, shapes, images) | {
+            "lidar2img": list(given.K @ given.lidar2cam),
+            "can_bus": can_bus,
+            "prev_bev": t > 0,
+        }
+    return {
+        "img": torch.stack([images for images, _ in pictures]),
+        "img_metas": metas,
+        "gt_bboxes_3d": drive[-1].labels["gt_bboxes_3d"],
+    }
+
+
+def _meta(given: Recording, shapes: list[tuple[int, int, int]], images: torch.Tensor) -> dict[str, Any]:
+    padded = [(*images.shape[-2:], 3)] * len(images)
+    return {
+        "filename": [f"{name}.jpg" for name in given.rig.names],
+        "ori_shape": shapes,
+        "img_shape": padded,
+        "pad_shape": padded,
+        "img_norm_cfg": _NORM,
+        "scene_token": "drive",
+    }
+
+
 FORMS: dict[str, Callable[[Recording], dict[str, Any]]] = {
     "mmdet3d": mmdet3d,
     "mmdet3d BEVFusion": mmdet3d_bevfusion,
@@ -240,5 +376,14 @@ FORMS: dict[str, Callable[[Recording], dict[str, Any]]] = {
     "DETR3D": detr3d,
     "PETR": petr,
     "BEVDet": bevdet,
+    "Sparse4D": sparse4d,
 }
 """A maker of each form by its framework's name."""
+
+QUEUES: dict[str, Callable[[Sequence[Recording]], Any]] = {
+    "BEVDet4D": bevdet4d,
+    "StreamPETR": streampetr,
+    "BEVFormer": bevformer,
+    "Sparse4D": lambda drive: [sparse4d_adapted(given) for given in drive],  # streams: a dict a frame
+}
+"""A maker of the form of several frames by its framework's name."""

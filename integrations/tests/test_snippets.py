@@ -12,7 +12,7 @@ import torch
 
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.integrations.mmdet3d import RigRetargetMultiView
-from integrations.mmdet3d.fake_results import FORMS, recording, source_rig
+from integrations.mmdet3d.fake_results import FORMS, LIDAR2EGO, bevdet4d, recorded_drive, recording, source_rig
 from integrations.nuscenes.fake_root import VERSION, fake_root
 from integrations.snippets import snippets
 
@@ -48,7 +48,7 @@ def test_nuscenes(tmp_path: Path) -> None:
 def test_mmdet3d(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The rig file, then each framework's step on its own form; mmdet 2 is not to be had, only its registry's face."""
     monkeypatch.chdir(tmp_path)
-    rig_file, new, old, others = snippets("mmdet3d")
+    rig_file, new, old, others, several = snippets("mmdet3d")
     exec(rig_file, {})
     registry = Registry()
     module = ModuleType("mmdet.datasets.builder")
@@ -70,3 +70,11 @@ def test_mmdet3d(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         kind = step.pop("type")
         out = registry.held[kind](**step)(FORMS[form](sample))
         assert out["coverage"].shape == (5, *step["size"])
+    steps.clear()
+    exec(several, names)
+    drive = recorded_drive([sample.sample] * 2)
+    one = {"lidar2ego": LIDAR2EGO, "scene_token": "drive"}
+    given = bevdet4d(drive), FORMS["DETR3D"](drive[0]) | one, FORMS["Sparse4D"](drive[0])
+    for step, results in zip(steps, given, strict=True):
+        out = registry.held[step.pop("type")](**{**step, "size": (48, 132)})(results)
+        assert out["coverage"].shape[-3:] == (5, 48, 132)

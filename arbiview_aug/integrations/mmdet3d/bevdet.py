@@ -10,6 +10,7 @@ import torch
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import SampleError
+from arbiview_aug.integrations.mmdet3d.images import Norm, levels, normalised
 from arbiview_aug.integrations.mmdet3d.matrices import Views, padded, upper_triangular
 from arbiview_aug.integrations.mmdet3d.results import (
     STALE_KEYS,
@@ -28,8 +29,6 @@ _PICTURES = "canvas"
 
 _KEY_CAMERA = "CAM_FRONT"
 _FORM = "(imgs, sensor2egos, ego2globals, intrins, post_rots, post_trans[, bda])"
-_ROUNDING = 0.01
-"""Grey levels of 255 by which a pixel that was normalised in float32 may miss a whole number."""
 
 
 def retarget_img_inputs(
@@ -38,9 +37,9 @@ def retarget_img_inputs(
     *,
     names: Sequence[str],
     ground_z_m: float = 0.0,
-    mean_std: tuple[Sequence[float], Sequence[float]] = MEAN_STD,
+    mean_std: Norm = MEAN_STD,
 ) -> dict[str, Any]:
-    """Re-render ``img_inputs`` of one frame, and what goes with it.
+    """Re-render ``img_inputs`` of one frame (BEVDet) or several (BEVDet4D, BEVStereo4D), and what goes with it.
 
     The source cameras are those of the images as they are: their resizing, cropping, flipping and turning is a part of
     their K and pose. The target's images are not augmented: ``post_rots`` are ones, ``post_trans`` zeros.
@@ -50,48 +49,86 @@ def retarget_img_inputs(
     LiDAR's pose there the boxes would be 0.33 m off at 9 m/s; BEVDet's own frames, whose first camera is
     ``CAM_FRONT_LEFT``, are 0.07 m off.
 
+    Frames lie as ``PrepareImageInputs(sequential=True)`` leaves them, the current one first: images by camera, then by
+    frame; all else by frame, then by camera.
+
     Args:
-        results: As ``PrepareImageInputs`` leaves it; it is not changed. ``ann_infos``, BEVDet's boxes, are read as
-            geometry and stay.
-        retarget: A ``RigRetarget``, or what calls one.
+        results: As ``PrepareImageInputs`` leaves it; it is not changed. ``ann_infos``, BEVDet's boxes (those of an
+            earlier frame in its entry of ``adjacent``), are read as geometry and stay.
+        retarget: A ``RigRetarget``, or what calls one: with the sample of each frame in turn.
         names: Of the target's cameras.
         ground_z_m: Height of the road in the source's ego frame.
         mean_std: Three numbers each, by which the images are normalised: (grey level − mean) / std.
 
     Raises:
-        SampleError: Another form, several frames (BEVDet4D), images that were normalised by other numbers.
+        SampleError: Another form, images that were normalised by other numbers.
         CalibrationError: A target with lenses.
     """
     given = results["img_inputs"]
-    images, sensor2egos, ego2globals, intrins, post_rots, post_trans = _checked(given)
+    tensors = _checked(given)
+    infos = [results.get("curr"), *results.get("adjacent", ())]
+    total = len(tensors[0])
+    in_source = list(results.get("cam_names", [f"camera {k}" for k in range(total // len(infos))]))
+    if not in_source or total % len(in_source):
+        raise SampleError(f"img_inputs: expected {len(in_source)} images a frame, as 'cam_names' says, got {total}")
+    count = total // len(in_source)
+    made: list[list[torch.Tensor]] = []
+    outs: list[Mapping[str, Any]] = []
+    changed = {key: value for key, value in results.items() if key not in STALE_KEYS}
+    for t in range(count):
+        rows = slice(t * len(in_source), (t + 1) * len(in_source))
+        frame = [tensors[0][t::count], *(tensor[rows] for tensor in tensors[1:])]
+        info = infos[t] if t < len(infos) else None
+        boxes = _boxes(results if t == 0 else info)
+        entries, out, target, key2global = _retargeted(
+            frame, retarget, in_source, boxes, names=names, ground_z_m=ground_z_m, mean_std=mean_std
+        )
+        made.append(entries)
+        outs.append(out)
+        if isinstance(info, Mapping) and "cams" in info:
+            infos[t] = {**info, "cams": _infos(target, key2global)}
+    images = torch.stack([entries[0] for entries in made], dim=1).flatten(0, 1)
+    rest = [torch.cat(of_frames) for of_frames in zip(*(entries[1:] for entries in made), strict=True)]
+    warn_of_dropped({key: value for key, value in results.items() if key != _PICTURES})
+    changed["img_inputs"] = type(given)([images, *rest, *given[6:]])
+    if "cam_names" in results:
+        changed["cam_names"] = list(target.names)
+    changed |= {key: info for key, info in (("curr", infos[0]), ("adjacent", infos[1:])) if key in results}
+    return changed | target_outputs(outs)
+
+
+def _retargeted(
+    entries: Sequence[torch.Tensor],
+    retarget: Retarget,
+    in_source: Sequence[str],
+    boxes: dict[str, torch.Tensor],
+    *,
+    names: Sequence[str],
+    ground_z_m: float,
+    mean_std: Norm,
+) -> tuple[list[torch.Tensor], Mapping[str, Any], Views, FloatArray]:
+    """A frame's six entries, its retargeted sample, the target cameras and the pose of the key ego frame."""
+    images, sensor2egos, ego2globals, intrins, post_rots, post_trans = entries
     size = images.shape[-2], images.shape[-1]
-    in_source = list(results.get("cam_names", [f"camera {k}" for k in range(len(images))]))
     key = in_source.index(_KEY_CAMERA) if _KEY_CAMERA in in_source else 0
     key2global = ego2globals[key].double().numpy()
     mounted = (np.linalg.inv(key2global) @ ego2globals.double().numpy()) @ sensor2egos.double().numpy()
     mirrored, K, cam2ego = _as_recorded(intrins, post_rots, post_trans, mounted, size)
-    levels = _levels(images, mean_std)
-    views = [image.flip(-1) if flip else image for image, flip in zip(levels, mirrored, strict=True)]
+    grey = levels("img_inputs", images, mean_std)
+    views = [image.flip(-1) if flip else image for image, flip in zip(grey, mirrored, strict=True)]
     source = Views(in_source, K, cam2ego, np.eye(4), key2global)
-    out = retarget({"images": torch.stack(views), "rig": source_rig(source, views, ground_z_m), **_boxes(results)})
+    out = retarget({"images": torch.stack(views), "rig": source_rig(source, views, ground_z_m), **boxes})
     target = target_views(out, source, names)
     count = len(target.names)
-    made: list[Any] = [
-        _normalised(out["images"], mean_std).to(images.dtype),
+    made = [
+        normalised(out["images"], mean_std).to(images.dtype),
         torch.from_numpy(target.cam2ego).to(sensor2egos),
         ego2globals[key].expand(count, -1, -1).clone(),
         torch.from_numpy(target.K).to(intrins),
         torch.eye(3).to(post_rots).expand(count, -1, -1).clone(),
         torch.zeros(count, 3).to(post_trans),
     ]
-    warn_of_dropped({key: value for key, value in results.items() if key != _PICTURES})
-    changed = {key: value for key, value in results.items() if key not in STALE_KEYS}
-    changed["img_inputs"] = type(given)([*made, *given[6:]])
-    if "cam_names" in results:
-        changed["cam_names"] = list(target.names)
-    if isinstance(results.get("curr"), Mapping) and "cams" in results["curr"]:
-        changed["curr"] = {**results["curr"], "cams": _infos(target, key2global)}
-    return changed | target_outputs(out)
+    return made, out, target, key2global
 
 
 def _checked(given: Any) -> list[torch.Tensor]:
@@ -131,28 +168,9 @@ def _as_recorded(
     return mirrored.tolist(), K / K[:, 2:, 2:], mounted @ np.linalg.inv(padded(turned))
 
 
-def _levels(images: torch.Tensor, mean_std: tuple[Sequence[float], Sequence[float]]) -> torch.Tensor:
-    """Normalised images (N, 3, h, w) as uint8."""
-    mean, std = (torch.tensor(numbers, dtype=torch.float64)[:, None, None] for numbers in mean_std)
-    levels = images.double() * std + mean
-    whole = levels.round()
-    off = float((levels - whole).abs().max())
-    if off > _ROUNDING or whole.min() < 0 or whole.max() > 255:
-        raise SampleError(
-            f"img_inputs: expected 8 bit images normalised by mean and std {mean_std}, got grey levels {off:.2g} off "
-            f"whole numbers, from {levels.min():.1f} to {levels.max():.1f}; pass img_norm=(mean, std)"
-        )
-    return whole.to(torch.uint8)
-
-
-def _normalised(images: torch.Tensor, mean_std: tuple[Sequence[float], Sequence[float]]) -> torch.Tensor:
-    mean, std = (torch.tensor(numbers)[:, None, None] for numbers in mean_std)
-    return (images.float() - mean) / std
-
-
-def _boxes(results: Mapping[str, Any]) -> dict[str, torch.Tensor]:
+def _boxes(info: Any) -> dict[str, torch.Tensor]:
     """``boxes_3d`` of ``ann_infos``, (B, 9): gravity centre, length, width, height, yaw, in the key ego frame."""
-    annotated = results.get("ann_infos")
+    annotated = info.get("ann_infos") if isinstance(info, Mapping) else None
     if not isinstance(annotated, list | tuple) or len(annotated) != 2:
         return {}
     boxes = np.asarray(annotated[0], np.float64).reshape(len(annotated[0]), -1)[:, :7]

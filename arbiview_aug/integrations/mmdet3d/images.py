@@ -1,8 +1,8 @@
-"""Images of mmdet3d's family, height × width × channels, as the package takes them, and back."""
+"""Images of mmdet3d's family as the package takes them, and back: height × width × channels, PIL, or tensors."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,43 +10,91 @@ import torch
 
 from arbiview_aug.errors import SampleError, SampleTypeError
 
+Norm = tuple[Sequence[float], Sequence[float]]
+"""Three means and three standard deviations: normalised images are (grey level − mean) / std."""
 
-def to_tensors(images: Any) -> list[torch.Tensor]:
-    """N tensors (3, H, W) uint8, channels in their order, of N arrays (H, W, 3) or PIL images.
+_ROUNDING = 0.01
+"""Grey levels of 255 by which a pixel that was normalised in float32 may miss a whole number."""
 
-    Floats are grey levels of 0 to 255, as ``to_float32=True`` loads them, and are rounded.
+
+def to_tensors(images: Any, norm: Norm | None = None) -> list[torch.Tensor]:
+    """N tensors (3, H, W) uint8, channels in their order, of N arrays (H, W, 3), tensors (3, H, W) or PIL images.
+
+    Floats are grey levels of 0 to 255, as ``to_float32=True`` loads them, and are rounded; with ``norm`` they are
+    normalised ones.
 
     Raises:
         SampleTypeError: Something else.
-        SampleError: Numbers beyond 0 to 255.
+        SampleError: Numbers beyond 0 to 255, or that ``norm`` does not lead to.
     """
-    if not isinstance(images, list | tuple | np.ndarray) or not len(images):
+    if not isinstance(images, list | tuple | np.ndarray | torch.Tensor) or not len(images):
         raise SampleTypeError(f"img: expected a list of (H, W, 3) arrays or PIL images, got {type(images).__name__}")
-    return [_tensor(k, image) for k, image in enumerate(images)]
+    return [_tensor(f"img[{k}]", image, norm) for k, image in enumerate(images)]
 
 
-def _tensor(k: int, image: Any) -> torch.Tensor:
+def _tensor(key: str, image: Any, norm: Norm | None) -> torch.Tensor:
+    if isinstance(image, torch.Tensor) and image.ndim == 3:
+        image = image.permute(1, 2, 0).cpu().numpy()
     array = image if isinstance(image, np.ndarray) else np.array(image)  # PIL's own memory is read-only
     if array.ndim != 3 or array.shape[2] != 3 or array.dtype.kind not in "uf":
-        raise SampleTypeError(f"img[{k}]: expected (H, W, 3), 8 bit or float, got {array.dtype} {array.shape}")
+        raise SampleTypeError(f"{key}: expected (H, W, 3), 8 bit or float, got {array.dtype} {array.shape}")
+    if norm is not None:
+        return levels(key, torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1))), norm)
     if array.dtype != np.uint8:
         low, high = float(array.min()), float(array.max())
         if not (low > -0.5 and high < 255.5):
             raise SampleError(
-                f"img[{k}]: expected grey levels from 0 to 255, got {low:g} to {high:g}; retarget right after loading, "
+                f"{key}: expected grey levels from 0 to 255, got {low:g} to {high:g}; retarget right after loading, "
                 "before photometric distortion and normalisation"
             )
         array = np.rint(array).astype(np.uint8)
     return torch.from_numpy(np.ascontiguousarray(array)).permute(2, 0, 1)
 
 
-def like_given(given: Sequence[Any], images: torch.Tensor) -> Any:
-    """Images (M, 3, h, w) uint8 as the given ones are: PIL, or arrays of their type, in a list or one array."""
-    arrays = [np.ascontiguousarray(image.permute(1, 2, 0).numpy()) for image in images]
+def like_given(given: Sequence[Any], images: torch.Tensor, norm: Norm | None = None) -> Any:
+    """Images (M, 3, h, w) uint8 as the given ones are: PIL, or arrays or tensors of their type, listed or stacked."""
     first = given[0]
+    images = images if norm is None else normalised(images, norm)
+    if isinstance(first, torch.Tensor):
+        typed_tensors = images.to(first)
+        return typed_tensors if isinstance(given, torch.Tensor) else list(typed_tensors)
+    arrays = [np.ascontiguousarray(image.permute(1, 2, 0).numpy()) for image in images]
     if not isinstance(first, np.ndarray):
         from PIL import Image
 
         return [Image.fromarray(array) for array in arrays]
     typed = [array.astype(first.dtype, copy=False) for array in arrays]
     return np.stack(typed) if isinstance(given, np.ndarray) else typed
+
+
+def norm_of(config: Any) -> Norm | None:
+    """mean and std of mmdet's ``img_norm_cfg``; None without one, and for that of images that are only loaded."""
+    if not isinstance(config, Mapping) or "mean" not in config or "std" not in config:
+        return None
+    mean, std = (np.asarray(config[key], np.float64).ravel() for key in ("mean", "std"))
+    return None if not mean.any() and (std == 1).all() else (mean.tolist(), std.tolist())
+
+
+def levels(key: str, images: torch.Tensor, norm: Norm) -> torch.Tensor:
+    """Normalised images (..., 3, h, w) as uint8.
+
+    Raises:
+        SampleError: They were not 8 bit images normalised so.
+    """
+    mean, std = (torch.tensor(numbers, dtype=torch.float64)[:, None, None] for numbers in norm)
+    grey = images.double() * std + mean
+    whole = grey.round()
+    off = float((grey - whole).abs().max())
+    if off > _ROUNDING or whole.min() < 0 or whole.max() > 255:
+        raise SampleError(
+            f"{key}: expected 8 bit images normalised by mean and std {norm}, got grey levels {off:.2g} off whole "
+            f"numbers, from {grey.min():.1f} to {grey.max():.1f}; pass img_norm=(mean, std), and retarget before "
+            "photometric distortion"
+        )
+    return whole.to(torch.uint8)
+
+
+def normalised(images: torch.Tensor, norm: Norm) -> torch.Tensor:
+    """Images (..., 3, h, w) uint8 as (grey level − mean) / std, float32."""
+    mean, std = (torch.tensor(numbers, dtype=torch.float32)[:, None, None] for numbers in norm)
+    return (images.float() - mean) / std

@@ -28,6 +28,7 @@ MATRICES = {
     "lidar2img": "lidar2img",
     "lidar2image": "lidar2img",
     "ori_lidar2img": "lidar2img",
+    "projection_mat": "lidar2img",
     "cam2global": "cam2global",
 }
 """What each key holds, for each camera."""
@@ -172,14 +173,15 @@ def like_given(given: Any, matrices: FloatArray) -> Any:
     first = given[0]
     rows, columns = np.shape(first)
     parts = matrices[:, :rows, :columns]
+    if isinstance(given, torch.Tensor | np.ndarray) or not isinstance(first, torch.Tensor | np.ndarray):
+        return like_array(given, parts)
+    return type(given)([like_array(first, part) for part in parts])
+
+
+def like_array(given: Any, values: Any) -> Any:
+    """Numbers as the given ones are: a tensor or an array of their type, else a list or tuple."""
     if isinstance(given, torch.Tensor):
-        return torch.from_numpy(parts.copy()).to(given)
+        return torch.tensor(np.asarray(values)).to(given)
     if isinstance(given, np.ndarray):
-        return parts.astype(given.dtype)
-    if isinstance(first, torch.Tensor):
-        made: list[Any] = [torch.from_numpy(part.copy()).to(first) for part in parts]
-    elif isinstance(first, np.ndarray):
-        made = [part.astype(first.dtype) for part in parts]
-    else:
-        made = parts.tolist()
-    return type(given)(made)
+        return np.asarray(values).astype(given.dtype)
+    return type(given)(np.asarray(values).tolist())

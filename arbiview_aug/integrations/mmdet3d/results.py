@@ -1,4 +1,4 @@
-"""The core: a ``results`` dict of mmdet3d, BEVFusion, DETR3D or PETR in, the same dict of the target's cameras out."""
+"""The core: a ``results`` dict of one frame in, the same dict of the target's cameras out."""
 
 from __future__ import annotations
 
@@ -12,10 +12,20 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets.nuscenes.tables import rotation_from_quaternion
 from arbiview_aug.errors import CalibrationError, SampleError
 from arbiview_aug.integrations.mmdet3d.images import like_given as images_like
-from arbiview_aug.integrations.mmdet3d.images import to_tensors
-from arbiview_aug.integrations.mmdet3d.matrices import MATRICES, Views, is_transposed, like_given, read_views, stacked
+from arbiview_aug.integrations.mmdet3d.images import norm_of, to_tensors
+from arbiview_aug.integrations.mmdet3d.matrices import (
+    MATRICES,
+    Views,
+    is_transposed,
+    like_array,
+    like_given,
+    padded,
+    read_views,
+    stacked,
+)
 
 Retarget = Callable[[dict[str, Any]], dict[str, Any]]
 
@@ -40,6 +50,9 @@ FILE_KEYS = ("filename", "img_path", "img_filename", "image_paths")
 """Lists of image files: no file holds the new images, so they become the cameras' names."""
 
 SHAPE_KEYS = ("img_shape", "ori_shape", "pad_shape")
+_MAX_PADDING_PX = 64
+"""Images are padded at the right and below to multiples of 32 or 64."""
+
 TARGET_OUTPUTS = ("coverage", "ignore", "confidence", "generated", "source_camera", "source_frame", "retarget_params")
 """Entries of a retargeted sample that the results get besides, as arrays."""
 
@@ -71,7 +84,8 @@ def retarget_results(
     """
     if results.get("img") is None:
         raise SampleError(f"results: expected 'img', loaded images, got {', '.join(map(str, results))}")
-    images = to_tensors(results["img"])
+    norm = norm_of(results.get("img_norm_cfg"))
+    images = to_tensors(_recorded(results), norm)
     _check_not_augmented(results)
     infos = results.get("images")
     source = read_views(
@@ -87,20 +101,21 @@ def retarget_results(
     if isinstance(made.get("ann_info"), Mapping):
         made["ann_info"] = {key: value for key, value in made["ann_info"].items() if key not in STALE_KEYS}
     warn_of_dropped(results)
-    made["img"] = images_like(results["img"], out["images"])
+    made["img"] = images_like(results["img"], out["images"], norm)
     _write_matrices(made, views)
+    _write_intrinsics(made, views, out["images"])
     if isinstance(infos, Mapping):
         made["images"] = _infos(infos, views, out["images"])
     _write_sizes(made, out["images"])
     for key in FILE_KEYS:
         if isinstance(made.get(key), list | tuple):
             made[key] = list(views.names)
-    if isinstance(made.get("img_timestamp"), list | tuple):  # PETR's: all views are of the LiDAR's time
-        time_s = made.get("timestamp", float(np.mean(made["img_timestamp"])))
-        made["img_timestamp"] = [time_s] * len(views.names)
+    if np.ndim(made.get("img_timestamp", 0.0)) == 1:  # PETR's: all views are of the LiDAR's time
+        time_s = float(made.get("timestamp", np.mean(np.asarray(made["img_timestamp"]))))
+        made["img_timestamp"] = like_array(made["img_timestamp"], [time_s] * len(views.names))
     if "num_views" in made:
         made["num_views"] = len(views.names)
-    return made | target_outputs(out)
+    return made | target_outputs([out])
 
 
 # --- source -----------------------------------------------------------------------------------------------------------
@@ -131,10 +146,15 @@ def _lidar2ego(results: Mapping[str, Any], given: Any) -> FloatArray:
     for holder in (points, results):
         if isinstance(holder, Mapping) and holder.get("lidar2ego") is not None:
             return stacked("lidar2ego", [holder["lidar2ego"]], 1)[0]
+    if "lidar2ego_rotation" in results and "lidar2ego_translation" in results:  # BEVFormer, Sparse4D
+        rotation = np.asarray(results["lidar2ego_rotation"], np.float64)
+        lidar2ego = padded((rotation_from_quaternion(rotation) if rotation.shape == (4,) else rotation)[None])[0]
+        lidar2ego[:3, 3] = results["lidar2ego_translation"]
+        return lidar2ego
     if given is None:
         raise SampleError(
-            "lidar2ego: expected the LiDAR's pose (4, 4) in results['lidar_points'] or results['lidar2ego'], found "
-            "none; pass lidar2ego= to the transform"
+            "lidar2ego: expected the LiDAR's pose (4, 4) in results['lidar_points'] or results['lidar2ego'], or "
+            "'lidar2ego_rotation' and 'lidar2ego_translation', found none; pass lidar2ego= to the transform"
         )
     return stacked("lidar2ego", [given], 1)[0]
 
@@ -153,6 +173,24 @@ def _without_padding(image: torch.Tensor, info: Any) -> torch.Tensor:
     return image[:, : int(info["height"]), : int(info["width"])]
 
 
+def _recorded(results: Mapping[str, Any]) -> Any:
+    """``img`` without the rims that ``PadMultiViewImage`` added, which wrote down each image's shape before."""
+    images = results["img"]
+    for key in SHAPE_KEYS:
+        shapes = results.get(key)
+        if not isinstance(shapes, list) or len(shapes) != len(images) or not isinstance(shapes[0], tuple | list):
+            continue
+        cut = []
+        for image, (h, w, *_) in zip(images, shapes, strict=True):
+            sides = image.shape[1:] if isinstance(image, torch.Tensor) else np.shape(image)[:2]
+            is_padded = all(0 <= side - shape < _MAX_PADDING_PX for side, shape in zip(sides, (h, w), strict=True))
+            if is_padded:
+                image = image[:, :h, :w] if isinstance(image, torch.Tensor) else image[:h, :w]
+            cut.append(image)
+        images = cut
+    return images
+
+
 def source_rig(views: Views, images: Sequence[torch.Tensor], ground_z_m: float) -> Rig:
     """The cameras of images (3, H, W)."""
     cameras = [
@@ -165,7 +203,8 @@ def source_rig(views: Views, images: Sequence[torch.Tensor], ground_z_m: float) 
 def geometry(results: Mapping[str, Any], lidar2ego: FloatArray) -> dict[str, torch.Tensor]:
     """The sample's ``points`` and ``boxes_3d`` in the ego frame, of what the results hold in the LiDAR's.
 
-    Boxes are taken by their corners: what their numbers mean differs between mmdet3d's versions.
+    Boxes are taken by their corners: what their numbers mean differs between mmdet3d's versions. Those of a plain array
+    (Sparse4D) are gravity centre, length, width, height and yaw.
     """
     found = {}
     points = results.get("points")
@@ -176,7 +215,13 @@ def geometry(results: Mapping[str, Any], lidar2ego: FloatArray) -> dict[str, tor
     annotated = results.get("ann_info")
     boxes = results.get("gt_bboxes_3d", annotated.get("gt_bboxes_3d") if isinstance(annotated, Mapping) else None)
     corners = getattr(boxes, "corners", None)
-    if corners is not None:
+    if isinstance(boxes, np.ndarray) and boxes.ndim == 2 and boxes.shape[1] >= 7:
+        rotation = lidar2ego[:3, :3]
+        centres, yaw = boxes[:, :3] @ rotation.T + lidar2ego[:3, 3], boxes[:, 6]
+        along = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=1) @ rotation.T
+        columns = [*centres.T, *boxes[:, 3:6].T, np.arctan2(along[:, 1], along[:, 0])]
+        found["boxes_3d"] = torch.from_numpy(np.stack(columns, axis=1)).float()
+    elif corners is not None:
         # Of both conventions: 1 is above 0, 3 beside it, 4 at the other end.
         x = np.asarray(corners, np.float64).reshape(-1, 8, 3) @ lidar2ego[:3, :3].T + lidar2ego[:3, 3]
         along, across, up = x[:, 4] - x[:, 0], x[:, 3] - x[:, 0], x[:, 1] - x[:, 0]
@@ -222,10 +267,15 @@ def check_no_lenses(lenses: Sequence[str]) -> None:
         )
 
 
-def target_outputs(out: Mapping[str, Any]) -> dict[str, Any]:
-    """Coverage, and what else was asked for, as arrays."""
-    found = {key: out[key] for key in TARGET_OUTPUTS if key in out}
-    return {key: value.numpy() if isinstance(value, torch.Tensor) else value for key, value in found.items()}
+def target_outputs(outs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Coverage, and what else was asked for, as arrays (views, h, w); of several frames (frames, views, h, w)."""
+    found: dict[str, Any] = {}
+    for key in TARGET_OUTPUTS:
+        if key in outs[0]:
+            values = [out[key].numpy() if isinstance(out[key], torch.Tensor) else out[key] for out in outs]
+            is_map = len(values) > 1 and isinstance(values[0], np.ndarray)
+            found[key] = np.stack(values) if is_map else values[0]  # one draw for all frames
+    return found
 
 
 def _write_matrices(made: dict[str, Any], views: Views) -> None:
@@ -236,6 +286,14 @@ def _write_matrices(made: dict[str, Any], views: Views) -> None:
             del made[key]
             continue
         made[key] = _as_written(made[key], views.matrices(kind))
+
+
+def _write_intrinsics(made: dict[str, Any], views: Views, images: torch.Tensor) -> None:
+    """Sparse4D's further ones: (w, h) of each image, and the geometric mean of its focal lengths."""
+    if "image_wh" in made:
+        made["image_wh"] = like_array(made["image_wh"], [images.shape[:-3:-1]] * len(images))
+    if "focal" in made:
+        made["focal"] = like_array(made["focal"], np.sqrt(np.abs(np.linalg.det(views.K[:, :2, :2]))))
 
 
 def _as_written(given: Any, matrices: FloatArray) -> Any:
@@ -266,7 +324,7 @@ def _infos(infos: Mapping[str, Any], views: Views, images: torch.Tensor) -> dict
 def _write_sizes(made: dict[str, Any], images: torch.Tensor) -> None:
     """(h, w), (h, w, 3), (h, w, 3, views) as given; (w, h) where images are PIL's."""
     h, w = images.shape[-2:]
-    is_array = isinstance(made["img"][0], np.ndarray)
+    is_array = isinstance(made["img"][0], np.ndarray | torch.Tensor)
     full = (h, w, 3, len(images)) if is_array else (w, h)
     for key in SHAPE_KEYS:
         if isinstance(made.get(key), tuple | list):

@@ -1,13 +1,18 @@
-"""``RigRetargetMultiView``: a pipeline step for mmdet3d, BEVFusion, BEVDet, DETR3D and PETR."""
+"""``RigRetargetMultiView``: a pipeline step for mmdet3d and its relatives, of one frame or of several."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from arbiview_aug import RandomRig, Rig, RigRetarget
+import torch
+
+from arbiview_aug import RandomRig, Rig, RigRetarget, SampleError
+from arbiview_aug.cameras.random_rig import sequence_rng
 from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD, retarget_img_inputs
+from arbiview_aug.integrations.mmdet3d.images import Norm
+from arbiview_aug.integrations.mmdet3d.queue import OneDraw, is_queue, retarget_queue
 from arbiview_aug.integrations.mmdet3d.results import check_no_lenses, retarget_results
 
 
@@ -15,13 +20,18 @@ class RigRetargetMultiView:
     """Re-renders the images of a ``results`` dict as another vehicle's cameras, and rewrites all that describes them.
 
     It stands right after what loads images (and points and annotations, where they are loaded: geometry), before
-    resizing, cropping, flipping and whatever turns points and boxes.
+    resizing, cropping, flipping and whatever turns points and boxes. Several frames in one dict (BEVDet4D, collected
+    queues) share one draw of ``p`` and of a ``RandomRig``. Where each frame of a drive passes the pipeline by itself,
+    ``sequence_key`` does that.
 
     Args:
         target: A rig's name, file, ``Rig`` or ``RandomRig``; of pinhole cameras (``Rig.undistorted()``).
         lidar2ego: (4, 4) the LiDAR's pose, where the dataset does not give it (DETR3D, PETR).
         ground_z_m: Height of the road in the source's ego frame: 0 in nuScenes and Waymo, -0.33 in Argoverse 2.
         img_norm: Means and standard deviations (three each) of BEVDet's normalisation.
+        sequence_key: Names the drive in the results (``scene_token``; Sparse4D: ``aug_config``): frames where it is
+            equal share one draw, in all workers of a DataLoader's epoch. By default that of a
+            ``RandomRig(per="sequence")``; else each dict has a draw of its own.
         settings: Any of ``RigRetarget``'s: ``size``, ``surface``, ``quality``, ``p``, ``harmonise``, ``holes``,
             ``outputs``.
 
@@ -35,7 +45,8 @@ class RigRetargetMultiView:
         *,
         lidar2ego: Any = None,
         ground_z_m: float = 0.0,
-        img_norm: tuple[Sequence[float], Sequence[float]] = MEAN_STD,
+        img_norm: Norm = MEAN_STD,
+        sequence_key: str | None = None,
         **settings: Any,
     ) -> None:
         self.retarget = RigRetarget(target, **settings)
@@ -44,16 +55,41 @@ class RigRetargetMultiView:
         check_no_lenses([camera.lens for camera in rig])
         self.names = rig.names
         self.lidar2ego, self.ground_z_m, self.img_norm = lidar2ego, float(ground_z_m), img_norm
+        by_target = held.sequence_key if isinstance(held, RandomRig) and held.per == "sequence" else None
+        self.sequence_key = sequence_key or by_target
 
     def __call__(self, results: Mapping[str, Any]) -> dict[str, Any]:
-        """A new ``results`` dict: see ``retarget_results`` and, with ``img_inputs``, ``retarget_img_inputs``."""
-        if "img_inputs" in results:
-            return retarget_img_inputs(
-                results, self.retarget, names=self.names, ground_z_m=self.ground_z_m, mean_std=self.img_norm
+        """A new ``results`` dict: see ``retarget_results``, ``retarget_queue`` and ``retarget_img_inputs``."""
+        of_all = OneDraw(self.retarget)
+
+        def of_frame(frame: Mapping[str, Any]) -> OneDraw:
+            return of_all if self.sequence_key is None else OneDraw(self.retarget, self._draw(frame))
+
+        def retargeted(frame: Mapping[str, Any]) -> dict[str, Any]:
+            return retarget_results(
+                frame, of_frame(frame), names=self.names, lidar2ego=self.lidar2ego, ground_z_m=self.ground_z_m
             )
-        return retarget_results(
-            results, self.retarget, names=self.names, lidar2ego=self.lidar2ego, ground_z_m=self.ground_z_m
-        )
+
+        if "img_inputs" in results:
+            retarget = of_frame({**results.get("curr", {}), **results})
+            return retarget_img_inputs(
+                results, retarget, names=self.names, ground_z_m=self.ground_z_m, mean_std=self.img_norm
+            )
+        return retarget_queue(results, retargeted) if is_queue(results) else retargeted(results)
+
+    def _draw(self, frame: Mapping[str, Any]) -> dict[str, float]:
+        """``retarget_params`` that are the same for all frames of a sequence.
+
+        Raises:
+            SampleError: The frame does not name its sequence.
+        """
+        key = str(self.sequence_key)
+        if key not in frame:
+            raise SampleError(f"sequence_key: expected {key!r} in the results, got {', '.join(map(str, frame))}")
+        target, p = self.retarget.target, self.retarget.p
+        rng = sequence_rng(frame[key], target.epoch if isinstance(target, RandomRig) else 0)
+        skipped = {"skipped": float(torch.rand((), generator=rng).item() >= p)} if p < 1 else {}
+        return skipped | (target.draw(rng) if isinstance(target, RandomRig) else {})
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.retarget.extra_repr()})"

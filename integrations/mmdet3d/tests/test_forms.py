@@ -95,7 +95,7 @@ def test_what_the_retargeting_is_given(given: Recording, form: str) -> None:
     held: dict[str, Any] = {}
     one = step()
     retarget = one.retarget
-    one.retarget = lambda sample: held.update(sample) or retarget(sample)
+    one.retarget = lambda sample, params: held.update(sample) or retarget(sample, params)
     results = FORMS[form](given)
     one(results)
     expected = in_key_frame(given) if form == "BEVDet" else given.sample
