@@ -13,6 +13,7 @@ from arbiview_aug.generator import config as generators
 from arbiview_aug.generator.config import GeneratorConfig, check_fields, from_plain
 
 GeoMode = Literal["normalised", "frobenius_sum"]
+PseudoQuality = Literal["fast", "paper"]
 
 _check = partial(check_fields, error=TrainingError)
 
@@ -21,6 +22,7 @@ _check = partial(check_fields, error=TrainingError)
 class PseudoViewConfig:
     """Pseudo views (Algorithm 1) and what is added to them; probabilities are per training item."""
 
+    quality: PseudoQuality = "fast"  # how FAVS renders them: as this package does, or by the published stages 1 to 4
     targets: int = 1  # real views to reconstruct together, of neighbouring cameras: each reads the others
     pairs: int = 1  # K of Algorithm 1: pairs of pseudo poses per draw of a real view; each is an item of its own
     yaw_deg: tuple[float, float] = (5.0, 35.0)  # range of a pseudo pose's turn to its side
@@ -39,6 +41,7 @@ class PseudoViewConfig:
     def __post_init__(self) -> None:
         shares = ("moved", "transplanted", "hidden", "leave_one_out", "virtual", "real_sources")
         _check(self, "a probability", lambda p: 0 <= p <= 1, *shares)
+        _check(self, "fast or paper", lambda q: q in ("fast", "paper"), "quality")
         _check(self, "at least 1", lambda n: n >= 1, "targets", "pairs", "mask_bank")
         _check(self, "0 <= low <= high <= 90", lambda yaw: 0 <= yaw[0] <= yaw[1] <= 90, "yaw_deg")
         _check(self, "0 < low <= high", lambda factor: 0 < factor[0] <= factor[1], "focal")
@@ -151,14 +154,16 @@ def _override(data: dict[str, Any], path: Sequence[str], value: Any, setting: st
 
 # --- configurations ---------------------------------------------------------------------------------------------------
 def paper() -> TrainConfig:
-    """Algorithm 1 as published, on Stable Diffusion's frozen weights (Sec. Training Parameters).
+    """Algorithm 1 as published, on Stable Diffusion's frozen weights and the published stages' pseudo views.
 
-    Two deviations: L_geo is normalised, since as printed it outgrows L_main (``loss.geo_mode="frobenius_sum"``), and
-    L_perceptual compares crops at early times.
+    See Sec. Training Parameters. Two deviations: L_geo is normalised, since as printed it outgrows L_main
+    (``loss.geo_mode="frobenius_sum"``), and L_perceptual compares crops at early times.
     """
     return TrainConfig(
         generator=generators.paper(),
-        pseudo_views=PseudoViewConfig(moved=1.0, transplanted=0.0, leave_one_out=0.0, virtual=0.0, real_sources=0.0),
+        pseudo_views=PseudoViewConfig(
+            quality="paper", moved=1.0, transplanted=0.0, leave_one_out=0.0, virtual=0.0, real_sources=0.0
+        ),
         loss=LossConfig(snr_limit=0.0, known=1.0, regression=0.0),
         steps=100_000,
         batch=8,

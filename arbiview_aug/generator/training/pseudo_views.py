@@ -21,17 +21,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch.utils.data import Dataset
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.favs.renderer import render_paper
 from arbiview_aug.generator.completion import Conditions, nearest_sources, seeded, valid_pixels
 from arbiview_aug.generator.config import GeneratorConfig
 from arbiview_aug.generator.geometry import FrameGeometry, batched, frame_geometry
 from arbiview_aug.generator.inpainting import telea
-from arbiview_aug.generator.training.config import PseudoViewConfig
+from arbiview_aug.generator.training.config import PseudoQuality, PseudoViewConfig
 from arbiview_aug.generator.training.data import Frames
 from arbiview_aug.generator.training.masks import one_of, uniform, with_focal
 from arbiview_aug.render.plan import build_plan
@@ -84,20 +86,29 @@ class Rendered(NamedTuple):
     confidence: torch.Tensor
 
 
-def favs(images: Sequence[torch.Tensor], rig: Rig, targets: Sequence[Camera]) -> Rendered:
+def favs(
+    images: Sequence[torch.Tensor], rig: Rig, targets: Sequence[Camera], quality: PseudoQuality = "fast"
+) -> Rendered:
     """Render N images (3, H, W), uint8 or in [0, 1], at M target cameras of one size in the rig's ego frame by FAVS.
 
-    On the surface ``far`` if all centres coincide, else on ``street``: training has images and poses alone.
+    On the surface ``far`` if all centres coincide, else on ``street``: training has images and poses alone. The
+    published stages (``paper``) know ``far`` alone, run on the CPU and have no confidence: it is 1 where they see.
     """
     target = Rig([replace(c, name=str(k), mask=None) for k, c in enumerate(targets)], ground_z_m=rig.ground_z_m)
+    if quality == "paper":
+        published = render_paper(rig, target, [image.cpu() for image in images])
+        covered = torch.from_numpy(np.stack(published.coverage)).to(images[0].device)
+        return Rendered(_unit([view.image for view in published.targets]).to(covered.device), covered, covered.float())
     is_moved = any(abs(c.center_m - rig[k].center_m).max() > 1e-6 for c in targets for k in nearest_sources(c, rig)[:1])
     plan = build_plan(rig, target, surface="street" if is_moved else "far", config=_FAVS)
     (rendered,) = Renderer().render([plan], [Frame(tuple(images), rig)], [None], ("confidence",))
-    unit = torch.stack(rendered.images).float()
-    if rendered.images[0].dtype == torch.uint8:
-        unit = unit / 255
     assert isinstance(rendered.coverage, torch.Tensor) and isinstance(rendered.confidence, torch.Tensor)  # one size
-    return Rendered(unit.clamp(0, 1), rendered.coverage, rendered.confidence)
+    return Rendered(_unit(rendered.images), rendered.coverage, rendered.confidence)
+
+
+def _unit(images: Sequence[torch.Tensor]) -> torch.Tensor:
+    """(M, 3, h, w) float32 in [0, 1] of images in uint8 or in [0, 1]."""
+    return (torch.stack(list(images)).float() / (255 if images[0].dtype == torch.uint8 else 1)).clamp(0, 1)
 
 
 def neighbours(rig: Rig, camera: int) -> list[int]:
@@ -155,9 +166,9 @@ class PseudoViews(Dataset[Batch]):
         shown, pseudo = [], []
         for target, mask in zip(targets, masks, strict=True):
             pair = self._pair(target, rng)
-            made = favs(images, rig, pair)
+            made = favs(images, rig, pair, config.quality)
             masked = [replace(c, mask=seen.cpu().numpy()) for c, seen in zip(pair, made.covered, strict=True)]
-            at_target = favs(list(made.images), Rig(masked, ground_z_m=rig.ground_z_m), [target])
+            at_target = favs(list(made.images), Rig(masked, ground_z_m=rig.ground_z_m), [target], config.quality)
             if is_transplanted and not is_hidden:
                 at_target = at_target._replace(covered=at_target.covered & mask.to(at_target.covered.device))
             shown.append(at_target)

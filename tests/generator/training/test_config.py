@@ -22,6 +22,7 @@ def test_presets_survive_json(name: str) -> None:
 def test_the_papers_settings() -> None:
     config = paper()
     assert (config.lr, config.batch, config.loss.geo, config.loss.perceptual) == (1e-4, 8, 0.1, 0.01)
+    assert config.pseudo_views.quality == "paper" and config.pseudo_views.targets == 1
     assert config.pseudo_views.transplanted == config.pseudo_views.virtual == config.loss.regression == 0.0
     assert config.generator.frozen_unet and config.generator.prediction == "epsilon"
 
@@ -47,6 +48,7 @@ def test_overrides() -> None:
         ("precision=fp16", "never fp16"),
         ("loss.geo_mode=sum", "expected normalised or frobenius_sum"),
         ("pseudo_views.virtual=2", "expected a probability"),
+        ("pseudo_views.quality=draft", "PseudoViewConfig.quality: expected fast or paper, got 'draft'"),
         ("loss.regression=1", r"LossConfig.regression: expected a value in \[0, 1\), got 1"),
     ],
 )

@@ -9,9 +9,11 @@ from typing import Any
 import pytest
 import torch
 
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.generator.training.config import PseudoViewConfig
 from arbiview_aug.generator.training.masks import mask_bank
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate, favs
+from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.generator.training.small import SIZE, config, frames
 
 AS_WRITTEN: Mapping[str, Any] = {
@@ -185,3 +187,19 @@ def test_favs_by_torch_is_favs_by_opencv() -> None:
     assert by_torch.images.requires_grad and torch.equal(by_opencv.covered, by_torch.covered)
     assert float((by_opencv.images - by_torch.images).detach().abs().max()) < 0.02
     assert torch.allclose(by_opencv.confidence, by_torch.confidence.detach(), atol=0.05)
+
+
+def test_pseudo_views_by_the_published_stages() -> None:
+    """Pair and condition are those of ``quality="paper"``, whose images are the package's own where nothing moves."""
+    made, plain = items(quality="paper", moved=1.0), items(moved=1.0)
+    item, again, other = made[0], made[0], plain[0]
+    assert all(torch.equal(x, y) for x, y in zip(flat(item), flat(again), strict=True))
+    assert torch.equal(item.truth, other.truth) and not torch.equal(item.sources, other.sources)
+    assert torch.equal(item.confidence, item.known.float()) and 0 < float(item.known.float().mean()) < 1
+    frame = made.frames[item.views[0][0][0]]
+    pair = [frame.rig[0].turned(yaw_deg=yaw) for yaw in (10, -10)]
+    published = RigRetarget(Rig([replace(c, name=str(k)) for k, c in enumerate(pair)]), quality="paper", holes="black")
+    expected = published({"images": torch.stack(frame.images), "rig": frame.rig})
+    rendered = favs(frame.images, frame.rig, pair, "paper")
+    assert torch.equal((rendered.images * 255).round().byte(), expected["images"])
+    assert torch.equal(rendered.covered, expected["coverage"])
