@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from arbiview_aug.environment import optional_package
+
 _MADE = "made"
 """A file that is written last: a folder without it is of an interrupted try."""
 
@@ -43,6 +45,14 @@ FAMILIES = {
     ),
     "nuscenes": Family(("nuscenes-devkit==1.2.0", "numpy<2"), borrows=False),
 }
+
+
+def required(name: str) -> None:
+    """End an example by one line that says how to install its framework, where that is missing."""
+    try:
+        optional_package(name)
+    except ImportError as error:
+        raise SystemExit(str(error)) from None
 
 
 def python_of(name: Literal["pipelines", "nuscenes"]) -> Path:

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from arbiview_aug.errors import SampleError
-from arbiview_aug.sample.batching import rewrapped
+from arbiview_aug.sample.batching import lens_names, rewrapped
 from arbiview_aug.sample.inputs import DEPTH_KEYS
 
 STACKED = ("images", "K", "cam2ego", "coverage", "ignore", "distortion", "ego2world", *DEPTH_KEYS)
@@ -20,6 +20,8 @@ def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """A batch of samples, before or after ``RigRetarget``: a ``collate_fn`` for frames with points and boxes.
 
     Cameras and maps over their images are stacked; of points, boxes and all else there is a list, an entry a frame.
+    ``lens`` stays a name for each camera, or has a list over the frames where they differ; torch's ``default_collate``
+    makes tuples of each camera's names, which ``RigRetarget`` reads as well.
     Frames of one rig keep it. Where each has its own (nuScenes: cameras and LiDAR expose at different times), ``K`` and
     ``cam2ego`` say so.
 
@@ -42,8 +44,8 @@ def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             batch[key] = _stacked(key, values)
         elif isinstance(values[0], Mapping) and "images" in values[0]:  # the ``sources`` of a view
             batch[key] = collate(values)
-        elif key == "lens":  # a name for each camera, or one for each of its frames
-            batch[key] = [list(of_camera) for of_camera in zip(*values, strict=True)]
+        elif key == "lens":
+            batch[key] = lens_names([list(names) for names in values], (len(values),))
         elif key == "ground_z_m":
             batch[key] = torch.tensor([float(value) for value in values], dtype=torch.float64)
         else:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-import lightning
 import torch
 
 from arbiview_aug import RigRetarget
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
-from arbiview_aug.integrations.lightning import RetargetDataModule
+from integrations.environments import required
+
+required("lightning")
+import lightning  # noqa: E402
+
+from arbiview_aug.integrations.lightning import RetargetDataModule  # noqa: E402
 
 SIZE = (64, 176)
 

@@ -60,6 +60,14 @@ def test_frameworks_are_imported_where_they_are_used() -> None:
     assert done.stdout.splitlines() == ["[]", *hints]
 
 
+@pytest.mark.parametrize("name", ["lightning", "webdataset"])
+def test_examples_check_their_framework_first(name: str) -> None:
+    code = f"import runpy, sys; sys.modules[{name!r}] = None; runpy.run_module(sys.argv[1], run_name='__main__')"
+    command = [sys.executable, "-c", code, f"integrations.{name}.example"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=500)
+    assert (done.returncode, done.stderr) == (1, f"{name} is not installed: pip install {name}\n")
+
+
 def test_importing_the_mmdet3d_adapter_registers_the_step(tmp_path: Path) -> None:
     """As ``custom_imports`` does; without mmengine nothing is registered, and the import works."""
     registry = tmp_path / "mmengine" / "registry.py"

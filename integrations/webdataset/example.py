@@ -10,12 +10,14 @@ from torch.utils.data import DataLoader
 from arbiview_aug import RigRetarget, load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.integrations.webdataset import stream, write_shard
+from integrations.environments import required
 
 SHARDS, FRAMES = 2, 2
 
 
 def main() -> int:
     """Two shards, two workers: each frame comes once."""
+    required("webdataset")
     drive = SyntheticDrive(demo_source_rig((96, 256)), num_frames=SHARDS * FRAMES, lidar=False)
     with TemporaryDirectory() as folder:
         for k in range(SHARDS):

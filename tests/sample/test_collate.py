@@ -1,5 +1,7 @@
 """Batches of retargeted samples in a DataLoader; of source samples: the tests of the Lightning adapter."""
 
+from dataclasses import replace
+
 import torch
 from torch.utils.data import DataLoader
 
@@ -20,4 +22,20 @@ def test_retargeted_samples_of_differing_numbers_of_objects() -> None:
     for k, sample in enumerate(alone):
         assert torch.equal(batch["images"][k], sample["images"]) and torch.equal(batch["K"][k], sample["K"])
         assert torch.equal(batch["boxes_3d"][k], sample["boxes_3d"])
-        assert [of_camera[k] for of_camera in batch["lens"]] == list(sample["lens"])
+        assert batch["lens"] == sample["lens"]
+
+
+def test_lenses_of_a_batch() -> None:
+    """A name for each camera, over the frames where they differ: what a loader gives can be retargeted again."""
+    plain = demo_source_rig((36, 64))
+    bent = plain.with_cameras([replace(c, lens="radtan", distortion=(-0.1, 0.01, 0, 0)) for c in plain])
+    step = RigRetarget(bent, size=(36, 64), p=0.5, surface="street")
+    sample = SyntheticDrive(plain, num_frames=1)[0]
+    skipped, done = (step(sample, params={"skipped": value}) for value in (1.0, 0.0))
+    assert collate([done, done])["lens"] == done["lens"] == ["radtan"] * len(plain)
+    mixed = collate([skipped, done])
+    assert mixed["lens"] == [["pinhole", "radtan"]] * len(plain)
+    back = RigRetarget(plain, surface="street")
+    again = back(mixed)
+    for k, single in enumerate((skipped, done)):
+        assert torch.equal(again["images"][k], back(single)["images"])
