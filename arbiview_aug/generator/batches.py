@@ -10,7 +10,14 @@ from typing import Any
 import torch
 
 from arbiview_aug.errors import SampleError
-from arbiview_aug.generator.completion import Maps, check_device, complete, known_and_holes, seeded
+from arbiview_aug.generator.completion import (
+    FrameViews,
+    Maps,
+    check_device,
+    complete_together,
+    known_and_holes,
+    seeded,
+)
 from arbiview_aug.generator.networks import GeneratorNetworks
 from arbiview_aug.generator.pretrained import HoleFiller
 from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
@@ -37,33 +44,24 @@ def complete_frames(
     """Fill the pixels of rendered ``frames`` that no camera saw, or saw with too little confidence.
 
     Filled pixels are no longer covered: ``coverage`` False, ``confidence`` 0, ``source_camera`` and ``source_frame``
-    -1. Gradients of the others stay. ``names`` decide the noise. A pretrained network sees all frames together.
+    -1. Gradients of the others stay. ``names`` decide the noise. Frames share a network's calls.
     """
     if isinstance(how.generator, HoleFiller):
         return _filled(how.generator, rendered, names, how)
-    return [_completed(how.generator, *one, how) for one in zip(rendered, frames, names, strict=True)]
-
-
-def _completed(
-    generator: GeneratorNetworks | None, rendered: RenderedFrame, frame: Frame, name: str, how: Completion
-) -> RenderedFrame:
-    # Noise by camera number: cameras have no names in a batch.
-    cameras = [replace(camera, name=str(k)) for k, camera in enumerate(rendered.rig)]
-    done = complete(
-        generator,
-        rendered.images,
-        rendered.coverage,
-        rendered.rig.with_cameras(cameras),
-        frame.images,
-        frame.rig,
-        confidence=rendered.confidence,
+    jobs = []
+    for one, frame, name in zip(rendered, frames, names, strict=True):
+        # Noise by camera number: cameras have no names in a batch.
+        rig = one.rig.with_cameras([replace(camera, name=str(k)) for k, camera in enumerate(one.rig)])
+        jobs.append(FrameViews(one.images, one.coverage, rig, frame.images, frame.rig, one.confidence, name))
+    done = complete_together(
+        how.generator,
+        jobs,
         min_confidence=how.min_confidence,
         steps=how.steps,
         guidance=how.guidance,
         seed=how.seed,
-        frame=name,
     )
-    return _put(rendered, done.images, list(done.generated))
+    return [_put(one, found.images, list(found.generated)) for one, found in zip(rendered, done, strict=True)]
 
 
 def _filled(
@@ -121,7 +119,7 @@ def complete_batch(
 ) -> dict[str, Any]:
     """Complete collated samples on the generator's device: DataLoader workers cannot use a GPU.
 
-    The pixels are those of ``RigRetarget(path="diffusion")``.
+    The pixels are those of ``RigRetarget(path="diffusion")``, but for rounding: frames are computed together.
 
     Args:
         generator: The model; None inpaints. The settings are those of ``RigRetarget``.

@@ -1,7 +1,7 @@
-"""Inference on the target views of a frame (Sec. CVC-SSL; appendix: The Multi-Branch U-Net).
+"""Inference on the target views of frames (Sec. CVC-SSL; appendix: The Multi-Branch U-Net).
 
 Pixels that FAVS covers with enough confidence are known and never change. Views that are almost complete are inpainted
-by Telea's method without the denoiser. The others are denoised together, so that they agree.
+by Telea's method without the denoiser. A frame's others are denoised together, so that they agree.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from arbiview_aug.generator.conditioning import Views
 from arbiview_aug.generator.config import GeneratorConfig
 from arbiview_aug.generator.correspondence import TokenWindow
 from arbiview_aug.generator.denoiser import REGRESSION
-from arbiview_aug.generator.geometry import FrameGeometry, frame_geometry
+from arbiview_aug.generator.geometry import FrameGeometry, batched, frame_geometry
 from arbiview_aug.generator.inpainting import telea
 from arbiview_aug.generator.networks import GeneratorNetworks
 from arbiview_aug.generator.sampler import guided, noise_schedule, sample
@@ -31,6 +31,7 @@ from arbiview_aug.sample.batching import stacked
 
 ALMOST_COMPLETE = 0.995  # share of known pixels from which a view is inpainted: what is left is a seam
 SOURCES_PER_TARGET = 2  # source branches of a target camera, as in training (Algorithm 1: left and right)
+VIEWS_AT_ONCE = 24  # views that the denoiser sees in one call; a whole frame in any case
 Maps = torch.Tensor | Sequence[torch.Tensor]  # with a leading camera dimension, or a tensor per camera
 
 
@@ -61,7 +62,38 @@ class Conditions(NamedTuple):
         return targets, geometry.source_views(sources, self.seen, self.seen)
 
 
-@torch.no_grad()
+class FrameViews(NamedTuple):
+    """A frame to complete.
+
+    Attributes:
+        views: (M, 3, h, w), or M tensors (3, h, w): FAVS at the target cameras, uint8 or float in [0, 1].
+        coverage: (M, h, w) bool, or M tensors: pixels that some source saw.
+        targets: The M target cameras; pixels of their own car (masks) are not generated.
+        source_images: N images (3, H, W).
+        sources: The N cameras that recorded them.
+        confidence: (M, h, w) in [0, 1], or M tensors; 1 by default.
+        frame: Name of the frame, for the noise.
+    """
+
+    views: Maps
+    coverage: Maps
+    targets: Rig
+    source_images: Maps
+    sources: Rig
+    confidence: Maps | None = None
+    frame: str | int = 0
+
+
+class _Draft(NamedTuple):
+    """A frame with its almost complete views inpainted; the others are left to the generator."""
+
+    images: list[torch.Tensor]
+    known: list[torch.Tensor]
+    holes: list[torch.Tensor]
+    left: list[int]  # numbers of the views
+    branches: list[int]  # numbers of the sources that they read
+
+
 def complete(
     generator: GeneratorNetworks | None,
     views: Maps,
@@ -71,30 +103,36 @@ def complete(
     sources: Rig,
     *,
     confidence: Maps | None = None,
+    frame: str | int = 0,
+    **settings: Any,
+) -> Completed:
+    """Complete the target views of one frame: ``FrameViews``, and the settings of ``complete_together``."""
+    one = FrameViews(views, coverage, targets, source_images, sources, confidence, frame)
+    return complete_together(generator, [one], **settings)[0]
+
+
+@torch.no_grad()
+def complete_together(
+    generator: GeneratorNetworks | None,
+    frames: Sequence[FrameViews],
+    *,
     min_confidence: float = 0.0,
     steps: int | None = None,
     guidance: float | None = None,
     seed: int = 0,
-    frame: str | int = 0,
-) -> Completed:
-    """Complete the target views of one frame.
+) -> list[Completed]:
+    """Complete the target views of frames; those with as many views to denoise share the denoiser's calls.
 
     The result depends on the seed, the frame and the cameras' names, not on the order of the cameras or on earlier
     calls. It is computed on the generator's device and returned on the views'.
 
     Args:
         generator: The model; None inpaints all holes by Telea's method.
-        views: (M, 3, h, w), or M tensors (3, h, w): FAVS at the target cameras, uint8 or float in [0, 1].
-        coverage: (M, h, w) bool, or M tensors: pixels that some source saw.
-        targets: The M target cameras; pixels of their own car (masks) are not generated.
-        source_images: N images (3, H, W).
-        sources: The N cameras that recorded them.
-        confidence: (M, h, w) in [0, 1], or M tensors; 1 by default.
+        frames: The frames.
         min_confidence: Covered pixels below this confidence are generated too.
         steps: Denoising steps; 1 is the one-step regression. Default: the generator's.
         guidance: Classifier-free guidance; 1 is none. Default: the generator's.
         seed: Seed of the noise.
-        frame: Name of the frame, for the noise.
 
     Raises:
         SampleError: Views, coverage and cameras that do not fit together.
@@ -102,32 +140,59 @@ def complete(
             GPU in a DataLoader worker.
     """
     config = None if generator is None else _settings(generator, steps, guidance)
-    targets = targets.in_frame_of(sources)
-    if len(source_images) != len(sources):
-        raise SampleError(f"complete: expected {len(sources)} source images, got {len(source_images)}")
-    _check_sizes(views, coverage, targets)
-    images = list(views)
-    trust = coverage if confidence is None else confidence
-    known, holes = known_and_holes(targets, coverage, trust, min_confidence)
-    todo = []
+    frames = [frame._replace(targets=frame.targets.in_frame_of(frame.sources)) for frame in frames]
+    drafts = [_draft(frame, min_confidence, inpaints_all=generator is None) for frame in frames]
+    alike: dict[tuple[int, int], list[int]] = {}
+    for k, draft in enumerate(drafts):
+        if draft.left:
+            alike.setdefault((len(draft.left), len(draft.branches)), []).append(k)
+    for (count, _), numbers in alike.items():
+        assert generator is not None and config is not None
+        batch = max(1, VIEWS_AT_ONCE // count)
+        for together in (numbers[start : start + batch] for start in range(0, len(numbers), batch)):
+            given = [_inputs(frames[k], drafts[k], config, seed) for k in together]
+            conditions = Conditions(*(torch.cat(part) for part in zip(*(one for one, *_ in given), strict=True)))
+            conditions = Conditions(*(part.to(generator.device) for part in conditions))
+            geometry = batched([one for _, one, _ in given]).to(generator.device)
+            noise = torch.cat([one for *_, one in given]).to(generator.device)
+            for k, images in zip(together, denoised(generator, config, geometry, conditions, noise), strict=True):
+                own = drafts[k]
+                for m, image in zip(own.left, images, strict=True):
+                    own.images[m] = _paste(image, own.images[m], own.holes[m])
+    return [Completed(stacked(own.images), stacked(own.holes), own.left) for own in drafts]
+
+
+def _draft(frame: FrameViews, min_confidence: float, inpaints_all: bool) -> _Draft:
+    """Inpaint the views of a frame that are almost complete, or all."""
+    targets, sources = frame.targets, frame.sources
+    if len(frame.source_images) != len(sources):
+        raise SampleError(f"complete: expected {len(sources)} source images, got {len(frame.source_images)}")
+    _check_sizes(frame.views, frame.coverage, targets)
+    images, trust = list(frame.views), frame.coverage if frame.confidence is None else frame.confidence
+    known, holes = known_and_holes(targets, frame.coverage, trust, min_confidence)
+    left = []
     for m, hole in enumerate(holes):
-        if generator is not None and float(hole.float().mean()) > 1 - ALMOST_COMPLETE:
-            todo.append(m)
+        if not inpaints_all and float(hole.float().mean()) > 1 - ALMOST_COMPLETE:
+            left.append(m)
         elif bool(hole.any()):
             images[m] = torch.where(hole, telea(images[m], ~known[m]), images[m])
-    if generator is not None and config is not None and todo:
-        size, device = config.image_size, generator.device
-        target_parts = [_prefilled(images[m], known[m], trust[m], size) for m in todo]
-        branches = sorted({k for m in todo for k in nearest_sources(targets[m], sources)})
-        seen = [valid_pixels(sources[k].resize(size)).float() for k in branches]
-        parts = [*zip(*target_parts, strict=True), [_at_size(source_images[k], size) for k in branches], seen]
-        conditions = Conditions(*(torch.stack(list(part))[None].to(device) for part in parts))
-        cameras = [targets[m] for m in todo], [sources[k] for k in branches]
-        geometry = frame_geometry(*cameras, sources.ground_z_m, config).to(device)
-        noise = torch.stack([_noise(config, seed, frame, camera.name) for camera in cameras[0]])[None].to(device)
-        for m, image in zip(todo, denoised(generator, config, geometry, conditions, noise)[0], strict=True):
-            images[m] = _paste(image, images[m], holes[m])
-    return Completed(stacked(images), stacked(holes), todo)
+    branches = sorted({k for m in left for k in nearest_sources(targets[m], sources)})
+    return _Draft(images, known, holes, left, branches)
+
+
+def _inputs(
+    frame: FrameViews, draft: _Draft, config: GeneratorConfig, seed: int
+) -> tuple[Conditions, FrameGeometry, torch.Tensor]:
+    """Conditions, cameras and noise of a frame's views that are left, on the CPU."""
+    size, sources = config.image_size, [frame.sources[k] for k in draft.branches]
+    targets = [frame.targets[m] for m in draft.left]
+    trust = frame.coverage if frame.confidence is None else frame.confidence
+    views = zip(*(_prefilled(draft.images[m], draft.known[m], trust[m], size) for m in draft.left), strict=True)
+    seen = [valid_pixels(camera.resize(size)).float() for camera in sources]
+    parts = [*views, [_at_size(frame.source_images[k], size) for k in draft.branches], seen]
+    conditions = Conditions(*(torch.stack(list(part))[None] for part in parts))
+    geometry = frame_geometry(targets, sources, frame.sources.ground_z_m, config)
+    return conditions, geometry, torch.stack([_noise(config, seed, frame.frame, one.name) for one in targets])[None]
 
 
 def _settings(generator: GeneratorNetworks, steps: int | None, guidance: float | None) -> GeneratorConfig:

@@ -169,6 +169,17 @@ def test_batches_are_completed_as_samples_are(generator: Generator, workers: int
                 assert torch.equal(batch[key][k], one[key]), key
 
 
+def test_frames_of_a_batch_share_the_denoisers_calls(generator: Generator) -> None:
+    retarget = RigRetarget(TARGET, outputs=("sources", "confidence"))
+    outs = [retarget(a_sample(f"frame {k}", k)) for k in range(3)]
+    calls = []
+    for given in (outs[0], default_collate(outs)):
+        before = generator.calls
+        generator.complete_batch(given, steps=2)
+        calls.append(generator.calls - before)
+    assert calls[0] == calls[1] > 0
+
+
 def test_one_sample_and_no_generator() -> None:
     out = RigRetarget(TARGET, outputs=("sources", "confidence"))(a_sample())
     done = CompletedLoader([out], None)
