@@ -5,8 +5,10 @@ from __future__ import annotations
 import inspect
 import itertools
 import math
+import signal
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -84,6 +86,26 @@ def saved_depth_model(folder: Path, kind: str = "DepthAnything", **changes: Any)
     size = {"height": 56, "width": 56}
     processor(size=size, keep_aspect_ratio=True, ensure_multiple_of=14).save_pretrained(folder)
     return folder
+
+
+class HangError(BaseException):
+    """The time is over; no handler of exceptions catches it."""
+
+
+@contextmanager
+def limited(seconds: float) -> Iterator[None]:
+    """CPU time, so that a busy machine is no hang; not SIGALRM, which pytest-timeout has."""
+
+    def over(*_: object) -> None:
+        raise HangError
+
+    before = signal.signal(signal.SIGVTALRM, over)
+    signal.setitimer(signal.ITIMER_VIRTUAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+        signal.signal(signal.SIGVTALRM, before)
 
 
 def few_or_all(few: int, every: int, what: str = "streets") -> list[Any]:

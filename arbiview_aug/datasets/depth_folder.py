@@ -101,7 +101,7 @@ class DepthFolder:
             misfit = None if of == token else (f"frame {token!r}", f"that of frame {of!r}")
             misfit = misfit or _misfit(arrays, rig, depth)
             kind, origin = _KINDS[str(arrays.get("kind", "motion"))], arrays["neighbours"].tolist()
-        except (*BROKEN_ARRAY, KeyError, TypeError) as error:
+        except (*BROKEN_ARRAY, KeyError, TypeError, OverflowError) as error:
             raise DataError(f"{path}: expected depth of a frame, got {type(error).__name__}; delete it") from None
         if misfit is not None:
             expected, got = misfit

@@ -31,7 +31,7 @@ from arbiview_aug.datasets.drive import (
     parts_of_clock,
 )
 from arbiview_aug.datasets.image_io import Reduce, check_reduce, decode_images, reduced_rig
-from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, WarnOnce
+from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, WarnOnce, shown
 from arbiview_aug.sample.masks import image_circle, without_specks
 from arbiview_aug.scene.boxes import checked_boxes
 
@@ -270,12 +270,12 @@ def _read_sequence(root: Path, index: Mapping[str, int]) -> tuple[dict[str, floa
         entries = [entry if isinstance(entry, Mapping) else {"name": entry} for entry in given]
         names = [str(entry["name"]) for entry in entries]
         times_s = {str(entry["name"]): float(entry["time_s"]) for entry in entries if "time_s" in entry}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
         expected = "{'frames': [names, or {'name': ..., 'time_s': ...}]}"
         raise DataError(f"{path}: expected {expected}, got {type(error).__name__}: {error}") from None
     for name in names:
         if name not in index:
-            raise DataError(f"{path}: expected names of the folders beside it, got {name!r}")
+            raise DataError(f"{path}: expected names of the folders beside it, got {shown(name)}")
         if not np.isfinite(times_s.get(name, 0.0)):
             raise DataError(f"{path}: frame {name!r}: time_s: expected a finite number, got {times_s[name]}")
     if len(set(names)) < len(names):

@@ -65,7 +65,7 @@ def read_config(folder: Path) -> tuple[dict[str, Any], str]:
     try:
         config = json.loads(path.read_text())
         found, weights = config.pop("format"), config.pop("weights")
-    except (ValueError, KeyError, AttributeError, TypeError) as error:
+    except (OSError, ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
         raise GeneratorError(f"{path}: expected a generator's configuration ({error!r})") from None
     if found != FORMAT:
         raise GeneratorError(f"{path}: expected format {FORMAT}, got {shown(found)}")

@@ -72,11 +72,16 @@ def _tv_tensor(value: Any) -> str:
 
 
 def _leaves(value: Any) -> Iterator[Any]:
-    if isinstance(value, Mapping | list | tuple):
-        for entry in value.values() if isinstance(value, Mapping) else value[:_MAX_ENTRIES]:
-            yield from _leaves(entry)
-    else:
-        yield value
+    """Yield the leaves of nested mappings and sequences, in order; a container that stands in itself is read once."""
+    seen: dict[int, Any] = {}
+    waiting = [value]
+    while waiting:
+        entry = waiting.pop()
+        if not isinstance(entry, Mapping | list | tuple):
+            yield entry
+        elif id(entry) not in seen:
+            seen[id(entry)] = entry
+            waiting += reversed([*entry.values()] if isinstance(entry, Mapping) else entry[:_MAX_ENTRIES])
 
 
 def warn_of_misnamed(

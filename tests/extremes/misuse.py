@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import random
-from collections.abc import Callable, Container, Mapping, MutableMapping
+from collections.abc import Callable, Container, Mapping, MutableMapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -55,8 +55,38 @@ JUNK: tuple[Callable[[], Any], ...] = (
     lambda: torch.zeros(2, 3, *SIZE).to(torch.float8_e5m2),
     lambda: torch.zeros(2, 3, 3, dtype=torch.complex64),
     lambda: torch.eye(4).expand(2, 4, 4),
+    lambda: "a\0b",
+    lambda: "\ud800",
+    lambda: nested(200),
+    lambda: circle(),
 )
 """Values that no key expects, made anew each time."""
+
+
+def nested(depth: int) -> Any:
+    value: Any = []
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
+def circle() -> Any:
+    value: Any = {"boxes": []}
+    value["boxes"].append(value)
+    return value
+
+
+_MEANT = {"digits": "7" * 5000, "deep": "[" * 3000 + "]" * 3000, "circle": "&a [*a]", "mappings": '{"a":' * 3000 + "}"}
+"""Texts that stand in a file in place of a word, which no writer of JSON writes."""
+
+TEXT_JUNK: tuple[Callable[[], Any], ...] = (
+    *(lambda: None, lambda: "x", lambda: "", lambda: True, lambda: 0, lambda: -1, lambda: 1.5, lambda: 10**400),
+    *(lambda: float("nan"), lambda: float("inf"), lambda: -1e308, lambda: 1e-320, lambda: 2**63, lambda: "7"),
+    *(lambda: [], lambda: {}, lambda: [None], lambda: [[1.0], [2.0, 3.0]], lambda: {"name": "x", "file": {}}),
+    *(lambda: "a\0b", lambda: "\ud800", lambda: "x" * 5000, lambda: "../x", lambda: "/dev/zero", lambda: nested(200)),
+    *(lambda word=word: word for word in _MEANT),  # type: ignore[misc]
+)
+"""The same in files of JSON."""
 
 TENSOR_CHANGES: tuple[Callable[[torch.Tensor], Any], ...] = (
     lambda t: t[:1],
@@ -131,7 +161,7 @@ def sample(rng: random.Random) -> dict[str, Any]:
     return {"images": images, "K": torch.from_numpy(cameras.K), "cam2ego": torch.from_numpy(cameras.cam2ego), **chosen}
 
 
-def mutated(value: Any, rng: random.Random) -> Any:
+def mutated(value: Any, rng: random.Random, junk: Sequence[Callable[[], Any]] = JUNK) -> Any:
     """A value with one thing wrong, somewhere inside it; containers are changed in place."""
     if isinstance(value, MutableMapping) and value and rng.random() < 0.95:
         key = rng.choice(list(value))
@@ -141,7 +171,7 @@ def mutated(value: Any, rng: random.Random) -> Any:
         elif roll < 0.12:
             value[rng.choice(["x", 1, None, ("a", 2)])] = value[key]
         else:
-            value[key] = mutated(value[key], rng)
+            value[key] = mutated(value[key], rng, junk)
         return value
     if isinstance(value, list) and value and rng.random() < 0.85:
         k = rng.randrange(len(value))
@@ -149,9 +179,9 @@ def mutated(value: Any, rng: random.Random) -> Any:
         if roll < 0.1:
             del value[k]
         elif roll < 0.2:
-            value.insert(k, copy.deepcopy(value[k]))
+            value.insert(k, copy.copy(value[k]))
         else:
-            value[k] = mutated(value[k], rng)
+            value[k] = mutated(value[k], rng, junk)
         return value
     readable = isinstance(value, torch.Tensor) and value.device.type == "cpu" and value.layout == torch.strided
     if readable and "float8" not in str(value.dtype) and rng.random() < 0.75:
@@ -166,7 +196,7 @@ def mutated(value: Any, rng: random.Random) -> Any:
             if isinstance(value, int)
             else rng.choice((*NUMBERS, value * 1e3, value + 1e-7))
         )
-    return rng.choice(JUNK)()
+    return rng.choice(junk)()
 
 
 NUMBERS = (float("nan"), float("inf"), -1e308, 1e300, 1e30, -1.0, 0.0, 1e-30, 5e-324, 1e5, 0.5)
@@ -244,14 +274,17 @@ def calibration() -> dict[str, Any]:
     }
 
 
-def mutated_text(rng: random.Random) -> bytes:
-    """A calib.json with one or two things wrong: in its values, or in its bytes."""
-    data = calibration()
+def mutated_text(data: Any, rng: random.Random) -> bytes:
+    """JSON with one or two things wrong: in its values, or in its bytes."""
+    data = copy.deepcopy(data)
     for _ in range(rng.choice((1, 1, 2))):
-        data = mutated(data, rng)
+        data = mutated(data, rng, TEXT_JUNK)
         if not isinstance(data, Mapping):
             break
-    text = bytearray(json.dumps(data, default=str, skipkeys=True).encode())
+    written = json.dumps(data, skipkeys=True)
+    for word, meant in _MEANT.items():
+        written = written.replace(f'"{word}"', meant)
+    text = bytearray(written.encode())
     if rng.random() < 0.3:
         for _ in range(rng.randrange(1, 4)):
             k = rng.randrange(max(1, len(text)))

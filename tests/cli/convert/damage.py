@@ -13,7 +13,6 @@ import io
 import json
 import os
 import random
-import signal
 import sys
 import time
 import traceback
@@ -29,9 +28,11 @@ from unittest import mock
 from arbiview_aug.__main__ import main as run
 from arbiview_aug.datasets import Neighbours, NuScenesDataset
 from arbiview_aug.errors import ArbiviewError
+from arbiview_aug.render.plan import compile_kernels
 from tests.cli.convert.drives import SURROUND, command, read_tables, tree, write_nuscenes
+from tests.helpers import HangError, limited
 
-LIMIT_S = 20.0
+LIMIT_S = 10.0
 """CPU seconds for a mutation: it takes one at most."""
 
 LEFT_OUT = "goes-sample-1"
@@ -246,6 +247,7 @@ class Range:
     """
 
     def __init__(self, root: Path) -> None:
+        compile_kernels()  # takes longer than a mutation may
         self.root, self.source = root, root / "source"
         write_nuscenes(self.source)
         _add_tables(self.source / VERSION)
@@ -266,10 +268,10 @@ class Range:
         else:
             path.write_bytes(damage.content)
         try:
-            with _limited(LIMIT_S), warnings.catch_warnings():
+            with limited(LIMIT_S), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 return self._verdict()
-        except _HangError:
+        except HangError:
             return Verdict("hang", traceback.format_exc(limit=-3))
         except Exception:
             return Verdict("foreign", traceback.format_exc(limit=-3))
@@ -368,26 +370,6 @@ def _judged(status: int, output: Path, said: str) -> Verdict:
         images = "expected a regular file" not in said and output.is_dir() and any(output.glob("samples/*/*"))
         return Verdict("late" if images else "refused", words)
     return Verdict("foreign", f"exit {status}: {said}")
-
-
-class _HangError(BaseException):
-    """The time is over; no handler of exceptions catches it."""
-
-
-@contextlib.contextmanager
-def _limited(seconds: float) -> Iterator[None]:
-    """CPU time, so that a busy machine is no hang; not SIGALRM, which pytest-timeout has."""
-
-    def over(*_: object) -> None:
-        raise _HangError
-
-    before = signal.signal(signal.SIGVTALRM, over)
-    signal.setitimer(signal.ITIMER_VIRTUAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
-        signal.signal(signal.SIGVTALRM, before)
 
 
 def _removed(folder: Path) -> None:

@@ -13,6 +13,7 @@ from arbiview_aug.datasets import NuScenesDataset
 from arbiview_aug.errors import DataError
 from tests.cli.convert import damage as damaging
 from tests.cli.convert.damage import ALLOWED, LEFT_OUT, VERSION, Damage, Range, damages
+from tests.helpers import few_or_all
 
 Rows = list[dict[str, Any]]
 
@@ -169,8 +170,8 @@ def test_some_damaged_tables(tried: Range) -> None:
     some(tried, 24, 3)
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_a_thousand_damaged_tables(tried: Range) -> None:
-    """As ``python -m tests.cli.convert.damage``: 5 minutes of CPU."""
-    some(tried, 1000, 0)
+@pytest.mark.timeout(7200)
+@pytest.mark.parametrize("thousands", few_or_all(1, 3, "thousand"))
+def test_thousands_of_damaged_tables(tried: Range, thousands: int) -> None:
+    """As ``python -m tests.cli.convert.damage``: 5 minutes of CPU a thousand."""
+    some(tried, 1000 * thousands, 0)
