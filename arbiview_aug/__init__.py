@@ -14,6 +14,7 @@ from arbiview_aug.sample.training import lift_mask, visible_boxes
 from arbiview_aug.transforms.resize import CropRig, ResizeRig
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
+__version__ = "0.2.0"
 __all__ = [
     "ArbiviewError",
     "CalibrationError",

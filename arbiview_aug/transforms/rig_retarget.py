@@ -287,7 +287,7 @@ class RigRetarget(torch.nn.Module):
         if "torch._dynamo" in sys.modules:  # importing it takes a second; nothing here can be compiled
             run = torch.compiler.disable(run)
         # Under another default device, numbers of plans would be made there, or nowhere (meta).
-        is_cpu = torch.get_default_device().type == "cpu"
+        is_cpu = torch.empty(0).device.type == "cpu"  # get_default_device of torch 2.6 misses contexts
         with nullcontext() if is_cpu else torch.device("cpu"):
             return run(sample, params)
 
