@@ -1,4 +1,4 @@
-"""``python -m arbiview_aug.train``: train a generator, or score it on held-out streets."""
+"""``python -m arbiview_aug.train``: train a generator, or score it on held-out frames."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ def parser() -> argparse.ArgumentParser:
     add("command", nargs="?", choices=COMMANDS, default="train", help="what to do (default: %(default)s)")
     add("--config", choices=tuple(CONFIGS), default="tiny", help="preset of all settings")
     kinds = " or ".join(f"{kind}:PATH" for kind in READERS)
-    add("--data", default="synthetic", metavar="DATA", help=f"synthetic, or real frames with their kind: {kinds}")
+    help_of_data = f"synthetic, or real frames with their kind: {kinds} (default: synthetic; evaluate: the run's)"
+    add("--data", metavar="DATA", help=help_of_data)
     add_output(found, "folder of the run")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting, such as steps=100 or loss.geo=0")
     add("--stage", choices=("all", "autoencoder"), default="all", help="autoencoder: that alone, if the config has one")
@@ -39,7 +40,7 @@ def parser() -> argparse.ArgumentParser:
     add("--vgg-weights", metavar="FILE", help="torchvision's vgg16 weights (default: cache or download)")
     add("--views", type=count, default=64, metavar="N", help="number of held-out views to score")
     add("--seeds", type=count, default=1, metavar="N", help="evaluate: targets a scene")
-    add("--steps", type=count, default=4, metavar="N", help="evaluate: steps of a sample")
+    add("--steps", type=count, metavar="N", help="evaluate: steps of a sample (default: the run's own)")
     add("--quiet", action="store_true", help="no progress bars")
     return found
 

@@ -40,22 +40,23 @@ from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.displaced import COPY, displaced_frames, surfaces_for
 from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
 from arbiview_aug.evaluate.images import as_arrays
-from arbiview_aug.evaluate.methods import Method, retargeting
-from arbiview_aug.evaluate.paper_study import SETS, draw_figures, measure_paper, paper_report
+from arbiview_aug.evaluate.methods import Method, retargeting, study_methods
+from arbiview_aug.evaluate.paper_study import SETS, draw_figures, measure_paper, paper_report, unseen_frames
 from arbiview_aug.evaluate.report.html import html_report
 from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.evaluate.report.sheet import frame_sheet
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
 from arbiview_aug.evaluate.run import Evaluation, evaluate
 from arbiview_aug.evaluate.targets import named_targets, without_masks
-from arbiview_aug.generator import Generator, load_generator
+from arbiview_aug.generator import Generator, HoleFiller, load_generator
+from arbiview_aug.generator.config import TrainedOn
 from arbiview_aug.sample.inputs import LEARNED_KEY
 from arbiview_aug.scene.scene import SURFACES
 from arbiview_aug.scene.surface import SurfaceName
 
 _FIXED = {
-    "paper": ("target", "yaws", "quality", "surface", "path", "generator", "steps", "seed", "reduce", "clean_masks"),
-    "figure": ("target", "yaws", "quality", "surface", "path", "generator", "steps", "frames"),
+    "paper": ("target", "yaws", "quality", "surface", "path", "steps", "seed", "reduce", "clean_masks"),
+    "figure": ("target", "yaws", "quality", "surface", "path", "steps", "frames"),
     "displaced": ("target", "yaws", "seed", "size"),
 }
 """Options that the modes fix."""
@@ -103,7 +104,11 @@ def _parser() -> argparse.ArgumentParser:
         "degrees such as --yaws=-11,11",
     )
     add_rendering(parser, several=True)
-    parser.add_argument("--generator", metavar="PATH", help="of --path diffusion, as in convert (default: the own)")
+    parser.add_argument(
+        "--generator",
+        metavar="PATH",
+        help="of --path diffusion, --paper and --figure, as in convert; these score held-out frames of its training",
+    )
     parser.add_argument("--steps", nargs="+", type=count, default=[4], metavar="N", help="steps of the generator")
     add_frames(parser, None, "number of frames (default: 1; --paper: 3 synthetic ones; --displaced: all)")
     add_reduce(parser)
@@ -275,13 +280,32 @@ def _displaced(arguments: argparse.Namespace, notes: list[str]) -> tuple[list[Me
 
 def _paper(arguments: argparse.Namespace, folder: Path) -> str:
     with named_steps([]) as tick:  # warnings of targets half outside the view are expected
-        study = measure_paper(arguments.data, frames=arguments.frames, size=arguments.size, tick=tick)
+        generator, trained_on = _generator(arguments)
+        study = measure_paper(
+            arguments.data,
+            frames=arguments.frames,
+            size=arguments.size,
+            methods=study_methods(generator),
+            trained_on=trained_on,
+            tick=tick,
+        )
+    study.generator = arguments.generator
     (folder / "paper.json").write_text(json.dumps(study.as_dict(), indent=1) + "\n")
     return f"{paper_report(study)}\n\nnumbers: {folder / 'paper.json'}"
 
 
+def _generator(arguments: argparse.Namespace) -> tuple[Generator | HoleFiller | None, TrainedOn | None]:
+    """The generator of ``--generator``, if any, and the data that it was trained on, if known."""
+    generator = None if arguments.generator is None else load_generator(arguments.generator)
+    return generator, generator.trained_on if isinstance(generator, Generator) else None
+
+
 def _figure(arguments: argparse.Namespace, folder: Path) -> str:
-    ((_, frame),) = scored_frames(open_frames(arguments, arguments.surface), 1, False)
+    generator, trained_on = _generator(arguments)
+    (index,) = unseen_frames(trained_on, arguments.data, 1)
+    if trained_on is not None and arguments.data is None and trained_on.unseen(None):
+        arguments.frames, arguments.seed = index + 1, trained_on.seed
+    frame = make_frame(open_frames(arguments, arguments.surface)[index], exposures=())
     with gathered_warnings([]):
-        files = draw_figures(frame.sample, folder)
+        files = draw_figures(frame.sample, folder, generator)
     return "\n".join(f"picture: {file}" for file in files)

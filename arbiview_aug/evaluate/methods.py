@@ -12,8 +12,9 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.evaluate.baselines import BASELINES, Renderer
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
-from arbiview_aug.generator import Generator
+from arbiview_aug.generator import Generator, HoleFiller
 from arbiview_aug.generator.generator import has_shipped
+from arbiview_aug.generator.networks import GeneratorNetworks
 from arbiview_aug.render.harmonise import Harmonise, Harmoniser
 from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.render.refinement import RefinementCache
@@ -171,16 +172,26 @@ def paper_stages() -> dict[str, PaperConfig]:
     }
 
 
-def study_methods() -> list[Method]:
-    """Rows of the paper's tables and ours, from images and poses alone; the generator's only with diffusers."""
+def study_methods(generator: GeneratorNetworks | HoleFiller | None = None) -> list[Method]:
+    """Rows of the paper's tables and ours, from images and poses alone.
+
+    The generator's row is of the shipped weights if none is given, and only with diffusers.
+    """
     published = [retargeting(config, "auto", name) for name, config in paper_stages().items()]
     return [
         *map(baseline, BASELINES),
         *published,
         *(retargeting(quality, "street", quality) for quality in OURS),
         retargeting("fast", "street", INPAINTED, path="inpaint"),
-        *([retargeting("fast", "street", GENERATED, path="diffusion")] if has_generator() else []),
+        *generating(GENERATED, generator),
     ]
+
+
+def generating(name: str, generator: GeneratorNetworks | HoleFiller | None) -> list[Method]:
+    """``fast`` with holes by a generator, or by the shipped weights; nothing where these are not installed."""
+    if generator is None and not has_generator():
+        return []
+    return [retargeting("fast", "street", name, path="diffusion", generator=generator)]
 
 
 def has_generator() -> bool:

@@ -20,16 +20,19 @@ from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.errors import CalibrationError, SampleError
+from arbiview_aug.errors import CalibrationError, DataError, SampleError
 from arbiview_aug.evaluate.baselines import BASELINES
 from arbiview_aug.evaluate.frames import Exposure, ScoredFrame, make_frame, scores
 from arbiview_aug.evaluate.images import Image, as_arrays
-from arbiview_aug.evaluate.methods import GENERATED, OURS, Method, baseline, has_generator, retargeting, study_methods
+from arbiview_aug.evaluate.methods import GENERATED, OURS, Method, baseline, generating, retargeting, study_methods
 from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.pictures import contact_sheet, save_picture
 from arbiview_aug.evaluate.report.sheet import left_to_right
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import TRUCK_UP_M, VEHICLES, YAWS_DEG, named_targets, paper_target, spacing_deg
+from arbiview_aug.generator import HoleFiller
+from arbiview_aug.generator.config import TrainedOn
+from arbiview_aug.generator.networks import GeneratorNetworks
 
 REAL_FRAMES = ("nuscenes-one", "ddad-one")
 SYNTHETIC = "synthetic"
@@ -65,6 +68,7 @@ class Study:
 
     means: dict[str, dict[str, dict[str, dict[str, float]]]] = field(default_factory=dict)
     declined: dict[str, str] = field(default_factory=dict)
+    generator: str | None = None  # whose row it is; None for the shipped weights
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON, with the paper's numbers."""
@@ -77,6 +81,7 @@ def measure_paper(
     frames: int | None = None,
     size: tuple[int, int] | None = None,
     methods: Sequence[Method] | None = None,
+    trained_on: TrainedOn | None = None,
     tick: Callable[[str, int], None] = lambda _, __: None,
 ) -> Study:
     """Measure all rows on a folder of real frames; by default on ``REAL_FRAMES`` below ARBIVIEW_DATA and on streets.
@@ -85,10 +90,11 @@ def measure_paper(
         frames: Frames per data set; by default 1 of real ones and ``SYNTHETIC_FRAMES``.
         size: (h, w) of the synthetic images.
         methods: By default ``study_methods``.
+        trained_on: Data of the generator's training, of which only held-out frames are measured.
         tick: Called before each step with its name and the number of steps so far.
     """
     study, rows, steps = Study(), methods or study_methods(), 0
-    for name, found in _data_sets(data, frames, size):
+    for name, found in _data_sets(data, frames, size, trained_on):
         collected: dict[str, dict[str, list[dict[str, float]]]] = {m.name: {kind: [] for kind in SETS} for m in rows}
         for frame in found:
             for kind in SETS:
@@ -108,23 +114,34 @@ def measure_paper(
 
 
 def _data_sets(
-    data: str | Path | None, frames: int | None, size: tuple[int, int] | None
+    data: str | Path | None, frames: int | None, size: tuple[int, int] | None, trained_on: TrainedOn | None
 ) -> Iterator[tuple[str, Iterator[ScoredFrame]]]:
     root = os.environ.get("ARBIVIEW_DATA")
     folders = [Path(data)] if data is not None else [Path(root) / name for name in REAL_FRAMES] if root else []
     for folder in folders:
         if data is not None or folder.is_dir():
             samples = open_data(folder, reduce=REDUCE)
-            count = min(frames or 1, len(samples))
-            yield data_name(folder), (make_frame(_bare(samples[k])) for k in range(count))
+            indices = unseen_frames(trained_on, folder, min(frames or 1, len(samples)))
+            yield data_name(folder), (make_frame(_bare(samples[k])) for k in indices)
     if data is None:
-        drive = SyntheticDrive(
-            demo_source_rig(size or SYNTHETIC_SIZE), num_frames=frames or SYNTHETIC_FRAMES, seed=SYNTHETIC_SEED
+        streets = unseen_frames(trained_on, None, frames or SYNTHETIC_FRAMES)
+        seed = SYNTHETIC_SEED if trained_on is None or trained_on.unseen(None) is None else trained_on.seed
+        drive = SyntheticDrive(demo_source_rig(size or SYNTHETIC_SIZE), num_frames=max(streets) + 1, seed=seed)
+        yield (
+            SYNTHETIC,
+            (make_frame(_bare(drive[k]), truth=partial(drive.render, k), exposures=("raw",)) for k in streets),
         )
-        streets = (
-            make_frame(_bare(drive[k]), truth=partial(drive.render, k), exposures=("raw",)) for k in range(len(drive))
-        )
-        yield SYNTHETIC, streets
+
+
+def unseen_frames(trained_on: TrainedOn | None, data: str | Path | None, count: int) -> Sequence[int]:
+    """The first frames of a folder, or of streets (None): held-out ones of the data that a generator was trained on.
+
+    DataError if that data has none.
+    """
+    held_out = None if trained_on is None else trained_on.unseen(data)
+    if held_out is not None and not held_out:
+        raise DataError(f"{data or SYNTHETIC}: the generator was trained on all of its scenes; expected other data")
+    return range(count) if held_out is None else held_out[:count]
 
 
 def _bare(sample: Mapping[str, Any]) -> dict[str, Any]:
@@ -135,6 +152,10 @@ def _bare(sample: Mapping[str, Any]) -> dict[str, Any]:
 _FOUR = (("PSNR", "{psnr_db:.2f}"), ("SSIM", "{ssim:.4f}"), ("MAE", "{mae:.2f}"), ("RMSE", "{rmse:.2f}"))
 _HEADINGS = {"paper": "six", "yaw": "turned", "vehicles": "vehicles", "truck": "truck"}
 _TURNS = ", ".join(f"{yaw:g}" for yaw in YAWS_DEG)
+_OWN_GENERATOR = (
+    f"*{GENERATED}*: `fast`, its holes by {{}}. Frames of the data that it was trained on are held-out ones; the "
+    "paper's were trained on nuScenes from Stable Diffusion's."
+)
 _GENERATOR = (
     f"*{GENERATED}*: `fast`, its holes by the weights in the package, which were trained on synthetic streets alone, "
     "those of the synthetic columns among them, "
@@ -155,7 +176,8 @@ _OTHERS = (
 def paper_report(study: Study) -> str:
     """Markdown tables: the paper's measure, PSNR on all targets, losses, and differences in protocol."""
     parts = [] if not study.means else [_SIX, _six(study), _OTHERS, _others(study), *_losses(study)]
-    caption = [_GENERATOR] if GENERATED in _methods(study) else []
+    of_generator = _GENERATOR if study.generator is None else _OWN_GENERATOR.format(study.generator)
+    caption = [of_generator] if GENERATED in _methods(study) else []
     return "\n\n".join([*parts, *caption, *(f"{where}: {why}" for where, why in study.declined.items()), PROTOCOL])
 
 
@@ -217,7 +239,7 @@ FIGURES: dict[int, tuple[float, ...]] = {2: (0.5, -0.25), 3: (0.2,), 4: (-0.2,),
 """The paper's figures, and the turns of their cameras as shares of the azimuth spacing."""
 
 
-def figure_methods() -> dict[str, Method]:
+def figure_methods(generator: GeneratorNetworks | HoleFiller | None = None) -> dict[str, Method]:
     """The paper's rows and ours, by caption."""
     methods = {
         "DriveSuprim: crop and slide": baseline("crop and slide"),
@@ -225,12 +247,12 @@ def figure_methods() -> dict[str, Method]:
         "FAVS as published": retargeting("paper"),
         "fast, street": retargeting("fast", "street"),
     }
-    if has_generator():
-        methods["fast, street, holes generated"] = retargeting("fast", "street", path="diffusion")
-    return methods
+    return methods | {method.name: method for method in generating("fast, street, holes generated", generator)}
 
 
-def draw_figures(sample: Mapping[str, Any], folder: Path) -> list[Path]:
+def draw_figures(
+    sample: Mapping[str, Any], folder: Path, generator: GeneratorNetworks | HoleFiller | None = None
+) -> list[Path]:
     """Write ``figure2.png`` to ``figure6.png`` of a sample; methods that cannot take the rig's lenses have no row."""
     rig: Rig = sample["rig"]
     images: list[Image] = as_arrays(sample["images"])
@@ -241,7 +263,7 @@ def draw_figures(sample: Mapping[str, Any], folder: Path) -> list[Path]:
         titles, labels = ["Recorded"], [[rig.names[k] for k in order]]
         for share in shares:
             target = paper_target(rig, share)
-            for name, method in figure_methods().items():
+            for name, method in figure_methods(generator).items():
                 try:
                     views = method.render(sample, target)
                 except (CalibrationError, SampleError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, is_dataclass, replace
+from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
 from arbiview_aug.errors import ArbiviewError, GeneratorError, shown
@@ -187,6 +188,21 @@ class GeneratorConfig:
         """(h, w) of the latents."""
         h, w = self.image_size
         return h // self.autoencoder.factor, w // self.autoencoder.factor
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainedOn:
+    """The data that a generator was trained on."""
+
+    data: str  # ``synthetic``, or ``KIND:PATH`` with the absolute path
+    seed: int  # of the streets, and of the split
+    held_out: tuple[int, ...]  # frames that it never saw
+
+    def unseen(self, data: str | Path | None) -> tuple[int, ...] | None:
+        """The held-out frames of a folder, or of streets (None); None for data that it was not trained on."""
+        trained = None if self.data == "synthetic" else Path(self.data.partition(":")[2])
+        asked = None if data is None else Path(str(data).partition(":")[2] or data).resolve()
+        return self.held_out if asked == trained else None
 
 
 # --- configurations ---------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from arbiview_aug.generator.batches import complete_batch
 from arbiview_aug.generator.checkpoint import CONFIG_FILE, load_weights, read_checkpoint, read_config, write_checkpoint
 from arbiview_aug.generator.completion import complete
 from arbiview_aug.generator.conditioning import input_channels
-from arbiview_aug.generator.config import GeneratorConfig, from_plain, paper
+from arbiview_aug.generator.config import GeneratorConfig, TrainedOn, from_plain, paper
 from arbiview_aug.generator.denoiser import Denoiser
 from arbiview_aug.generator.networks import GeneratorNetworks
 from arbiview_aug.generator.pretrained import HoleFiller, PipelineFiller, TorchScriptFiller
@@ -123,6 +123,8 @@ class Generator(GeneratorNetworks):
             generator = cls.from_config(config)
         weights = {name: t.float() if t.is_floating_point() else t for name, t in tensors.items()}
         load_weights(generator, weights, folder, assign=True)
+        if data.get("trained_on") is not None:
+            generator.trained_on = from_plain(TrainedOn, data["trained_on"], f"{folder}/config.json")
         # Inside a user's module its parameters must not be found by the optimiser or DDP.
         return generator.eval().requires_grad_(False)
 
@@ -143,6 +145,8 @@ class Generator(GeneratorNetworks):
         """
         scaled = replace(self.config.autoencoder, scale=self.autoencoder.scale)
         config = {"generator": asdict(replace(self.config, autoencoder=scaled))}
+        if self.trained_on is not None:
+            config["trained_on"] = asdict(self.trained_on)
         write_checkpoint(Path(folder), config, self.state_dict())
 
     # --- use ----------------------------------------------------------------------------------------------------------

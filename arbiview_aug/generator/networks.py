@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 from arbiview_aug.generator.autoencoder import Autoencoder
-from arbiview_aug.generator.config import GeneratorConfig
+from arbiview_aug.generator.config import GeneratorConfig, TrainedOn
 from arbiview_aug.generator.denoiser import Denoiser
 
 
@@ -22,6 +22,7 @@ class GeneratorNetworks(nn.Module):
             for parameter in denoiser.own_parameters():
                 parameter.requires_grad_(True)
         self.calls = 0
+        self.trained_on: TrainedOn | None = None  # set by the training, and read from a folder
 
     @property
     def device(self) -> torch.device:

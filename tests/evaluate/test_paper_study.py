@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from arbiview_aug.__main__ import main
+from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate import paper_study
 from arbiview_aug.evaluate.methods import Method, baseline, retargeting
-from arbiview_aug.evaluate.paper_study import PROTOCOL, PUBLISHED, Study, measure_paper, paper_report
+from arbiview_aug.evaluate.paper_study import (
+    PROTOCOL,
+    PUBLISHED,
+    Study,
+    measure_paper,
+    paper_report,
+    unseen_frames,
+)
+from arbiview_aug.generator.config import TrainedOn
 
 
 def methods() -> list[Method]:
@@ -123,3 +133,21 @@ def test_the_command(
 
 def test_an_empty_study() -> None:
     assert paper_report(Study()) == PROTOCOL
+
+
+def test_a_generator_is_measured_on_frames_that_it_never_saw(no_real_frames: None, tmp_path: Path) -> None:
+    trained_on = TrainedOn(data="synthetic", seed=3, held_out=(2, 5))
+    ((name, streets),) = paper_study._data_sets(None, 4, (16, 44), trained_on)
+    assert name == "synthetic" and [frame.sample["token"] for frame in streets] == ["synthetic-3-2", "synthetic-3-5"]
+    on_frames = TrainedOn(data=f"frames:{tmp_path.resolve()}", seed=3, held_out=(2, 5))
+    assert list(unseen_frames(on_frames, tmp_path, 1)) == [2]
+    assert list(unseen_frames(on_frames, f"frames:{tmp_path}", 3)) == [2, 5]
+    assert list(unseen_frames(on_frames, tmp_path / "other", 3)) == [0, 1, 2]
+    ((_, streets),) = paper_study._data_sets(None, 1, (16, 44), on_frames)
+    assert [frame.sample["token"] for frame in streets] == ["synthetic-0-0"]
+    with pytest.raises(DataError, match="the generator was trained on all of its scenes"):
+        unseen_frames(replace(on_frames, held_out=()), tmp_path, 1)
+    study = Study({"street": {"generator": {}}}, generator="output/tiny")
+    assert "its holes by output/tiny. Frames of the data that it was trained on are held-out ones" in paper_report(
+        study
+    )

@@ -126,7 +126,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Train, score and print the table."""
     arguments = parser().parse_args(argv)
     config = overridden(CONFIGS[arguments.config](), arguments.set)
-    frames = open_frames(arguments.data, config.generator.image_size, scenes=config.scenes, seed=config.seed)
+    frames = open_frames(
+        arguments.data or "synthetic", config.generator.image_size, scenes=config.scenes, seed=config.seed
+    )
     ablate(config, frames, Path(arguments.output), views=arguments.views, show=not arguments.quiet)
     return 0
 

@@ -39,21 +39,25 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
     if not processes.is_main_process:
         say = _discard
     size, seed = config.generator.image_size, config.seed
-    frames = open_frames(arguments.data, size, scenes=config.scenes, seed=seed, device=device)
-    split = frames.split(seed)
     if arguments.command == "evaluate":
         generator = Generator.from_pretrained(output / "generator").to(device)
-        indices, seeds = split.held_out[: arguments.views], range(arguments.seeds)
+        data = arguments.data or (generator.trained_on.data if generator.trained_on else "synthetic")
+        frames = open_frames(data, size, scenes=config.scenes, seed=seed, points=True, device=device)
+        indices, seeds = frames.split(seed).held_out[: arguments.views], range(arguments.seeds)
         if not indices:
-            raise TrainingError("evaluate: expected held-out scenes, this data has too few")
+            raise TrainingError(f"evaluate: {data}: expected at least two scenes, one to train on and one held out")
         scores = held_out_scores(generator, frames, indices, seeds=seeds, steps=arguments.steps, show=show)
+        say(f"{data}, {arguments.steps or generator.config.steps} steps, guidance {generator.config.guidance:g}")
         report(scores, len(seeds), say)
         return 0
+    data = arguments.data or "synthetic"
+    frames = open_frames(data, size, scenes=config.scenes, seed=seed, device=device)
+    split = frames.split(seed)
     if arguments.stage == "autoencoder" and config.autoencoder is None:
         raise TrainingError(f"--stage autoencoder: --config {arguments.config} has none of its own")
     check_weights(config, arguments.weights)
     perceptual = load_perceptual(arguments.vgg_weights) if config.loss.perceptual else None
-    if arguments.data == "synthetic":
+    if data == "synthetic":
         used = [*split.training, *split.validation]
         if device.type != "cpu" and config.workers:
             frames.check_fits(used)

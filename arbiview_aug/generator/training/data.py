@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
@@ -42,10 +43,15 @@ class Split(NamedTuple):
 
 
 class Frames:
-    """Frames of a map-style data set at the training size (h, w), cached in memory; ``scenes`` names each one's."""
+    """Frames of a map-style data set at the training size (h, w), cached in memory.
 
-    def __init__(self, dataset: Dataset[dict[str, Any]], size: tuple[int, int], scenes: Sequence[str]) -> None:
-        self.dataset, self.size, self.scenes = dataset, size, list(scenes)
+    ``scenes`` names each frame's, ``name`` the data set as ``TrainedOn.data`` does.
+    """
+
+    def __init__(
+        self, dataset: Dataset[dict[str, Any]], size: tuple[int, int], scenes: Sequence[str], name: str = ""
+    ) -> None:
+        self.dataset, self.size, self.scenes, self.name = dataset, size, list(scenes), name
         self._cache: LRUCache[int, TrainingFrame] = LRUCache(CACHE_BYTES, _bytes_of)
 
     def __len__(self) -> int:
@@ -87,11 +93,14 @@ class Frames:
             )
 
     def split(self, seed: int = 0) -> Split:
-        """Split 60/20/20 by whole scenes; depends on the seed and the scenes' names alone."""
+        """Split 60/20/20 by whole scenes; depends on the seed and the scenes' names alone.
+
+        One of at least two scenes is held out; two and three have no validation part.
+        """
         names = sorted(set(self.scenes))
         order = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed)).tolist()
         first = max(1, round(SHARES[0] * len(names)))
-        second = first + round(SHARES[1] * len(names))
+        second = max(first, min(first + round(SHARES[1] * len(names)), len(names) - 1))
         part = {names[k]: (place >= first) + (place >= second) for place, k in enumerate(order)}
         parts: tuple[list[int], list[int], list[int]] = ([], [], [])
         for index, scene in enumerate(self.scenes):
@@ -127,24 +136,31 @@ def _unchanged(value: Any) -> Any:
 
 
 def open_frames(
-    data: str, size: tuple[int, int], *, scenes: int, seed: int = 0, device: torch.device | str = "cpu"
+    data: str,
+    size: tuple[int, int],
+    *,
+    scenes: int,
+    seed: int = 0,
+    points: bool = False,
+    device: torch.device | str = "cpu",
 ) -> Frames:
     """Open the frames (h, w) that ``--data`` names: ``KIND:PATH``, or a number of synthetic ``scenes``.
 
-    Streets are rendered on ``device``; workers cannot render on a GPU. TrainingError for an unknown kind, DataError for
-    a folder without such data.
+    Streets are rendered on ``device``; workers cannot render on a GPU. Real samples have LiDAR ``points`` only if asked
+    for. TrainingError for an unknown kind, DataError for a folder without such data.
     """
     kind, _, folder = data.partition(":")
     if data == "synthetic":
         drive = SyntheticDrive(demo_source_rig(size), num_frames=scenes, seed=seed, lidar=False, device=device)
-        return Frames(drive, size, [str(k) for k in range(scenes)])
+        return Frames(drive, size, [str(k) for k in range(scenes)], data)
     if kind not in READERS or not folder:
         raise TrainingError(f"--data {data}: expected synthetic, {' or '.join(f'{name}:PATH' for name in READERS)}")
     found = open_data(data)
-    found.load_points = False
+    found.load_points = points
     if isinstance(found, NuScenesDataset):
-        return Frames(found, size, found.scene_tokens)
-    if not (found.root / SEQUENCE_FILE).is_file():
-        return Frames(found, size, found.tokens)
-    # A drive is cut into blocks: frames next to each other show the same street.
-    return Frames(found, size, [f"block {_BLOCKS * k // len(found)}" for k in range(len(found))])
+        names = found.scene_tokens
+    elif not (found.root / SEQUENCE_FILE).is_file():
+        names = found.tokens
+    else:  # a drive is cut into blocks: frames next to each other show the same street
+        names = [f"block {_BLOCKS * k // len(found)}" for k in range(len(found))]
+    return Frames(found, size, names, f"{kind}:{Path(folder).resolve()}")

@@ -1,31 +1,49 @@
-"""Scores on held-out streets with true pixels: filled target views against Telea's inpainting, inside the holes."""
+"""Scores on held-out frames: filled target views against Telea's inpainting, inside the holes.
+
+Streets are scored by their true pixels, real frames by LiDAR points.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
 from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.evaluate.images import as_arrays
-from arbiview_aug.evaluate.metrics import gradient_energy_ratio
+from arbiview_aug.evaluate.lidar import coloured_points, visible_points
+from arbiview_aug.evaluate.metrics import errors, gradient_energy_ratio
 from arbiview_aug.generator import Generator
+from arbiview_aug.generator.completion import valid_pixels
 from arbiview_aug.generator.inpainting import telea
 from arbiview_aug.generator.training.data import Frames, TrainingFrame
-from arbiview_aug.generator.training.masks import one_of, retarget
+from arbiview_aug.generator.training.masks import mask_bank, one_of, retarget
 from arbiview_aug.generator.training.measure import Interval, bootstrap, hole_psnr
 from arbiview_aug.generator.training.pseudo_views import Rendered, favs
 
 MIN_HOLES = 0.05  # smallest share of holes in a drawn target
 
-_TRIES = 20
+_TRIES = 60
+_MIN_POINTS = 50  # smallest number of LiDAR points that score a target
+
+
+class Case(NamedTuple):
+    """A target with holes, and what scores the images (1, 3, h, w) in [0, 1] that fill them."""
+
+    target: Camera
+    view: Rendered  # FAVS at the target
+    sources: Rig  # the cameras that it was rendered from
+    psnr_db: Callable[[torch.Tensor], float]  # inside the holes
+    truth: torch.Tensor | None  # (3, h, w) in [0, 1], if each pixel is known
 
 
 def held_out_scores(
@@ -34,7 +52,7 @@ def held_out_scores(
     indices: Sequence[int],
     *,
     seeds: Sequence[int] = (0,),
-    steps: int = 4,
+    steps: int | None = None,
     mean_of: int = 8,
     show: bool = True,
 ) -> dict[str, list[float]]:
@@ -45,55 +63,109 @@ def held_out_scores(
     and the one-step regression are scored separately.
 
     Args:
-        generator: The model.
-        frames: Synthetic streets, whose true pixels are known, and the ``indices`` of held-out ones.
+        generator: The model, with its own guidance.
+        frames: Synthetic streets, whose true pixels are known, or samples with LiDAR points; see ``case_of``.
+        indices: Held-out ones.
         seeds: Seeds of targets and noise.
-        steps: Denoising steps of the samples, of which ``mean_of`` make the mean; 0 leaves it out.
+        steps: Denoising steps of the samples, of which ``mean_of`` make the mean; 0 leaves it out. Default: the
+            generator's own. A single step is the regression, which has no samples.
 
     Returns:
         Values of ``telea``, ``one_step`` (if trained), ``sample``, ``mean``; and ``sample_energy``, the gradient energy
-        relative to the truth.
+        relative to the truth, on streets.
 
     Raises:
-        TrainingError: Frames without truth.
+        TrainingError: Frames without truth and points, or without a target that they score.
     """
-    drive = frames.dataset
-    if not isinstance(drive, SyntheticDrive):
-        raise TrainingError("held-out scores: expected synthetic streets, whose true pixels are known")
+    steps = steps or generator.config.steps
     scores: dict[str, list[float]] = {}
     cases = [(seed, index) for seed in seeds for index in indices]
     for seed, index in tqdm(cases, desc="held out", unit="view", disable=not show):
-        frame = frames[index]
-        target, view = _target(frame, torch.Generator().manual_seed(100_003 * (seed + 1) + index))
-        rig = Rig([target], ground_z_m=frame.rig.ground_z_m)
-        truth = drive.render(index, rig).images[0].float()[None, None] / 255
-        holes = ~view.covered[None]
-        inputs = view.images, view.covered, rig, frame.images, frame.rig
-        complete = partial(generator.complete_views, *inputs, confidence=view.confidence, frame=frame.token)
-        filled = {"telea": telea(view.images[0], holes[0, 0])[None]}
+        frame, rng = frames[index], torch.Generator().manual_seed(100_003 * (seed + 1) + index)
+        case = case_of(frames, index, rng)
+        holes = ~case.view.covered[0]
+        rig = Rig([case.target], ground_z_m=frame.rig.ground_z_m)
+        inputs = case.view.images, case.view.covered, rig, frame.images, case.sources
+        complete = partial(generator.complete_views, *inputs, confidence=case.view.confidence, frame=frame.token)
+        filled = {"telea": telea(case.view.images[0], holes)[None]}
         if generator.config.one_step:
             filled["one_step"] = torch.as_tensor(complete(steps=1, seed=0).images)
-        filled["sample"] = torch.as_tensor(complete(steps=steps, seed=seed).images)
-        if mean_of:
+        if steps > 1:
+            filled["sample"] = torch.as_tensor(complete(steps=steps, seed=seed).images)
+        if steps > 1 and mean_of:
             samples = [complete(steps=steps, seed=1000 * (seed + 1) + k).images for k in range(mean_of)]
             filled["mean"] = torch.stack([torch.as_tensor(images) for images in samples]).mean(0)
         for name, images in filled.items():
-            scores.setdefault(name, []).append(float(hole_psnr(images[None], truth, holes)))
-        sample, true = (as_arrays(images)[0] for images in (filled["sample"], truth[0]))
-        energy = gradient_energy_ratio(sample, true, holes[0, 0].numpy())
-        if energy is not None:
-            scores.setdefault("sample_energy", []).append(energy)
+            scores.setdefault(name, []).append(case.psnr_db(images))
+        if "sample" in filled and case.truth is not None:
+            sample, true = (as_arrays(images)[0] for images in (filled["sample"], case.truth[None]))
+            energy = gradient_energy_ratio(sample, true, holes.numpy())
+            if energy is not None:
+                scores.setdefault("sample_energy", []).append(energy)
     return scores
 
 
-def _target(frame: TrainingFrame, rng: torch.Generator) -> tuple[Camera, Rendered]:
-    """Draw a target camera with holes, and render it by FAVS."""
+def case_of(frames: Frames, index: int, rng: torch.Generator) -> Case:
+    """Draw targets until one has holes, and true pixels or points in them; TrainingError if none of many has."""
+    frame, drive = frames[index], frames.dataset
+    points = None if isinstance(drive, SyntheticDrive) else drive[index].get("points")
+    if points is None and not isinstance(drive, SyntheticDrive):
+        raise TrainingError(f"frame {frame.token}: expected LiDAR points, which score real frames, found none")
     for _ in range(_TRIES):
-        camera = replace(retarget(frame.rig[one_of(rng, len(frame.rig))], rng), mask=None)
-        view = favs(frame.images, frame.rig, [camera])
-        if float((~view.covered).float().mean()) >= MIN_HOLES and bool(view.covered.any()):
-            return camera, view
+        place = one_of(rng, len(frame.rig))
+        target = replace(retarget(frame.rig[place], rng), mask=None)
+        if isinstance(drive, SyntheticDrive):
+            case = _street_case(drive, index, frame, target)
+        else:
+            assert points is not None
+            case = _lidar_case(frame, place, target, points.numpy(), rng)
+        if case is not None and float((~case.view.covered).float().mean()) >= MIN_HOLES:
+            return case
     raise TrainingError(f"frame {frame.token}: expected targets with holes of {MIN_HOLES:.0%}, none in {_TRIES} draws")
+
+
+def _street_case(drive: SyntheticDrive, index: int, frame: TrainingFrame, target: Camera) -> Case | None:
+    """A target of a street, scored by its true pixels; None without any covered pixel."""
+    view = favs(frame.images, frame.rig, [target])
+    if not bool(view.covered.any()):
+        return None
+    truth = drive.render(index, Rig([target], ground_z_m=frame.rig.ground_z_m)).images[0].float() / 255
+
+    def psnr_db(images: torch.Tensor) -> float:
+        return float(hole_psnr(images[None], truth[None, None], ~view.covered[None]))
+
+    return Case(target, view, frame.rig, psnr_db, truth)
+
+
+def _lidar_case(
+    frame: TrainingFrame, place: int, target: Camera, points: FloatArray, rng: torch.Generator
+) -> Case | None:
+    """A target of a real frame, scored by LiDAR points (P, >=3) in holes; None with too few of them.
+
+    Points in the holes of a real target have no colour, since no camera saw them. So a drawn mask hides a part of the
+    camera at this place from FAVS and from the generator, and colours the points there.
+    """
+    camera = frame.rig[place]
+    seed = int(torch.randint(2**31, (), generator=rng))
+    hidden, own = ~mask_bank(frame.rig, 1, seed)[0].numpy(), valid_pixels(camera).numpy()
+    cameras = list(frame.rig)
+    cameras[place] = replace(camera, mask=own & ~hidden)
+    sources = frame.rig.with_cameras(cameras)
+    view = favs(frame.images, sources, [target])
+    hider = frame.rig.with_cameras([replace(camera, mask=own & hidden)])
+    coloured = coloured_points(hider, as_arrays([frame.images[place]]), points)
+    index, uv, _ = visible_points(target, coloured.points)
+    h, w = target.size
+    column, row = np.round(uv).astype(int).clip(0, [w - 1, h - 1]).T
+    in_hole = ~view.covered[0].numpy()[row, column]
+    if in_hole.sum() < _MIN_POINTS:
+        return None
+    column, row, colours = column[in_hole], row[in_hole], coloured.colours[index[in_hole]]
+
+    def psnr_db(images: torch.Tensor) -> float:
+        return errors(as_arrays(images)[0][row, column], colours)["psnr_db"]
+
+    return Case(target, view, sources, psnr_db, None)
 
 
 def gains(scores: Mapping[str, Sequence[float]], seeds: int = 1) -> dict[str, Interval]:

@@ -18,7 +18,7 @@ from arbiview_aug.generator.training.pseudo_views import Batch
 @torch.no_grad()
 def sampled(generator: Generator, batch: Batch, *, steps: int, seed: int, pasted: bool = True) -> torch.Tensor:
     """Sample a batch's targets: (B, N, 3, H, W) images in [0, 1], known pixels of FAVS ``pasted`` as at inference."""
-    config = replace(generator.config, steps=steps, guidance=1.0)
+    config = replace(generator.config, steps=steps)
     size = (*batch.truth.shape[:2], config.autoencoder.latent_channels, *config.latent_size)
     noise = torch.randn(size, generator=torch.Generator().manual_seed(seed)).to(batch.truth.device)
     images = denoised(generator, config, batch.geometry, batch.conditions, noise)

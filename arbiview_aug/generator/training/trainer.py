@@ -18,6 +18,7 @@ from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import shown_condition
 from arbiview_aug.generator.conditioning import pooled
+from arbiview_aug.generator.config import TrainedOn
 from arbiview_aug.generator.training.checkpointing import Average, has_state, load_state, save_state, stop_requests
 from arbiview_aug.generator.training.config import TrainConfig
 from arbiview_aug.generator.training.data import Frames, item_workers
@@ -79,6 +80,7 @@ class Trainer:
         generator.autoencoder.requires_grad_(False)
         generator.denoiser.gradient_checkpointing = config.checkpointing
         self.split = frames.split(config.seed)
+        generator.trained_on = TrainedOn(data=frames.name, seed=config.seed, held_out=tuple(self.split.held_out))
         self.perceptual = perceptual.to(self.device) if config.loss.perceptual and perceptual is not None else None
         step = Step(config, generator.denoiser, generator.autoencoder, self.perceptual)
         self.optimiser = torch.optim.AdamW(

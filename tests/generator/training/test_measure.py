@@ -15,13 +15,13 @@ from arbiview_aug.errors import GeneratorError, TrainingError
 from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import shown_condition
-from arbiview_aug.generator.training.data import open_frames
-from arbiview_aug.generator.training.held_out import gains, held_out_scores
+from arbiview_aug.generator.training.data import Frames, open_frames
+from arbiview_aug.generator.training.held_out import case_of, gains, held_out_scores
 from arbiview_aug.generator.training.measure import bootstrap, hole_psnr, picture, sampled
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
 from arbiview_aug.generator.training.step import without_attention
 from tests.generator.small import ring, stirred
-from tests.generator.training.small import config, frames
+from tests.generator.training.small import Pictures, config, frames
 from tests.generator.training.test_pseudo_views import HOLE
 from tests.studies import training
 from tests.studies.training import correct_correspondences, seen_scores, text_of, wrong_rig
@@ -104,8 +104,53 @@ def test_held_out_streets_are_scored_against_their_truth(generator: Generator) -
     assert of_telea["one_step"] == pytest.approx(of_telea["telea"], abs=0.05)  # starts as what it is given
 
 
+class OneColour(Pictures):
+    """Frames whose cameras show one colour each, and a wall of LiDAR points around them."""
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        sample = super().__getitem__(index)
+        for k, image in enumerate(sample["images"]):
+            image[:] = 40 * k + 10
+        azimuth, height = torch.meshgrid(torch.linspace(-3.1, 3.1, 800), torch.linspace(-15, 15, 150), indexing="ij")
+        points = torch.stack([20 * azimuth.cos(), 20 * azimuth.sin(), height], -1).reshape(-1, 3)
+        return sample | {"points": points}
+
+
+def test_real_frames_are_scored_by_lidar_points_in_the_holes(generator: Generator) -> None:
+    """The points have the colours of the camera that is hidden there; what is seen elsewhere does not count."""
+    real = Frames(OneColour(), config().generator.image_size, ["0"] * 5)
+    case = case_of(real, 0, torch.Generator().manual_seed(1))
+    ((place, hidden),) = ((k, camera.mask) for k, camera in enumerate(case.sources) if camera.mask is not None)
+    holes = ~case.view.covered
+    of_camera = torch.full((1, 3, *case.target.size), (40 * place + 10) / 255)
+    assert bool(holes.any()) and case.psnr_db(of_camera) > 100  # of one colour: no difference at all
+    assert case.psnr_db(torch.where(holes[:, None], of_camera + 0.1, 0)) == pytest.approx(20, abs=1e-3)
+    assert not hidden.all()
+    scores = held_out_scores(generator, real, [0, 1], steps=2, mean_of=0, show=False)
+    assert set(scores) == {"telea", "one_step", "sample"} and all(map(math.isfinite, scores["sample"]))
+
+
+def test_scores_are_of_the_runs_own_steps_and_guidance(monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)
+    own = Generator.from_config(replace(config().generator, steps=3, guidance=2.5))
+    used: list[tuple[int, float]] = []
+
+    def denoised(_: Any, settings: Any, geometry: Any, conditions: Any, noise: torch.Tensor) -> torch.Tensor:
+        used.append((settings.steps, settings.guidance))
+        return torch.zeros(*noise.shape[:2], 3, *settings.image_size)
+
+    monkeypatch.setattr("arbiview_aug.generator.completion.denoised", denoised)
+    monkeypatch.setattr("arbiview_aug.generator.training.measure.denoised", denoised)
+    real = Frames(OneColour(), config().generator.image_size, ["0"] * 5)
+    held_out_scores(own, real, [0], mean_of=1, show=False)
+    assert used == [(1, 2.5), (3, 2.5), (3, 2.5)]
+    items = PseudoViews(frames(), [0], config().pseudo_views, own.config, HOLE, seed=0)
+    sampled(own, items[0], steps=3, seed=0)
+    assert used[-1] == (3, 2.5)
+
+
 def test_other_frames_have_no_truth(generator: Generator) -> None:
-    with pytest.raises(TrainingError, match="expected synthetic streets"):
+    with pytest.raises(TrainingError, match="frame frame 0: expected LiDAR points, which score real frames"):
         held_out_scores(generator, frames(), [0], show=False)
 
 
