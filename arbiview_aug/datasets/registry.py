@@ -10,6 +10,7 @@ from arbiview_aug.datasets.drive import Neighbours, Recording
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, FrameFolder
 from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset, table_folders
+from arbiview_aug.datasets.py123d import Py123dDataset, log_folders
 from arbiview_aug.errors import DataError
 
 
@@ -35,6 +36,12 @@ READERS = {
             root, version or table_folders(root)[0], **options
         ),
         writer="arbiview_aug.cli.convert.nuscenes:NuScenes",
+    ),
+    "py123d": Reader(
+        "folder of py123d's logs (with sync.arrow in it)",
+        lambda root: bool(log_folders(root)),
+        lambda root, *, version, clean_masks=False, **options: Py123dDataset(root, **options),
+        writer="arbiview_aug.cli.convert.frame_folders:LogFrames",
     ),
 }
 """Every kind of data set, by its name in ``KIND:PATH``; the first one that recognises a folder opens it."""

@@ -96,9 +96,9 @@ def test_frame_folders_win_over_tables(tmp_path: Path) -> None:
     ("data", "kind", "message"),
     [
         ("nowhere", None, "data nowhere: expected a folder, found none$"),
-        ("kitti:nowhere", None, "expected a folder, found none; the kinds of KIND:PATH are frames, nuscenes"),
+        ("kitti:nowhere", None, "expected a folder, found none; the kinds of KIND:PATH are frames, nuscenes, py123d"),
         ("nuscenes:nowhere", None, "data nowhere: expected a folder, found none$"),
-        (".", "kitti", "expected a kind of frames, nuscenes, got 'kitti'"),
+        (".", "kitti", "expected a kind of frames, nuscenes, py123d, got 'kitti'"),
         (".", None, r"expected a frame folder \(calib.json .* or a nuScenes root .*, found none of them"),
     ],
 )

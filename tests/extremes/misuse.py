@@ -181,7 +181,8 @@ def mutated(value: Any, rng: random.Random, junk: Sequence[Callable[[], Any]] = 
         elif roll < 0.2:
             value.insert(k, copy.copy(value[k]))
         else:
-            value[k] = mutated(value[k], rng, junk)
+            changed = mutated(value[k], rng, junk)
+            value[k : k + 1] = [changed]  # a circle may be shorter now
         return value
     readable = isinstance(value, torch.Tensor) and value.device.type == "cpu" and value.layout == torch.strided
     if readable and "float8" not in str(value.dtype) and rng.random() < 0.75:

@@ -198,6 +198,8 @@ def _begin(settings: Settings, data: Recording, arguments: argparse.Namespace) -
         raise DataError(str(error)) from None
     jobs, shard, shards = _jobs(settings, data, arguments), arguments.shard_index, arguments.num_shards
     facts = {"versions": versions(), "settings": settings.rendering(), "source": jobs.format.facts()}
+    for note in jobs.format.notes():
+        print(f"note: {note}", file=sys.stderr)
     if not (settings.output / FOLDER / "settings.json").is_file():
         jobs.format.check()
         writable_folder(settings.output, str(settings.output))

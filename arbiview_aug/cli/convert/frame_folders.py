@@ -1,24 +1,29 @@
-"""Frame folders out of frame folders: images and masks, a calibration with lenses, the points linked."""
+"""Frame folders out of frame folders and logs: images and masks, a calibration with lenses, points and boxes."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from arbiview_aug.atomic_io import file_name, write_whole
 from arbiview_aug.cli.convert.manifest import Record
 from arbiview_aug.cli.convert.settings import FOLDER, Settings
 from arbiview_aug.cli.convert.writer import Converted, Writer
-from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, POINTS_FILE, SEQUENCE_FILE, FrameFolder
+from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, POINTS_FILE, SEQUENCE_FILE
+from arbiview_aug.datasets.py123d import NOT_SHARED
 from arbiview_aug.errors import DataError
 
 
 class FrameFolders(Writer):
     """A folder for each frame of the source, by its name."""
 
-    def __init__(self, settings: Settings, data: FrameFolder) -> None:
+    def __init__(self, settings: Settings, data: Any) -> None:
         self.output, self.data = settings.output, data
 
     def facts(self) -> dict[str, Any]:
@@ -36,11 +41,7 @@ class FrameFolders(Writer):
         """The calibration, which is written last and makes the folder a frame; the points are kept."""
         calibration, *_ = files = self.data.files(converted.index)
         source = json.loads(calibration.read_text(encoding="utf-8"))
-        calib = converted.rig.to_dict()
-        for entry, names in zip(calib["cameras"], converted.views, strict=True):
-            for suffix, name in names.items():
-                key = {".jpg": "file", ".png": "file"}.get(suffix, suffix.split(".")[1])
-                entry[key] = Path(name).name
+        calib = _calibration(converted)
         kept = {key: value for key, value in source.items() if key not in (*calib, "dataset", "lidar")}
         folder = calibration.parent.name
         points = {f"{folder}/{POINTS_FILE}": files[-1]} if "points" in converted.sample else {}
@@ -62,3 +63,57 @@ class FrameFolders(Writer):
 
     def finished(self) -> list[str]:
         return [SEQUENCE_FILE] if (self.data.root / SEQUENCE_FILE).is_file() else []
+
+
+class LogFrames(FrameFolders):
+    """A folder for each iteration of py123d's logs, with points, boxes and pose of its own."""
+
+    def facts(self) -> dict[str, Any]:
+        root = self.data.root.resolve().name
+        return {"kind": "py123d", "root": root, "licences": self.data.licences, "frames": self.data.tokens}
+
+    def notes(self) -> list[str]:
+        may = "read it before you share the conversion"
+        restricted = "it restricts who may be given derivatives, and the conversion is one"
+        licences = self.data.licences.items()
+        return [f"{of}: licence {name}: {restricted if of in NOT_SHARED else may}" for of, name in licences]
+
+    def rest(self, converted: Converted) -> tuple[dict[str, bytes], dict[str, Path], dict[str, Any]]:
+        """Points, and the calibration with boxes, pose and licence, last."""
+        sample, folder, files = converted.sample, self.data.tokens[converted.index], {}
+        calib = _calibration(converted) | {"licences": self.data.licences, "ego2world": sample["ego2world"].tolist()}
+        if "points" in sample:
+            points = BytesIO()
+            np.save(points, sample["points"].numpy())
+            files[f"{folder}/{POINTS_FILE}"] = points.getvalue()
+            calib["lidar"] = {"file": POINTS_FILE}
+        if "boxes_3d" in sample:
+            boxes = sample["boxes_3d"].tolist()
+            calib["boxes_3d"] = [[None if math.isnan(number) else number for number in row] for row in boxes]
+            calib["box_names"] = sample["box_names"]
+        return {**files, f"{folder}/{CALIBRATION_FILE}": json.dumps(calib, indent=1).encode()}, {}, {}
+
+    def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
+        """Write the sequence of a single drive."""
+        if not self.data.is_one_drive:
+            return [f"no {SEQUENCE_FILE}, which holds one drive: convert each log alone for neighbours"]
+        frames = [
+            {"name": token, "time_s": self.data.time_s(k)}
+            for k, token in enumerate(self.data.tokens)
+            if token not in left_out
+        ]
+        write_whole({self.output / SEQUENCE_FILE: json.dumps({"frames": frames}, indent=1).encode()})
+        return []
+
+    def finished(self) -> list[str]:
+        return [SEQUENCE_FILE] if self.data.is_one_drive else []
+
+
+def _calibration(converted: Converted) -> dict[str, Any]:
+    """The cameras with the names of their files."""
+    calib = converted.rig.to_dict()
+    for entry, names in zip(calib["cameras"], converted.views, strict=True):
+        for suffix, name in names.items():
+            key = {".jpg": "file", ".png": "file"}.get(suffix, suffix.split(".")[1])
+            entry[key] = Path(name).name
+    return calib

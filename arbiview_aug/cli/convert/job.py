@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -124,7 +124,7 @@ class Jobs(Dataset[Done]):
         cameras = rig.to_dict()["cameras"]
         coverage = [round(float(mask.float().mean()), 6) for mask in out["coverage"]]
         sources = self.source_files(index)
-        sums = {path: checksum(path) for path in sources.values()}
+        sums = {path: checksum_once(path) for path in sources.values()}
         record: dict[str, Any] = {
             "token": self.data.tokens[index],
             "ground_z_m": rig.ground_z_m,
@@ -170,6 +170,17 @@ class Jobs(Dataset[Done]):
         if isinstance(self.samples, WithDepth):
             files += [folder.path(self.data.tokens[index]) for folder in self.samples.folders]
         return {_below(path, self.data.root): path for path in files}
+
+
+def checksum_once(path: Path) -> str:
+    """SHA-256 of a source, computed once in a process: many samples may be read from one file."""
+    status = path.stat()
+    return _checksum_of(path, status.st_size, status.st_mtime_ns)
+
+
+@lru_cache(maxsize=64)
+def _checksum_of(path: Path, size: int, time_ns: int) -> str:
+    return checksum(path)
 
 
 def _total_bytes(files: Iterable[Path]) -> int:

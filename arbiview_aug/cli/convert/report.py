@@ -14,7 +14,7 @@ from arbiview_aug.cli.convert.settings import FOLDER, Settings
 from arbiview_aug.cli.convert.views import coverage_of
 from arbiview_aug.datasets.depth_folder import FOLDERS
 from arbiview_aug.datasets.drive import Recording
-from arbiview_aug.datasets.registry import open_data
+from arbiview_aug.datasets.registry import kinds_of, open_data
 from arbiview_aug.evaluate.frames import make_frame
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.evaluate.methods import Method, retargeting
@@ -33,7 +33,8 @@ def converted(settings: Settings) -> Method:
         settings.quality, "auto" if SURFACES[settings.surface].needs in ("points", *FOLDERS) else settings.surface
     )
     manifest, target = Manifest(settings.output), settings.sized_target
-    written = open_data(settings.output, kind=settings.kind, version=settings.version)
+    kind = settings.kind if settings.kind in kinds_of(settings.output) else None  # logs become frame folders
+    written = open_data(settings.output, kind=kind, version=settings.version)
     written.load_points = False  # they may be links that leave the output
 
     def render(sample: Mapping[str, Any], rig: Rig) -> list[RenderedView]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from torch.utils.data import Dataset
 
 from arbiview_aug.atomic_io import checksum
-from arbiview_aug.cli.convert.job import Done, Jobs
+from arbiview_aug.cli.convert.job import Done, Jobs, checksum_once
 from arbiview_aug.errors import described
 
 
@@ -65,7 +65,7 @@ def differences_of_all(jobs: Jobs) -> Iterator[str]:
 
 def _difference(path: Path, recorded: str | None, fix: str) -> Iterator[str]:
     try:
-        found = checksum(path)
+        found = checksum_once(path)
     except OSError as error:
         found = error.strerror or str(error)
     if found != recorded:

@@ -42,6 +42,10 @@ class Writer(ABC):
     def check(self) -> None:
         """Look for everything that could not be written, before hours of work end with it, and raise DataError."""
 
+    def notes(self) -> list[str]:
+        """What the user should know before the conversion starts."""
+        return []
+
     @abstractmethod
     def stem(self, index: int, camera: int, name: str) -> str:
         """Path of a view below the output, without its suffix."""

@@ -1,0 +1,332 @@
+"""Logs of py123d: one Arrow format for Argoverse 2, nuScenes, nuPlan, KITTI-360, PandaSet, Waymo and others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import FloatArray, LensName
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets.drive import (
+    Drive,
+    LazyFrame,
+    Neighbours,
+    Unreadable,
+    WritableRecording,
+    camera_fields,
+    check_neighbours,
+)
+from arbiview_aug.datasets.frame_folder import checked_points
+from arbiview_aug.datasets.image_io import Reduce, check_reduce, reduced_rig
+from arbiview_aug.datasets.nuscenes.tables import rotation_from_quaternion
+from arbiview_aug.environment import optional_package
+from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, described
+
+LICENCES = {
+    "av2-sensor": "CC BY-NC-SA 4.0",
+    "nuscenes": "CC BY-NC-SA 4.0",
+    "nuplan": "CC BY-NC-SA 4.0",
+    "kitti360": "CC BY-NC-SA 3.0",
+    "wod-perception": "Waymo Dataset License Agreement for Non-Commercial Use",
+    "physical-ai-av": "NVIDIA Autonomous Vehicle Dataset License Agreement",
+    "ncore": "NVIDIA Autonomous Vehicle Dataset License Agreement",
+}
+"""Licences by ``LogMetadata.dataset``, as their publishers name them; the licence that came with the data decides."""
+
+NOT_SHARED = ("wod-perception", "physical-ai-av", "ncore")
+"""Data sets whose licences restrict who may be given derivatives."""
+
+_PATTERNS = ("sync.arrow", "*/sync.arrow", "*/*/sync.arrow", "logs/*/*/sync.arrow")
+_MEI_HALF_FOV_RAD, _MEI_ERROR_PX = np.deg2rad(95.0), 0.5
+
+
+def log_folders(root: Path) -> list[Path]:
+    """Folders of the logs below py123d's data root, its ``logs``, or one split; a log's folder is the only one."""
+    found = (sorted(path.parent for path in root.glob(pattern)) for pattern in _PATTERNS)
+    return next(filter(None, found), [])
+
+
+@dataclass(frozen=True)
+class _Log:
+    """A log: py123d's scene over all of it, and its cameras, by py123d's identity, posed in the ego frame."""
+
+    folder: Path
+    scene: Any
+    cameras: Mapping[Any, Camera]
+    ground_z_m: float
+    lidars: Sequence[Any]
+
+    def pose(self, iteration: int, column: str, *modality: Any) -> FloatArray | None:
+        """(4, 4) pose in the world; None where the modality recorded nothing."""
+        found = self.scene.get_modality_column_at_iteration(iteration, column, *modality)
+        return None if found is None else _matrix(found)
+
+
+class Py123dDataset(WritableRecording):
+    """The iterations of py123d's logs, in the order of their folders and times.
+
+    A sample is a dict, everything in the ego frame (py123d's IMU frame) at the iteration's time: ``images`` (N, 3, h,
+    w) uint8 RGB, or a list if sizes differ; ``rig``; ``K`` and ``cam2ego`` float64, cameras posed as at their
+    exposure; ``token`` (split, log and microseconds); ``ego2world`` (4, 4) float64; ``time_s``; and, if the log has
+    them, ``points`` (P, 3) float32, and ``boxes_3d`` (B, 9) float32 with ``box_names``: as of ``NuScenesDataset``.
+    ``neighbours`` are other iterations of the same log. A sample has the cameras that recorded in its iteration.
+
+    A fisheye camera of the MEI model becomes the ``fisheye`` lens that is nearest to it, within half a pixel; its
+    tangential terms are left out, as py123d does. The road is at the bottom of the vehicle's box.
+
+    Args:
+        root: py123d's data root (with ``logs``), the folder of logs, a split, or a log.
+        reduce: Reduce the images to 1, 1/2 or 1/4 of their size.
+        load_points: Whether to read the LiDARs' points.
+        neighbours: Which other frames of the drive come with a sample; None for none.
+        cameras: Names of the cameras to read; None for all.
+
+    Raises:
+        ImportError: py123d is not installed.
+        TypeError: ``neighbours`` is neither ``Neighbours`` nor None.
+        DataError: No log, or one that py123d cannot read.
+        CalibrationError: A camera of a lens that no lens here comes near, such as f-theta.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        reduce: Reduce = 1,
+        load_points: bool = True,
+        neighbours: Neighbours | None = None,
+        cameras: Sequence[str] | None = None,
+    ) -> None:
+        check_reduce(reduce)
+        check_neighbours(neighbours)
+        self.root, self.reduce, self.load_points, self.neighbours = Path(root), reduce, load_points, neighbours
+        scene_of = optional_package("py123d.api.scene.arrow.arrow_scene_api", "py123d").ArrowSceneAPI
+        folders = log_folders(self.root)
+        if not folders:
+            raise DataError(f"py123d {root}: expected logs (folders with sync.arrow), found none")
+        self._logs: list[_Log] = []
+        self.datasets: list[str] = []
+        frames: list[tuple[int, int, int]] = []
+        for folder in folders:
+            with _reading(folder):
+                log = _open(folder, scene_of(folder), cameras)
+                times_us = [int(time.time_us) for time in log.scene.get_all_iteration_timestamps()]
+                dataset = str(log.scene.get_log_metadata().dataset)
+            frames += [(len(self._logs), k, time_us) for k, time_us in enumerate(times_us)]
+            self._logs.append(log)
+            self.datasets.append(dataset)
+        self._frames = frames
+        self.tokens = [f"{self._logs[n].folder.parent.name}-{self._logs[n].folder.name}-{us}" for n, _, us in frames]
+        self._drive = None if neighbours is None else self._find_drive()
+
+    @property
+    def licences(self) -> dict[str, str]:
+        """Licences by the names of the data sets that the logs were made of."""
+        return {name: LICENCES.get(name, "unknown") for name in sorted(set(self.datasets))}
+
+    @property
+    def is_one_drive(self) -> bool:
+        return len(self._logs) == 1
+
+    def time_s(self, index: int) -> float:
+        return 1e-6 * self._frames[index][2]
+
+    def files(self, index: int) -> list[Path]:
+        """Files of the log; images and points that a log names elsewhere are not among them."""
+        folder = self._logs[self._frames[index][0]].folder
+        return sorted(path for path in folder.iterdir() if path.suffix in (".arrow", ".mp4"))
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        index = range(len(self))[index]  # IndexError, and negative indices
+        number, iteration, _ = self._frames[index]
+        log = self._logs[number]
+        with _reading(log.folder):
+            fields = self._fields(index)
+            sample = fields | camera_fields(fields["rig"], self._images(index, fields["rig"]), self.tokens[index])
+            if self.load_points and log.lidars:
+                found = [log.scene.get_lidar_at_iteration(iteration, lidar) for lidar in log.lidars]
+                clouds = [np.asarray(one.point_cloud_3d, np.float32) for one in found if one is not None]
+                if clouds:
+                    sample["points"] = checked_points(np.concatenate(clouds), f"of {self.tokens[index]}")
+        if self._drive is not None and self.neighbours is not None:
+            sample["neighbours"] = [self._neighbour(k) for k in self._drive.neighbours(index, self.neighbours)]
+        return sample
+
+    def _fields(self, index: int) -> dict[str, Any]:
+        """Everything but the images and points."""
+        number, iteration, _ = self._frames[index]
+        log = self._logs[number]
+        ego2world = self._ego2world(index)
+        world2ego = np.linalg.inv(ego2world).astype(np.float64, copy=False)
+        rig = []
+        for identity, camera in log.cameras.items():
+            cam2world = log.pose(iteration, "camera_to_global_se3", "camera", identity)
+            if cam2world is not None:
+                rig.append(replace(camera, cam2ego=world2ego @ cam2world))
+        if not rig:
+            raise DataError(f"py123d log {log.folder}: iteration {iteration}: expected a camera's image, got none")
+        name = self.datasets[number]
+        fields = {"token": self.tokens[index], "time_s": self.time_s(index), "ego2world": torch.from_numpy(ego2world)}
+        fields["rig"] = reduced_rig(Rig(rig, ground_z_m=log.ground_z_m, name=name), self.reduce)
+        detections = log.scene.get_box_detections_se3_at_iteration(iteration)
+        if detections is not None:
+            fields["boxes_3d"] = torch.from_numpy(_boxes(detections, world2ego))
+            fields["box_names"] = [one.attributes.label.serialize() for one in detections]
+        return fields
+
+    def _images(self, index: int, rig: Rig) -> torch.Tensor | list[torch.Tensor]:
+        number, iteration, _ = self._frames[index]
+        log, images = self._logs[number], []
+        for identity, camera in log.cameras.items():
+            if camera.name in rig.names:
+                with _reading(log.folder):
+                    image = log.scene.get_camera_at_iteration(iteration, identity).rgb_image
+                    where = f"py123d log {log.folder}: iteration {iteration}: camera {camera.name!r}"
+                    if image.shape != (*camera.size, 3) or image.dtype != np.uint8:
+                        raise DataError(f"{where}: expected {(*camera.size, 3)} uint8, got {image.shape} {image.dtype}")
+                    images.append(torch.from_numpy(_reduced(image, self.reduce)).permute(2, 0, 1).contiguous())
+        return torch.stack(images) if len({image.shape for image in images}) == 1 else images
+
+    def _ego2world(self, index: int) -> FloatArray:
+        number, iteration, _ = self._frames[index]
+        pose = self._logs[number].pose(iteration, "imu_se3", "ego_state_se3")
+        if pose is None:
+            folder = self._logs[number].folder
+            raise DataError(f"py123d log {folder}: iteration {iteration}: expected the ego's pose, got none")
+        return pose
+
+    def _find_drive(self) -> Drive:
+        positions_m = []
+        for index, (number, _, _) in enumerate(self._frames):
+            with _reading(self._logs[number].folder):
+                positions_m.append(self._ego2world(index)[:3, 3])
+        parts = np.array([number for number, _, _ in self._frames], np.int64)
+        return Drive(np.array(positions_m).reshape(-1, 3), parts)
+
+    def _neighbour(self, index: int) -> LazyFrame:
+        """Another frame of the drive; its images are decoded on access, where a broken one raises."""
+        try:
+            with _reading(self._logs[self._frames[index][0]].folder):
+                fields = self._fields(index)
+        except ArbiviewError as error:
+            return Unreadable({"token": self.tokens[index]}, error)
+        return LazyFrame(fields, partial(self._images, index, fields["rig"]))
+
+
+def _open(folder: Path, scene: Any, names: Sequence[str] | None) -> _Log:
+    cameras = {}
+    for metadata in sorted(scene.get_camera_metadatas().values(), key=lambda one: int(one.camera_id)):
+        if names is None or metadata.camera_name in names:
+            cameras[metadata.camera_id] = _camera(metadata, f"py123d log {folder}")
+    if not cameras:
+        raise DataError(f"py123d log {folder}: expected cameras{f' {names}' if names else ''}, found none of them")
+    ego = scene.get_ego_state_se3_metadata()
+    if ego is None:
+        raise DataError(f"py123d log {folder}: expected the ego's poses (ego_state_se3.arrow), found none")
+    keys = scene.get_all_modality_metadatas()
+    lidars = ["lidar_merged"] if "lidar.lidar_merged" in keys else [*scene.get_lidar_metadatas()]
+    return _Log(folder, scene, cameras, float(ego.center_to_imu_se3.z - ego.half_height), lidars)
+
+
+def _camera(metadata: Any, where: str) -> Camera:
+    """A camera at the ego's origin; CalibrationError for another lens."""
+    where = f"{where}: camera {metadata.camera_name!r}"
+    lens: LensName
+    distortion: Any
+    model = metadata.camera_model.serialize()
+    if model == "pinhole" and metadata.intrinsics is not None:
+        given, bent = metadata.intrinsics, None if metadata.is_undistorted else metadata.distortion
+        K = np.array([[given.fx, given.skew, given.cx], [0, given.fy, given.cy], [0, 0, 1]])
+        lens, distortion = "pinhole", ()
+        if bent is not None:
+            lens, distortion = "radtan", (bent.k1, bent.k2, bent.p1, bent.p2, bent.k3)
+    elif model == "fisheye_mei" and metadata.projection is not None and metadata.mirror_parameter is not None:
+        lens, (K, distortion) = "fisheye", _fisheye(metadata, where)
+    else:
+        raise CalibrationError(
+            f"{where}: expected a calibrated pinhole or fisheye MEI lens, got {model}; name the other cameras, cameras="
+        )
+    size = {"width_px": int(metadata.width), "height_px": int(metadata.height)}
+    coefficients = tuple(map(float, distortion))
+    try:
+        return Camera(
+            name=metadata.camera_name,
+            K=K,
+            cam2ego=np.eye(4),
+            lens=lens,
+            distortion=coefficients,
+            **size,  # type: ignore[arg-type]
+        )
+    except CalibrationError as error:
+        raise CalibrationError(f"{where}: {error}") from None
+
+
+def _fisheye(metadata: Any, where: str) -> tuple[FloatArray, FloatArray]:
+    """K and k1..k4 of the ``fisheye`` lens nearest to a MEI lens, by least squares over the image."""
+    xi, to = float(metadata.mirror_parameter), metadata.projection
+    k1, k2 = (0.0, 0.0) if metadata.distortion is None else (metadata.distortion.k1, metadata.distortion.k2)
+    corner = np.maximum([to.u0, to.v0], [metadata.width - 1 - to.u0, metadata.height - 1 - to.v0])
+    reach = float(np.hypot(*(corner / [to.gamma1, to.gamma2])))
+    theta = np.linspace(0.0, _MEI_HALF_FOV_RAD, 2000)[1:]
+    rho = np.sin(theta) / np.maximum(np.cos(theta) + xi, 1e-9)
+    radius = rho * (1 + k1 * rho**2 + k2 * rho**4)
+    end = int(np.argmax(np.append((np.diff(radius) <= 0) | (radius[1:] > reach), True))) + 1
+    theta, radius = theta[:end], radius[:end]
+    powers = np.stack([theta**n for n in (3, 5, 7, 9)], axis=-1)
+    wanted = radius * (1 + xi) - theta  # the slope on the axis is 1 / (1 + xi)
+    found = np.linalg.lstsq(powers, wanted, rcond=None)[0]
+    error_px = float(np.abs(powers @ found - wanted).max() / (1 + xi) * max(to.gamma1, to.gamma2))
+    if not error_px <= _MEI_ERROR_PX:
+        raise CalibrationError(
+            f"{where}: expected a MEI lens within {_MEI_ERROR_PX} px of a fisheye lens, got {error_px:.2f} px"
+        )
+    K = np.array([[to.gamma1 / (1 + xi), 0, to.u0], [0, to.gamma2 / (1 + xi), to.v0], [0, 0, 1]])
+    return K, found
+
+
+def _boxes(detections: Any, world2ego: FloatArray) -> Any:
+    """(B, 9) float32 in the ego frame."""
+    rows = np.array([one.bounding_box_se3.array for one in detections], np.float64).reshape(-1, 10)
+    moved = world2ego[:3, :3] @ rotation_from_quaternion(rows[:, 3:7])
+    yaw = np.arctan2(moved[:, 1, 0], moved[:, 0, 0])
+    given = [one.velocity_3d for one in detections]
+    velocity = np.array([[np.nan] * 3 if v is None else [v.x, v.y, v.z] for v in given]).reshape(-1, 3)
+    centre = rows[:, :3] @ world2ego[:3, :3].T + world2ego[:3, 3]
+    return np.column_stack([centre, rows[:, 7:10], yaw, (velocity @ world2ego[:3, :3].T)[:, :2]]).astype(np.float32)
+
+
+def _matrix(pose: Any) -> FloatArray:
+    """(4, 4) of x y z and a quaternion w x y z."""
+    numbers = np.array(pose, np.float64)
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation_from_quaternion(numbers[3:7]), numbers[:3]
+    return matrix
+
+
+def _reduced(image: Any, reduce: int) -> Any:
+    """As PNGs of other readers are reduced: about the outer top-left corner."""
+    if reduce == 1:
+        return np.ascontiguousarray(image)
+    h, w = image.shape[:2]
+    image = cv2.copyMakeBorder(image, 0, -h % reduce, 0, -w % reduce, cv2.BORDER_REPLICATE)
+    return cv2.resize(image, (-(-w // reduce), -(-h // reduce)), interpolation=cv2.INTER_AREA)
+
+
+@contextmanager
+def _reading(folder: Path) -> Iterator[None]:
+    """Turn errors of py123d and pyarrow, which are of many types, into DataError."""
+    try:
+        yield
+    except ArbiviewError:
+        raise
+    except Exception as error:
+        raise DataError(f"py123d log {folder}: expected a log that py123d reads, got {described(error)}") from None
