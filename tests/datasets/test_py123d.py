@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from arbiview_aug import RetargetedDataset, RigRetarget, collate, load_rig
+from arbiview_aug import Camera, RetargetedDataset, RigRetarget, collate, load_rig
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets import FrameFolder, Neighbours, Py123dDataset, open_data
 from arbiview_aug.datasets import py123d as logs
@@ -154,8 +154,14 @@ def test_kitti_360s_fisheye_is_within_a_tenth_of_a_pixel() -> None:
         projection=SimpleNamespace(gamma1=1336.3220825849971, gamma2=1335.8094720005, u0=716.9433, v0=705.7645),
         **{"width": 1400, "height": 1400, "camera_name": "image_02"},
     )
-    K, _ = logs._fisheye(metadata, "")
-    assert K[0, 0] == pytest.approx(1336.322 / 3.2134, rel=1e-4)
+    K, coefficients = logs._fisheye(metadata, "")
+    theta = np.deg2rad(np.linspace(0.1, 95, 500))
+    p = np.stack([np.sin(theta), 0 * theta, np.cos(theta)], -1)
+    camera = Camera(
+        name="x", width_px=1400, height_px=1400, K=K, cam2ego=np.eye(4), lens="fisheye", distortion=coefficients
+    )
+    theirs = d.FisheyeMEICameraMetadata.cam2image(metadata, p)
+    assert np.abs(camera.project(p).uv[:, 0] - theirs[0]).max() < 0.1  # 0.04 px
 
 
 def test_other_lenses_and_broken_logs_are_named(root: Path, tmp_path: Path) -> None:
