@@ -71,7 +71,7 @@ class RigRetargetMultiView:
             )
 
         if "img_inputs" in results:
-            retarget = of_frame({**results.get("curr", {}), **results})
+            retarget = of_frame({**(results.get("curr") or {}), **results})
             return retarget_img_inputs(
                 results, retarget, names=self.names, ground_z_m=self.ground_z_m, mean_std=self.img_norm
             )
