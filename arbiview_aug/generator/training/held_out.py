@@ -11,6 +11,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from tqdm import tqdm
 
@@ -20,7 +21,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.evaluate.images import as_arrays
-from arbiview_aug.evaluate.lidar import coloured_points, visible_points
+from arbiview_aug.evaluate.lidar import visible_points
 from arbiview_aug.evaluate.metrics import errors, gradient_energy_ratio
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import valid_pixels
@@ -29,10 +30,12 @@ from arbiview_aug.generator.training.data import Frames, TrainingFrame
 from arbiview_aug.generator.training.masks import mask_bank, one_of, retarget
 from arbiview_aug.generator.training.measure import Interval, bootstrap, hole_psnr
 from arbiview_aug.generator.training.pseudo_views import Rendered, favs
+from arbiview_aug.scene.point_cloud import own_car
 
 MIN_HOLES = 0.05  # smallest share of holes in a drawn target
 
 _TRIES = 60
+_Z_BUFFER_WIDTH = 400  # smallest width at which occluded points are found: its cells have 8 pixels
 _MIN_POINTS = 50  # smallest number of LiDAR points that score a target
 
 
@@ -152,20 +155,31 @@ def _lidar_case(
     cameras[place] = replace(camera, mask=own & ~hidden)
     sources = frame.rig.with_cameras(cameras)
     view = favs(frame.images, sources, [target])
-    hider = frame.rig.with_cameras([replace(camera, mask=own & hidden)])
-    coloured = coloured_points(hider, as_arrays([frame.images[place]]), points)
-    index, uv, _ = visible_points(target, coloured.points)
-    h, w = target.size
-    column, row = np.round(uv).astype(int).clip(0, [w - 1, h - 1]).T
+    points = points[~own_car(points), :3].astype(np.float64)
+    index, row, column = _pixels_of(camera, points)
+    is_hidden = (own & hidden)[row, column]
+    colours = as_arrays([frame.images[place]])[0][row, column][is_hidden]
+    index, row, column = _pixels_of(target, points[index[is_hidden]])
     in_hole = ~view.covered[0].numpy()[row, column]
     if in_hole.sum() < _MIN_POINTS:
         return None
-    column, row, colours = column[in_hole], row[in_hole], coloured.colours[index[in_hole]]
+    row, column, wanted = row[in_hole], column[in_hole], colours[index[in_hole]]
 
     def psnr_db(images: torch.Tensor) -> float:
-        return errors(as_arrays(images)[0][row, column], colours)["psnr_db"]
+        return errors(as_arrays(images)[0][row, column], wanted)["psnr_db"]
 
     return Case(target, view, sources, psnr_db, None)
+
+
+def _pixels_of(
+    camera: Camera, points: FloatArray
+) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Indices of the visible points (P, 3), and the rows and columns of the pixels that they fall on."""
+    h, w = camera.size
+    scale = max(1, -(-_Z_BUFFER_WIDTH // w))
+    index, uv, _ = visible_points(camera.resize((scale * h, scale * w)), points)
+    column, row = np.floor((uv + 0.5) / scale).astype(np.intp).clip(0, [w - 1, h - 1]).T
+    return index, row, column
 
 
 def gains(scores: Mapping[str, Sequence[float]], seeds: int = 1) -> dict[str, Interval]:

@@ -21,7 +21,7 @@ from arbiview_aug.generator.training.measure import bootstrap, hole_psnr, pictur
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
 from arbiview_aug.generator.training.step import without_attention
 from tests.generator.small import ring, stirred
-from tests.generator.training.small import Pictures, config, frames
+from tests.generator.training.small import OneColour, config, frames
 from tests.generator.training.test_pseudo_views import HOLE
 from tests.studies import training
 from tests.studies.training import correct_correspondences, seen_scores, text_of, wrong_rig
@@ -102,18 +102,6 @@ def test_held_out_streets_are_scored_against_their_truth(generator: Generator) -
     untrained = Generator.from_config(config().generator)
     of_telea = held_out_scores(untrained, streets, [0], steps=2, mean_of=0, show=False)
     assert of_telea["one_step"] == pytest.approx(of_telea["telea"], abs=0.05)  # starts as what it is given
-
-
-class OneColour(Pictures):
-    """Frames whose cameras show one colour each, and a wall of LiDAR points around them."""
-
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        sample = super().__getitem__(index)
-        for k, image in enumerate(sample["images"]):
-            image[:] = 40 * k + 10
-        azimuth, height = torch.meshgrid(torch.linspace(-3.1, 3.1, 800), torch.linspace(-15, 15, 150), indexing="ij")
-        points = torch.stack([20 * azimuth.cos(), 20 * azimuth.sin(), height], -1).reshape(-1, 3)
-        return sample | {"points": points}
 
 
 def test_real_frames_are_scored_by_lidar_points_in_the_holes(generator: Generator) -> None:

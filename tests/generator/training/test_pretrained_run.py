@@ -1,0 +1,118 @@
+"""The whole command line on Stable Diffusion's layout, with 4 and 9 channels: tiny random folders, from ``--weights``
+to a filler of holes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from arbiview_aug.__main__ import main as package_main
+from arbiview_aug.evaluate import paper_study
+from arbiview_aug.generator import Generator, load_generator
+from arbiview_aug.generator.checkpoint import read_checkpoint
+from arbiview_aug.generator.config import GeneratorConfig, TrainedOn
+from arbiview_aug.generator.training import command
+from arbiview_aug.generator.training.config import CONFIGS, overridden
+from arbiview_aug.generator.training.data import Frames
+from arbiview_aug.generator.training.trainer import Trainer
+from arbiview_aug.train import main
+from arbiview_aug.transforms.rig_retarget import RigRetarget
+from tests.generator.test_stable_diffusion import saved
+from tests.generator.training.small import OneColour
+
+SETTINGS = (
+    "generator.image_size=[32, 48]",
+    "generator.unet.widths=[32, 32, 64, 64]",
+    "generator.unet.heads=[2, 2, 2, 2]",
+    "generator.unet.context_width=24",
+    "generator.unet.layers=1",
+    "generator.unet.norm_groups=8",
+    "generator.autoencoder.widths=[16, 16, 16, 16]",
+    "generator.autoencoder.layers=1",
+    "generator.autoencoder.norm_groups=8",
+    "generator.steps=2",
+    "loss.perceptual=0",
+    "precision=no",
+    "workers=0",
+    "batch=1",
+    "steps=2",
+    "validation_items=1",
+    "pseudo_views.mask_bank=2",
+)
+
+
+def saved_with_text_encoder(folder: Path, settings: GeneratorConfig) -> Path:
+    transformers = pytest.importorskip("transformers")
+    size = {"hidden_size": 24, "intermediate_size": 32, "num_attention_heads": 2, "num_hidden_layers": 1}
+    encoder = transformers.CLIPTextModel(transformers.CLIPTextConfig(**size, vocab_size=49408))
+    encoder.save_pretrained(folder / "text_encoder")
+    return saved(folder, settings)
+
+
+@pytest.mark.parametrize("name", [pytest.param("paper", marks=pytest.mark.slow), "inpaint"])
+def test_from_pretrained_weights_to_filled_holes(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real = OneColour()
+    monkeypatch.setattr(
+        command, "open_frames", lambda *_, **__: Frames(real, (32, 48), [str(k) for k in range(5)], "synthetic")
+    )
+    settings = overridden(CONFIGS[name](), SETTINGS)
+    weights = saved_with_text_encoder(tmp_path / "weights", settings.generator)
+    arguments = ["--config", name, "--quiet", *(f"--set={setting}" for setting in SETTINGS)]
+
+    def train(folder: str) -> int:
+        return main([*arguments, "--weights", str(weights), "--output", str(tmp_path / folder)])
+
+    assert main([*arguments, "--output", str(tmp_path / "without")]) == 2
+    expected = "Stable Diffusion 1.5 inpainting in" if settings.generator.inpainting else "Stable Diffusion 1.5 in"
+    assert expected in capsys.readouterr().err
+    # --- trained at once, and stopped after a step and resumed
+    assert train("whole") == 0
+    plain = Trainer.train_step
+
+    def stopped(self: Trainer, batch: Any) -> dict[str, float]:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return plain(self, batch)
+
+    monkeypatch.setattr(Trainer, "train_step", stopped)
+    assert train("parts") == 0
+    monkeypatch.setattr(Trainer, "train_step", plain)
+    assert train("parts") == 0
+    assert "stopped after step 1 of 2" in capsys.readouterr().out
+    whole, parts = (read_checkpoint(tmp_path / folder / "state")[1] for folder in ("whole", "parts"))
+    assert whole.keys() == parts.keys() and all(torch.equal(whole[key], parts[key]) for key in whole)
+    assert any(".lora_B." in key for key in whole) == bool(settings.generator.lora_rank)
+    # --- evaluated as it samples: its own steps and guidance
+    assert main(["evaluate", "--quiet", "--output", str(tmp_path / "whole"), "--views", "1"]) == 0
+    printed = capsys.readouterr().out
+    assert f"synthetic, 2 steps, guidance {settings.generator.guidance:g}" in printed and "  sample " in printed
+    # --- used as a filler
+    generator = load_generator(tmp_path / "whole" / "generator")
+    assert isinstance(generator, Generator)
+    split = Frames(real, (32, 48), [str(k) for k in range(5)]).split()
+    assert generator.trained_on == TrainedOn(data="synthetic", seed=0, held_out=tuple(split.held_out))
+    sample = real[split.held_out[0]]
+    target = sample["rig"].turned(pitch_deg=12)
+    seen = RigRetarget(target, holes="black")(sample)
+    filled = RigRetarget(target, path="diffusion", generator=generator)(sample)
+    holes = ~seen["coverage"]
+    assert torch.equal(filled["generated"], holes) and bool(holes.any())
+    known = seen["coverage"][:, None].expand_as(seen["images"])
+    assert torch.equal(filled["images"][known], seen["images"][known])
+    assert float(filled["images"][~known].float().std()) > 0
+    # --- scored in the paper's tables
+    if name == "paper":
+        monkeypatch.setattr(paper_study, "SETS", ("truck",))
+        monkeypatch.delenv("ARBIVIEW_DATA", raising=False)
+        paper = ["evaluate", "--paper", "--generator", str(tmp_path / "whole" / "generator")]
+        assert package_main([*paper, "--size", "24x66", "--frames", "1", "--output", str(tmp_path / "paper")]) == 0
+        printed = capsys.readouterr().out
+        assert "| generator " in printed and "Frames of the data that it was trained on are held-out ones" in printed
+        assert "generator" in json.loads((tmp_path / "paper" / "paper.json").read_text())["means"]["synthetic"]
