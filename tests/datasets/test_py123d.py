@@ -81,7 +81,9 @@ def write_log(root: Path, name: str = "drive", dataset: str = "kitti360", more: 
     assert writer.reset(d.LogMetadata(dataset, f"{dataset}_train", name, "somewhere"))
     center = g.PoseSE3.from_R_t(np.eye(3), np.array([1.4, 0.0, 0.5]))
     ego = d.EgoStateSE3Metadata("car", 1.9, 4.6, 1.6, 2.7, center, IDENTITY)
-    lidar = d.LidarMetadata("top", d.LidarID.LIDAR_TOP, IDENTITY)
+    lidar: Any = d.LidarMetadata("top", d.LidarID.LIDAR_TOP, IDENTITY)
+    if name == "merged":
+        lidar = d.LidarMergedMetadata({d.LidarID.LIDAR_TOP: lidar})
     boxes = d.BoxDetectionsSE3Metadata(KITTI360BoxDetectionLabel)
     rng = np.random.default_rng(0)
     for k in range(3):
@@ -212,11 +214,13 @@ def test_demo_loader_and_convert(root: Path, tmp_path: Path, capsys: pytest.Capt
 
 def test_licences_that_restrict_derivatives(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_log(tmp_path / "source", dataset="physical-ai-av")
-    write_log(tmp_path / "source", "second", dataset="physical-ai-av")
+    write_log(tmp_path / "source", "merged", dataset="physical-ai-av")
     assert main(command(f"py123d:{tmp_path / 'source'}", tmp_path / "new")) == 0
     said = capsys.readouterr().err
     assert "Agreement: it restricts who may be given derivatives, and the conversion is one" in said
     assert said.index("restricts") < said.index("frame/s") and "no sequence.json" in said
     assert not (tmp_path / "new" / "sequence.json").exists()
-    drive = open_data(tmp_path / "source", neighbours=Neighbours(count=9))[2]
+    data = open_data(tmp_path / "source", neighbours=Neighbours(count=9))
+    assert "-merged-" in data.tokens[3] and torch.equal(data[3]["points"], data[0]["points"])
+    drive = data[2]
     assert all("-drive-" in frame["token"] for frame in drive["neighbours"])

@@ -119,6 +119,16 @@ def test_mutated_inputs_are_checked() -> None:
             works_or_refuses(lambda sample=sample: str(find_mistakes(sample)), seed, (ArbiviewError,))
 
 
+def test_samples_that_hold_themselves() -> None:
+    """Their containers are read once: two references in each of 60 lists would be 2^60 paths."""
+    many: list[Any] = []
+    for _ in range(60):
+        many = [many, many]
+    sample = {"images": torch.zeros(2, 3, *misuse.SIZE), "rig": misuse.rig(), "meta": [misuse.circle(), many]}
+    with limited(HANG_S):
+        assert RigRetarget(TARGET)(sample)["images"].isfinite().all()
+
+
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("thousands", few_or_all(2, 10, "thousand"))
 def test_thousands_of_mutated_inputs(thousands: int, frame_folder: Path, worst: Worst) -> None:

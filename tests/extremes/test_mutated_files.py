@@ -20,7 +20,7 @@ import pytest
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets import FrameFolder, Neighbours
 from arbiview_aug.datasets.depth_folder import DepthFolder
-from arbiview_aug.errors import ArbiviewError
+from arbiview_aug.errors import ArbiviewError, DataError, GeneratorError
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.training.checkpointing import saved_config
 from arbiview_aug.generator.training.config import TrainConfig
@@ -155,6 +155,24 @@ def check(target: Target, seeds: range) -> None:
 
 def test_mutated_files(target: Target) -> None:
     check(target, range(60))
+
+
+def test_what_the_mutations_found(target: Target) -> None:
+    """Each was another package's exception."""
+    frames = [{"name": "0000", "time_s": 10**400}, {"name": "0001", "time_s": 1.0}]
+    (target.drive / "sequence.json").write_text(json.dumps({"frames": frames}))
+    with pytest.raises(DataError, match=r"sequence\.json: expected .* got OverflowError"):
+        FrameFolder(target.drive)
+    (target.generator / "config.json").write_text("[" * 3000)
+    with pytest.raises(GeneratorError, match=r"config\.json: expected a generator's configuration"):
+        Generator.from_pretrained(target.generator)
+    with np.load(target.depths.path("0000")) as file:
+        arrays = {name: file[name] for name in file.files}
+    np.savez(target.depths.path("0000"), **{**arrays, "format": np.array(np.inf)})
+    with pytest.raises(DataError, match=r"0000\.npz: expected depth of a frame, got OverflowError; delete it"):
+        target.depths.read("0000", FRAMES)
+    for name in ("drive/sequence.json", "generator/config.json", "depth/0000.npz"):
+        (target.root / name).write_bytes(target.sound[name])
 
 
 @pytest.mark.timeout(3600)

@@ -68,7 +68,7 @@ class Writer(ABC):
 
     def kept_path(self, name: str, where: str = "") -> Path:
         """Path of a kept file in the output: it may be a link that leaves the output, its folder may not."""
-        what = f"--output {self.output}: {where}"
+        what = f"--output {self.output}{where and f': {where}'}"
         check_name(name, what)
         folder, _, file = name.rpartition("/")
         return inside(self.output, folder or ".", what) / file
