@@ -164,26 +164,30 @@ def camera_fields(rig: Rig, images: Any, token: str) -> dict[str, Any]:
 
 
 class LazyFrame(Mapping[str, Any]):
-    """A neighbour with ``fields`` (pose, calibration, time, token), whose images ``load`` decodes on first access."""
+    """A neighbour with ``fields`` (pose, calibration, time, token), whose images ``load`` decodes on first access, and
+    whose LiDAR points ``points`` reads, if given."""
 
-    def __init__(self, fields: Mapping[str, Any], load: Callable[[], Any]) -> None:
-        self._fields, self._load = dict(fields), load
+    def __init__(
+        self, fields: Mapping[str, Any], load: Callable[[], Any], points: Callable[[], Any] | None = None
+    ) -> None:
+        self._fields = dict(fields)
+        self._loads = {"images": load} if points is None else {"images": load, "points": points}
         self.is_broken = False  # whether an access failed
 
     def __getitem__(self, key: str) -> Any:
-        if key == "images" and key not in self._fields:
+        if key in self._loads and key not in self._fields:
             try:
-                self._fields[key] = self._load()
+                self._fields[key] = self._loads[key]()
             except (ArbiviewError, OSError):
                 self.is_broken = True
                 raise
         return self._fields[key]
 
     def __iter__(self) -> Iterator[str]:
-        return iter({**self._fields, "images": None})
+        return iter({**self._fields, **self._loads})
 
     def __len__(self) -> int:
-        return len({**self._fields, "images": None})
+        return len({**self._fields, **self._loads})
 
     def __repr__(self) -> str:
         return f"LazyFrame({', '.join(self)})"

@@ -207,7 +207,8 @@ class FrameFolder(WritableRecording):
             fields |= {"rig": rig, **self._boxes_pose_time(calib, frame)}
         except ArbiviewError as error:
             return Unreadable(fields, error)
-        return LazyFrame(fields, partial(self._images, calib, frame, rig))
+        points = partial(_read_points, calib, frame) if self.load_points else None
+        return LazyFrame(fields, partial(self._images, calib, frame, rig), points)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_last_rig": None}

@@ -24,6 +24,7 @@ from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.render.atlas import AtlasLayout
 from arbiview_aug.render.view_plan import ViewPlan
 from arbiview_aug.render.view_planner import ViewPlanner
+from arbiview_aug.scene.point_cloud import seen_through
 from arbiview_aug.scene.scene import SURFACES, Scene
 
 
@@ -108,6 +109,7 @@ def compile_kernels() -> None:
     )
     target = Rig([camera for camera in views if camera.name.endswith("0")])
     scene, config = Scene(boxes=boxes, points=wall), FavsConfig(certainty=True)
+    seen_through(wall, wall, target[0].center_m)
     for surface in ("ground", "objects", "lidar"):
         plan = build_plan(source, target, surface=surface, config=config, scene=scene)
     kernels.read_ahead(np.zeros((1, 3), np.uint8), 3, plan.targets[0].at.packed, plan.targets[0].source_camera)

@@ -15,13 +15,17 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import ArbiviewError, SampleError, SampleTypeError
 from arbiview_aug.sample.images import check_container, checked_images
 from arbiview_aug.sample.inputs import Frame, frame_from, numbers, of_frames
-from arbiview_aug.scene.boxes import checked_boxes, moved_boxes
+from arbiview_aug.scene.boxes import carried, checked_boxes, moved_boxes
+from arbiview_aug.scene.point_cloud import checked_points, own_car, seen_through
 from arbiview_aug.scene.surface import Points
 
 MAX_NEIGHBOURS = 120  # frame numbers are int8
 
 STILL_M, STILL_DEG = 0.1, 0.5
 """A frame with less motion than this sees what the current one sees."""
+
+MAX_SWEEPS = 2
+"""So many neighbours, the nearest, lend their LiDAR points: four win 0.1 dB on synthetic streets, in twice the time."""
 
 MAX_TRAVEL_M = 60.0
 """Largest distance to a neighbour: farther on, none of the ground nearby is in view."""
@@ -50,6 +54,7 @@ class Neighbour:
         seconds: Time from the current frame to it; None if either has no time.
         boxes: (B, 7) labelled objects at its time, in the current ego frame; None if unknown.
         boxes_now: (B, 7) labelled objects in the current frame; None if unknown.
+        ego2ego: (4, 4) its ego frame to the current one.
         given: The entry itself; its images are read lazily.
     """
 
@@ -61,6 +66,7 @@ class Neighbour:
     seconds: float | None
     boxes: FloatArray | None
     boxes_now: FloatArray | None
+    ego2ego: FloatArray
     given: Mapping[str, Any]
 
     @property
@@ -79,6 +85,16 @@ class Neighbour:
         if self.boxes is None or self.boxes_now is None:
             return None
         return moved_boxes(self.boxes_now, self.boxes)
+
+    def points(self) -> FloatArray | None:
+        """(P, 3) its points in the current ego frame, those of labelled objects where these are now; None without."""
+        value = self.given.get("points")
+        if value is None:
+            return None
+        (own,) = of_frames("points", value, 1, ())
+        own = checked_points(own)
+        points = own[~own_car(own)] @ self.ego2ego[:3, :3].T + self.ego2ego[:3, 3]
+        return points if self.boxes is None or self.boxes_now is None else carried(points, self.boxes, self.boxes_now)
 
     def images(self, like: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
         """Its images, checked, with the dtype and device of the current ones."""
@@ -99,9 +115,9 @@ def neighbours_of_frames(
 
     ``neighbours`` is a list of mappings, each another frame of the same rig (in a batch, a list of such lists):
     ``images``; ``ego2ego`` (4, 4), its ego frame to the current one, or ``ego2world`` as in the sample; optionally
-    ``boxes_3d`` in its own ego frame, ``time_s``, ``token``, and its calibration where it differs. K and cam2ego alone
-    keep the current lenses and masks. Without own boxes, the sample's are moved by their velocities (columns 7 and 8,
-    m/s in the ego frame) if both frames have a time and all velocities are finite.
+    ``points`` and ``boxes_3d`` in its own ego frame, ``time_s``, ``token``, and its calibration where it differs. K and
+    cam2ego alone keep the current lenses and masks. Without own boxes, the sample's are moved by their velocities
+    (columns 7 and 8, m/s in the ego frame) if both frames have a time and all velocities are finite.
 
     Frames at the same place are left out silently, unusable ones with a warning.
     """
@@ -134,6 +150,24 @@ def neighbours_of_frames(
     return found
 
 
+def points_of_neighbours(rig: Rig, points: Points, neighbours: Sequence[Neighbour], warn: Warn) -> FloatArray | None:
+    """(P, 3) LiDAR points of other frames in the current ego frame, metres; None if there are none.
+
+    Points that the frame's own (Q, 3) contradict are left out, and points that cannot be read, with a warning.
+    """
+    found: list[FloatArray] = []
+    origin = np.mean([camera.center_m for camera in rig], axis=0)
+    for neighbour in neighbours[:MAX_SWEEPS]:
+        try:
+            others = neighbour.points()
+        except (ArbiviewError, OSError) as error:
+            warn(f"points of {neighbour.name}", f"points of neighbour {neighbour.name} are left out: {error}")
+            continue
+        if others is not None:
+            found.append(others[~seen_through(points, others, origin)])
+    return np.concatenate(found) if found else None
+
+
 def warn_lost(warn: Warn, name: str, error: Exception) -> None:
     """Warn that a neighbour is not used."""
     warn(f"neighbour {name}", f"neighbour {name} is left out: {error}; the frame is rendered without it")
@@ -161,7 +195,7 @@ def _neighbour(
     cameras = [camera.moved(ego2ego) for camera in own]
     rig = Rig(cameras, ground_z_m=frame.rig.ground_z_m, name=f"{frame.rig.name} {name}".strip())
     now, then = _boxes(current, entry, ego2ego, seconds)
-    return Neighbour(number, name, rig, travel_m, float(ego2ego[0, 3]), seconds, then, now, entry)
+    return Neighbour(number, name, rig, travel_m, float(ego2ego[0, 3]), seconds, then, now, ego2ego, entry)
 
 
 def _own_rig(frame: Frame, entry: Mapping[str, Any]) -> Rig:

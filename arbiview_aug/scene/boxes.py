@@ -17,7 +17,7 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import CELL_PX, PixelRays, pixel_rays
 from arbiview_aug.errors import SampleError
 from arbiview_aug.image_ops import FRESH, Memory
-from arbiview_aug.scene.shapes import points_by_box, whole
+from arbiview_aug.scene.shapes import AIR_M, points_by_box, whole
 from arbiview_aug.scene.surface import LayeredSurface, OcclusionMap, Points, StaticSurface, Surface
 
 UNLABELLED = 0.45
@@ -229,6 +229,28 @@ def checked_boxes(boxes: Any) -> FloatArray:
 
 STAYED_M = 0.4
 """Largest label motion of a parked vehicle: labels jitter by decimetres."""
+
+
+SAME_SIZE_M = 0.2
+"""Largest difference of one object's labelled sizes from frame to frame."""
+
+
+def carried(points: Points, one: FloatArray, two: FloatArray) -> FloatArray:
+    """The points (P, 3), those in boxes ``one`` (B, 7) moved to where the same objects are in ``two`` (C, 7).
+
+    The same are boxes of one size that are each other's nearest. Points in other boxes are left out.
+    """
+    moved, kept = points.astype(np.float64), np.ones(len(points), bool)
+    apart = np.linalg.norm(one[:, None, :3] - two[None, :, :3], axis=-1)
+    apart[np.abs(one[:, None, 3:6] - two[None, :, 3:6]).max(axis=-1) > SAME_SIZE_M] = np.inf
+    for k, rows in enumerate(points_in(one, points, AIR_M)):
+        match = int(apart[k].argmin()) if len(two) else -1
+        kept[rows] = is_same = match >= 0 and apart[k, match] < np.inf and apart[:, match].argmin() == k
+        if is_same:
+            c, s = np.cos(two[match, 6]), np.sin(two[match, 6])
+            to_ego = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+            moved[rows] = _in_box_frame(one[k], points[rows] - one[k, :3]) @ to_ego + two[match, :3]
+    return moved[kept]
 
 
 def moved_boxes(one: FloatArray, two: FloatArray) -> FloatArray:

@@ -131,6 +131,27 @@ def drop_hidden(q: Any, number: Any, points: Any, origin: Any, away: int, side: 
 
 
 @compiled
+def seen_through(q: Any, rows: Any, columns: Any, most: Any, up: int, side: int, found: Any) -> None:
+    """Find the points of other scans that lie clearly before all of a scan's own points around them.
+
+    Args:
+        q: (n,) inverse distances of the others.
+        rows: (n,) their rows in the panorama.
+        columns: (n,) their columns.
+        most: (h, w) largest inverse distance of the scan's points in each cell, 0 without; becomes that of a window.
+        up: Cells of the window above and below.
+        side: ... and on each side.
+        found: (n,) bool, written.
+    """
+    (h, w), (height, width) = most.shape, (2 * up, 2 * side)
+    _window_max(most, height, width)
+    for i in range(q.shape[0]):
+        row, column = int(np.rint(rows[i])) - up, int(np.rint(columns[i])) - side
+        known = most[row, column] if 0 <= row < h - height and 0 <= column < w - width else _ZERO
+        found[i] = known > _ZERO and _hidden_below(q[i]) > known
+
+
+@compiled
 def complete(
     cells: Any, own: Any, residuals: Any, reach: float, support: float, smooth: int, work: Any, layers: Any
 ) -> None:

@@ -28,6 +28,7 @@ class Scene:
         boxes: (B, 7) labelled objects: centre x, y, z, length, width, height (metres), yaw (radians).
         points: (P, 3) measured points, metres.
         motion: (P, 3) points of depth from motion, metres.
+        sweeps: (P, 3) points of neighbouring frames beside ``points``, metres.
         further: Arrays of other sample keys that a row of ``SURFACES`` reads.
         corrections: Corrections of the street's distances by depth from overlap.
     """
@@ -35,6 +36,7 @@ class Scene:
     boxes: FloatArray | None = None
     points: Points | None = None
     motion: Points | None = None
+    sweeps: Points | None = None
     further: Mapping[str, Points] = field(default_factory=dict)
     corrections: tuple[Correction, ...] = ()
     _surfaces: dict[tuple[str, float], Surface] = field(default_factory=dict, init=False, repr=False)
@@ -56,6 +58,7 @@ class Scene:
     def words(self) -> str:
         """How much of which geometry there is; empty without any."""
         arrays = {"boxes": self.boxes, "points": self.points, "points of depth from motion": self.motion}
+        arrays["points of neighbouring frames"] = self.sweeps
         arrays |= {f"points of {key}": array for key, array in self.further.items() if array.ndim == 2}
         return ", ".join(f"{len(array)} {name}" for name, array in arrays.items() if array is not None and len(array))
 
@@ -76,7 +79,8 @@ class Scene:
     def key(self) -> bytes:
         """Content hash."""
         digest = hashlib.sha256(repr(sorted(self.further)).encode())
-        for array in (self.boxes, self.points, self.motion, *(self.further[key] for key in sorted(self.further))):
+        own = self.boxes, self.points, self.motion, self.sweeps
+        for array in (*own, *(self.further[key] for key in sorted(self.further))):
             digest.update(b"none" if array is None else repr((array.shape, array.dtype.str)).encode())
             for rows in () if array is None else np.array_split(array, 1 + len(array) // _ROWS):
                 digest.update(rows.tobytes())
@@ -132,17 +136,18 @@ def _boxes(scene: Scene, ground_z_m: float) -> Surface:
 
 
 def _point_cloud(scene: Scene, ground_z_m: float, points: Points | None, *maps: Points | None) -> Surface:
-    """Points, and those of depth maps, with the scene's boxes."""
+    """Points with those of neighbouring frames, and those of depth maps, with the scene's boxes."""
     boxes = scene.boxes if scene.boxes is not None and len(scene.boxes) else None
-    parts = [np.zeros((0, 3), np.float32) if part is None else part[:, :3] for part in (points, *maps)]
+    sweeps = None if points is None else scene.sweeps
+    parts = [np.zeros((0, 3), np.float32) if part is None else part[:, :3] for part in (points, sweeps, *maps)]
     # One type and layout: kernels are compiled for each.
     street, together = _street(scene, ground_z_m), np.ascontiguousarray(np.concatenate(parts), np.float32)
     if len(together) == 0:
         return scene.surface("street" if boxes is None else "objects", ground_z_m)
-    mapped = len(together) - len(parts[0])
+    mapped, swept = len(together) - len(parts[0]) - len(parts[1]), len(parts[1]) > 0
     if boxes is None:
-        return PointCloudSurface(street, together, mapped)
-    return PointCloudWithBoxes.among(street, together, boxes, mapped)
+        return PointCloudSurface(street, together, mapped, swept)
+    return PointCloudWithBoxes.among(street, together, boxes, mapped, swept)
 
 
 SURFACES: dict[str, SurfaceRow] = {

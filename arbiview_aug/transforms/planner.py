@@ -25,7 +25,7 @@ from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.render.requirements import harm_remedies, needs_geometry, static_harm
 from arbiview_aug.sample.detections import OfCameras, detections_of_frames
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, Frame, names_of_frames, read_scenes, scenes_on_device
-from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames
+from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames, points_of_neighbours
 from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.temporal.fill import Fills, Reach, neighbour_images, plan_fills
@@ -179,6 +179,8 @@ class FramePlanner:
                 motion = self._motion(frame, scene, neighbours)
             if depth is not None:
                 scene = replace(scene, corrections=depth.corrections)
+            if neighbours and self.reach is not None and scene.points is not None and pair.needs_geometry:
+                scene = replace(scene, sweeps=points_of_neighbours(frame.rig, scene.points, neighbours, self.warn))
             if uses_motion and scene.motion is None:
                 points = motion.points(frame.rig, scene.geometry("points")) if motion else np.zeros((0, 3))
                 scene = replace(scene, motion=points)

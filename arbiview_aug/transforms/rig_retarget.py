@@ -116,7 +116,8 @@ class RigRetarget(torch.nn.Module):
             computes depth and plans for every frame; a ``RefinementCache`` reuses both where its key is the same.
         neighbours: What other frames of the drive (the sample's ``neighbours``, see ``arbiview_aug.sample.neighbours``)
             may fill: ``ground``, the road near the cameras; ``all``, whatever the surface says; None, nothing. Covered
-            pixels are never replaced. Not used by ``paper``.
+            pixels are never replaced. Unless None, their ``points`` also add scan lines to the frame's own. Not used by
+            ``paper``.
         size: (h, w) of every output image; the target cameras are brought to it by ``fit``, and ``K`` says so.
         fit: ``crop``: keep the aspect, cut the excess at the top and both sides. ``pad``: keep the aspect, add black
             bars at the top and both sides; there ``coverage`` is False, ``ignore`` True, labels are ``label_fill``, and

@@ -1,7 +1,8 @@
 """What measured points are worth: on real frames against the protocol's ``ground`` renderer, and on synthetic streets.
 
 Real frames: half resolution, exposures made even, quality ``fast``; the surface is made of the points of every other
-degree of azimuth, the others score it. Synthetic streets: how far the outlines of vehicles are from the truth.
+degree of azimuth, the others score it. Synthetic streets: how far the outlines of vehicles are from the truth, and
+what the scan lines of neighbouring frames are worth between the frame's own.
 Run with ``-s`` for the tables.
 """
 
@@ -13,15 +14,19 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
+from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig
+from arbiview_aug.datasets import Neighbours
+from arbiview_aug.datasets.synthetic import RenderedViews, SceneClass, SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
 from arbiview_aug.render.labels import render_labels
-from arbiview_aug.render.plan import build_plan
+from arbiview_aug.render.opencv_backend import render_opencv
+from arbiview_aug.render.plan import RenderPlan, build_plan
 from arbiview_aug.scene.boxes import checked_boxes
 from arbiview_aug.scene.point_cloud import checked_points
 from arbiview_aug.scene.scene import Scene
@@ -37,6 +42,10 @@ GAINS_DB = {"nuscenes-one": (8.0, 9.0, 3.0), "ddad-one": (7.0, 7.0, 3.5)}
 SEEDS = few_or_all(1, 4)
 STREET_MOVES = {"0.7 m higher": {"z_m": 0.7}, "1 m sideways": {"y_m": 1.0}}
 LARGEST_SHIFT_PX = 1.5
+
+SWEPT_FRAMES = ((0, 0), (0, 1), (5, 0), (5, 1))  # seeds and scenes
+OFF_LINES_PX = (3, 10)  # of the frame's own points
+GAIN_DB = 1.5
 
 
 @pytest.mark.slow
@@ -86,6 +95,17 @@ def edge_shifts(rendered: np.ndarray, truth: np.ndarray, covered: np.ndarray) ->
                 yield abs(int(ours[edge]) - int(true[edge]))
 
 
+def vehicle_shifts(plan: RenderPlan, source: RenderedViews, truth: RenderedViews) -> Iterator[float]:
+    """Displacements of the vehicles' outlines in all views of a plan."""
+    views = render_labels(plan, list(source.instances), -2)
+    for view, true, classes in zip(views, truth.instances, truth.classes, strict=True):
+        vehicles = np.unique(true[classes == SceneClass.VEHICLE].numpy())
+        for k in vehicles[vehicles >= 0]:
+            mask = (true == k).numpy()
+            if mask.sum() >= 200:  # smaller ones are a few pixels high
+                yield from edge_shifts((view == k).numpy(), mask, (view != -2).numpy())
+
+
 @pytest.fixture(scope="module", params=SEEDS)
 def shifts(request: pytest.FixtureRequest) -> dict[tuple[str, str], np.ndarray]:
     """Displacements of vehicles' outlines, by (move, surface)."""
@@ -99,14 +119,7 @@ def shifts(request: pytest.FixtureRequest) -> dict[tuple[str, str], np.ndarray]:
             truth = drive.render(0, rig.shifted(**by))
             for surface in ("lidar", "street"):
                 plan = build_plan(rig, rig.shifted(**by), surface=surface, scene=scene)
-                views = render_labels(plan, list(source.instances), -2)
-                for view, true, classes in zip(views, truth.instances, truth.classes, strict=True):
-                    vehicles = np.unique(true[classes == SceneClass.VEHICLE].numpy())
-                    for k in vehicles[vehicles >= 0]:
-                        mask = (true == k).numpy()
-                        if mask.sum() >= 200:  # smaller ones are a few pixels high
-                            rows = edge_shifts((view == k).numpy(), mask, (view != -2).numpy())
-                            found.setdefault((move, surface), []).extend(rows)
+                found.setdefault((move, surface), []).extend(vehicle_shifts(plan, source, truth))
     for (move, surface), values in found.items():
         half, more, most = np.percentile(values, [50, 75, 90])
         print(
@@ -119,3 +132,49 @@ def shifts(request: pytest.FixtureRequest) -> dict[tuple[str, str], np.ndarray]:
 def test_vehicles_keep_their_outlines(shifts: dict[tuple[str, str], np.ndarray], move: str) -> None:
     assert np.median(shifts[move, "lidar"]) <= LARGEST_SHIFT_PX
     assert shifts[move, "lidar"].mean() < shifts[move, "street"].mean()
+
+
+def off_lines(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """(h, w) pixels between the scan lines of points."""
+    uv, z, valid = camera.project(points)
+    x, y = np.rint(uv[valid & (z > 0)]).astype(int).T
+    inside = (x >= 0) & (x < camera.width_px) & (y >= 0) & (y < camera.height_px)
+    free = np.ones(camera.size, np.uint8)
+    free[y[inside], x[inside]] = 0
+    away_px = cv2.distanceTransform(free, cv2.DIST_L2, 5)
+    return (away_px >= OFF_LINES_PX[0]) & (away_px <= OFF_LINES_PX[1])
+
+
+@pytest.mark.parametrize("count", few_or_all(1, len(SWEPT_FRAMES), "frames"))
+def test_other_frames_show_what_is_between_scan_lines(count: int) -> None:
+    """32 lines from the roof, traffic, no labels."""
+    rig, moves = demo_source_rig((256, 704)), {"0.6 m higher": {"z_m": 0.6}, "1 m aside": {"y_m": 1.0}}
+    psnr: dict[tuple[str, str], list[float]] = {}
+    shifts: dict[tuple[str, str], list[float]] = {}
+    for seed, index in SWEPT_FRAMES[:count]:
+        drive = SyntheticDrive(rig, num_frames=2, seed=seed, neighbours=Neighbours())
+        sample, source = drive[index], drive.render(index)
+        del sample["boxes_3d"]
+        near = [{key: frame[key] for key in frame if key != "boxes_3d"} for frame in sample["neighbours"]]
+        bare = [{key: value for key, value in frame.items() if key != "points"} for frame in near]
+        points = sample["points"].numpy()[:, :3].astype(float)
+        for move, by in moves.items():
+            target = rig.shifted(**by)
+            truth = drive.render(index, target)
+            for name, given in (("alone", bare), ("swept", near)):
+                plan = RigRetarget(target).explain(sample | {"neighbours": given}).plan
+                shifts.setdefault((move, name), []).extend(vehicle_shifts(plan, source, truth))
+                views = render_opencv(plan, list(sample["images"]))
+                for view, true, z, covered, camera in zip(
+                    views, truth.images, truth.depth_m.numpy(), plan.coverage, target, strict=True
+                ):
+                    use = covered & np.isfinite(z) & off_lines(camera, points)
+                    error = (view.float() - true.float()).numpy()[:, use]
+                    psnr.setdefault((move, name), []).append(float(10 * np.log10(255**2 / np.mean(error**2))))
+    for move, name in psnr:
+        half, more, most = np.percentile(shifts[move, name], [50, 75, 90])
+        words = f"{np.mean(psnr[move, name]):.1f} dB, 50/75/90 %: {half:.0f}/{more:.0f}/{most:.0f} px"
+        print(f"\n{move:<14}{name:<8}{words}", end="")
+    for move in moves:
+        assert np.mean(psnr[move, "swept"]) >= np.mean(psnr[move, "alone"]) + GAIN_DB
+        assert np.median(shifts[move, "swept"]) <= LARGEST_SHIFT_PX

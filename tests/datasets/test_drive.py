@@ -74,6 +74,10 @@ def test_a_lazy_frame_decodes_once_and_only_when_asked() -> None:
     frame = LazyFrame({"token": "a"}, lambda: calls.append(1) or "pixels")
     assert frame["token"] == "a" and set(frame) == {"token", "images"} and len(frame) == 2 and not calls
     assert frame["images"] == "pixels" == frame["images"] and len(calls) == 1
+    with_points = LazyFrame({}, list, lambda: calls.append(2) or "points")
+    assert set(with_points) == {"images", "points"} and calls == [1]
+    assert with_points.get("points") == "points" == with_points["points"] and calls == [1, 2]
+    assert frame.get("points") is None
 
 
 # --- a street that moves ----------------------------------------------------------------------------------------------
@@ -92,6 +96,21 @@ def test_a_synthetic_drive_moves_on() -> None:
     assert still > 10 and moved > 10
     images = sample["neighbours"][0]["images"]
     assert images.shape == sample["images"].shape and not torch.equal(images, sample["images"])
+
+
+def test_a_synthetic_drive_has_points_of_its_neighbours() -> None:
+    """Walls are where they were; noise is drawn anew."""
+    drive = SyntheticDrive(demo_source_rig(SIZE), num_frames=1, neighbours=Neighbours(direction="past"))
+    sample = drive[0]
+    (before,) = sample["neighbours"]
+    now = sample["points"].numpy()[:, :3]
+    ego2ego = np.linalg.solve(sample["ego2world"].numpy(), before["ego2world"].numpy())
+    then = before["points"].numpy()[:, :3] @ ego2ego[:3, :3].T + ego2ego[:3, 3]
+    high, others = (one[(one[:, 2] > 2.5) & (np.hypot(*one.T[:2]) < 20)] for one in (now, then))
+    apart_m = np.linalg.norm(high - others[::20, None], axis=-1).min(axis=1)
+    assert len(apart_m) > 50 and np.median(apart_m) < 0.25 and apart_m.min() > 0
+    without = SyntheticDrive(drive.rig, num_frames=1, lidar=False, neighbours=drive.neighbours)[0]
+    assert "points" not in without["neighbours"][0]
 
 
 def test_neighbours_change_no_scene() -> None:

@@ -25,6 +25,7 @@ from tests.datasets.nuscenes_root import (
     VERSION,
     Street,
     Tables,
+    recorded,
     seconds,
     streets,
     tables_of,
@@ -158,7 +159,8 @@ def test_convention_each_camera_is_where_it_recorded(root: Path, channels: tuple
 
 
 def files_of(neighbour: Any) -> list[str]:
-    dataset, cameras = neighbour._load.func.__self__, neighbour._load.args[0]
+    load = neighbour._loads["images"]
+    dataset, cameras = load.func.__self__, load.args[0]
     return [dataset._recordings.file(row) for row in cameras]
 
 
@@ -173,6 +175,30 @@ def test_images_of_one_turn_go_together(dataset: NuScenesDataset) -> None:
             np.testing.assert_allclose(apart_s, [0.008, 0.017, 0.025, 0.033, -0.008], atol=1e-9)
             seen += 1
     assert seen > 30
+
+
+def test_points_are_of_the_turn_nearest_in_time(dataset: NuScenesDataset) -> None:
+    """Each file's one point, in the ego frame of the neighbour's own time; keyframes have the LiDAR's."""
+    sweeps = 0
+    for neighbour in dataset.by_token("goes-sample-2")["neighbours"]:
+        time_s = since(neighbour)
+        turns = {row["timestamp"] for row in recorded(GOES, "LIDAR_TOP", "lidar", (0, 0))}
+        turn_s = min(map(seconds, turns), key=lambda moment: abs(moment - time_s))
+        then2now = np.linalg.solve(GOES.ego2world(time_s), GOES.ego2world(turn_s))
+        np.testing.assert_allclose(neighbour["points"][:, :3], [(then2now @ [5.0, 1.0, -0.5, 1.0])[:3]], atol=1e-3)
+        sweeps += turn_s != time_s
+    assert sweeps > 3
+
+
+def test_sweeps_of_the_lidar_that_were_never_copied(root: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(root, copy, ignore=lambda folder, _: ["LIDAR_TOP"] if folder.endswith("sweeps") else [])
+    with pytest.warns(UserWarning, match="sweeps/LIDAR_TOP: found no sweeps: only keyframes have points"):
+        dataset = NuScenesDataset(copy, neighbours=EVERY)
+    has_points = {"sample" in n["token"]: "points" in set(n) for n in dataset.by_token("goes-sample-2")["neighbours"]}
+    assert has_points == {True: True, False: False}
+    bare = NuScenesDataset(copy, neighbours=EVERY, load_points=False).by_token("goes-sample-2")
+    assert all("points" not in set(n) for n in bare["neighbours"])
 
 
 def test_without_compensation_the_mounting_alone(root: Path) -> None:
@@ -260,7 +286,7 @@ def test_without_boxes_there_are_none(root: Path) -> None:
 def test_a_lost_file_is_named_and_the_frame_rendered_without_it(root: Path, tmp_path: Path, damage: str) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(root, copy)
-    dataset = NuScenesDataset(copy, neighbours=Neighbours(count=1, step_m=1.2))
+    dataset = NuScenesDataset(copy, neighbours=Neighbours(count=1, step_m=1.2), load_points=False)
     sample = dataset.by_token("goes-sample-2")
     before, after = sample["neighbours"]
     victim = copy / files_of(after)[0]

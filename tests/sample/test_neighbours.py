@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import RigRetarget, SampleError, SampleTypeError
+from arbiview_aug import Rig, RigRetarget, SampleError, SampleTypeError
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames
+from arbiview_aug.scene.point_cloud import seen_through
 
 RIG = demo_source_rig((64, 176))
 
@@ -210,3 +211,62 @@ def test_frames_of_two_leading_dimensions(sample: dict[str, Any]) -> None:
     for b in np.ndindex(2, 3):
         assert torch.equal(both["source_frame"][b], alone["source_frame"])
         assert torch.equal(both["images"][b], alone["images"])
+
+
+# --- LiDAR points of other frames -------------------------------------------------------------------------------------
+def test_points_come_where_they_and_their_objects_are_now(sample: dict[str, Any]) -> None:
+    """A post stays, a car drives on and turns, one without a counterpart and the own car are left out."""
+    first = sample["neighbours"][0] | {"ego2ego": pose(-1.2), "time_s": -0.1}
+    car, other = [10.0, 0, 0.8, 4, 1.8, 1.6, 0], [30.0, 5, 0.8, 6, 2.5, 3, 0]
+    first["boxes_3d"] = np.array([car, other])
+    now = np.array([[11.0, 0, 0.8, 4, 1.8, 1.6, np.pi / 2]])
+    first["points"] = np.array([[20.0, 3, 1], [11.5, 0.5, 1], [30.0, 5, 1], [0.5, 0.5, 0.5]], np.float32)
+    ((found, *_), said) = read(sample | {"neighbours": [first], "boxes_3d": now})
+    assert not said
+    # The car's centre was at 8.8 in the current frame; its front right lies on the left of where it is now.
+    np.testing.assert_allclose(found.points(), [[18.8, 3, 1], [10.5, 1.5, 1]], atol=1e-5)
+    for then, here in ((np.zeros((0, 7)), now), (first["boxes_3d"], now[:0])):
+        ((found, *_), _) = read(sample | {"neighbours": [first | {"boxes_3d": then}], "boxes_3d": here})
+        assert len(found.points()) == (3 if len(here) else 1)
+    del first["boxes_3d"]
+    ((found, *_), _) = read(sample | {"neighbours": [first], "boxes_3d": now})
+    np.testing.assert_allclose(found.points(), first["points"][:3] - [1.2, 0, 0], atol=1e-5)
+
+
+def _wall(x_m: float, y_m: tuple[float, float], z_m: Any) -> np.ndarray:
+    y, z = np.meshgrid(np.linspace(*y_m, 150), z_m)
+    return np.stack([np.full_like(y, x_m), y, z], -1).reshape(-1, 3)
+
+
+def test_scan_lines_of_other_frames_fill_the_gaps(sample: dict[str, Any]) -> None:
+    """A wall at 8 m between the lines of a scan, and a ghost before it that those lines see through."""
+    lines, between = _wall(8.0, (-3, 0), [0.3, 2.7]), _wall(8.0, (-3, 0), np.arange(0.4, 2.7, 0.05))
+    far, ghost = _wall(40.0, (6, 20), np.arange(0.0, 8.0, 0.35)), _wall(8.0, (1.6, 2.8), [1.6, 1.7])
+    given = {key: sample[key] for key in ("images", "rig", "ego2world")}
+    given |= {"points": torch.from_numpy(np.concatenate([lines, far]))}
+    then = {**sample["neighbours"][0], "points": np.concatenate([between, ghost])}
+    then["points"][:, 0] += 1.2
+    del then["boxes_3d"]
+    retarget = RigRetarget(Rig([RIG[0].shifted(z_m=0.6)]))
+    plain, swept = (retarget.explain(given | {"neighbours": [one]}) for one in ({**then, "points": None}, then))
+    assert "neighbouring frames" not in str(plain)
+    assert f"points, {len(between)} points of neighbouring frames; the street" in str(swept)
+    off = {}
+    for name, found in (("plain", plain), ("swept", swept)):
+        (plan,) = found.plan.targets
+        off[name] = np.arange(64)[:, None] - plan.at.to_float()[..., 1]
+    near_px = 0.6 / (8 - RIG[0].center_m[0]) * RIG[0].K[1, 1]
+    rows = slice(28, 38)
+    assert abs(off["swept"][rows, 100:130] - near_px).max() < 0.5 < abs(off["plain"][rows, 100:130] - near_px).max()
+    for points in (np.zeros((0, 3)), np.zeros((2, 3)), RIG.cam2ego[:, :3, 3].mean(0)[None]):  # which contradict nothing
+        assert not seen_through(points, then["points"], RIG.cam2ego[:, :3, 3].mean(0)).any()
+    # None but the frame's own points without neighbours, and none are read over the street.
+    unread = {**then, "points": "unreadable"}
+    assert torch.equal(
+        RigRetarget(retarget.target, neighbours=None)(given | {"neighbours": [unread]})["images"],
+        RigRetarget(retarget.target, neighbours=None)(given)["images"],
+    )
+    RigRetarget(retarget.target, surface="street")(given | {"neighbours": [unread]})
+    with pytest.warns(UserWarning, match=r"points of neighbour '.*' are left out: points: expected a tensor"):
+        out = retarget(given | {"neighbours": [unread]})
+    assert torch.equal(out["images"], retarget(given | {"neighbours": [{**then, "points": None}]})["images"])

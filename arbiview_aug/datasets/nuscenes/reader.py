@@ -56,7 +56,8 @@ class NuScenesDataset(WritableRecording):
 
     With ``neighbours`` a sample also has other frames of its scene, keyframes and sweeps, by the distance that the
     vehicle travelled between the images of the first of ``channels``. A sweep has its own time and ego pose, the image
-    of each other camera nearest in time, and the boxes interpolated to its time. Images are decoded on access.
+    of each other camera nearest in time, the LiDAR's turn nearest in time, and the boxes interpolated to its time.
+    Images and points are read on access.
 
     All files lie below the root, which may be a link: names and links that leave it are refused when they are read.
 
@@ -74,7 +75,8 @@ class NuScenesDataset(WritableRecording):
         load_boxes: Whether to read the boxes.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size; the rig follows (see ``decode_images``).
         neighbours: Which other frames of the drive come with a sample; None for none. Sweeps make opening half as long
-            again. If no sweep's file exists, only keyframes are neighbours, with a warning.
+            again. If no sweep's file exists, only keyframes are neighbours, with a warning; if none of the LiDAR's
+            does, only they have points.
 
     Raises:
         TypeError: ``neighbours`` is neither ``Neighbours`` nor None.
@@ -109,7 +111,8 @@ class NuScenesDataset(WritableRecording):
         scenes = [scene[token] for token in self.scene_tokens]
         self.channels = _chosen_channels(tables, channels)
         self.other_channels = [row["channel"] for row in tables.rows("sensor") if row.get("modality") != "camera"]
-        self._recordings = read_recordings(tables, self._index, scenes, self.channels, neighbours is not None)
+        sweeps = [] if neighbours is None else [*self.channels, LIDAR] if load_points else self.channels
+        self._recordings = read_recordings(tables, self._index, scenes, self.channels, sweeps)
         times_s = self._recordings.time_s(self._recordings.keyframes[:, -1])
         self._annotations = read_annotations(tables, self._index, times_s, np.array(scenes)) if load_boxes else None
         if self._annotations is not None and self.tokens and not len(self._annotations.tokens):
@@ -119,6 +122,7 @@ class NuScenesDataset(WritableRecording):
                 "without boxes_3d",
                 stacklevel=2,
             )
+        self._has_lidar_sweeps = False
         self._drive_rows = np.empty(0, np.int64) if neighbours is None else self._find_drive_rows()
         positions_m = self._recordings.ego2global(self._drive_rows)[:, :3, 3]
         self._drive = Drive(positions_m, self._recordings.parts[self._drive_rows])
@@ -137,8 +141,7 @@ class NuScenesDataset(WritableRecording):
         sample |= {"ego2world": torch.from_numpy(ego2global), "time_s": float(recordings.time_s(lidar))}
         sample["scene_token"] = self.scene_tokens[index]
         if self.load_points:
-            sensor2ego = recordings.sensor2ego[recordings.rows["sensor"][lidar]]
-            sample["points"] = _read_points(self._file(lidar), sensor2ego)
+            sample["points"] = self._points(lidar)
         if self._annotations is not None:
             boxes = self._annotations.rows(index)
             sample["boxes_3d"] = torch.from_numpy(self._annotations.at_sample(index, _inverse(ego2global)))
@@ -179,22 +182,35 @@ class NuScenesDataset(WritableRecording):
             reduce=self.reduce,
         )
 
+    def _points(self, lidar: int, own2ego: FloatArray | None = None) -> torch.Tensor:
+        """A recording's points in its own ego frame, or in the one that ``own2ego`` leads to."""
+        sensor2ego = self._recordings.sensor2ego[self._recordings.rows["sensor"][lidar]]
+        return _read_points(self._file(lidar), sensor2ego if own2ego is None else own2ego @ sensor2ego)
+
     # --- other frames of the drive ------------------------------------------------------------------------------------
     def _find_drive_rows(self) -> IntArray:
-        """Rows of the first camera that can be neighbours: all, or keyframes only if sweeps were not copied."""
+        """Rows of the first camera that can be neighbours: all, or keyframes only if sweeps were not copied.
+
+        Find out too whether the LiDAR's were copied.
+        """
         recordings = self._recordings
         rows, is_key = np.arange(len(recordings.tokens)), recordings.rows["key"]
         sweeps = np.flatnonzero(~is_key)
         _, first_of_channels = np.unique(recordings.rows["channel"][sweeps], return_index=True)
         for sweep in sweeps[first_of_channels]:
             folder = (self.root / recordings.file(sweep)).parent
-            if not os.path.isdir(folder):  # False for impossible names too
+            is_lidar = recordings.rows["channel"][sweep] == len(self.channels)
+            if os.path.isdir(folder):  # False for impossible names too
+                self._has_lidar_sweeps |= is_lidar
+            elif is_lidar:
+                warnings.warn(f"nuScenes: {folder}: found no sweeps: only keyframes have points", stacklevel=3)
+            else:
                 warnings.warn(f"nuScenes: {folder}: found no sweeps: only keyframes are neighbours", stacklevel=3)
                 return rows[is_key[rows]]
         return rows
 
     def _neighbour(self, row: int) -> LazyFrame:
-        """Another frame of the drive; its images are decoded on access, where a broken one raises."""
+        """Another frame of the drive; its images and points are read on access, where a broken one raises."""
         recordings, record = self._recordings, self._recordings.rows[row]
         sample, is_keyframe = int(record["sample"]), recordings.is_keyframe(row)
         moment = int(recordings.keyframes[sample, -1]) if is_keyframe else row
@@ -216,7 +232,11 @@ class NuScenesDataset(WritableRecording):
             else:
                 boxes = self._annotations.at_time(int(record["scene"]), time_s, global2ego)
             fields["boxes_3d"] = torch.from_numpy(boxes)
-        return LazyFrame(fields, partial(self._images, cameras))
+        lidar = moment if is_keyframe else recordings.lidar_beside(row) if self._has_lidar_sweeps else None
+        points = None
+        if self.load_points and lidar is not None:
+            points = partial(self._points, lidar, _inverse(ego2global) @ recordings.ego2global(lidar))
+        return LazyFrame(fields, partial(self._images, cameras), points)
 
 
 def _inverse(pose: FloatArray) -> FloatArray:

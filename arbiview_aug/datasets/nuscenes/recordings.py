@@ -108,13 +108,20 @@ class Recordings:
             found[channel] = first + apart_us.argmin()
         return found
 
+    def lidar_beside(self, row: int) -> int | None:
+        """Row of the LiDAR's recording nearest in time to a row of the first camera; None beyond ``MAX_APART_S``."""
+        scenes = (len(self.first) - 1) // len(self.channels)
+        first, end = self.first[(len(self.channels) - 1) * scenes + self.rows["scene"][row] :][:2]
+        apart_us = np.abs(self.rows["time_us"][first:end] - self.rows["time_us"][row])
+        return int(first + apart_us.argmin()) if apart_us.min() <= 1e6 * MAX_APART_S else None
+
 
 def read_recordings(
-    tables: Tables, samples: Mapping[str, int], scenes: Sequence[int], channels: Sequence[str], sweeps: bool
+    tables: Tables, samples: Mapping[str, int], scenes: Sequence[int], channels: Sequence[str], sweeps: Sequence[str]
 ) -> Recordings:
     """Read the recordings of the samples (number by token), which lie in ``scenes``, by the cameras ``channels``.
 
-    ``sweeps`` also reads the images between keyframes, nine tenths of two tables. DataError for a malformed row, a
+    ``sweeps`` are channels read between keyframes too, nine tenths of two tables. DataError for a malformed row, a
     dangling token, or a sample that lacks a recording.
     """
     wanted = [*channels, LIDAR]
@@ -133,7 +140,7 @@ def read_recordings(
         kept = [row for row, token in zip(kept, of_samples, strict=True) if token in samples]  # of the chosen scenes
         sensors = tables.follow(table, kept, "calibrated_sensor_token", "calibrated_sensor", calibrated)
         is_wanted = [
-            sensor >= 0 and (row["is_key_frame"] or channel_of[sensor] < len(channels))
+            sensor >= 0 and (row["is_key_frame"] or wanted[channel_of[sensor]] in sweeps)
             for row, sensor in zip(kept, sensors, strict=True)
         ]
         kept, sensors = [*compress(kept, is_wanted)], [*compress(sensors, is_wanted)]

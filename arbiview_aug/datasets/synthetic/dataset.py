@@ -125,10 +125,13 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
                 for sign in self.neighbours.signs
                 for k in range(1, self.neighbours.count + 1)
             ]
-            sample["neighbours"] = [self._neighbour(scene.after(s), s, sample["token"]) for s in moments]
+            sample["neighbours"] = [
+                self._neighbour(scene.after(s), s, sample["token"], (self.seed, self._checked_index(index), 2 + k))
+                for k, s in enumerate(moments)
+            ]
         return sample
 
-    def _neighbour(self, scene: Scene, seconds: float, token: str) -> LazyFrame:
+    def _neighbour(self, scene: Scene, seconds: float, token: str, noise: tuple[int, ...]) -> LazyFrame:
         fields = {
             "rig": self.rig,
             "ego2world": torch.from_numpy(scene.ego2street),
@@ -136,7 +139,9 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
             "boxes_3d": self._boxes(scene),
             "token": f"{token}{seconds:+.3f}s",
         }
-        return LazyFrame(fields, partial(self._images, scene))
+        return LazyFrame(
+            fields, partial(self._images, scene), partial(self._points, scene, noise) if self.lidar else None
+        )
 
     def _images(self, scene: Scene) -> Tensor | list[Tensor]:
         views = self._renderer.render(scene, self.rig.cameras, self.rig.ground_z_m)
@@ -159,7 +164,10 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
     def points(self, index: int) -> Tensor:
         """(P, 4) float32 LiDAR-like points x y z intensity (0 to 255) of scene ``index``, in the rig's ego frame."""
         index = self._checked_index(index)
-        scene = self.scene(index)
+        return self._points(self.scene(index), (self.seed, index, 1))
+
+    def _points(self, scene: Scene, noise: tuple[int, ...]) -> Tensor:
+        """The points of a scene, whose noise has a seed of its own."""
         elevation = np.radians(np.linspace(*LIDAR_BEAMS_DEG, _BEAMS))
         azimuth = np.linspace(0, 2 * math.pi, LIDAR_COLUMNS, endpoint=False)
         el, az = (a.ravel() for a in np.meshgrid(elevation, azimuth, indexing="xy"))  # columns are neighbours
@@ -173,10 +181,10 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
             start = torch.as_tensor(origin[None].astype(np.float32))
             distance, hit = cast(local, start, rays, find_candidates(local, rays))
         t, row = distance.cpu().numpy().ravel().astype(np.float64), hit.cpu().numpy().ravel()
-        rng = np.random.default_rng(np.random.SeedSequence([self.seed, index, 1]))
-        noise, gain = rng.normal(0, LIDAR_NOISE_M, len(t)), rng.uniform(0.8, 1.2, len(t))
+        rng = np.random.default_rng(np.random.SeedSequence(noise))
+        noise_m, gain = rng.normal(0, LIDAR_NOISE_M, len(t)), rng.uniform(0.8, 1.2, len(t))
         keep = (t > LIDAR_RANGE_M[0]) & (t < LIDAR_RANGE_M[1])
-        points = position + ego[keep] * (t + noise)[keep, None]
+        points = position + ego[keep] * (t + noise_m)[keep, None]
         points[:, 2] += self.rig.ground_z_m
         albedo = scene.color.mean(1)[row.clip(0)]
         albedo = np.where(row == GROUND_ID, 0.5 * scene.street.asphalt, albedo)[keep]
