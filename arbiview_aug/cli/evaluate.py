@@ -109,7 +109,8 @@ def _parser() -> argparse.ArgumentParser:
         metavar="PATH",
         help="of --path diffusion, --paper and --figure, as in convert; these score held-out frames of its training",
     )
-    parser.add_argument("--steps", nargs="+", type=count, default=[4], metavar="N", help="steps of the generator")
+    steps = "steps of the generator (default: its own)"
+    parser.add_argument("--steps", nargs="+", type=count, default=[None], metavar="N", help=steps)
     add_frames(parser, None, "number of frames (default: 1; --paper: 3 synthetic ones; --displaced: all)")
     add_reduce(parser)
     add_output(parser)

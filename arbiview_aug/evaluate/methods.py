@@ -66,7 +66,7 @@ def retargeting(
     harmonise: Harmonise = False,
     **settings: Any,
 ) -> Method:
-    """Wrap ``RigRetarget`` as a method, with its arguments; holes stay black with ``path="favs"``.
+    """Wrap ``RigRetarget`` as a method, with its arguments; ``holes`` are black by default with ``path="favs"``.
 
     Exposures stay as recorded by default: metrics compare with them. The name is by default made of quality, surface
     and path. A source camera alone is never completed.
@@ -74,7 +74,8 @@ def retargeting(
     completes, steps = path != "favs", settings.get("steps")
     if path == "diffusion" and settings.get("generator") is None:
         settings["generator"] = Generator.shipped()  # once, not for each target
-    settings |= {"path": path, "harmonise": harmonise, "holes": "fill" if completes else "black", "cache_bytes": 0}
+    settings = {"holes": "fill" if completes else "black", "cache_bytes": 0} | settings
+    settings |= {"path": path, "harmonise": harmonise}
 
     @lru_cache(_CACHED_TRANSFORMS)
     def transform(target: Rig) -> RigRetarget:
