@@ -265,7 +265,8 @@ def test_the_neighbours_table_is_the_commands() -> None:
 def test_the_generators_table_is_the_commands() -> None:
     (table,) = tables(measured("generator"))
     assert table[0] == ["", *(heading for heading, *_ in generator.COLUMNS)]
-    assert [row[0] for row in table[2:]] == ["holes black", "inpainted", *map(generator.row_name, generator.STEPS)]
+    fills = ["holes black", "filled", "inpainted"]
+    assert [row[0] for row in table[2:]] == [*fills, *map(generator.row_name, generator.STEPS)]
     assert all(re.fullmatch(r"[\d.]+", cell) for row in table[2:] for cell in row[1:])
     assert generator.NOTES in measured("generator")
 

@@ -15,6 +15,6 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tiny = ["--size", "32x56", "--steps", "1", "--frames", "1", "--repeats", "1"]
     assert main([*tiny, "--output", str(tmp_path)]) == 0
     report = json.loads((tmp_path / "generator.json").read_text())
-    assert list(report["rows"]) == ["holes black", "inpainted", "1 step"] and report["size"] == [32, 56]
+    assert list(report["rows"]) == ["holes black", "filled", "inpainted", "1 step"] and report["size"] == [32, 56]
     printed = capsys.readouterr().out
     assert all(f"| {name} " in printed for name in report["rows"])

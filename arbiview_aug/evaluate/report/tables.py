@@ -22,13 +22,13 @@ TRUTH_COLUMNS = (
     ("SSIM", "{true_covered_ssim:.4f}"),
     ("holes", "{true_hole_psnr_db:.2f}"),
     ("hole MAE", "{true_hole_mae:.2f}"),
-    ("sharp", "{true_hole_gradient_ratio:.2f}"),
+    ("texture dB", "{true_hole_spectrum_db:.1f}"),
     ("whole view", "{true_psnr_db:.2f}"),
 )
 TRUTH_NOTES = (
     "seen: share of the target's pixels. ground, objects, sky: PSNR there. MAE in grey levels of 255. holes, hole MAE: "
-    "pixels that no source saw. sharp: gradient energy there, relative to the truth. whole view: PSNR of all pixels; "
-    "holes are black unless a path fills them."
+    "pixels that no source saw. texture: distance of the radial power spectrum there to the truth's; 0 is the truth's. "
+    "whole view: PSNR of all pixels; holes are black unless a path fills them."
 )
 PHOTOGRAPH_COLUMNS = (
     SEEN,

@@ -22,7 +22,7 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.lidar import visible_points
-from arbiview_aug.evaluate.metrics import errors, gradient_energy_ratio
+from arbiview_aug.evaluate.metrics import errors, spectrum_distance_db
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import valid_pixels
 from arbiview_aug.generator.inpainting import telea
@@ -74,8 +74,8 @@ def held_out_scores(
             generator's own. A single step is the regression, which has no samples.
 
     Returns:
-        Values of ``telea``, ``one_step`` (if trained), ``sample``, ``mean``; and ``sample_energy``, the gradient energy
-        relative to the truth, on streets.
+        Values of ``telea``, ``one_step`` (if trained), ``sample``, ``mean``; and ``sample_spectrum``, the
+        distance of a sample's power spectrum to the truth's in dB, on streets.
 
     Raises:
         TrainingError: Frames without truth and points, or without a target that they score.
@@ -102,9 +102,9 @@ def held_out_scores(
             scores.setdefault(name, []).append(case.psnr_db(images))
         if "sample" in filled and case.truth is not None:
             sample, true = (as_arrays(images)[0] for images in (filled["sample"], case.truth[None]))
-            energy = gradient_energy_ratio(sample, true, holes.numpy())
-            if energy is not None:
-                scores.setdefault("sample_energy", []).append(energy)
+            distance = spectrum_distance_db(sample, true, holes.numpy())
+            if distance is not None:
+                scores.setdefault("sample_spectrum", []).append(distance)
     return scores
 
 
@@ -187,7 +187,7 @@ def gains(scores: Mapping[str, Sequence[float]], seeds: int = 1) -> dict[str, In
 
     The ``seeds`` views of a street are resampled together.
     """
-    methods = [name for name in scores if name not in ("telea", "sample_energy")]
+    methods = [name for name in scores if name not in ("telea", "sample_spectrum")]
     gain = {name: np.subtract(scores[name], scores["telea"]).reshape(seeds, -1).mean(0) for name in methods}
     return {name: bootstrap(of_street.tolist()) for name, of_street in gain.items()}
 
@@ -198,6 +198,6 @@ def report(scores: Mapping[str, Sequence[float]], seeds: int = 1, say: Callable[
     say(f"inside the holes of {count} held-out views; Telea {sum(scores['telea']) / count:.2f} dB; against it, dB:")
     for name, gain in gains(scores, seeds).items():
         say(f"  {name:<9} {gain}")
-    energies = scores.get("sample_energy", [])
-    if energies:
-        say(f"  gradient energy of a sample against the truth: {sum(energies) / len(energies):.2f}")
+    distances = scores.get("sample_spectrum", [])
+    if distances:
+        say(f"  power spectrum of a sample, distance to the truth's: {sum(distances) / len(distances):.1f} dB")

@@ -91,7 +91,7 @@ def test_scores_of_the_attention(batch: Batch, generator: Generator) -> None:
 def test_held_out_streets_are_scored_against_their_truth(generator: Generator) -> None:
     streets = open_frames("synthetic", config().generator.image_size, scenes=1)
     scores = held_out_scores(generator, streets, [0], seeds=(0, 1), steps=2, mean_of=2, show=False)
-    assert set(scores) == {"telea", "one_step", "sample", "mean", "sample_energy"}
+    assert set(scores) == {"telea", "one_step", "sample", "mean", "sample_spectrum"}
     assert all(len(values) == 2 and all(map(math.isfinite, values)) for values in scores.values())
     assert set(gains(scores)) == {"one_step", "sample", "mean"}
     twice = {"telea": [0.0] * 8, "one_step": [1.0, 2.0, 3.0, 4.0] * 2}  # two views that say the same of each street
