@@ -17,7 +17,7 @@ from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.sample.batching import leading_shape, split
 from arbiview_aug.sample.images import check_container, checked_images
 from arbiview_aug.scene.boxes import checked_boxes
-from arbiview_aug.scene.depth_maps import motion_camera, points_of_depth
+from arbiview_aug.scene.depth_maps import believed, motion_camera, points_of_depth
 from arbiview_aug.scene.point_cloud import checked_points
 from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.surface import Points
@@ -94,7 +94,8 @@ def read_scenes(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[
     row = SURFACES[surface]
     found: dict[str, list[Points]] = {}
     for name in row.reads:
-        arrays = _geometry(name, sample, frames, lead, found)
+        doubted = name == "motion" and LEARNED_KEY in row.reads
+        arrays = _geometry(name, sample, frames, lead, found, sample.get(LEARNED_KEY) if doubted else None)
         if arrays is not None:
             found[name] = arrays
         elif name == row.needs and name != "motion" and (name != "points" or sample.get("depth_m") is None):
@@ -149,8 +150,12 @@ def _geometry(
     frames: Sequence[Frame],
     lead: tuple[int, ...],
     found: Mapping[str, Sequence[Points]],
+    network_m: Any = None,
 ) -> list[Points] | None:
-    """The array of each frame for a name in ``SurfaceRow.reads``, beside those ``found`` before; None without any."""
+    """The array of each frame for a name in ``SurfaceRow.reads``, beside those ``found`` before; None without any.
+
+    Depth from motion is believed where a network's maps, if given, do not contradict it.
+    """
     parts: list[list[Points]] = []
     for key in _SAMPLE_KEYS.get(name, (name,)):
         value = sample.get(key)
@@ -160,7 +165,7 @@ def _geometry(
             measured = [found[one] for one in ("points", "depth_m", "motion") if one in found and key != "depth_m"]
             none = [np.zeros((0, 3))] * len(frames)
             anchors = [np.concatenate(arrays) for arrays in zip(none, *measured, strict=True)]
-            parts.append(_points_of_maps(key, value, frames, lead, anchors))
+            parts.append(_points_of_maps(key, value, frames, lead, anchors, network_m))
             continue
         arrays = of_frames(key, value, len(frames), lead)
         parts.append([_CHECKS[key](array) for array in arrays] if key in _CHECKS else arrays)
@@ -170,22 +175,38 @@ def _geometry(
 
 
 def _points_of_maps(
-    key: str, depth_m: Any, frames: Sequence[Frame], lead: tuple[int, ...], anchors: Sequence[Points]
+    key: str,
+    depth_m: Any,
+    frames: Sequence[Frame],
+    lead: tuple[int, ...],
+    anchors: Sequence[Points],
+    network_m: Any = None,
 ) -> list[Points]:
     """(P, 3) points of each frame's depth maps, brought to ``anchors`` (P, 3) if there are any."""
+    maps = _maps_of_frames(key, depth_m, frames, lead)
+    doubts = maps if network_m is None else _maps_of_frames(LEARNED_KEY, network_m, frames, lead)
+    found: list[Points] = []
+    for frame, of_cameras, of_network, anchor in zip(frames, maps, doubts, anchors, strict=True):
+        cameras = [camera if key == "depth_m" else motion_camera(camera) for camera in frame.rig]
+        kept = of_cameras if network_m is None else map(believed, of_cameras, of_network)
+        pairs = zip(cameras, kept, strict=True)
+        found.append(np.concatenate([points_of_depth(c, depth, key, anchor) for c, depth in pairs]))
+    return found
+
+
+def _maps_of_frames(key: str, depth_m: Any, frames: Sequence[Frame], lead: tuple[int, ...]) -> list[list[Any]]:
+    """The depth maps (H, W) of each frame's cameras."""
     try:
         maps = split(depth_m, lead)
     except (AttributeError, TypeError, ValueError, RuntimeError) as error:
         raise SampleError(f"{key}: expected one map (H, W) for each image ({error})") from None
-    found: list[Points] = []
-    for frame, of_cameras, anchor in zip(frames, maps, anchors, strict=True):
+    found = []
+    for frame, of_cameras in zip(frames, maps, strict=True):
         if isinstance(of_cameras, torch.Tensor | np.ndarray):
             of_cameras = list(numbers(key, of_cameras)) if of_cameras.ndim else ()
         if not isinstance(of_cameras, list | tuple) or len(of_cameras) != len(frame.rig):
             raise SampleError(f"{key}: expected {len(frame.rig)} maps (H, W), one for each image")
-        cameras = [camera if key == "depth_m" else motion_camera(camera) for camera in frame.rig]
-        pairs = zip(cameras, of_cameras, strict=True)
-        found.append(np.concatenate([points_of_depth(c, numbers(key, depth), key, anchor) for c, depth in pairs]))
+        found.append([numbers(key, depth) for depth in of_cameras])
     return found
 
 

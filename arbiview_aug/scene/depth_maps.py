@@ -63,6 +63,15 @@ def anchored(camera: Camera, depth_m: FloatArray, points: Points) -> FloatArray:
     return np.asarray(np.where(others > agreeing, 0, depth_m / scale))
 
 
+def believed(depth_m: FloatArray, network_m: FloatArray) -> FloatArray:
+    """Depth from motion (H, W), 0 where a network's depth (H, W) contradicts it: moving things have wrong distances."""
+    if depth_m.shape != network_m.shape:
+        return depth_m
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = depth_m / np.where(np.isfinite(network_m) & (network_m > 0), network_m, depth_m)
+    return np.where((ratio < 1 - ANCHOR_SHARE) | (ratio > 1 / (1 - ANCHOR_SHARE)), 0, depth_m)
+
+
 def points_of_depth(
     camera: Camera, depth_m: FloatArray, key: str = "depth_m", anchors: Points | None = None
 ) -> FloatArray:

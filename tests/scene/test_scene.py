@@ -76,6 +76,28 @@ def test_learned_depth_follows_what_was_measured() -> None:
     assert (away_px[30, [12, 16, 80, 84]] < 1).all()
 
 
+def test_a_network_overrules_motion_where_they_contradict_each_other() -> None:
+    """A wall at 10 m, which a network puts 5 % too far, and a car before it at 5 m, which moved: motion says 8 m."""
+    camera = Camera.looking(name="front", azimuth_deg=0, width_px=96, height_px=64, horizontal_fov_deg=80)
+    car = np.s_[24:44, 30:60]
+    network, motion = torch.full((64, 96), 10.5), torch.full((64, 96), 10.0)
+    network[car], motion[car] = 5.0, 8.0
+    sample = {"images": torch.rand(1, 3, 64, 96), "rig": Rig([camera])}
+    sample |= {"learned_depth_m": network[None], "motion_depth_m": motion[None]}
+
+    def depth_m(given: dict[str, object], row: int, column: int) -> float:
+        (plan,) = RigRetarget(Rig([camera.shifted(z_m=0.5)]), surface="fused").explain(given).plan.targets
+        return float(0.5 * camera.K[1, 1] / (row - plan.at.to_float()[row, column, 1]))
+
+    assert depth_m(sample, 36, 45) == pytest.approx(5.0, rel=0.03)
+    assert depth_m(sample, 30, 80) == pytest.approx(10.0, rel=0.02)
+    batch = {key: torch.stack([value] * 2) for key, value in sample.items() if key != "rig"} | {"rig": sample["rig"]}
+    torch.testing.assert_close(*RigRetarget(Rig([camera.shifted(z_m=0.5)]), surface="fused")(batch)["images"])
+    agreed = sample | {"learned_depth_m": torch.minimum(network, motion * 0.9)[None]}
+    agreed["learned_depth_m"][0][car] = 7.5
+    assert depth_m(agreed, 36, 45) == pytest.approx(8.0, rel=0.04)
+
+
 @dataclass(frozen=True)
 class Ramp(StaticSurface):
     """A toy surface: a road that rises ahead, with nothing on it or above it."""
