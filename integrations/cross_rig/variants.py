@@ -103,6 +103,9 @@ VARIANTS: dict[str, Variant] = {
             for noise, title in NOISES.items()
         ),
         _filled(name="auto_fill_labels", title="auto, filled holes, no mask, labels of the views", labels="views"),
+        _filled(
+            name="recipe", title="recipe: auto, filled, no mask, labels of the views, + raw", labels="views", mixed=True
+        ),
         _filled(name="auto_fill_random", title="RandomRig around B, auto, filled holes, no mask", random=True),
         Variant(name="oracle_labels", title="B's own frames, A's labels", kind="oracle", labels="A"),
         Variant(name="oracle_mixed", title="B's own frames, + raw", kind="oracle", mixed=True),
