@@ -147,16 +147,12 @@ class Py123dDataset(WritableRecording):
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         index = range(len(self))[index]  # IndexError, and negative indices
-        number, iteration, _ = self._frames[index]
-        log = self._logs[number]
-        with _reading(log.folder):
+        number = self._frames[index][0]
+        with _reading(self._logs[number].folder):
             fields = self._fields(index)
             sample = fields | camera_fields(fields["rig"], self._images(index, fields["rig"]), self.tokens[index])
-            if self.load_points and log.lidars:
-                found = [log.scene.get_lidar_at_iteration(iteration, lidar) for lidar in log.lidars]
-                clouds = [np.asarray(one.point_cloud_3d, np.float32) for one in found if one is not None]
-                if clouds:
-                    sample["points"] = checked_points(np.concatenate(clouds), f"of {self.tokens[index]}")
+            if self.load_points and (points := self._points(index)) is not None:
+                sample["points"] = points
         if self._drive is not None and self.neighbours is not None:
             sample["neighbours"] = [self._neighbour(k) for k in self._drive.neighbours(index, self.neighbours)]
         return sample
@@ -196,6 +192,14 @@ class Py123dDataset(WritableRecording):
                     images.append(torch.from_numpy(_reduced(image, self.reduce)).permute(2, 0, 1).contiguous())
         return torch.stack(images) if len({image.shape for image in images}) == 1 else images
 
+    def _points(self, index: int) -> torch.Tensor | None:
+        number, iteration, _ = self._frames[index]
+        log = self._logs[number]
+        with _reading(log.folder):
+            found = [log.scene.get_lidar_at_iteration(iteration, lidar) for lidar in log.lidars]
+            clouds = [np.asarray(one.point_cloud_3d, np.float32) for one in found if one is not None]
+        return checked_points(np.concatenate(clouds), f"of {self.tokens[index]}") if clouds else None
+
     def _ego2world(self, index: int) -> FloatArray:
         number, iteration, _ = self._frames[index]
         pose = self._logs[number].pose(iteration, "imu_se3", "ego_state_se3")
@@ -213,13 +217,14 @@ class Py123dDataset(WritableRecording):
         return Drive(np.array(positions_m).reshape(-1, 3), parts)
 
     def _neighbour(self, index: int) -> LazyFrame:
-        """Another frame of the drive; its images are decoded on access, where a broken one raises."""
+        """Another frame of the drive; its images and points are read on access, where a broken one raises."""
         try:
             with _reading(self._logs[self._frames[index][0]].folder):
                 fields = self._fields(index)
         except ArbiviewError as error:
             return Unreadable({"token": self.tokens[index]}, error)
-        return LazyFrame(fields, partial(self._images, index, fields["rig"]))
+        points = partial(self._points, index) if self.load_points else None
+        return LazyFrame(fields, partial(self._images, index, fields["rig"]), points)
 
 
 def _open(folder: Path, scene: Any, names: Sequence[str] | None) -> _Log:

@@ -129,6 +129,9 @@ def test_what_was_written_is_read(root: Path) -> None:
     assert [frame["token"] for frame in sample["neighbours"]] == [data.tokens[0], data.tokens[2]]
     before = sample["neighbours"][0]
     assert before["images"].shape == (3, 3, *SIZE) and before["rig"].names == ["front", "left", "right"]
+    assert before["points"].shape == (50, 3) and "points" not in set(
+        Py123dDataset(root, load_points=False, neighbours=Neighbours())[1]["neighbours"][0]
+    )
     for kind in (root / "logs", root / "logs" / "kitti360_train", root / "logs" / "kitti360_train" / "drive"):
         assert len(Py123dDataset(kind)) == 3
     halved = Py123dDataset(root, reduce=2)[0]
