@@ -2,7 +2,8 @@
 
 Sweeps quality, surface, decoded size, execution and cached depth from overlap; marks the Pareto front, and
 recommends a setting for ``--budget-ms`` or ``--min-psnr``, measured again. Static surfaces are not recommended
-where cameras move (``requirements.static_harm``): PSNR does not show what a detector learns from them.
+where cameras move (``requirements.static_harm``): PSNR does not show what a detector learns from them. What fills holes
+is compared at the recommended setting: the default fill, inpainting, and every ``--generator``.
 
 Times are CPU time of a ``RigRetarget`` call on one thread, with the plan where every frame needs its own. Accuracy is
 the mean PSNR of pixels that some source sees, against LiDAR points or the true views, in the colours of images decoded
@@ -43,6 +44,7 @@ from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.evaluate.methods import Method, Sample, views_of
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.favs.config import FavsConfig, Quality
+from arbiview_aug.generator import load_generator
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.render.requirements import HELPFUL_DATA, static_harm
 from arbiview_aug.scene.scene import SURFACES
@@ -69,8 +71,8 @@ class Setting:
         depth = ["depth held"] if self.cached else []
         return ", ".join([self.quality, self.surface, *depth, f"1/{self.reduce}", self.execution])
 
-    def transform(self, target: Rig) -> RigRetarget:
-        """Create the setting's transform, which caches the last plan alone."""
+    def transform(self, target: Rig, **filling: Any) -> RigRetarget:
+        """Create the setting's transform, which caches the last plan alone; holes stay black unless ``filling``."""
         return RigRetarget(
             target,
             quality=self.quality,
@@ -78,12 +80,12 @@ class Setting:
             execution="torch" if self.execution == "cuda" else self.execution,
             refinement=RefinementCache() if self.cached else None,
             cache_bytes=0,
-            holes="black",
+            **(filling or {"holes": "black"}),
         )
 
-    def method(self, target: Rig) -> Method:
+    def method(self, target: Rig, **filling: Any) -> Method:
         """Create a row of a study of one target."""
-        retarget = self.transform(target)
+        retarget = self.transform(target, **filling)
         return Method(self.name, lambda sample, _: views_of(retarget(self.on_device(sample))))
 
     def on_device(self, sample: Sample) -> dict[str, Any]:
@@ -92,9 +94,9 @@ class Setting:
             return dict(sample)
         return {**sample, "images": [image.to("cuda") for image in sample["images"]]}
 
-    def call(self, target: Rig, sample: Sample) -> Callable[[], Any]:
+    def call(self, target: Rig, sample: Sample, **filling: Any) -> Callable[[], Any]:
         """Create a transform and alternate it between two frames of one calibration."""
-        sample, retarget = self.on_device(sample), self.transform(target)
+        sample, retarget = self.on_device(sample), self.transform(target, **filling)
         samples = itertools.cycle([sample, as_of_another_frame(sample)])
 
         def run() -> None:
@@ -156,6 +158,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--surface", nargs="+", choices=surfaces, help="(default: what the samples offer)")
     parser.add_argument("--reduce", nargs="+", type=int, choices=REDUCES, default=[*REDUCES], help="decode at 1/N")
     parser.add_argument("--execution", nargs="+", choices=executions, default=executions, help="backends")
+    of = "also fill holes by a generator's folder, a folder of diffusers or a TorchScript file"
+    parser.add_argument("--generator", nargs="+", default=[], metavar="PATH", help=of)
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument("--budget-ms", type=float, metavar="MS", help="recommend the most accurate within it")
     limit.add_argument("--min-psnr", type=float, metavar="DB", help="recommend the fastest that reaches it")
@@ -211,6 +215,10 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
 
     recommended = advice(rows, again, budget_ms=arguments.budget_ms, min_psnr_db=arguments.min_psnr)
     front = {row["name"] for row in pareto_front(rows)}
+    steps = [row["name"] for row in distinct_steps(rows)]
+    filled = by_name[recommended["setting"] if recommended and recommended["setting"] else steps[-1]]
+    frames = [frame(index, filled.reduce) for index in range(arguments.frames)]
+    fills = measure_fills(filled, target, frames, arguments)
     return {
         "clock": "CPU time of the process, milliseconds, one thread",
         "data": data.name,
@@ -219,9 +227,38 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
         "frames": arguments.frames,
         "against": "true views" if data.truth is not None else "LiDAR points, exposures made even",
         "settings": [{**row, "front": row["name"] in front} for row in rows],
-        "steps": [row["name"] for row in distinct_steps(rows)],
+        "steps": steps,
         "advice": recommended,
+        "filled": filled.name,
+        "fills": fills,
     }
+
+
+def measure_fills(
+    setting: Setting, target: Rig, frames: Sequence[ScoredFrame], arguments: argparse.Namespace
+) -> list[dict[str, Any]]:
+    """Score and time what fills the holes of one setting's views."""
+    fillings: dict[str, dict[str, Any]] = {how: {"holes": how} for how in ("black", "fill")}
+    fillings["inpaint"] = {"path": "inpaint"}
+    for path in arguments.generator:
+        fillings[path] = {"path": "diffusion", "generator": load_generator(path)}
+    sample = frames[0].scored_sample
+    calls = {name: setting.call(target, sample, **how) for name, how in fillings.items()}
+    rows = []
+    for name, how in fillings.items():
+        generator = how.get("generator")
+        memory = peak_mib(calls[name])
+        before = 0 if generator is None else generator.calls
+        (found,) = study([setting.method(target, **how)], frames, {"target": [target]}, repeats=0).values()
+        means, prefix = found["target"], "even" if frames[0].truth is None else "true"
+        row = {"name": name, "peak_mib": memory, "whole_psnr_db": means[f"{prefix}_psnr_db"]}
+        row |= {"hole_psnr_db": means["true_hole_psnr_db"]} if "true_hole_psnr_db" in means else {}
+        rows.append(row | ({} if generator is None else {"calls": (generator.calls - before) / len(frames)}))
+    times = timed_rounds(calls, arguments.repeats, "fills", enough_ms=_ENOUGH_MS)
+    for row in rows:
+        row |= quartiles(times[row["name"]])._asdict()
+        row["kept"] = None if arguments.budget_ms is None else row["q3_ms"] <= arguments.budget_ms
+    return rows
 
 
 def _surfaces(sample: Sample) -> list[SurfaceName]:
@@ -240,6 +277,14 @@ COLUMNS = (
     ("MiB", "{peak_mib:.0f}"),
     ("dB", "{psnr_db:.2f}"),
     ("seen", "{seen:.1%}"),
+    ("whole dB", "{whole_psnr_db:.2f}"),
+)
+FILL_COLUMNS = (
+    ("ms", "{median_ms:.1f}"),
+    ("quartiles", "{q1_ms:.1f} to {q3_ms:.1f}"),
+    ("MiB", "{peak_mib:.0f}"),
+    ("calls", "{calls:.1f}"),
+    ("holes dB", "{hole_psnr_db:.2f}"),
     ("whole dB", "{whole_psnr_db:.2f}"),
 )
 NOTES = (
@@ -269,6 +314,12 @@ def table(report: Mapping[str, Any]) -> str:
     ]
     if len(rows) > len(shown):
         lines += ["", f"{len(rows) - len(shown)} more settings, none of them on the front, are in the JSON."]
+    lines += ["", f"What fills the holes of {report['filled']}; calls: of the network, for each frame."]
+    lines += ["", metric_table(report["fills"], FILL_COLUMNS)]
+    kept = [row for row in report["fills"] if row["kept"]]
+    if kept:
+        best = max(kept, key=lambda row: row["whole_psnr_db"])
+        lines += ["", f"Nearest to the whole view within the budget: {best['name']}, {best['whole_psnr_db']:.2f} dB."]
     if report["advice"]:
         lines += ["", advice_line(report["advice"])]
     return "\n".join(lines)
