@@ -238,6 +238,9 @@ def test_the_ablation_is_the_commands() -> None:
     assert shown[0] == printed[0] and [row[:2] for row in shown] == [row[:2] for row in printed]
     assert all(re.fullmatch(r"\d\d\.\d\d \([+-]\d\.\d\d\)", row[k]) for row in shown[2:] for k in (2, 3, 6, 7))
     assert NOTES in words(measured("ablation"))
+    whole = markdown({"data": {"synthetic street": {"steps": dict.fromkeys(STEPS, figures), "overlap": []}}})
+    ((synthetic,), (street,)) = tables(whole), tables(measured("synthetic-ablation"))
+    assert street[0] == synthetic[0] and [row[:2] for row in street] == [row[:2] for row in synthetic]
 
 
 def test_the_trade_is_the_commands() -> None:

@@ -1,8 +1,8 @@
-"""``python -m arbiview_aug bench ablation``: gain of each stage and setting, in dB and in milliseconds.
+"""``python -m arbiview_aug bench ablation``: gain of each stage, setting and kind of geometry, in dB and milliseconds.
 
 All rows render the paper's six configurations and the rig raised by 0.6 m. A step is the difference of two rows. Its
-milliseconds are the median over the targets of their differences, CPU time without plans, unless its plan belongs to
-one frame.
+milliseconds are the median over the targets of their differences, CPU time without plans, unless plans belong to one
+frame.
 """
 
 from __future__ import annotations
@@ -15,26 +15,38 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import add_data
 from arbiview_aug.cli.bench.study import benchmark, benchmark_parser, study
 from arbiview_aug.cli.bench.timing import machine_line, quartiles, show
 from arbiview_aug.datasets import open_data, reduced_rig
+from arbiview_aug.datasets.depth_folder import WANTED
 from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.agreement import source_overlap, summary
 from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
-from arbiview_aug.evaluate.methods import Method, paper_stages, retargeting
+from arbiview_aug.evaluate.images import RenderedView
+from arbiview_aug.evaluate.methods import Method, Sample, paper_stages, retargeting
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import UP_M, named_targets, shifted_target
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality
 from arbiview_aug.render.refinement import RefinementCache
+from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
+from arbiview_aug.scene.depth_maps import motion_camera
 from arbiview_aug.scene.surface import SurfaceName
+from arbiview_aug.transforms.explain import Explanation
+from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 SYNTHETIC = "synthetic street"
+GEOMETRY = {"boxes": "boxes_3d", "LiDAR": "points", "motion": MOTION_KEY, "learned": LEARNED_KEY}
+"""Kinds of geometry, and the sample's keys."""
+
+_LEARNED_ERROR, _LEARNED_PX = 0.05, 8  # of simulated learned depth: standard deviation, and the size of its patches
+
 WEIGHTS = ("distance", "gradient", "quality", "primary")
 """Weights of the paper's stage 4."""
 
@@ -48,10 +60,14 @@ def without_weights(config: PaperConfig, *weights: str) -> PaperConfig:
 
 
 class Row(NamedTuple):
-    """Settings of ``retargeting``; ``cached`` caches depth from overlap, ``reduce`` shrinks the targets by a factor."""
+    """Settings of ``retargeting``, and the geometry that it ``reads`` of ``GEOMETRY``.
+
+    ``cached`` caches depth from overlap, ``reduce`` shrinks the targets by a factor.
+    """
 
     quality: Quality | FavsConfig | PaperConfig
     surface: SurfaceName = "street"
+    reads: tuple[str, ...] = ()
     harmonise: bool = False
     cached: bool = False
     reduce: Reduce = 1
@@ -60,13 +76,23 @@ class Row(NamedTuple):
         """Create the method, with empty caches."""
         refinement = RefinementCache() if self.cached else None
         given = self.quality, self.surface, name
-        return retargeting(*given, harmonise=self.harmonise, refinement=refinement)
+        method = retargeting(*given, harmonise=self.harmonise, refinement=refinement)
+        hidden = {*GEOMETRY.values(), "neighbours"}.difference(self.reads)
+
+        def render(sample: Sample, target: Rig) -> list[RenderedView]:
+            return method.render({key: value for key, value in sample.items() if key not in hidden}, target)
+
+        return replace(method, render=render)
+
+    @property
+    def replans(self) -> bool:
+        """Whether every frame needs a plan of its own."""
+        corrected = isinstance(self.quality, str) and self.quality == "accurate" and not self.cached
+        return bool(self.reads) or corrected
 
     def fits(self, frame: ScoredFrame) -> bool:
-        """Whether a frame has boxes or the truth, where the row needs them (LiDAR points cannot score antialiasing)."""
-        if self.reduce > 1:
-            return frame.truth is not None
-        return self.surface != "objects" or "boxes_3d" in frame.sample
+        """Whether a frame has the geometry, and the truth where it is needed (points cannot score antialiasing)."""
+        return frame.sample.keys() >= set(self.reads) and (self.reduce == 1 or frame.truth is not None)
 
 
 ROWS: dict[str, Row] = {
@@ -78,7 +104,16 @@ ROWS: dict[str, Row] = {
     "fast": Row("fast"),
     "fast, far": Row("fast", "far"),
     "fast, ground": Row("fast", "ground"),
-    "fast, objects": Row("fast", "objects"),
+    "fast, objects": Row("fast", "objects", (GEOMETRY["boxes"],)),
+    "fast, LiDAR": Row("fast", "lidar", (GEOMETRY["LiDAR"],)),
+    "fast, LiDAR, boxes": Row("fast", "lidar", (GEOMETRY["LiDAR"], GEOMETRY["boxes"])),
+    "fast, motion": Row("fast", "motion", (MOTION_KEY,)),
+    "fast, learned": Row("fast", "learned", (LEARNED_KEY,)),
+    "fast, fused": Row("fast", "fused", tuple(GEOMETRY.values())),
+    **{
+        f"fast, fused without {kind}": Row("fast", "fused", tuple(of for of in GEOMETRY.values() if of != key))
+        for kind, key in GEOMETRY.items()
+    },
     "fast, a quarter as large": Row("fast", reduce=4),
     "fast, a quarter as large, aliased": Row(FavsConfig(antialias=False), reduce=4),
     "fast, harmonised": Row("fast", harmonise=True),
@@ -88,11 +123,10 @@ ROWS: dict[str, Row] = {
 
 
 class Step(NamedTuple):
-    """Two rows that differ by one setting; ``replanned``: the first needs a new plan for every frame."""
+    """Two rows that differ by one setting."""
 
     row: str
     without: str
-    replanned: bool = False
 
 
 STEPS: dict[str, Step] = {
@@ -107,9 +141,12 @@ STEPS: dict[str, Step] = {
     "ground, not far": Step("fast, ground", "fast, far"),
     "street, not far": Step("fast", "fast, far"),
     "street, not ground": Step("fast", "fast, ground"),
-    "boxes on the street": Step("fast, objects", "fast", replanned=True),
+    "boxes on the street": Step("fast, objects", "fast"),
+    **{f"{kind} on the street": Step(f"fast, {kind}", "fast") for kind in GEOMETRY if kind != "boxes"},
+    "boxes beside LiDAR": Step("fast, LiDAR, boxes", "fast, LiDAR"),
+    **{f"{kind}, fused": Step("fast, fused", f"fast, fused without {kind}") for kind in GEOMETRY},
     "antialiasing": Step("fast, a quarter as large", "fast, a quarter as large, aliased"),
-    "depth from overlap": Step("accurate", "fast", replanned=True),
+    "depth from overlap": Step("accurate", "fast"),
     "depth from overlap, held": Step("accurate, held", "fast"),
     "harmonising": Step("fast, harmonised", "fast"),
 }
@@ -117,9 +154,11 @@ STEPS: dict[str, Step] = {
 NOTES = (
     f"PSNR in dB on the paper's six configurations (turned) and {UP_M} m higher (raised): on real frames at LiDAR "
     "points, exposures made even, unseen pixels black; on the synthetic street against the true views, on seen pixels. "
-    "CPU ms a frame on one thread, without plans, but for boxes and depth from overlap, where every frame needs its "
-    "own. In parentheses what the step adds; last what a ms of it buys, in 0.001 dB turned / raised; *no time*: the "
-    "added time is within its spread over the targets."
+    "CPU ms a frame on one thread, without plans, but for geometry of the frame and depth from overlap, where every "
+    "frame needs its own. In parentheses what the step adds; last what a ms of it buys, in 0.001 dB turned / raised; "
+    "*no time*: the added time is within its spread over the targets. *Fused* is boxes, LiDAR, depth from motion "
+    "(found before, without labels) and learned depth (simulated: the truth with errors of "
+    f"{_LEARNED_ERROR:.0%}) together."
 )
 
 
@@ -193,8 +232,28 @@ def _frames(data: Sequence[str], reduce: Reduce, seed: int, size: tuple[int, int
             raise DataError(f"--data {folder}: expected LiDAR points to score by, got none")
         yield data_name(folder), make_frame(sample, exposures=("even",))
     if not data:
-        drive = SyntheticDrive(demo_source_rig(size), num_frames=1, seed=seed, lidar=False)
-        yield SYNTHETIC, make_frame(drive[0], truth=partial(drive.render, 0), exposures=())
+        drive = SyntheticDrive(demo_source_rig(size), num_frames=1, seed=seed, neighbours=WANTED)
+        sample = drive[0] | {LEARNED_KEY: _learned(drive), MOTION_KEY: _motion(drive[0])}
+        yield SYNTHETIC, make_frame(sample, truth=partial(drive.render, 0), exposures=(), hand_over_points=True)
+
+
+def _motion(sample: Mapping[str, Any]) -> list[torch.Tensor]:
+    """Depth from motion, without the labels."""
+    frames = [{key: frame[key] for key in frame if key != "boxes_3d"} for frame in (sample, *sample["neighbours"])]
+    raised = RigRetarget(shifted_target(sample["rig"], z_m=UP_M), surface="motion", neighbours=None)
+    explained = raised.explain(frames[0] | {"neighbours": frames[1:]})
+    assert isinstance(explained, Explanation) and explained.motion is not None
+    return [torch.from_numpy(depth) for depth in explained.motion.depth_m]
+
+
+def _learned(drive: SyntheticDrive) -> torch.Tensor:
+    """Learned depth, simulated: the truth with relative errors that are alike within patches."""
+    true = drive.render(0, drive.rig.with_cameras([motion_camera(camera) for camera in drive.rig])).depth_m
+    assert isinstance(true, torch.Tensor)
+    n, h, w = true.shape
+    patches = torch.randn((1, n, h // _LEARNED_PX, w // _LEARNED_PX), generator=torch.Generator().manual_seed(0))
+    errors = torch.nn.functional.interpolate(patches, (h, w), mode="bicubic")[0]
+    return true.nan_to_num(posinf=0) * (1 + _LEARNED_ERROR * errors / errors.std()).clamp(min=0.1)
 
 
 def _rows(data: str, frame: ScoredFrame, names: set[str]) -> dict[str, dict[str, Any]]:
@@ -212,8 +271,10 @@ def _rows(data: str, frame: ScoredFrame, names: set[str]) -> dict[str, dict[str,
 def step_figures(step: Step, rows: Mapping[str, Any], metric: str) -> dict[str, Any]:
     """PSNR of a step, its gain, and its gain per ms; None where the added time is within its spread."""
     row, without = rows[step.row], rows[step.without]
-    ms = np.add(row["ms"], row["plan_ms"]) if step.replanned else np.array(row["ms"])
-    added = quartiles(ms - np.array(without["ms"]))
+    ms, less = (
+        np.array(rows[name]["ms"]) + (np.array(rows[name]["plan_ms"]) if ROWS[name].replans else 0) for name in step
+    )
+    added = quartiles(ms - less)
     figures: dict[str, Any] = {"ms": statistics.median(ms.tolist()), "added_ms": added._asdict()}
     for move in ("turned", "raised"):
         gain = row[move][metric] - without[move][metric]

@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 
 from arbiview_aug.__main__ import main
+from arbiview_aug.cli.bench import ablation
 from arbiview_aug.cli.bench.ablation import NOTES, ROWS, STEPS, SYNTHETIC, Step, markdown, measure, step_figures
+from arbiview_aug.evaluate.frames import ScoredFrame
+from arbiview_aug.evaluate.methods import Method
 from arbiview_aug.favs.config import PaperConfig, favs_config
 
 
@@ -31,7 +34,10 @@ def test_no_two_rows_are_alike_and_steps_need_all() -> None:
         ("antialiasing", {"antialias"}),
         ("depth from overlap", {"overlap_depth"}),
         ("street, not far", {"surface"}),
-        ("boxes on the street", {"surface"}),
+        ("boxes on the street", {"surface", "reads"}),
+        ("motion on the street", {"surface", "reads"}),
+        ("boxes beside LiDAR", {"reads"}),
+        ("learned, fused", {"reads"}),
         ("harmonising", {"harmonise"}),
     ],
 )
@@ -44,23 +50,30 @@ def test_a_step_changes_one_thing(step: str, changed: set[str]) -> None:
 
 
 def test_figures_of_a_step() -> None:
-    rows = {
-        "with": {
-            "turned": {"db": 30.0},
-            "raised": {"db": 20.0},
-            "ms": [12.0, 14.0, 16.0],
-            "plan_ms": [40.0, 40.0, 40.0],
-        },
-        "without": {"turned": {"db": 29.0}, "raised": {"db": 20.5}, "ms": [10.0, 10.0, 10.0], "plan_ms": [5.0] * 3},
-        "noisy": {"turned": {"db": 29.0}, "raised": {"db": 20.5}, "ms": [13.0, 14.0, 15.0], "plan_ms": [5.0] * 3},
-    }
-    found = step_figures(Step("with", "without"), rows, "db")
+    low = {"turned": {"db": 29.0}, "raised": {"db": 20.5}, "plan_ms": [5.0] * 3}
+    row = {"turned": {"db": 30.0}, "raised": {"db": 20.0}, "ms": [12.0, 14.0, 16.0], "plan_ms": [40.0] * 3}
+    ms = {"draft": [10.0, 10.0, 10.0], "fast, far": [13.0, 14.0, 15.0], "fast, LiDAR": [10.0, 10.0, 10.0]}
+    rows = {"fast": row, "fast, objects": row, **{name: {**low, "ms": of_row} for name, of_row in ms.items()}}
+    found = step_figures(Step("fast", "draft"), rows, "db")
     assert found["ms"] == 14 and found["added_ms"] == {"median_ms": 4, "q1_ms": 3, "q3_ms": 5}
     assert found["turned"] == {"psnr_db": 30, "gain_db": 1, "gain_db_per_ms": 0.25}
     assert found["raised"] == {"psnr_db": 20, "gain_db": -0.5, "gain_db_per_ms": -0.125}
-    replanned = step_figures(Step("with", "without", replanned=True), rows, "db")
+    replanned = step_figures(Step("fast, objects", "draft"), rows, "db")
     assert replanned["ms"] == 54 and replanned["added_ms"]["median_ms"] == 44, "its plan is paid in every frame"
-    assert step_figures(Step("with", "noisy"), rows, "db")["turned"]["gain_db_per_ms"] is None, "-1, 0 and 1 ms"
+    both = step_figures(Step("fast, objects", "fast, LiDAR"), rows, "db")
+    assert both["ms"] == 54 and both["added_ms"]["median_ms"] == 39, "and so is that of what it is compared with"
+    assert step_figures(Step("fast", "fast, far"), rows, "db")["turned"]["gain_db_per_ms"] is None, "-1, 0 and 1 ms"
+
+
+def test_geometry_that_a_row_does_not_read_is_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[set[str]] = []
+    monkeypatch.setattr(ablation, "retargeting", lambda *_, **__: Method("", lambda sample, _: given.append({*sample})))
+    sample = dict.fromkeys(("images", "rig", "points", "boxes_3d", "motion_depth_m", "learned_depth_m", "neighbours"))
+    for name in ("fast", "fast, LiDAR", "fast, fused without motion"):
+        ROWS[name].method(name).render(sample, None)
+    plain = {"images", "rig"}
+    assert given == [plain, plain | {"points"}, plain | {"points", "boxes_3d", "learned_depth_m"}]
+    assert ROWS["fast, LiDAR"].fits(ScoredFrame(sample)) and not ROWS["fast, LiDAR"].fits(ScoredFrame({}))
 
 
 def test_the_table() -> None:
@@ -88,9 +101,12 @@ def test_the_table() -> None:
 def test_a_street_tells_the_surfaces_apart() -> None:
     report = json.loads(json.dumps(measure([], list(STEPS), size=(64, 176))))
     street = report["data"][SYNTHETIC]
-    assert list(street["rows"]) == list(ROWS) and list(street["steps"]) == list(STEPS), "it has boxes and the truth"
+    assert list(street["rows"]) == list(ROWS) and list(street["steps"]) == list(STEPS), (
+        "it has all geometry and the truth"
+    )
     steps, rows = street["steps"], street["rows"]
-    for name in ("street, not far", "ground, not far", "boxes on the street"):
+    geometry = [name for name in STEPS if name.endswith("on the street")]
+    for name in ("street, not far", "ground, not far", *geometry):
         assert steps[name]["turned"]["gain_db"] > 0.3 and steps[name]["raised"]["gain_db"] > 0.3, name
     assert steps["antialiasing"]["turned"]["gain_db"] > 0 < steps["bilinear, not nearest"]["turned"]["gain_db"]
     stages_1_and_4, far = rows["paper without stages 2 and 3"]["turned"], rows["fast, far"]["turned"]
