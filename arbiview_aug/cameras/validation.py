@@ -19,6 +19,7 @@ ROTATION_TOLERANCE = 1e-4
 """Largest entry of |R Rᵀ - I| accepted as a rotation: published calibrations carry 5 to 7 digits."""
 
 _MAX_COEFFICIENT = 1e6  # real lenses stay below 1e3, and near 1e300 their polynomials overflow
+_SHORTEST_PX = 1e-6  # focal length; the inverse of 5e-324 is infinite
 
 _FARTHEST_M, _MOST_HEIGHT_M = 20.0, 8.0  # of a vehicle's cameras, from the ego origin and over the road
 
@@ -93,8 +94,9 @@ def _holds_booleans(value: Sequence[Any]) -> bool:
 def checked_intrinsics(name: str, value: Any) -> FloatArray:
     """(3, 3) K: upper triangular, normalised, with positive focal lengths."""
     K = checked_array(name, "K", value, (3, 3))
-    if K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise _error(name, "K", "positive focal lengths", f"fx {K[0, 0]:g}, fy {K[1, 1]:g}")
+    if K[0, 0] < _SHORTEST_PX or K[1, 1] < _SHORTEST_PX:
+        expected = f"positive focal lengths, {_SHORTEST_PX:g} px at least"
+        raise _error(name, "K", expected, f"fx {K[0, 0]:g}, fy {K[1, 1]:g}")
     if K[1, 0] != 0 or K[2, 0] != 0 or K[2, 1] != 0 or abs(K[2, 2] - 1) > 1e-9:
         fix = "pass K.T" if np.any(K[2, :2]) and not np.any(K[:2, 2]) else "divide K by K[2, 2]"
         raise _error(name, "K", "[[fx, s, cx], [0, fy, cy], [0, 0, 1]]", f"{K.tolist()}", fix)

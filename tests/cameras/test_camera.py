@@ -55,8 +55,12 @@ BAD = {
     "transposed K": ({"K": K.T}, r"K: expected \[\[fx, s, cx\].*pass K.T"),
     "K with another scale": ({"K": 2 * K}, r"divide K by K\[2, 2\]"),
     "transposed pose": ({"cam2ego": POSE.T}, r"cam2ego: expected last row \(0, 0, 0, 1\).*pass cam2ego.T"),
-    "negative focal": ({"K": edited(K, (0, 0), -500.0)}, r"K: expected positive focal lengths, got fx -500"),
-    "zero focal": ({"K": edited(K, (1, 1), 0.0)}, r"positive focal lengths, got fx 500, fy 0"),
+    "negative focal": (
+        {"K": edited(K, (0, 0), -500.0)},
+        r"K: expected positive focal lengths, 1e-06 px at least, got fx -500",
+    ),
+    "zero focal": ({"K": edited(K, (1, 1), 0.0)}, r"positive focal lengths, 1e-06 px at least, got fx 500, fy 0"),
+    "focal whose inverse is infinite": ({"K": edited(K, (1, 1), 5e-324)}, r"1e-06 px at least, got fx 500, fy 4.94"),
     "unknown lens": ({"lens": "brown"}, r"lens: expected one of pinhole, radtan, fisheye, got 'brown'"),
     "coefficients of a pinhole": ({"distortion": (0.1,) * 4}, r"0 coefficients for a pinhole lens.*name the lens"),
     "six coefficients": (
