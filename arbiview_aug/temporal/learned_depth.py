@@ -180,7 +180,7 @@ class View(NamedTuple):
         small = motion_camera(camera)
         prompt = None
         if takes_prompt and frame.points is not None:
-            prompt = _dense(motion_camera(pinhole), frame.points)
+            prompt = dense_depth(motion_camera(pinhole), frame.points)
         return View(small, pinhole, frame.rig.ground_z_m, image, prompt)
 
     def sampled(self, values: Layer) -> tuple[Layer, BoolArray]:
@@ -207,7 +207,7 @@ def _measured(camera: Camera, points: FloatArray) -> tuple[Any, FloatArray]:
     return (row[nearest], column[nearest]), z[seen][nearest]
 
 
-def _dense(camera: Camera, points: FloatArray) -> Layer | None:
+def dense_depth(camera: Camera, points: FloatArray) -> Layer | None:
     """A depth map (h, w) with the depth of the nearest measured pixel everywhere; None if there are too few."""
     pixels, depth_m = _measured(camera, points)
     if len(depth_m) < LEAST_POINTS:

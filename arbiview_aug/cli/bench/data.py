@@ -10,11 +10,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
 import torch
 
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.arguments import REAL_TARGET
 from arbiview_aug.datasets import Neighbours, open_data
+from arbiview_aug.datasets.depth_folder import FOLDERS, DepthFolder
 from arbiview_aug.datasets.frame_writer import write_drive, write_frame
 from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.datasets.registry import data_name
@@ -23,6 +25,10 @@ from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.frames import LidarReference, ScoredFrame, make_frame
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.sample.inputs import DEPTH_KEYS
+from arbiview_aug.scene.depth_maps import motion_camera
+from arbiview_aug.scene.panorama import Layer
+from arbiview_aug.temporal.learned_depth import LearnedDepth, dense_depth
+from arbiview_aug.temporal.motion_depth import MotionDepth
 
 REDUCES: tuple[Reduce, ...] = get_args(Reduce)
 
@@ -80,7 +86,8 @@ def recorded(
 ) -> Iterator[Recorded]:
     """Open a user's frames, or write synthetic ones of ``size`` (h, w) as JPEGs to a temporary folder.
 
-    With ``neighbours`` it writes one frame with these neighbours, as a drive.
+    With ``neighbours`` it writes one frame with these neighbours, as a drive; else frames with depth maps of LiDAR in
+    place of the ``depth`` command's.
     """
     if data is not None:
         yield Recorded(data_name(data), Path(data))
@@ -92,9 +99,20 @@ def recorded(
             write_drive(Path(folder), [sample, *sample["neighbours"]])
         else:
             for k in range(frames):
-                write_frame(Path(folder) / f"{k:04}", drive[k])
+                sample = drive[k]
+                write_frame(Path(folder) / f"{k:04}", sample)
+                for name, kind in zip(FOLDERS.values(), (MotionDepth, LearnedDepth), strict=True):
+                    depth = kind(tuple(lidar_maps(sample)), "from LiDAR")
+                    DepthFolder(Path(folder) / name).write(f"{k:04}", sample["rig"], depth)
         name = "synthetic streets" if neighbours is None else "synthetic drive"
         yield Recorded(name, Path(folder), drive.render)
+
+
+def lidar_maps(sample: Mapping[str, Any]) -> list[Layer]:
+    """Depth maps of the size that the ``depth`` command writes: at every pixel the depth of the nearest LiDAR point."""
+    cameras, points = [motion_camera(camera) for camera in sample["rig"]], sample["points"][:, :3].numpy().astype(float)
+    maps = [dense_depth(camera, points) for camera in cameras]
+    return [np.zeros(c.size, np.float32) if one is None else one for c, one in zip(cameras, maps, strict=True)]
 
 
 def as_of_another_frame(sample: Mapping[str, Any]) -> dict[str, Any]:

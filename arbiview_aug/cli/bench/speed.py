@@ -8,9 +8,11 @@ outputs, with float32 maps that read a source of the view's own size at
 A time is the median over the rounds; a ratio is the median of call / floor within a round.
 
 The targets are Waymo's five cameras without and with their lenses, four fisheye cameras, and the source's own, turned
-or lowered. *Held*: the calibration comes back, and with it the plan; every other call plans anew. Images are decoded
-at half size where they are then still larger than the views. They lie channels-last in one block, as this package's
-readers give them; contiguous ones are planes, torch's usual layout. Holes stay black unless they are *filled*.
+or lowered. *Depth maps* from motion and from a network cost the same; these say at every pixel the depth of the nearest
+LiDAR point. *Fused* is LiDAR with two maps. *Held*: the calibration comes back, and with it the plan; every other call
+plans anew. Images are decoded at half size where they are then still larger than the views. They lie channels-last in
+one block, as this package's readers give them; contiguous ones are planes, torch's usual layout. Holes stay black
+unless they are *filled*.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ import torch
 
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.arguments import add_data, device_named, size
-from arbiview_aug.cli.bench.data import Recorded, lifted, recorded
+from arbiview_aug.cli.bench.data import Recorded, lidar_maps, lifted, recorded
 from arbiview_aug.cli.bench.device import YAW_DEG, device_table, measure_device
 from arbiview_aug.cli.bench.neighbours import lowered
 from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
@@ -42,6 +44,7 @@ from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.generator.fillers import Holes
 from arbiview_aug.render.harmonise import Harmonise
 from arbiview_aug.render.plan import compile_kernels
+from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
@@ -154,6 +157,8 @@ def _calls(sample: Sample, target: Rig) -> Calls:
         **{f"{n} boxes": _anew({**sample, "boxes_3d": boxes_around(n)}, target, "objects") for n in BOXES},
         "LiDAR": _anew(sample, target, "lidar"),
         "LiDAR, 75 boxes": _anew({**sample, "boxes_3d": boxes_around(75)}, target, "lidar"),
+        "depth maps": _anew(sample, target, "learned"),
+        "fused, 75 boxes": _anew({**sample, "boxes_3d": boxes_around(75)}, target, "fused"),
     }
 
 
@@ -217,8 +222,9 @@ def remap_floor(images: torch.Tensor, size: tuple[int, int]) -> Callable[[], Non
 
 
 def _sample(data: Recorded, reduce: Reduce) -> dict[str, Any]:
-    """Images (N, 3, h, w) of the first frame, its rig without masks, and its points."""
+    """Images (N, 3, h, w) of the first frame, its rig without masks, its points, and depth maps made of them."""
     sample = data.sample(0, reduce)
     if not isinstance(sample["images"], torch.Tensor) or "points" not in sample:
         raise DataError(f"--data {data.root}: expected images of one size, and LiDAR points")
-    return {"images": sample["images"], "rig": without_masks(sample["rig"]), "points": sample["points"]}
+    found = {"images": sample["images"], "rig": without_masks(sample["rig"]), "points": sample["points"]}
+    return found | dict.fromkeys((MOTION_KEY, LEARNED_KEY), torch.from_numpy(np.stack(lidar_maps(found))))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 from arbiview_aug import RigRetarget
-from arbiview_aug.cli.bench.data import as_of_another_frame
+from arbiview_aug.cli.bench.data import as_of_another_frame, recorded
+from arbiview_aug.datasets import WithDepth, open_data
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.scene.depth_maps import motion_camera
 
 
 def test_another_frame() -> None:
@@ -27,3 +30,17 @@ def test_nothing_estimated_for_one_frame_serves_another() -> None:
     retarget = RigRetarget(sample["rig"].shifted(z_m=0.5), quality="accurate", surface="street")
     one, two, again = (retarget.explain(frame) for frame in (sample, as_of_another_frame(sample), sample))
     assert one.depth.corrections and one.plan is not two.plan and two.plan is not again.plan
+
+
+def test_depth_maps_of_synthetic_streets_are_those_of_lidar() -> None:
+    """They fit images that were decoded at half size."""
+    with recorded(None, size=(256, 704)) as data:
+        sample = WithDepth(open_data(data.root, reduce=2), data.root)[0]
+    maps = {key: sample[key] for key in ("motion_depth_m", "learned_depth_m")}
+    assert all(one.shape == (6, 128, 352) and float((one > 0).float().mean()) == 1 for one in maps.values())
+    camera, points = motion_camera(sample["rig"][0]), sample["points"][:, :3].double().numpy()
+    uv, z, valid = camera.project(points)
+    (column, row), near = np.rint(uv[valid]).astype(int).T, z[valid]
+    seen = (row >= 0) & (row < 128) & (column >= 0) & (column < 352) & (near > 0.5)
+    share = maps["learned_depth_m"][0].numpy()[row[seen], column[seen]] / near[seen]
+    assert np.median(np.abs(share - 1)) < 0.01

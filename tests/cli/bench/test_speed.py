@@ -41,6 +41,7 @@ def test_runs_and_restores_threads() -> None:
     assert all((m["ratio"] == 1) == (m["name"] == "bare cv2.remap") for m in measures)
     small, full = ({m["name"] for m in measures if tuple(m["size"]) == size} for size in ((32, 88), (64, 176)))
     assert small >= set(BOUNDS[SIZE]) and full >= set(BOUNDS[FULL_SIZE])
+    assert {"depth maps", "fused, 75 boxes"} <= small & full
     printed = table(report)
     assert all(m["name"] in printed for m in measures) and cv2.__version__ in printed
 
