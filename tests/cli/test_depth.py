@@ -127,7 +127,7 @@ def test_what_was_found_from_less_is_found_again(recorded: Path, tmp_path: Path,
     (root / "sequence.json").unlink()
     asked = ["depth", "--data", str(root)]
     leftover = root / "motion_depth" / f".000.npz.-{_host()}-{10**9}-01234567.part"
-    leftover.parent.mkdir()
+    leftover.parent.mkdir(exist_ok=True)
     leftover.write_bytes(b"of a killed run")
     assert main(asked) == 0 and "0 of 4 frames have depth" in capsys.readouterr().out and not leftover.exists()
     (root / "sequence.json").write_text(sequence)

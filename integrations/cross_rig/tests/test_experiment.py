@@ -194,7 +194,7 @@ def test_presets():
     # Raw and scale/crop once for each seed, five variants for each change: 3 * (2 + 3 * 5).
     assert len(jobs(pilot())) == 51
     names = [job.name for job in jobs(full())]
-    assert len(names) == len(set(names)) == 3 * (2 + 9 * 36)
+    assert len(names) == len(set(names)) == 3 * (2 + 9 * 37)
 
 
 def test_keys_follow_what_matters(done):
