@@ -13,6 +13,7 @@ from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE
 from arbiview_aug.datasets.registry import open_data, split_kind
 from arbiview_aug.errors import ArbiviewError
 from arbiview_aug.evaluate.report.tables import markdown_table
+from arbiview_aug.evaluate.rig_gap import rig_gap
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -35,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         rigs = [_load(name) for name in arguments.rigs]
         print("\n\n".join(map(repr, rigs)))
         for other in rigs[1:]:
-            print(f"\n{differences(rigs[0], other)}")
+            print(f"\n{differences(rigs[0], other)}\n\n{rig_gap(rigs[0], other)}")
         print(f"\npicture: {save_picture(arguments.output, draw_rigs(rigs))}")
     except ArbiviewError as error:
         print(f"{parser.prog}: {error}", file=sys.stderr)

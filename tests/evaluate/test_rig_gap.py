@@ -1,0 +1,86 @@
+"""How far apart two rigs are: by hand where a formula is known."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import integrations.cross_rig
+from arbiview_aug import Camera, Rig, load_rig
+from arbiview_aug.__main__ import main
+from arbiview_aug.evaluate.rig_gap import rig_gap
+from integrations.cross_rig.worlds import CHANGES, source_rig
+
+RESULTS = Path(integrations.cross_rig.__path__[0]) / "results" / "gap.json"
+
+
+def ring(height_m: float = 1.5, fov_deg: float = 70.0, width_px: int = 640) -> Rig:
+    return Rig(
+        [
+            Camera.looking(
+                name=f"c{k}",
+                azimuth_deg=60.0 * k,
+                position_m=(0, 0, height_m),
+                width_px=width_px,
+                height_px=width_px // 2,
+                horizontal_fov_deg=fov_deg,
+            )
+            for k in range(6)
+        ]
+    )
+
+
+def test_a_rig_is_no_distance_from_itself_at_any_resolution_or_road():
+    for target in (ring(), ring(width_px=320), load_moved(ring())):
+        gap = rig_gap(ring(), target)
+        assert (gap.unseen, gap.row, gap.size, gap.parallax_deg) == pytest.approx((0, 0, 0, 0), abs=2e-3)
+        assert gap.expected_loss == pytest.approx(0, abs=0.05)
+
+
+def load_moved(rig: Rig) -> Rig:
+    """The same cameras in an ego frame one metre higher."""
+    return Rig(list(rig.shifted(z_m=-1)), ground_z_m=-1.0)
+
+
+def test_height_changes_what_rows_tell_and_the_field_of_view_what_sizes_tell():
+    higher = rig_gap(ring(), ring(height_m=2.2))
+    assert higher.row == pytest.approx(math.log(2.2 / 1.5), abs=1e-6) and higher.size < 0.01
+    assert 1 < higher.parallax_deg < 4 and higher.unseen == 0
+    zoomed = rig_gap(ring(), ring(fov_deg=61.0))
+    assert zoomed.size == pytest.approx(math.log(math.tan(math.radians(35)) / math.tan(math.radians(30.5))), abs=0.02)
+    assert zoomed.row == pytest.approx(zoomed.size, abs=0.05) and zoomed.parallax_deg == pytest.approx(0, abs=1e-4)
+
+
+def test_what_the_source_never_sees_is_a_share_of_what_the_target_sees():
+    front = Rig([ring()[0]])
+    assert rig_gap(front, ring()).unseen > 0.7
+    assert rig_gap(ring(), front).unseen == 0
+    behind = rig_gap(front, Rig([ring()[3]]))
+    assert behind.unseen == 1 and math.isnan(behind.row)
+
+
+def test_shipped_rigs_with_lenses():
+    for name in ("fisheye_surround", "argoverse2", "ddad"):
+        gap = rig_gap(load_rig("nuscenes"), load_rig(name))
+        assert 0 <= gap.unseen <= 1 and 0 < gap.row < 1.4 and 0 < gap.size < 1.4 and 0 < gap.parallax_deg < 60
+
+
+def test_it_predicts_what_detectors_lost():
+    """The correlation that ``inspect`` states, from the report beside the detectors."""
+    report = json.loads(RESULTS.read_text())["changes"]
+    source, losses, expected = source_rig((96, 256)), [], []
+    for name, change in report.items():
+        raw, oracle = (change["variants"][variant]["iou"]["value"] for variant in ("raw", "oracle"))
+        losses.append(100 * (oracle - raw))
+        expected.append(rig_gap(source, CHANGES[name].target((96, 256))).expected_loss)
+    assert len(losses) >= 6 and np.corrcoef(losses, expected)[0, 1] == pytest.approx(0.88, abs=0.01)
+    assert np.abs(np.subtract(losses, expected)).max() < 2.5
+
+
+def test_inspect_says_it(capsys, tmp_path):
+    assert main(["inspect", "nuscenes", "waymo", "--output", str(tmp_path / "rigs.png")]) == 0
+    out = capsys.readouterr().out
+    assert "For a detector: 0% of the objects unseen; distances wrong by 87% by their row, by 34% by their size" in out
+    assert "about 10 points of IoU" in out
