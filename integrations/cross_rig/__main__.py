@@ -29,7 +29,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     settings = _settings(arguments)
     try:
-        device_named(settings.schedule.device)  # before hours of rendering
+        if not arguments.list:
+            device_named(settings.schedule.device)  # before hours of rendering
         setup = _run(arguments, settings)
     except (ValueError, ArbiviewError) as error:
         print(error, file=sys.stderr)
