@@ -60,6 +60,7 @@ def test_frameworks_are_imported_where_they_are_used() -> None:
     assert done.stdout.splitlines() == ["[]", *hints]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lightning", "webdataset"])
 def test_examples_check_their_framework_first(name: str) -> None:
     code = f"import runpy, sys; sys.modules[{name!r}] = None; runpy.run_module(sys.argv[1], run_name='__main__')"

@@ -260,6 +260,7 @@ def test_specks_in_masks_are_cleaned_on_demand(ddad_root: Path) -> None:
     assert any((one.mask != two.mask).any() for one, two in zip(given, cleaned, strict=True))
 
 
+@pytest.mark.slow
 def test_rims_are_those_of_several_frames(fisheye_root: Path, tmp_path: Path) -> None:
     """A dark first frame neither hides the rim nor widens it, and every frame gets the same rig."""
     for name, gain in (("a", 0.1), ("b", 1.0), ("c", 0.5)):

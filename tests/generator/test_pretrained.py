@@ -128,6 +128,7 @@ def test_cracks_cost_no_call(lama: Path) -> None:
     assert filler.calls == 0 and torch.equal(done, telea(view, hole))
 
 
+@pytest.mark.slow
 def test_a_pipeline_from_disk_completes_frames_everywhere(
     pipeline: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -173,6 +174,7 @@ def test_a_pipeline_from_disk_completes_frames_everywhere(
     assert_completed(written(tmp_path / "done"), written(tmp_path / "seen"))
 
 
+@pytest.mark.slow
 def test_a_pipeline_fills_six_views_the_same_way_each_time(pipeline: Path) -> None:
     drive = SyntheticDrive(demo_source_rig((40, 64)), num_frames=1)
     target = drive.rig.shifted(z_m=0.5)

@@ -88,6 +88,7 @@ def test_code_hash_follows_imports_and_ignores_words(tmp_path, monkeypatch):
     code_hash.cache_clear()
 
 
+@pytest.mark.slow
 def test_frames_are_made_anew_when_the_renderer_changes(tmp_path, monkeypatch):
     """Kernels, shapes and fills are part of what names a variant's frames."""
     read = set()

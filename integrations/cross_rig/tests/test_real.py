@@ -55,6 +55,7 @@ def roots(tmp_path_factory) -> tuple[str, str]:
     return str(a), str(_root(folder / "B", rig.shifted(z_m=0.7), 4))
 
 
+@pytest.mark.slow
 def test_frames_have_labels_where_the_lidar_saw_a_vehicle(roots, tmp_path):
     run = real.recorded_run(*roots, on_real(SMALL), tmp_path)
     assert (run.settings.train_frames, run.settings.val_frames, run.settings.test_frames) == (4, 2, 2)
@@ -73,6 +74,7 @@ def test_frames_have_labels_where_the_lidar_saw_a_vehicle(roots, tmp_path):
     np.testing.assert_array_equal(source.maker()(4)["state"], arrays["state"])
 
 
+@pytest.mark.slow
 def test_views_have_the_other_vehicles_cameras_over_one_road(roots, tmp_path):
     run = real.recorded_run(*roots, on_real(SMALL), tmp_path)
     by_name = {job.variant.name: job for job in real_jobs(run)}

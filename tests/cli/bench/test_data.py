@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from arbiview_aug import RigRetarget
@@ -32,6 +33,7 @@ def test_nothing_estimated_for_one_frame_serves_another() -> None:
     assert one.depth.corrections and one.plan is not two.plan and two.plan is not again.plan
 
 
+@pytest.mark.slow
 def test_depth_maps_of_synthetic_streets_are_those_of_lidar() -> None:
     """They fit images that were decoded at half size."""
     with recorded(None, size=(256, 704)) as data:

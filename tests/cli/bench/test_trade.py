@@ -74,6 +74,7 @@ def test_the_sweep(report: dict[str, Any]) -> None:
     assert "Nearest to the whole view within the budget: " in printed
 
 
+@pytest.mark.slow
 def test_every_generator_fills_holes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     class Grey(torch.nn.Module):
         def forward(self, image: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
@@ -92,6 +93,7 @@ def test_every_generator_fills_holes(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert f"| {script} " in printed and "Nearest to the whole view" not in printed
 
 
+@pytest.mark.slow
 def test_what_nothing_keeps_to_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     only = ["--quality", "draft", "--surface", "objects", "--reduce", "1", "--execution", "opencv", "--size", "32x88"]
     assert main(["bench", "trade", *only, "--repeats", "1", "--min-psnr", "90", "--output", str(tmp_path)]) == 1

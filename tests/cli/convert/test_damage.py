@@ -166,6 +166,7 @@ def some(tried: Range, count: int, seed: int) -> None:
     assert not wrong, "\n".join(wrong)
 
 
+@pytest.mark.slow
 def test_some_damaged_tables(tried: Range) -> None:
     some(tried, 24, 3)
 

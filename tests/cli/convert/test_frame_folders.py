@@ -330,6 +330,7 @@ def test_records_of_other_samples_and_forms(source: Path, tmp_path: Path, capsys
     assert main(asked) == 2 and f"settings.json: {wrote} list" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_kept_files_come_along_as_asked(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     points = source / "0001" / "lidar.npy"
     for how in ("copy", "hard", "symlink", "hard"):

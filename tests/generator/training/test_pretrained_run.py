@@ -55,7 +55,8 @@ def saved_with_text_encoder(folder: Path, settings: GeneratorConfig) -> Path:
     return saved(folder, settings)
 
 
-@pytest.mark.parametrize("name", [pytest.param("paper", marks=pytest.mark.slow), "inpaint"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["paper", "inpaint"])
 def test_from_pretrained_weights_to_filled_holes(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
