@@ -110,7 +110,7 @@ def _size(camera: Camera, feet: FloatArray) -> FloatArray:
 
 
 def _row_error(a: Camera, b: Camera, feet: FloatArray, ground_z_m: float) -> FloatArray:
-    """|ln| of the distance on the road that camera ``a`` has at the pixel of ``b``, over the true distance."""
+    """ln of the distance on the road that camera ``a`` has at the pixel of ``b``, over the true distance."""
     uv = b.project(feet).uv
     middle = np.array([[b.width_px - 1, b.height_px - 1], [a.width_px - 1, a.height_px - 1]]) / 2
     rays, valid = a.unproject((uv - middle[0]) * (a.width_px / b.width_px) + middle[1])

@@ -60,6 +60,13 @@ def recording(data: str) -> Recording:
     return opened
 
 
+@lru_cache(maxsize=4)
+def first_rig(data: str) -> Rig:
+    """The rig of the first drive's first sample, whose images are read for it."""
+    rig: Rig = recording(data)[frames_of(data, None)[0]]["rig"]
+    return rig
+
+
 def drives_of(data: str) -> list[str]:
     """The drive of each sample."""
     return list(recording(data).scene_tokens)  # type: ignore[attr-defined]
@@ -90,20 +97,24 @@ class RecordedSource(Source):
     b: str
 
     @property
+    def is_of_a(self) -> bool:
+        """Whether A recorded these frames, or what they are rendered from."""
+        return self.change is None or self.variant is not None
+
+    @property
     def data(self) -> str:
         """The data set whose frames these are."""
-        return self.a if self.change is None or self.variant is not None else self.b
+        return self.a if self.is_of_a else self.b
 
     @cached_property
     def frames(self) -> list[int]:
         """Its samples."""
-        return frames_of(self.data, None if self.data == self.a else self.split)
+        return frames_of(self.data, None if self.is_of_a else self.split)
 
     @cached_property
     def rig(self) -> Rig:
         """The cameras of the first frame, small and without lenses, over a road at z = 0."""
-        data = self.a if self.change is None else self.b
-        return small_rig(recording(data)[frames_of(data, None)[0]]["rig"], self.size)
+        return small_rig(first_rig(self.a if self.change is None else self.b), self.size)
 
     def store(self) -> FrameStore:
         """Where they lie: named after the data set, its samples, the code, and the variant."""

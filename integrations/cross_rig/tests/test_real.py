@@ -97,6 +97,10 @@ def test_drives_are_split_and_drawn_together(roots, tmp_path):
     names = real.drives_of(roots[1])
     splits = [{names[k] for k in real.frames_of(roots[1], split)} for split in ("train", "val", "test")]
     assert all(splits) and sum(map(len, splits)) == len(set(names)) == len(set.union(*splits))
+    # A data set against itself: what tests is no less apart from what trains the oracle.
+    itself = real.recorded_run(roots[1], roots[1], on_real(SMALL), tmp_path)
+    tested, trained = (set(itself.source(split, REAL).frames) for split in ("test", "train"))
+    assert tested and trained and not tested & trained
     drives = run.drives(REAL)
     assert len(drives) == run.settings.test_frames and len(set(drives)) == len(splits[2])
 
