@@ -85,6 +85,9 @@ def _parser() -> argparse.ArgumentParser:
     change.add_argument("--families", nargs="+", choices=FAMILIES, metavar="FAMILY", help=", ".join(FAMILIES))
     change.add_argument("--seeds", nargs="+", type=int, metavar="SEED")
     change.add_argument("--streets", type=int, metavar="N", help="another world of streets: 200, 300, …")
+    change.add_argument(
+        "--two-wheelers", action="store_const", const=True, help="streets with bicycles and motorcycles in them"
+    )
     change.add_argument("--train-frames", type=int, metavar="N")
     change.add_argument("--val-frames", type=int, metavar="N")
     change.add_argument("--test-frames", type=int, metavar="N")
@@ -105,7 +108,10 @@ def _run(arguments: argparse.Namespace, settings: Settings) -> Run:
 def _settings(arguments: argparse.Namespace) -> Settings:
     settings = PRESETS[arguments.preset]()
     settings = real(settings) if arguments.real else settings
-    names = ("changes", "variants", "families", "seeds", "streets", "train_frames", "val_frames", "test_frames")
+    names = (
+        *("changes", "variants", "families", "seeds", "streets", "two_wheelers"),
+        *("train_frames", "val_frames", "test_frames"),
+    )
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
     of_schedule = {n: getattr(arguments, n) for n in ("steps", "precision", "device") if getattr(arguments, n)}

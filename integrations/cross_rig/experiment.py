@@ -40,7 +40,13 @@ class Run:
         """A set of frames of this run."""
         s = self.settings
         return Source(
-            root=self.output / "frames", size=s.size, split=split, change=change, variant=variant, streets=s.streets
+            root=self.output / "frames",
+            size=s.size,
+            split=split,
+            change=change,
+            variant=variant,
+            streets=s.streets,
+            two_wheelers=s.two_wheelers,
         )
 
     def sources(self) -> list[tuple[Source, int]]:

@@ -58,6 +58,7 @@ class Source:
         change: Vehicle B by its change; None: vehicle A.
         variant: Whose training set; None: the rig's own true frames. Variants that only draw differently share one.
         streets: The world, by ``worlds.street_seed``.
+        two_wheelers: Whether bicycles and motorcycles are in the streets.
     """
 
     root: Path
@@ -66,11 +67,18 @@ class Source:
     change: str | None = None
     variant: Variant | None = None
     streets: int = STREETS
+    two_wheelers: bool = False
 
     @property
     def street_seed(self) -> int:
         """Of the streets' dataset."""
         return street_seed(self.split, self.streets)
+
+    def drive(self, rig: Rig) -> SyntheticDrive:
+        """The streets' dataset, as a rig sees them."""
+        return SyntheticDrive(
+            rig, num_frames=_MAX_FRAMES, seed=self.street_seed, lidar=False, two_wheelers=self.two_wheelers
+        )
 
     @property
     def rig(self) -> Rig:
@@ -88,6 +96,8 @@ class Source:
             "world": code_hash(_WORLD, within=_WORLD),
             "labels": code_hash("integrations.cross_rig.labels"),
         }
+        if self.two_wheelers:
+            spec["two_wheelers"] = True
         if self.variant is not None:
             variant = self.variant
             renderer = "transforms.rig_retarget" if variant.kind == "retarget" else "evaluate.baselines"
@@ -138,7 +148,7 @@ class Source:
 
 
 def box_store(source: Source) -> FrameStore:
-    """Boxes of a split's vehicles, in A's ego frame; of no rendering."""
+    """Boxes of a split's vehicles, in A's ego frame; of no rendering. They are the same with two-wheelers."""
     spec = {
         "format": _FORMAT,
         "boxes": code_hash("integrations.cross_rig.boxes"),
@@ -151,7 +161,7 @@ def box_store(source: Source) -> FrameStore:
 def make_boxes(source: Source, num_frames: int) -> None:
     """Make what is missing."""
     store = box_store(source)
-    drive = SyntheticDrive(source_rig((96, 256)), num_frames=_MAX_FRAMES, seed=source.street_seed, lidar=False)
+    drive = source.drive(source_rig((96, 256)))
     for chunk in store.missing(num_frames):
         fill(store, lambda k: {"boxes": vehicle_boxes(Grid(), drive.scene(k), drive.rig.ground_z_m)}, chunk)
 
@@ -197,7 +207,7 @@ class _TrueFrames:
 
     def __init__(self, source: Source) -> None:
         self.source, self.rig = source, source.rig
-        self.drive = SyntheticDrive(self.rig, num_frames=_MAX_FRAMES, seed=source.street_seed, lidar=False)
+        self.drive = source.drive(self.rig)
 
     def __call__(self, index: int) -> Arrays:
         start = time.process_time()
@@ -221,9 +231,9 @@ class _VariantFrames:
         assert source.variant is not None
         self.variant, self.original = source.variant, source.original()
         self.store = self.original.store()
-        rig, noise, seed = self.original.rig, self.variant.noise, source.street_seed
+        rig, noise = self.original.rig, self.variant.noise
         self.views = ViewMaker(self.variant, turned(rig) if noise == "calibration" else rig, source.rig)
-        self.drive = SyntheticDrive(rig, num_frames=_MAX_FRAMES, seed=seed, lidar=False)
+        self.drive = source.drive(rig)
         self.measured = _Later(self.drive, LATE_S) if noise == "late" else self.drive
 
     def __call__(self, index: int) -> Arrays:
@@ -271,7 +281,9 @@ class _Later(SyntheticDrive):
     """The same streets, so much later."""
 
     def __init__(self, drive: SyntheticDrive, seconds: float) -> None:
-        super().__init__(drive.rig, num_frames=len(drive), seed=drive.seed, lidar=False)
+        super().__init__(
+            drive.rig, num_frames=len(drive), seed=drive.seed, lidar=False, two_wheelers=drive.two_wheelers
+        )
         self.seconds = seconds
 
     def scene(self, index: int) -> Scene:

@@ -91,8 +91,9 @@ def markdown(report: Mapping[str, Any]) -> str:
     s = report["settings"]
     rows = [row for change in report["changes"].values() for row in change["variants"].values()]
     shown = ", [95 % interval] over seeds and frames" if all("low" in row["iou"] for row in rows) else ""
+    wheels = " with two-wheelers" if s.get("two_wheelers") else ""  # reports from before them do not say
     lines = [
-        f"{s['train_frames']} training and {s['test_frames']} test frames at {s['size'][0]}×{s['size'][1]}, "
+        f"{s['train_frames']} training and {s['test_frames']} test frames{wheels} at {s['size'][0]}×{s['size'][1]}, "
         f"{s['schedule']['steps']} steps of {s['schedule']['batch']}, {report['tests_done']} of {report['tests']} "
         f"tests done. IoU of vehicle cells in %{shown}; recovered: (variant − raw) / "
         "(oracle − raw), where oracle − raw is at least 5 points; loading: CPU ms that the variant adds to a frame "

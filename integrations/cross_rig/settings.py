@@ -40,6 +40,7 @@ class Settings:
         size: (h, w) of every image.
         train_frames, val_frames, test_frames: Of the three sets of streets.
         streets: The world that all three come from, a whole hundred: ``worlds.street_seed``.
+        two_wheelers: Whether bicycles and motorcycles are in its streets.
         seeds: Of the trainings; each variant is trained once with each.
         changes: Names of ``worlds.CHANGES``, or ``REAL`` alone.
         variants: Names of ``variants.VARIANTS``.
@@ -55,6 +56,7 @@ class Settings:
     val_frames: int = 200
     test_frames: int = 1000
     streets: int = STREETS
+    two_wheelers: bool = False
     seeds: tuple[int, ...] = (0, 1, 2)
     changes: tuple[str, ...] = tuple(CHANGES)
     variants: tuple[str, ...] = tuple(VARIANTS)

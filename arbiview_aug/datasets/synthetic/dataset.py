@@ -68,6 +68,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         supersampling: Rays across a pixel at outlines; 1 for no antialiasing.
         lidar: Whether samples carry ``points``.
         neighbours: Which other frames of the drive come with a sample; None for none.
+        two_wheelers: Whether bicycles and motorcycles join the same streets; their boxes come last.
         device: Device to render on; samples lie on the CPU. Different kinds of device agree up to rounding.
 
     Raises:
@@ -84,6 +85,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         supersampling: int = 2,
         lidar: bool = True,
         neighbours: Neighbours | None = None,
+        two_wheelers: bool = False,
         device: torch.device | str = "cpu",
     ) -> None:
         self.rig = _checked_rig(rig)
@@ -92,6 +94,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         self.lidar = bool(lidar)
         check_neighbours(neighbours)
         self.neighbours = neighbours
+        self.two_wheelers = bool(two_wheelers)
         self._renderer = Renderer(supersampling=_checked_count("supersampling", supersampling, 1, 8), device=device)
         self._scene: tuple[int, Scene] | None = None
 
@@ -109,7 +112,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         """The street as plain data; IndexError past the end."""
         index = self._checked_index(index)
         if self._scene is None or self._scene[0] != index:
-            self._scene = (index, make_scene(self.seed, index))
+            self._scene = (index, make_scene(self.seed, index, two_wheelers=self.two_wheelers))
         return self._scene[1]
 
     def __getitem__(self, index: int) -> dict[str, Any]:

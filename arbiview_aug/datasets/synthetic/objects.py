@@ -1,4 +1,4 @@
-"""Objects built from primitives: vehicles, pedestrians, trees, lamp posts, signs, buildings.
+"""Objects built from primitives: vehicles, people, trees, lamp posts, signs, buildings.
 
 Every labelled object touches all six sides of its 3D box.
 """
@@ -6,10 +6,11 @@ Every labelled object touches all six sides of its 3D box.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from arbiview_aug.datasets.synthetic.scene import BoxClass, Material, Range, SceneBuilder, SceneClass, Vector
+from arbiview_aug.datasets.synthetic.scene import BoxClass, Material, Placed, Range, SceneBuilder, SceneClass, Vector
 
 Color = Vector
 
@@ -20,7 +21,7 @@ VEHICLE_SIZES: dict[BoxClass, tuple[Range, Range, Range]] = {
     BoxClass.TRUCK: ((6.2, 9.0), (2.20, 2.50), (2.80, 3.60)),
     BoxClass.BUS: ((9.0, 12.0), (2.50, 2.55), (2.95, 3.40)),
 }
-_PAINTS: tuple[Color, ...] = (
+PAINTS: tuple[Color, ...] = (
     (0.85, 0.85, 0.86), (0.80, 0.81, 0.83), (0.62, 0.64, 0.66), (0.40, 0.42, 0.44), (0.16, 0.17, 0.19),
     (0.10, 0.10, 0.12), (0.55, 0.10, 0.10), (0.12, 0.20, 0.42), (0.18, 0.32, 0.24), (0.72, 0.58, 0.22),
     (0.45, 0.36, 0.28), (0.30, 0.44, 0.58),
@@ -40,8 +41,8 @@ TIRE: Color = (0.09, 0.09, 0.095)
 DARK: Color = (0.11, 0.11, 0.12)
 
 
-def _pick(rng: np.random.Generator, colors: tuple[Color, ...], spread: float = 0.05) -> Color:
-    # Brightness varies more than hue.
+def pick(rng: np.random.Generator, colors: tuple[Color, ...], spread: float = 0.05) -> Color:
+    """One of the colours, a little off: brightness varies more than hue."""
     base = np.array(colors[int(rng.integers(len(colors)))]) + rng.normal(0, spread) + rng.normal(0, spread / 4, 3)
     return tuple(float(c) for c in base.clip(0.05, 0.92))  # type: ignore[return-value]
 
@@ -60,7 +61,7 @@ def add_vehicle(
     length, width, height = size
     row = builder.add_box(np.array([*xy, height / 2]), size, yaw, cls)
     place = builder.place((*xy, 0.0), yaw, SceneClass.VEHICLE, row)
-    paint = _pick(rng, _PAINTS)
+    paint = pick(rng, PAINTS)
     x, y = length / 2, width / 2 - 0.02  # wheels stand out by 2 cm and give the width
     radius = min(0.25 + 0.05 * height, 0.48)
     reach = (0.68 if cls is BoxClass.TRUCK else 0.62) * x
@@ -80,7 +81,7 @@ def add_vehicle(
     elif cls is BoxClass.TRUCK:
         cab = rng.uniform(1.7, 2.2)
         top = height * rng.uniform(0.72, 0.9)
-        cab_color = _pick(rng, _PAINTS)
+        cab_color = pick(rng, PAINTS)
         place.box((x - cab, x), (-y + 0.05, y - 0.05), (0.45, 1.35), Material.PAINT, cab_color)
         cabin = (x - cab, x), (-y + 0.05, y - 0.05), (1.35, top)
         place.box(*cabin, Material.GLASSHOUSE, cab_color, taper=(0.22, 0, 0.04, 0.04), param=(1.0, 0, 0, 0))
@@ -94,6 +95,37 @@ def add_vehicle(
             place.cylinder(center, (radius, radius), 0.11, Material.WHEEL, TIRE, lateral=True)
 
 
+class Clothes(NamedTuple):
+    """Colours of a person."""
+
+    trousers: Color
+    jacket: Color
+    sleeve: Color
+    skin: Color
+
+
+def pick_clothes(rng: np.random.Generator) -> Clothes:
+    """What a person wears."""
+    trousers, jacket = pick(rng, _TROUSERS), pick(rng, _CLOTHES)
+    skin = pick(rng, ((0.80, 0.62, 0.52), (0.55, 0.38, 0.28), (0.35, 0.24, 0.18)), 0.02)
+    return Clothes(trousers, jacket, (jacket[0] * 0.85, jacket[1] * 0.85, jacket[2] * 0.85), skin)
+
+
+def add_trunk(place: Placed, hip: float, shoulder: float, width: float, wears: Clothes) -> None:
+    """Torso, shoulders and neck along the z axis of ``place``."""
+    middle, half = (hip + shoulder) / 2, (shoulder - hip) / 2
+    radii = (0.14 * 0.9, (width / 2 - 0.08) * 0.88)
+    place.cylinder((0.0, 0.0, middle), radii, half, Material.ROUGH, wears.jacket, param=(0.1, 0.06, 0, 0))
+    place.ellipsoid((0, 0, shoulder - 0.03), (0.085, width / 2 - 0.03, 0.075), Material.PLAIN, wears.sleeve)
+    place.cylinder((0, 0, shoulder + 0.04), (0.055, 0.055), 0.09, Material.PLAIN, wears.skin)
+
+
+def add_head(place: Placed, x: float, top: float, skin: Color) -> None:
+    """An upright head below ``top``."""
+    half = 0.115
+    place.ellipsoid((x, 0, top - half), (0.10, 0.085, half), Material.PLAIN, skin)
+
+
 def add_pedestrian(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, yaw: float) -> None:
     """A standing or walking person and their box."""
     height = rng.uniform(1.5, 1.92)
@@ -101,25 +133,19 @@ def add_pedestrian(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector,
     center = np.array([xyz[0], xyz[1], xyz[2] + height / 2])
     row = builder.add_box(center, (length, width, height), yaw, BoxClass.PEDESTRIAN)
     place = builder.place(xyz, yaw, SceneClass.PEDESTRIAN, row)
-    trousers, jacket = _pick(rng, _TROUSERS), _pick(rng, _CLOTHES)
-    skin = _pick(rng, ((0.80, 0.62, 0.52), (0.55, 0.38, 0.28), (0.35, 0.24, 0.18)), 0.02)
-    sleeve: Color = (jacket[0] * 0.85, jacket[1] * 0.85, jacket[2] * 0.85)
-    hip, shoulder, head = 0.48 * height, 0.83 * height, 0.115
+    wears = pick_clothes(rng)
+    hip, shoulder = 0.48 * height, 0.83 * height
     stride = length / 2 - 0.075
     for side in (-1, 1):
         leg = (side * stride * 0.9, side * width * 0.17, hip / 2)
-        place.cylinder(leg, (0.075, 0.07), hip / 2, Material.PLAIN, trousers)
-    torso = ((hip + shoulder) / 2, (shoulder - hip) / 2)
-    middle, reach = (0.0, 0.0, torso[0]), (0.14, width / 2 - 0.08)
-    place.cylinder(middle, (reach[0] * 0.9, reach[1] * 0.88), torso[1], Material.ROUGH, jacket, param=(0.1, 0.06, 0, 0))
-    place.ellipsoid((0, 0, shoulder - 0.03), (0.085, width / 2 - 0.03, 0.075), Material.PLAIN, sleeve)
-    place.cylinder((0, 0, shoulder + 0.04), (0.055, 0.055), 0.09, Material.PLAIN, skin)
+        place.cylinder(leg, (0.075, 0.07), hip / 2, Material.PLAIN, wears.trousers)
+    add_trunk(place, hip, shoulder, width, wears)
     for side in (-1, 1):
         # The swinging arms carry the box's length and width.
-        arm = (-side * (length / 2 - 0.055), side * (width / 2 - 0.055), torso[0])
-        place.cylinder(arm, (0.055, 0.055), torso[1] * 0.92, Material.PLAIN, sleeve)
-        place.ellipsoid((arm[0], arm[1], hip - 0.03), (0.045, 0.045, 0.08), Material.PLAIN, skin)
-    place.ellipsoid((0, 0, height - head), (0.10, 0.085, head), Material.PLAIN, skin)
+        arm = (-side * (length / 2 - 0.055), side * (width / 2 - 0.055), (hip + shoulder) / 2)
+        place.cylinder(arm, (0.055, 0.055), (shoulder - hip) / 2 * 0.92, Material.PLAIN, wears.sleeve)
+        place.ellipsoid((arm[0], arm[1], hip - 0.03), (0.045, 0.045, 0.08), Material.PLAIN, wears.skin)
+    add_head(place, 0, height, wears.skin)
 
 
 def add_tree(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, reach_m: float = math.inf) -> None:
@@ -127,11 +153,11 @@ def add_tree(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, re
     place = builder.place(xyz, rng.uniform(0, 6.28), SceneClass.VEGETATION)
     height, trunk = rng.uniform(4.5, 10), rng.uniform(0.09, 0.22)
     fork = height * rng.uniform(0.35, 0.5)
-    bark = _pick(rng, ((0.30, 0.25, 0.20), (0.36, 0.33, 0.29)), 0.03)
+    bark = pick(rng, ((0.30, 0.25, 0.20), (0.36, 0.33, 0.29)), 0.03)
     place.cylinder((0, 0, fork * 0.6), (trunk, trunk), fork * 0.6, Material.ROUGH, bark, param=(0.12, 0.12, 0, 0))
     # No lump reaches further than (0.8 + 0.58) spreads.
     spread = min((height - fork) * rng.uniform(0.38, 0.55), reach_m / 1.38)
-    green = _pick(rng, ((0.22, 0.31, 0.13), (0.17, 0.26, 0.11), (0.30, 0.33, 0.14), (0.36, 0.28, 0.12)), 0.02)
+    green = pick(rng, ((0.22, 0.31, 0.13), (0.17, 0.26, 0.11), (0.30, 0.33, 0.14), (0.36, 0.28, 0.12)), 0.02)
     for k in range(int(rng.integers(7, 11))):
         # The golden angle spreads the lumps evenly around the trunk.
         turn, out = 2.4 * k, spread * rng.uniform(0.35, 0.8) * (k > 0)
@@ -144,7 +170,7 @@ def add_tree(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, re
 def add_bush(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, scale: float = 1.0) -> None:
     """Low ellipsoids of leaves."""
     place = builder.place(xyz, rng.uniform(0, 6.28), SceneClass.VEGETATION)
-    green = _pick(rng, ((0.20, 0.28, 0.13), (0.26, 0.30, 0.15)), 0.02)
+    green = pick(rng, ((0.20, 0.28, 0.13), (0.26, 0.30, 0.15)), 0.02)
     for _ in range(4):
         x, y = rng.normal(0, 0.4 * scale, 2)
         r, height = scale * rng.uniform(0.35, 0.65), scale * rng.uniform(0.35, 0.75)
@@ -170,7 +196,7 @@ def add_sign(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, yaw: 
     colors: tuple[Color, ...] = ((0.78, 0.12, 0.12), (0.10, 0.25, 0.62), (0.85, 0.72, 0.10), (0.90, 0.90, 0.90))
     for k in range(int(rng.integers(1, 3))):
         w, z = rng.uniform(0.25, 0.36), height - 0.35 - 0.7 * k
-        place.box((-0.06, -0.04), (-w, w), (z - 0.3, z + 0.3), Material.SIGN, _pick(rng, colors, 0.02))
+        place.box((-0.06, -0.04), (-w, w), (z - 0.3, z + 0.3), Material.SIGN, pick(rng, colors, 0.02))
 
 
 def add_traffic_light(builder: SceneBuilder, xyz: Vector, yaw: float) -> None:
@@ -192,7 +218,7 @@ def add_building(
 ) -> None:
     """A block with windows; detailed ones have a cornice, now and then bays or an awning over the ground floor."""
     place = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.BUILDING)
-    wall = _pick(rng, _WALLS)
+    wall = pick(rng, _WALLS)
     bay, storey = rng.uniform(2.2, 4.2), rng.uniform(2.9, 3.6)
     # bay width, storey height, share of the wall that is glass, whether the ground floor is shops
     param = (bay, storey, rng.uniform(0.42, 0.72), float(rng.random() < 0.55))
@@ -204,7 +230,7 @@ def add_building(
     place.box(*cornice, Material.ROUGH, trim, param=(0.8, 0.08, 0, 0))
     front, outward = (y[0], -1.0) if y[0] > 0 else (y[1], 1.0)
     if param[3] and rng.random() < 0.6:
-        cloth = _pick(rng, _CLOTHES)
+        cloth = pick(rng, _CLOTHES)
         a = rng.uniform(x[0] + 0.3, (x[0] + x[1]) / 2)
         b = min(a + rng.uniform(3, 7), x[1] - 0.2)
         ends = sorted((front, front + outward * rng.uniform(0.8, 1.3)))
@@ -224,7 +250,7 @@ def add_barrier(
     height = base_m + rng.uniform(0.9, 1.4 if hedge else 2.0)
     if hedge:
         place = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.VEGETATION)
-        place.box(x, y, (base_m - 0.05, height), Material.LEAF, _pick(rng, ((0.19, 0.27, 0.12),), 0.02))
+        place.box(x, y, (base_m - 0.05, height), Material.LEAF, pick(rng, ((0.19, 0.27, 0.12),), 0.02))
         return
     place = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.BUILDING)
-    place.box(x, y, (base_m - 0.05, height), Material.ROUGH, _pick(rng, _WALLS), param=(1.2, 0.08, 0, 0))
+    place.box(x, y, (base_m - 0.05, height), Material.ROUGH, pick(rng, _WALLS), param=(1.2, 0.08, 0, 0))

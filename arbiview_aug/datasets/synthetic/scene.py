@@ -34,6 +34,7 @@ class SceneClass(IntEnum):
     VEGETATION = 6
     VEHICLE = 7
     PEDESTRIAN = 8
+    TWO_WHEELER = 9  # with its rider
 
 
 class BoxClass(IntEnum):
@@ -44,6 +45,8 @@ class BoxClass(IntEnum):
     TRUCK = 2
     BUS = 3
     PEDESTRIAN = 4
+    BICYCLE = 5
+    MOTORCYCLE = 6
 
 
 class Material(IntEnum):
@@ -248,6 +251,21 @@ class Placed:
         """Add a capped elliptic cylinder, upright or (wheels) with its axis along the object's y."""
         axes = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]) if lateral else _NO_TURN
         self._add(CYLINDER, np.array(center), np.array([*radii, half_length]), material, color, param, axes=axes)
+
+    def along(self, start: Vector, end: Vector) -> tuple[Placed, float]:
+        """A frame at ``start`` whose z axis points to ``end`` (not straight aside), and their distance."""
+        way = np.subtract(end, start)
+        length = float(np.linalg.norm(way))
+        forward = np.cross((0.0, 1.0, 0.0), way)
+        forward /= np.linalg.norm(forward)
+        axes = np.column_stack([forward, np.cross(way / length, forward), way / length])
+        origin = self.origin + self.rotation @ np.array(start)
+        return replace(self, origin=origin, rotation=self.rotation @ axes), length
+
+    def tube(self, start: Vector, end: Vector, radius: float, material: Material, color: Vector) -> None:
+        """Add a round cylinder between two points, not straight aside of each other."""
+        place, length = self.along(start, end)
+        place.cylinder((0.0, 0.0, length / 2), (radius, radius), length / 2, material, color)
 
     def _add(
         self,

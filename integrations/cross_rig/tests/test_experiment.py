@@ -221,6 +221,13 @@ def test_command_lists_and_refuses(capsys, tmp_path):
     assert "expected cpu or a CUDA device that is there" in capsys.readouterr().err
 
 
+def test_command_puts_two_wheelers_into_every_set(tmp_path):
+    for given in ([], ["--two-wheelers"]):
+        settings = command._settings(command._parser().parse_args(["--quick", *given]))
+        setup = Run(settings=settings, output=tmp_path)
+        assert {source.two_wheelers for source, _ in setup.sources()} == {bool(given)}
+
+
 @pytest.mark.slow
 def test_the_large_run_is_planned_on_a_machine_without_a_gpu(tmp_path):
     assert command.main(["--large", "--list", "--output", str(tmp_path)]) == 0

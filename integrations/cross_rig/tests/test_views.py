@@ -11,7 +11,7 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.temporal.motion_depth import MotionDepth
 from integrations.cross_rig import views
 from integrations.cross_rig.augmentation import SCALE, scaled_and_cropped
-from integrations.cross_rig.frames import NEIGHBOURS, Source, _VariantFrames
+from integrations.cross_rig.frames import NEIGHBOURS, Source, _Later, _TrueFrames, _VariantFrames, box_store
 from integrations.cross_rig.settings import Settings
 from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.views import ViewMaker
@@ -148,6 +148,23 @@ def test_streets_are_disjoint_and_rigs_stand_on_one_road():
     )
     assert CHANGES["fov50"].target(SIZE)[0].fov_deg[0] == pytest.approx(50)
     assert CHANGES["pitched"].target(SIZE)[0].elevation_deg == pytest.approx(-5)
+
+
+def test_two_wheelers_are_clutter_in_the_same_streets(tmp_path):
+    """Frames of their own, with the same vehicles, and labels that differ in what is seen alone."""
+    plain = Source(root=tmp_path, size=SIZE, split="train", change="up70", variant=VARIANTS["auto_neighbours"])
+    joined = replace(plain, two_wheelers=True)
+    a, b = (source.original().store().spec for source in (plain, joined))
+    assert a | {"two_wheelers": True} == b != a
+    assert box_store(plain).key == box_store(joined).key
+    assert all(source.two_wheelers for source in (*joined.needs(), joined.rendered()))
+    a, b = (_TrueFrames(source.original())(5) for source in (plain, joined))
+    assert 0.001 < (a["images"] != b["images"]).mean() < 0.3
+    np.testing.assert_array_equal(a["state"] > 0, b["state"] > 0)
+    np.testing.assert_array_equal(a["height_dm"], b["height_dm"])
+    frames = _VariantFrames(joined)
+    boxes = frames._neighbours(5)["neighbours"][0]["boxes_3d"]
+    assert len(boxes) == len(_Later(frames.drive, 0.1).scene(5).boxes) > len(plain.drive(plain.rig).scene(5).boxes)
 
 
 def test_unknown_names_are_refused():
