@@ -1,4 +1,4 @@
-"""Solids inside labelled boxes: what a car, a person or a cone fills of its box, as up to two convex pieces.
+"""Solids inside labelled boxes: what a car, a person or a bicycle fills of its box, as up to two convex pieces.
 
 A piece is a tapered slab of six planes n · x <= d. Shares of bodies are those of production cars: the glasshouse is
 about a third of the height, the bonnet a quarter of the length, and a windscreen leans by 60 to 65 degrees.
@@ -68,18 +68,23 @@ _LOOSE_PERSON = (
 )
 _BARRIER = ((Piece(-0.5, -0.2, -0.35, 0.35, 0.5, 0.17, 0.17), Piece(-0.2, 0.48, -0.18, 0.18, 0.5, 0.1, 0.1)),)
 _CONE = ((Piece(-0.5, 0.5, rear_lean=0.4, front_lean=0.4, side_lean=0.4),),)
-_KINDS = (_CARS, _VANS, _LARGE, _PERSON, _LOOSE_PERSON, _BARRIER, _CONE, (_BOX,))
+_TWO_WHEELER = (
+    (Piece(-0.5, 0.04, side=0.2, rear_lean=0.1, front_lean=0.1), Piece(0.04, 0.5, -0.2, 0.25, 0.4, 0.02, 0.1, 0.25)),
+)
+_KINDS = (_CARS, _VANS, _LARGE, _PERSON, _LOOSE_PERSON, _BARRIER, _CONE, _TWO_WHEELER, (_BOX,))
 _FROM_M = (
     *((3.0, 1.3, 1.1), (3.0, 1.3, 1.1), (3.0, 1.3, 1.95)),
-    *((0.0, 0.0, 1.2), (0.0, 0.0, 1.2), (0.3, 1.2, 0.7), (0.0, 0.0, 0.3), (0.0, 0.0, 0.0)),
+    *((0.0, 0.0, 1.2), (0.0, 0.0, 1.2), (0.3, 1.2, 0.7), (0.0, 0.0, 0.3), (1.4, 0.35, 0.9)),
+    (0.0, 0.0, 0.0),
 )
 _TO_M = (
     *((5.6, 2.8, 1.95), (6.6, 2.8, 2.8), (30.0, 3.5, 5.0)),
-    *((0.65, 0.65, 2.2), (1.2, 1.2, 2.2), (1.1, 2.6, 1.4), (0.7, 0.7, 1.2), (np.inf,) * 3),
+    *((0.65, 0.65, 2.2), (1.2, 1.2, 2.2), (1.1, 2.6, 1.4), (0.7, 0.7, 1.2), (2.7, 1.1, 2.1)),
+    (np.inf,) * 3,
 )
 KIND_M = np.array([_FROM_M, _TO_M])
 """Least and largest length, width and height (2, kinds, 3) of cars, vans, lorries and buses, people in tight boxes and
-in loose ones, barriers, cones, and others. An object is of the first kind that it fits."""
+in loose ones, barriers, cones, bicycles and motorcycles, and others. An object is of the first kind that it fits."""
 
 _NOTHING = Piece(0.5, 0.5, 0.0, 0.0, 0.0)
 PROFILES = np.array([[*one, _NOTHING][:PIECES] for kind in _KINDS for one in kind], np.float64)

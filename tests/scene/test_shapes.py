@@ -25,6 +25,7 @@ SIZES = {
     "person in a loose box": (0.9, 0.8, 1.75),
     "barrier": (0.7, 2.0, 1.1),
     "cone": (0.4, 0.4, 0.8),
+    "two-wheeler": (1.75, 0.6, 1.7),
     "trailer": (2.0, 1.5, 1.5),
 }
 CAR = np.array([[12.0, 0.5, 0.725, *SIZES["car"], np.pi]])
@@ -63,7 +64,14 @@ def test_objects_lie_within_their_boxes() -> None:
         assert np.isin(own, inside).all() and len(own) > 0.1 * len(inside)
 
 
-def test_people_in_loose_boxes_and_barriers_leave_room() -> None:
+def test_kinds_of_thin_objects_stay_apart() -> None:
+    """nuScenes' mean sizes of bicycles and motorcycles, and the longest and widest of the others."""
+    sizes = [(1.70, 0.60, 1.28), (2.11, 0.77, 1.47), (1.2, 1.2, 1.8), (1.1, 1.2, 1.1), (2.0, 1.2, 1.5), (3.0, 1.3, 1.5)]
+    names = [list(SIZES)[kind] for kind in kinds(boxes_of({str(k): size for k, size in enumerate(sizes)}))]
+    assert names == ["two-wheeler"] * 2 + ["person in a loose box", "barrier", "trailer", "car"]
+
+
+def test_people_in_loose_boxes_barriers_and_two_wheelers_leave_room() -> None:
     """Points at half their height and at the top, by the share of the box's length and width from its middle."""
     boxes = boxes_of(SIZES)
     boxes[:, 6] = 0
@@ -74,6 +82,10 @@ def test_people_in_loose_boxes_and_barriers_leave_room() -> None:
         ("barrier", -0.45, 0.3, 0.45, True),
         ("barrier", 0.4, 0.08, 0.45, True),
         ("barrier", 0.4, 0.2, 0.0, False),
+        ("two-wheeler", -0.3, 0.45, 0.15, True),
+        ("two-wheeler", -0.3, 0.0, 0.25, False),
+        ("two-wheeler", 0.2, 0.1, 0.25, True),
+        ("two-wheeler", 0.3, 0.3, 0.0, False),
     ):
         row = list(SIZES).index(name)
         point = boxes[row, :3] + np.array([along, across, height]) * boxes[row, 3:6]
