@@ -121,6 +121,7 @@ def test_missing_frames_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert list(measure_paper(frames=1, size=(16, 44), methods=methods()[:1]).means) == ["synthetic"]
 
 
+@pytest.mark.slow
 def test_the_command(
     no_real_frames: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -85,6 +85,7 @@ def wide(done: dict[str, Any]) -> torch.Tensor:
     return nn.functional.max_pool2d(nn.functional.pad(inner.float(), (4, 4, 4, 4)), 5, 1)[:, 0] == 1
 
 
+@pytest.mark.slow
 def test_a_script_fills_a_frame_and_a_batch(lama: Path, drive: SyntheticDrive) -> None:
     target = drive.rig.shifted(z_m=0.5)
     filler = TorchScriptFiller(lama, size=64)

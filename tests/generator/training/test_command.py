@@ -67,6 +67,7 @@ def test_train_and_evaluate_on_streets(tmp_path: Path, capsys: pytest.CaptureFix
     assert "wrong rig" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_an_autoencoder_comes_first(drawn_frames: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     smaller = [
         *SMALLER,
