@@ -1,0 +1,17 @@
+"""``python -m tests.compiled``: compile all kernels that tests call, or load them from numba's cache."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from arbiview_aug.__main__ import main
+from arbiview_aug.render.plan import compile_kernels
+from tests.cli.convert.drives import command, write_frames
+
+if __name__ == "__main__":
+    compile_kernels()
+    with TemporaryDirectory() as folder:  # those of depth from motion, and of points and boxes in float32
+        drive = write_frames(Path(folder) / "drive", 3)
+        main(["depth", "--data", str(drive)])
+        main(command(drive, Path(folder) / "new", "--surface", "auto"))
