@@ -48,8 +48,10 @@ OFF_LINES_PX = (3, 10)  # of the frame's own points
 GAIN_DB = 1.5
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("frame", GAINS_DB)
+@pytest.mark.parametrize(
+    "frame",
+    [pytest.param("nuscenes-one", marks=pytest.mark.slow), pytest.param("ddad-one", marks=pytest.mark.release)],
+)
 def test_gain_over_ground(frame: str, referee: ModuleType, data_root: Path) -> None:
     if not (data_root / frame).is_dir():
         pytest.skip(f"no frame {frame} in {data_root}")
