@@ -39,8 +39,8 @@ def pytest_xdist_node_collection_finished(node: Any) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with what trains for four minutes: everything else fits beside it."""
-    items.sort(key=lambda item: item.path.name != "test_learning.py")
+    """Begin with the modules that train for minutes: everything else fits beside them."""
+    items.sort(key=lambda item: item.path.name not in ("test_learning.py", "test_experiment.py"))
 
 
 @pytest.fixture
