@@ -110,6 +110,7 @@ def test_degrees_of_yaw(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert both == pytest.approx((first + second) / 2)
 
 
+@pytest.mark.slow
 def test_lenses_that_a_method_cannot_take(
     fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

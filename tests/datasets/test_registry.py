@@ -68,6 +68,7 @@ def test_kind_and_path() -> None:
     assert data_name("frames:.") == Path.cwd().name
 
 
+@pytest.mark.slow
 def test_a_folder_of_two_kinds(nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert kinds_of(nuscenes_root) == ["frames", "nuscenes"]
     assert isinstance(open_data(nuscenes_root), FrameFolder)

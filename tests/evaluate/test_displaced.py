@@ -51,6 +51,7 @@ def test_a_camera_that_is_the_source_itself(tmp_path: Path) -> None:
         assert row["true_covered_psnr_db"] == pytest.approx(SAME_DB, abs=0.1) and row["spread_db"] == 0
 
 
+@pytest.mark.slow
 def test_a_stereo_pair(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = stereo(tmp_path / "data", 0.5, 2)
     found, printed = run(data, tmp_path / "out"), capsys.readouterr().out

@@ -136,6 +136,7 @@ def test_an_empty_study() -> None:
     assert paper_report(Study()) == PROTOCOL
 
 
+@pytest.mark.slow
 def test_a_generator_is_measured_on_frames_that_it_never_saw(no_real_frames: None, tmp_path: Path) -> None:
     trained_on = TrainedOn(data="synthetic", seed=3, held_out=(2, 5))
     ((name, streets),) = paper_study._data_sets(None, 4, (16, 44), trained_on)

@@ -26,6 +26,7 @@ def test_another_frame() -> None:
             assert torch.equal(two[..., 1:], one[..., :-1])
 
 
+@pytest.mark.slow
 def test_nothing_estimated_for_one_frame_serves_another() -> None:
     sample = SyntheticDrive(demo_source_rig((64, 176)), num_frames=1, lidar=False)[0]
     retarget = RigRetarget(sample["rig"].shifted(z_m=0.5), quality="accurate", surface="street")

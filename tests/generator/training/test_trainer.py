@@ -191,7 +191,7 @@ def test_a_frozen_unet_stays_as_it_is(tmp_path: Path) -> None:
     assert run(tmp_path, generator=frozen, steps=2).done == 2
 
 
-@pytest.mark.parametrize("checkpointing", [False, True])
+@pytest.mark.parametrize("checkpointing", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_bfloat16_and_recomputed_blocks_train(tmp_path: Path, checkpointing: bool) -> None:
     from accelerate.state import AcceleratorState  # one precision a process, but for this
 
