@@ -1,4 +1,4 @@
-"""``python -m integrations.cross_rig --quick | --pilot | --full | --large``, from the repository's root."""
+"""``python -m integrations.cross_rig --quick | --small | --pilot | --full | --large``, from the repository's root."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from integrations.cross_rig.experiment import Run, run
 from integrations.cross_rig.families import FAMILIES
 from integrations.cross_rig.real import recorded_run
 from integrations.cross_rig.report import markdown, write_report
-from integrations.cross_rig.settings import Settings, full, jobs, large, pilot, quick, real
+from integrations.cross_rig.settings import Settings, full, jobs, large, pilot, quick, real, small
 from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.worlds import CHANGES
 
-PRESETS = {"quick": quick, "pilot": pilot, "full": full, "large": large}
+PRESETS = {"quick": quick, "small": small, "pilot": pilot, "full": full, "large": large}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

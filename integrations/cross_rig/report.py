@@ -95,14 +95,20 @@ def markdown(report: Mapping[str, Any]) -> str:
     lines = [
         f"{s['train_frames']} training and {s['test_frames']} test frames{wheels} at {s['size'][0]}×{s['size'][1]}, "
         f"{s['schedule']['steps']} steps of {s['schedule']['batch']}, {report['tests_done']} of {report['tests']} "
-        f"tests done. IoU of vehicle cells in %{shown}; recovered: (variant − raw) / "
+        f"tests done. IoU of vehicle cells in %{shown}; closed gap: (variant − raw) / "
         "(oracle − raw), where oracle − raw is at least 5 points; loading: CPU ms that the variant adds to a frame "
         "that is drawn.",
     ]
     distances = [f"{a:g}–{b:g} m" for a, b in pairwise(DISTANCES_M)]
     heights = [f"{a:g}–{b:g} m high" for a, b in pairwise(HEIGHTS_M)]
     scored = any("ap" in row for row in rows)
-    head = ["variant", "IoU", "over raw", "recovered %", *(["IoU at 0.3", "AP", "AP recovered %"] if scored else [])]
+    head = [
+        "variant",
+        "IoU",
+        "over raw",
+        "closed gap %",
+        *(["IoU at 0.3", "AP", "closed gap % by AP"] if scored else []),
+    ]
     head += [*(f"IoU {d}" for d in distances)]
     head += [*(f"recall {h}" for h in heights), "loading"]
     for name, change in report["changes"].items():
@@ -122,6 +128,29 @@ def markdown(report: Mapping[str, Any]) -> str:
             cells.append(f"{1000 * row['loading_cpu_s']:.1f}")
             lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
+
+
+def summary(report: Mapping[str, Any]) -> str:
+    """A short table: every variant of a single change; of several changes, each variant between raw and the oracle.
+
+    Shares are means of the seeds with t-intervals, from three seeds on; with fewer they have those of the bootstrap.
+    """
+    changes = {change["title"]: change["variants"] for change in report["changes"].values() if change["variants"]}
+    lone = len(changes) == 1
+    table = [["trained on" if lone else "B", "IoU", "closed gap %", "AP", "closed gap % by AP"], ["---", *["---:"] * 4]]
+    for title, variants in changes.items():
+        named = [name for name in variants if lone or name not in ("raw", "oracle")]
+        for name in named:
+            row = variants[name]
+            shown = [row] if lone else [variants["raw"], row, variants["oracle"]]
+            table.append([row["title"] if lone else title if len(named) == 1 else f"{title}; {row['title']}"])
+            table[-1] += [", ".join(f"{100 * one['iou']['value']:.1f}" for one in shown), _share(row)]
+            table[-1] += [", ".join(f"{100 * one['ap']['value']['value']:.1f}" for one in shown), _share(row["ap"])]
+    return "".join("| " + " | ".join(cells) + " |\n" for cells in table)
+
+
+def _share(score: Mapping[str, Any]) -> str:
+    return _text(score.get("share_t") or score["share"], 0)
 
 
 def _text(value: Mapping[str, float] | None, digits: int, *, sign: bool = False) -> str:

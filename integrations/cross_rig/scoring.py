@@ -1,4 +1,4 @@
-"""The hierarchical bootstrap, and the share of the gap that a variant recovers."""
+"""The hierarchical bootstrap, and the share of the gap that a variant closes."""
 
 from __future__ import annotations
 
@@ -100,7 +100,9 @@ class VariantScore:
         value: IoU of all seeds' frames together, or mean AP of the seeds.
         over_raw: Value minus raw's.
         over_raw_t: The mean of the seeds' differences from raw and its t-interval; None of fewer than three seeds.
-        share: (variant - raw) / (oracle - raw); None where the gap is below ``MIN_GAP`` or no oracle was trained.
+        share: Of the gap, (variant - raw) / (oracle - raw); None where the gap is below ``MIN_GAP`` or no oracle was
+            trained.
+        share_t: The mean of the seeds' shares and its t-interval; None of fewer than three seeds.
         seeds: Value of each seed.
     """
 
@@ -108,6 +110,7 @@ class VariantScore:
     over_raw: Interval | None
     over_raw_t: Interval | None
     share: Interval | None
+    share_t: Interval | None
     seeds: list[float]
 
 
@@ -140,7 +143,7 @@ def _scores(
     raw, oracle = values.get("raw"), values.get("oracle")
     scores = {}
     for name, value in values.items():
-        over = paired = share = None
+        over = paired = share = share_t = None
         if raw is not None and name != "raw":
             over = interval(value - raw, draws[name] - draws["raw"])
             paired = t_interval(seeds[name] - seeds["raw"])
@@ -148,7 +151,8 @@ def _scores(
             # A draw whose gap is nil would make its share infinite: its place in the order is what counts.
             gaps = np.maximum(draws["oracle"] - draws["raw"], 1e-3)
             share = interval((value - raw) / (oracle - raw), (draws[name] - draws["raw"]) / gaps)
+            share_t = t_interval((seeds[name] - seeds["raw"]) / np.maximum(seeds["oracle"] - seeds["raw"], 1e-3))
         scores[name] = VariantScore(
-            interval(value, draws[name]), over, paired, share, [float(one) for one in seeds[name]]
+            interval(value, draws[name]), over, paired, share, share_t, [float(one) for one in seeds[name]]
         )
     return scores

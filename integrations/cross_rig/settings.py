@@ -130,6 +130,20 @@ def pilot() -> Settings:
     )
 
 
+def small() -> Settings:
+    """One change on streets that no constant was chosen on, two seeds: the tables of docs/benchmarks.md."""
+    return Settings(
+        train_frames=200,
+        val_frames=100,
+        test_frames=200,
+        streets=200,
+        seeds=(0, 1),
+        changes=("up70",),
+        variants=("raw", "recipe", "oracle"),
+        schedule=Schedule(steps=400),
+    )
+
+
 def full() -> Settings:
     """Everything at the pilot's size."""
     return Settings()

@@ -69,7 +69,8 @@ def test_mmdet3d(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for step, form in zip(steps, forms, strict=True):
         kind = step.pop("type")
         out = registry.held[kind](**step)(FORMS[form](sample))
-        assert out["coverage"].shape == (5, *step["size"])
+        assert out["coverage"].shape == (6, *step["size"])
+        assert step.get("p") == (0.5 if form in ("mmdet3d", "PETR") else None)  # the recipe: not for lifting by depths
     steps.clear()
     exec(several, names)
     drive = recorded_drive([sample.sample] * 2)
@@ -77,4 +78,4 @@ def test_mmdet3d(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given = bevdet4d(drive), FORMS["DETR3D"](drive[0]) | one, FORMS["Sparse4D"](drive[0])
     for step, results in zip(steps, given, strict=True):
         out = registry.held[step.pop("type")](**{**step, "size": (48, 132)})(results)
-        assert out["coverage"].shape[-3:] == (5, 48, 132)
+        assert out["coverage"].shape[-3:] == (6, 48, 132)

@@ -1,4 +1,4 @@
-"""The tables of the README are those of the reports beside it."""
+"""The tables beside the README, and the short ones of the benchmarks, are those of the reports."""
 
 import json
 import re
@@ -6,27 +6,34 @@ from pathlib import Path
 
 import pytest
 
-from integrations.cross_rig.report import markdown
+from integrations.cross_rig.report import markdown, summary
 
 FOLDER = Path(__file__).parents[1]
 REPORTS = sorted((FOLDER / "results").glob("*.json"))
-
-
-def test_there_are_results():
-    assert REPORTS and all(path.with_suffix(".png").is_file() for path in REPORTS)
+SHORT = dict(
+    re.findall(
+        r"<!-- cross_rig: (\w+) -->\n(.*?)<!-- /cross_rig -->",
+        (FOLDER.parents[1] / "docs" / "benchmarks.md").read_text(),
+        re.DOTALL,
+    )
+)
 
 
 @pytest.mark.parametrize("path", REPORTS, ids=lambda path: path.stem)
 def test_tables_are_the_reports(path):
     report = json.loads(path.read_text())
     assert report["tests_done"] == report["tests"]
-    readme = (FOLDER / "README.md").read_text()
-    (block,) = re.findall(rf"<!-- {path.stem}: .*?-->\n(.*?)<!-- /{path.stem} -->", readme, re.DOTALL)
-    assert block == markdown(report)
+    assert path.with_suffix(".md").read_text() == markdown(report)
+    assert f"[{path.stem}](results/{path.stem}.md)" in (FOLDER / "README.md").read_text()
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_the_short_tables_of_the_benchmarks_are_the_reports(name):
+    assert SHORT[name] == summary(json.loads((FOLDER / "results" / f"{name}.json").read_text()))
 
 
 def test_reports_without_intervals_are_written_as_points():
-    report = json.loads((FOLDER / "results" / "holes.json").read_text())
+    report = json.loads((FOLDER / "results" / "rest.json").read_text())
     assert "[95 % interval]" in markdown(report)
     for change in report["changes"].values():
         for row in change["variants"].values():
@@ -34,3 +41,17 @@ def test_reports_without_intervals_are_written_as_points():
                 del figure["low"], figure["high"]
     text = markdown(report)
     assert "[" not in text and "interval" not in text
+
+
+def test_a_short_table_of_one_change_has_a_row_for_each_variant():
+    table = summary(json.loads((FOLDER / "results" / "recipe.json").read_text())).splitlines()
+    assert table[0].startswith("| trained on | IoU ") and table[2].startswith("| raw A |") and " – |" in table[2]
+
+
+def test_a_short_table_of_several_changes_has_a_row_for_each_between_both_ends():
+    report = json.loads((FOLDER / "results" / "families.json").read_text())
+    table = summary(report).splitlines()
+    assert table[0].startswith("| B | IoU ") and len(table) == 2 + len(report["changes"])
+    first = next(iter(report["changes"].values()))
+    ends = [f"{100 * first['variants'][name]['iou']['value']:.1f}" for name in ("raw", "recipe", "oracle")]
+    assert table[2].startswith(f"| {first['title']} | {', '.join(ends)} |")

@@ -48,7 +48,7 @@ def test_variants_are_paired():
     np.testing.assert_array_equal(draws["raw"], draws["same"])
 
 
-def test_share_recovered():
+def test_share_of_the_gap():
     variants = {"raw": share(0.4, seeds=3), "variant": share(0.5, seeds=3), "oracle": share(0.6, seeds=3)}
     score = iou_scores({name: frames(hits) for name, hits in variants.items()})["variant"]
     assert score.share is not None and score.over_raw is not None
@@ -74,6 +74,16 @@ def test_differences_of_seeds_have_a_t_interval():
     assert (paired.value, paired.low, paired.high) == pytest.approx((0.13, 0.13 - half, 0.13 + half), abs=1e-4)
     two = {name: frames(hits[:2]) for name, hits in variants.items()}
     assert iou_scores(two)["variant"].over_raw_t is None
+
+
+def test_shares_of_seeds_have_a_t_interval():
+    """Each seed's own gap: half of 0.2, then of 0.4."""
+    ends = {"raw": (0.2, 0.2, 0.3), "variant": (0.3, 0.4, 0.5), "oracle": (0.4, 0.6, 0.7)}
+    variants = {name: np.concatenate([share(hits, 100) for hits in row]) for name, row in ends.items()}
+    found = iou_scores({name: frames(hits) for name, hits in variants.items()})["variant"].share_t
+    assert found is not None and (found.value, found.low, found.high) == pytest.approx((0.5, 0.5, 0.5), abs=1e-9)
+    two = {name: frames(hits[:2]) for name, hits in variants.items()}
+    assert iou_scores(two)["variant"].share_t is None
 
 
 def test_ap_is_paired_and_averaged_over_seeds():
