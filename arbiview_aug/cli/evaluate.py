@@ -37,11 +37,12 @@ from arbiview_aug.datasets.depth_folder import LEARNED_FOLDER, WANTED, WithDepth
 from arbiview_aug.datasets.registry import split_kind
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.errors import DataError
+from arbiview_aug.evaluate import paper_study
 from arbiview_aug.evaluate.displaced import COPY, displaced_frames, surfaces_for
 from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.methods import Method, retargeting, study_methods
-from arbiview_aug.evaluate.paper_study import SETS, draw_figures, measure_paper, paper_report, unseen_frames
+from arbiview_aug.evaluate.paper_study import draw_figures, measure_paper, paper_report, unseen_frames
 from arbiview_aug.evaluate.report.html import html_report
 from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.evaluate.report.sheet import frame_sheet
@@ -136,12 +137,12 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _yaws(text: str) -> str | list[float]:
-    if text in SETS:
+    if text in paper_study.SETS:
         return text
     try:
         return [float(value) for value in text.split(",")]
     except ValueError:
-        expected = f"{', '.join(SETS)}, or degrees such as -11,11"
+        expected = f"{', '.join(paper_study.SETS)}, or degrees such as -11,11"
         raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}") from None
 
 
