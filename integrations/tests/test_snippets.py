@@ -36,6 +36,7 @@ def test_kornia() -> None:
         assert out["images"].shape == (5, 3, 128, 352) and out["images"].dtype == torch.uint8
 
 
+@pytest.mark.slow
 def test_nuscenes(tmp_path: Path) -> None:
     root = fake_root(tmp_path / "root")
     (code,) = snippets("nuscenes", {"data/nuscenes": str(root), "v1.0-trainval": VERSION, "num_workers=8": ""})

@@ -54,6 +54,7 @@ def test_every_frame_gets_a_file_and_a_line_if_it_has_no_depth(made: Path, recor
     assert "other: depth from motion: none, no frame 0.4 to 3 m before or after it" in out
 
 
+@pytest.mark.slow
 def test_it_goes_on_where_it_was(made: Path, recorded: Path, tmp_path: Path, capsys) -> None:
     """Also after a file was cut short; by more than one process to the same bytes."""
     output, whole = tmp_path / "depth", contents(made)

@@ -152,7 +152,9 @@ def test_an_interrupt_is_one_line_and_130(
         ),
     ],
 )
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, *(pytest.param(one, marks=pytest.mark.slow) for one in (signal.SIGTERM, signal.SIGHUP))]
+)
 def test_a_real_interrupt(code: str, expected: str, number: signal.Signals, tmp_path: Path) -> None:
     wait = "import sys, threading; wait = lambda *_, **__: (print('ready', flush=True), threading.Event().wait())\n"
     command = [sys.executable, "-c", wait + code, str(tmp_path)]

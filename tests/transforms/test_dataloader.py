@@ -136,7 +136,8 @@ def test_a_generator_is_refused_in_workers(samples: ModuleType) -> None:
 
 
 # --- threads ----------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("start", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("start", ["fork", "spawn"])
 def test_workers_have_a_thread_each(samples: ModuleType, start: str) -> None:
     watched = samples.Watched(samples.Frames(), RigRetarget(samples.rig().turned(yaw_deg=9)))
     before = cv2.getNumThreads()

@@ -70,6 +70,7 @@ def test_a_killed_run_goes_on_to_the_same_numbers(done, tmp_path, monkeypatch):
     assert not list(tmp_path.rglob(".*"))
 
 
+@pytest.mark.slow
 def test_what_is_done_is_not_done_again(done, monkeypatch):
     monkeypatch.setattr(experiment, "train", None)
     assert list(run(done, 1, lambda line: None)) == [0]
@@ -126,6 +127,7 @@ def test_variants_without_a_mask_lift_every_pixel(tmp_path):
     assert (frames[2].images[~seen] > 0).mean() > 0.5
 
 
+@pytest.mark.slow
 def test_report(done):
     report = write_report(done)
     assert json.loads((done.output / "report.json").read_text()) == json.loads(json.dumps(report))
@@ -165,6 +167,7 @@ def test_families_have_tables_of_their_own(done):
     assert len(set(losses)) == 3
 
 
+@pytest.mark.slow
 def test_labels_are_the_sources_within_the_targets_cells(done):
     raw, _, mixed, oracle = (done.training_set(job) for job in jobs(TINY))
     np.testing.assert_array_equal(raw.state, mixed.state)
@@ -172,6 +175,7 @@ def test_labels_are_the_sources_within_the_targets_cells(done):
     assert raw.counts.sum() > oracle.counts.sum()
 
 
+@pytest.mark.slow
 def test_variants_are_paired(done):
     """The same frames in the same order, whatever else a variant draws."""
     first = []
@@ -182,6 +186,7 @@ def test_variants_are_paired(done):
     np.testing.assert_array_equal(first[0], first[2])
 
 
+@pytest.mark.slow
 def test_mixed_variants_draw_raw_frames_half_of_the_time(done):
     job = next(job for job in jobs(TINY) if job.variant.mixed)
     draws, raw_rig = done.draws(job), done.source("train").rig
@@ -197,6 +202,7 @@ def test_presets():
     assert len(names) == len(set(names)) == 3 * (2 + 9 * 37)
 
 
+@pytest.mark.slow
 def test_keys_follow_what_matters(done):
     raw, _, mixed, oracle = jobs(TINY)
     keys = {done.training_key(job) for job in (raw, mixed, oracle)}

@@ -64,6 +64,7 @@ def stop_after(made: Trainer, steps: int) -> None:
     made.train_step = step  # type: ignore[method-assign]
 
 
+@pytest.mark.slow
 def test_a_stopped_run_goes_on_bit_for_bit(tmp_path: Path) -> None:
     whole = run(tmp_path / "whole")
     assert whole.train()
