@@ -1,4 +1,4 @@
-"""``python -m tests.compiled``: compile all kernels that tests call, or load them from numba's cache."""
+"""``python -m tests.compiled``: compile nearly all kernels that tests call, or load them from numba's cache."""
 
 from __future__ import annotations
 
