@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
@@ -112,14 +111,6 @@ class CameraMaps:
     def of_lens(self, camera: Camera, key: Any, make: Callable[[], Planes]) -> Planes:
         """What ``make`` gives for the rays of a camera; held."""
         return self._cache.get((_lens_key(camera), key), make)
-
-    def copy_on(self, device: torch.device, key: Any, make: Callable[[], Any]) -> torch.Tensor:
-        """What ``make`` gives for a content key, on a device; held."""
-        return self._cache.get((key, device), lambda: torch.from_numpy(make()).to(device))
-
-    def rays_on(self, camera: Camera, device: torch.device) -> torch.Tensor:
-        """The unit rays (3, h, w) of a lens on a device; held."""
-        return self.copy_on(device, _lens_key(camera), lambda: self.rays(camera).planes)
 
     def clean_pixels(self, camera: Camera, level: int) -> npt.NDArray[np.uint8]:
         """255 (h, w) where a source halved ``level`` times shows no part of the own car; (0, 0) without a mask."""

@@ -43,15 +43,14 @@ def fill_frame(rendered: RenderedFrame, how: Holes) -> RenderedFrame:
     """Fill the holes of a rendered frame by ``fill_holes``, in place where possible."""
     if how == "black":
         return rendered
-    paint = [of_view() if callable(of_view) else of_view for of_view in rendered.paint]
-    images = fill_holes(rendered.images, list(rendered.coverage), rendered.layers, paint, how)
+    images = fill_holes(rendered.images, list(rendered.coverage), rendered.layers, rendered.paint, how)
     return replace(rendered, images=images, generated=stacked([~seen for seen in rendered.coverage]))
 
 
 def fill_holes(
     views: Sequence[torch.Tensor],
     coverage: Sequence[torch.Tensor],
-    layers: Sequence[npt.NDArray[np.uint8] | torch.Tensor | None],
+    layers: Sequence[npt.NDArray[np.uint8] | None],
     paint: Sequence[Paint | None],
     how: Holes,
 ) -> list[torch.Tensor]:
@@ -81,7 +80,7 @@ def fill_holes(
         if how == "mean":
             _put(view, ~known, mean)
             continue
-        of_view = np.zeros(known.shape, np.uint8) if layer is None else torch.as_tensor(layer).cpu().numpy()
+        of_view = np.zeros(known.shape, np.uint8) if layer is None else layer
         _fill(view, known, of_view, mean)
         if tops is not None:
             put_paint(tops.pixel, tops.part, tops.beside, colours, known.reshape(-1), view.reshape(3, -1))

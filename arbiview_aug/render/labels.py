@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import torch
 
-from arbiview_aug.render.atlas import Slot
 from arbiview_aug.render.plan import RenderPlan
-from arbiview_aug.render.torch_backend import positions
 
 
 def render_labels(plan: RenderPlan, labels: Sequence[torch.Tensor], fill: float) -> list[torch.Tensor]:
@@ -20,9 +18,10 @@ def render_labels(plan: RenderPlan, labels: Sequence[torch.Tensor], fill: float)
         fill: Value of uncovered pixels.
     """
     rendered, device = [], labels[0].device
-    for at, winner, slots in _views(plan, device):
+    for target in plan.targets:
+        at, winner = (torch.from_numpy(a).to(device) for a in (target.at.to_float(), target.source_camera))
         out = labels[0].new_full((*labels[0].shape[:-2], *winner.shape), fill)
-        for slot in slots:
+        for slot in [plan.layout.slot(pair.source, pair.level) for pair in target.pairs]:
             won, label = winner == slot.source, labels[slot.source]
             x, y = (
                 ((at[..., k][won] - first + 0.5) * 2**slot.level).floor().long().clamp(0, n - 1)
@@ -32,14 +31,3 @@ def render_labels(plan: RenderPlan, labels: Sequence[torch.Tensor], fill: float)
         rendered.append(out)
     return rendered
 
-
-def _views(plan: RenderPlan, device: torch.device) -> Iterator[tuple[torch.Tensor, torch.Tensor, Sequence[Slot]]]:
-    """Atlas positions (h, w, 2) and winning sources (h, w) of each view, and where its sources lie."""
-    if device in plan.on_devices:
-        for maps in plan.on_devices[device]:
-            yield positions(maps.grid, plan.layout.size), maps.source, maps.slots
-        return
-    for target in plan.targets:
-        slots = [plan.layout.slot(pair.source, pair.level) for pair in target.pairs]
-        at, winner = (torch.from_numpy(a).to(device) for a in (target.at.to_float(), target.source_camera))
-        yield at, winner, slots

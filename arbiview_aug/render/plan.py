@@ -35,7 +35,7 @@ class RenderPlan:
     source: Rig
     target: Rig  # in the source's ego frame, on the source's road
     layout: AtlasLayout  # the sources' places in the atlas
-    targets: tuple[ViewPlan, ...]  # one plan for each target camera; () if it was made on a device
+    targets: tuple[ViewPlan, ...]  # one plan for each target camera
     counters: dict[str, int] = field(default_factory=dict)  # pairs by surface, cells, pixels of solids, bands
     # The maps as tensors, by device (``torch_backend.maps_on``); not pickled.
     on_devices: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)

@@ -51,7 +51,7 @@ class RenderedFrame:
         confidence: Float32 in [0, 1], 0 where uncovered.
         generated: Bool, True where a filler made up the pixel; None before filling.
         layers: (h, w) uint8 of each view as in ``ViewPlan``, or None.
-        paint: That of each view as in ``ViewPlan``, what makes it, or None.
+        paint: That of each view as in ``ViewPlan``, or None.
         certainty: (h, w) uint8 of each view as in ``ViewPlan``, for ``confidence_of``.
         seams: (h, w) float32 of each view, by how much blending changed it, for ``confidence_of``.
         labels: Renders label maps; None if there are none.
@@ -64,8 +64,8 @@ class RenderedFrame:
     source_frame: Maps | None = None
     confidence: Maps | None = None
     generated: Maps | None = None
-    layers: Sequence[npt.NDArray[np.uint8] | torch.Tensor | None] = ()
-    paint: Sequence[Paint | Callable[[], Paint | None] | None] = ()
+    layers: Sequence[npt.NDArray[np.uint8] | None] = ()
+    paint: Sequence[Paint | None] = ()
     certainty: Sequence[npt.NDArray[np.uint8] | torch.Tensor] = ()
     seams: Sequence[torch.Tensor] = ()
     labels: LabelRenderer | None = None
@@ -168,19 +168,14 @@ class Renderer:
 def _rendered(
     plan: RenderPlan, images: list[torch.Tensor], seams: Sequence[torch.Tensor], outputs: Collection[str]
 ) -> RenderedFrame:
-    views: Any = plan.on_devices.get(images[0].device)
-    if views is not None:
-        winners = [view.source for view in views]
-    else:
-        views = plan.targets
-        winners = [torch.from_numpy(view.source_camera) for view in views]
+    views, on_device = plan.targets, plan.on_devices.get(images[0].device)
+    winners = [view.source for view in on_device or ()] or [torch.from_numpy(view.source_camera) for view in views]
     rendered = _from_winners(images, plan.target, winners, partial(render_labels, plan), outputs)
     rendered = replace(rendered, layers=[view.layers for view in views], paint=[view.paint for view in views])
     if "confidence" not in outputs:
         return rendered
-    rendered = replace(
-        rendered, certainty=[view.certainty for view in views if view.certainty is not None], seams=seams
-    )
+    certainty = [view.certainty for view in on_device or views if view.certainty is not None]
+    rendered = replace(rendered, certainty=certainty, seams=seams)
     return replace(rendered, confidence=confidence_of(rendered))
 
 

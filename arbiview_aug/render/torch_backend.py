@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from arbiview_aug.render.atlas import AtlasLayout, Slot
+from arbiview_aug.render.atlas import AtlasLayout
 from arbiview_aug.render.plan import RenderPlan
-from arbiview_aug.render.view_plan import Paint, ViewPlan
+from arbiview_aug.render.view_plan import ViewPlan
 
 
 @dataclass(frozen=True)
@@ -40,18 +40,14 @@ class ViewMaps:
     source: torch.Tensor  # (h, w) int8 index of the winning source, -1 where none sees
     blend: Blend | None
     edge: tuple[torch.Tensor, torch.Tensor] | None  # the view's ``BilinearFallback``: (n,) int64 and (1, n, 2) float32
-    interpolation: str  # as in ``ViewPlan``, like the next three
+    interpolation: str  # as in ``ViewPlan``, like the next one
     certainty: torch.Tensor | None  # (h, w) uint8
-    layers: torch.Tensor | None  # (h, w) uint8
-    paint: Callable[[], Paint | None]  # made when it is asked for: it is read back from the device
-    slots: tuple[Slot, ...]  # where its sources lie in the atlas, the one that wins most pixels first
-    covered: float  # share of its pixels that some source sees
 
     @property
     def nbytes(self) -> int:
         """Memory in bytes."""
-        further = [part for part in (self.certainty, self.layers) if part is not None]
-        tensors = [self.grid, self.source, *(self.edge or ()), *further]
+        tensors = [self.grid, self.source, *(self.edge or ())]
+        tensors += [] if self.certainty is None else [self.certainty]
         if self.blend is not None:
             tensors += [self.blend.pixel, self.blend.grid, self.blend.weight, self.blend.source]
         return sum(tensor.nbytes for tensor in tensors)
@@ -68,25 +64,13 @@ def maps_on(plan: RenderPlan, device: torch.device) -> Sequence[ViewMaps]:
 
 def _view_maps(plan: RenderPlan, target: ViewPlan, device: torch.device) -> ViewMaps:
     atlas_size = plan.layout.size
-    source, certainty, layers, pixel = (
-        None if array is None else torch.from_numpy(array).to(device)
-        for array in (target.source_camera, target.certainty, target.layers, target.edge and target.edge.pixel)
-    )
-    assert source is not None
+    source = torch.from_numpy(target.source_camera).to(device)
+    certainty = None if target.certainty is None else torch.from_numpy(target.certainty).to(device)
     edge = None
-    if target.edge is not None and pixel is not None:
-        edge = pixel, _grid(target.edge.at.to_float(), atlas_size, device)
+    if target.edge is not None:
+        edge = torch.from_numpy(target.edge.pixel).to(device), _grid(target.edge.at.to_float(), atlas_size, device)
     grid, blend = _grid(target.at.to_float(), atlas_size, device), _blend(target, atlas_size, device)
-    slots = tuple(plan.layout.slot(pair.source, pair.level) for pair in target.pairs)
-    seen, paint = float(target.coverage.mean()), lambda: target.paint
-    return ViewMaps(grid, source, blend, edge, target.interpolation, certainty, layers, paint, slots, seen)
-
-
-def positions(grid: torch.Tensor, atlas_size: tuple[int, int]) -> torch.Tensor:
-    """Atlas positions (..., 2) of a ``grid_sample`` grid, in whole 32nds of a pixel."""
-    h, w = atlas_size
-    scale = torch.tensor([max(w - 1, 1), max(h - 1, 1)], dtype=torch.float64, device=grid.device)
-    return ((grid.double() + 1) * (16 * scale)).round().div(32).float()
+    return ViewMaps(grid, source, blend, edge, target.interpolation, certainty)
 
 
 def _blend(target: ViewPlan, atlas_size: tuple[int, int], device: torch.device) -> Blend | None:

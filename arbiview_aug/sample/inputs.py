@@ -112,25 +112,6 @@ def read_scenes(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[
     return scenes
 
 
-def scenes_on_device(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...], surface: str) -> Any:
-    """As ``read_scenes``, of boxes and points that lie on the images' device: neither copied nor checked; else None."""
-    row, device, scenes = SURFACES[surface], frames[0].images[0].device, [Scene() for _ in frames]
-    keys = {key for name in row.reads for key in _SAMPLE_KEYS.get(name, (name,))}
-    if any(sample.get(key) is not None for key in keys.intersection(DEPTH_KEYS)):
-        return None
-    for name, key, width in (("boxes", "boxes_3d", 7), ("points", "points", 3)):
-        value = sample.get(key)
-        if name not in row.reads or value is None:
-            continue
-        arrays = list(value) if lead and isinstance(value, list | tuple) else split(value, lead)
-        if len(arrays) != len(frames) or not all(
-            isinstance(a, torch.Tensor) and a.device == device and a.ndim == 2 and a.shape[1] >= width for a in arrays
-        ):
-            return None
-        scenes = [replace(scene, **{name: array.detach()}) for scene, array in zip(scenes, arrays, strict=True)]
-    return None if row.needs is not None and scenes[0].geometry(row.needs) is None else scenes
-
-
 DEPTH_KEYS = ("depth_m", MOTION_KEY, LEARNED_KEY)
 _SAMPLE_KEYS = {"boxes": ("boxes_3d",), "points": ("points",), "motion": (MOTION_KEY,)}
 """Sample keys of the geometry that has a field in ``Scene``; others are read under their own name."""

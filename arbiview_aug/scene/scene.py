@@ -62,11 +62,6 @@ class Scene:
         arrays |= {f"points of {key}": array for key, array in self.further.items() if array.ndim == 2}
         return ", ".join(f"{len(array)} {name}" for name, array in arrays.items() if array is not None and len(array))
 
-    @property
-    def has_maps(self) -> bool:
-        """Whether any of the geometry comes from depth maps."""
-        return self.motion is not None or not self.further.keys().isdisjoint(("depth_m", "learned_depth_m"))
-
     @cached_property
     def best(self) -> SurfaceName:
         """The surface that ``auto`` uses: made of the most accurate geometry."""
@@ -108,7 +103,6 @@ class SurfaceRow:
         reads: The geometry that it uses: ``boxes``, ``points``, ``motion``, or any other key of the sample.
         needs: The geometry that it cannot be made without.
         overlap_depth: Whether depth from overlap may correct it.
-        on_device: Whether plans over it can be made on a device (``render.torch_planner``).
         has_wall: Whether it ends in the far wall, which has edges when seen from outside.
     """
 
@@ -116,7 +110,6 @@ class SurfaceRow:
     reads: tuple[str, ...] = ()
     needs: str | None = None
     overlap_depth: bool = False
-    on_device: bool = False
     has_wall: bool = True
 
     @cached_property
@@ -154,15 +147,14 @@ SURFACES: dict[str, SurfaceRow] = {
     "auto": SurfaceRow(
         lambda scene, z_m: scene.surface(scene.best, z_m), ("boxes", "points", "depth_m", "motion"), overlap_depth=True
     ),
-    "far": SurfaceRow(lambda scene, z_m: Far(), on_device=True, has_wall=False),
-    "ground": SurfaceRow(lambda scene, z_m: Ground(ground_z_m=z_m), on_device=True),
-    "street": SurfaceRow(_street, overlap_depth=True, on_device=True),
-    "objects": SurfaceRow(_boxes, ("boxes",), "boxes", overlap_depth=True, on_device=True),
+    "far": SurfaceRow(lambda scene, z_m: Far(), has_wall=False),
+    "ground": SurfaceRow(lambda scene, z_m: Ground(ground_z_m=z_m)),
+    "street": SurfaceRow(_street, overlap_depth=True),
+    "objects": SurfaceRow(_boxes, ("boxes",), "boxes", overlap_depth=True),
     "lidar": SurfaceRow(
         lambda scene, z_m: _point_cloud(scene, z_m, scene.points, scene.further.get("depth_m")),
         ("boxes", "points", "depth_m"),
         "points",
-        on_device=True,
     ),
     "motion": SurfaceRow(
         lambda scene, z_m: _point_cloud(scene, z_m, None, scene.motion), ("boxes", "motion"), "motion"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from operator import attrgetter
 from typing import Any
 
@@ -24,7 +24,7 @@ from arbiview_aug.render.plan import RenderPlan, build_plan, plan_key
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.render.requirements import harm_remedies, needs_geometry, static_harm
 from arbiview_aug.sample.detections import OfCameras, detections_of_frames
-from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, Frame, names_of_frames, read_scenes, scenes_on_device
+from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, Frame, names_of_frames, read_scenes
 from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames, points_of_neighbours
 from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.surface import SurfaceName
@@ -127,14 +127,14 @@ class FramePlanner:
         *,
         explained: bool = False,
     ) -> list[FramePlan]:
-        """Plan each frame of a sample: on its images' device, where everything that decides lies there.
+        """Plan each frame of a sample.
 
         Args:
             sample: The sample.
             frames: Its frames.
             lead: Leading dimensions of its images.
             target: The target rig.
-            explained: Plan on the CPU, as explanations are written there.
+            explained: Describe the geometry too.
 
         Raises:
             SampleError: The sample lacks what the settings need, or it is impossible.
@@ -149,12 +149,8 @@ class FramePlanner:
         fills_holes = self.reach is not None and isinstance(given, list | tuple) and len(given) > 0
         is_needed = any(pair.needs_geometry for pair in pairs)
         scenes: Sequence[Scene] = ()
-        on_device = not explained and given is None and self._plans_on_device(frames)
         if is_needed or self.surface != "auto" or fills_holes:  # objects decide what neighbours may fill
-            scenes = (on_device and scenes_on_device(sample, frames, lead, self.surface)) or ()
-            if not all(SURFACES[self._surface(scene)].on_device for scene in scenes) or not scenes:
-                scenes = read_scenes(sample, frames, lead, self.surface)
-                on_device &= not any(scene.has_maps for scene in scenes)
+            scenes = read_scenes(sample, frames, lead, self.surface)
         scenes = scenes or [pair.road for pair in pairs]
         names = self._names(sample, len(frames), lead)
         uses_motion = SURFACES[self.surface].needs == "motion"
@@ -168,10 +164,8 @@ class FramePlanner:
         neighbouring: list[list[Neighbour]] = [[] for _ in frames]
         if given is not None and (estimates_motion or self.reach is not None):
             neighbouring = neighbours_of_frames(sample, frames, lead, self.warn)
-        made = self._made_on_device(pairs, frames, scenes) if on_device else {}
         plans = []
-        frames_in_turn = enumerate(zip(frames, pairs, scenes, names, neighbouring, strict=True))
-        for number, (frame, pair, scene, name, neighbours) in frames_in_turn:
+        for frame, pair, scene, name, neighbours in zip(frames, pairs, scenes, names, neighbouring, strict=True):
             depth = motion = fills = None
             if pair.needs_geometry and self.config.overlap_depth:
                 depth = self._depth(frame, scene, name)
@@ -184,12 +178,11 @@ class FramePlanner:
             if uses_motion and scene.motion is None:
                 points = motion.points(frame.rig, scene.geometry("points")) if motion else np.zeros((0, 3))
                 scene = replace(scene, motion=points)
-            plan = made.get(number) or self._plan_of_pair(pair, frame.rig, scene, self.config)
+            plan = self._plan_of_pair(pair, frame.rig, scene, self.config)
             surface = self._surface(scene)
             if neighbours and self.reach is not None:
                 fills = plan_fills(plan, neighbours, scene, surface, self.config, self.reach, self.maps)
-            on_device = plan.on_devices.get(frame.images[0].device, ())
-            views = [view.pairs + view.bands for view in plan.targets] or [maps.slots for maps in on_device]
+            views = [view.pairs + view.bands for view in plan.targets]
             curves = self.harmoniser.curves(frame.rig, frame.images, views) if self.harmoniser.is_on else None
             harm = pair.harm if SURFACES[surface].is_static else None
             extras = depth, motion, fills, curves, harm, scene.words if explained else ""
@@ -222,42 +215,6 @@ class FramePlanner:
     def _surface(self, scene: Scene) -> SurfaceName:
         """The surface that a scene is rendered over."""
         return scene.best if self.surface == "auto" else self.surface
-
-    def _plans_on_device(self, frames: Sequence[Frame]) -> bool:
-        """Whether plans are made by tensor code on the images' device; those for the CPU's are compiled."""
-        if frames[0].images[0].device.type == "cpu" or not isinstance(self.config, FavsConfig):
-            return False
-        from arbiview_aug.cameras.kernels import LENS_CODES
-
-        return not self.config.overlap_depth and all(c.lens in LENS_CODES for frame in frames for c in frame.rig)
-
-    def _made_on_device(
-        self, pairs: Sequence[_RigPair], frames: Sequence[Frame], scenes: Sequence[Scene]
-    ) -> dict[int, RenderPlan]:
-        """Plans by the frames' numbers, on their images' device; those that are not cached are made in one batch."""
-        from arbiview_aug.render.torch_planner import Request, build_plans
-
-        assert isinstance(self.config, FavsConfig)
-        device = frames[0].images[0].device
-        keys: dict[int, Any] = {}
-        requests: dict[Any, Request] = {}
-        for number, (pair, frame, scene) in enumerate(zip(pairs, frames, scenes, strict=True)):
-            is_road = scene.is_empty or not pair.needs_geometry
-            scene = pair.road if is_road else scene
-            if not SURFACES[self._surface(scene)].on_device:
-                continue
-            keys[number] = key = (pair.road_key, device) if is_road else number
-            if key not in self.plans:
-                requests.setdefault(key, Request(frame.rig, pair.target, scene))
-        made = build_plans(list(requests.values()), self.surface, self.config, device, self.maps)
-        found = dict(zip(requests, made, strict=True))
-        for request, plan in zip(requests.values(), made, strict=True):
-            covered = [view.covered for view in plan.on_devices[device]]
-            self._judge_reach(request.source, request.target, request.scene, covered)
-        for key in keys.values():
-            if isinstance(key, tuple):
-                found[key] = self.plans.get(key, partial(found.__getitem__, key))
-        return {number: found[key] for number, key in keys.items()}
 
     def _built(self, source: Rig, target: Rig, scene: Scene, config: FavsConfig) -> RenderPlan:
         plan = build_plan(source, target, surface=self.surface, config=config, scene=scene, maps=self.maps)

@@ -3,18 +3,17 @@
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from arbiview_aug import Camera, Rig
 from arbiview_aug.cameras.rays import pixel_rays
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.render.plan import build_plan
 from arbiview_aug.scene.boxes import BoxSurface, points_in
+from arbiview_aug.scene.kernels import planes_of
 from arbiview_aug.scene.point_cloud import PointCloudWithBoxes
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.shapes import KIND_M, OF_KIND, PROFILES, kinds, solids, solids_among
 from arbiview_aug.scene.static import Street
-from arbiview_aug.scene.torch_surface import candidates
 from tests.scene.single_rays import inverse_distance, occlusion_depth, solids_ahead
 
 SIZES = {
@@ -33,6 +32,13 @@ CAR = np.array([[12.0, 0.5, 0.725, *SIZES["car"], np.pi]])
 
 def boxes_of(sizes: dict[str, tuple[float, float, float]]) -> np.ndarray:
     return np.array([[6.0 * k, 3.0, size[2] / 2, *size, 0.3 * k] for k, size in enumerate(sizes.values())])
+
+
+def profile_planes(box: np.ndarray, number: int) -> np.ndarray:
+    """Planes (pieces, 6, 4) of a profile in a box."""
+    planes = np.empty((PROFILES.shape[1], 6, 4))
+    planes_of(box, PROFILES[number], planes)
+    return planes
 
 
 def beside(planes: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -92,16 +98,9 @@ def test_people_in_loose_boxes_barriers_and_two_wheelers_leave_room() -> None:
         assert (beside(solids(boxes)[row], point[None])[0] <= 0) == inside
 
 
-def test_tensors_hold_the_same_shapes() -> None:
-    boxes = boxes_of(SIZES)
-    of_tensor = candidates(torch.from_numpy(boxes)).numpy()
-    assert np.allclose(of_tensor[:, 0], solids(boxes), atol=1e-9)
-    assert of_tensor.shape[1] == OF_KIND.shape[1]
-
-
 def test_points_choose_among_profiles() -> None:
     for number in OF_KIND[0]:
-        planes = candidates(torch.from_numpy(CAR))[0, number].numpy()
+        planes = profile_planes(CAR[0], number)
         chosen, is_own = solids_among(CAR, surface_points(planes, CAR[0]))
         assert np.allclose(chosen[0], planes) and is_own.mean() > 0.9
     assert len(PROFILES) > len(OF_KIND[0])
@@ -130,7 +129,7 @@ def test_a_roof_that_no_source_saw_is_a_hole(surface: str) -> None:
     low = Camera.looking(
         name="low", azimuth_deg=0, position_m=(0.0, 0.0, 1.3), width_px=320, height_px=160, horizontal_fov_deg=60
     )
-    planes = candidates(torch.from_numpy(CAR))[0, 2].numpy()
+    planes = profile_planes(CAR[0], 2)
     points = surface_points(planes, CAR[0])
     points = points[points[:, 2] < 1.3] if surface == "lidar" else np.zeros((0, 3))
     rig = Rig([low])
