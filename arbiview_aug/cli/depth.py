@@ -25,8 +25,8 @@ from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.depth_folder import FOLDER, LEARNED_FOLDER, WANTED, DepthFolder
 from arbiview_aug.datasets.registry import open_data, split_kind
 from arbiview_aug.errors import ArbiviewError, WarnOnce, described
-from arbiview_aug.sample.inputs import read_frames, read_scenes
-from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames, warn_lost
+from arbiview_aug.sample.inputs import read_frames, read_scene
+from arbiview_aug.sample.neighbours import Neighbour, read_neighbours, warn_lost
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, DepthModel, Reference, learned_depth
 from arbiview_aug.temporal.motion_depth import compile_matching, motion_depth
@@ -68,7 +68,7 @@ class _Frames(Dataset[Done]):
         rig = sample["rig"]
         (frame,) = read_frames(sample, None)
         warn = WarnOnce()
-        (neighbours,) = neighbours_of_frames(sample, [frame], (), warn)
+        neighbours = read_neighbours(frame, warn)
         used = [neighbour.name for neighbour in neighbours]
         known = self.depths.find(token, rig, used)
         if known is not None:
@@ -119,7 +119,7 @@ class _Inputs(Dataset[_Loaded | Done]):
 
     def _loaded(self, token: str, sample: dict[str, Any]) -> _Loaded | Done:
         (frame,) = read_frames(sample, None)
-        (scene,) = read_scenes(sample, [frame], (), "auto") or [Scene()]
+        scene = read_scene(frame, "auto") or Scene()
         measured = [one for one in (scene.points, scene.further.get("depth_m")) if one is not None]
         points = np.concatenate(measured).astype(float) if measured and "LiDAR" in self.wanted else None
         is_there = "motion" in self.wanted and self.motion.path(token).is_file()

@@ -135,6 +135,6 @@ def _checked_retarget(retarget: Any, name: str) -> Retarget:
         raise SampleTypeError(f"{name}: expected a callable such as RigRetarget, got {type(retarget).__name__}")
     if isinstance(retarget, RigRetarget):
         compile_kernels()  # here, once, and not in every worker
-        if SURFACES[retarget.planner.surface].needs == "motion":
+        if SURFACES[retarget.surface].needs == "motion":
             compile_matching()
     return retarget  # type: ignore[no-any-return]

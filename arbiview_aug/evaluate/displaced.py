@@ -18,7 +18,7 @@ from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.evaluate.methods import Method
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.sample.inputs import read_frames
-from arbiview_aug.sample.neighbours import neighbours_of_frames
+from arbiview_aug.sample.neighbours import read_neighbours
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.temporal.motion_depth import without_objects
 
@@ -52,7 +52,7 @@ def _next_frame(sample: dict[str, Any]) -> tuple[Photographs, dict[str, Any]] | 
     """Photographs of the nearest later neighbour, and the sample with the other neighbours, if there are others."""
     problems: list[str] = []
     (frame,) = read_frames(sample, None)
-    (neighbours,) = neighbours_of_frames(sample, [frame], (), lambda _, message: problems.append(message))
+    neighbours = read_neighbours(frame, lambda _, message: problems.append(message))
     later = next((one for one in neighbours if one.is_later), None)
     if later is None:
         if problems:

@@ -18,7 +18,7 @@ from arbiview_aug.generator.networks import GeneratorNetworks
 from arbiview_aug.render.harmonise import Harmonise, Harmoniser
 from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.render.refinement import RefinementCache
-from arbiview_aug.sample.inputs import read_frames, read_scenes
+from arbiview_aug.sample.inputs import read_frames, read_scene
 from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
@@ -120,10 +120,10 @@ def _overlap_estimates(
     gains = harmoniser.report(rig, images).gains if harmoniser.is_on else None
     if surface is None:
         return None, gains
-    (scene,) = read_scenes(sample, read_frames(sample, None), (), surface) or [Scene()]
+    scene = read_scene(read_frames(sample, None)[0], surface) or Scene()
     row = SURFACES[scene.best if surface == "auto" else surface]
     boxes = scene.boxes if row.overlap_depth and "boxes" in row.reads else None
-    return overlap_depth(rig, images, boxes), gains  # as ``FramePlanner`` measures it
+    return overlap_depth(rig, images, boxes), gains  # as ``transforms.estimate_depth`` measures it
 
 
 def one_camera(sample: Sample, camera: int) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from arbiview_aug.generator.networks import GeneratorNetworks
 from arbiview_aug.generator.pretrained import HoleFiller
 from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
 from arbiview_aug.sample.batching import gathered, leading_shape, rewrapped, split, stacked
-from arbiview_aug.sample.inputs import Frame, names_of_frames, read_frames
+from arbiview_aug.sample.inputs import Frame, read_frames
 
 SOURCES_KEY = "sources"  # holds the source sample of a retargeted one, for completion after collating
 
@@ -101,15 +101,12 @@ def _put(rendered: RenderedFrame, images: Maps, holes: Sequence[torch.Tensor]) -
     return replace(rendered.with_maps(without_holes), images=views, generated=stacked(list(holes)))
 
 
-def frame_names(
-    sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...], how: Completion
-) -> list[str]:
-    """Keys of the frames' noise: their ``token``, else a digest of their images; empty without a generator."""
+def frame_names(samples: Sequence[Frame], frames: Sequence[Frame], how: Completion) -> list[str]:
+    """Keys of the frames' noise: ``token`` of their ``samples``, else a digest of their images; empty if inpainted."""
     if how.generator is None:  # hashing six images of 1600 x 900 takes 33 ms
         return [""] * len(frames)
-    if sample.get("token") is not None:
-        return [str(name) for name in names_of_frames("token", sample["token"], len(frames), lead)]
-    return [_digest(frame.images) for frame in frames]
+    pairs = zip(samples, frames, strict=True)
+    return [s.name("token") if s.sample.get("token") is not None else _digest(frame.images) for s, frame in pairs]
 
 
 def _digest(images: Sequence[torch.Tensor]) -> str:
@@ -165,7 +162,7 @@ def complete_batch(
             images = [torch.where(seen, image, 0) for seen, image in zip(maps["coverage"][b], images, strict=True)]
         seen = {key: frames[b] for key, frames in maps.items()}
         rendered.append(RenderedFrame(images, view.rig, **seen))
-    done = complete_frames(rendered, sources, frame_names(batch, sources, lead, how), how)
+    done = complete_frames(rendered, sources, frame_names(views, sources, how), how)
     out = {key: value for key, value in batch.items() if key != SOURCES_KEY}
     for key in (*maps, "generated"):
         out[key] = gathered([getattr(frame, key) for frame in done], lead)

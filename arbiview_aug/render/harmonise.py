@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from statistics import median
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,7 @@ from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import check_ranges
 from arbiview_aug.lru_cache import LRUCache
+from arbiview_aug.render.view_plan import ViewPlan
 from arbiview_aug.scene.static import Street
 
 _VIEW_SIZE, _TILE_PX = (225, 400), 16  # the evaluation's views and tiles at half resolution
@@ -319,21 +320,21 @@ class Harmoniser:
         return estimate_gains(rig, images, self.config, overlaps=overlaps)
 
     def curves(
-        self, rig: Rig, images: Sequence[torch.Tensor], views: Sequence[Sequence[Any]]
+        self, rig: Rig, images: Sequence[torch.Tensor], views: Sequence[ViewPlan]
     ) -> npt.NDArray[np.float64] | None:
         """The tone curves (M, N, 2) of each camera in each view; None if the images stay as they are.
 
         Args:
             rig: The source rig.
             images: Its N images (3, H, W).
-            views: What each view reads, with its ``source``, the main one first: estimated gains leave that as it is.
+            views: Plans of the views. Estimated gains leave the source that wins most pixels of a view as it is.
         """
-        if self.estimates and all(len(uses) < 2 for uses in views):
+        if self.estimates and all(len(view.pairs) + len(view.bands) < 2 for view in views):
             return None
         gains = self.report(rig, images).gains
         if all(gain == 1 for gain in gains):
             return None
-        mains = [gains[uses[0].source] if uses and self.estimates else 1.0 for uses in views]
+        mains = [gains[view.pairs[0].source] if view.pairs and self.estimates else 1.0 for view in views]
         return tone_curves(np.divide.outer(gains, mains).T, self.config.knee)
 
 

@@ -54,6 +54,7 @@ class RenderedFrame:
         paint: That of each view as in ``ViewPlan``, or None.
         certainty: (h, w) uint8 of each view as in ``ViewPlan``, for ``confidence_of``.
         seams: (h, w) float32 of each view, by how much blending changed it, for ``confidence_of``.
+        curves: (M, N, 2) tone curves of each view for each source; None if exposures are as recorded.
         labels: Renders label maps; None if there are none.
     """
 
@@ -68,6 +69,7 @@ class RenderedFrame:
     paint: Sequence[Paint | None] = ()
     certainty: Sequence[npt.NDArray[np.uint8] | torch.Tensor] = ()
     seams: Sequence[torch.Tensor] = ()
+    curves: npt.NDArray[np.float64] | None = None
     labels: LabelRenderer | None = None
 
     def with_maps(self, change: Callable[[Sequence[torch.Tensor], int], Maps]) -> RenderedFrame:
@@ -136,14 +138,15 @@ class Renderer:
                 continue
             seams: list[torch.Tensor] | None = [] if with_seams else None
             views = render_opencv(plan, frame.images, self._scratch, curves[b], seams)
-            rendered[b] = _rendered(plan, views, seams or (), outputs)
+            rendered[b] = _rendered(plan, views, seams or (), curves[b], outputs)
         for members in batches.values():
             plan = plans[members[0]]
             seams = [] if with_seams else None
             sources = [torch.stack(images) for images in zip(*(frames[b].images for b in members), strict=True)]
             views = render_torch(plan, sources, [curves[b] for b in members], seams)
             for k, b in enumerate(members):
-                rendered[b] = _rendered(plan, [view[k] for view in views], [seam[k] for seam in seams or ()], outputs)
+                of_frame = [view[k] for view in views], [seam[k] for seam in seams or ()]
+                rendered[b] = _rendered(plan, *of_frame, curves[b], outputs)
         return [rendered[b] for b in range(len(frames))]
 
     def views(
@@ -166,12 +169,17 @@ class Renderer:
 
 
 def _rendered(
-    plan: RenderPlan, images: list[torch.Tensor], seams: Sequence[torch.Tensor], outputs: Collection[str]
+    plan: RenderPlan,
+    images: list[torch.Tensor],
+    seams: Sequence[torch.Tensor],
+    curves: npt.NDArray[np.float64] | None,
+    outputs: Collection[str],
 ) -> RenderedFrame:
     views, on_device = plan.targets, plan.on_devices.get(images[0].device)
     winners = [view.source for view in on_device or ()] or [torch.from_numpy(view.source_camera) for view in views]
     rendered = _from_winners(images, plan.target, winners, partial(render_labels, plan), outputs)
-    rendered = replace(rendered, layers=[view.layers for view in views], paint=[view.paint for view in views])
+    layers, paint = [view.layers for view in views], [view.paint for view in views]
+    rendered = replace(rendered, layers=layers, paint=paint, curves=curves)
     if "confidence" not in outputs:
         return rendered
     certainty = [view.certainty for view in on_device or views if view.certainty is not None]

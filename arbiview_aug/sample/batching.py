@@ -32,6 +32,17 @@ def split(value: Any, lead: tuple[int, ...]) -> list[Any]:
     return list(value.reshape(math.prod(lead), *value.shape[len(lead) :]).unbind(0))
 
 
+def entry(value: Any, lead: tuple[int, ...], index: tuple[int, ...]) -> Any:
+    """One frame's entry, as ``split`` gives it, at an ``index`` into the leading dimensions."""
+    if not lead:
+        return value
+    if isinstance(value, list | tuple):
+        return [entry(of_camera, lead, index) for of_camera in value]
+    if tuple(value.shape[: len(lead)]) != lead:
+        raise ValueError(f"expected the images' leading dimensions {lead}, got shape {tuple(value.shape)}")
+    return value[index]
+
+
 def is_readable(value: Any) -> bool:
     """Whether a value is a dense, real tensor with values and arithmetic: not on ``meta``, no 8-bit floats."""
     if not isinstance(value, torch.Tensor) or value.layout != torch.strided or value.device.type == "meta":

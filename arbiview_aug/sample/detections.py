@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,36 +13,36 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.favs.stage3_objects import Detection
 from arbiview_aug.sample.boxes_2d import outline
-from arbiview_aug.sample.inputs import Frame, numbers, read_scenes
+from arbiview_aug.sample.inputs import Frame, numbers, read_scene
 
 UNNAMED_TYPE = "upright"  # type of labelled boxes without names
 OfCameras = Mapping[int, Sequence[Detection]]  # the detections of a frame, by the index of its camera
 
 
-def detections_of_frames(
-    sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...]
-) -> Sequence[OfCameras]:
-    """The detections of each frame: the sample's ``detections``, else its ``boxes_3d`` projected into its cameras.
+def read_detections(frame: Frame) -> OfCameras:
+    """The sample's ``detections`` of a frame, else its ``boxes_3d`` projected into the cameras.
 
     ``detections``: for each camera ``{"boxes": (n, 4), "labels": [n names]}``, boxes x0 y0 x1 y1 in source pixels;
     in a batch, such a list for each frame. ``box_names``: a name for each of the ``boxes_3d``, ``upright`` by default;
     in a batch, a list for each frame.
     """
-    if (given := sample.get("detections")) is not None:
-        of_frames = _entries("detections", given, len(frames), "frames") if lead else [given]
-        return [_of_cameras(found, frame) for found, frame in zip(of_frames, frames, strict=True)]
+    sample = frame.sample
+    if sample.get("detections") is not None:
+        return _of_cameras(_of_frame("detections", frame), frame)
     if sample.get("boxes_3d") is None:
-        return [{} for _ in frames]
-    scenes, names = read_scenes(sample, frames, lead, "objects"), sample.get("box_names")
-    names_of = [names] if not lead or names is None else _entries("box_names", names, len(frames), "frames")
-    names_of = names_of * (len(frames) // len(names_of))
-    found = []
-    for frame, scene, of_frame in zip(frames, scenes, names_of, strict=True):
-        assert scene.boxes is not None
-        count = len(scene.boxes)
-        kinds = [UNNAMED_TYPE] * count if of_frame is None else _names("box_names", of_frame, count)
-        found.append({k: _projected(camera, scene.boxes, kinds) for k, camera in enumerate(frame.rig)})
-    return found
+        return {}
+    scene = read_scene(frame, "objects")
+    assert scene is not None and scene.boxes is not None
+    boxes = scene.boxes
+    names = [UNNAMED_TYPE] * len(boxes)
+    if sample.get("box_names") is not None:
+        names = _names("box_names", _of_frame("box_names", frame), len(boxes))
+    return {k: _projected(camera, boxes, names) for k, camera in enumerate(frame.rig)}
+
+
+def _of_frame(key: str, frame: Frame) -> Any:
+    value = frame.sample[key]
+    return _entries(key, value, math.prod(frame.lead), "frames")[frame.number] if frame.lead else value
 
 
 def _of_cameras(given: Any, frame: Frame) -> OfCameras:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from arbiview_aug.cameras.key_names import hint
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, canonical_name
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError, SampleTypeError
-from arbiview_aug.sample.batching import leading_shape, split
+from arbiview_aug.sample.batching import entry, leading_shape, split
 from arbiview_aug.sample.images import check_container, checked_images
 from arbiview_aug.scene.boxes import checked_boxes
 from arbiview_aug.scene.depth_maps import believed, motion_camera, points_of_depth
@@ -49,12 +50,60 @@ MAX_CAMERAS = 128  # winning sources are int8
 _OFF_CENTER = 0.2  # a principal point is never off centre by this share of the image's size along both axes
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
-    """One checked frame: N images (3, H, W), uint8 or float in [0, 1], and their cameras."""
+    """One checked frame of a sample.
+
+    Attributes:
+        images: N images (3, H, W), uint8 or float in [0, 1].
+        rig: Their cameras.
+        sample: The sample it was read from; further entries are read and checked on request.
+        lead: Leading dimensions of the sample's images.
+        index: Place of the frame in them.
+    """
 
     images: tuple[torch.Tensor, ...]
     rig: Rig
+    sample: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    lead: tuple[int, ...] = ()
+    index: tuple[int, ...] = ()
+
+    @property
+    def number(self) -> int:
+        """Number of the frame in a flattened batch."""
+        return int(np.ravel_multi_index(self.index, self.lead)) if self.lead else 0
+
+    def array(self, key: str) -> Points | None:
+        """The frame's array of a sample key; None without one.
+
+        Args:
+            key: Holds an array, a tensor with the sample's leading dimensions, or a list with an array for each frame.
+        """
+        value = self.sample.get(key)
+        if value is None or not self.lead:
+            return None if value is None else as_array(key, value)
+        count = math.prod(self.lead)
+        if isinstance(value, list | tuple):
+            if len(value) == count:
+                return as_array(key, value[self.number])
+        elif tuple(getattr(value, "shape", ()))[: len(self.lead)] == self.lead:
+            return as_array(key, value[self.index])
+        got = f"shape {tuple(value.shape)}" if hasattr(value, "shape") else type(value).__name__
+        raise SampleError(f"{key}: expected a tensor {self.lead} + (n, ...), or a list of {count} of them, got {got}")
+
+    def name(self, key: str) -> str:
+        """The frame's name under a sample key that holds one name, or in a batch a list or tensor of names."""
+        value, count = self.sample[key], math.prod(self.lead)
+        if self.lead:
+            names = list(value.reshape(count, -1)) if isinstance(value, torch.Tensor) and value.ndim else value
+            if not isinstance(names, list | tuple) or len(names) != count:
+                raise SampleError(f"{key}: expected a name for each of {count} frames, got {type(names).__name__}")
+            value = names[self.number]
+        if not isinstance(value, torch.Tensor):
+            return str(value)
+        if value.device.type == "meta" or value.layout != torch.strided:
+            raise SampleTypeError(f"{key}: expected names, got tensors without values")
+        return str(value.tolist())
 
 
 def read_frames(sample: Any, source_rig: Rig | None) -> list[Frame]:
@@ -89,27 +138,30 @@ def read_frames(sample: Any, source_rig: Rig | None) -> list[Frame]:
     ]
 
 
-def read_scenes(sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...], surface: str) -> list[Scene]:
-    """Read the scene geometry that a surface uses for each frame, in the source's ego frame; [] without any."""
-    row = SURFACES[surface]
-    found: dict[str, list[Points]] = {}
+def read_scene(frame: Frame, surface: str) -> Scene | None:
+    """Read the geometry that a surface uses, in the source's ego frame; None without any.
+
+    Args:
+        frame: The frame.
+        surface: A name in ``SURFACES``.
+
+    Raises:
+        SampleError: The sample lacks what the surface needs, or it is impossible.
+    """
+    row, sample = SURFACES[surface], frame.sample
+    arrays: dict[str, Points] = {}
     for name in row.reads:
-        doubted = name == "motion" and LEARNED_KEY in row.reads
-        arrays = _geometry(name, sample, frames, lead, found, sample.get(LEARNED_KEY) if doubted else None)
-        if arrays is not None:
-            found[name] = arrays
+        array = _geometry(name, frame, arrays, name == "motion" and LEARNED_KEY in row.reads)
+        if array is not None:
+            arrays[name] = array
         elif name == row.needs and name != "motion" and (name != "points" or sample.get("depth_m") is None):
             # Neighbouring frames may still give depth from motion.
             expected, keys = _EXPECTED.get(name, f"{name!r} in the sample, got none"), _SAMPLE_KEYS.get(name, (name,))
             raise SampleError(f"surface={surface!r}: expected {expected}{hint(sample, keys)}")
-    if not found:
-        return []
-    scenes = []
-    for k in range(len(frames)):
-        further: dict[str, Any] = {name: arrays[k] for name, arrays in found.items()}
-        own = {name: further.pop(name) for name in _SAMPLE_KEYS if name in further}
-        scenes.append(Scene(**own, further=further))
-    return scenes
+    if not arrays:
+        return None
+    fields: dict[str, Any] = {name: arrays.pop(name) for name in _SAMPLE_KEYS if name in arrays}
+    return Scene(**fields, further=arrays)
 
 
 DEPTH_KEYS = ("depth_m", MOTION_KEY, LEARNED_KEY)
@@ -125,96 +177,46 @@ _EXPECTED = {
 _CHECKS: dict[str, Callable[[Points], Points]] = {"boxes_3d": checked_boxes, "points": checked_points}
 
 
-def _geometry(
-    name: str,
-    sample: Mapping[str, Any],
-    frames: Sequence[Frame],
-    lead: tuple[int, ...],
-    found: Mapping[str, Sequence[Points]],
-    network_m: Any = None,
-) -> list[Points] | None:
-    """The array of each frame for a name in ``SurfaceRow.reads``, beside those ``found`` before; None without any.
+def _geometry(name: str, frame: Frame, arrays: Mapping[str, Points], is_doubted: bool) -> Points | None:
+    """The array of a name in ``SurfaceRow.reads``, beside the ``arrays`` read before; None without any.
 
-    Depth from motion is believed where a network's maps, if given, do not contradict it.
+    Depth from motion that ``is_doubted`` is left out where a network's maps, if there are any, contradict it.
     """
-    parts: list[list[Points]] = []
+    parts: list[Points] = []
     for key in _SAMPLE_KEYS.get(name, (name,)):
-        value = sample.get(key)
-        if value is None:
+        if frame.sample.get(key) is None:
             continue
         if key in DEPTH_KEYS:
-            measured = [found[one] for one in ("points", "depth_m", "motion") if one in found and key != "depth_m"]
-            none = [np.zeros((0, 3))] * len(frames)
-            anchors = [np.concatenate(arrays) for arrays in zip(none, *measured, strict=True)]
-            parts.append(_points_of_maps(key, value, frames, lead, anchors, network_m))
+            anchors = [arrays[one] for one in ("points", "depth_m", "motion") if one in arrays and key != "depth_m"]
+            parts.append(_points_of_maps(key, frame, np.concatenate([np.zeros((0, 3)), *anchors]), is_doubted))
             continue
-        arrays = of_frames(key, value, len(frames), lead)
-        parts.append([_CHECKS[key](array) for array in arrays] if key in _CHECKS else arrays)
-    if not parts:
-        return None
-    return [arrays[0] if len(arrays) == 1 else np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
+        array = frame.array(key)
+        assert array is not None
+        parts.append(_CHECKS[key](array) if key in _CHECKS else array)
+    return (parts[0] if len(parts) == 1 else cast(Points, np.concatenate(parts))) if parts else None
 
 
-def _points_of_maps(
-    key: str,
-    depth_m: Any,
-    frames: Sequence[Frame],
-    lead: tuple[int, ...],
-    anchors: Sequence[Points],
-    network_m: Any = None,
-) -> list[Points]:
-    """(P, 3) points of each frame's depth maps, brought to ``anchors`` (P, 3) if there are any."""
-    maps = _maps_of_frames(key, depth_m, frames, lead)
-    doubts = maps if network_m is None else _maps_of_frames(LEARNED_KEY, network_m, frames, lead)
-    found: list[Points] = []
-    for frame, of_cameras, of_network, anchor in zip(frames, maps, doubts, anchors, strict=True):
-        cameras = [camera if key == "depth_m" else motion_camera(camera) for camera in frame.rig]
-        kept = of_cameras if network_m is None else map(believed, of_cameras, of_network)
-        pairs = zip(cameras, kept, strict=True)
-        found.append(np.concatenate([points_of_depth(c, depth, key, anchor) for c, depth in pairs]))
-    return found
+def _points_of_maps(key: str, frame: Frame, anchors: Points, is_doubted: bool) -> Points:
+    """(P, 3) points of a frame's depth maps, brought to ``anchors`` (P, 3) if there are any."""
+    maps = _depth_maps(key, frame)
+    if is_doubted and frame.sample.get(LEARNED_KEY) is not None:
+        maps = list(map(believed, maps, _depth_maps(LEARNED_KEY, frame)))
+    cameras = [camera if key == "depth_m" else motion_camera(camera) for camera in frame.rig]
+    pairs = zip(cameras, maps, strict=True)
+    return np.concatenate([points_of_depth(camera, depth_m, key, anchors) for camera, depth_m in pairs])
 
 
-def _maps_of_frames(key: str, depth_m: Any, frames: Sequence[Frame], lead: tuple[int, ...]) -> list[list[Any]]:
-    """The depth maps (H, W) of each frame's cameras."""
+def _depth_maps(key: str, frame: Frame) -> list[FloatArray]:
+    """The depth maps (H, W) of a frame's cameras."""
     try:
-        maps = split(depth_m, lead)
+        maps = entry(frame.sample[key], frame.lead, frame.index)
     except (AttributeError, TypeError, ValueError, RuntimeError) as error:
         raise SampleError(f"{key}: expected one map (H, W) for each image ({error})") from None
-    found = []
-    for frame, of_cameras in zip(frames, maps, strict=True):
-        if isinstance(of_cameras, torch.Tensor | np.ndarray):
-            of_cameras = list(numbers(key, of_cameras)) if of_cameras.ndim else ()
-        if not isinstance(of_cameras, list | tuple) or len(of_cameras) != len(frame.rig):
-            raise SampleError(f"{key}: expected {len(frame.rig)} maps (H, W), one for each image")
-        found.append([numbers(key, depth) for depth in of_cameras])
-    return found
-
-
-def names_of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[object]:
-    """Hashable names of each frame: from one name, or in a batch a list or tensor of names."""
-    values = [value]
-    if lead:
-        values = list(value.reshape(count, -1)) if isinstance(value, torch.Tensor) and value.ndim else value
-        if not isinstance(values, list | tuple) or len(values) != count:
-            raise SampleError(f"{key}: expected a name for each of {count} frames, got {type(value).__name__}")
-    if any(isinstance(v, torch.Tensor) and (v.device.type == "meta" or v.layout != torch.strided) for v in values):
-        raise SampleTypeError(f"{key}: expected names, got tensors without values")
-    return [str(v.tolist()) if isinstance(v, torch.Tensor) else str(v) for v in values]
-
-
-def of_frames(key: str, value: Any, count: int, lead: tuple[int, ...]) -> list[Points]:
-    """The array of each frame: from a tensor with the images' leading dimensions, or a list with one per frame."""
-    if not lead:
-        return [_array(key, value)]
-    try:
-        frames = value if isinstance(value, list | tuple) else split(value, lead)
-    except (AttributeError, TypeError, ValueError, RuntimeError):
-        frames = ()
-    if len(frames) != count:
-        got = f"shape {tuple(value.shape)}" if hasattr(value, "shape") else type(value).__name__
-        raise SampleError(f"{key}: expected a tensor {lead} + (n, ...), or a list of {count} of them, got {got}")
-    return [_array(key, frame) for frame in frames]
+    if isinstance(maps, torch.Tensor | np.ndarray):
+        maps = list(numbers(key, maps)) if maps.ndim else ()
+    if not isinstance(maps, list | tuple) or len(maps) != len(frame.rig):
+        raise SampleError(f"{key}: expected {len(frame.rig)} maps (H, W), one for each image")
+    return [numbers(key, depth_m) for depth_m in maps]
 
 
 # --- calibration ------------------------------------------------------------------------------------------------------
@@ -241,7 +243,7 @@ def frame_from(
             fix = "height and width are swapped" if size == camera.size[::-1] else "use rig.resized((h, w)) or crop"
             expected = f"an image of (h, w) = {camera.size}, as calibrated"
             raise SampleError(f"camera {camera.name!r}: expected {expected}, got {size}; {fix}")
-    return Frame(images, _with_masks(rig, sample, lead, index))
+    return Frame(images, _with_masks(rig, sample, lead, index), sample, lead, index)
 
 
 def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any], index: tuple[int, ...]) -> Rig:
@@ -330,7 +332,7 @@ def _with_masks(rig: Rig, sample: Mapping[str, Any], lead: tuple[int, ...], inde
         if sample.get(key) is None:
             continue
         try:
-            maps = split(sample[key], lead)[np.ravel_multi_index(index, lead) if lead else 0]
+            maps = entry(sample[key], lead, index)
             hidden = [~m if key == "coverage" else m for m in maps]
             for k, (camera, pixels) in enumerate(zip(rig, hidden, strict=True)):
                 if tuple(pixels.shape) != camera.size or pixels.dtype != torch.bool:
@@ -350,14 +352,14 @@ def _with_masks(rig: Rig, sample: Mapping[str, Any], lead: tuple[int, ...], inde
 
 def numbers(key: str, value: Any, index: tuple[int, ...] = ()) -> FloatArray:
     """An entry of a sample as a float64 array, at an ``index`` into its leading dimensions; scalars hold for all."""
-    array = np.asarray(_array(key, value), np.float64)
+    array = np.asarray(as_array(key, value), np.float64)
     try:
         return np.asarray(array[index]) if array.ndim else array
     except IndexError:
         raise SampleError(f"{key}: expected the images' leading dimensions, got shape {array.shape}") from None
 
 
-def _array(key: str, value: Any) -> Points:
+def as_array(key: str, value: Any) -> Points:
     """An entry of a sample as an array: float32 in the same memory, anything else as float64."""
     try:
         if isinstance(value, torch.Tensor):

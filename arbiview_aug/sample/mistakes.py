@@ -13,9 +13,8 @@ from arbiview_aug.cameras.key_names import misnamed
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import is_mounted, pose_mistake
-from arbiview_aug.sample.batching import leading_shape
 from arbiview_aug.sample.check import EGO_KEYS, PIXEL_BOUND_KEYS
-from arbiview_aug.sample.inputs import Frame, of_frames, read_frames
+from arbiview_aug.sample.inputs import Frame, read_frames
 from arbiview_aug.sample.masks import CLEANING, image_circle, without_specks
 from arbiview_aug.scene.boxes import checked_boxes, points_in
 from arbiview_aug.scene.point_cloud import checked_points, own_car
@@ -97,8 +96,7 @@ def check(sample: Mapping[str, Any], source_rig: Rig | None = None) -> CheckRepo
         ArbiviewError: What ``RigRetarget`` would refuse too.
     """
     frames = read_frames(sample, source_rig)
-    lead = leading_shape(sample["images"])
-    boxes, points = (_arrays(sample, key, frames, lead) for key in ("boxes_3d", "points"))
+    boxes, points = (_arrays(sample, key, frames) for key in ("boxes_3d", "points"))
     found = list(_key_findings(sample, source_rig is not None or sample.get("rig") is not None))
     for frame, of_frame, cloud in zip(frames, boxes, points, strict=True):
         # Holes of an earlier retargeting are masks too, of any shape.
@@ -136,12 +134,12 @@ def check_rig(rig: Rig, *, masks: bool = True) -> list[Finding]:
     return found
 
 
-def _arrays(sample: Mapping[str, Any], key: str, frames: Sequence[Frame], lead: tuple[int, ...]) -> list[Any]:
+def _arrays(sample: Mapping[str, Any], key: str, frames: Sequence[Frame]) -> list[Any]:
     """The boxes or points of each frame, checked; None where the sample has none."""
     if sample.get(key) is None:
         return [None] * len(frames)
     checked: Callable[[Any], Any] = checked_boxes if key == "boxes_3d" else checked_points
-    return [checked(array) for array in of_frames(key, sample[key], len(frames), lead)]
+    return [checked(frame.array(key)) for frame in frames]
 
 
 def _key_findings(sample: Mapping[str, Any], calibrated: bool) -> Iterator[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,7 +15,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import ArbiviewError, SampleError, SampleTypeError
 from arbiview_aug.sample.images import check_container, checked_images
-from arbiview_aug.sample.inputs import Frame, frame_from, numbers, of_frames
+from arbiview_aug.sample.inputs import Frame, as_array, frame_from, numbers
 from arbiview_aug.scene.boxes import carried, checked_boxes, moved_boxes
 from arbiview_aug.scene.point_cloud import checked_points, own_car, seen_through
 from arbiview_aug.scene.surface import Points
@@ -91,8 +92,7 @@ class Neighbour:
         value = self.given.get("points")
         if value is None:
             return None
-        (own,) = of_frames("points", value, 1, ())
-        own = checked_points(own)
+        own = checked_points(as_array("points", value))
         points = own[~own_car(own)] @ self.ego2ego[:3, :3].T + self.ego2ego[:3, 3]
         return points if self.boxes is None or self.boxes_now is None else carried(points, self.boxes, self.boxes_now)
 
@@ -108,10 +108,8 @@ class Neighbour:
         return tuple(image.to(like[0].device) for image in images)
 
 
-def neighbours_of_frames(
-    sample: Mapping[str, Any], frames: Sequence[Frame], lead: tuple[int, ...], warn: Warn
-) -> list[list[Neighbour]]:
-    """Read the neighbours of each frame, nearest first.
+def read_neighbours(frame: Frame, warn: Warn) -> list[Neighbour]:
+    """Read the neighbours of a frame, nearest first.
 
     ``neighbours`` is a list of mappings, each another frame of the same rig (in a batch, a list of such lists):
     ``images``; ``ego2ego`` (4, 4), its ego frame to the current one, or ``ego2world`` as in the sample; optionally
@@ -121,33 +119,28 @@ def neighbours_of_frames(
 
     Frames at the same place are left out silently, unusable ones with a warning.
     """
-    value = sample.get("neighbours")
+    value, count = frame.sample.get("neighbours"), math.prod(frame.lead)
     if value is None:
-        return [[] for _ in frames]
-    lists = list(value) if lead and isinstance(value, list | tuple) else [value]
-    if len(lists) != len(frames) or not all(isinstance(entries, list | tuple) for entries in lists):
-        expected = f"a list of {len(frames)} lists, one for each frame of the batch" if lead else "a list of frames"
+        return []
+    lists = list(value) if frame.lead and isinstance(value, list | tuple) else [value]
+    if len(lists) != count or not all(isinstance(entries, list | tuple) for entries in lists):
+        expected = f"a list of {count} lists, one for each frame of the batch" if frame.lead else "a list of frames"
         raise SampleTypeError(f"neighbours: expected {expected}, got {type(value).__name__}")
-    most = max(map(len, lists))
-    if most > MAX_NEIGHBOURS:
-        raise SampleError(f"neighbours: expected at most {MAX_NEIGHBOURS} for a frame, got {most}")
-    boxes = sample.get("boxes_3d")
-    current = [None] * len(frames) if boxes is None else of_frames("boxes_3d", boxes, len(frames), lead)
-    found = []
-    for index, frame, now, entries in zip(np.ndindex(*lead), frames, current, lists, strict=True):
-        of_frame = []
-        for number, entry in enumerate(entries):
-            token = entry.get("token") if isinstance(entry, Mapping) else None
-            name = str(number) if token is None else repr(str(token))
-            try:
-                neighbour = _neighbour(sample, index, frame, now, entry, number, name)
-            except (ArbiviewError, OSError) as error:
-                warn_lost(warn, name, error)
-                continue
-            if neighbour is not None:
-                of_frame.append(neighbour)
-        found.append(sorted(of_frame, key=lambda neighbour: neighbour.travel_m))
-    return found
+    entries = lists[frame.number]
+    if len(entries) > MAX_NEIGHBOURS:
+        raise SampleError(f"neighbours: expected at most {MAX_NEIGHBOURS} for a frame, got {len(entries)}")
+    boxes, neighbours = frame.array("boxes_3d"), []
+    for number, entry in enumerate(entries):
+        token = entry.get("token") if isinstance(entry, Mapping) else None
+        name = str(number) if token is None else repr(str(token))
+        try:
+            neighbour = _neighbour(frame, boxes, entry, number, name)
+        except (ArbiviewError, OSError) as error:
+            warn_lost(warn, name, error)
+            continue
+        if neighbour is not None:
+            neighbours.append(neighbour)
+    return sorted(neighbours, key=lambda neighbour: neighbour.travel_m)
 
 
 def points_of_neighbours(rig: Rig, points: Points, neighbours: Sequence[Neighbour], warn: Warn) -> FloatArray | None:
@@ -173,20 +166,12 @@ def warn_lost(warn: Warn, name: str, error: Exception) -> None:
     warn(f"neighbour {name}", f"neighbour {name} is left out: {error}; the frame is rendered without it")
 
 
-def _neighbour(
-    sample: Mapping[str, Any],
-    index: tuple[int, ...],
-    frame: Frame,
-    current: Points | None,
-    entry: Any,
-    number: int,
-    name: str,
-) -> Neighbour | None:
+def _neighbour(frame: Frame, current: Points | None, entry: Any, number: int, name: str) -> Neighbour | None:
     if not isinstance(entry, Mapping):
         raise SampleTypeError(f"expected a mapping with images and a pose, got {type(entry).__name__}")
-    ego2ego = _ego2ego(sample, index, entry)
+    ego2ego = _ego2ego(frame.sample, frame.index, entry)
     travel_m, turned_deg = float(np.linalg.norm(ego2ego[:3, 3])), _angle_deg(ego2ego[:3, :3])
-    seconds = _seconds(sample, index, entry)
+    seconds = _seconds(frame.sample, frame.index, entry)
     _check_motion(ego2ego, travel_m, seconds)
     if travel_m < STILL_M and turned_deg < STILL_DEG:
         return None

@@ -31,6 +31,7 @@ class Scene:
         sweeps: (P, 3) points of neighbouring frames beside ``points``, metres.
         further: Arrays of other sample keys that a row of ``SURFACES`` reads.
         corrections: Corrections of the street's distances by depth from overlap.
+        known: Surface whose distances are known, in place of all others but ``far``.
     """
 
     boxes: FloatArray | None = None
@@ -39,6 +40,7 @@ class Scene:
     sweeps: Points | None = None
     further: Mapping[str, Points] = field(default_factory=dict)
     corrections: tuple[Correction, ...] = ()
+    known: Surface | None = None
     _surfaces: dict[tuple[str, float], Surface] = field(default_factory=dict, init=False, repr=False)
 
     def geometry(self, name: str) -> Points | None:
@@ -85,6 +87,8 @@ class Scene:
 
     def surface(self, name: str, ground_z_m: float) -> Surface:
         """A surface by name, over a road at ``ground_z_m``; cached."""
+        if self.known is not None and name != "far":
+            return self.known
         key = name, ground_z_m
         if key not in self._surfaces:
             row = SURFACES.get(name)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -32,7 +32,7 @@ from arbiview_aug.sample.neighbours import Neighbour, Warn, warn_lost
 from arbiview_aug.scene.boxes import BoxSurface
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.shapes import whole
-from arbiview_aug.scene.static import Far, Street
+from arbiview_aug.scene.static import Street
 from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Surface
 from arbiview_aug.temporal.change import BOX_MARGIN_M, ChangeRisk, change_risks
 from arbiview_aug.temporal.merge import Candidate, merged
@@ -133,8 +133,6 @@ class Fills:
 class _HoleSurface(DenseSurface):
     """Known distances of the holes' pixels, hidden from a neighbour by labelled objects and by what was measured.
 
-    Plans take it for a scene, whose only surface it is.
-
     Attributes:
         holes: The holes.
         full: The frame's surface.
@@ -144,12 +142,6 @@ class _HoleSurface(DenseSurface):
     holes: Sequence[Hole]
     full: Surface
     objects: BoxSurface | None
-    best: ClassVar[str] = "street"
-    boxes: ClassVar[None] = None  # fills have no seams
-
-    def surface(self, name: str, ground_z_m: float) -> Surface:
-        """It; at a camera's own centre no distance matters."""
-        return Far() if name == "far" else self
 
     @property
     def is_dense(self) -> bool:  # type: ignore[override]
@@ -206,8 +198,9 @@ def plan_fills(
     fills = []
     for neighbour in neighbours:
         boxes = neighbour.labelled + np.array([0, 0, 0, 2 * BOX_MARGIN_M, 2 * BOX_MARGIN_M, 0, 0])
-        of_holes: Any = _HoleSurface(holes, full, BoxSurface(Street(), boxes, whole(boxes)) if len(boxes) else None)
-        views = build_plan(neighbour.rig, rig, surface=surface, config=config, scene=of_holes, maps=maps)
+        objects = BoxSurface(Street(), boxes, whole(boxes)) if len(boxes) else None
+        known = Scene(known=_HoleSurface(holes, full, objects))
+        views = build_plan(neighbour.rig, rig, surface=surface, config=config, scene=known, maps=maps)
         shown = [_shown(hole, view, neighbour) for hole, view in zip(holes, views.targets, strict=True)]
         if any((hole.free & one.shows).any() for hole, one in zip(holes, shown, strict=True)):
             fills.append(Fill(neighbour, views, shown))
@@ -273,26 +266,23 @@ def _shown(hole: Hole, view: ViewPlan, neighbour: Neighbour) -> Candidate:
 # --- filling ----------------------------------------------------------------------------------------------------------
 def fill_from_neighbours(
     rendered: RenderedFrame,
-    fills: Fills | None,
+    fills: Fills,
     images: Sequence[torch.Tensor],
-    curves: npt.NDArray[np.float64] | None,
     renderer: Renderer,
     warn: Warn,
 ) -> RenderedFrame:
     """Fill the holes of a rendered frame from its neighbours.
 
     Args:
-        rendered: The frame; its maps, and its images where possible, are written into.
-        fills: The planned fills; None for none.
+        rendered: The frame; its maps, and its images where possible, are written into. Its tone curves serve the
+            neighbours' cameras too: the holes overlap the current views too little to estimate others.
+        fills: The planned fills.
         images: The current frame's source images.
-        curves: The current views' tone curves, which serve the neighbours' cameras too: the holes overlap the current
-            views too little to estimate others.
         renderer: Renders the neighbours.
         warn: Called for neighbours that cannot be read.
     """
-    if fills is None:
-        return rendered
-    neighbours, tones = [], None if curves is None else curves[[hole.target for hole in fills.holes]]
+    tones = None if rendered.curves is None else rendered.curves[[hole.target for hole in fills.holes]]
+    neighbours = []
     for fill in fills.fills:
         sources = neighbour_images(fill.neighbour, images, warn)
         if sources is not None:

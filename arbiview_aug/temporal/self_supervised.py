@@ -24,7 +24,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.sample.inputs import read_frames
-from arbiview_aug.sample.neighbours import neighbours_of_frames
+from arbiview_aug.sample.neighbours import read_neighbours
 from arbiview_aug.scene.depth_maps import motion_camera
 from arbiview_aug.scene.static import Street
 from arbiview_aug.temporal.learned_depth import DepthInputs, Prediction, View
@@ -113,7 +113,7 @@ class _Shot(NamedTuple):
 def read_targets(sample: Mapping[str, Any], size: tuple[int, int]) -> Targets | None:
     """Read a frame with its neighbours; None if none of them is at a useful distance."""
     (frame,) = read_frames(sample, None)
-    (neighbours,) = neighbours_of_frames(sample, [frame], (), lambda _, __: None)
+    neighbours = read_neighbours(frame, lambda _, __: None)
     near = [one for one in neighbours if TRAVEL_M[0] <= one.travel_m <= TRAVEL_M[1]]
     if not near:
         return None

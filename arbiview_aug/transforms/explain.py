@@ -13,26 +13,26 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.favs.renderer import PaperRendering, SourceReport
 from arbiview_aug.render.harmonise import PhotometricReport
-from arbiview_aug.render.overlap_depth import OverlapDepth
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.requirements import harm_remedies
 from arbiview_aug.render.view_plan import SourceUse
 from arbiview_aug.temporal.fill import Fills
-from arbiview_aug.temporal.motion_depth import MotionDepth
+from arbiview_aug.transforms.plans import FramePlan
 
 
 @dataclass(frozen=True)
 class Explanation:
     """Why a frame is rendered as it is; ``str`` prints it, ``as_dict`` gives plain data."""
 
-    plan: RenderPlan
+    planned: FramePlan
     harmonisation: PhotometricReport | None = None  # the sources' gains and why, if they are harmonised
-    depth: OverlapDepth | None = None  # from overlap, if it was asked for and matters
-    motion: MotionDepth | None = None  # depth from motion, if it was estimated
     learned: str | None = None  # the model of learned depth and how it was fitted, if the surface is made of it
     fills: Fills | None = None  # how other frames of the drive fill holes, if there are any
-    harm: str | None = None  # why a detector suffers, if cameras move over a static surface
-    geometry: str = ""  # what surfaces are made of: ``Scene.words``
+
+    @property
+    def plan(self) -> RenderPlan:
+        """The render plan."""
+        return self.planned.plan
 
     def as_dict(self) -> list[dict[str, Any]]:
         """One entry for each target camera: coverage, share to invent, and its sources with surface and reason.
@@ -63,14 +63,14 @@ class Explanation:
         lines = []
         if self.harmonisation is not None:
             lines.append(str(self.harmonisation))
-        if self.harm is not None:
-            lines += [self.harm, f"better: {harm_remedies(self.plan.source, self.plan.target)}"]
-        if self.depth is not None:
-            lines += str(self.depth).splitlines()
-        if self.geometry:
-            lines.append(f"geometry: {self.geometry}; the street elsewhere")
-        if self.motion is not None:
-            lines.append(str(self.motion))
+        if self.planned.harm is not None:
+            lines += [self.planned.harm, f"better: {harm_remedies(self.plan.source, self.plan.target)}"]
+        if self.planned.overlap is not None:
+            lines += str(self.planned.overlap).splitlines()
+        if geometry := self.planned.scene.words:
+            lines.append(f"geometry: {geometry}; the street elsewhere")
+        if self.planned.motion is not None:
+            lines.append(str(self.planned.motion))
         if self.learned is not None:
             lines += self.learned.splitlines()
         if self.fills is not None:

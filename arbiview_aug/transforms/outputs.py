@@ -36,18 +36,17 @@ class SampleWriter:
 
     def write(
         self,
-        sample: Mapping[str, Any],
         frames: Sequence[Frame],
-        lead: tuple[int, ...],
         rendered: Sequence[RenderedFrame],
         labels: Sequence[str],
         target: Rig,
         params: Mapping[str, float],
     ) -> dict[str, Any]:
-        """Write the output sample of a sample, its frames and its leading dimensions; the input is not changed.
+        """Write the output sample of a sample's frames; the input is not changed.
 
         ``labels`` are the sample's keys that hold label maps; ``target`` is in its own ego frame.
         """
+        sample, lead = frames[0].sample, frames[0].lead
         out = self._passed_on(sample, labels)
         out["images"] = rewrapped(gathered([stacked(frame.images) for frame in rendered], lead), sample["images"])
         device = rendered[0].images[0].device

@@ -7,10 +7,12 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import cv2
+import numpy as np
 import torch
 
 from arbiview_aug.cameras.framing import Fit, framing
@@ -29,15 +31,18 @@ from arbiview_aug.render.harmonise import Harmonise, Harmoniser, PhotometricRepo
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.render.rendered import Execution, RenderedFrame, Renderer, as_rendered, resize_only
-from arbiview_aug.sample.batching import leading_shape
 from arbiview_aug.sample.check import check_other_keys, warn_of_misnamed, warn_of_rims
-from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, Frame, read_frames
-from arbiview_aug.scene.scene import SURFACES, Scene
+from arbiview_aug.sample.detections import read_detections
+from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, Frame, read_frames, read_scene
+from arbiview_aug.sample.neighbours import points_of_neighbours, read_neighbours
+from arbiview_aug.scene.scene import SURFACES, Scene, SurfaceRow
 from arbiview_aug.scene.surface import SurfaceName
-from arbiview_aug.temporal.fill import Reach, fill_from_neighbours
+from arbiview_aug.temporal.fill import Fills, Reach, fill_from_neighbours, plan_fills
+from arbiview_aug.transforms.checks import check_reach, warn_of_harm
+from arbiview_aug.transforms.estimate_depth import estimate_motion, estimate_overlap, estimates_motion
 from arbiview_aug.transforms.explain import Explanation, PaperExplanation
 from arbiview_aug.transforms.outputs import SampleWriter
-from arbiview_aug.transforms.planner import FramePlan, FramePlanner
+from arbiview_aug.transforms.plans import FramePlan, Plans
 from arbiview_aug.transforms.settings import (
     OUTPUTS,
     RenderPath,
@@ -227,18 +232,17 @@ class RigRetarget(torch.nn.Module):
         self._warn = WarnOnce()
         # Plans of rigs drawn for each sample are never reused.
         drawn_anew = isinstance(self.target, RandomRig) and self.target.per == "sample"
-        self.planner = FramePlanner(
-            self.config,
-            surface,
-            Harmoniser(False if harmonise is None and isinstance(self.config, PaperConfig) else harmonise),
-            refinement,
-            cache_bytes=0 if drawn_anew else cache_bytes,
-            reach=neighbours,
-            mixed=p <= _MIXED_P,
-            strict=strict,
-            unseen=unseen_note(path if holes == "fill" else holes),
-            warn=self._warn,
-        )
+        self.surface, self.reach, self.refinement, self.strict = surface, neighbours, refinement, strict
+        self.harmoniser = Harmoniser(False if harmonise is None and isinstance(self.config, PaperConfig) else harmonise)
+        unseen = unseen_note(path if holes == "fill" else holes)
+        self._check_reach = partial(check_reach, unseen=unseen, warn=self._warn)
+        config = None if isinstance(self.config, PaperConfig) else self.config
+        if config is None and self.harmoniser.is_on:
+            raise ValueError(f"harmonise: quality='paper' is as published: expected None, got {self.harmoniser!r}")
+        max_bytes, keeps_refined = 0 if drawn_anew else cache_bytes, refinement is not None
+        self._plans = Plans(config, surface, max_bytes, keeps_refined, self._check_reach)
+        if refinement is not None and not (config and config.overlap_depth):
+            raise ValueError("refinement: expected quality='accurate' (or overlap_depth=True) with a RefinementCache")
         self._fixed_target = self._sized(self.target) if isinstance(self.target, Rig) else None
         base = base if self.size is None else base.resized(self.size, fit)
         # The output's keys depend on the settings alone, so that batches collate.
@@ -260,12 +264,11 @@ class RigRetarget(torch.nn.Module):
     def extra_repr(self) -> str:
         """Target and settings, for ``repr``."""
         target = self.target if isinstance(self.target, RandomRig) else (self.target.name or "unnamed rig")
-        how = self.planner
         settings = (
-            f"path={self.path}, holes={self.holes}, surface={how.surface}, harmonise={how.harmoniser}, "
+            f"path={self.path}, holes={self.holes}, surface={self.surface}, harmonise={self.harmoniser}, "
             f"size={self.size}, fit={self.fit}, p={self.p:g}"
         )
-        refinement = "" if how.refinement is None else f"refinement={how.refinement!r}, "
+        refinement = "" if self.refinement is None else f"refinement={self.refinement!r}, "
         return f"target={target}, {settings}, {refinement}{self.config}"
 
     # --- the transform --------------------------------------------------------------------------------------------
@@ -294,22 +297,14 @@ class RigRetarget(torch.nn.Module):
 
     def _retargeted(self, sample: Mapping[str, Any], params: Mapping[str, float] | None) -> dict[str, Any]:
         self._limit_threads()
-        frames, lead = read_frames(sample, self.source_rig), leading_shape(sample["images"])
+        frames = read_frames(sample, self.source_rig)
         labels = self._check_keys(sample, frames)
-        target, skip, draws = self._make_params(sample, frames, params)
+        target, skip, draws = self._make_params(frames, params)
         if skip and self.size is not None:
             rendered = [resize_only(frame, self.size, self.fit, self.outputs) for frame in frames]
         else:
-            plans = self.planner.plan(sample, frames, lead, target)
-            self.planner.judge(plans)
-            rendered = self._render(plans, frames)
-            for k, (plan, frame) in enumerate(zip(plans, frames, strict=True)):
-                if plan.fills is not None:
-                    rendered[k] = fill_from_neighbours(
-                        rendered[k], plan.fills, frame.images, plan.curves, self.renderer, self._warn
-                    )
-            rendered = self._complete(rendered, sample, frames, lead)
-        return self._writer.write(sample, frames, lead, rendered, labels, target, draws)
+            rendered = self._inpainted(self._rendered(frames, target), frames)
+        return self._writer.write(frames, rendered, labels, target, draws)
 
     def _check_keys(self, sample: Mapping[str, Any], frames: Sequence[Frame]) -> list[str]:
         """Check the sample's further keys, and return those that hold label maps."""
@@ -323,39 +318,83 @@ class RigRetarget(torch.nn.Module):
             self._checked = types
         return check_other_keys(sample, list(sizes), self.label_keys, self.pass_keys)
 
-    def _render(self, plans: Sequence[FramePlan], frames: Sequence[Frame]) -> list[RenderedFrame]:
-        if isinstance(self.config, PaperConfig):
-            published = map(self._published, plans, frames)
-            return [as_rendered(rendering, self.outputs) for rendering in published]
-        outputs = (*self.outputs, "confidence") if self._needs_confidence else self.outputs
-        render_plans = [plan.plan for plan in plans if plan.plan is not None]
-        return self.renderer.render(render_plans, frames, [plan.curves for plan in plans], outputs)
+    # --- stages -------------------------------------------------------------------------------------------------------
+    def plan_frame(self, frame: Frame, target: Rig) -> FramePlan:
+        """Read a frame's scene, estimate the depth that its geometry asks for, and plan how it is rendered."""
+        pair = self._plans.pair(frame.rig, target)
+        has_neighbours, fills = frame.sample.get("neighbours") is not None, self.reach is not None
+        from_motion = self._row.needs == "motion" and pair.needs_geometry and estimates_motion(frame, self.surface)
+        neighbours = read_neighbours(frame, self._warn) if has_neighbours and (fills or from_motion) else []
+        reads_scene = pair.needs_geometry or self.surface != "auto" or bool(neighbours)  # objects limit what they fill
+        scene = (reads_scene and read_scene(frame, self.surface)) or pair.road
+        overlap = motion = None
+        if pair.needs_geometry and isinstance(self.config, FavsConfig) and self.config.overlap_depth:
+            overlap = estimate_overlap(frame, scene, self.surface, self.refinement)
+        if from_motion:
+            motion = estimate_motion(frame, scene, neighbours, self._warn)
+        if overlap is not None:
+            scene = replace(scene, corrections=overlap.corrections)
+        if fills and neighbours and scene.points is not None and pair.needs_geometry:
+            scene = replace(scene, sweeps=points_of_neighbours(frame.rig, scene.points, neighbours, self._warn))
+        if self._row.needs == "motion" and scene.motion is None:
+            points = motion.points(frame.rig, scene.geometry("points")) if motion else np.zeros((0, 3))
+            scene = replace(scene, motion=points)
+        surface = scene.best if self.surface == "auto" else self.surface
+        plan = self._plans.plan(pair, scene)
+        return FramePlan(frame, pair, scene, surface, plan, neighbours if fills else (), overlap, motion)
 
-    def _published(self, plan: FramePlan, frame: Frame) -> PaperRendering:
+    def plan_fills(self, planned: FramePlan) -> Fills | None:
+        """Plan what a frame's neighbours fill."""
+        if self.reach is None or not planned.neighbours:
+            return None
+        assert isinstance(self.config, FavsConfig)
+        settings = planned.surface, self.config, self.reach, self._plans.maps
+        return plan_fills(planned.plan, planned.neighbours, planned.scene, *settings)
+
+    def _warn_of_harm(self, planned: Sequence[FramePlan]) -> None:
+        if self.surface != "auto" or self.p <= _MIXED_P or (not self.strict and "static" in self._warn.topics):
+            return
+        for one in planned:
+            if one.harm is not None:
+                warn_of_harm(one.harm, one.frame.rig, one.pair.target, self.strict, self._warn)
+
+    def _rendered(self, frames: Sequence[Frame], target: Rig) -> list[RenderedFrame]:
+        """Render the frames; what sources do not see is filled from neighbouring frames alone."""
+        if isinstance(self.config, PaperConfig):
+            return [as_rendered(self._published(frame, target), self.outputs) for frame in frames]
+        planned = [self.plan_frame(frame, target) for frame in frames]
+        self._warn_of_harm(planned)
+        outputs = (*self.outputs, "confidence") if self._needs_confidence else self.outputs
+        curves = [self.harmoniser.curves(one.frame.rig, one.frame.images, one.plan.targets) for one in planned]
+        rendered = self.renderer.render([one.plan for one in planned], frames, curves, outputs)
+        for k, one in enumerate(planned):
+            if (fills := self.plan_fills(one)) is not None:
+                rendered[k] = fill_from_neighbours(rendered[k], fills, one.frame.images, self.renderer, self._warn)
+        return rendered
+
+    def _published(self, frame: Frame, target: Rig) -> PaperRendering:
         """Render a frame by the paper's stages."""
         assert isinstance(self.config, PaperConfig)
-        rendering = render_paper(frame.rig, plan.target, frame.images, self.config, plan.detections)
-        self.planner.warn_unreachable(plan.source, plan.target, rendering.coverage)
+        pair, sample = self._plans.pair(frame.rig, target), frame.sample
+        has_detections = any(sample.get(key) is not None for key in ("detections", "boxes_3d"))
+        detections = read_detections(frame) if self.config.use_detections and has_detections else {}
+        rendering = render_paper(pair.source, pair.target, frame.images, self.config, detections)
+        self._check_reach(pair.source, pair.target, rendering.coverage)
         return rendering
 
-    def _complete(
-        self,
-        rendered: Sequence[RenderedFrame],
-        sample: Mapping[str, Any],
-        frames: Sequence[Frame],
-        lead: tuple[int, ...],
-    ) -> list[RenderedFrame]:
+    def _inpainted(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
+        """Fill what no frame shows."""
         if self.completion is None:
             rendered = [fill_frame(of_frame, self.holes) for of_frame in rendered]
         if self.size is not None and self.fit == "pad":
             rendered = [of_frame.between_bars(self.size) for of_frame in rendered]
         if self.completion is None:
             return list(rendered)
-        names = frame_names(sample, frames, lead, self.completion)
+        names = frame_names(frames, frames, self.completion)
         return complete_frames(rendered, frames, names, self.completion)
 
     def _make_params(
-        self, sample: Mapping[str, Any], frames: Sequence[Frame], params: Mapping[str, float] | None
+        self, frames: Sequence[Frame], params: Mapping[str, float] | None
     ) -> tuple[Rig, bool, dict[str, float]]:
         """Draw the target rig and whether to skip; return both, and the parameters that replay them."""
         if self.rng is not None and torch.utils.data.get_worker_info() is not None:
@@ -367,7 +406,7 @@ class RigRetarget(torch.nn.Module):
         elif self.p < 1 and given is not None:
             draws["skipped"] = given.pop("skipped", 0.0)
         if isinstance(self.target, RandomRig):
-            rig_params = self.target.draw_for(sample, self.rng) if given is None else given
+            rig_params = self.target.draw_for(frames[0].sample, self.rng) if given is None else given
             target = self._sized(self.target.rig(rig_params))
             draws.update(rig_params)
         else:
@@ -393,7 +432,11 @@ class RigRetarget(torch.nn.Module):
     @property
     def plans(self) -> LRUCache[bytes, RenderPlan]:
         """The cached plans."""
-        return self.planner.plans
+        return self._plans.cache
+
+    @property
+    def _row(self) -> SurfaceRow:
+        return SURFACES[self.surface]
 
     def plan(self, source: Rig, target: Rig, scene: Scene | None = None) -> RenderPlan:
         """The cached render plan of a pair of rigs in a scene.
@@ -401,7 +444,7 @@ class RigRetarget(torch.nn.Module):
         Raises:
             ValueError: With ``quality="paper"``.
         """
-        return self.planner.render_plan(source, target, scene)
+        return self._plans.plan(self._plans.pair(source, target), scene or Scene())
 
     def prepare(self, source: Rig | None = None) -> RenderPlan:
         """Build the plan for a source rig before DataLoader workers fork: they share its memory.
@@ -415,11 +458,11 @@ class RigRetarget(torch.nn.Module):
         source = source or self.source_rig
         if source is None or self._fixed_target is None:
             raise ValueError("prepare: expected a source rig and a fixed target rig")
-        surface = self.planner.surface
-        if SURFACES[surface].needs is not None and self.planner.needs_geometry(source, self._fixed_target):
+        pair = self._plans.pair(source, self._fixed_target)
+        if self._row.needs is not None and pair.needs_geometry:
             raise ValueError(
-                f"prepare: expected a surface whose plans come back, got {surface!r}: boxes, points or depth need a "
-                "new plan for every frame"
+                f"prepare: expected a surface whose plans come back, got {self.surface!r}: boxes, points or depth need "
+                "a new plan for every frame"
             )
         return self.plan(source, self._fixed_target)
 
@@ -430,20 +473,20 @@ class RigRetarget(torch.nn.Module):
         With ``quality="paper"``: what each stage made of each source. A random target is explained for one draw. Like a
         call, it fills the caches, issues warnings once, and advances the RNG.
         """
-        frames, lead = read_frames(sample, self.source_rig), leading_shape(sample["images"])
-        target, _, _ = self._make_params(sample, frames[:1], None)
-        plan = self.planner.plan(sample, frames, lead, target, explained=True)[0]
-        if plan.plan is None:
-            return PaperExplanation(self._published(plan, frames[0]))
-        gains = self.harmonisation(sample) if self.planner.harmoniser.is_on else None
-        words = sample.get(LEARNED_WORDS_KEY) if LEARNED_KEY in SURFACES[self.planner.surface].reads else None
+        frame = read_frames(sample, self.source_rig)[0]
+        target, _, _ = self._make_params([frame], None)
+        if isinstance(self.config, PaperConfig):
+            return PaperExplanation(self._published(frame, target))
+        planned = self.plan_frame(frame, target)
+        gains = self.harmonisation(sample) if self.harmoniser.is_on else None
+        words = sample.get(LEARNED_WORDS_KEY) if LEARNED_KEY in self._row.reads else None
         learned = words if isinstance(words, str) or words is None else words[0]  # a batch has one for each frame
-        return Explanation(plan.plan, gains, plan.depth, plan.motion, learned, plan.fills, plan.harm, plan.geometry)
+        return Explanation(planned, gains, learned, self.plan_fills(planned))
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
         """The gains that a sample's source images would get, and why; for a batch, its first frame's."""
         frame = read_frames(sample, self.source_rig)[0]
-        return self.planner.harmoniser.report(frame.rig, frame.images)
+        return self.harmoniser.report(frame.rig, frame.images)
 
     # --- processes --------------------------------------------------------------------------------------------------
     def _limit_threads(self) -> None:

@@ -13,7 +13,7 @@ from arbiview_aug import Camera, RandomRig, Rig, RigRetarget, visible_boxes
 from arbiview_aug.evaluate.baselines import row_split
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.sample.inputs import read_frames
-from arbiview_aug.sample.neighbours import neighbours_of_frames
+from arbiview_aug.sample.neighbours import read_neighbours
 from arbiview_aug.temporal.fill import Reach
 from arbiview_aug.temporal.motion_depth import motion_depth
 from integrations.cross_rig.cache import Arrays
@@ -92,7 +92,7 @@ class ViewMaker:
     def _motion(self, given: Mapping[str, Any]) -> list[torch.Tensor]:
         """Depth from motion, as the ``depth`` command finds it: beside learned depth, no call finds it anew."""
         (frame,) = read_frames(given, self.source)
-        (neighbours,) = neighbours_of_frames(given, [frame], (), lambda _, __: None)
+        neighbours = read_neighbours(frame, lambda _, __: None)
         found = motion_depth(frame.rig, frame.images, neighbours, None, lambda one: one.images(frame.images))
         return [torch.from_numpy(depth_m) for depth_m in found.depth_m]
 

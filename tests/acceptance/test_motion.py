@@ -16,7 +16,7 @@ from arbiview_aug import Rig, RigRetarget
 from arbiview_aug.datasets import FrameFolder, Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.sample.inputs import MOTION_KEY, read_frames
-from arbiview_aug.sample.neighbours import neighbours_of_frames
+from arbiview_aug.sample.neighbours import read_neighbours
 from arbiview_aug.temporal.motion_depth import MotionDepth, motion_depth
 from tests.helpers import Standing
 
@@ -52,7 +52,7 @@ def sample_of(index: int, standing: bool, labels: bool, turned_deg: float) -> di
 
 def depth_of(sample: dict[str, Any]) -> MotionDepth:
     (frame,) = read_frames(sample, None)
-    (near,) = neighbours_of_frames(sample, [frame], (), lambda topic, message: pytest.fail(message))
+    near = read_neighbours(frame, lambda topic, message: pytest.fail(message))
     boxes = sample["boxes_3d"].numpy().astype(float) if "boxes_3d" in sample else None
     return motion_depth(frame.rig, frame.images, near, boxes, lambda n: n.images(frame.images))
 

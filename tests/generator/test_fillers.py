@@ -15,7 +15,7 @@ from arbiview_aug import Rig, RigRetarget
 from arbiview_aug.generator import fillers as holes_module
 from arbiview_aug.generator.fillers import fill_holes, mean_colour, object_colours
 from arbiview_aug.render.kernels import farthest_occluded, mark_objects
-from arbiview_aug.render.plan import RenderPlan, build_plan
+from arbiview_aug.render.plan import build_plan
 from arbiview_aug.render.view_plan import BACKGROUND, OBJECT, OCCLUDED, Paint
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.transforms.resize import CropRig, ResizeRig
@@ -138,9 +138,7 @@ def test_occluded_pixels_are_those_that_an_image_contains(size: tuple[int, int],
 def test_what_objects_hide_is_occluded_and_what_nobody_looks_at_is_not(street: dict[str, Any]) -> None:
     for surface in ("objects", "lidar"):
         out = RigRetarget(raised(street), surface=surface)  # type: ignore[arg-type]
-        (frame_plan,) = out.planner.plan(street, read_frames(street, None), (), raised(street))
-        plan = frame_plan.plan
-        assert isinstance(plan, RenderPlan)
+        plan = out.plan_frame(read_frames(street, None)[0], raised(street)).plan
         for view in plan.targets:
             assert view.layers is None or not ((view.layers == OCCLUDED) & view.coverage).any()
         occluded = [view.layers == OCCLUDED for view in plan.targets if view.layers is not None]

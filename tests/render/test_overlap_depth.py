@@ -132,7 +132,7 @@ def test_declines_what_says_nothing(name: str) -> None:
         TARGET, source_rig=RIG, surface="street", quality=replace(favs_config("accurate"), overlap_depth=False)
     )
     assert torch.equal(refining(sample)["images"], plain(sample)["images"])
-    (report,) = refining.explain(sample).depth.reports  # type: ignore[union-attr]
+    (report,) = refining.explain(sample).planned.overlap.reports  # type: ignore[union-attr]
     assert not report.accepted and report.reason
 
 
@@ -158,7 +158,7 @@ def test_not_where_every_pixel_is_exact(monkeypatch: pytest.MonkeyPatch) -> None
     def refuse(*_: object) -> None:
         raise AssertionError("matched without need")
 
-    monkeypatch.setattr("arbiview_aug.transforms.planner.overlap_depth", refuse)
+    monkeypatch.setattr("arbiview_aug.transforms.estimate_depth.overlap_depth", refuse)
     one = Rig([camera("left", 25, 0), camera("right", -25, 0)])
     sample = {"images": noise(0)}
     RigRetarget(one.turned(yaw_deg=5), source_rig=one, quality="accurate")(sample)
@@ -198,7 +198,7 @@ def test_boxes_matter_where_they_are_solids(nearer: tuple[torch.Tensor, OverlapD
     images, _ = nearer
     sample = {"images": images, "boxes_3d": np.array([[12.0, 0.0, 0.0, 1, 40, 40, 0]])}
     for surface, accepted in (("objects", False), ("auto", False), ("street", True)):
-        depth = RigRetarget(TARGET, source_rig=RIG, quality="accurate", surface=surface).explain(sample).depth  # type: ignore[arg-type]
+        depth = RigRetarget(TARGET, source_rig=RIG, quality="accurate", surface=surface).explain(sample).planned.overlap  # type: ignore[arg-type]
         assert depth is not None and depth.reports[0].accepted is accepted
 
 

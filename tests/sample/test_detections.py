@@ -11,7 +11,7 @@ import torch
 from arbiview_aug import Camera, PaperConfig, Rig, RigRetarget, SampleError
 from arbiview_aug.datasets import FrameFolder, NuScenesDataset
 from arbiview_aug.favs.renderer import PaperRendering
-from arbiview_aug.sample.detections import UNNAMED_TYPE, detections_of_frames
+from arbiview_aug.sample.detections import UNNAMED_TYPE, read_detections
 from arbiview_aug.sample.inputs import Frame, read_frames
 
 # 90 degrees over 801 px: focal length 400 px, principal point (400, 200), looking along the ego's x axis.
@@ -24,7 +24,7 @@ IMAGES = torch.zeros(2, 3, 401, 801, dtype=torch.uint8)
 
 def found(sample: dict, lead: tuple[int, ...] = ()) -> list:
     frames: list[Frame] = read_frames({"images": IMAGES.expand(*lead, -1, -1, -1, -1), "rig": RIG}, None)
-    return detections_of_frames(sample, frames, lead)
+    return [read_detections(replace(frame, sample=sample)) for frame in frames]
 
 
 def box(x: float, y: float = 0.0, z: float = 1.0, yaw: float = 0.0, size=(2.0, 2.0, 2.0)) -> list[float]:

@@ -12,7 +12,7 @@ from arbiview_aug import Rig, RigRetarget, SampleError, SampleTypeError
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.sample.inputs import read_frames
-from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames
+from arbiview_aug.sample.neighbours import Neighbour, read_neighbours
 from arbiview_aug.scene.point_cloud import seen_through
 
 RIG = demo_source_rig((64, 176))
@@ -32,7 +32,7 @@ def sample(recorded: dict[str, Any]) -> dict[str, Any]:
 
 def read(sample: dict[str, Any]) -> tuple[list[Neighbour], list[str]]:
     said: list[str] = []
-    (found,) = neighbours_of_frames(sample, read_frames(sample, None), (), lambda _, message: said.append(message))
+    found = read_neighbours(read_frames(sample, None)[0], lambda _, message: said.append(message))
     return found, said
 
 
@@ -167,7 +167,7 @@ def test_lenses_and_masks_of_the_rig_that_all_samples_share(sample: dict[str, An
         neighbour.pop("rig", None)
         neighbour |= {"K": rig.K, "cam2ego": rig.cam2ego}
     said: list[str] = []
-    (found,) = neighbours_of_frames(bare, read_frames(bare, rig), (), lambda _, message: said.append(message))
+    found = read_neighbours(read_frames(bare, rig)[0], lambda _, message: said.append(message))
     assert not said and len(found) == 2
     for camera in found[0].rig:
         assert camera.lens == "radtan" and np.array_equal(camera.mask, mask)

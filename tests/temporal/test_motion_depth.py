@@ -12,7 +12,7 @@ from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.sample.inputs import read_frames
-from arbiview_aug.sample.neighbours import Neighbour, neighbours_of_frames
+from arbiview_aug.sample.neighbours import Neighbour, read_neighbours
 from arbiview_aug.temporal.motion_depth import MotionDepth, motion_depth
 from tests.helpers import Standing
 
@@ -37,7 +37,7 @@ def sample(drive: SyntheticDrive) -> dict[str, Any]:
 
 def found(sample: dict[str, Any], **changes: Any) -> MotionDepth:
     (frame,) = read_frames(sample, None)
-    near = neighbours_of_frames(sample, [frame], (), lambda topic, message: pytest.fail(message))[0]
+    near = read_neighbours(frame, lambda topic, message: pytest.fail(message))
     settings: dict[str, Any] = {"neighbours": near, "boxes": None, "load": lambda n: n.images(frame.images)}
     return motion_depth(frame.rig, frame.images, **(settings | changes))
 

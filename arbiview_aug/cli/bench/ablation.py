@@ -242,8 +242,8 @@ def _motion(sample: Mapping[str, Any]) -> list[torch.Tensor]:
     frames = [{key: frame[key] for key in frame if key != "boxes_3d"} for frame in (sample, *sample["neighbours"])]
     raised = RigRetarget(shifted_target(sample["rig"], z_m=UP_M), surface="motion", neighbours=None)
     explained = raised.explain(frames[0] | {"neighbours": frames[1:]})
-    assert isinstance(explained, Explanation) and explained.motion is not None
-    return [torch.from_numpy(depth) for depth in explained.motion.depth_m]
+    assert isinstance(explained, Explanation) and explained.planned.motion is not None
+    return [torch.from_numpy(depth) for depth in explained.planned.motion.depth_m]
 
 
 def _learned(drive: SyntheticDrive) -> torch.Tensor:

@@ -27,8 +27,8 @@ from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.scene.surface import SurfaceName
-from arbiview_aug.temporal.fill import fill_from_neighbours
-from arbiview_aug.transforms.planner import FramePlan
+from arbiview_aug.temporal.fill import Fills, fill_from_neighbours
+from arbiview_aug.transforms.plans import FramePlan
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 COUNTS = (0, 1, 2, 8)
@@ -173,16 +173,19 @@ def _read(data: Any, index: int, number: int) -> None:
         neighbour["images"]
 
 
-def _plan(retarget: RigRetarget, frames: Iterator[Mapping[str, Any]], target: Rig) -> FramePlan:
-    sample = next(frames)
-    return retarget.planner.plan(sample, read_frames(sample, None), (), target)[0]
+def _plan(retarget: RigRetarget, frames: Iterator[Mapping[str, Any]], target: Rig) -> tuple[FramePlan, Fills | None]:
+    planned = retarget.plan_frame(read_frames(next(frames), None)[0], target)
+    return planned, retarget.plan_fills(planned)
 
 
 def _fill(retarget: RigRetarget, sample: Mapping[str, Any], target: Rig) -> Callable[[], Any]:
-    frames, plan = read_frames(sample, None), _plan(retarget, iter([sample]), target)
-    assert plan.plan is not None
-    (rendered,) = retarget.renderer.render([plan.plan], frames, [plan.curves])
-    return partial(fill_from_neighbours, rendered, plan.fills, frames[0].images, plan.curves, retarget.renderer, print)
+    planned, fills = _plan(retarget, iter([sample]), target)
+    frame = planned.frame
+    curves = retarget.harmoniser.curves(frame.rig, frame.images, planned.plan.targets)
+    (rendered,) = retarget.renderer.render([planned.plan], [frame], [curves])
+    if fills is None:
+        return lambda: None
+    return partial(fill_from_neighbours, rendered, fills, frame.images, retarget.renderer, print)
 
 
 COLUMNS = (

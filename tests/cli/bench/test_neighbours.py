@@ -21,7 +21,7 @@ from arbiview_aug.datasets.frame_writer import write_drive
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import one_thread
 from arbiview_aug.temporal import fill
-from arbiview_aug.transforms import planner
+from arbiview_aug.transforms import rig_retarget
 from tests.helpers import street_sample
 
 TOLERANCE = 0.02
@@ -86,7 +86,7 @@ def test_without_neighbours_nothing_of_fills_is_built_or_called(
     """Neither where a sample has none, nor where they are not wanted, nor where a list of them is empty."""
     target = lowered(sample["rig"], (32, 88))
     expected = RigRetarget(target, surface=surface, neighbours=None)(sample)
-    for module, names in ((planner, ("plan_fills",)), (fill, ("build_plan", "merged"))):
+    for module, names in ((rig_retarget, ("plan_fills",)), (fill, ("build_plan", "merged"))):
         for name in names:
             monkeypatch.setattr(module, name, lambda *_, **__: pytest.fail("fills are made"))
     monkeypatch.setattr("arbiview_aug.sample.neighbours._neighbour", lambda *_: pytest.fail("a neighbour is looked at"))
@@ -111,7 +111,7 @@ def test_fast_costs_the_same_without_neighbours(report_bound: Callable[..., None
     retarget = RigRetarget(sample["rig"].turned(yaw_deg=22))
 
     def frame(reach: Any) -> None:
-        retarget.planner.reach = reach
+        retarget.reach = reach
         retarget(sample)
 
     work = {"reading": partial(frame, "ground"), "not": partial(frame, None)}

@@ -1,0 +1,140 @@
+"""Render plans of calibrations and scenes: what follows from a pair of rigs, and the cache of plans."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from operator import attrgetter
+
+import numpy as np
+
+from arbiview_aug.cameras.rays import CameraMaps
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.lru_cache import LRUCache
+from arbiview_aug.render.overlap_depth import OverlapDepth
+from arbiview_aug.render.plan import RenderPlan, build_plan, plan_key
+from arbiview_aug.render.requirements import needs_geometry, static_harm
+from arbiview_aug.sample.inputs import Frame
+from arbiview_aug.sample.neighbours import Neighbour
+from arbiview_aug.scene.scene import SURFACES, Scene
+from arbiview_aug.scene.surface import SurfaceName
+from arbiview_aug.temporal.motion_depth import MotionDepth
+from arbiview_aug.transforms.checks import Coverages
+
+_MAX_RIG_PAIRS = 64  # one or two kilobytes each, beside the target's cameras
+
+
+class RigPair:
+    """A source rig, a target rig in the source's ego frame, and what follows from their calibrations alone."""
+
+    def __init__(self, source: Rig, target: Rig, surface: SurfaceName, config: FavsConfig | None) -> None:
+        self.source, self.target = source, target.in_frame_of(source)
+        self.road = Scene()  # nothing else is known
+        self.needs_geometry = config is not None and needs_geometry(source, self.target, surface, config)
+        self._surface, self._config = surface, config
+
+    @cached_property
+    def road_key(self) -> bytes:
+        """Key of the plan over the road alone."""
+        return self.plan_key(self.road)
+
+    def plan_key(self, scene: Scene) -> bytes:
+        """Key of the plan in a scene."""
+        assert self._config is not None
+        return plan_key(self.source, self.target, self._surface, self._config, scene)
+
+    @cached_property
+    def harm(self) -> str | None:
+        """Why a detector suffers if the target is rendered over a static surface; None if it does not."""
+        return None if self._config is None else static_harm(self.source, self.target, "street", self._config)
+
+
+@dataclass(frozen=True, eq=False)
+class FramePlan:
+    """How one frame is rendered, and from what it was planned.
+
+    Attributes:
+        frame: The frame.
+        pair: Its rig and the target.
+        scene: Geometry of the sample, with estimated depth.
+        surface: Name of the surface that the target is rendered over, where centres differ.
+        plan: The plan.
+        neighbours: Other frames of the drive that may fill holes, the nearest first.
+        overlap: Depth from overlap, if it was estimated.
+        motion: Depth from motion, if it was estimated.
+    """
+
+    frame: Frame
+    pair: RigPair
+    scene: Scene
+    surface: SurfaceName
+    plan: RenderPlan
+    neighbours: Sequence[Neighbour] = ()
+    overlap: OverlapDepth | None = None
+    motion: MotionDepth | None = None
+
+    @property
+    def harm(self) -> str | None:
+        """Why a detector suffers from cameras that move over a static surface; None if it does not."""
+        return self.pair.harm if SURFACES[self.surface].is_static else None
+
+
+class Plans:
+    """Builds render plans, and caches those of calibrations that come back.
+
+    Args:
+        config: Settings; None for the paper's stages, which depend on every image and have no plans.
+        surface: A name in ``SURFACES``.
+        max_bytes: Memory for plans; the least recently used go first.
+        keep_refined: Whether plans over a street that depth from overlap corrected come back.
+        check_reach: Called with the source, the target and its coverage for each new plan.
+
+    Attributes:
+        cache: Plans that come back.
+        maps: Rays and masks of cameras.
+    """
+
+    def __init__(
+        self,
+        config: FavsConfig | None,
+        surface: SurfaceName,
+        max_bytes: int,
+        keep_refined: bool,
+        check_reach: Callable[[Rig, Rig, Coverages], None],
+    ) -> None:
+        self.config, self.surface, self.check_reach = config, surface, check_reach
+        self.cache: LRUCache[bytes, RenderPlan] = LRUCache(max_bytes, attrgetter("nbytes"))
+        self.maps = CameraMaps()
+        self._keep_refined = keep_refined
+        self._last: LRUCache[bytes, RenderPlan] = LRUCache(1)
+        self._pairs: LRUCache[tuple[bytes, bytes], RigPair] = LRUCache(_MAX_RIG_PAIRS)
+
+    def pair(self, source: Rig, target: Rig) -> RigPair:
+        """The pair of a source and a target rig; cached."""
+        key = source.content_key, target.content_key
+        return self._pairs.get(key, lambda: RigPair(source, target, self.surface, self.config))
+
+    def plan(self, pair: RigPair, scene: Scene) -> RenderPlan:
+        """The plan of a pair in a scene; cached. The scene is ignored where no pixel depends on it.
+
+        Raises:
+            ValueError: There are no plans.
+        """
+        if self.config is None:
+            raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
+        if scene.is_empty or not pair.needs_geometry:
+            return self.cache.get(pair.road_key, lambda: self._built(pair, pair.road))
+        # A frame's own geometry never comes back: its plan must not push out those that do.
+        cache = self.cache if self._keep_refined and scene.best == "street" else self._last
+        return cache.get(pair.plan_key(scene), lambda: self._built(pair, scene))
+
+    def _built(self, pair: RigPair, scene: Scene) -> RenderPlan:
+        source, target = pair.source, pair.target
+        plan = build_plan(source, target, surface=self.surface, config=self.config, scene=scene, maps=self.maps)
+        coverage = plan.coverage
+        if not scene.is_empty and not any(map(np.any, coverage)):  # objects may hide all of a frame's target
+            coverage = build_plan(source, target, surface="street", config=self.config, maps=self.maps).coverage
+        self.check_reach(source, target, coverage)
+        return plan
