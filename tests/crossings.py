@@ -12,13 +12,26 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import torch
+
 import arbiview_aug
 from arbiview_aug import RigRetarget, load_rig
+from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive
+from arbiview_aug.sample.inputs import LEARNED_KEY
+from arbiview_aug.scene.depth_maps import motion_camera
 
 PACKAGE = str(Path(arbiview_aug.__file__).parent)
-BOUNDS = {"street, plan held": (15, 47), "LiDAR + boxes": (35, 1700), "paper": (19, 130)}
-"""Most files and crossings that a call may have; one file estimates exposures. Aims: (10, 50), (20, 500), (12, 150)."""
+BOUNDS = {
+    "street, plan cached": (15, 47),
+    "LiDAR + boxes": (35, 1700),
+    "learned depth": (36, 1700),
+    "generated": (36, 3500),
+    "neighbours, all": (44, 5200),
+    "motion": (50, 6000),
+    "paper": (19, 130),
+}
+"""Most files and crossings that a call may have."""
 
 
 class Tracer:
@@ -48,24 +61,41 @@ class Tracer:
 
 
 def traced_calls() -> dict[str, Tracer]:
-    """A tracer for each kind of call, with warm caches."""
-    sample = SyntheticDrive(load_rig("nuscenes").undistorted().resized((90, 160)), num_frames=1)[0]
+    """A tracer for each kind of call, with warm caches but for what every frame brings anew."""
+    rig = load_rig("nuscenes").undistorted().resized((90, 160))
+    sample = SyntheticDrive(rig, num_frames=1)[0]
+    drive = SyntheticDrive(rig, num_frames=3, neighbours=Neighbours(count=1, step_m=1.2))[1]
     bare = {key: value for key, value in sample.items() if key not in ("points", "boxes_3d")}
+    of_network = bare | {LEARNED_KEY: [torch.full(motion_camera(camera).size, 12.0) for camera in rig]}
+    unmeasured = {key: value for key, value in drive.items() if key != "points"}
     target = load_rig("argoverse2").undistorted().resized((64, 96))
     calls = {
-        "street, plan held": (RigRetarget(target), bare),
+        "street, plan cached": (RigRetarget(target), bare),
         "LiDAR + boxes": (RigRetarget(target), sample),
+        "learned depth": (RigRetarget(target, surface="learned"), of_network),
+        "generated": (RigRetarget(target, path="diffusion"), bare),
+        "neighbours, all": (RigRetarget(target, neighbours="all"), drive),
+        "motion": (RigRetarget(target, surface="motion"), unmeasured),
         "paper": (RigRetarget(target, quality="paper"), bare),
     }
-    found = {}
+    tracers = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for name, (retarget, given) in calls.items():
             retarget(given)
-            again = given | {"points": given["points"] + 0.01} if "points" in given else given  # needs a new plan
-            with Tracer() as found[name]:
-                retarget(again)
-    return found
+            with Tracer() as tracers[name]:
+                retarget(_anew(given))
+    return tracers
+
+
+def _anew(sample: dict[str, Any]) -> dict[str, Any]:
+    """The sample with geometry that needs a new plan."""
+    anew = dict(sample)
+    if "points" in sample:
+        anew["points"] = sample["points"] + 0.01
+    if LEARNED_KEY in sample:
+        anew[LEARNED_KEY] = [depth_m + 0.1 for depth_m in sample[LEARNED_KEY]]
+    return anew
 
 
 def main() -> int:

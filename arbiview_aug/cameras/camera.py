@@ -25,14 +25,9 @@ from arbiview_aug.cameras.rotations import CAMERA_AXES_IN_EGO, rotation_x, rotat
 from arbiview_aug.cameras.validation import (
     MAX_SIZE_PX,
     checked_array,
-    checked_distortion,
-    checked_intrinsics,
-    checked_lens,
-    checked_mask,
-    checked_name,
+    checked_calibration,
     checked_numbers,
     checked_pixels,
-    checked_pose,
     checked_size,
 )
 from arbiview_aug.errors import CalibrationError
@@ -93,16 +88,7 @@ class Camera:
     mask: BoolArray | None = None
 
     def __post_init__(self) -> None:
-        put = lambda field, value: object.__setattr__(self, field, value)  # noqa: E731 - frozen dataclass
-        name = checked_name(self.name)
-        for field in ("width_px", "height_px"):
-            put(field, checked_pixels(name, field, getattr(self, field)))
-        put("K", checked_intrinsics(name, self.K))
-        put("cam2ego", checked_pose(name, self.cam2ego))
-        put("lens", checked_lens(name, self.lens))
-        put("distortion", checked_distortion(name, self.lens, self.distortion))
-        if self.mask is not None:
-            put("mask", checked_mask(name, self.mask, self.size))
+        self.__dict__.update(checked_calibration(**self.__dict__))
 
     # --- construction ---------------------------------------------------------------------------------------------
     @classmethod
@@ -169,7 +155,7 @@ class Camera:
         """(height, width) in pixels."""
         return self.height_px, self.width_px
 
-    @property
+    @cached_property
     def center_m(self) -> FloatArray:
         """(3,) optical centre in the ego frame."""
         return self.cam2ego[:3, 3]
@@ -229,7 +215,7 @@ class Camera:
         directions, valid = self.unproject_cam(border)
         return math.acos(float(np.clip(directions[..., 2].min(), -1, 1))) if valid.all() else math.pi
 
-    @property
+    @cached_property
     def cone_rad(self) -> float:
         """Largest angle off the optical axis at which a point can fall into the image."""
         return min(self.half_angle_rad, self.lens_model.fold_rad)

@@ -6,6 +6,7 @@ Directions lie plane by plane in memory, (3, ny, nx): three times faster.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -47,13 +48,15 @@ def source_points(
     return np.moveaxis(points.reshape(3, *directions.shape[:-1]), 0, -1)
 
 
-def look_apart(one: Camera, two: Camera, nearest: float) -> bool:
-    """Whether the viewing cones of two cameras are disjoint for all scene points up to inverse distance ``nearest``.
+def look_apart(camera: Camera, others: Sequence[Camera], nearest: float) -> list[bool]:
+    """Whether the viewing cones of other cameras are disjoint from one's, for inverse distances up to ``nearest``.
 
     By the law of sines, the directions to a point at 1 / q from two centres differ by at most asin(baseline * q).
     """
-    sine = math.dist(one.center_m, two.center_m) * nearest
-    if sine >= 1:
-        return False
-    angle = math.acos(min(max(float(one.cam2ego[:3, 2] @ two.cam2ego[:3, 2]), -1), 1))
-    return angle > one.half_angle_rad + two.half_angle_rad + math.asin(sine) + 0.01
+    apart = []
+    for other in others:
+        sine = math.dist(camera.center_m, other.center_m) * nearest
+        angle = math.acos(min(max(float(camera.cam2ego[:3, 2] @ other.cam2ego[:3, 2]), -1), 1))
+        spread = camera.half_angle_rad + other.half_angle_rad
+        apart.append(sine < 1 and angle > spread + math.asin(sine) + 0.01)
+    return apart

@@ -27,10 +27,24 @@ MAX_SIZE_PX = 32766
 """Largest image side: OpenCV's remap needs sizes below 32767."""
 
 
-def checked_name(name: Any) -> str:
+def checked_calibration(
+    name: Any, width_px: Any, height_px: Any, K: Any, cam2ego: Any, lens: Any, distortion: Any, mask: Any
+) -> dict[str, Any]:
+    """The checked fields of a camera."""
     if not isinstance(name, str) or not name:
         raise CalibrationError(f"camera name: expected a non-empty string, got {shown(name)}")
-    return name
+    w, h = checked_pixels(name, "width_px", width_px), checked_pixels(name, "height_px", height_px)
+    K, cam2ego, lens = checked_intrinsics(name, K), checked_pose(name, cam2ego), checked_lens(name, lens)
+    return {
+        "name": name,
+        "width_px": w,
+        "height_px": h,
+        "K": K,
+        "cam2ego": cam2ego,
+        "lens": lens,
+        "distortion": checked_distortion(name, lens, distortion),
+        "mask": None if mask is None else checked_mask(name, mask, (h, w)),
+    }
 
 
 def checked_pixels(name: str, field: str, value: Any, least: int = 1) -> int:
@@ -130,7 +144,7 @@ def checked_pose(name: str, value: Any) -> FloatArray:
 
 def checked_lens(name: str, value: Any) -> LensName:
     """The name of a lens in ``LENSES``, also for its aliases."""
-    value = canonical_name(value) if isinstance(value, str) else value
+    value = canonical_name(value) if isinstance(value, str) and value not in LENSES else value
     if not isinstance(value, str) or value not in LENSES:
         raise _error(name, "lens", f"one of {', '.join(LENSES)}", shown(value))
     return cast(LensName, value)

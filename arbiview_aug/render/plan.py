@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from dataclasses import dataclass, field, fields, replace
-from functools import cache, partial
+from functools import cache
 from typing import Any, cast
 
 import numpy as np
@@ -25,7 +25,7 @@ from arbiview_aug.render.atlas import AtlasLayout
 from arbiview_aug.render.view_plan import ViewPlan
 from arbiview_aug.render.view_planner import ViewPlanner
 from arbiview_aug.scene.point_cloud import seen_through
-from arbiview_aug.scene.scene import SURFACES, Scene
+from arbiview_aug.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -135,21 +135,14 @@ def _built(
     counters: Counter[str] = Counter()
     order = content_order(source.cameras)
     maps = maps or CameraMaps()
-    by_name = partial(scene.surface, ground_z_m=source.ground_z_m)
-    boxes = scene.boxes if "boxes" in SURFACES[surface].reads else None
-    planners = [
-        ViewPlanner(source, order, camera, surface, scene.best, by_name, boxes, config, counters, maps)
-        for camera in target
-    ]
+    planners = [ViewPlanner(source, order, camera, surface, scene, config, counters, maps) for camera in target]
     used = [(region.source, region.level) for planner in planners for region in planner.regions]
     layout = AtlasLayout.for_sources(source.sizes, used)
     targets = tuple(planner.finish(layout) for planner in planners)
-    read = {
-        (region.source, region.level)
-        for planner, target in zip(planners, targets, strict=True)
-        for region in planner.regions
-        if region.source in target.sources
-    }
+    read = set[tuple[int, int]]()
+    for planner, view in zip(planners, targets, strict=True):
+        sources = view.sources
+        read |= {(region.source, region.level) for region in planner.regions if region.source in sources}
     layout = layout.without_others(read)
     counters["bands"] = sum(len(t.bands) for t in targets)
     return RenderPlan(source, target, layout, targets, dict(counters))

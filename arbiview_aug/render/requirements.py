@@ -60,8 +60,7 @@ def needs_geometry(source: Rig, target: Rig, surface: str, config: FavsConfig) -
         ):
             continue
         focal_px = float(camera.K[0, 0])
-        for one, b in zip(source, row.tolist(), strict=True):
-            apart = look_apart(one, camera, 1 / NEAREST_SCENE_M)
+        for apart, b in zip(look_apart(camera, source.cameras, 1 / NEAREST_SCENE_M), row.tolist(), strict=True):
             if surface == "auto" and (worst_parallax_px(b, focal_px) < config.far_parallax_px or apart):
                 continue
             if b >= SAME_CENTER_M:

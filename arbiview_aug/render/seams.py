@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -62,7 +62,7 @@ class SecondBest:
         weight, second = memory.full(size, 0, np.float32), memory.full(size, -1, np.int8)
         self.images = weight, second, memory.empty(size, np.int32), memory.empty(size, np.uint16)
 
-    def blend_regions(self, sources: Sequence[int], best: npt.NDArray[np.float32]) -> Iterator[BlendRegion]:
+    def blend_regions(self, sources: Sequence[int], best: npt.NDArray[np.float32]) -> list[BlendRegion]:
         """Rectangles around the pixels that a second source adds to.
 
         Args:
@@ -73,7 +73,7 @@ class SecondBest:
 
         share, second, *where = self.images
         if not share.size:
-            return
+            return []
         bands = np.empty((len(sources) * -(-len(share) // _STRIP_PX) * self.shared.shape[1], 5), np.int64)
         order = np.array(sources)
         cells = self.shared, self._step
@@ -82,6 +82,8 @@ class SecondBest:
         ends = [0, *np.cumsum(size.prod(axis=1)).tolist()]
         xy, frac, weight = (np.empty(ends[-1], kind) for kind in (np.int32, np.uint16, np.float32))
         cut_bands(bands, *cells, share, second, *where, xy, frac, weight)
+        regions = []
         for (source, y0, _, x0, _), (h, w), a, b in zip(bands.tolist(), size.tolist(), ends, ends[1:], strict=False):
             at = FixedMap(xy[a:b].view(np.int16).reshape(h, w, 2), frac[a:b].reshape(h, w))
-            yield BlendRegion(y0, x0, source, at, weight[a:b].reshape(h, w))
+            regions.append(BlendRegion(y0, x0, source, at, weight[a:b].reshape(h, w)))
+        return regions

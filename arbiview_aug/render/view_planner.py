@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, cast
+from typing import Any
 
 import cv2
 import numpy as np
@@ -34,9 +34,9 @@ from arbiview_aug.render.view_plan import (
     nearer_cells,
 )
 from arbiview_aug.scene.point_cloud import occlusion_level
-from arbiview_aug.scene.scene import SURFACES
+from arbiview_aug.scene.scene import SURFACES, Scene
 from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
-from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE, Surface
+from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 
 SMALL_SIDE_PX = 64  # weights of targets with a shorter side are evaluated at every pixel
 _SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
@@ -53,6 +53,7 @@ class _Geometry:
     """A surface as a target sees it.
 
     Attributes:
+        surface: The surface.
         q: (h, w) float32 inverse distances along the pixels' rays, 1/m.
         face: (h, w) int32 faces of solids in front of the background, -1 elsewhere; (0, 0) without any.
         on_nodes: (ny + 1, nx + 1) ``q`` on the nodes.
@@ -61,8 +62,11 @@ class _Geometry:
         nearest: (ny, nx) float32 largest inverse distance in each cell.
         farthest: (ny, nx) float32 least inverse distance in each cell.
         uncertainty: (ny + 1, nx + 1) expected error of the inverse distance on the nodes, 1/m.
+        apart: Whether each source looks elsewhere.
+        is_guess: Whether its background was not measured.
     """
 
+    surface: Any
     q: npt.NDArray[np.float32]
     face: npt.NDArray[np.int32]
     on_nodes: npt.NDArray[np.float32]
@@ -71,6 +75,8 @@ class _Geometry:
     nearest: npt.NDArray[np.float32]
     farthest: npt.NDArray[np.float32]
     uncertainty: FloatArray
+    apart: list[bool]
+    is_guess: bool
 
 
 @dataclass
@@ -105,16 +111,15 @@ class ViewPlanner:
         order: list[int],
         camera: Camera,
         surface: str,
-        best: str,
-        surface_by_name: Callable[[str], Surface],
-        boxes: FloatArray | None,
+        scene: Scene,
         config: FavsConfig,
         counters: Counter[str],
         maps: CameraMaps,
     ) -> None:
-        self.source, self.camera, self.surface, self.config = source, camera, surface, config
-        self.best, self.surface_by_name, self.boxes = best, surface_by_name, boxes
-        self.counters, self.maps = counters, maps
+        self.sources, self.camera, self.surface, self.config = source.cameras, camera, surface, config
+        self.scene, self.ground_z_m, self.counters, self.maps = scene, source.ground_z_m, counters, maps
+        self.baselines_m = [math.dist(camera.center_m, one.center_m) for one in self.sources]
+        self.parallax_px = worst_parallax_px(np.array(self.baselines_m), float(camera.K[0, 0]))
         self.rays = maps.rays(camera)
         # From outside, the far wall is a narrow strip with edges, which cells could step over.
         coarse = min(camera.size) >= SMALL_SIDE_PX
@@ -131,14 +136,14 @@ class ViewPlanner:
         self._geometries: dict[str, _Geometry] = {}
         # Cells that sources elsewhere may change: none without a ray.
         self._open = _whole_cells(self.corner_rays.any(axis=0))
-        exact = {k: self._region(k) for k in order if self._baseline_m(k) < SAME_CENTER_M}
+        exact = {k: self._region(k) for k in order if self.baselines_m[k] < SAME_CENTER_M}
         for one in filter(None, exact.values()):
             self._open = self._open & self._around_unseen(one)
         if any(exact.values()):  # however far the scene is
             near, far = (np.full(self._open.shape, q, np.float32) for q in (MAX_INVERSE_DISTANCE, 0))
             seen, cells = np.zeros_like(self._open), np.arange(self._open.shape[1])
             for k in set(order) - set(exact):
-                first, last = self._in_view(self.source[k], self._projection(self.source[k]), near, far).T
+                first, last = self._in_view(self.sources[k], self._projection(self.sources[k]), near, far).T
                 seen |= (first[:, None] <= cells) & (cells < last[:, None])
             self._open = seen
         found = exact | {k: self._region(k) for k in order if k not in exact}
@@ -146,18 +151,15 @@ class ViewPlanner:
         self.regions = [region for k in order if (region := found[k]) is not None]
 
     # --- what a source sees -------------------------------------------------------------------------------------------
-    def _baseline_m(self, index: int) -> float:
-        return math.dist(self.camera.center_m, self.source[index].center_m)
-
-    def _choose_surface(self, baseline_m: float, focal_px: float) -> tuple[str, str]:
+    def _choose_surface(self, index: int) -> tuple[str, str]:
+        baseline_m, worst = self.baselines_m[index], self.parallax_px[index]
         if baseline_m < SAME_CENTER_M:
             return "far", "centres coincide: exact"
         if self.surface != "auto":
             return self.surface, "asked for"
-        worst = worst_parallax_px(baseline_m, focal_px)
         if worst < self.config.far_parallax_px:
             return "far", f"worst-case parallax {worst:.2f} px"
-        return self.best, f"centres {baseline_m:.2f} m apart"
+        return self.scene.best, f"centres {baseline_m:.2f} m apart"
 
     def _around_unseen(self, region: _Region) -> BoolArray:
         """Cells (ny, nx) that an exact source does not certainly win, and those around them that seams may reach."""
@@ -190,7 +192,9 @@ class ViewPlanner:
             return self._geometries[name]
         from arbiview_aug.render.kernels import depth_range
 
-        surface, center, memory = cast(Any, self.surface_by_name(name)), self.camera.center_m, self.maps.memory
+        surface: Any = self.scene.surface(name, self.ground_z_m)
+        background = surface.background
+        center, memory = self.camera.center_m, self.maps.memory
         size = np.repeat(self.camera.size, 2)
         rows, columns = (np.flatnonzero(self._open.any(axis)) for axis in (1, 0))
         cells = np.array([rows[0], rows[-1] + 1, columns[0], columns[-1] + 1])
@@ -206,8 +210,8 @@ class ViewPlanner:
             wide[y0:y1, x0:x1] = image
             return wide
 
-        q = widened(surface.background.image(camera, rays, memory), 0)
-        self.counters["dense_pixels"] += (y1 - y0) * (x1 - x0) if surface.background.is_dense else 0
+        q = widened(background.image(camera, rays, memory), 0)
+        self.counters["dense_pixels"] += (y1 - y0) * (x1 - x0) if background.is_dense else 0
         behind = q[self.at_nodes]
         face = np.zeros((0, 0), np.int32)
         if surface.is_layered:
@@ -221,7 +225,9 @@ class ViewPlanner:
         uncertainty = surface.uncertainty(center, self._directions, at_nodes[0])
         nearest, farthest = np.empty((2, *self._open.shape), np.float32)
         depth_range(q, self.step, nearest, farthest)
-        self._geometries[name] = _Geometry(q, face, *at_nodes, behind, nearest, farthest, uncertainty)
+        apart = look_apart(self.camera, self.sources, float(nearest.max()))
+        measured = q, face, *at_nodes, behind, nearest, farthest, uncertainty
+        self._geometries[name] = _Geometry(surface, *measured, apart, background.is_guess)
         return self._geometries[name]
 
     def _projection(self, source: Camera) -> tuple[Any, ...]:
@@ -244,13 +250,13 @@ class ViewPlanner:
         from arbiview_aug.cameras.kernels import FAR_AWAY_PX
         from arbiview_aug.render.kernels import measure_nodes, seen_image
 
-        source = self.source[index]
-        baseline_m, focal_px = self._baseline_m(index), float(self.camera.K[0, 0])
-        name, reason = self._choose_surface(baseline_m, focal_px)
+        source = self.sources[index]
+        baseline_m, focal_px = self.baselines_m[index], float(self.camera.K[0, 0])
+        name, reason = self._choose_surface(index)
         if not self._open.any():
             return None
-        surface, geometry = cast(Any, self.surface_by_name(name)), self._geometry(name)
-        if look_apart(self.camera, source, float(geometry.nearest.max())):
+        geometry = self._geometry(name)
+        if geometry.apart[index]:
             return None
         A, o, kind, P = projection = self._projection(source)
         columns = self._in_view(source, projection, geometry.nearest, geometry.farthest)
@@ -271,7 +277,7 @@ class ViewPlanner:
         seen = edge_px > 0  # pixels that it cannot project lie far outside
         most = np.sort(resolution[seen][::4])
         level = halvings(most[len(most) // 5], source.size) if self.config.antialias and len(most) else 0
-        kernel = self._kernel(source, level, surface, geometry, A, o)
+        kernel = self._kernel(source, level, geometry, A, o, P)
         visible = np.zeros(seen.shape, bool)
         given = np.ascontiguousarray(kernel[-1][(slice(None), *self.at_nodes)]) if kind < 0 else kernel[-1]
         on_nodes = self.node_rays, self.rays.parameters, geometry.on_nodes, geometry.face_on_nodes
@@ -299,11 +305,11 @@ class ViewPlanner:
             certainty=None if certain is None else _filled(certain, np.abs(u) < 0.9 * FAR_AWAY_PX),
         )
 
-    def _kernel(self, source: Camera, level: int, surface: Any, geometry: _Geometry, A: Any, o: Any) -> tuple[Any, ...]:
+    def _kernel(self, source: Camera, level: int, geometry: _Geometry, A: Any, o: Any, P: Any) -> tuple[Any, ...]:
         """The source as ``kernels.put_source`` reads it, halved ``level`` times."""
         from arbiview_aug.cameras.kernels import LENS_CODES, camera_parameters
 
-        kind = LENS_CODES.get(source.lens, -1)
+        kind, surface = LENS_CODES.get(source.lens, -1), geometry.surface
         given = np.zeros((2, 0, 0), np.float32)
         if kind < 0:
             u, v, _ = source_pixels(self.camera, self.rays.at(*map(np.arange, self.camera.size)), geometry.q, source)
@@ -313,7 +319,7 @@ class ViewPlanner:
         if surface.is_layered or surface.is_dense:
             # Points hide by cells: a pixel for each is enough. Silhouettes of objects are sharper.
             coarser = level if surface.is_layered else max(level, occlusion_level(source))
-            half = halved_camera(source, coarser)
+            half = halved_camera(source, coarser) if coarser else source
             shadow, solid = surface.occlusion_map(half, self.maps.rays(half), self.maps.memory)
             shadow_scale = 0.5 ** (coarser - level)
         before_m = np.zeros(0, np.float32)
@@ -323,13 +329,13 @@ class ViewPlanner:
             A,
             o,
             kind,
-            camera_parameters(source, 0.5**level),
+            camera_parameters(source, 0.5**level) if level else P,
             np.array([*source_bounds(source, level), shadow_scale], np.float32),
             self.maps.clean_pixels(source, level),
             before_m,
             shadow,
             np.ascontiguousarray(solid),
-            bool(surface.background.is_guess),
+            geometry.is_guess,
             given,
         )
 
@@ -340,6 +346,7 @@ class ViewPlanner:
 
         size, memory = self.camera.size, self.maps.memory
         fixed = FixedMap.outside(size, memory)
+        packed = fixed.packed
         winner, in_image = memory.full(size, -1, np.int8), memory.full(size, 0, np.uint8)
         best = memory.full(size, -1, np.float32)  # a source that sees a pixel beats none, even with a weight of 0
         weights = self._weights()
@@ -350,7 +357,7 @@ class ViewPlanner:
             place = region.source, slot.x, slot.y
             put_source(
                 *self._target(region), region.kernel, place, weight, self.step, region.columns,
-                seconds.shared, best, winner, fixed.packed, fixed.frac, in_image, *seconds.images,
+                seconds.shared, best, winner, packed, fixed.frac, in_image, *seconds.images,
             )  # fmt: skip
         won_px = Counter({r.source: int(np.count_nonzero(winner == r.source)) for r in self.regions})
         bands = tuple(seconds.blend_regions([region.source for region in self.regions], best))
@@ -377,13 +384,13 @@ class ViewPlanner:
         near = next((region for region in self.regions if region.surface != "far"), None)
         if near is None:
             return None
-        surface, geometry = cast(Any, self.surface_by_name(near.surface)), near.geometry
+        geometry = near.geometry
         farthest = np.empty(self._open.shape, np.float32)
         farthest_occluded(geometry.q, geometry.face, layers, self.step, farthest)
         side = 2 * nearer_cells(self.camera.size, self.step) + 1
         limit = cv2.erode(NEARER * farthest, np.ones((side, side), np.uint8))
         mark_objects(geometry.q, geometry.face, winner, limit, self.step, layers)
-        return Paint.of(geometry.face, winner, surface.face_parts) if geometry.face.size else None
+        return Paint.of(geometry.face, winner, geometry.surface.face_parts) if geometry.face.size else None
 
     def _weights(self) -> list[npt.NDArray[np.float32]]:
         """Weights of the sources on the nodes: their scores, for one source or hard seams."""
@@ -395,9 +402,10 @@ class ViewPlanner:
         winner = np.empty(scores[0].shape, np.int8)
         stacked, boxes, cone = np.stack(scores), np.zeros((0, 7)), np.zeros(4)
         parallax = stacked  # unused without boxes
-        if self.boxes is not None and len(self.boxes):
-            near_last = np.argsort(-np.linalg.norm(self.boxes[:, :3] - self.camera.center_m, axis=-1), kind="stable")
-            boxes, cone = self.boxes[near_last, :7], self.rays.cone
+        labelled = self.scene.boxes if "boxes" in SURFACES[self.surface].reads else None
+        if labelled is not None and len(labelled):
+            near_last = np.argsort(-np.linalg.norm(labelled[:, :3] - self.camera.center_m, axis=-1), kind="stable")
+            boxes, cone = labelled[near_last, :7], self.rays.cone
             parallax = np.stack([region.parallax for region in self.regions])
         pose = np.ascontiguousarray(self.camera.center_m), np.ascontiguousarray(self.camera.cam2ego[:3, :3])
         node_rad = self.step / float(self.camera.K[0, 0])
@@ -422,7 +430,7 @@ class ViewPlanner:
         edge = np.zeros(winner.shape, np.uint8)
         for region in self.regions:
             slot = layout.slot(region.source, region.level)
-            (h, w), source = slot.size, self.source[region.source]
+            (h, w), source = slot.size, self.sources[region.source]
             own: Any = cv2.inRange(winner, region.source, region.source)  # type: ignore[call-overload]
             low, high = (slot.x + 1, slot.y + 1), (slot.x + w - 3, slot.y + h - 3)
             inside: Any = cv2.inRange(fixed.xy, low, high)  # type: ignore[call-overload]
@@ -482,9 +490,9 @@ def source_bounds(source: Camera, level: int) -> npt.NDArray[np.float64]:
 
 @lru_cache(32)  # all targets ask for the same ones
 def halved_camera(camera: Camera, level: int) -> Camera:
-    """The camera of an image that was halved ``level`` times."""
+    """The camera of an image that was halved ``level`` times, at least once."""
     h, w = level_size(camera.size, level)
-    return camera.crop(0, 0, (h << level, w << level)).resize((h, w)) if level else camera
+    return camera.crop(0, 0, (h << level, w << level)).resize((h, w))
 
 
 def continued(rays: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

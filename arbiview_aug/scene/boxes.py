@@ -49,7 +49,7 @@ class BoxSurface(LayeredSurface):
     street: Surface
     boxes: FloatArray
     solids: FloatArray
-    _shadows: dict[Camera, OcclusionMap] = field(default_factory=dict, repr=False)
+    _shadows: dict[bytes, OcclusionMap] = field(default_factory=dict, repr=False)
 
     @property
     def background(self) -> Surface:
@@ -59,14 +59,15 @@ class BoxSurface(LayeredSurface):
     # --- images -------------------------------------------------------------------------------------------------------
     def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
         """What objects hide from a source; kept for the next target."""
-        if camera not in self._shadows:
+        key = camera.content_key
+        if key not in self._shadows:
             pixel_rad = float(1 / camera.K[0, 0])
             scale = 1 / (1 + 2 * pixel_rad)  # a lookup's error
             onto = self._hidden(camera, rays, memory, coarse=True)
             widened = self._widened(camera.center_m, pixel_rad, lift=0.5)
             drawn = draw_solids(camera, *widened, rays, memory, scale=scale, faces=False, onto=onto)
-            self._shadows[camera] = OcclusionMap(*drawn)
-        return self._shadows[camera]
+            self._shadows[key] = OcclusionMap(*drawn)
+        return self._shadows[key]
 
     def drawn(
         self, camera: Camera, rays: PixelRays, memory: Memory = FRESH

@@ -237,9 +237,9 @@ class PointCloudSurface(DenseSurface):
     mapped: int = 0
     swept: bool = False
     _panoramas: dict[bytes, tuple[tuple[float, float], list[Panorama]]] = field(default_factory=dict, repr=False)
-    _shadows: dict[Camera, OcclusionMap] = field(default_factory=dict, repr=False)
+    _shadows: dict[bytes, OcclusionMap] = field(default_factory=dict, repr=False)
     _latest: dict[bytes, Panorama] = field(default_factory=dict, repr=False)
-    _nodes: dict[tuple[Camera, Cells], tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
+    _nodes: dict[tuple[bytes, Cells], tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         kept = ~own_car(self.points)
@@ -267,10 +267,11 @@ class PointCloudSurface(DenseSurface):
         and only within measured outlines: nothing hides where the LiDAR is silent. Coarse cells gain 0.2 dB on nuScenes
         and DDAD, -0.1 to +0.4 by view.
         """
-        if camera not in self._shadows:
+        key = camera.content_key
+        if key not in self._shadows:
             solid = memory.full(camera.size, -1, np.int32)
-            self._shadows[camera] = OcclusionMap(self.hidden(camera, rays, memory), solid)
-        return self._shadows[camera]
+            self._shadows[key] = OcclusionMap(self.hidden(camera, rays, memory), solid)
+        return self._shadows[key]
 
     def hidden(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH, *, coarse: bool = True) -> Layer:
         """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart."""
@@ -300,7 +301,8 @@ class PointCloudSurface(DenseSurface):
 
         Kept for the next question.
         """
-        if (camera, cells) not in self._nodes:
+        key = camera.content_key, cells
+        if key not in self._nodes:
             R = camera.cam2ego[:3, :3]
             directions, step = directions_of(rays, R)
             view = self.view(camera.center_m, directions, cells, memory)
@@ -308,9 +310,9 @@ class PointCloudSurface(DenseSurface):
             steep = len(directions) == 0 or float(np.abs(directions[:, 2]).max()) > _STEEP
             step = 1 if steep or view.window.columns >= view.window.cells.turn else step
             local = rays.planes if step == 1 and rays.planes.size else nodes_of(rays, step)
-            self._nodes[camera, cells] = view, *view.cells(local, R), step
-        self._latest[camera.center_m.tobytes()] = self._nodes[camera, cells][0]
-        return self._nodes[camera, cells]
+            self._nodes[key] = view, *view.cells(local, R), step
+        self._latest[camera.center_m.tobytes()] = self._nodes[key][0]
+        return self._nodes[key]
 
     def view(
         self, origin: FloatArray, directions: FloatArray, cells: Cells | None = None, memory: Memory = FRESH

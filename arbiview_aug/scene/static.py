@@ -168,6 +168,6 @@ NEAREST_SCENE_M = 2.0
 """Distance of the nearest scene point assumed for worst-case parallax."""
 
 
-def worst_parallax_px(baseline_m: float, focal_px: float) -> float:
+def worst_parallax_px(baseline_m: Any, focal_px: float) -> Any:
     """Largest pixel shift between two centres if the scene is anywhere from ``NEAREST_SCENE_M`` to infinity."""
     return focal_px * baseline_m / NEAREST_SCENE_M

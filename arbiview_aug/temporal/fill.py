@@ -248,7 +248,7 @@ def _shown(hole: Hole, view: ViewPlan, neighbour: Neighbour) -> Candidate:
     blur, risk = np.zeros(usable.shape, np.uint8), np.full(usable.shape, ChangeRisk.UNLABELLED, np.uint8)
     directions, q = hole.nodes
     for pair in view.pairs:
-        source = neighbour.rig[pair.source]
+        source = neighbour.rig.cameras[pair.source]
         # Pixels per metre along the road, which is the coarser axis: proportional to sin(incidence) / distance.
         from_source = (hole.camera.center_m - source.center_m) * q[..., None] + directions
         relative = np.maximum((from_source**2).sum(axis=-1), 1e-9)
