@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from arbiview_aug.cameras.framing import Fit, framing
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, Lens, LensName, intrinsics_for_fov
@@ -196,6 +197,22 @@ class Camera:
             if self.mask is None
             else hashlib.sha256(repr(self.size).encode() + np.packbits(self.mask).tobytes()).digest()
         )
+
+    @cached_property
+    def parameters(self) -> npt.NDArray[np.float32]:
+        """``parameters_at(1)``."""
+        return self.parameters_at(1.0)
+
+    def parameters_at(self, scale: float) -> npt.NDArray[np.float32]:
+        """Intrinsics and lens of the image resized by ``scale`` as kernels read them: fx, skew, cx, fy, cy, fold limit,
+        eight lens coefficients (14,). Resizing keeps outer edges, as ``image_ops.at_level`` does.
+        """
+        K = self.K.copy()
+        K[:2] *= scale
+        K[:2, 2] += (scale - 1) / 2
+        fold = min(self.lens_model.fold_limit, 1e12)
+        further = (*self.distortion, *(0.0,) * (8 - len(self.distortion)))
+        return np.array([K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2], fold, *further], np.float32)
 
     @cached_property
     def lens_model(self) -> Lens:

@@ -9,9 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import MIN_DEPTH
 from arbiview_aug.environment import compiled
 
@@ -35,19 +33,6 @@ _QUARTER_PI, _HALF_PI, _PI = np.float32(np.pi / 4), np.float32(np.pi / 2), np.fl
 # Minimax polynomial of (atan(t) - t) / t^3 in t^2 for |t| <= tan(22.5 deg), error 2e-8 (Cephes, atanf).
 _ATAN = tuple(np.float32(c) for c in (8.05374449538e-2, -1.38776856032e-1, 1.99777106478e-1, -3.33329491539e-1))
 _A0, _A1, _A2, _A3 = _ATAN
-
-
-def camera_parameters(camera: Camera, scale: float = 1.0) -> npt.NDArray[np.float32]:
-    """(14,) float32 fx, skew, cx, fy, cy, fold limit, eight lens coefficients; pixels of an image resized by ``scale``.
-
-    Resizing keeps outer edges, as ``image_ops.at_level`` does.
-    """
-    K = camera.K.copy()
-    K[:2] *= scale
-    K[:2, 2] += (scale - 1) / 2
-    fold = min(camera.lens_model.fold_limit, 1e12)
-    further = (*camera.distortion, *(0.0,) * (8 - len(camera.distortion)))
-    return np.array([K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2], fold, *further], np.float32)
 
 
 @compiled

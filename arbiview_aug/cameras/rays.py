@@ -32,7 +32,7 @@ class PixelRays:
 
     Attributes:
         size: (h, w).
-        parameters: ``kernels.camera_parameters``.
+        parameters: ``Camera.parameters``.
         planes: (3, h, w) float32 unit rays, 0 where there is none; (3, 0, 0) for a pinhole.
     """
 
@@ -134,10 +134,8 @@ def _lens_key(camera: Camera) -> Any:
 
 def pixel_rays(camera: Camera) -> PixelRays:
     """The rays of a camera's pixels."""
-    from arbiview_aug.cameras.kernels import camera_parameters
-
     planes = _NO_PLANES if camera.is_rectilinear else _unprojected(camera)
-    return PixelRays(camera.size, camera_parameters(camera), planes)
+    return PixelRays(camera.size, camera.parameters, planes)
 
 
 def clean_pixels(mask: BoolArray, level: int) -> Any:
@@ -168,12 +166,12 @@ def source_pixels(
         u and v (h, w), ``kernels.FAR_AWAY_PX`` where there is no pixel, and the points' inverse distances from the
         source (h, w), 1/m.
     """
-    from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES, camera_parameters, project_image
+    from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES, project_image
 
     A, o = relative_pose(target, source)
     u, v, nearness = (np.empty(inverse_distance.shape, np.float32) for _ in range(3))
     kind = LENS_CODES.get(source.lens, 0)
-    project_image(rays, inverse_distance, A, o, kind, camera_parameters(source), u, v, nearness)
+    project_image(rays, inverse_distance, A, o, kind, source.parameters, u, v, nearness)
     if source.lens not in LENS_CODES:
         points = np.tensordot(A, rays, 1) + o[:, None, None] * inverse_distance
         uv, _, valid = source.project_cam(np.moveaxis(points, 0, -1).astype(np.float64))

@@ -397,7 +397,7 @@ def put_source(
 
     Args:
         planes: (3, h, w) the target's rays; (3, 0, 0) for a pinhole.
-        target: Its ``camera_parameters``.
+        target: Its ``Camera.parameters``.
         q: (h, w) inverse distances along its rays.
         face: (h, w) int32 faces of solids, -1 elsewhere; (0, 0) without any.
         source: As ``view_planner.ViewPlanner._kernel`` makes it.

@@ -232,9 +232,9 @@ class ViewPlanner:
 
     def _projection(self, source: Camera) -> tuple[Any, ...]:
         """Relative pose (2 arrays), lens and parameters of a source, as kernels read them."""
-        from arbiview_aug.cameras.kernels import LENS_CODES, camera_parameters
+        from arbiview_aug.cameras.kernels import LENS_CODES
 
-        return *relative_pose(self.camera, source), LENS_CODES.get(source.lens, -1), camera_parameters(source)
+        return *relative_pose(self.camera, source), LENS_CODES.get(source.lens, -1), source.parameters
 
     def _in_view(
         self, source: Camera, projection: tuple[Any, ...], nearest: Any, farthest: Any
@@ -307,7 +307,7 @@ class ViewPlanner:
 
     def _kernel(self, source: Camera, level: int, geometry: _Geometry, A: Any, o: Any, P: Any) -> tuple[Any, ...]:
         """The source as ``kernels.put_source`` reads it, halved ``level`` times."""
-        from arbiview_aug.cameras.kernels import LENS_CODES, camera_parameters
+        from arbiview_aug.cameras.kernels import LENS_CODES
 
         kind, surface = LENS_CODES.get(source.lens, -1), geometry.surface
         given = np.zeros((2, 0, 0), np.float32)
@@ -329,7 +329,7 @@ class ViewPlanner:
             A,
             o,
             kind,
-            camera_parameters(source, 0.5**level) if level else P,
+            source.parameters_at(0.5**level) if level else P,
             np.array([*source_bounds(source, level), shadow_scale], np.float32),
             self.maps.clean_pixels(source, level),
             before_m,

@@ -24,7 +24,7 @@ def static_image(planes: Any, P: Any, R: Any, kind: int, S: Any, q: Any) -> None
 
     Args:
         planes: (3, h, w) rays, or (3, 0, 0) for a pinhole.
-        P: ``camera_parameters``.
+        P: ``Camera.parameters``.
         R: (3, 3) float32 camera to ego.
         kind: ``GROUND`` or ``STREET``.
         S: (6,) float32: 1 / height over the road, 0 on or under it; 1 / semi-axes of the wall; the camera's centre in
@@ -134,7 +134,7 @@ def draw_solids(
 
     Args:
         planes: (3, h, w) rays, or (3, 0, 0) for a pinhole.
-        P: ``camera_parameters``.
+        P: ``Camera.parameters``.
         rows: (n, ROW) float32: six planes, those that the camera lies before first, each as the inverse distance along
             rays x, y, z and its slope (24); how many are before; the direction of its box's middle (3) and the cosine
             of its cone; the planes' numbers (6).

@@ -39,7 +39,7 @@ def match_walls(
     """Costs (K, h, w) of surfaces by the normalised cross-correlation of windows.
 
     Arguments up to ``windows`` are those of a ``SweptImage``. ``walls`` (K,) are 1/radius, ascending; ``pose`` is the
-    rotation (3, 3) and shift (3,) into the neighbour's frame; ``lens`` the neighbour's code, its ``camera_parameters``,
+    rotation (3, 3) and shift (3,) into the neighbour's frame; ``lens`` the neighbour's code, its ``Camera.parameters``,
     and positions (K, 2, h, w) for a negative code; ``other`` and ``unmasked`` (H, W) are its image and mask.
     """
     h, w = road.shape

@@ -116,7 +116,7 @@ class SweptImage:
             other: The neighbour's image, in the same ego frame.
             walls: (K,) 1/radius of the walls, 1/m, ascending.
         """
-        from arbiview_aug.cameras.kernels import LENS_CODES, camera_parameters
+        from arbiview_aug.cameras.kernels import LENS_CODES
         from arbiview_aug.temporal.kernels import INVALID, match_walls
 
         h, w = self.camera.size
@@ -124,7 +124,7 @@ class SweptImage:
         if kind < 0:
             given = np.stack([self.positions(other.camera, self.inverse_distance(wall)) for wall in walls])
             given = given.transpose(0, 3, 1, 2)
-        pose, lens = relative_pose(self.camera, other.camera), (kind, camera_parameters(other.camera), given)
+        pose, lens = relative_pose(self.camera, other.camera), (kind, other.camera.parameters, given)
         costs = np.full((len(walls), h, w), INVALID, np.uint16)
         if min(other.camera.size) < 2:  # nothing lies between its pixels
             return costs
