@@ -13,6 +13,8 @@ from typing import Any
 
 import cv2
 
+from arbiview_aug.errors import MissingPackageError
+
 _CV2_WHEELS = ("opencv-python", "opencv-python-headless", "opencv-contrib-python", "opencv-contrib-python-headless")
 
 
@@ -42,7 +44,8 @@ def warn_about_cv2_wheels() -> None:
 def optional_package(name: str, extra: str | None = None) -> Any:
     """Import an optional package, which an ``extra`` of this package installs if given.
 
-    ImportError with the command that installs it.
+    Raises:
+        MissingPackageError: It is not installed.
     """
     try:
         return import_module(name)
@@ -51,7 +54,7 @@ def optional_package(name: str, extra: str | None = None) -> Any:
         if (error.name or "").split(".")[0] != top:
             raise  # one of its own dependencies is missing
         wanted = f"'arbiview_aug[{extra}]'" if extra else top
-        raise ImportError(f"{top} is not installed: pip install {wanted}") from None
+        raise MissingPackageError(f"{top} is not installed: pip install {wanted}") from None
 
 
 def compiled(function: Any) -> Any:

@@ -34,16 +34,14 @@ def described(error: Exception) -> str:
 def exit_status(
     program: str,
     command: Callable[[], int | None],
-    errors: tuple[type[Exception], ...] = (ArbiviewError,),
     *,
     resumable: bool = False,
 ) -> int:
-    """Run a command; an error, Ctrl-C, SIGTERM or SIGHUP becomes one line on stderr.
+    """Run a command; what the user can fix, Ctrl-C, SIGTERM or SIGHUP becomes one line on stderr.
 
     Args:
         program: Starts that line.
         command: Returns its exit status; None is 0.
-        errors: Exceptions that the user can fix.
         resumable: Whether the command continues an interrupted run.
 
     Returns:
@@ -56,8 +54,8 @@ def exit_status(
         fix = "; run it again to go on" if resumable else ""
         print(f"{program}: interrupted{fix}", file=sys.stderr)
         return INTERRUPTED
-    except errors as error:
-        print(f"{program}: {error}", file=sys.stderr)
+    except (ArbiviewError, OSError) as error:
+        print(f"{program}: {' '.join(str(error).splitlines())}", file=sys.stderr)
         return 2
 
 
@@ -102,6 +100,10 @@ class DataError(ArbiviewError, ValueError):
 
 class GeneratorError(ArbiviewError, ValueError):
     """A generator whose settings, weights and inputs do not fit together."""
+
+
+class MissingPackageError(ArbiviewError, ImportError):
+    """An optional package that is not installed; the message gives the command that installs it."""
 
 
 class OutputError(ArbiviewError, RuntimeError):

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from arbiview_aug.cli.arguments import add_output, command_parser, count
 from arbiview_aug.datasets.registry import READERS
-from arbiview_aug.errors import ArbiviewError, exit_status
+from arbiview_aug.errors import exit_status
 from arbiview_aug.generator.training.command import COMMANDS, run
 from arbiview_aug.generator.training.config import CONFIGS
 
@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns 0 if done or stopped while training, 2 after an error, 130 after any other Ctrl-C."""
     arguments = parser().parse_args(argv)
     program = "python -m arbiview_aug.train"
-    return exit_status(program, lambda: run(arguments), (ArbiviewError, OSError, ImportError), resumable=True)
+    return exit_status(program, lambda: run(arguments), resumable=True)
 
 
 if __name__ == "__main__":

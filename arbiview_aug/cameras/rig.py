@@ -32,8 +32,8 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.plain_yaml import parse_yaml
 from arbiview_aug.errors import CalibrationError, shown
 
-MOST_CAMERAS = 128
-"""Of a rig file."""
+MOST_CAMERAS, MOST_BYTES = 128, 1 << 20
+"""Largest rig, and largest rig file: 8 KiB a camera."""
 
 _CAMERA_KEYS = {"name", "width", "height", "K", "cam2ego", "distortion", "mask"}
 
@@ -269,6 +269,9 @@ def load_rig(name_or_path: str | Path) -> Rig:
         raise CalibrationError(
             f"{where}: expected a file or one of the shipped rigs ({', '.join(shipped_rigs())}), found neither"
         )
+    if os.path.getsize(path) > MOST_BYTES:  # counted before it is read: YAML takes seconds a megabyte
+        got = f"{os.path.getsize(path) / 2**20:.1f}"
+        raise CalibrationError(f"{where}: expected at most {MOST_CAMERAS} cameras in 1 MiB, got a file of {got} MiB")
     try:
         text = path.read_text()
         data = json.loads(text) if path.suffix == ".json" else parse_yaml(text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -121,6 +122,14 @@ def count(text: str) -> int:
 def seed(text: str) -> int:
     """Integer from 0."""
     return _integer(text, 0, "from 0")
+
+
+def positive(text: str) -> float:
+    """Finite number above 0."""
+    value = float(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a finite number above 0, got {text!r}")
+    return value
 
 
 def _integer(text: str, least: int, expected: str) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -39,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_output(parser, "folder for the pictures")
     arguments = parser.parse_args(argv)
     kind, path = split_kind(arguments.data)
-    if kind is None and not path.is_dir():
+    if kind is None and not os.path.isdir(path):
         report = CheckReport(tuple(check_rig(load_rig(arguments.data))))
         print(report)
         return int(not report.ok)

@@ -172,6 +172,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.model and arguments.fit:
         parser.error("argument --fit: expected it without --model")
     is_learned = arguments.model is not None or arguments.fit is not None
+    if arguments.device and not is_learned:
+        parser.error("argument --device: expected it with --model alone: depth from motion is computed on the CPU")
+    device = device_named(arguments.device)
     data: Any = open_data(arguments.data, neighbours=None if arguments.model else WANTED)
     _, root = split_kind(arguments.data)
     folder = Path(arguments.output or inside(root, LEARNED_FOLDER if is_learned else FOLDER, "depth"))
@@ -180,7 +183,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     warned: list[str] = []
     with gathered_warnings(warned):
         if is_learned:
-            device = device_named(arguments.device or ("cuda" if torch.cuda.is_available() else "cpu"))
             model: DepthModel
             if arguments.model:
                 model = TransformersDepth(arguments.model, device)

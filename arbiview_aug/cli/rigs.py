@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 
@@ -71,9 +72,9 @@ def differences(source: Rig, target: Rig) -> str:
 
 def _load(name: str) -> Rig:
     kind, root = split_kind(name)
-    if kind is None and (root / CALIBRATION_FILE).is_file():  # its images need not be there
+    if kind is None and os.path.isfile(root / CALIBRATION_FILE):  # its images need not be there
         return load_rig(root / CALIBRATION_FILE)
-    if kind is None and not root.is_dir():
+    if kind is None and not os.path.isdir(root):
         return load_rig(name)
     recording = open_data(data(name))
     recording.load_points = False

@@ -19,7 +19,7 @@ from arbiview_aug.atomic_io import BROKEN_ARRAY, check_name, inside
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.key_names import hint, misnamed
 from arbiview_aug.cameras.lens import BoolArray
-from arbiview_aug.cameras.rig import Rig, read_mask
+from arbiview_aug.cameras.rig import MOST_CAMERAS, Rig, read_mask
 from arbiview_aug.datasets.drive import (
     Drive,
     LazyFrame,
@@ -248,7 +248,7 @@ class FrameFolder(WritableRecording):
 
 
 def _find_frames(root: Path) -> list[_Frame]:
-    if not root.is_dir():
+    if not os.path.isdir(root):  # unlike Path.is_dir, False for a name that is too long
         raise DataError(f"frame folder {root}: expected a folder, found none")
     if (root / CALIBRATION_FILE).is_file():
         return [_Frame(root.resolve(), root.resolve())]  # resolved, so that "." has a name
@@ -287,7 +287,11 @@ def _read_sequence(root: Path, index: Mapping[str, int]) -> tuple[dict[str, floa
 def _read_calibration(frame: _Frame) -> dict[str, Any]:
     path = frame.file(CALIBRATION_FILE)
     try:
-        calib = json.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        _check_count(text.count('"cam2ego"') // 2, path)  # before millions of entries are parsed; notes may name it too
+        calib = json.loads(text)
+    except CalibrationError:
+        raise
     except FileNotFoundError:
         raise DataError(f"{path}: expected a calibration, found no file") from None
     except (OSError, ValueError, RecursionError) as error:  # ValueError: numbers of thousands of digits too
@@ -295,10 +299,16 @@ def _read_calibration(frame: _Frame) -> dict[str, Any]:
     if not isinstance(calib, dict) or not isinstance(calib.get("cameras"), list):
         got = type(calib).__name__ + (hint(calib, ("cameras",)) if isinstance(calib, dict) else "")
         raise DataError(f"{path}: expected an object with a list 'cameras', got {got}")
+    _check_count(len(calib["cameras"]), path)
     for k, entry in enumerate(calib["cameras"]):
         if not isinstance(entry, dict):
             raise CalibrationError(f"{path}: camera {k}: expected a mapping, got {type(entry).__name__}")
     return calib
+
+
+def _check_count(cameras: int, path: Path) -> None:
+    if cameras > MOST_CAMERAS:
+        raise CalibrationError(f"{path}: expected at most {MOST_CAMERAS} cameras, got {cameras} or more")
 
 
 def _calibration_of(entry: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,8 @@ from arbiview_aug.errors import DataError
 class Reader:
     description: str  # such a folder, for messages and help texts
     recognises: Callable[[Path], bool]  # whether a folder is of this kind
-    open: Callable[..., Recording]  # opens a folder, given the other keywords of ``open_data``
+    open: Callable[..., Recording]  # opens a folder, given ``reduce``, ``neighbours`` and its ``options``
+    options: tuple[str, ...] = ()  # further options of ``open_data`` that it takes
     writer: str | None = None  # subclass of ``Writer`` as ``module:Class``; None if ``convert`` has none
 
 
@@ -26,21 +28,21 @@ READERS = {
     "frames": Reader(
         f"frame folder ({CALIBRATION_FILE} in it or in its folders)",
         lambda root: (root / CALIBRATION_FILE).is_file() or any(root.glob(f"*/{CALIBRATION_FILE}")),
-        lambda root, *, version, **options: FrameFolder(root, **options),
+        FrameFolder,
+        options=("clean_masks",),
         writer="arbiview_aug.cli.convert.frame_folders:FrameFolders",
     ),
     "nuscenes": Reader(
         "nuScenes root (with a folder of tables such as v1.0-mini)",
         lambda root: bool(table_folders(root)),
-        lambda root, *, version, clean_masks=False, **options: NuScenesDataset(
-            root, version or table_folders(root)[0], **options
-        ),
+        lambda root, version=None, **options: NuScenesDataset(root, version or table_folders(root)[0], **options),
+        options=("version",),
         writer="arbiview_aug.cli.convert.nuscenes:NuScenes",
     ),
     "py123d": Reader(
         "folder of py123d's logs (with sync.arrow in it)",
         lambda root: bool(log_folders(root)),
-        lambda root, *, version, clean_masks=False, **options: Py123dDataset(root, **options),
+        Py123dDataset,
         writer="arbiview_aug.cli.convert.frame_folders:LogFrames",
     ),
 }
@@ -55,28 +57,34 @@ def split_kind(data: str | Path) -> tuple[str | None, Path]:
 
 def data_name(data: str | Path) -> str:
     """Name of a data set's folder, for tables."""
-    return split_kind(data)[1].resolve().name
+    return os.path.basename(os.path.realpath(split_kind(data)[1]))  # unlike Path.resolve, no error where links loop
 
 
 def kinds_of(root: Path) -> list[str]:
-    """All kinds whose readers recognise a folder."""
-    return [kind for kind, reader in READERS.items() if reader.recognises(root)]
+    """All kinds whose readers recognise a folder; none for what is no folder."""
+    return [kind for kind, reader in READERS.items() if os.path.isdir(root) and reader.recognises(root)]
 
 
-def find_reader(data: str | Path, kind: str | None = None) -> tuple[Path, Reader]:
+def find_reader(data: str | Path, kind: str | None = None, *, version: str | None = None) -> tuple[Path, Reader]:
     """Find a data set's folder and its reader; arguments and errors as for ``open_data``."""
     named, root = split_kind(data)
     kind = kind or named
     if kind is not None and kind not in READERS:
         raise DataError(f"data {root}: expected a kind of {', '.join(READERS)}, got {kind!r}")
-    if not root.is_dir():
+    if not os.path.isdir(root):  # unlike Path.is_dir, False for a name that is too long
         fix = f"; the kinds of KIND:PATH are {', '.join(READERS)}" if ":" in str(root) else ""
         raise DataError(f"data {root}: expected a folder, found none{fix}")
-    found = kinds_of(root) if kind is None else [kind]
-    if not found:
+    kinds = kinds_of(root)
+    if kind is None and not kinds:
         expected = " or ".join(f"a {reader.description}" for reader in READERS.values())
         raise DataError(f"data {root}: expected {expected}, found none of them")
-    return root, READERS[found[0]]
+    reader = READERS[kind or kinds[0]]
+    if version is not None and "version" not in reader.options:
+        raise DataError(f"data {root}: expected no version, which a {reader.description} has not, got {version!r}")
+    if kind is not None and kind not in kinds and version is None:  # a version names the folder of tables
+        instead = f"; it is a {READERS[kinds[0]].description}: {kinds[0]}:{root}" if kinds else ""
+        raise DataError(f"data {root}: expected a {reader.description}, found none{instead}")
+    return root, reader
 
 
 def open_data(
@@ -100,8 +108,9 @@ def open_data(
         clean_masks: As for ``FrameFolder``; nuScenes has no masks.
 
     Raises:
-        DataError: There is no such folder, or no reader fits it.
+        DataError: There is no such folder, no reader fits it, or the version is not for this kind.
     """
-    root, reader = find_reader(data, kind)
-    options = {"clean_masks": True} if clean_masks else {}  # not every reader has masks
-    return reader.open(root, version=version, reduce=reduce, neighbours=neighbours, **options)
+    root, reader = find_reader(data, kind, version=version)
+    further = {"version": version, "clean_masks": clean_masks}
+    options = {name: value for name, value in further.items() if value and name in reader.options}
+    return reader.open(root, reduce=reduce, neighbours=neighbours, **options)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,7 @@ from arbiview_aug.generator.stable_diffusion import PLAIN_UNET, load_part
 from arbiview_aug.generator.stable_diffusion import empty_prompt as embedded_empty_prompt
 
 _SHIPPED = Path(__file__).with_name("weights")
+_HUB_ID = re.compile(r"\w[\w.-]*/[\w.-]+")
 
 
 def has_shipped() -> bool:
@@ -161,8 +164,12 @@ def load_generator(where: str | Path) -> Generator | HoleFiller:
         GeneratorError: None of these.
     """
     path = Path(where)
-    if path.is_file():
+    if os.path.isfile(path):
         return TorchScriptFiller(path)
-    if (path / "model_index.json").is_file() or not path.exists():
+    is_there = os.path.isdir(path)
+    if not is_there and not _HUB_ID.fullmatch(str(where)):
+        expected = "a folder of a generator or of diffusers, a TorchScript file, or OWNER/NAME on the Hugging Face Hub"
+        raise GeneratorError(f"generator {where}: expected {expected}, found none")
+    if not is_there or (path / "model_index.json").is_file():
         return PipelineFiller.from_pretrained(where)
     return Generator.from_pretrained(path)

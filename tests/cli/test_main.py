@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,7 +18,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from arbiview_aug import __main__, environment
+from arbiview_aug import __main__, environment, load_rig
 from arbiview_aug.__main__ import COMMANDS, main
 
 
@@ -86,6 +88,68 @@ def test_errors_are_one_line(
     assert main([command, *arguments]) == 2
     said = capsys.readouterr().err
     assert said.startswith(f"python -m arbiview_aug {command}: ") and message in said and len(said.splitlines()) == 1
+
+
+LONG = "x" * 300
+DATA_COMMANDS: dict[str, tuple[str, ...]] = {
+    **{f"{name} --data": () for name in ("bench speed", "bench loader", "bench ablation", "demo", "depth", "evaluate")},
+    "convert --data": ("--target", "waymo", "--output", "converted"),
+    "check": (),
+    "inspect": (),
+}
+"""Commands that read data, before its path, and what must follow."""
+
+
+@pytest.fixture
+def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A working directory of a frame, logs, links in circles, and a rig and a frame of too many cameras."""
+    monkeypatch.chdir(tmp_path)
+    camera = load_rig("waymo").to_dict()["cameras"][0]
+    for folder, cameras in (("frame", []), ("crowd", [camera] * 300), ("few", [camera] * 129)):
+        Path(folder).mkdir()
+        Path(folder, "calib.json").write_text(json.dumps({"cameras": cameras}))
+    for name in ("loop", "loop.yaml"):
+        Path(name).symlink_to(name)
+    Path("logs/log").mkdir(parents=True)
+    Path("logs/log/sync.arrow").touch()
+    Path("million.yaml").write_text("cameras:\n" + "- {name: a, cam2ego: []}\n" * 1_000_000)
+    monkeypatch.setitem(sys.modules, "py123d", None)
+
+
+@pytest.mark.usefixtures("mistakes")
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        *((f"{name} nuscenes:frame", "expected a nuScenes root .*; it is a frame folder") for name in DATA_COMMANDS),
+        ("check py123d:frame", "expected a folder of py123d's logs .*found none"),
+        ("check py123d:logs", r"py123d is not installed: pip install 'arbiview_aug\[py123d\]'"),
+        *((f"{name} {LONG}", "expected a (folder|file or)") for name in DATA_COMMANDS),
+        *((f"{name} {kind}:{LONG}", "expected a folder") for name in DATA_COMMANDS for kind in ("frames", "nuscenes")),
+        *((f"{name} loop", "expected a (folder|file or)") for name in DATA_COMMANDS),
+        (f"demo --output {LONG}/{LONG}", "expected a folder that can be written to, got File name too long"),
+        *((f"demo --target {name}", "expected a file or one of the shipped rigs") for name in (LONG, "loop.yaml")),
+        *((f"demo --output {name}", "expected a folder that can be written to") for name in ("loop", "loop/a.png")),
+        ("convert --data frame --target waymo --output loop", "expected a folder, got a file or a link"),
+        ("inspect million.yaml", r"expected at most 128 cameras in 1 MiB, got a file of 23\.8 MiB"),
+        *((f"check {name}", "expected at most 128 cameras, got 1[25]. or more") for name in ("crowd", "few")),
+        ("convert --data frame --target waymo --output o --version v1.0-mini", "expected no version, which a frame f"),
+        *((f"bench trade --budget-ms {ms}", "expected a finite number above 0") for ms in (-1, 0, "nan", "inf")),
+        ("bench trade --generator /nope", "generator /nope: expected a folder of a generator or .*, found none"),
+        ("evaluate --path diffusion --generator /nope", "generator /nope: expected a folder of a generator"),
+        ("depth --data frame --device nope", "argument --device: expected it with --model alone"),
+        ("depth --data frame --model m --device nope", "expected cpu, cuda, cuda:1, ..., got 'nope'"),
+    ],
+)
+def test_mistakes_are_one_line(command: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    program, *arguments = command.split()
+    arguments += DATA_COMMANDS.get(command.rpartition(" ")[0], ())
+    try:
+        assert main([program, *arguments]) == 2
+    except SystemExit as refused:  # argparse, after the usage
+        assert refused.code == 2
+    said = capsys.readouterr()
+    assert re.search(message, said.err.splitlines()[-1]) and "Traceback" not in said.err
+    assert said.err.startswith("usage") or len(said.err.splitlines()) == 1
 
 
 def test_usage(capsys: pytest.CaptureFixture[str]) -> None:

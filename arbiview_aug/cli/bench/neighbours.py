@@ -18,7 +18,7 @@ import numpy as np
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.arguments import seed
+from arbiview_aug.cli.arguments import positive, seed
 from arbiview_aug.cli.bench.data import as_of_another_frame, recorded
 from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
 from arbiview_aug.cli.bench.timing import machine_line, peak_mib, quartiles, show, timed_rounds
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         example="--data FOLDER --counts 0 2",
     )
     parser.add_argument("--counts", type=seed, nargs="+", default=list(COUNTS), metavar="N", help="of neighbours")
-    parser.add_argument("--step-m", type=float, default=Neighbours.step_m, metavar="M", help="between neighbours")
+    parser.add_argument("--step-m", type=positive, default=Neighbours.step_m, metavar="M", help="between neighbours")
     parser.add_argument("--surface", nargs="+", choices=NEEDS, default=list(NEEDS), help="scene geometry")
     arguments = parser.parse_args(argv)
     try:

@@ -24,7 +24,7 @@ import torch
 from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.arguments import add_target, count, writable_folder
+from arbiview_aug.cli.arguments import add_target, count, positive, writable_folder
 from arbiview_aug.cli.bench.data import REDUCES, SOURCES_OVER_VIEWS, Recorded, as_of_another_frame, recorded
 from arbiview_aug.cli.bench.speed import remap_floor
 from arbiview_aug.cli.bench.study import (
@@ -132,6 +132,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print the tables, write the JSON; return 1 if no harmless setting keeps the limit."""
     arguments = _parser().parse_args(argv)
     folder = writable_folder(Path(arguments.output), arguments.output)
+    arguments.generator = {path: load_generator(path) for path in arguments.generator}
     h, w = (SOURCES_OVER_VIEWS * side for side in arguments.size)
     with recorded(arguments.data, frames=arguments.frames, size=(h, w)) as data:
         report = measure(data, arguments)
@@ -161,8 +162,8 @@ def _parser() -> argparse.ArgumentParser:
     of = "also fill holes by a generator's folder, a folder of diffusers or a TorchScript file"
     parser.add_argument("--generator", nargs="+", default=[], metavar="PATH", help=of)
     limit = parser.add_mutually_exclusive_group()
-    limit.add_argument("--budget-ms", type=float, metavar="MS", help="recommend the most accurate within it")
-    limit.add_argument("--min-psnr", type=float, metavar="DB", help="recommend the fastest that reaches it")
+    limit.add_argument("--budget-ms", type=positive, metavar="MS", help="recommend the most accurate within it")
+    limit.add_argument("--min-psnr", type=positive, metavar="DB", help="recommend the fastest that reaches it")
     return parser
 
 
@@ -240,8 +241,8 @@ def measure_fills(
     """Score and time what fills the holes of one setting's views."""
     fillings: dict[str, dict[str, Any]] = {how: {"holes": how} for how in ("black", "fill")}
     fillings["inpaint"] = {"path": "inpaint"}
-    for path in arguments.generator:
-        fillings[path] = {"path": "diffusion", "generator": load_generator(path)}
+    for path, generator in arguments.generator.items():
+        fillings[path] = {"path": "diffusion", "generator": generator}
     sample = frames[0].scored_sample
     calls = {name: setting.call(target, sample, **how) for name, how in fillings.items()}
     rows = []

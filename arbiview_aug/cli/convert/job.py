@@ -50,7 +50,7 @@ class Jobs(Dataset[Done]):
     """Samples of a shard, by their ``indices``, each converted on access; DataError if the reader names no writer."""
 
     def __init__(self, settings: Settings, data: Recording, indices: Sequence[int], on_error: OnError) -> None:
-        _, reader = find_reader(settings.root, settings.kind)
+        _, reader = find_reader(settings.root, settings.kind, version=settings.version)
         if reader.writer is None or not isinstance(data, WritableRecording):
             raise DataError(f"--data {settings.root}: expected a kind that can be written, got a {reader.description}")
         self.settings, self.data, self.indices, self.on_error = settings, data, indices, on_error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -94,14 +95,14 @@ class Settings:
 
 def check_output(settings: Settings) -> None:
     """Raise DataError if the output overlaps the source, or holds files that no conversion wrote."""
-    source, output = settings.root.resolve(), settings.output.resolve()
+    source, output = (Path(os.path.realpath(path)) for path in (settings.root, settings.output))  # links may loop
     if source == output or source in output.parents or output in source.parents:
         where = "the source itself" if source == output else "in it" if source in output.parents else "around it"
         raise DataError(f"--output {settings.output}: expected a folder apart from the source {source}, got {where}")
-    if not output.exists():
+    if not os.path.lexists(output):
         return
     if not output.is_dir():
-        raise DataError(f"--output {settings.output}: expected a folder, got a file")
+        raise DataError(f"--output {settings.output}: expected a folder, got a file or a link that leads nowhere")
     if (output / FOLDER / "settings.json").is_file():
         return
     foreign = next((path.name for path in output.rglob("*") if not path.is_dir() and not is_part(path)), None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -85,7 +86,7 @@ class Tables:
         if nusc is None:
             assert root is not None
             self.root, self.version = Path(root), version
-            if not (self.root / version).is_dir():
+            if not os.path.isdir(self.root / version):
                 found = ", ".join(sorted(p.parent.name for p in self.root.glob("*/sample.json"))) or "none"
                 raise DataError(
                     f"nuScenes {root}: expected a folder of tables {version!r}, found none; "
