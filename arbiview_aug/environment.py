@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 import sys
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -13,7 +12,7 @@ from typing import Any
 
 import cv2
 
-from arbiview_aug.errors import MissingPackageError
+from arbiview_aug.errors import MissingPackageError, warn
 
 _CV2_WHEELS = ("opencv-python", "opencv-python-headless", "opencv-contrib-python", "opencv-contrib-python-headless")
 
@@ -33,11 +32,10 @@ def warn_about_cv2_wheels() -> None:
     if len(found) < 2:
         return
     versions = " and ".join(f"{name} {version}" for name, version in found.items())
-    warnings.warn(
+    warn(
         f"{versions} are installed together: they overwrite each other's files, so cv2 may break or change with the "
         f"order of installation. Keep one: pip uninstall -y {' '.join(found)} && pip install {list(found)[-1]}",
         RuntimeWarning,
-        stacklevel=3,
     )
 
 

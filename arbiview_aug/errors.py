@@ -7,6 +7,8 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing import parent_process
+from types import FrameType
 
 INTERRUPTED = 130
 """Exit status of a process that Ctrl-C ended: 128 + SIGINT, as shells report it."""
@@ -115,21 +117,41 @@ class TrainingError(ArbiviewError, RuntimeError):
 
 
 class WarnOnce:
-    """Warnings issued once per topic; ``topics`` are those issued."""
+    """Warnings issued once per topic; ``topics`` are those issued.
+
+    A warning points at the user's nearest line; in a DataLoader's worker without one, at the line that built this.
+    """
 
     def __init__(self) -> None:
         self.topics: set[str] = set()
+        frame = _users_frame()
+        self._built_at = _UNKNOWN if frame is None else (frame.f_code.co_filename, frame.f_lineno)
 
-    def __call__(self, topic: str, message: str) -> None:
+    def __call__(self, topic: str, message: str, category: type[Warning] = UserWarning) -> None:
         """Warn, unless this topic was warned of before."""
         if topic not in self.topics:
             self.topics.add(topic)
-            warnings.warn(message, stacklevel=_callers_level())
+            warn(message, category, otherwise=self._built_at)
 
 
-def _callers_level() -> int:
-    """``stacklevel``, for our caller, of the nearest line outside this package and torch."""
-    level, frame, inside = 1, sys._getframe(1), (__name__.partition(".")[0], "torch", "torchvision")
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in inside:
-        level, frame = level + 1, frame.f_back
-    return level
+_UNKNOWN = ("sys", 1)  # as Python's own warnings without a frame
+_NOT_USERS = frozenset(("arbiview_aug", "torch", "torchvision")) | sys.stdlib_module_names
+
+
+def warn(message: str, category: type[Warning] = UserWarning, *, otherwise: tuple[str, int] = _UNKNOWN) -> None:
+    """Warn at the user's nearest line, or at the file and line ``otherwise`` if no frame is the user's."""
+    frame = _users_frame()
+    if frame is None:
+        warnings.warn_explicit(message, category, *otherwise)
+        return
+    module, registry = frame.f_globals.get("__name__"), frame.f_globals.setdefault("__warningregistry__", {})
+    warnings.warn_explicit(message, category, frame.f_code.co_filename, frame.f_lineno, module, registry)
+
+
+def _users_frame() -> FrameType | None:
+    """Nearest frame outside this package, torch and the standard library; None in a spawned process without one."""
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _NOT_USERS:
+        frame = frame.f_back
+    is_start = frame is not None and frame.f_back is None and frame.f_code.co_filename == "<string>"
+    return None if is_start and parent_process() is not None else frame

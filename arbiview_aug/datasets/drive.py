@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.errors import ArbiviewError, DataError
+from arbiview_aug.errors import ArbiviewError, DataError, warn
 from arbiview_aug.sample.neighbours import STILL_M
 
 Direction = Literal["both", "past", "future"]
@@ -148,7 +147,7 @@ def parts_of_clock(names: Sequence[str], times_s: Mapping[str, float] | None, wh
         goes_back = times_s is not None and times_s[two] <= times_s[one]
         parts[k] = parts[k - 1] + goes_back
         if goes_back:
-            warnings.warn(clock_message(where, one, two), stacklevel=4)
+            warn(clock_message(where, one, two))
     return np.array(parts, np.int64)
 
 

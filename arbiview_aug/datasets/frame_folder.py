@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -31,7 +30,7 @@ from arbiview_aug.datasets.drive import (
     parts_of_clock,
 )
 from arbiview_aug.datasets.image_io import Reduce, check_reduce, decode_images, reduced_rig
-from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, WarnOnce, shown
+from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, WarnOnce, shown, warn
 from arbiview_aug.sample.masks import image_circle, without_specks
 from arbiview_aug.scene.boxes import checked_boxes
 
@@ -191,7 +190,7 @@ class FrameFolder(WritableRecording):
                 if pose is not None:
                     positions_m[name] = _pose(pose, frame.where).numpy()[:3, 3]
             except ArbiviewError as error:
-                warnings.warn(f"{error}; this frame is no neighbour", stacklevel=3)
+                warn(f"{error}; this frame is no neighbour")
         names = self._drive_names = list(positions_m)
         times_s = self._times_s if all(name in self._times_s for name in names) else None
         parts = parts_of_clock(names, times_s, str(self.root / SEQUENCE_FILE))

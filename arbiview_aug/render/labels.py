@@ -30,4 +30,3 @@ def render_labels(plan: RenderPlan, labels: Sequence[torch.Tensor], fill: float)
             out[..., won] = label[..., y, x]
         rendered.append(out)
     return rendered
-

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
@@ -30,7 +29,7 @@ from arbiview_aug.datasets.image_io import Reduce, check_reduce, decode_images, 
 from arbiview_aug.datasets.nuscenes.boxes import read_annotations
 from arbiview_aug.datasets.nuscenes.recordings import LIDAR, IntArray, read_recordings
 from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Row, Tables
-from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError
+from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, warn
 
 CAMERA_RING = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_FRONT_LEFT")
 """Order of the cameras in a sample, clockwise from above; other cameras follow by name."""
@@ -117,10 +116,9 @@ class NuScenesDataset(WritableRecording):
         self._annotations = read_annotations(tables, self._index, times_s, np.array(scenes)) if load_boxes else None
         if self._annotations is not None and self.tokens and not len(self._annotations.tokens):
             self._annotations = None  # an empty list of boxes would mean an empty street
-            warnings.warn(
+            warn(
                 f"nuScenes {self.root}: sample_annotation has no rows of these samples (a test split?): they come "
-                "without boxes_3d",
-                stacklevel=2,
+                "without boxes_3d"
             )
         self._has_lidar_sweeps = False
         self._drive_rows = np.empty(0, np.int64) if neighbours is None else self._find_drive_rows()
@@ -203,9 +201,9 @@ class NuScenesDataset(WritableRecording):
             if os.path.isdir(folder):  # False for impossible names too
                 self._has_lidar_sweeps |= is_lidar
             elif is_lidar:
-                warnings.warn(f"nuScenes: {folder}: found no sweeps: only keyframes have points", stacklevel=3)
+                warn(f"nuScenes: {folder}: found no sweeps: only keyframes have points")
             else:
-                warnings.warn(f"nuScenes: {folder}: found no sweeps: only keyframes are neighbours", stacklevel=3)
+                warn(f"nuScenes: {folder}: found no sweeps: only keyframes are neighbours")
                 return rows[is_key[rows]]
         return rows
 

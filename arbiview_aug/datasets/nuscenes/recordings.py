@@ -5,7 +5,6 @@ Rows as Python objects would take ten times the memory, in every worker.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
@@ -28,7 +27,7 @@ from arbiview_aug.datasets.nuscenes.tables import (
     Tokens,
     rotation_from_quaternion,
 )
-from arbiview_aug.errors import DataError
+from arbiview_aug.errors import DataError, warn
 
 LIDAR = "LIDAR_TOP"  # sensor whose time and ego pose are the sample's
 MAX_APART_S = 0.1  # maximum time to a sweep's nearest image; cameras record every 50 to 100 ms
@@ -248,5 +247,5 @@ def _parts(scene: npt.NDArray[Any], tokens: Sequence[str], previous: Sequence[st
     number = np.arange(len(before))
     same_scene = (before >= 0) & (scene[before] == scene)
     for k in np.flatnonzero(same_scene & (before > number)).tolist():
-        warnings.warn(clock_message(where, tokens[before[k]], tokens[k]), stacklevel=4)
+        warn(clock_message(where, tokens[before[k]], tokens[k]))
     return np.cumsum(~(same_scene & (before == number - 1)))

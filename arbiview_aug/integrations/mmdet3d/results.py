@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -13,7 +12,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.nuscenes.tables import rotation_from_quaternion
-from arbiview_aug.errors import CalibrationError, SampleError
+from arbiview_aug.errors import CalibrationError, SampleError, warn
 from arbiview_aug.integrations.mmdet3d.images import like_given as images_like
 from arbiview_aug.integrations.mmdet3d.images import norm_of, to_tensors
 from arbiview_aug.integrations.mmdet3d.matrices import (
@@ -334,9 +333,9 @@ def _write_sizes(made: dict[str, Any], images: torch.Tensor) -> None:
 
 
 def warn_of_dropped(results: Mapping[str, Any]) -> None:
-    """Name what is dropped, at the line of whoever called the retargeting."""
+    """Warn of labels that are dropped."""
     annotated = results.get("ann_info")
     held = [*results, *(annotated if isinstance(annotated, Mapping) else ())]
     dropped = sorted({key for key in held if key in STALE_KEYS})
     if dropped:
-        warnings.warn(f"retarget: drops {', '.join(dropped)}: they speak of the source's pixels", stacklevel=4)
+        warn(f"retarget: drops {', '.join(dropped)}: they speak of the source's pixels")
