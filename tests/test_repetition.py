@@ -84,6 +84,12 @@ def test_opencv_is_left_as_it_was() -> None:
     assert (cv2.getNumThreads(), cv2.ipp.useIPP()) == before
 
 
+def test_tests_run_on_the_threads_of_their_environment() -> None:
+    """``conftest.py`` sets them before anything reads them, in the processes of ``-n`` too."""
+    assert torch.get_num_threads() == int(os.environ["OMP_NUM_THREADS"])
+    assert cv2.getNumThreads() == int(os.environ["OPENCV_FOR_THREADS_NUM"])
+
+
 @pytest.mark.slow
 def test_a_street_in_two_processes() -> None:
     one, two = (in_another_process(seed) for seed in (1, 2))

@@ -218,7 +218,8 @@ def test_the_text_encoder_is_loaded_completely_or_not_at_all(folder: Path, monke
     save({**published, "text_model.embeddings.position_ids": torch.arange(77)[None]})  # as in Stable Diffusion 1.5
     tokens = torch.tensor([[49406, *[49407] * 76]])
     with torch.no_grad():
-        assert torch.equal(empty_prompt(folder), encoder.eval()(tokens).last_hidden_state[0])
+        expected = encoder.eval()(tokens).last_hidden_state[0]
+        assert torch.allclose(empty_prompt(folder), expected, atol=1e-5)
     layer = {name: value for name, value in good.items() if "layers.1." in name}
     save({name: value for name, value in good.items() if name not in layer})
     expected = r"text_encoder: expected exactly the weights of this CLIPTextModel; "
