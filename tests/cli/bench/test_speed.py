@@ -98,6 +98,7 @@ def _known_miss(name: str, fisheye: bool) -> list[pytest.MarkDecorator]:
         for size, bounds in BOUNDS.items()
         for name in bounds
         for fisheye in (False, True)
+        if not (fisheye and name.endswith(("contiguous", "two neighbours")))  # measured with one target alone
     ],
 )
 def test_bounds(
@@ -107,6 +108,11 @@ def test_bounds(
     best_ratios: dict[Any, float],
     report_bound: Callable[..., None],
 ) -> None:
-    for (of_size, call, target), ratio in best_ratios.items():
-        if (of_size, call, target == "fisheye") == (size, name, fisheye):
-            report_bound(f"ratio, {size}, {name}, {target}", ratio, at_most=BOUNDS[size][name])
+    ratios = {
+        target: ratio
+        for (of_size, call, target), ratio in best_ratios.items()
+        if (of_size, call, target == "fisheye") == (size, name, fisheye)
+    }
+    assert ratios, f"{name} was not measured"
+    for target, ratio in ratios.items():
+        report_bound(f"ratio, {size}, {name}, {target}", ratio, at_most=BOUNDS[size][name])
