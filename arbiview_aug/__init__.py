@@ -1,46 +1,56 @@
 """Re-render the labelled camera samples of one vehicle as the cameras of another would have seen them."""
 
-from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.random_rig import RandomRig
-from arbiview_aug.cameras.rig import Rig, load_rig, shipped_rigs
-from arbiview_aug.datasets.wrappers import MixedDataset, RetargetedDataset, RetargetedIterable
-from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, SampleTypeError
-from arbiview_aug.favs.config import FavsConfig, PaperConfig
-from arbiview_aug.render.refinement import RefinementCache
-from arbiview_aug.sample.boxes_2d import ImageBoxes, project_boxes_3d
-from arbiview_aug.sample.collate import collate
-from arbiview_aug.sample.mistakes import CheckReport, Finding, check
-from arbiview_aug.sample.training import lift_mask, visible_boxes
-from arbiview_aug.transforms.resize import CropRig, ResizeRig
-from arbiview_aug.transforms.rig_retarget import RigRetarget
+from typing import TYPE_CHECKING
 
-__version__ = "0.2.0"
-__all__ = [
-    "ArbiviewError",
-    "CalibrationError",
-    "Camera",
-    "CheckReport",
-    "CropRig",
-    "DataError",
-    "FavsConfig",
-    "Finding",
-    "ImageBoxes",
-    "MixedDataset",
-    "PaperConfig",
-    "RandomRig",
-    "RefinementCache",
-    "ResizeRig",
-    "RetargetedDataset",
-    "RetargetedIterable",
-    "Rig",
-    "RigRetarget",
-    "SampleError",
-    "SampleTypeError",
-    "check",
-    "collate",
-    "lift_mask",
-    "load_rig",
-    "project_boxes_3d",
-    "shipped_rigs",
-    "visible_boxes",
-]
+from arbiview_aug.environment import lazy_names
+
+if TYPE_CHECKING:
+    from arbiview_aug.cameras.camera import Camera as Camera
+    from arbiview_aug.cameras.random_rig import RandomRig as RandomRig
+    from arbiview_aug.cameras.rig import Rig as Rig
+    from arbiview_aug.cameras.rig import load_rig as load_rig
+    from arbiview_aug.cameras.shipped import shipped_rigs as shipped_rigs
+    from arbiview_aug.datasets.wrappers import MixedDataset as MixedDataset
+    from arbiview_aug.datasets.wrappers import RetargetedDataset as RetargetedDataset
+    from arbiview_aug.datasets.wrappers import RetargetedIterable as RetargetedIterable
+    from arbiview_aug.errors import ArbiviewError as ArbiviewError
+    from arbiview_aug.errors import CalibrationError as CalibrationError
+    from arbiview_aug.errors import DataError as DataError
+    from arbiview_aug.errors import SampleError as SampleError
+    from arbiview_aug.errors import SampleTypeError as SampleTypeError
+    from arbiview_aug.favs.config import FavsConfig as FavsConfig
+    from arbiview_aug.favs.config import PaperConfig as PaperConfig
+    from arbiview_aug.render.refinement import RefinementCache as RefinementCache
+    from arbiview_aug.sample.boxes_2d import ImageBoxes as ImageBoxes
+    from arbiview_aug.sample.boxes_2d import project_boxes_3d as project_boxes_3d
+    from arbiview_aug.sample.collate import collate as collate
+    from arbiview_aug.sample.mistakes import CheckReport as CheckReport
+    from arbiview_aug.sample.mistakes import Finding as Finding
+    from arbiview_aug.sample.mistakes import check as check
+    from arbiview_aug.sample.training import lift_mask as lift_mask
+    from arbiview_aug.sample.training import visible_boxes as visible_boxes
+    from arbiview_aug.transforms.resize import CropRig as CropRig
+    from arbiview_aug.transforms.resize import ResizeRig as ResizeRig
+    from arbiview_aug.transforms.rig_retarget import RigRetarget as RigRetarget
+else:
+    __getattr__, __dir__, __all__ = lazy_names(
+        __name__,
+        {
+            "cameras.camera": "Camera",
+            "cameras.random_rig": "RandomRig",
+            "cameras.rig": "Rig load_rig",
+            "cameras.shipped": "shipped_rigs",
+            "datasets.wrappers": "MixedDataset RetargetedDataset RetargetedIterable",
+            "errors": "ArbiviewError CalibrationError DataError SampleError SampleTypeError",
+            "favs.config": "FavsConfig PaperConfig",
+            "render.refinement": "RefinementCache",
+            "sample.boxes_2d": "ImageBoxes project_boxes_3d",
+            "sample.collate": "collate",
+            "sample.mistakes": "CheckReport Finding check",
+            "sample.training": "lift_mask visible_boxes",
+            "transforms.resize": "CropRig ResizeRig",
+            "transforms.rig_retarget": "RigRetarget",
+        },
+    )
+
+__version__ = "0.3.0"

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import platform
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module, metadata
 from typing import Any
-
-import cv2
 
 from arbiview_aug.errors import MissingPackageError, warn
 
@@ -37,6 +35,31 @@ def warn_about_cv2_wheels() -> None:
         f"order of installation. Keep one: pip uninstall -y {' '.join(found)} && pip install {list(found)[-1]}",
         RuntimeWarning,
     )
+
+
+def imported(name: str) -> Any:
+    """Import what ``module:name`` names."""
+    module, _, attribute = name.partition(":")
+    return getattr(import_module(module), attribute)
+
+
+def lazy_names(
+    package: str, homes: Mapping[str, str]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """``__getattr__``, ``__dir__`` and ``__all__`` of a package whose names are imported on first use (PEP 562).
+
+    ``homes`` are modules of ``arbiview_aug``, and the names that each defines, separated by blanks.
+    """
+    modules = {name: module for module, names in homes.items() for name in names.split()}
+
+    def get(name: str) -> Any:
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        value = imported(f"arbiview_aug.{modules[name]}:{name}")
+        setattr(sys.modules[package], name, value)
+        return value
+
+    return get, lambda: sorted({*vars(sys.modules[package]), *modules}), sorted(modules)
 
 
 def optional_package(name: str, extra: str | None = None) -> Any:
@@ -103,6 +126,8 @@ def repeatable_opencv() -> Iterator[None]:
     The last bits of IPP's ``distanceTransform`` and ``magnitude`` depend on memory alignment, and SIFT's angles on
     those (OpenCV 5.0, IPP 2026.0). IPP can only be disabled for the calling thread. The thread count is process-wide.
     """
+    import cv2
+
     ipp, threads = cv2.ipp.useIPP(), cv2.getNumThreads()
     cv2.ipp.setUseIPP(False)
     cv2.setNumThreads(1)
@@ -116,6 +141,7 @@ def repeatable_opencv() -> Iterator[None]:
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Run OpenCV, torch and the linear algebra behind numpy on one thread."""
+    import cv2
     import torch
     from threadpoolctl import threadpool_limits  # a dependency of scikit-learn
 
@@ -132,6 +158,8 @@ def one_thread() -> Iterator[None]:
 
 def versions() -> dict[str, str]:
     """Versions that results and times depend on."""
+    import cv2
+
     names = "arbiview_aug", "torch", "numpy", "kornia"
     packages = {name: installed_version(name) or "not installed" for name in names}
     return {"python": platform.python_version(), "opencv": cv2.__version__, **packages}

@@ -19,6 +19,7 @@ import arbiview_aug
 from arbiview_aug import RigRetarget
 from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import shipped_rigs
+from arbiview_aug.choices import SurfaceName
 from arbiview_aug.cli.bench import neighbours, trade
 from arbiview_aug.cli.bench.ablation import NOTES, ROWS, STEPS, markdown
 from arbiview_aug.datasets import registry
@@ -29,7 +30,6 @@ from arbiview_aug.evaluate.paper_study import REAL_FRAMES, SETS, SYNTHETIC, Stud
 from arbiview_aug.favs.config import Quality
 from arbiview_aug.generator.training import command as train_command
 from arbiview_aug.render.requirements import HELPFUL_DATA
-from arbiview_aug.scene.surface import SurfaceName
 from tests.generator.training.small import frames as drawn_frames
 from tests.generator.training.test_command import SMALLER
 from tests.helpers import saved_depth_model

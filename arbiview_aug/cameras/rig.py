@@ -30,6 +30,7 @@ from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.key_names import hint, misnamed
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.plain_yaml import parse_yaml
+from arbiview_aug.cameras.shipped import shipped_rigs
 from arbiview_aug.errors import CalibrationError, shown
 
 MOST_CAMERAS, MOST_BYTES = 128, 1 << 20
@@ -243,12 +244,6 @@ class Rig:
             raise CalibrationError(f"rig file {path}: expected the suffix .yaml, .yml or .json, got {path.suffix!r}")
         path.write_text(text)
         return path
-
-
-def shipped_rigs() -> list[str]:
-    """Names of the rigs that ship with the package, for ``load_rig``."""
-    folder = resources.files("arbiview_aug.cameras") / "rigs"
-    return sorted(f.name.removesuffix(".yaml") for f in folder.iterdir() if f.name.endswith(".yaml"))
 
 
 def load_rig(name_or_path: str | Path) -> Rig:

@@ -15,12 +15,11 @@ import torch
 from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import shipped_rigs
-from arbiview_aug.datasets.image_io import Reduce
+from arbiview_aug.choices import Reduce, RenderPath
 from arbiview_aug.datasets.registry import READERS, kinds_of, split_kind
 from arbiview_aug.errors import DataError
 from arbiview_aug.favs.config import Quality
 from arbiview_aug.scene.scene import SURFACES
-from arbiview_aug.transforms.settings import RenderPath
 
 REAL_TARGET = "waymo"  # default target rig of real frames
 

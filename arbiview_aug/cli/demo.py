@@ -11,6 +11,7 @@ from timeit import timeit
 
 import cv2
 
+from arbiview_aug.choices import RenderPath, SurfaceName
 from arbiview_aug.cli.arguments import (
     add_data,
     add_frames,
@@ -29,9 +30,7 @@ from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.evaluate.report.sheet import frame_sheet
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
 from arbiview_aug.favs.config import Quality
-from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-from arbiview_aug.transforms.settings import RenderPath
 
 PICTURE_FILE = "demo.png"
 _COMPARED: tuple[SurfaceName, ...] = ("street", "ground", "far")

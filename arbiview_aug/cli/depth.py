@@ -20,6 +20,7 @@ from torch.utils.data import Dataset
 from tqdm import tqdm
 
 from arbiview_aug.atomic_io import inside, remove_parts
+from arbiview_aug.choices import Reference
 from arbiview_aug.cli.arguments import add_data, command_parser, count, device_named, gathered_warnings, writable_folder
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.depth_folder import FOLDER, LEARNED_FOLDER, WANTED, DepthFolder
@@ -28,7 +29,7 @@ from arbiview_aug.errors import ArbiviewError, WarnOnce, described
 from arbiview_aug.sample.inputs import read_frames, read_scene
 from arbiview_aug.sample.neighbours import Neighbour, read_neighbours, warn_lost
 from arbiview_aug.scene.scene import Scene
-from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, DepthModel, Reference, learned_depth
+from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, DepthModel, learned_depth
 from arbiview_aug.temporal.motion_depth import compile_matching, motion_depth
 from arbiview_aug.temporal.self_supervised import FittedDepth, fit_to_drive, size_for
 from arbiview_aug.temporal.transformers_depth import TransformersDepth

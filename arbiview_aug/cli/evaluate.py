@@ -18,6 +18,7 @@ from typing import Any
 
 from arbiview_aug.atomic_io import inside
 from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.choices import SurfaceName
 from arbiview_aug.cli.arguments import (
     REAL_TARGET,
     add_data,
@@ -53,7 +54,6 @@ from arbiview_aug.generator import Generator, HoleFiller, load_generator
 from arbiview_aug.generator.config import TrainedOn
 from arbiview_aug.sample.inputs import LEARNED_KEY
 from arbiview_aug.scene.scene import SURFACES
-from arbiview_aug.scene.surface import SurfaceName
 
 _FIXED = {
     "paper": ("target", "yaws", "quality", "surface", "path", "steps", "seed", "reduce", "clean_masks"),

@@ -28,7 +28,7 @@ def results(
     context = None
     if workers > 1:
         context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["arbiview_aug"])
+        context.set_forkserver_preload(["arbiview_aug.transforms.rig_retarget"])  # the package is lazy
     loader = DataLoader(
         jobs,
         batch_size=None,

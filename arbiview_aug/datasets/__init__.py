@@ -1,29 +1,37 @@
 """Readers that give samples in this package's format, and wrappers that retarget any dataset's."""
 
-from arbiview_aug.datasets.depth_folder import WithDepth, WithMotionDepth
-from arbiview_aug.datasets.drive import LazyFrame, Neighbours
-from arbiview_aug.datasets.frame_folder import FrameFolder
-from arbiview_aug.datasets.image_io import decode_images, reduced_camera, reduced_rig
-from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
-from arbiview_aug.datasets.py123d import Py123dDataset
-from arbiview_aug.datasets.registry import open_data
-from arbiview_aug.datasets.wrappers import MixedDataset, RetargetedDataset, RetargetedIterable
-from arbiview_aug.sample.masks import cleaned_rig
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "FrameFolder",
-    "LazyFrame",
-    "MixedDataset",
-    "Neighbours",
-    "NuScenesDataset",
-    "Py123dDataset",
-    "RetargetedDataset",
-    "RetargetedIterable",
-    "WithDepth",
-    "WithMotionDepth",
-    "cleaned_rig",
-    "decode_images",
-    "open_data",
-    "reduced_camera",
-    "reduced_rig",
-]
+from arbiview_aug.environment import lazy_names
+
+if TYPE_CHECKING:
+    from arbiview_aug.datasets.depth_folder import WithDepth as WithDepth
+    from arbiview_aug.datasets.depth_folder import WithMotionDepth as WithMotionDepth
+    from arbiview_aug.datasets.drive import LazyFrame as LazyFrame
+    from arbiview_aug.datasets.drive import Neighbours as Neighbours
+    from arbiview_aug.datasets.frame_folder import FrameFolder as FrameFolder
+    from arbiview_aug.datasets.image_io import decode_images as decode_images
+    from arbiview_aug.datasets.image_io import reduced_camera as reduced_camera
+    from arbiview_aug.datasets.image_io import reduced_rig as reduced_rig
+    from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset as NuScenesDataset
+    from arbiview_aug.datasets.py123d import Py123dDataset as Py123dDataset
+    from arbiview_aug.datasets.registry import open_data as open_data
+    from arbiview_aug.datasets.wrappers import MixedDataset as MixedDataset
+    from arbiview_aug.datasets.wrappers import RetargetedDataset as RetargetedDataset
+    from arbiview_aug.datasets.wrappers import RetargetedIterable as RetargetedIterable
+    from arbiview_aug.sample.masks import cleaned_rig as cleaned_rig
+else:
+    __getattr__, __dir__, __all__ = lazy_names(
+        __name__,
+        {
+            "datasets.depth_folder": "WithDepth WithMotionDepth",
+            "datasets.drive": "LazyFrame Neighbours",
+            "datasets.frame_folder": "FrameFolder",
+            "datasets.image_io": "decode_images reduced_camera reduced_rig",
+            "datasets.nuscenes.reader": "NuScenesDataset",
+            "datasets.py123d": "Py123dDataset",
+            "datasets.registry": "open_data",
+            "datasets.wrappers": "MixedDataset RetargetedDataset RetargetedIterable",
+            "sample.masks": "cleaned_rig",
+        },
+    )

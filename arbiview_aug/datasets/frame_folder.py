@@ -19,6 +19,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.key_names import hint, misnamed
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import MOST_CAMERAS, Rig, read_mask
+from arbiview_aug.choices import Reduce
 from arbiview_aug.datasets.drive import (
     Drive,
     LazyFrame,
@@ -29,12 +30,12 @@ from arbiview_aug.datasets.drive import (
     check_neighbours,
     parts_of_clock,
 )
-from arbiview_aug.datasets.image_io import Reduce, check_reduce, decode_images, reduced_rig
+from arbiview_aug.datasets.image_io import check_reduce, decode_images, reduced_rig
+from arbiview_aug.datasets.layouts import CALIBRATION_FILE
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, WarnOnce, shown, warn
 from arbiview_aug.sample.masks import image_circle, without_specks
 from arbiview_aug.scene.boxes import checked_boxes
 
-CALIBRATION_FILE = "calib.json"
 SEQUENCE_FILE = "sequence.json"
 POINTS_FILE = "lidar.npy"
 

@@ -10,7 +10,7 @@ import stat
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -19,9 +19,9 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import Reduce
 from arbiview_aug.errors import DataError, SampleTypeError
 
-Reduce = Literal[1, 2, 4]
 ByteArray = npt.NDArray[np.uint8]
 
 # The reduced flags without their BGR bit, which excludes IMREAD_COLOR_RGB.

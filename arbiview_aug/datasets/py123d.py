@@ -16,6 +16,7 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray, LensName
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import Reduce
 from arbiview_aug.datasets.drive import (
     Drive,
     LazyFrame,
@@ -26,7 +27,8 @@ from arbiview_aug.datasets.drive import (
     check_neighbours,
 )
 from arbiview_aug.datasets.frame_folder import checked_points
-from arbiview_aug.datasets.image_io import Reduce, check_reduce, reduced_rig
+from arbiview_aug.datasets.image_io import check_reduce, reduced_rig
+from arbiview_aug.datasets.layouts import log_folders
 from arbiview_aug.datasets.nuscenes.tables import rotation_from_quaternion
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, described
@@ -45,14 +47,7 @@ LICENCES = {
 NOT_SHARED = ("wod-perception", "physical-ai-av", "ncore")
 """Data sets whose licences restrict who may be given derivatives."""
 
-_PATTERNS = ("sync.arrow", "*/sync.arrow", "*/*/sync.arrow", "logs/*/*/sync.arrow")
 _MEI_HALF_FOV_RAD, _MEI_ERROR_PX = np.deg2rad(95.0), 0.5
-
-
-def log_folders(root: Path) -> list[Path]:
-    """Folders of the logs below py123d's data root, its ``logs``, or one split; a log's folder is the only one."""
-    found = (sorted(path.parent for path in root.glob(pattern)) for pattern in _PATTERNS)
-    return next(filter(None, found), [])
 
 
 @dataclass(frozen=True)

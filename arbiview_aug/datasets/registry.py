@@ -1,4 +1,4 @@
-"""Table of readers, and the choice of one for a folder."""
+"""Table of readers, which are imported when they open a folder, and the choice of one."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from arbiview_aug.datasets.drive import Neighbours, Recording
-from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, FrameFolder
-from arbiview_aug.datasets.image_io import Reduce
-from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset, table_folders
-from arbiview_aug.datasets.py123d import Py123dDataset, log_folders
+from arbiview_aug.choices import Reduce
+from arbiview_aug.datasets.layouts import CALIBRATION_FILE, has_frames, log_folders, table_folders
+from arbiview_aug.environment import imported
 from arbiview_aug.errors import DataError
+
+if TYPE_CHECKING:
+    from arbiview_aug.datasets.drive import Neighbours, Recording
 
 
 @dataclass(frozen=True)
@@ -27,22 +29,24 @@ class Reader:
 READERS = {
     "frames": Reader(
         f"frame folder ({CALIBRATION_FILE} in it or in its folders)",
-        lambda root: (root / CALIBRATION_FILE).is_file() or any(root.glob(f"*/{CALIBRATION_FILE}")),
-        FrameFolder,
+        has_frames,
+        lambda root, **options: imported("arbiview_aug.datasets.frame_folder:FrameFolder")(root, **options),
         options=("clean_masks",),
         writer="arbiview_aug.cli.convert.frame_folders:FrameFolders",
     ),
     "nuscenes": Reader(
         "nuScenes root (with a folder of tables such as v1.0-mini)",
         lambda root: bool(table_folders(root)),
-        lambda root, version=None, **options: NuScenesDataset(root, version or table_folders(root)[0], **options),
+        lambda root, version=None, **options: imported("arbiview_aug.datasets.nuscenes.reader:NuScenesDataset")(
+            root, version or table_folders(root)[0], **options
+        ),
         options=("version",),
         writer="arbiview_aug.cli.convert.nuscenes:NuScenes",
     ),
     "py123d": Reader(
         "folder of py123d's logs (with sync.arrow in it)",
         lambda root: bool(log_folders(root)),
-        Py123dDataset,
+        lambda root, **options: imported("arbiview_aug.datasets.py123d:Py123dDataset")(root, **options),
         writer="arbiview_aug.cli.convert.frame_folders:LogFrames",
     ),
 }

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import SurfaceName
 from arbiview_aug.datasets.depth_folder import WithDepth
 from arbiview_aug.datasets.frame_folder import FrameFolder
 from arbiview_aug.errors import DataError
@@ -19,7 +20,6 @@ from arbiview_aug.evaluate.methods import Method
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.sample.neighbours import read_neighbours
-from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.temporal.motion_depth import without_objects
 
 

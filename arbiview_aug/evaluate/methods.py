@@ -9,6 +9,7 @@ from functools import lru_cache
 from typing import Any
 
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import RenderPath, SurfaceName
 from arbiview_aug.evaluate.baselines import BASELINES, Renderer
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
@@ -20,9 +21,7 @@ from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.sample.inputs import read_frames, read_scene
 from arbiview_aug.scene.scene import SURFACES, Scene
-from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-from arbiview_aug.transforms.settings import RenderPath
 
 Sample = Mapping[str, Any]
 

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import Reduce
 from arbiview_aug.datasets import open_data
-from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import CalibrationError, DataError, SampleError

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
+from arbiview_aug.choices import Holes
 from arbiview_aug.generator.inpainting import GREY
 from arbiview_aug.render.rendered import RenderedFrame
 from arbiview_aug.render.view_plan import BACKGROUND, OBJECT, Paint
 from arbiview_aug.sample.batching import stacked
-
-Holes = Literal["fill", "mean", "black"]  # how pixels are filled that no source sees
 
 CELLS = 64  # cells along a view's shorter side
 

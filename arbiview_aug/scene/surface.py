@@ -7,7 +7,7 @@ handled as the homogeneous (o q + d, q).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,9 +16,6 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rays import PixelRays
 from arbiview_aug.image_ops import FRESH, Memory
-
-SurfaceName = Literal["auto", "far", "ground", "street", "objects", "lidar", "motion", "fused", "learned"]
-"""Names in ``scene.SURFACES``. ``auto`` decides per pair of target and source camera."""
 
 Points = npt.NDArray[np.float32] | npt.NDArray[np.float64]
 """(P, 3) points in their recorded precision; surfaces use float32."""

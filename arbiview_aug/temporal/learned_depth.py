@@ -18,13 +18,11 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import Reference
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.depth_maps import motion_camera
 from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.temporal.motion_depth import FARTHEST_M, MotionDepth
-
-Reference = Literal["LiDAR", "motion", "road"]
-"""What predictions are fitted to, the best first."""
 
 LEAST_POINTS = 50
 """Least number of pixels to fit a camera to."""

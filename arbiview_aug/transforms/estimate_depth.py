@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import torch
 
+from arbiview_aug.choices import SurfaceName
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, Frame
 from arbiview_aug.sample.neighbours import Neighbour
 from arbiview_aug.scene.scene import SURFACES, Scene
-from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.temporal.fill import neighbour_images
 from arbiview_aug.temporal.motion_depth import MotionDepth, motion_depth
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from arbiview_aug.cameras.rays import CameraMaps
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import SurfaceName
 from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.overlap_depth import OverlapDepth
@@ -19,7 +20,6 @@ from arbiview_aug.render.requirements import needs_geometry, static_harm
 from arbiview_aug.sample.inputs import Frame
 from arbiview_aug.sample.neighbours import Neighbour
 from arbiview_aug.scene.scene import SURFACES, Scene
-from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.temporal.motion_depth import MotionDepth
 from arbiview_aug.transforms.checks import Coverages
 

@@ -18,6 +18,7 @@ import torch
 from arbiview_aug.cameras.framing import Fit, framing
 from arbiview_aug.cameras.random_rig import RandomRig
 from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.choices import Holes, RenderPath, SurfaceName
 from arbiview_aug.environment import warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
@@ -25,7 +26,7 @@ from arbiview_aug.favs.renderer import PaperRendering, check_settings, render_pa
 from arbiview_aug.favs.stage1_geometry import check_pinhole
 from arbiview_aug.generator import Generator, HoleFiller
 from arbiview_aug.generator.batches import complete_frames, frame_names
-from arbiview_aug.generator.fillers import Holes, fill_frame
+from arbiview_aug.generator.fillers import fill_frame
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.harmonise import Harmonise, Harmoniser, PhotometricReport
 from arbiview_aug.render.plan import RenderPlan
@@ -36,7 +37,6 @@ from arbiview_aug.sample.detections import read_detections
 from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, Frame, read_frames, read_scene
 from arbiview_aug.sample.neighbours import points_of_neighbours, read_neighbours
 from arbiview_aug.scene.scene import SURFACES, Scene, SurfaceRow
-from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.temporal.fill import Fills, Reach, fill_from_neighbours, plan_fills
 from arbiview_aug.transforms.checks import check_reach, warn_of_harm
 from arbiview_aug.transforms.estimate_depth import estimate_motion, estimate_overlap, estimates_motion
@@ -45,7 +45,6 @@ from arbiview_aug.transforms.outputs import SampleWriter
 from arbiview_aug.transforms.plans import FramePlan, Plans
 from arbiview_aug.transforms.settings import (
     OUTPUTS,
-    RenderPath,
     checked_names,
     checked_params,
     checked_size,

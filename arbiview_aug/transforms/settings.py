@@ -5,14 +5,12 @@ from __future__ import annotations
 import operator
 from collections.abc import Sequence
 from numbers import Real
-from typing import Any, Literal
+from typing import Any
 
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.errors import SampleError
 from arbiview_aug.generator import Generator, HoleFiller
 from arbiview_aug.generator.batches import SOURCES_KEY, Completion
-
-RenderPath = Literal["favs", "inpaint", "diffusion"]
 
 OUTPUTS = ("source_camera", "source_frame", "confidence", SOURCES_KEY)  # further keys of the output, on request
 

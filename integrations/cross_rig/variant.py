@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from arbiview_aug.scene.surface import SurfaceName
+from arbiview_aug.choices import SurfaceName
 
 Kind = Literal["raw", "oracle", "row_split", "retarget"]
 Geometry = Literal["points", "boxes_3d", "depth_m", "learned_depth_m", "neighbours"]

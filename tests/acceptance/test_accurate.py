@@ -19,6 +19,7 @@ import pytest
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import SurfaceName
 from arbiview_aug.datasets.synthetic import GROUND_CLASSES, SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.agreement import overlap_scores
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
@@ -31,7 +32,7 @@ from arbiview_aug.render.overlap_depth import overlap_depth
 from arbiview_aug.render.plan import build_plan
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.scene.scene import Scene
-from arbiview_aug.scene.surface import Surface, SurfaceName
+from arbiview_aug.scene.surface import Surface
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.helpers import ProtocolFrame, as_camera, few_or_all
 

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import torch
 
+from arbiview_aug.choices import SurfaceName
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.render.confidence import EXPECTED_ERROR_LEVELS
-from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.helpers import few_or_all
 

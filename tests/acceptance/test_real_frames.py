@@ -16,11 +16,11 @@ from types import ModuleType
 import pytest
 
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import SurfaceName
 from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
 from arbiview_aug.evaluate.lidar import coloured_points
 from arbiview_aug.evaluate.targets import UP_M, YAWS_DEG
-from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.helpers import ProtocolFrame, as_camera, score_targets
 

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import SurfaceName
 from arbiview_aug.datasets.synthetic import GROUND_CLASSES, SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.metrics import psnr_db
-from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.helpers import few_or_all
 

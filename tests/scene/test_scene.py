@@ -11,10 +11,11 @@ import torch
 
 from arbiview_aug import Camera, Rig, RigRetarget
 from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.choices import SurfaceName
 from arbiview_aug.errors import SampleError
 from arbiview_aug.scene.depth_maps import anchored
 from arbiview_aug.scene.scene import SURFACES, Scene, SurfaceRow
-from arbiview_aug.scene.surface import StaticSurface, SurfaceName
+from arbiview_aug.scene.surface import StaticSurface
 
 
 def test_names_of_the_type_are_those_of_the_table() -> None:

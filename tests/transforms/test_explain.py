@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from arbiview_aug import RandomRig, Rig, RigRetarget, load_rig
-from arbiview_aug.scene.surface import SurfaceName
+from arbiview_aug.choices import SurfaceName
 from arbiview_aug.transforms.explain import Explanation
 
 

@@ -18,12 +18,12 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import Reduce, SurfaceName
 from arbiview_aug.cli.arguments import add_data
 from arbiview_aug.cli.bench.study import benchmark, benchmark_parser, study
 from arbiview_aug.cli.bench.timing import machine_line, quartiles, show
 from arbiview_aug.datasets import open_data, reduced_rig
 from arbiview_aug.datasets.depth_folder import WANTED
-from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import DataError
@@ -37,7 +37,6 @@ from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
 from arbiview_aug.scene.depth_maps import motion_camera
-from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.explain import Explanation
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 

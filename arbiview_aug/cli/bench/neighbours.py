@@ -18,6 +18,7 @@ import numpy as np
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import SurfaceName
 from arbiview_aug.cli.arguments import positive, seed
 from arbiview_aug.cli.bench.data import as_of_another_frame, recorded
 from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
@@ -26,7 +27,6 @@ from arbiview_aug.datasets import Neighbours, open_data
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.sample.inputs import read_frames
-from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.temporal.fill import Fills, fill_from_neighbours
 from arbiview_aug.transforms.plans import FramePlan
 from arbiview_aug.transforms.rig_retarget import RigRetarget

@@ -31,21 +31,19 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.choices import Holes, Reduce, SurfaceName
 from arbiview_aug.cli.arguments import add_data, device_named, size
 from arbiview_aug.cli.bench.data import Recorded, lidar_maps, lifted, recorded
 from arbiview_aug.cli.bench.device import YAW_DEG, device_table, measure_device
 from arbiview_aug.cli.bench.neighbours import lowered
 from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
 from arbiview_aug.cli.bench.timing import machine_line, quartiles, show, timed_rounds
-from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import without_masks
-from arbiview_aug.generator.fillers import Holes
 from arbiview_aug.render.harmonise import Harmonise
 from arbiview_aug.render.plan import compile_kernels
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
-from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 FULL_SIZE = (900, 1600)

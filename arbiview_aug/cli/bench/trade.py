@@ -24,6 +24,7 @@ import torch
 from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import Reduce, SurfaceName
 from arbiview_aug.cli.arguments import add_target, count, positive, writable_folder
 from arbiview_aug.cli.bench.data import REDUCES, SOURCES_OVER_VIEWS, Recorded, as_of_another_frame, recorded
 from arbiview_aug.cli.bench.speed import remap_floor
@@ -39,7 +40,6 @@ from arbiview_aug.cli.bench.study import (
     study,
 )
 from arbiview_aug.cli.bench.timing import Quartiles, machine_line, peak_mib, quartiles, show, timed_rounds
-from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.evaluate.methods import Method, Sample, views_of
 from arbiview_aug.evaluate.report.tables import metric_table
@@ -48,7 +48,6 @@ from arbiview_aug.generator import load_generator
 from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.render.requirements import HELPFUL_DATA, static_harm
 from arbiview_aug.scene.scene import SURFACES
-from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 Execution = Literal["opencv", "torch", "cuda"]

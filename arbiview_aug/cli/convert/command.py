@@ -16,6 +16,7 @@ import numpy as np
 from arbiview_aug.atomic_io import Link, inside, remove_parts
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.rig import load_rig
+from arbiview_aug.choices import Holes, OnError
 from arbiview_aug.cli.arguments import (
     add_data,
     add_reduce,
@@ -27,7 +28,7 @@ from arbiview_aug.cli.arguments import (
     size,
     writable_folder,
 )
-from arbiview_aug.cli.convert.job import Done, Jobs, OnError, State
+from arbiview_aug.cli.convert.job import Done, Jobs, State
 from arbiview_aug.cli.convert.ray_runner import ray_results
 from arbiview_aug.cli.convert.report import write_report
 from arbiview_aug.cli.convert.settings import FOLDER, RETARGET_OPTIONS, Settings, check_output
@@ -38,7 +39,6 @@ from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.registry import split_kind
 from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError
-from arbiview_aug.generator.fillers import Holes
 from arbiview_aug.scene.scene import SURFACES
 
 

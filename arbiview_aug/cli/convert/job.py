@@ -14,6 +14,7 @@ import numpy as np
 from torch.utils.data import Dataset
 
 from arbiview_aug.atomic_io import checksum, inside, link_whole, write_whole
+from arbiview_aug.choices import OnError
 from arbiview_aug.cli.arguments import gathered_warnings
 from arbiview_aug.cli.convert.manifest import Manifest, Record
 from arbiview_aug.cli.convert.settings import Settings
@@ -25,10 +26,6 @@ from arbiview_aug.datasets.registry import find_reader
 from arbiview_aug.environment import repeatable_opencv
 from arbiview_aug.errors import DataError, OutputError, described
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-
-OnError = Literal["report", "skip", "fatal"]
-"""Policy for samples that cannot be read or rendered: ``report`` converts the others and leaves the output unfinished,
-``skip`` leaves the sample out and reports it, ``fatal`` stops."""
 
 State = Literal["made", "kept", "skipped", "failed", "stopped"]  # kept: made by an earlier run; stopped: not written
 

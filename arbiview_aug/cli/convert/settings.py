@@ -10,16 +10,13 @@ from typing import Any, Literal
 from arbiview_aug.atomic_io import Link, checksum, is_part
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import Holes, Reduce, RenderPath, SurfaceName
 from arbiview_aug.datasets.drive import Neighbours, Recording
-from arbiview_aug.datasets.image_io import Reduce
 from arbiview_aug.datasets.registry import open_data
 from arbiview_aug.errors import DataError
 from arbiview_aug.favs.config import Quality
 from arbiview_aug.generator import load_generator
-from arbiview_aug.generator.fillers import Holes
-from arbiview_aug.scene.surface import SurfaceName
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-from arbiview_aug.transforms.settings import RenderPath
 
 RETARGET_OPTIONS = ("path", "holes", "steps", "quality", "surface", "size", "fit")  # as ``RigRetarget`` names them
 FOLDER = "conversion"  # subfolder of an output with manifest, provenance and report

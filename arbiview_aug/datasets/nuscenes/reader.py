@@ -15,6 +15,7 @@ from arbiview_aug.atomic_io import inside
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import Reduce
 from arbiview_aug.datasets.drive import (
     Drive,
     LazyFrame,
@@ -25,7 +26,7 @@ from arbiview_aug.datasets.drive import (
     check_neighbours,
 )
 from arbiview_aug.datasets.frame_folder import checked_points
-from arbiview_aug.datasets.image_io import Reduce, check_reduce, decode_images, reduced_rig
+from arbiview_aug.datasets.image_io import check_reduce, decode_images, reduced_rig
 from arbiview_aug.datasets.nuscenes.boxes import read_annotations
 from arbiview_aug.datasets.nuscenes.recordings import LIDAR, IntArray, read_recordings
 from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Row, Tables
@@ -35,12 +36,6 @@ CAMERA_RING = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CA
 """Order of the cameras in a sample, clockwise from above; other cameras follow by name."""
 
 _POINT_FLOATS = 5  # x y z intensity ring
-
-
-def table_folders(root: Path) -> list[str]:
-    """Names of a root's folders of tables: v1.0-mini and v1.0-trainval first."""
-    found = (path.name for path in root.glob("v1.0-*") if path.is_dir())
-    return sorted(found, key=lambda name: (name not in ("v1.0-mini", "v1.0-trainval"), name))
 
 
 class NuScenesDataset(WritableRecording):

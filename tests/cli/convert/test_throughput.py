@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from arbiview_aug import load_rig
+from arbiview_aug.choices import SurfaceName
 from arbiview_aug.cli.convert.job import Done, Jobs
 from arbiview_aug.cli.convert.settings import Settings
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.environment import one_thread
-from arbiview_aug.scene.surface import SurfaceName
 
 SAMPLES, OWN_PLANS, SIZE = 40, 6, (256, 704)
 LEAST_SPEEDUP, MOST_RETARGETING, IDLE = 1.8, 0.5, 1.95
