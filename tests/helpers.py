@@ -144,7 +144,9 @@ def sampled(*factors: Iterable[Any]) -> list[Any]:
     return [pytest.param(*c, marks=() if c in chosen else pytest.mark.slow) for c in combinations]
 
 
-def examples(few: int, many: int, **strategies: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def examples(
+    few: int, many: int, most: int | None = None, *, share: tuple[float, float] | None = None, **strategies: Any
+) -> Callable[[Callable[..., Any]], Callable[..., None]]:
     """Run a property on some drawn examples by default, and on many of them as a slow test.
 
     Shrinking rigs takes minutes, past the time limit, and explains little: a failure shows what was drawn.
@@ -152,27 +154,33 @@ def examples(few: int, many: int, **strategies: Any) -> Callable[[Callable[..., 
     Args:
         few: Examples of the default run.
         many: Examples of the slow one.
+        most: Examples of the release check, if there is one.
+        share: Range of the share of examples for which the property returns True.
         strategies: What to draw, by the property's parameters; others are fixtures.
     """
-    drawing = settings(
-        suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much], phases=[Phase.generate]
-    )
+    drawing = settings(suppress_health_check=list(HealthCheck), phases=[Phase.generate])
 
-    def decorate(holds: Callable[..., None]) -> Callable[..., None]:
+    def decorate(holds: Callable[..., Any]) -> Callable[..., None]:
         def test(count: int, **fixtures: Any) -> None:
+            results = []
+
             @settings(drawing, max_examples=count)
             @given(**strategies)
             def drawn(**values: Any) -> None:
-                holds(**fixtures, **values)
+                results.append(holds(**fixtures, **values))
 
             drawn()
+            assert share is None or share[0] < sum(results) / len(results) < share[1], f"{sum(results)}/{len(results)}"
 
         known = inspect.signature(holds).parameters.values()
         count = inspect.Parameter("count", inspect.Parameter.POSITIONAL_OR_KEYWORD)
         asked = inspect.Signature([count, *(p for p in known if p.name not in strategies)])
         vars(test).update(__signature__=asked)  # what pytest reads the fixtures from
         test.__doc__, test.__name__ = holds.__doc__, holds.__name__
-        return pytest.mark.parametrize("count", [few, pytest.param(many, marks=pytest.mark.slow)])(test)
+        counts = [few, pytest.param(many, marks=pytest.mark.slow)]
+        if most is not None:
+            counts.append(pytest.param(most, marks=[pytest.mark.release, pytest.mark.timeout(7200)]))
+        return pytest.mark.parametrize("count", counts)(test)
 
     return decorate
 

@@ -6,16 +6,16 @@ import contextlib
 import io
 import json
 import os
-import random
 import re
-import warnings
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
 import pytest
+from hypothesis import strategies as st
 
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets import FrameFolder, Neighbours
@@ -27,10 +27,9 @@ from arbiview_aug.generator.training.config import TrainConfig
 from arbiview_aug.render.plan import compile_kernels
 from arbiview_aug.temporal.motion_depth import MotionDepth
 from tests.cli.convert.drives import FRAMES, command, tree, write_frames
-from tests.extremes.misuse import TEXT_JUNK, mutated_text
-from tests.extremes.test_misuse import works_or_refuses
 from tests.generator.small import small_config
-from tests.helpers import few_or_all
+from tests.helpers import examples
+from tests.mutations import TEXT_JUNK, mutated_bytes, mutated_json, works
 
 FOREIGN = re.compile(r"Traceback|\b[A-Za-z]+(Error|Exception)\b: ")
 """As commands describe exceptions that are not the package's own."""
@@ -54,41 +53,16 @@ class Target:
         config = json.loads((self.generator / "config.json").read_text())
         config["training"] = asdict(self.training)  # as the state of a training run has it
         (self.generator / "config.json").write_text(json.dumps(config))
-        self.records = sorted((self.output / "conversion").rglob("*.json"))
-        self.root, self.sound = root, tree(root)
-
-    def try_out(self, seed: int) -> bool:
-        """Whether what reads a mutated file works; the file is mended again."""
-        rng = random.Random(seed)
-        ways = (self._sequence, self._sequence, self._depth, self._depth, self._record, self._config, self._weights)
-        path, call = rng.choice(ways)(rng)
-        sound = path.read_bytes()
-        text = _mutated_arrays(sound, rng) if path.suffix == ".npz" else None
-        if path.suffix == ".json":
-            text = mutated_text(json.loads(sound), rng)
-        path.unlink()  # what links to it elsewhere stays
-        path.write_bytes(text or _mutated_bytes(sound, rng))
-        try:
-            return works_or_refuses(call, seed, (ArbiviewError,))
-        finally:
-            path.write_bytes(sound)
-
-    def _sequence(self, rng: random.Random) -> tuple[Path, Callable[[], object]]:
-        return self.drive / "sequence.json", self._read_drive
-
-    def _depth(self, rng: random.Random) -> tuple[Path, Callable[[], object]]:
-        return self.depths.path("0000"), lambda: self.depths.read("0000", FRAMES)
-
-    def _record(self, rng: random.Random) -> tuple[Path, Callable[[], object]]:
-        more = rng.choice(([], ["--verify"]))
-        return rng.choice(self.records), lambda: self._converted(more)
-
-    def _config(self, rng: random.Random) -> tuple[Path, Callable[[], object]]:
-        return self.generator / "config.json", self._read_generator
-
-    def _weights(self, rng: random.Random) -> tuple[Path, Callable[[], object]]:
         (weights,) = self.generator.glob("*.safetensors")
-        return weights, self._read_generator
+        self.files: dict[str, tuple[list[Path], Callable[[], object]]] = {
+            "sequence": ([self.drive / "sequence.json"], self._read_drive),
+            "depth": ([self.depths.path("0000")], lambda: self.depths.read("0000", FRAMES)),
+            "record": (sorted((self.output / "conversion").rglob("*.json")), self._go_on),
+            "verified record": (sorted((self.output / "conversion").rglob("*.json")), lambda: self._go_on("--verify")),
+            "config": ([self.generator / "config.json"], self._read_generator),
+            "weights": ([weights], self._read_generator),
+        }
+        self.root, self.sound = root, tree(root)
 
     def _read_drive(self) -> None:
         for neighbour in FrameFolder(self.drive, neighbours=Neighbours())[0]["neighbours"]:
@@ -99,7 +73,7 @@ class Target:
             saved_config(self.generator, self.training)
         Generator.from_pretrained(self.generator)
 
-    def _converted(self, more: list[str]) -> None:
+    def _go_on(self, *more: str) -> None:
         """Go on with the conversion, or verify it; nothing changes outside its own folder."""
         said, before = io.StringIO(), self._outside()
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said), mock.patch.object(os, "fsync"):
@@ -113,32 +87,34 @@ class Target:
         return {name: content for name, content in tree(self.root).items() if not name.startswith("output/conversion/")}
 
 
-def _mutated_bytes(sound: bytes, rng: random.Random) -> bytes:
-    found = bytearray(sound[: rng.choice((len(sound), len(sound), rng.randrange(len(sound))))])
-    for _ in range(rng.randrange(1, 6)):
-        found[rng.randrange(min(len(found), rng.choice((300, len(found))))) if found else slice(0)] = rng.randrange(256)
-    return bytes(found)
+ARRAY_CHANGES: tuple[Callable[[np.ndarray], object], ...] = (
+    *(lambda a: a[..., :-1] if a.ndim else a, lambda a: a[None], lambda a: a.reshape(-1)[:0]),
+    *(lambda a: a.astype(str), lambda a: np.full(a.shape, np.nan), lambda a: np.full(a.shape, np.inf)),
+    *(lambda a: a.astype("U5"), lambda a: np.full(a.shape, 10**15), lambda a: np.zeros(a.shape, complex)),
+    *((lambda a, junk=junk: np.array(str(junk))) for junk in TEXT_JUNK),
+)
 
 
-def _mutated_arrays(sound: bytes, rng: random.Random) -> bytes | None:
-    """A file of arrays, one of which is missing, of another type or shape, or not finite; None for mutated bytes."""
-    if rng.random() < 0.3:
-        return None
+@st.composite
+def mutated_arrays(draw: st.DrawFn, sound: bytes) -> bytes:
+    """A file of arrays, one of which is missing, of another type or shape, or not finite."""
     with np.load(io.BytesIO(sound)) as file:
-        arrays = {name: file[name] for name in file.files}
-    name = rng.choice(sorted(arrays))
+        arrays: dict[str, Any] = {name: file[name] for name in file.files}
+    name = draw(st.sampled_from(sorted(arrays)))
     array = arrays.pop(name)
-    if rng.random() < 0.9:
-        ways: tuple[Callable[[], object], ...] = (
-            *(lambda: array[..., :-1] if array.ndim else array, lambda: array[None], lambda: array.reshape(-1)[:0]),
-            *(lambda: array.astype(str), lambda: np.full(array.shape, np.nan), lambda: np.full(array.shape, np.inf)),
-            *(lambda: array.astype("U5"), lambda: np.full(array.shape, 10**15), lambda: np.zeros(array.shape, complex)),
-            lambda: np.array(str(rng.choice(TEXT_JUNK)())),
-        )
-        arrays[name] = np.asarray(rng.choice(ways)())
-    written = io.BytesIO()
-    np.savez(written, **arrays)  # type: ignore[arg-type]
-    return written.getvalue()
+    if draw(st.integers(0, 9)):
+        arrays[name] = np.asarray(draw(st.sampled_from(ARRAY_CHANGES))(array))
+    changed = io.BytesIO()
+    np.savez(changed, **arrays)
+    return changed.getvalue()
+
+
+@st.composite
+def mutated_file(draw: st.DrawFn, path: Path) -> bytes:
+    sound = path.read_bytes()
+    if path.suffix == ".json":
+        return draw(mutated_json(json.loads(sound)))
+    return draw(mutated_arrays(sound) | mutated_bytes(sound) if path.suffix == ".npz" else mutated_bytes(sound))
 
 
 @pytest.fixture(scope="module")
@@ -146,15 +122,17 @@ def target(tmp_path_factory: pytest.TempPathFactory) -> Target:
     return Target(tmp_path_factory.mktemp("mutated"))
 
 
-def check(target: Target, seeds: range) -> None:
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")
-        worked = sum(map(target.try_out, seeds))
-    assert 0.02 < worked / len(seeds) < 0.8, "the mutations reach what is behind the first check"
-
-
-def test_mutated_files(target: Target) -> None:
-    check(target, range(60))
+@examples(60, 1000, 4000, share=(0.02, 0.8), data=st.data())
+def test_mutated_files(target: Target, data: st.DataObject) -> bool:
+    paths, read = target.files[data.draw(st.sampled_from(sorted(target.files)))]
+    path = data.draw(st.sampled_from(paths))
+    sound, text = path.read_bytes(), data.draw(mutated_file(path))
+    path.unlink()  # what links to it elsewhere stays
+    path.write_bytes(text)
+    try:
+        return works(read)
+    finally:
+        path.write_bytes(sound)
 
 
 def test_what_the_mutations_found(target: Target) -> None:
@@ -173,9 +151,3 @@ def test_what_the_mutations_found(target: Target) -> None:
         target.depths.read("0000", FRAMES)
     for name in ("drive/sequence.json", "generator/config.json", "depth/0000.npz"):
         (target.root / name).write_bytes(target.sound[name])
-
-
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("thousands", few_or_all(1, 4, "thousand"))
-def test_thousands_of_mutated_files(target: Target, thousands: int) -> None:
-    check(target, range(60, 60 + 1000 * thousands))

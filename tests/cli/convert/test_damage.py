@@ -1,34 +1,175 @@
-"""Damaged nuScenes tables: named errors before the first image, never another exception, a hang or a half output."""
+"""Damaged nuScenes tables, read and converted: named errors before the first image, or an output that is finished.
+
+Whatever is wrong with a table, no other exception and no hang follows, and nothing outside the output changes.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import io
 import json
+import os
+import shutil
+import sys
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+from unittest import mock
 
 import pytest
+from hypothesis import strategies as st
 
-from arbiview_aug.datasets import NuScenesDataset
-from arbiview_aug.errors import DataError
-from tests.cli.convert import damage as damaging
-from tests.cli.convert.damage import ALLOWED, LEFT_OUT, VERSION, Damage, Range, damages
-from tests.helpers import few_or_all, sampled
+from arbiview_aug.__main__ import main
+from arbiview_aug.datasets import Neighbours, NuScenesDataset
+from arbiview_aug.errors import ArbiviewError, DataError
+from arbiview_aug.render.plan import compile_kernels
+from tests import mutations
+from tests.cli.convert.drives import SURROUND, command, read_tables, tree, write_nuscenes
+from tests.helpers import examples, sampled
+from tests.mutations import mutated_json, works, written
 
 Rows = list[dict[str, Any]]
 
+LEFT_OUT = "goes-sample-1"
+"""The sample whose image is broken where samples are skipped: the chains around it are closed."""
+
+VERSION = "v1.0-mini"
+COMMAND = "python -m arbiview_aug convert"
 POSITION = "expected translation of shape (3,), below 1e+09 and finite, got ["
+TABLES_HANDED_ON: dict[str, Rows] = {
+    "log": [{"token": "log", "logfile": "l", "vehicle": "v", "date_captured": "", "location": "x"}],
+    "attribute": [{"token": "moving", "name": "vehicle.moving", "description": ""}],
+    "lidarseg": [{"token": "seg", "sample_data_token": "goes-LIDAR_TOP-0-0", "filename": "lidarseg/x.bin"}],
+}
+
+
+class Verdict(NamedTuple):
+    """``read``, ``refused``, or ``partly``: some samples failed; and the error."""
+
+    kind: str
+    words: str
+
+
+class Range:
+    """A folder with a small data set in it, whose tables are damaged one at a time."""
+
+    def __init__(self, root: Path) -> None:
+        compile_kernels()  # takes longer than a mutation may
+        self.root, self.source = root, root / "source"
+        write_nuscenes(self.source)
+        self.tables: dict[str, Rows] = read_tables(self.source) | TABLES_HANDED_ON
+        for row in self.tables["scene"]:
+            row["log_token"] = "log"
+        for row in self.tables["sample_annotation"]:
+            row["attribute_tokens"] = ["moving"]
+        for name in self.tables:
+            self._write(name, written(self.tables[name]))
+        (root / "beside").mkdir()
+        (root / "beside" / "x.bin").write_bytes(b"not ours")
+        SURROUND.with_cameras(SURROUND.cameras[:2]).shifted(x_m=0.3).save(root / "two.json")
+        self._image = NuScenesDataset(self.source).files(NuScenesDataset(self.source).tokens.index(LEFT_OUT))[2]
+        self._runs = 0
+
+    def _write(self, table: str, content: bytes | None) -> None:
+        path = self.source / VERSION / f"{table}.json"
+        path.unlink(missing_ok=True)
+        if content is not None:
+            path.write_bytes(content)
+
+    def try_out(self, table: str, content: bytes | None) -> Verdict:
+        """Read and convert with another table, None for no file; the table is mended again."""
+        self._write(table, content)
+        verdicts: list[Verdict] = []
+
+        def read_and_convert() -> None:
+            verdicts.extend((self._read(), self._read_devkit(), self._converted("skip"), self._converted("report")))
+
+        try:
+            assert works(read_and_convert)
+        finally:
+            self._write(table, written(self.tables[table]))
+        return [Verdict("read", ""), *(verdict for verdict in verdicts if verdict.kind != "read")][-1]
+
+    def changed(self, table: str, change: Callable[[Rows], object]) -> Verdict:
+        """Try out a table with some rows changed."""
+        rows = copy.deepcopy(self.tables[table])
+        change(rows)
+        return self.try_out(table, json.dumps(rows).encode())
+
+    def _read(self) -> Verdict:
+        try:
+            dataset = NuScenesDataset(self.source, neighbours=Neighbours(count=1))
+            for index in {0, len(dataset) - 1} if len(dataset) else ():
+                for neighbour in dataset[index]["neighbours"]:
+                    _ = neighbour["images"], neighbour.get("boxes_3d")
+        except ArbiviewError as error:
+            return Verdict("refused", str(error))
+        return Verdict("read", "")
+
+    def _read_devkit(self) -> Verdict:
+        """As far as the devkit would have read it: lists of rows."""
+        try:
+            tables = read_tables(self.source)
+        except (ValueError, RecursionError):
+            return Verdict("read", "")
+        nusc = SimpleNamespace(dataroot=str(self.source), version=VERSION, **tables)
+        try:
+            dataset = NuScenesDataset(nusc=nusc, neighbours=Neighbours())
+            _ = len(dataset) and dataset[0]
+        except ArbiviewError as error:
+            return Verdict("refused", str(error))
+        return Verdict("read", "")
+
+    def _converted(self, on_error: str) -> Verdict:
+        """With one broken image where samples are skipped; every second time with neighbours."""
+        self._runs += 1
+        output = self.root / f"output-{self._runs}"
+        asked = [*command(self.source, output), "--on-error", on_error, "--neighbours", str(self._runs // 2 % 2)]
+        asked[asked.index("argoverse2")] = str(self.root / "two.json")
+        sound = self._image.read_bytes()
+        if on_error == "skip":
+            self._image.write_bytes(b"\xff\xd8 cut off")
+        before, said = self._outside(output), io.StringIO()
+        try:
+            with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+                with mock.patch.object(os, "fsync"):  # nine tenths of the time
+                    status = main(asked)
+            assert self._outside(output) == before
+            return judged(status, output, said.getvalue())
+        finally:
+            self._image.unlink()  # what links to it in an output stays
+            self._image.write_bytes(sound)
+            shutil.rmtree(output, ignore_errors=True)
+
+    def _outside(self, output: Path) -> dict[str, bytes]:
+        return {name: content for name, content in tree(self.root).items() if not name.startswith(f"{output.name}/")}
+
+
+def judged(status: int, output: Path, said: str) -> Verdict:
+    """What a conversion left behind, against what it says."""
+    words = next((line for line in said.splitlines() if f"{COMMAND}: " in line or ": failed: " in line), said[-200:])
+    finished = (output / "conversion" / "provenance.json").is_file()
+    assert "Traceback" not in said, said
+    if status == 0:
+        assert finished
+        samples = list(NuScenesDataset(output))  # type: ignore[call-overload]
+        assert samples and all(sample["images"].shape[0] == 2 for sample in samples)
+        return Verdict("read", "")
+    assert not finished and not (output / VERSION / "sample.json").exists(), f"exit {status} of a finished output"
+    if status == 1 and ": failed: " in said:
+        return Verdict("partly", words)
+    assert status == 2 and f"{COMMAND}: " in said, f"exit {status}: {said}"
+    # A file that is a folder on the disk is seen when it is linked: looking at millions would take minutes.
+    early = "expected a regular file" in said or not output.is_dir() or not any(output.glob("samples/*/*"))
+    assert early, f"refused after the first image: {words}"
+    return Verdict("refused", words)
 
 
 @pytest.fixture(scope="module")
 def tried(tmp_path_factory: pytest.TempPathFactory) -> Range:
     return Range(tmp_path_factory.mktemp("damaged"))
-
-
-def changed(tried: Range, table: str, change: Callable[[Rows], object]) -> Damage:
-    rows = copy.deepcopy(tried.tables[table])
-    change(rows)
-    return Damage(table, table, json.dumps(rows).encode())
 
 
 def circle(key: str, length: int, of: str = LEFT_OUT) -> Callable[[Rows], None]:
@@ -48,7 +189,7 @@ def circle(key: str, length: int, of: str = LEFT_OUT) -> Callable[[Rows], None]:
 )
 def test_chains_that_do_not_end(tried: Range, table: str, key: str, length: int) -> None:
     """Closed around a sample that is left out, annotations made the conversion run for ever."""
-    kind, words = tried.try_out(changed(tried, table, circle(key, length)))
+    kind, words = tried.changed(table, circle(key, length))
     assert kind == "refused"
     assert f"table {table}: expected {key} that lead to an end, got a circle through row '" in words
     assert f"empty one row's {key}" in words
@@ -99,7 +240,7 @@ def of_front(rows: Rows) -> dict[str, Any]:
 )
 def test_rows_that_are_none(tried: Range, table: str, change: Callable[[Rows], None], message: str) -> None:
     """Named by table, row and column before the first image is written."""
-    kind, words = tried.try_out(changed(tried, table, change))
+    kind, words = tried.changed(table, change)
     assert kind == "refused" and message in words
 
 
@@ -108,20 +249,20 @@ def test_two_keyframes_of_one_sensor(tried: Range) -> None:
         row = next(row for row in rows if row["token"] == "goes-LIDAR_TOP-1-0")
         rows.append(row | {"token": "another"})
 
-    kind, words = tried.try_out(changed(tried, "sample_data", change))
+    kind, words = tried.changed("sample_data", change)
     assert kind == "refused" and "expected one keyframe of LIDAR_TOP for sample goes-sample-1, got 2" in words
 
 
 @pytest.mark.parametrize("table", ["attribute", "map", "log", "lidarseg", "visibility"])
 def test_tables_that_are_only_handed_on(tried: Range, table: str) -> None:
     """They are read before the first image is written, too."""
-    kind, words = tried.try_out(Damage(table, table, b'[{"token": '))
+    kind, words = tried.try_out(table, b'[{"token": ')
     assert kind == "refused" and f"table {table}: expected JSON, got" in words
 
 
 def test_a_number_of_many_digits(tried: Range) -> None:
     """Python's JSON reader does not read it, and says so in another exception than for other texts."""
-    kind, words = tried.try_out(Damage("sample", "sample", b'[{"timestamp": ' + b"7" * 5000 + b"}]"))
+    kind, words = tried.try_out("sample", b'[{"timestamp": ' + b"7" * 5000 + b"}]")
     assert kind == "refused" and "table sample: expected JSON, got" in words
 
 
@@ -136,34 +277,67 @@ def test_a_devkit_object_whose_tables_are_no_lists(tried: Range) -> None:
 
 def test_nothing_is_wrong_with_sound_tables(tried: Range) -> None:
     """Nor with maps that name no file, as those of cut-out data sets do."""
-    assert tried.try_out(changed(tried, "map", put("filename", ""))) == ("read", "")
+    assert tried.changed("map", put("filename", "")) == ("read", "")
 
 
-def test_damage_that_must_be_noticed(tried: Range, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The helper itself: a hang, an exception, a file outside the output."""
+@pytest.mark.parametrize(
+    ("fault", "noticed"),
+    [
+        (lambda root: {}["x"], (KeyError, "x")),
+        (lambda root: (root / "beside" / "y").write_bytes(b""), (AssertionError, "beside/y")),
+        (lambda root: print("Traceback", file=sys.stderr), (AssertionError, "Traceback")),
+        (lambda root: next(iter(int, 1)) or [None for _ in iter(int, 1)], (AssertionError, "over 1.0 s of CPU")),
+    ],
+    ids=["an exception", "a file outside the output", "a traceback", "a hang"],
+)
+def test_faults_that_must_be_noticed(
+    tried: Range, fault: Callable[[Path], object], noticed: tuple[Any, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The tests here themselves."""
+    monkeypatch.setattr(mutations, "HANG_S", 1.0)
+    monkeypatch.setitem(globals(), "main", lambda argv: fault(tried.root) and 1)
+    with pytest.raises(noticed[0], match=noticed[1]):
+        tried.changed("scene", lambda rows: None)
+    (tried.root / "beside" / "y").unlink(missing_ok=True)
 
-    def verdict_of(way: Callable[[], object]) -> str:
-        monkeypatch.setattr(damaging, "run", lambda argv: way() or 1)
-        return tried.try_out(changed(tried, "scene", lambda rows: None)).kind
 
-    def hang() -> None:
-        while True:
-            pass
-
-    monkeypatch.setattr(damaging, "LIMIT_S", 1.0)
-    assert verdict_of(hang) == "hang"
-    assert verdict_of(lambda: {}["x"]) == "foreign"
-    assert verdict_of(lambda: (tried.root / "beside" / "y").write_bytes(b"")) == "outside"
-    (tried.root / "beside" / "y").unlink()
+# --- drawn ------------------------------------------------------------------------------------------------------------
+FILES = ("../beside/x.bin", "{root}/beside/x.bin", "..", ".", "samples", "/dev/null", "a" * 300 + ".bin", "x/")
 
 
-@pytest.mark.timeout(7200)
-@pytest.mark.parametrize("count", few_or_all(200, 3000, "tables"))
-def test_many_damaged_tables(tried: Range, count: int) -> None:
-    """As ``python -m tests.cli.convert.damage``: 5 minutes of CPU a thousand."""
-    wrong = []
-    for damage in damages(tried.tables, count, 0, tried.root):
-        kind, words = tried.try_out(damage)
-        if kind not in ALLOWED:
-            wrong.append(f"{damage.name}: {kind}: {words}")
-    assert not wrong, "\n".join(wrong)
+@st.composite
+def rows_elsewhere(draw: st.DrawFn, tables: dict[str, Rows], table: str, root: Path) -> bytes:
+    """A table whose rows are repeated or gone, or whose tokens or files lead elsewhere, also in a circle."""
+    rows = copy.deepcopy(tables[table])
+    row = draw(st.sampled_from(rows))
+    other = draw(st.sampled_from([one for name in sorted(tables) for one in tables[name]] + 10 * rows))
+    keys = [key for key in row if key.endswith("token") or key in ("prev", "next")]
+    ways = ["repeated", "half gone", "led elsewhere", "changed", *["file"] * ("filename" in row)]
+    match draw(st.sampled_from([*ways, *["circle"] * 4 * ("next" in row)])):
+        case "repeated":
+            rows.append(copy.deepcopy(row))
+        case "half gone":
+            del rows[draw(st.integers(0, 1)) :: 2]
+        case "led elsewhere":
+            row[draw(st.sampled_from(keys))] = other["token"]
+        case "changed":
+            row[draw(st.sampled_from(keys))] += "!"
+        case "file":
+            row["filename"] = draw(st.sampled_from(FILES)).format(root=root)
+        case "circle":
+            owner = next((k for k in ("instance_token", "calibrated_sensor_token", "scene_token") if k in row), "token")
+            related = [one for one in rows if one is not row and one.get(owner) == row.get(owner)]
+            circle = [row, *related[: draw(st.sampled_from([0, 1, 2, len(related)]))]]
+            key = draw(st.sampled_from(["next", "prev"]))
+            for one, two in zip(circle, [*circle[1:], row], strict=True):
+                one[key] = two["token"]
+    return json.dumps(rows).encode()
+
+
+@examples(24, 200, 3000, data=st.data())
+def test_damaged_tables(tried: Range, data: st.DataObject) -> None:
+    """5 minutes of CPU a thousand."""
+    table = data.draw(st.sampled_from(sorted(tried.tables)))
+    rows = tried.tables[table]
+    damage = mutated_json(rows) | st.none()
+    tried.try_out(table, data.draw(damage | rows_elsewhere(tried.tables, table, tried.root) if rows else damage))
