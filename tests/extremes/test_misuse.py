@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import random
 import resource
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from hypothesis import strategies as st
 
 from arbiview_aug import ArbiviewError, Camera, FavsConfig, PaperConfig, RandomRig, Rig, RigRetarget, load_rig
 from arbiview_aug import check as find_mistakes
@@ -23,10 +22,10 @@ from arbiview_aug.render.plan import compile_kernels
 from arbiview_aug.sample.batching import is_readable
 from tests.extremes import misuse
 from tests.extremes.conftest import Worst
-from tests.helpers import HangError, few_or_all, limited
+from tests.helpers import examples, limited
+from tests.mutations import HANG_S, mutated_json, works
 
 TARGET = misuse.rig(spread_deg=30.0).shifted(z_m=0.3)
-HANG_S = 10  # CPU seconds; the slowest input takes about one
 GROWTH_KB = 1024**2  # of the process's peak memory: 1 GiB beyond what the tests before it needed
 
 
@@ -38,54 +37,12 @@ def compiled() -> None:
 
 @contextmanager
 def bounded(worst: Worst) -> Iterator[None]:
-    """Fails on inputs that together need a GiB more memory than the process had."""
+    """Fails on an input that needs a GiB more memory than the process had."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     yield
     growth_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-    worst("MiB more memory, mutated inputs together", growth_kb / 1024)
+    worst("MiB more memory, mutated input", growth_kb / 1024)
     assert growth_kb < GROWTH_KB
-
-
-def works_or_refuses(call: Callable[[], Any], seed: int, allowed: tuple[type[Exception], ...]) -> bool:
-    """Whether the call worked; any exception but the allowed ones, which need a message, fails the test."""
-    try:
-        with limited(HANG_S):
-            call()
-    except allowed as error:
-        assert str(error), f"seed {seed}: no message"
-        return False
-    except (Exception, HangError) as error:
-        raise AssertionError(f"seed {seed}: {type(error).__name__}: {str(error)[:500]}") from error
-    return True
-
-
-def try_sample(seed: int) -> bool:
-    rng = random.Random(seed)
-    sample = misuse.sample(rng)
-    settings_too = rng.random() < 0.25
-    chosen = misuse.mutated_settings(rng, sample) if settings_too else misuse.settings(rng, sample)
-    made: list[RigRetarget] = []
-    if not works_or_refuses(lambda: made.append(RigRetarget(TARGET, **chosen)), seed, (ArbiviewError, ValueError)):
-        return False
-    if not settings_too:
-        for _ in range(rng.choice((1, 1, 2))):
-            sample = misuse.mutated(sample, rng)
-
-    def render() -> None:
-        out = made[0](sample)
-        images = out["images"] if isinstance(out["images"], list) else [out["images"]]
-        assert all(is_readable(image) and bool(image.isfinite().all()) for image in images)
-
-    return works_or_refuses(render, seed, (ArbiviewError,))
-
-
-def try_files(seed: int, folder: Path) -> bool:
-    text = misuse.mutated_text(misuse.calibration(), random.Random(seed))
-    for name in ("calib.json", "rig.yaml"):
-        (folder / name).write_bytes(text)
-    works = works_or_refuses(lambda: FrameFolder(folder)[0], seed, (ArbiviewError,))
-    readable = "rig.yaml" if seed % 8 == 0 else "calib.json"  # YAML's reader is slow
-    return works_or_refuses(lambda: repr(load_rig(folder / readable)), seed, (ArbiviewError,)) and works
 
 
 @pytest.fixture
@@ -97,26 +54,37 @@ def frame_folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def check(samples: range, files: range, folder: Path, worst: Worst) -> None:
-    with bounded(worst), warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")
-        worked = sum(try_sample(seed) for seed in samples)
-        opened = sum(try_files(seed, folder) for seed in files)
-    assert 0.2 < worked / len(samples) < 0.8, "the mutations reach what is behind the first check"
-    assert 0.1 < opened / len(files) < 0.8
+@examples(120, 1100, 5500, share=(0.2, 0.8), data=st.data())
+def test_mutated_samples_and_settings(worst: Worst, data: st.DataObject) -> bool:
+    sample = data.draw(misuse.samples())
+    if data.draw(st.sampled_from(["sample", "sample", "sample", "settings"])) == "settings":
+        settings = data.draw(misuse.wrong_settings(sample))
+    else:
+        settings, sample = data.draw(misuse.settings(sample)), data.draw(misuse.wrong_samples())
+    retargets: list[RigRetarget] = []
+    if not works(lambda: retargets.append(RigRetarget(TARGET, **settings)), (ArbiviewError, ValueError)):
+        return False
+
+    def render() -> None:
+        images = retargets[0](sample)["images"]
+        assert all(is_readable(image) and bool(image.isfinite().all()) for image in images)
+
+    with bounded(worst):
+        return works(render)
 
 
-def test_mutated_inputs(frame_folder: Path, worst: Worst) -> None:
-    check(range(120), range(100), frame_folder, worst)
+@examples(100, 900, 4500, share=(0.05, 0.8), text=mutated_json(misuse.calibration()), yaml=st.integers(0, 7))
+def test_mutated_calibrations(frame_folder: Path, worst: Worst, text: bytes, yaml: int) -> bool:
+    for name in ("calib.json", "rig.yaml"):
+        (frame_folder / name).write_bytes(text)
+    readable = "rig.yaml" if yaml == 0 else "calib.json"  # YAML's reader is slow
+    with bounded(worst):
+        return works(lambda: FrameFolder(frame_folder)[0]) & works(lambda: repr(load_rig(frame_folder / readable)))
 
 
-def test_mutated_inputs_are_checked() -> None:
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")
-        for seed in range(100):
-            rng = random.Random(seed)
-            sample = misuse.mutated(misuse.sample(rng), rng)
-            works_or_refuses(lambda sample=sample: str(find_mistakes(sample)), seed, (ArbiviewError,))
+@examples(100, 500, sample=misuse.wrong_samples())
+def test_mutated_samples_are_checked(sample: dict[str, Any]) -> None:
+    works(lambda: str(find_mistakes(sample)))
 
 
 def test_samples_that_hold_themselves() -> None:
@@ -127,12 +95,6 @@ def test_samples_that_hold_themselves() -> None:
     sample = {"images": torch.zeros(2, 3, *misuse.SIZE), "rig": misuse.rig(), "meta": [misuse.circle(), many]}
     with limited(HANG_S):
         assert RigRetarget(TARGET)(sample)["images"].isfinite().all()
-
-
-@pytest.mark.timeout(1800)
-@pytest.mark.parametrize("thousands", few_or_all(2, 10, "thousand"))
-def test_thousands_of_mutated_inputs(thousands: int, frame_folder: Path, worst: Worst) -> None:
-    check(range(120, 120 + 550 * thousands), range(100, 100 + 450 * thousands), frame_folder, worst)
 
 
 @pytest.mark.parametrize(
