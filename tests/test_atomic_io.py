@@ -1,4 +1,4 @@
-"""Files that are whole or not there."""
+"""Files that are whole or not there, and names that lead nowhere else."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from arbiview_aug import atomic_io
-from arbiview_aug.atomic_io import link_whole, remove_parts, whole_file, write_whole
-from arbiview_aug.errors import OutputError
+from arbiview_aug.atomic_io import inside, link_whole, remove_parts, whole_file, write_whole
+from arbiview_aug.errors import DataError, OutputError
 
 
 def names(root: Path) -> list[str]:
@@ -64,3 +65,71 @@ def test_only_what_nobody_writes_is_removed(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(b"")
     remove_parts(tmp_path, lambda owner: int(owner) % 2 == 0)
     assert set(names(tmp_path)) == {others, shared, elsewhere, ".hidden.part", "x"}
+
+
+# --- names of a data set ----------------------------------------------------------------------------------------------
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A folder with a file in a folder, beside another folder with the same."""
+    for folder in ("root", "beside"):
+        (tmp_path / folder / "deep").mkdir(parents=True)
+        (tmp_path / folder / "deep" / "x.bin").write_bytes(b"")
+    return tmp_path / "root"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("../beside/deep/x.bin", "deep/../../beside/deep/x.bin", "deep\\..\\x.bin", "..", "/etc/hostname", "\\x", ""),
+        *("a\0b", "a\ud800b", "x" * 256, f"deep/{'车' * 86}", None, 7, ["x"]),
+    ],
+)
+def test_names_that_no_file_of_a_data_set_has(name: Any, root: Path) -> None:
+    with pytest.raises(DataError, match=r"^table map, row 'x': expected a file name relative to the folder"):
+        inside(root, name, "table map, row 'x'")
+
+
+@pytest.mark.parametrize("name", ["deep/x.bin", "deep", "not/there.bin", "x" * 255, "a..b", "~", "deep/./x.bin"])
+def test_names_of_files_below_the_folder(name: str, root: Path) -> None:
+    assert inside(root, name, "table map") == root / name
+    (root.parent / "link").symlink_to(root)
+    assert inside(root.parent / "link", name, "table map") == root.parent / "link" / name, "the root may be a link"
+
+
+@pytest.mark.parametrize(
+    ("link", "target", "name"),
+    [
+        ("link", "../beside/deep/x.bin", "link"),
+        ("link", "{beside}/deep/x.bin", "link"),
+        ("link", "../beside", "link/deep/x.bin"),
+        ("deep/link", "../../beside/deep", "deep/link/x.bin"),
+        ("link", "/etc/hostname", "link"),
+    ],
+)
+def test_links_that_leave_the_folder(link: str, target: str, name: str, root: Path) -> None:
+    (root / link).symlink_to(target.format(beside=root.parent / "beside"))
+    with pytest.raises(DataError, match=r"map: expected a file in .*/root, got .*: links must not leave the folder"):
+        inside(root, name, "map")
+
+
+@pytest.mark.parametrize(
+    ("link", "target", "name"),
+    [
+        ("link", "deep/x.bin", "link"),
+        ("link", "deep", "link/x.bin"),
+        ("deep/link", "../deep/x.bin", "deep/link"),
+        ("link", "{root}/deep/x.bin", "link"),
+        ("link", "..", "link/root/deep/x.bin"),  # out and back in
+    ],
+)
+def test_links_that_stay_in_the_folder(link: str, target: str, name: str, root: Path) -> None:
+    (root / link).symlink_to(target.format(root=root))
+    assert inside(root, name, "map") == root / name
+
+
+def test_pipes_are_no_files(root: Path) -> None:
+    os.mkfifo(root / "pipe")
+    (root / "link").symlink_to("pipe")
+    for name in ("pipe", "link"):
+        with pytest.raises(DataError, match=r"map: expected a regular file, got .*, a pipe, socket or device"):
+            inside(root, name, "map")

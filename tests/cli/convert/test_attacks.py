@@ -1,4 +1,7 @@
-"""Data sets that mean harm: names and links that lead elsewhere, and samples that raise what nobody expects."""
+"""Data sets that mean harm: names and links that lead elsewhere, and samples that raise what nobody expects.
+
+``tests/test_atomic_io.py`` has all such names and links; here is every place that takes one, and whole conversions.
+"""
 
 from __future__ import annotations
 
@@ -29,148 +32,136 @@ from arbiview_aug.errors import DataError
 from tests.cli.convert.drives import command, tree, write_frames, write_nuscenes
 
 VICTIM = "years of work"
-NAMES = ("../.bashrc", "samples/../../.bashrc", "/etc/hostname", "", "a\0b", "a\ud800b", "x" * 300, None)
-"""Names that no file of a data set may have."""
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def originals(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     root = tmp_path_factory.mktemp("sources")
     return {"nuscenes": write_nuscenes(root / "nuscenes", 2), "frames": write_frames(root / "frames", 3)}
 
 
-@pytest.fixture(scope="module")
-def smallest(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    root = tmp_path_factory.mktemp("smallest")
-    return {"nuscenes": write_nuscenes(root / "nuscenes", 1), "frames": write_frames(root / "frames", 2)}
+class Home:
+    """A folder with a data set to attack with, and files that must stay as they are.
 
+    Attributes:
+        root: The folder: ``in`` is what an archive may bring, ``new`` the output of conversions.
+        source: A copy of the data set, in ``in``.
+        said: What the last command printed on standard error.
+    """
 
-@pytest.fixture
-def home(tmp_path: Path) -> Path:
-    """A folder with files that must stay as they are, and what an archive may bring to ``in/``, beside the source."""
-    return make_home(tmp_path)
+    def __init__(self, root: Path, original: Path, capsys: pytest.CaptureFixture[str] | None = None) -> None:
+        self.root, self.output, self._capsys, self.said = root, root / "new", capsys, ""
+        (root / "in" / "folder").mkdir(parents=True)
+        for name in (".bashrc", "secret", "in/secret.png", "in/folder/x.bin"):
+            (root / name).write_text(VICTIM)
+        (root / "in" / ".bashrc").write_text("rm -rf ~")
+        self.source = Path(shutil.copytree(original, root / "in" / "source"))
 
+    def outside(self) -> dict[str, tuple[Any, ...]]:
+        """All but the output: contents, and inodes and numbers of links of what is not the source's."""
+        files: dict[str, tuple[Any, ...]] = {}
+        for path in sorted(self.root.rglob("*")):
+            name = path.relative_to(self.root).as_posix()
+            if name.split("/")[0] == "new" or not (path.is_file() or path.is_symlink()):
+                continue
+            status, content = path.lstat(), path.read_bytes() if path.is_file() else b""
+            files[name] = (content,) if name.startswith("in/source/") else (content, status.st_ino, status.st_nlink)
+        return files
 
-def make_home(home: Path) -> Path:
-    (home / "in").mkdir(parents=True)
-    for path in (home / ".bashrc", home / "secret", home / "in" / "secret.png"):
-        path.write_text(VICTIM)
-    (home / "in" / ".bashrc").write_text("rm -rf ~")
-    (home / "in" / "folder").mkdir()
-    (home / "in" / "folder" / "x.bin").write_text(VICTIM)
-    return home
+    def run(self, *arguments: str) -> int:
+        """The status of a command, which changes nothing outside its output and prints no traceback."""
+        before = self.outside()
+        status = main([*arguments])
+        assert self.outside() == before
+        if self._capsys is not None:
+            self.said = self._capsys.readouterr().err
+        assert "Traceback" not in self.said
+        return status
 
+    def convert(self, *more: str) -> int:
+        return self.run(*command(self.source, self.output), *more)
 
-def outside(home: Path) -> dict[str, tuple[Any, ...]]:
-    """Everything but the output: contents, and of what is not the source's also inodes and how many links they have."""
-    found: dict[str, tuple[Any, ...]] = {}
-    for path in sorted(home.rglob("*")):
-        name = path.relative_to(home).as_posix()
-        if name.split("/")[0] == "new" or not (path.is_file() or path.is_symlink()):
-            continue
-        status, content = path.lstat(), path.read_bytes() if path.is_file() else b""
-        found[name] = (content,) if name.startswith("in/source/") else (content, status.st_ino, status.st_nlink)
-    return found
+    def change(self, table: str, edit: Callable[[list[dict[str, Any]]], None]) -> None:
+        path = self.source / "v1.0-mini" / f"{table}.json"
+        rows = json.loads(path.read_text()) if path.is_file() else []
+        edit(rows)
+        path.write_text(json.dumps(rows))
 
+    def rename(self, table: str, name: Any, part: str = "RADAR") -> str:
+        """Give a file of a table another name; gives the row's token."""
+        tokens: list[str] = []
 
-def change(root: Path, table: str, edit: Callable[[list[dict[str, Any]]], None]) -> None:
-    path = root / "v1.0-mini" / f"{table}.json"
-    rows = json.loads(path.read_text()) if path.is_file() else []
-    edit(rows)
-    path.write_text(json.dumps(rows))
+        def edit(rows: list[dict[str, Any]]) -> None:
+            if table in ("lidarseg", "panoptic"):
+                rows.append({"token": "attack", "sample_data_token": "x", "filename": ""})
+            row = rows[-1] if table != "sample_data" else next(row for row in rows if part in row["filename"])
+            row["filename"] = name
+            tokens.append(row["token"])
 
+        self.change(table, edit)
+        return tokens[0]
 
-def renamed(root: Path, table: str, name: Any, part: str = "RADAR") -> str:
-    """Give a file of a table another name; gives the row's token."""
-    tokens: list[str] = []
-
-    def edit(rows: list[dict[str, Any]]) -> None:
-        if table in ("lidarseg", "panoptic"):
-            rows.append({"token": "attack", "sample_data_token": "x", "filename": ""})
-        row = rows[-1] if table != "sample_data" else next(row for row in rows if part in row["filename"])
-        row["filename"] = name
-        tokens.append(row["token"])
-
-    change(root, table, edit)
-    return tokens[0]
-
-
-def with_calibration(root: Path, edit: Callable[[dict[str, Any]], None], frame: str = "0001") -> None:
-    path = root / frame / "calib.json"
-    calib = json.loads(path.read_text())
-    edit(calib)
-    path.write_text(json.dumps(calib))
-
-
-def name_of(key: str, name: Any) -> Callable[[dict[str, Any]], None]:
-    """An edit that gives a frame's image, mask or points another name."""
-
-    def edit(calib: dict[str, Any]) -> None:
+    def calibrate(self, key: str, name: Any) -> None:
+        """Give the image, mask or points of frame 0001 another name."""
+        path = self.source / "0001" / "calib.json"
+        calib = json.loads(path.read_text())
         if key == "lidar":
             calib["lidar"] = {"file": name}
         else:
             calib["cameras"][0][key] = name
+        path.write_text(json.dumps(calib))
 
-    return edit
+
+@pytest.fixture
+def tables(originals: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Home:
+    return Home(tmp_path / "tables", originals["nuscenes"], capsys)
+
+
+@pytest.fixture
+def frames(originals: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Home:
+    return Home(tmp_path / "frames", originals["frames"], capsys)
 
 
 # --- names ------------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(
-    ("table", "name"),
-    [*(("sample_data", name) for name in NAMES), *((table, NAMES[0]) for table in ("lidarseg", "panoptic", "map"))],
-)
-def test_names_of_kept_files(
-    table: str, name: Any, made: dict[str, Path], home: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("table", ["sample_data", "lidarseg", "panoptic", "map"])
+def test_names_of_kept_files(table: str, tables: Home) -> None:
     """``../.bashrc`` of a radar replaced a file beside the output."""
-    source = shutil.copytree(made["nuscenes"], home / "in" / "source")
-    token = renamed(source, table, name)
-    before = outside(home)
-    assert main(command(source, home / "new")) == 2
-    said = capsys.readouterr().err
-    assert f"table {table}: " in said and repr(token) in said and "filename" in said and "Traceback" not in said
-    assert outside(home) == before and not (home / "new").exists()
+    token = tables.rename(table, "../.bashrc")
+    assert tables.convert() == 2 and not tables.output.exists()
+    assert all(part in tables.said for part in (f"table {table}: ", repr(token), "filename"))
 
 
-def test_names_of_the_conversions_own_files(
-    made: dict[str, Path], home: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name in ("conversion/settings.json", "v1.0-mini/sample.json", "samples/ring_front_center/0.jpg"):
-        source = shutil.copytree(made["nuscenes"], home / "in" / "source")
-        (source / name).parent.mkdir(parents=True, exist_ok=True)
-        (source / name).touch()
-        renamed(source, "sample_data", name)
-        assert main(command(source, home / "new")) == 2
-        assert f"got one in {Path(name).parent}" in capsys.readouterr().err and not (home / "new").exists()
-        shutil.rmtree(source)
+@pytest.mark.parametrize(
+    "name", ["conversion/settings.json", "v1.0-mini/sample.json", "samples/ring_front_center/0.jpg"]
+)
+def test_names_of_the_conversions_own_files(name: str, tables: Home) -> None:
+    (tables.source / name).parent.mkdir(parents=True, exist_ok=True)
+    (tables.source / name).touch()
+    tables.rename("sample_data", name)
+    assert tables.convert() == 2 and not tables.output.exists()
+    assert f"got one in {Path(name).parent}" in tables.said
 
 
 @pytest.mark.parametrize("channel", ["CAM_FRONT__", "LIDAR_TOP"])
-@pytest.mark.parametrize("name", NAMES)
-def test_readers_of_tables_refuse_names(channel: str, name: Any, made: dict[str, Path], home: Path) -> None:
-    source = shutil.copytree(made["nuscenes"], home / "in" / "source")
-
+def test_readers_of_tables_refuse_names(channel: str, tables: Home) -> None:
     def edit(rows: list[dict[str, Any]]) -> None:
         for row in rows:
             if channel in row["filename"] and row["is_key_frame"]:
-                row["filename"] = name
+                row["filename"] = "../.bashrc"
 
-    change(source, "sample_data", edit)
+    tables.change("sample_data", edit)
     for wrap in (lambda data: data, lambda data: RetargetedDataset(data, lambda sample: sample)):
         with pytest.raises(DataError, match="expected "):
-            next(iter(DataLoader(wrap(NuScenesDataset(source)), batch_size=None)))
+            next(iter(DataLoader(wrap(NuScenesDataset(tables.source)), batch_size=None)))
 
 
 @pytest.mark.parametrize("key", ["file", "mask", "lidar"])
-@pytest.mark.parametrize("name", ["../../secret.png", "{home}/in/secret.png", "a\0b", "a\ud800b", "x" * 300, 7])
-def test_frame_folders_refuse_names(key: str, name: Any, made: dict[str, Path], home: Path) -> None:
-    source = shutil.copytree(made["frames"], home / "in" / "source")
-    if name in ("../../secret.png", "{home}/in/secret.png"):  # those that could be read
-        target = home / "in" / "secret.png"
-        shutil.copy(source / "0001" / ("lidar.npy" if key == "lidar" else "00.jpg"), target)
-    name = name.format(home=home) if isinstance(name, str) else name
-    with_calibration(source, name_of(key, name))
-    data = FrameFolder(source)
+@pytest.mark.parametrize("name", ["../../secret.png", "{root}/in/secret.png", 7])
+def test_frame_folders_refuse_names(key: str, name: Any, frames: Home) -> None:
+    original = frames.source / "0001" / ("lidar.npy" if key == "lidar" else "00.jpg")
+    shutil.copy(original, frames.root / "in" / "secret.png")  # it could be read
+    frames.calibrate(key, name.format(root=frames.root) if isinstance(name, str) else name)
+    data = FrameFolder(frames.source)
     wrapped = RetargetedDataset(data, RigRetarget(load_rig("argoverse2"), size=(24, 40), surface="street"))
     assert {"points", "images"} < set(data[0])
     for of in (data, wrapped):
@@ -179,244 +170,184 @@ def test_frame_folders_refuse_names(key: str, name: Any, made: dict[str, Path], 
         assert type(caught.value).__name__ in ("DataError", "CalibrationError")
 
 
-def test_a_frames_files_may_lie_in_other_frames(made: dict[str, Path], home: Path) -> None:
-    source = shutil.copytree(made["frames"], home / "in" / "source")
-    with_calibration(source, name_of("file", "../0000/00.jpg"))
-    assert FrameFolder(source)[1]["images"].shape[0] == 2
+def test_a_frames_files_may_lie_in_other_frames(frames: Home) -> None:
+    frames.calibrate("file", "../0000/00.jpg")
+    assert FrameFolder(frames.source)[1]["images"].shape[0] == 2
     with pytest.raises(DataError, match="expected"):
-        FrameFolder(source / "0001")[0]
+        FrameFolder(frames.source / "0001")[0]
 
 
-def test_a_frame_alone_shares_masks_of_frames_beside_it(made: dict[str, Path], home: Path) -> None:
+def test_a_frame_alone_shares_masks_of_frames_beside_it(frames: Home) -> None:
     """A real drive does; anything else beside the frame is refused, and so is a link out of the other frame."""
-    source = shutil.copytree(made["frames"], home / "in" / "source")
+    source = frames.source
     size = FrameFolder(source)[1]["rig"][0].size
-    mask = cv2.imencode(".png", np.full(size, 255, np.uint8))[1].tobytes()
-    (source / "0000" / "mask.png").write_bytes(mask)
-    (source / "mask.png").write_bytes(mask)
     (source / "other").mkdir()
-    (source / "other" / "mask.png").write_bytes(mask)
+    for name in ("0000/mask.png", "mask.png", "other/mask.png"):
+        cv2.imwrite(str(source / name), np.full(size, 255, np.uint8))
     (source / "0000" / "link.png").symlink_to(source / "mask.png")
-    with_calibration(source, name_of("mask", "../0000/mask.png"))
+    frames.calibrate("mask", "../0000/mask.png")
     assert FrameFolder(source / "0001")[0]["rig"][0].mask.all()
-    for name in ("../mask.png", "../other/mask.png", "../0000/link.png", "../../mask.png", "../0000/../mask.png"):
-        with_calibration(source, name_of("mask", name))
-        with pytest.raises(DataError, match=r"0001.*: expected"):
-            FrameFolder(source / "0001")[0]
-    for name in ("../a\0b/c", f"../{'x' * 300}/c", "../a\ud800b/c"):
-        with_calibration(source, name_of("mask", name))
+    elsewhere = ("../mask.png", "../other/mask.png", "../0000/link.png", "../../mask.png", "../0000/../mask.png")
+    for name in (*elsewhere, "../a\0b/c", f"../{'x' * 300}/c", "../a\ud800b/c"):
+        frames.calibrate("mask", name)
         with pytest.raises(DataError, match=r"0001.*: expected"):
             FrameFolder(source / "0001")[0]
 
 
-def test_cameras_whose_names_are_no_folders(
-    made: dict[str, Path], home: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name in ("..", "x" * 300):
-        rig = load_rig("argoverse2").to_dict()
-        rig["cameras"][0]["name"] = name
-        (home / "rig.json").write_text(json.dumps(rig))
-        asked = command(made["nuscenes"], home / "new")
-        asked[asked.index("argoverse2")] = str(home / "rig.json")
-        assert main(asked) == 2
-        assert "expected a" in capsys.readouterr().err and not (home / "new").exists()
+@pytest.mark.parametrize("name", ["..", "x" * 300])
+def test_cameras_whose_names_are_no_folders(name: str, tables: Home) -> None:
+    rig = load_rig("argoverse2").to_dict()
+    rig["cameras"][0]["name"] = name
+    (tables.root / "rig.json").write_text(json.dumps(rig))
+    assert tables.convert("--target", str(tables.root / "rig.json")) == 2
+    assert "expected a" in tables.said and not tables.output.exists()
 
 
 @pytest.mark.parametrize("name", ["3" * 250, "车" * 80])
-def test_frames_of_long_names(name: str, made: dict[str, Path], home: Path) -> None:
-    source = shutil.copytree(made["frames"], home / "in" / "source")
-    (source / "sequence.json").unlink()
-    (source / "0001").rename(source / name)
-    assert main(command(source, home / "new")) == 0
-    assert len(FrameFolder(home / "new")) == 3
+def test_frames_of_long_names(name: str, frames: Home) -> None:
+    (frames.source / "sequence.json").unlink()
+    (frames.source / "0001").rename(frames.source / name)
+    assert frames.convert() == 0
+    assert len(FrameFolder(frames.output)) == 3
 
 
 # --- links ------------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
-    ("kind", "name", "target"),
+    ("kind", "name"),
     [
-        ("nuscenes", "{radar}", "secret"),
-        ("nuscenes", "{radar}", "../../../secret"),
-        ("nuscenes", "{camera}", "in/secret.png"),
-        ("nuscenes", "{lidar}", "in/folder/x.bin"),
-        ("nuscenes", "samples/RADAR_FRONT", "in/folder"),
-        ("nuscenes", "sweeps", "in/folder"),
-        ("nuscenes", "v1.0-mini/attribute.json", "in/folder/table.json"),
-        ("nuscenes", "maps/map.png", "secret"),
-        ("nuscenes", "maps", "in/folder"),
-        ("frames", "0001/lidar.npy", "in/folder/lidar.npy"),
-        ("frames", "0001/00.jpg", "in/folder/00.jpg"),
-        ("frames", "0001/calib.json", "in/folder/calib.json"),
-        ("frames", "0001", "in/folder"),
-        ("frames", "sequence.json", "in/folder/sequence.json"),
+        *(("tables", f"samples/{name}") for name in ("RADAR_FRONT/*", "CAM_FRONT/*", "LIDAR_TOP/*", "RADAR_FRONT")),
+        *(("tables", name) for name in ("sweeps", "v1.0-mini/attribute.json", "maps/map.png", "maps")),
+        *(("frames", f"0001/{name}") for name in ("lidar.npy", "00.jpg", "calib.json")),
+        *(("frames", name) for name in ("0001", "sequence.json")),
     ],
 )
-def test_links_that_leave_the_root(
-    kind: str, name: str, target: str, made: dict[str, Path], home: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_links_that_leave_the_root(kind: str, name: str, request: pytest.FixtureRequest) -> None:
     """A link to a system file became a second link to its inode; calibrations and tables were copied."""
-    source = shutil.copytree(made[kind], home / "in" / "source")
-    if kind == "nuscenes":
-        (home / "in" / "folder" / "table.json").write_text("[]")
-        channels = {"radar": "RADAR_FRONT", "camera": "CAM_FRONT", "lidar": "LIDAR_TOP"}
-        names = {key: sorted((source / "samples" / channel).iterdir())[0] for key, channel in channels.items()}
-        path = source / name.format(**names)
-        for file in sorted((source / "samples" / "RADAR_FRONT").iterdir()):
-            shutil.copy(file, home / "in" / "folder" / file.name)
-        for channel in ("LIDAR_TOP", "RADAR_FRONT"):
-            (home / "in" / "folder" / channel).mkdir()
-            for file in (source / "sweeps" / channel).iterdir():
-                shutil.copy(file, home / "in" / "folder" / channel)
-    else:
-        shutil.copytree(source / "0001", home / "in" / "folder", dirs_exist_ok=True)
-        shutil.copy(source / "sequence.json", home / "in" / "folder")
-        path = source / name
-    if path.is_dir():
-        shutil.rmtree(path)
-    path.unlink(missing_ok=True)
-    path.symlink_to(target if target.startswith("..") else home / target)
-    before = outside(home)
-    assert main(command(source, home / "new")) in (1, 2)
-    said = capsys.readouterr().err
-    assert "links must not leave the folder" in said and path.name in said and "Traceback" not in said
-    assert outside(home) == before
+    home: Home = request.getfixturevalue(kind)
+    (home.source / "v1.0-mini").is_dir() and (home.source / "v1.0-mini" / "attribute.json").write_text("[]")
+    path = sorted(home.source.glob(name))[0]
+    path.rename(home.root / "in" / "elsewhere")
+    path.symlink_to(home.root / "in" / "elsewhere")
+    assert home.convert() in (1, 2)
+    assert "links must not leave the folder" in home.said and path.name in home.said
 
 
-@pytest.mark.parametrize("kind", ["nuscenes", "frames"])
-def test_links_that_stay_in_the_root(kind: str, made: dict[str, Path], home: Path) -> None:
+@pytest.mark.parametrize("kind", ["tables", "frames"])
+def test_links_that_stay_in_the_root(kind: str, request: pytest.FixtureRequest) -> None:
     """Files and a folder that are links, in a root that is one."""
-    source = shutil.copytree(made[kind], home / "in" / "source")
-    if kind == "frames":
-        (source / "sequence.json").unlink()
-    assert main(command(source, home / "plain")) == 0
-    for path in [path for path in sorted(source.rglob("*")) if path.suffix in (".bin", ".npy", ".jpg", ".png")]:
-        held = source / "blobs" / path.relative_to(source)
-        held.parent.mkdir(parents=True, exist_ok=True)
-        path.rename(held)
-        path.symlink_to(os.path.relpath(held, path.parent))
-    folder = source / ("maps" if kind == "nuscenes" else "0001")
-    folder.rename(source / "blobs" / "moved")
-    folder.symlink_to(Path("blobs", "moved"))
-    for path in (source / "blobs" / "moved").iterdir():
-        if path.is_symlink():
-            held = source / "blobs" / folder.name / path.name
-            path.unlink()
-            path.symlink_to(held)
-    (home / "root").symlink_to(Path("in", "source"))
-    assert main(command(home / "root", home / "new")) == 0
-    plain, linked = tree(home / "plain"), tree(home / "new")
+    home: Home = request.getfixturevalue(kind)
+    (home.source / "sequence.json").unlink(missing_ok=True)  # its names are of frames
+    assert main(command(home.source, home.root / "plain")) == 0
+    blobs = home.source / "blobs"
+    (home.source / ("maps" if kind == "tables" else "0001")).rename(home.root / "folder")
+    for k, path in enumerate(sorted(home.source.rglob("*.*"))):
+        if path.suffix in (".bin", ".npy", ".jpg", ".png"):
+            (blobs / str(k)).mkdir(parents=True)
+            moved = path.rename(blobs / str(k) / path.name)
+            path.symlink_to(os.path.relpath(moved, path.parent))
+    (home.root / "folder").rename(blobs / "folder")
+    (home.source / ("maps" if kind == "tables" else "0001")).symlink_to(Path("blobs", "folder"))
+    (home.root / "root").symlink_to(Path("in", "source"))
+    assert main(command(home.root / "root", home.output)) == 0
+    plain, linked = tree(home.root / "plain"), tree(home.output)
     own = {"conversion/settings.json", "conversion/provenance.json"}  # the roots have other names
     assert {name for name in plain if linked.get(name) != plain[name]} <= own and plain.keys() == linked.keys()
-    assert not any(path.is_symlink() for path in (home / "new").rglob("*"))
+    assert not any(path.is_symlink() for path in home.output.rglob("*"))
 
 
-def test_pipes_are_not_waited_for(made: dict[str, Path], home: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source = shutil.copytree(made["frames"], home / "in" / "source")
-    (source / "0001" / "lidar.npy").unlink()
-    os.mkfifo(source / "0001" / "lidar.npy")
+def test_pipes_are_not_waited_for(frames: Home, tables: Home) -> None:
+    radar = sorted((tables.source / "samples" / "RADAR_FRONT").iterdir())[0]
+    for path in (frames.source / "0001" / "lidar.npy", radar):
+        path.unlink()
+        os.mkfifo(path)
     with pytest.raises(DataError, match=r"lidar: expected a regular file, got .*, a pipe, socket or device"):
-        FrameFolder(source)[1]
-    source = shutil.copytree(made["nuscenes"], home / "tables")
-    radar = sorted((source / "samples" / "RADAR_FRONT").iterdir())[0]
-    radar.unlink()
-    os.mkfifo(radar)
-    assert main(command(source, home / "new")) == 2
-    assert "expected a regular file" in capsys.readouterr().err
+        FrameFolder(frames.source)[1]
+    assert tables.convert() == 2
+    assert "expected a regular file" in tables.said
 
 
-def test_depth_is_not_written_elsewhere(made: dict[str, Path], home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_depth_is_not_written_elsewhere(frames: Home) -> None:
     """Into a folder that a link in the data leads to; or a link in its place."""
-    source = shutil.copytree(made["frames"], home / "in" / "source")
-    (source / "motion_depth").symlink_to(home / "in" / "folder")
-    before = outside(home)
-    assert main(["depth", "--data", str(source)]) == 2
-    assert "links must not leave the folder" in capsys.readouterr().err and outside(home) == before
-    assert main([*command(source, home / "new"), "--surface", "motion"]) == 2
-    assert main(["depth", "--data", str(source), "--output", str(home / "in" / "folder")]) == 0  # as it was told
+    (frames.source / "motion_depth").symlink_to(frames.root / "in" / "folder")
+    assert frames.run("depth", "--data", str(frames.source)) == 2
+    assert "links must not leave the folder" in frames.said
+    assert frames.convert("--surface", "motion") == 2
+    told = frames.root / "in" / "folder"
+    assert main(["depth", "--data", str(frames.source), "--output", str(told)]) == 0  # as it was told
 
 
 # --- whatever a sample raises -----------------------------------------------------------------------------------------
-@pytest.mark.parametrize("key", ["file", "lidar"])
-@pytest.mark.parametrize("name", ["a\0b", "a\ud800b", "x" * 300])
-@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.slow)])
-def test_names_that_no_file_can_have(
-    key: str, name: str, workers: str, made: dict[str, Path], home: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize(
+    ("key", "workers"), [("file", "1"), ("lidar", "1"), pytest.param("file", "2", marks=pytest.mark.slow)]
+)
+def test_names_that_no_file_can_have(key: str, workers: str, frames: Home, capsys: pytest.CaptureFixture[str]) -> None:
     """Stopped the conversion with a traceback, whatever was to become of such samples."""
-    if workers == "2" and (key, name) != ("file", "a\ud800b"):
-        pytest.skip("one name shows it: processes take seconds to start")
-    source = shutil.copytree(made["frames"], home / "in" / "source")
-    with_calibration(source, name_of(key, name))
-    asked = [*command(source, home / "new"), "--on-error"]
-    asked[asked.index("--workers") + 1] = workers
+    frames.calibrate(key, "a\ud800b")
+    asked = command(frames.source, frames.output, "--workers", workers, "--on-error")
     assert main([*asked, "report"]) == 1
     captured = capsys.readouterr()
     assert "2 samples converted, 1 failed" in captured.out and "0001: failed: " in captured.err
     assert main([*asked, "skip"]) == 0
     assert "0001: skipped: " in capsys.readouterr().err
-    assert FrameFolder(home / "new").tokens == ["0000", "0002"]
+    assert FrameFolder(frames.output).tokens == ["0000", "0002"]
 
 
-def test_a_camera_image_of_tables_with_such_a_name(
-    made: dict[str, Path], home: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_camera_image_of_tables_with_such_a_name(tables: Home) -> None:
     """A camera's file is not kept: so its sample alone is broken."""
-    source = shutil.copytree(made["nuscenes"], home / "in" / "source")
-    renamed(source, "sample_data", "../a\0b", "samples/CAM_FRONT/")
-    assert main([*command(source, home / "new"), "--on-error", "skip"]) == 0
-    assert capsys.readouterr().err.count("skipped: nuScenes") == 1
-    assert len(NuScenesDataset(home / "new")) == 3
+    tables.rename("sample_data", "../a\0b", "samples/CAM_FRONT/")
+    assert tables.convert("--on-error", "skip") == 0
+    assert tables.said.count("skipped: nuScenes") == 1
+    assert len(NuScenesDataset(tables.output)) == 3
+
+
+def broken_once(monkeypatch: pytest.MonkeyPatch, of: Any, name: str) -> None:
+    """Let the second call of a function raise."""
+    calls, sound = [0], getattr(of, name)
+
+    def broken(*given: Any) -> Any:
+        calls[0] += 1
+        if calls[0] == 2:
+            raise ZeroDivisionError("of something")
+        return sound(*given)
+
+    monkeypatch.setattr(of, name, broken)
 
 
 @pytest.mark.parametrize("step", ["read", "retarget", "write"])
 @pytest.mark.parametrize("on_error", ["report", "skip", "fatal"])
-def test_errors_that_nobody_expects(
-    step: str,
-    on_error: str,
-    made: dict[str, Path],
-    home: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    def broken(self: Any, *given: Any) -> Any:
-        if broken.calls == 1:  # type: ignore[attr-defined]
-            broken.calls += 1  # type: ignore[attr-defined]
-            raise ZeroDivisionError("of something")
-        broken.calls += 1  # type: ignore[attr-defined]
-        return sound(self, *given)
-
-    broken.calls = 0  # type: ignore[attr-defined]
-    of, name = {"read": (FrameFolder, "__getitem__"), "retarget": (RigRetarget, "forward"), "write": (job, "rig_of")}[
-        step
-    ]
-    sound = getattr(of, name)
-    monkeypatch.setattr(of, name, broken)
-    assert main([*command(made["frames"], home / "new"), "--on-error", on_error]) == (0 if on_error == "skip" else 1)
+def test_errors_that_nobody_expects(step: str, on_error: str, frames: Home, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = {"read": (FrameFolder, "__getitem__"), "retarget": (RigRetarget, "forward"), "write": (job, "rig_of")}
+    broken_once(monkeypatch, *steps[step])
+    assert frames.convert("--on-error", on_error) == (0 if on_error == "skip" else 1)
     state = "skipped" if on_error == "skip" else "failed"
-    assert f"0001: {state}: ZeroDivisionError: of something" in capsys.readouterr().err
-    assert (home / "new" / "0002").exists() == (on_error != "fatal")
+    assert f"0001: {state}: ZeroDivisionError: of something" in frames.said
+    assert (frames.output / "0002").exists() == (on_error != "fatal")
 
 
-def test_an_interrupt_is_no_samples_fault(
-    made: dict[str, Path], home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_depth_command_goes_on(frames: Home, monkeypatch: pytest.MonkeyPatch) -> None:
+    sound = FrameFolder.__getitem__
+    monkeypatch.setattr(FrameFolder, "__getitem__", lambda self, index: 1 / 0 if index == 1 else sound(self, index))
+    assert frames.run("depth", "--data", str(frames.source), "--output", str(frames.output)) == 1
+    assert "0001: failed: ZeroDivisionError: division by zero" in frames.said
+    assert sorted(path.name for path in frames.output.iterdir()) == ["0000.npz", "0002.npz"]
+
+
+def test_an_interrupt_is_no_samples_fault(frames: Home, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: Any) -> Any:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(FrameFolder, "__getitem__", interrupted)
-    assert main([*command(made["frames"], home / "new"), "--on-error", "skip"]) == 130
-    assert "run it again to go on" in capsys.readouterr().err
+    assert frames.convert("--on-error", "skip") == 130
+    assert "run it again to go on" in frames.said
 
 
-def test_errors_that_nobody_expects_in_ray_actors(
-    made: dict[str, Path], home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_errors_that_nobody_expects_in_ray_actors(frames: Home, monkeypatch: pytest.MonkeyPatch) -> None:
     """What an actor does: Ray itself is started by the slow test."""
 
     def broken(*_: Any) -> Any:
         raise ZeroDivisionError("of \ud800")
 
-    asked = Settings(root=made["frames"], target=load_rig("argoverse2"), output=home / "new", size=(24, 40))
+    asked = Settings(root=frames.source, target=load_rig("argoverse2"), output=frames.output, size=(24, 40))
     monkeypatch.setattr(FrameFolder, "__getitem__", broken)
     monkeypatch.setattr(ray_runner, "optional_package", lambda *_: SimpleNamespace(get_gpu_ids=list))
     row = Actor(Jobs(asked, asked.open(), range(3), "skip"))({"id": 1})
@@ -426,34 +357,16 @@ def test_errors_that_nobody_expects_in_ray_actors(
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_ray_goes_on_without_a_sample(
-    made: dict[str, Path], home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ray_goes_on_without_a_sample(frames: Home, monkeypatch: pytest.MonkeyPatch) -> None:
     ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'arbiview_aug[distributed]'")
     monkeypatch.setenv("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    source = shutil.copytree(made["frames"], home / "in" / "source")
-    with_calibration(source, name_of("file", "a\ud800b"))
+    frames.calibrate("file", "a\ud800b")
     try:
-        assert main([*command(source, home / "new"), "--runner", "ray", "--on-error", "skip"]) == 0
+        assert frames.convert("--runner", "ray", "--on-error", "skip") == 0
     finally:
         ray.shutdown()
-    assert "0001: skipped: " in capsys.readouterr().err
-
-
-def test_the_depth_command_goes_on(
-    made: dict[str, Path], home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def broken(self: FrameFolder, index: int) -> Any:
-        if index == 1:
-            raise ZeroDivisionError("of something")
-        return sound(self, index)
-
-    sound = FrameFolder.__getitem__
-    monkeypatch.setattr(FrameFolder, "__getitem__", broken)
-    assert main(["depth", "--data", str(made["frames"]), "--output", str(home / "depth")]) == 1
-    assert "0001: failed: ZeroDivisionError: of something" in capsys.readouterr().err
-    assert sorted(path.name for path in (home / "depth").iterdir()) == ["0000.npz", "0002.npz"]
+    assert "0001: skipped: " in frames.said
 
 
 # --- drawn ------------------------------------------------------------------------------------------------------------
@@ -474,29 +387,27 @@ def test_nothing_outside_the_output_changes(
     absolute: bool,
     target: str | None,
     skip: bool,
-    smallest: dict[str, Path],
+    originals: dict[str, Path],
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     """Whatever a file is called, and wherever a link of that name leads: no traceback either."""
-    home = make_home(tmp_path_factory.mktemp("home"))
-    kind = "frames" if place in ("file", "mask", "lidar", "sequence") else "nuscenes"
-    source = shutil.copytree(smallest[kind], home / "in" / "source")
+    is_frame = place in ("file", "mask", "lidar", "sequence")
+    home = Home(tmp_path_factory.mktemp("home"), originals["frames" if is_frame else "nuscenes"])
     if target is not None:
-        _link(source / "0001" if kind == "frames" else source, name, home / target)
-    named = f"{home}/{name}" if absolute else name
+        _link(home.source / "0001" if is_frame else home.source, name, home.root / target)
+    named = f"{home.root}/{name}" if absolute else name
     if place == "sequence":
-        (source / "sequence.json").write_text(json.dumps({"frames": ["0000", named]}))
-    elif kind == "frames":
-        with_calibration(source, name_of(place, named))
+        (home.source / "sequence.json").write_text(json.dumps({"frames": ["0000", named]}))
+    elif is_frame:
+        home.calibrate(place, named)
+    elif place == "camera":
+        home.rename("sample_data", named, "samples/CAM_FRONT/")
     else:
-        table, part = ("sample_data", "samples/CAM_FRONT/") if place == "camera" else (place, "RADAR")
-        renamed(source, table, named, part)
-    before = outside(home)
-    assert main([*command(source, home / "new"), *(["--on-error", "skip"] if skip else [])]) in (0, 1, 2)
-    assert outside(home) == before
-    victims = {value[1] for key, value in before.items() if len(value) > 1}
-    assert not victims & {path.stat().st_ino for path in (home / "new").rglob("*") if path.is_file()}
-    shutil.rmtree(home)
+        home.rename(place, named)
+    victims = {value[1] for value in home.outside().values() if len(value) > 1}
+    assert home.convert(*(["--on-error", "skip"] if skip else [])) in (0, 1, 2)
+    assert not victims & {path.stat().st_ino for path in home.output.rglob("*") if path.is_file()}
+    shutil.rmtree(home.root)
 
 
 def _link(folder: Path, name: str, target: Path) -> None:
