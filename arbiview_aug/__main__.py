@@ -1,34 +1,57 @@
-"""``python -m arbiview_aug COMMAND``: each command is a module with ``main(argv)``, imported on use."""
+"""``python -m arbiview_aug COMMAND``: options are parsed before a command's module is imported."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from importlib import import_module
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
-from arbiview_aug.environment import installed_version, warn_about_cv2_wheels
+from arbiview_aug.cli import parsers
+from arbiview_aug.environment import imported, installed_version, warn_about_cv2_wheels
 from arbiview_aug.errors import exit_status
 
-COMMANDS = {
-    "bench": ("arbiview_aug.cli.bench", "measure speed against accuracy, on your own data too"),
-    "check": ("arbiview_aug.cli.check", "find silent mistakes in a data set, and draw its labels into its images"),
-    "convert": ("arbiview_aug.cli.convert.command", "write a data set as another vehicle's cameras would have seen it"),
-    "demo": ("arbiview_aug.cli.demo", "retarget a synthetic street or real frames, with numbers and a picture"),
-    "depth": ("arbiview_aug.cli.depth", "compute the depth of a drive's frames, from motion or by a network"),
-    "evaluate": ("arbiview_aug.cli.evaluate", "measure the quality of rendered views: metrics, pictures, a report"),
-    "inspect": ("arbiview_aug.cli.rigs", "show rigs: tables, differences, a picture"),
-    "train": ("arbiview_aug.train", "train the generator that completes what no camera saw"),
-}
-"""Module and one-line help of each command."""
 
-_RESUMABLE = ("convert", "depth", "train")
+class Command(NamedTuple):
+    """A command, whose function in ``cli.parsers`` has its name."""
+
+    summary: str
+    module: str  # with ``run``, a function of the parsed arguments
+    resumable: bool = False
+
+
+COMMANDS = {
+    "bench": Command("measure speed against accuracy, on your own data too", "cli.bench.pareto"),
+    "check": Command("find silent mistakes in a data set, and draw its labels into its images", "cli.check"),
+    "convert": Command(
+        "write a data set as another vehicle's cameras would have seen it", "cli.convert.command", resumable=True
+    ),
+    "demo": Command("retarget a synthetic street or real frames, with numbers and a picture", "cli.demo"),
+    "depth": Command("compute the depth of a drive's frames, from motion or by a network", "cli.depth", resumable=True),
+    "evaluate": Command("measure the quality of rendered views: metrics, pictures, a report", "cli.evaluate"),
+    "inspect": Command("show rigs: tables, differences, a picture", "cli.rigs"),
+    "train": Command(
+        "train the generator that completes what no camera saw", "generator.training.command", resumable=True
+    ),
+}
+
+BENCHMARKS = {
+    "pareto": Command("speed against accuracy of all settings, and which to use (the default)", "cli.bench.pareto"),
+    "speed": Command(
+        "milliseconds against bare cv2.remap calls; --device: batches by torch against a copy", "cli.bench.speed"
+    ),
+    "ablation": Command("each stage and setting on and off: dB and milliseconds", "cli.bench.ablation"),
+    "loader": Command("frames per second of a DataLoader, memory per worker", "cli.bench.loader"),
+}
+"""Commands after ``bench``."""
+
+RENAMED = {"trade": "pareto", "neighbours": "speed --only neighbour"}
+"""Benchmarks of version 0.2."""
 
 
 def usage() -> str:
     """The commands with their one-line help."""
-    commands = "\n".join(f"  {name:<9} {summary}" for name, (_, summary) in COMMANDS.items())
     head, tail = "usage: python -m arbiview_aug [--version] COMMAND ...", "python -m arbiview_aug COMMAND --help"
-    return f"{head}\n\ncommands:\n{commands}\n\n{tail} explains each."
+    return f"{head}\n\ncommands:\n{_listed(COMMANDS)}\n\n{tail} explains each."
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -50,11 +73,40 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"python -m arbiview_aug: unknown command {name!r}\n\n{usage()}", file=sys.stderr)
         return 2
     warn_about_cv2_wheels()
+    if name == "bench":
+        return _bench(rest)
+    return run(f"python -m arbiview_aug {name}", name, COMMANDS[name], rest)
 
-    def command() -> int | None:
-        return import_module(COMMANDS[name][0]).main(rest)
 
-    return exit_status(f"python -m arbiview_aug {name}", command, resumable=name in _RESUMABLE)
+def run(program: str, name: str, command: Command, argv: Sequence[str] | None) -> int:
+    """Parse a command's arguments, import it and run it; the exit status of ``main``."""
+
+    def parsed_and_run() -> int | None:
+        parser = getattr(parsers, name)()
+        arguments = parser.parse_args(argv)
+        parsers.check_together(name, parser, arguments)
+        status: int | None = imported(f"arbiview_aug.{command.module}:run")(arguments)
+        return status
+
+    return exit_status(program, parsed_and_run, resumable=command.resumable)
+
+
+def _bench(argv: Sequence[str]) -> int:
+    """Run the benchmark that is named first, else ``pareto``; ``--help`` after its name explains it."""
+    program = "python -m arbiview_aug bench"
+    if argv[:1] in (["-h"], ["--help"]):
+        print(f"usage: {program} [BENCHMARK] ...\n\nMeasurements, as tables and JSON.\n\nbenchmarks:")
+        print(f"{_listed(BENCHMARKS)}\n")
+    name, *rest = argv if argv and not argv[0].startswith("-") else ["pareto", *argv]
+    if name not in BENCHMARKS:
+        new = f"; it is now {program} {RENAMED[name]}" if name in RENAMED else ""
+        print(f"{program}: expected one of {', '.join(BENCHMARKS)}, got {name!r}{new}", file=sys.stderr)
+        return 2
+    return run(program, name, BENCHMARKS[name], rest)
+
+
+def _listed(commands: Mapping[str, Command]) -> str:
+    return "\n".join(f"  {name:<9} {command.summary}" for name, command in commands.items())
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from arbiview_aug import RigRetarget
 from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import shipped_rigs
 from arbiview_aug.choices import SurfaceName
-from arbiview_aug.cli.bench import neighbours, trade
+from arbiview_aug.cli.bench import pareto
 from arbiview_aug.cli.bench.ablation import NOTES, ROWS, STEPS, markdown
 from arbiview_aug.datasets import registry
 from arbiview_aug.evaluate import paper_study
@@ -43,41 +43,41 @@ LARGEST_PICTURE_BYTES = 300_000
 LARGEST_PICTURES_BYTES = 900_000
 
 TINY_DEMO = ["--size", "40x104", "--width", "600"]
-TINY_BENCH = ["--quality", "draft", "--reduce", "4", "--size", "40x72", "--repeats", "1"]
+TINY_BENCH = ["--quality", "draft", "--downscale", "4", "--size", "40x72", "--repeats", "1"]
 TINY = {
     "demo": TINY_DEMO,  # the install line's
     "demo --seed 2 --width 1400 --output docs/images/demo.jpg": TINY_DEMO,
     "demo --target truck.yaml --seed 2 --width 1000 --output docs/images/truck.jpg": TINY_DEMO,
     "demo --target truck.yaml": TINY_DEMO,
     "demo --data FOLDER --target waymo": ["--size", "64x112"],
-    "evaluate --data FOLDER --yaws paper": ["--reduce", "4", "--size", "40x72"],
-    "evaluate --data FOLDER --target waymo": ["--reduce", "4", "--size", "40x72"],
-    "evaluate --displaced --data FOLDER": ["--surface", "street", "--reduce", "4", "--frames", "1"],
+    "evaluate --data FOLDER --target-set paper": ["--downscale", "4", "--size", "40x72"],
+    "evaluate --data FOLDER --target waymo": ["--downscale", "4", "--size", "40x72"],
+    "evaluate --displaced --data FOLDER": ["--surface", "street", "--downscale", "4", "--frames", "1"],
     "evaluate --paper": ["--size", "16x44", "--frames", "1"],
-    "evaluate --figure --data FOLDER": ["--reduce", "4"],
-    "check FOLDER": ["--reduce", "4"],
-    "check FOLDER --frames 5 --output output": ["--reduce", "4"],
+    "evaluate --figure --data FOLDER": ["--downscale", "4"],
+    "check FOLDER": ["--downscale", "4"],
+    "check FOLDER --frames 5 --output output": ["--downscale", "4"],
     "inspect nuscenes waymo": [],
     "inspect nuscenes waymo --output docs/images/rigs.jpg": [],
     "inspect nuscenes truck.yaml": [],
     "bench --data FOLDER --budget-ms 20": [*TINY_BENCH, "--surface", "far", "lidar", "--budget-ms", "5000"],
     "bench --data FOLDER --budget-ms 200": [*TINY_BENCH, "--surface", "far", "lidar", "--budget-ms", "5000"],
     "bench loader --data FOLDER": [
-        *["--surface", "street", "--size", "32x88", "--reduce", "4", "--workers", "0", "1"],
+        *["--surface", "street", "--size", "32x88", "--downscale", "4", "--workers", "0", "1"],
         *["--frames", "2", "--epochs", "1"],
     ],
-    "bench neighbours": ["--size", "32x88", "--repeats", "1", "--counts", "0", "1", "--surface", "street"],
+    "bench speed --only neighbour": ["--repeats", "1", "--size", "32x88"],
     "bench speed --device cuda": ["--device", "cpu", "--repeats", "1"],
     "bench speed": ["--repeats", "1", "--size", "32x88"],
     "convert --data FOLDER --target argoverse2 --output converted --size 256x704": [
-        *("--size", "24x40", "--reduce", "4", "--workers", "1", "--surface", "street", "--report", "0")
+        *("--size", "24x40", "--downscale", "4", "--workers", "1", "--surface", "street", "--report", "0")
     ],
     "depth --data FOLDER": ["--output", "depth"],
     "depth --model ID_OR_PATH --data FOLDER": ["--output", "depth"],
     "depth --model ID_OR_PATH --data FOLDER --reference motion road": ["--output", "depth"],
     "depth --fit --data FOLDER": ["--output", "depth", "--fit", "2"],
-    "evaluate --data FOLDER --target waymo --surface learned street": ["--reduce", "4", "--surface", "street"],
-    "bench ablation --data FOLDER": ["--reduce", "4", "--only", "street, not far"],
+    "evaluate --data FOLDER --target waymo --surface learned street": ["--downscale", "4", "--surface", "street"],
+    "bench ablation --data FOLDER": ["--downscale", "4", "--only", "street, not far"],
     "train --output output/tiny": ["--quiet", *SMALLER],
 }
 """Every command of the README and the pages, and options that make it quick."""
@@ -89,7 +89,7 @@ SLOW = (
     "evaluate --paper",
     "evaluate --figure",
     "evaluate --data FOLDER --target waymo --surface learned",
-    "evaluate --data FOLDER --yaws",
+    "evaluate --data FOLDER --target-set",
 )
 
 
@@ -244,25 +244,16 @@ def test_the_ablation_is_the_commands() -> None:
 
 
 def test_the_trade_is_the_commands() -> None:
-    (block,) = re.findall(r"<!-- trade -->\n(.*?)<!-- /trade -->", BENCHMARKS, re.DOTALL)
+    (block,) = re.findall(r"<!-- pareto -->\n(.*?)<!-- /pareto -->", BENCHMARKS, re.DOTALL)
     (table,) = re.findall(r"((?:^\|.*\n)+)", block, re.MULTILINE)
     head, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
-    assert head == ["", "", *(heading for heading, _ in trade.COLUMNS)]
-    known = {setting.name for setting in trade.settings(["far", "ground", "street", "lidar"])}
+    assert head == ["", "", *(heading for heading, _ in pareto.COLUMNS)]
+    known = {setting.name for setting in pareto.settings(["far", "ground", "street", "lidar"])}
     assert {name for name, *_ in rows} <= known and sum(mark == "step" for _, mark, *_ in rows) >= 3
-    assert trade.NOTES in block
+    assert pareto.NOTES in block
     fastest = min(float(row[2]) for row in rows if "lidar" in row[0])  # the others are static, and cameras move
     assert f"\nNo recommendation: nothing keeps to 20 ms: the fastest takes {fastest} ms. Static surfaces " in block
     assert f"Better: {HELPFUL_DATA}.\n" in block
-
-
-def test_the_neighbours_table_is_the_commands() -> None:
-    (table,) = tables(measured("neighbours"))
-    counts = dict.fromkeys(neighbours.NEEDS, neighbours.COUNTS) | {"motion": neighbours.MOTION_COUNTS}
-    names = [neighbours.row_name(surface, n) for surface in neighbours.NEEDS for n in counts[surface]]
-    assert table[0] == ["", *(heading for heading, _ in neighbours.COLUMNS)] and [row[0] for row in table[2:]] == names
-    assert all(re.fullmatch(r"[\d.]+%?", cell) for row in table[2:] for cell in row[1:])
-    assert neighbours.NOTES in measured("neighbours")
 
 
 def test_the_generators_table_is_the_commands() -> None:

@@ -16,7 +16,7 @@ PACKAGE = Path(__file__).parents[1] / "arbiview_aug"
 ROOMS = (
     *("choices", "errors", "environment", "lru_cache", "atomic_io", "image_ops"),
     *("cameras", "scene", "favs", "sample", "render", "temporal", "generator", "transforms", "datasets", "evaluate"),
-    *("cli", "generator.training", "train", "integrations", "__main__"),
+    *("cli", "generator.training", "__main__", "train", "integrations"),
 )
 """From the ground up: a module imports from its own room and from those before it, within functions too.
 

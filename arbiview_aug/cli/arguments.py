@@ -4,24 +4,32 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, NoReturn, get_args
 
-import torch
 from tqdm import tqdm
 
-from arbiview_aug.cameras.rig import shipped_rigs
-from arbiview_aug.choices import Reduce, RenderPath
+from arbiview_aug.cameras.shipped import shipped_rigs
+from arbiview_aug.choices import Reduce, RenderPath, SurfaceName
 from arbiview_aug.datasets.registry import READERS, kinds_of, split_kind
 from arbiview_aug.errors import DataError
 from arbiview_aug.favs.config import Quality
-from arbiview_aug.scene.scene import SURFACES
+
+if TYPE_CHECKING:
+    import torch
 
 REAL_TARGET = "waymo"  # default target rig of real frames
+
+RENAMED = {
+    "--motion-depth": "--depth",
+    "--reduce": "--downscale",
+}
+"""Options of version 0.2."""
 
 
 class _HelpFormatter(argparse.HelpFormatter):
@@ -32,8 +40,22 @@ class _HelpFormatter(argparse.HelpFormatter):
         has_none = default is None or isinstance(default, bool) or default in ("", [], argparse.SUPPRESS)
         if has_none or "default" in text or not action.option_strings:
             return text
-        words = " ".join(map(str, default)) if isinstance(default, list) else str(default)
-        return f"{text} (default: {words})"
+        shown = [f"{one[0]}x{one[1]}" if isinstance(one, tuple) else str(one) for one in _several(default)]
+        return f"{text} (default: {' '.join(shown)})"
+
+
+class _Parser(argparse.ArgumentParser):
+    """Parser whose errors give the new names of options that were renamed."""
+
+    def error(self, message: str) -> NoReturn:
+        for old, new in RENAMED.items():
+            if re.search(rf"(?<![\w-]){old}(?![\w-])", message):
+                message += f"; {old} is now {new}"
+        super().error(message)
+
+
+def _several(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
 
 
 def command_parser(
@@ -41,7 +63,7 @@ def command_parser(
 ) -> argparse.ArgumentParser:
     """Create the parser of a command, without its options; ``example`` shows arguments at work."""
     prog = f"{program} {command}".strip()
-    return argparse.ArgumentParser(
+    return _Parser(
         prog=prog, description=description, epilog=f"example: {prog} {example}", formatter_class=_HelpFormatter
     )
 
@@ -80,7 +102,7 @@ def add_rendering(parser: argparse.ArgumentParser, *, several: bool = False) -> 
     path = "what fills holes; favs: continued from their borders (docs/holes.md)"
     for name, choices, default, text in (
         ("--quality", get_args(Quality), "fast", quality),
-        ("--surface", tuple(SURFACES), "auto", "scene geometry; auto: the best that the data offers"),
+        ("--surface", get_args(SurfaceName), "auto", "scene geometry; auto: the best that the data offers"),
         ("--path", get_args(RenderPath), "favs", path),
     ):
         options: dict[str, Any] = {"nargs": "+", "default": [default]} if several else {"default": default}
@@ -100,11 +122,14 @@ def add_frames(parser: argparse.ArgumentParser, default: int | None, text: str =
     )
 
 
-def add_reduce(parser: argparse.ArgumentParser) -> None:
-    """Add ``--reduce`` and ``--clean-masks``."""
-    parser.add_argument(
-        "--reduce", type=int, choices=get_args(Reduce), default=1, help="decode images at 1/N of their size"
-    )
+def add_downscale(parser: argparse.ArgumentParser, default: Reduce = 1) -> None:
+    text = "decode images at 1/N of their size"
+    parser.add_argument("--downscale", dest="reduce", type=int, choices=get_args(Reduce), default=default, help=text)
+
+
+def add_reading(parser: argparse.ArgumentParser) -> None:
+    """Add ``--downscale`` and ``--clean-masks``."""
+    add_downscale(parser)
     text = "take specks out of frame folders' masks, and mask the dark rims of fisheye images without a mask"
     parser.add_argument("--clean-masks", action="store_true", help=text)
 
@@ -131,6 +156,15 @@ def positive(text: str) -> float:
     return value
 
 
+def degrees(text: str) -> list[float]:
+    """Angles from ``-11,11``."""
+    try:
+        return [float(value) for value in text.split(",")]
+    except ValueError:
+        expected = "degrees such as -11,11 (names of sets are for --target-set)"
+        raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}") from None
+
+
 def _integer(text: str, least: int, expected: str) -> int:
     value = int(text)
     if value < least:
@@ -140,6 +174,8 @@ def _integer(text: str, least: int, expected: str) -> int:
 
 def device_named(name: str | None) -> torch.device:
     """Torch device of this name, by default a GPU if there is one; DataError for one that is not there."""
+    import torch
+
     if name is None:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -166,6 +202,15 @@ def writable_folder(path: Path, asked: str) -> Path:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(f"--output {asked}: expected a folder that can be written to, got {error.strerror}") from None
+    return path
+
+
+def output_file(asked: str) -> Path:
+    """Path of a file to write, given by ``--output``; creates its folder before any work starts."""
+    path = Path(asked)
+    if path.is_dir():
+        raise DataError(f"--output {asked}: expected a file, got a folder")
+    writable_folder(path.parent, asked)
     return path
 
 

@@ -2,43 +2,25 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from arbiview_aug.cameras.rig import load_rig
-from arbiview_aug.cli.arguments import (
-    add_output,
-    add_reduce,
-    command_parser,
-    count,
-    data,
-    gathered_warnings,
-    kinds_text,
-    writable_folder,
-)
+from arbiview_aug.cli.arguments import data, gathered_warnings, writable_folder
 from arbiview_aug.datasets.registry import open_data, split_kind
+from arbiview_aug.evaluate.images import as_arrays
+from arbiview_aug.evaluate.report.pictures import draw_labels, save_picture
 from arbiview_aug.sample.mistakes import CheckReport, check, check_rig
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Print one line for each finding, and draw the first frame; 1 if there are findings."""
-    parser = command_parser(
-        "check",
-        "Look for silent mistakes: yaw in degrees, other columns or axes, points in the LiDAR's frame, a wrong road, "
-        "K of another resolution, specks in masks, keys that are not read. Draws boxes and points into the images.",
-        "/data/frames --frames 5",
-    )
-    text = f"real frames, by their path alone or with their kind, or a rig file. {kinds_text()}"
-    parser.add_argument("data", metavar="[KIND:]PATH", help=text)
-    parser.add_argument("--frames", type=count, default=3, metavar="N", help="number of frames, spread over the data")
-    add_reduce(parser)
-    add_output(parser, "folder for the pictures")
-    arguments = parser.parse_args(argv)
     kind, path = split_kind(arguments.data)
     if kind is None and not os.path.isdir(path):
         report = CheckReport(tuple(check_rig(load_rig(arguments.data))))
@@ -69,10 +51,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _draw(sample: Mapping[str, Any], folder: Path) -> str:
     """Write a picture for each camera of a reader's sample; return what they are called."""
-    # Imported late so that --help is quick.
-    from arbiview_aug.evaluate.images import as_arrays
-    from arbiview_aug.evaluate.report.pictures import draw_labels, save_picture
-
     points, boxes = (None if sample.get(key) is None else sample[key].numpy() for key in ("points", "boxes_3d"))
     for camera, image in zip(sample["rig"], as_arrays(sample["images"]), strict=True):
         name = re.sub(r"[^\w+-]+", "-", camera.name)

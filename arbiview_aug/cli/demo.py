@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import statistics
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from timeit import timeit
@@ -12,17 +11,7 @@ from timeit import timeit
 import cv2
 
 from arbiview_aug.choices import RenderPath, SurfaceName
-from arbiview_aug.cli.arguments import (
-    add_data,
-    add_frames,
-    add_output,
-    add_rendering,
-    add_target,
-    command_parser,
-    count,
-    gathered_warnings,
-    writable_folder,
-)
+from arbiview_aug.cli.arguments import gathered_warnings, writable_folder
 from arbiview_aug.cli.evaluate import frames_text, measured, open_frames
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.methods import Method, retargeting, views_of
@@ -38,12 +27,8 @@ _TIMED_CALLS = 5
 _SYNTHETIC_SIZE = (256, 704)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Retarget, explain, compare, and write the contact sheet."""
-    parser = _parser()
-    arguments = parser.parse_args(argv)
-    if arguments.quality == "paper" and arguments.surface not in ("auto", "far"):
-        parser.error(f"argument --surface: quality paper knows the far surface alone, got {arguments.surface}")
     path = Path(arguments.output)
     if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         path = path / PICTURE_FILE
@@ -77,24 +62,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     truth = None if done.first is None or done.first.truth is None else as_arrays(done.first.truth(target).images)
     sheet = frame_sheet(source, as_arrays(sample["images"]), target, views, truth, width_px=arguments.width)
     print(f"picture: {save_picture(path, sheet)}")
-    return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "demo",
-        "Retarget a synthetic street, or real frames, to another vehicle's cameras: the plan in words, metrics, time, "
-        "and one contact sheet.",
-        "--data FOLDER --target waymo",
-    )
-    add_data(parser, "a synthetic street")
-    add_target(parser)
-    add_output(parser, f"folder for {PICTURE_FILE}, or a picture file ending in .png or .jpg")
-    add_rendering(parser)
-    add_frames(parser, 1)
-    parser.add_argument("--width", type=count, default=1800, metavar="PX", help="width of the contact sheet")
-    parser.set_defaults(yaws=None, reduce=1, clean_masks=False)
-    return parser
 
 
 def _compared(quality: Quality, surface: SurfaceName, path: RenderPath) -> list[Method]:

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from arbiview_aug.atomic_io import inside, remove_parts
 from arbiview_aug.choices import Reference
-from arbiview_aug.cli.arguments import add_data, command_parser, count, device_named, gathered_warnings, writable_folder
+from arbiview_aug.cli.arguments import device_named, gathered_warnings, writable_folder
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.depth_folder import FOLDER, LEARNED_FOLDER, WANTED, DepthFolder
 from arbiview_aug.datasets.registry import open_data, split_kind
@@ -133,48 +133,9 @@ class _Inputs(Dataset[_Loaded | Done]):
         return _Loaded(token, DepthInputs(frame.rig, frame.images, points, motion, scene.boxes), origin)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Compute and write the depth of every frame that has none yet; return 1 if a frame failed, else 0."""
-    parser = command_parser(
-        "depth",
-        "Compute the depth of every frame of a drive: from motion, for surface='motion', or with --model by a network, "
-        "for surface='learned'. Frames whose depth is there, of the same origin, are left as they are: run it again to "
-        "go on.",
-        "--data nuscenes:ROOT --workers 4",
-    )
-    add_data(parser)
-    parser.add_argument(
-        "--output",
-        metavar="FOLDER",
-        help=f"where to write (default: {FOLDER} or {LEARNED_FOLDER} beside the data)",
-    )
-    parser.add_argument("--workers", type=count, default=1, metavar="N", help="processes")
-    parser.add_argument(
-        "--model", metavar="ID_OR_PATH", help="depth model of transformers: a folder, or a name on its Hub"
-    )
-    parser.add_argument(
-        "--fit",
-        type=count,
-        nargs="?",
-        const=2000,
-        metavar="STEPS",
-        help="instead of --model: a small network that learns from this drive alone (2000 steps without a number)",
-    )
-    parser.add_argument("--device", metavar="NAME", help="cpu, cuda, cuda:1, ... (default: the GPU, if there is one)")
-    parser.add_argument("--batch", type=count, default=8, metavar="N", help="images that the model sees at once")
-    parser.add_argument(
-        "--reference",
-        nargs="+",
-        choices=get_args(Reference),
-        default=list(get_args(Reference)),
-        help="what scale and shift of the model are fitted to, the first that a camera has",
-    )
-    arguments = parser.parse_args(argv)
-    if arguments.model and arguments.fit:
-        parser.error("argument --fit: expected it without --model")
     is_learned = arguments.model is not None or arguments.fit is not None
-    if arguments.device and not is_learned:
-        parser.error("argument --device: expected it with --model alone: depth from motion is computed on the CPU")
     device = device_named(arguments.device)
     data: Any = open_data(arguments.data, neighbours=None if arguments.model else WANTED)
     _, root = split_kind(arguments.data)

@@ -19,26 +19,12 @@ from typing import Any
 from arbiview_aug.atomic_io import inside
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import SurfaceName
-from arbiview_aug.cli.arguments import (
-    REAL_TARGET,
-    add_data,
-    add_frames,
-    add_output,
-    add_reduce,
-    add_rendering,
-    add_target,
-    command_parser,
-    count,
-    gathered_warnings,
-    named_steps,
-    writable_folder,
-)
+from arbiview_aug.cli.arguments import REAL_TARGET, gathered_warnings, named_steps, writable_folder
 from arbiview_aug.datasets import FrameFolder, open_data
 from arbiview_aug.datasets.depth_folder import LEARNED_FOLDER, WANTED, WithDepth
 from arbiview_aug.datasets.registry import split_kind
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate import paper_study
 from arbiview_aug.evaluate.displaced import COPY, displaced_frames, surfaces_for
 from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
 from arbiview_aug.evaluate.images import as_arrays
@@ -55,24 +41,11 @@ from arbiview_aug.generator.config import TrainedOn
 from arbiview_aug.sample.inputs import LEARNED_KEY
 from arbiview_aug.scene.scene import SURFACES
 
-_FIXED = {
-    "paper": ("target", "yaws", "quality", "surface", "path", "steps", "seed", "reduce", "clean_masks"),
-    "figure": ("target", "yaws", "quality", "surface", "path", "steps", "frames"),
-    "displaced": ("target", "yaws", "seed", "size"),
-}
-"""Options that the modes fix."""
+_MODES = ("paper", "figure", "displaced")  # their options are no settings of an evaluation
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Measure, print the tables, write JSON, pictures and the report."""
-    parser = _parser()
-    arguments = parser.parse_args(argv)
-    for mode, fixed in _FIXED.items():
-        for name in fixed:
-            if getattr(arguments, mode) and getattr(arguments, name) != parser.get_default(name):
-                parser.error(f"argument --{name.replace('_', '-')}: --{mode} has its own; expected none")
-    if arguments.displaced and arguments.data is None:
-        parser.error("argument --displaced: expected --data FOLDER with it, found none")
     folder = writable_folder(Path(arguments.output), arguments.output)
     notes: list[str] = []
     if arguments.paper:
@@ -84,66 +57,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     for note in notes:
         print(f"note: {note}\n")
     print(text)
-    return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "evaluate",
-        "Measure the quality of rendered views: sparse LiDAR metrics, overlap and consistency on real frames, truth on "
-        "synthetic streets. Writes tables, evaluate.json, pictures, and a self-contained report.html.",
-        "--data FOLDER --target waymo --surface auto street",
-    )
-    add_data(parser, "synthetic streets")
-    target = parser.add_mutually_exclusive_group()
-    add_target(target)
-    target.add_argument(
-        "--yaws",
-        metavar="SET",
-        type=_yaws,
-        help="instead of --target: paper (its six configurations), yaw (5 turns), vehicles, truck (1 m higher), or "
-        "degrees such as --yaws=-11,11",
-    )
-    add_rendering(parser, several=True)
-    parser.add_argument(
-        "--generator",
-        metavar="PATH",
-        help="of --path diffusion, --paper and --figure, as in convert; these score held-out frames of its training",
-    )
-    steps = "steps of the generator (default: its own)"
-    parser.add_argument("--steps", nargs="+", type=count, default=[None], metavar="N", help=steps)
-    add_frames(parser, None, "number of frames (default: 1; --paper: 3 synthetic ones; --displaced: all)")
-    add_reduce(parser)
-    add_output(parser)
-    what = parser.add_mutually_exclusive_group()
-    what.add_argument(
-        "--displaced",
-        nargs="?",
-        const=True,
-        metavar="NEXT",
-        help="photographs as truth: of the frames' `truth` camera (docs/formats.md), else of the next frame of the "
-        "drive; with NEXT of this frame folder's first frame. Surfaces: a copy, and all that the data offers",
-    )
-    what.add_argument(
-        "--paper",
-        action="store_true",
-        help="the paper's Tables 1 and 2: baselines, the published stages and ours; without --data on nuscenes-one and "
-        "ddad-one below ARBIVIEW_DATA and on synthetic streets; quarter of an hour",
-    )
-    what.add_argument(
-        "--figure", action="store_true", help="the paper's Figures 2 to 6 from the first frame, as PNG files"
-    )
-    return parser
-
-
-def _yaws(text: str) -> str | list[float]:
-    if text in paper_study.SETS:
-        return text
-    try:
-        return [float(value) for value in text.split(",")]
-    except ValueError:
-        expected = f"{', '.join(paper_study.SETS)}, or degrees such as -11,11"
-        raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}") from None
 
 
 # --- frames and targets -----------------------------------------------------------------------------------------------
@@ -163,11 +76,11 @@ def open_frames(arguments: argparse.Namespace, surfaces: Sequence[SurfaceName], 
 
 def target_rigs(arguments: argparse.Namespace, chosen: Rig | None, source: Rig) -> dict[str, Rig]:
     """Rigs to render, by name; ``chosen`` is the rig of ``--target``."""
-    if arguments.yaws is None:
+    if arguments.target_set is not None:
+        found = named_targets(arguments.target_set, source)
+    elif arguments.yaws is None:
         rig = chosen or (load_rig(REAL_TARGET) if arguments.data else demo_target_rig(source.sizes[0]))
         found = {rig.name or "target": rig}
-    elif isinstance(arguments.yaws, str):
-        found = named_targets(arguments.yaws, source)
     else:
         found = {f"yaw {yaw:+g}": without_masks(source.turned(yaw_deg=yaw)) for yaw in arguments.yaws}
     if "paper" in arguments.quality:  # homographies know no lens; all methods share the targets
@@ -240,7 +153,7 @@ def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> 
     count_of = len({view["frame"] for view in done.views})
     source = arguments.data or f"Synthetic streets, seed {arguments.seed}"
     title = f"{source}: {count_of} frame{'s' * (count_of > 1)}"
-    settings = {key: value for key, value in vars(arguments).items() if key not in _FIXED}
+    settings = {key: value for key, value in vars(arguments).items() if key not in _MODES}
     report: dict[str, Any] = {"arguments": settings, "scored_on_other_points": done.first.held_out}
     report |= dict(zip(("means", "agreement"), (rows for _, rows, *_ in tables), strict=False))
     report |= {"views": done.views, "pairs": done.pairs}

@@ -2,47 +2,28 @@
 
 from __future__ import annotations
 
+import argparse
 import os
-import sys
-from collections.abc import Sequence
 
 import numpy as np
 
-from arbiview_aug.cameras.rig import Rig, load_rig, shipped_rigs
-from arbiview_aug.cli.arguments import command_parser, data
+from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.cli.arguments import data
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE
 from arbiview_aug.datasets.registry import open_data, split_kind
-from arbiview_aug.errors import ArbiviewError
+from arbiview_aug.evaluate.report.pictures import save_picture
+from arbiview_aug.evaluate.report.rig_picture import draw_rigs
 from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.evaluate.rig_gap import rig_gap
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Print the rigs and the differences of the others from the first; write the picture."""
-    parser = command_parser("inspect", "Show rigs: tables, differences, a picture.", "nuscenes waymo")
-    parser.add_argument(
-        "rigs",
-        nargs="+",
-        metavar="RIG",
-        help=f"a shipped rig ({', '.join(shipped_rigs())}), a rig file (YAML or JSON), or data as other commands' "
-        "--data takes it: the rig of its first frame",
-    )
-    parser.add_argument("--output", default="inspect.png", metavar="FILE", help="the picture")
-    arguments = parser.parse_args(argv)
-    # Imported late so that --help is quick.
-    from arbiview_aug.evaluate.report.pictures import save_picture
-    from arbiview_aug.evaluate.report.rig_picture import draw_rigs
-
-    try:
-        rigs = [_load(name) for name in arguments.rigs]
-        print("\n\n".join(map(repr, rigs)))
-        for other in rigs[1:]:
-            print(f"\n{differences(rigs[0], other)}\n\n{rig_gap(rigs[0], other)}")
-        print(f"\npicture: {save_picture(arguments.output, draw_rigs(rigs))}")
-    except ArbiviewError as error:
-        print(f"{parser.prog}: {error}", file=sys.stderr)
-        return 2
-    return 0
+    rigs = [_load(name) for name in arguments.rigs]
+    print("\n\n".join(map(repr, rigs)))
+    for other in rigs[1:]:
+        print(f"\n{differences(rigs[0], other)}\n\n{rig_gap(rigs[0], other)}")
+    print(f"\npicture: {save_picture(arguments.output, draw_rigs(rigs))}")
 
 
 def differences(source: Rig, target: Rig) -> str:

@@ -48,7 +48,7 @@ def test_numbers_agree_with_the_protocol(
     referee: ModuleType, nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The command's sparse figures, against the protocol's metrics of the same renderings."""
-    common = ["--data", str(nuscenes_root), "--reduce", "2", "--surface", "street"]
+    common = ["--data", str(nuscenes_root), "--downscale", "2", "--surface", "street"]
     found = run([*common, "--yaws", "22"], tmp_path)
     assert "every other degree" not in capsys.readouterr().out
     sample = FrameFolder(nuscenes_root, reduce=2)[0]
@@ -82,7 +82,7 @@ def test_numbers_agree_with_the_protocol(
 def test_points_that_methods_may_read_do_not_score(
     nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    common = ["--data", str(nuscenes_root), "--reduce", "4", "--target", "waymo", "--size", "80x144"]
+    common = ["--data", str(nuscenes_root), "--downscale", "4", "--target", "waymo", "--size", "80x144"]
     whole = run([*common, "--surface", "street"], tmp_path / "street")
     held = run([*common, "--surface", "auto"], tmp_path / "auto")
     assert held["scored_on_other_points"] and not whole["scored_on_other_points"]
@@ -137,9 +137,9 @@ def test_figures(nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     "arguments",
     [
         ["--yaws", "left"],
-        ["--target", "waymo", "--yaws", "paper"],
+        ["--target", "waymo", "--target-set", "paper"],
         ["--paper", "--figure"],
-        ["--paper", "--yaws", "yaw"],
+        ["--paper", "--target-set", "yaw"],
         ["--figure", "--surface", "far"],
         ["--displaced"],
         ["--displaced", "--target", "waymo", "--data", "."],

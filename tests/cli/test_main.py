@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib
-import importlib.util
+import inspect
 import json
 import os
 import re
@@ -14,12 +15,17 @@ import warnings
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from types import SimpleNamespace
+from typing import get_args
 
 import pytest
 
 from arbiview_aug import __main__, environment, load_rig
-from arbiview_aug.__main__ import COMMANDS, main
+from arbiview_aug.__main__ import BENCHMARKS, COMMANDS, Command, main
+from arbiview_aug.choices import TARGET_SETS, TRAINING_PRESETS, SurfaceName
+from arbiview_aug.evaluate import paper_study
+from arbiview_aug.favs.config import PRESETS, Quality
+from arbiview_aug.generator.training.config import CONFIGS
+from arbiview_aug.scene.scene import SURFACES
 
 
 @pytest.fixture(autouse=True)
@@ -133,8 +139,8 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("inspect million.yaml", r"expected at most 128 cameras in 1 MiB, got a file of 23\.8 MiB"),
         *((f"check {name}", "expected at most 128 cameras, got 1[25]. or more") for name in ("crowd", "few")),
         ("convert --data frame --target waymo --output o --version v1.0-mini", "expected no version, which a frame f"),
-        *((f"bench trade --budget-ms {ms}", "expected a finite number above 0") for ms in (-1, 0, "nan", "inf")),
-        ("bench trade --generator /nope", "generator /nope: expected a folder of a generator or .*, found none"),
+        *((f"bench pareto --budget-ms {ms}", "expected a finite number above 0") for ms in (-1, 0, "nan", "inf")),
+        ("bench pareto --generator /nope", "generator /nope: expected a folder of a generator or .*, found none"),
         ("evaluate --path diffusion --generator /nope", "generator /nope: expected a folder of a generator"),
         ("depth --data frame --device nope", "argument --device: expected it with --model alone"),
         ("depth --data frame --model m --device nope", "expected cpu, cuda, cuda:1, ..., got 'nope'"),
@@ -170,30 +176,72 @@ def test_version(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
     assert capsys.readouterr().out == "arbiview_aug (not installed)\n"
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_has_a_module(name: str) -> None:
-    assert importlib.util.find_spec(COMMANDS[name][0]) is not None
+ALL = {**COMMANDS, **{f"bench {name}": command for name, command in BENCHMARKS.items()}}
 
 
-def test_the_dispatcher_imports_no_command_and_nothing_optional() -> None:
-    modules = ["sklearn", "torchvision", "diffusers", "arbiview_aug.cli.rigs", "arbiview_aug.evaluate.report.pictures"]
-    code = (
-        "import sys; from arbiview_aug.__main__ import main; main(['--version']); "
-        f"sys.exit(', '.join(m for m in {modules} if m in sys.modules) or 0)"
-    )
+@pytest.mark.parametrize("command", ALL.values())
+def test_every_command_runs_a_function(command: Command) -> None:
+    module = importlib.import_module(f"arbiview_aug.{command.module}")
+    assert next(iter(inspect.signature(module.run).parameters)) == "arguments"
+
+
+def test_help_imports_nothing_that_takes_time() -> None:
+    """Neither torch nor OpenCV nor numba, and none of the package's modules of work, before arguments are parsed."""
+    code = f"""
+import contextlib, io, sys
+from arbiview_aug import train
+from arbiview_aug.__main__ import main
+for words in {["", *ALL]}:
+    with contextlib.redirect_stdout(io.StringIO()) as said, contextlib.suppress(SystemExit):
+        main([*words.split(), "--help"])
+    assert "usage: python -m arbiview_aug" in said.getvalue(), words
+    loaded = {{"torch", "cv2", "numba", "sklearn", "diffusers", "arbiview_aug.scene"}} & {{*sys.modules}}
+    assert not loaded, (words, loaded)
+with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+    train.main(["--help"])
+assert "torch" not in sys.modules
+"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=500)
-    assert done.returncode == 0 and not done.stderr, done.stderr
+    assert done.returncode == 0, done.stderr
+
+
+def test_names_in_options_are_those_of_the_tables() -> None:
+    assert [*get_args(Quality)] == [*PRESETS] and {*get_args(SurfaceName)} == {*SURFACES}
+    assert {*TRAINING_PRESETS} == {*CONFIGS} and paper_study.SETS == TARGET_SETS
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("convert --data d --target waymo --output o --reduce 2", "--reduce is now --downscale"),
+        ("convert --data d --target waymo --output o --motion-depth=d", "--motion-depth is now --depth"),
+        (
+            "evaluate --yaws vehicles",
+            "names of sets are for --target-set",
+        ),
+        ("bench trade", "it is now python -m arbiview_aug bench pareto"),
+        ("bench neighbours", "it is now python -m arbiview_aug bench speed --only neighbour"),
+    ],
+)
+def test_old_names_give_the_new_ones(command: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        assert main(command.split()) == 2
+    except SystemExit as refused:
+        assert refused.code == 2
+    assert re.search(message, capsys.readouterr().err.splitlines()[-1])
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_an_interrupt_is_one_line_and_130(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def interrupted(_: list[str]) -> int:
+    def interrupted(_: argparse.Namespace) -> int:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(__main__, "import_module", lambda _: SimpleNamespace(main=interrupted))
-    assert main([name]) == 130
+    monkeypatch.setattr(__main__, "imported", lambda _: interrupted)
+    needed = {"check": ["d"], "inspect": ["d"], "depth": ["--data", "d"]}
+    needed["convert"] = ["--data", "d", "--target", "waymo", "--output", "o"]
+    assert main([name, *needed.get(name, [])]) == 130
     fix = "; run it again to go on" if name in ("convert", "depth", "train") else ""
     assert capsys.readouterr().err == f"python -m arbiview_aug {name}: interrupted{fix}\n"
 
@@ -251,7 +299,15 @@ HELP = {
     "check": ("[KIND:]PATH", "--frames N", "--output DIR", "--clean-masks"),
     "demo": ("--data [KIND:]PATH", "--target RIG", "--output DIR", "--quality", "--surface", "--seed N seed of"),
     "depth": ("--data [KIND:]PATH", "--output", "--workers"),
-    "evaluate": ("--data [KIND:]PATH", "--target RIG", "--output DIR", "--quality", "--yaws", "--paper"),
+    "evaluate": (
+        "--data [KIND:]PATH",
+        "--target RIG",
+        "--output DIR",
+        "--quality",
+        "--target-set",
+        "--yaws",
+        "--paper",
+    ),
     "inspect": ("RIG", "--output FILE"),
     "train": ("--data", "--output DIR", "--config", "--set KEY=VALUE"),
 }

@@ -7,15 +7,16 @@ from pathlib import Path
 import cv2
 import pytest
 
+from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import load_rig
-from arbiview_aug.cli.rigs import differences, main
+from arbiview_aug.cli.rigs import differences
 
 
 def test_prints_tables_and_differences_and_writes_the_picture(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = tmp_path / "rigs.png"
-    assert main(["nuscenes", "waymo", "--output", str(output)]) == 0
+    assert main(["inspect", "nuscenes", "waymo", "--output", str(output)]) == 0
     printed = capsys.readouterr().out
     assert repr(load_rig("nuscenes")) in printed and repr(load_rig("waymo")) in printed
     assert "From nuscenes to waymo:" in printed and f"picture: {output}" in printed
@@ -42,11 +43,13 @@ def test_same_rig_has_no_differences() -> None:
 def test_files_and_folders(tmp_path: Path) -> None:
     load_rig("waymo").save(tmp_path / "calib.json")
     arguments = ["--output", str(tmp_path / "rig.png")]
-    assert main([str(tmp_path), *arguments]) == main([str(tmp_path / "calib.json"), *arguments]) == 0
+    assert (
+        main(["inspect", str(tmp_path), *arguments]) == main(["inspect", str(tmp_path / "calib.json"), *arguments]) == 0
+    )
 
 
 def test_unknown_rig_and_unwritable_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["tesla"]) == 2
+    assert main(["inspect", "tesla"]) == 2
     assert "expected a file or one of the shipped rigs" in capsys.readouterr().err
-    assert main(["waymo", "--output", str(tmp_path / "rig.words")]) == 2
+    assert main(["inspect", "waymo", "--output", str(tmp_path / "rig.words")]) == 2
     assert "expected a name ending in .png" in capsys.readouterr().err

@@ -78,7 +78,7 @@ def test_a_folder_of_two_kinds(nuscenes_root: Path, tmp_path: Path, capsys: pyte
     for data in (f"frames:{nuscenes_root}", f"nuscenes:{nuscenes_root}"):
         assert main(["inspect", data, *picture]) == 0
         assert not capsys.readouterr().err
-    options = ["--target", "argoverse2", "--size", "32x40", "--surface", "far", "--reduce", "4"]
+    options = ["--target", "argoverse2", "--size", "32x40", "--surface", "far", "--downscale", "4"]
     assert main(["evaluate", "--data", str(nuscenes_root), *options, "--output", str(tmp_path)]) == 0
     note = f"--data {nuscenes_root}: taken as a frame folder (calib.json in it or in its folders); otherwise: "
     assert f"{note}--data nuscenes:{nuscenes_root}\n" in capsys.readouterr().err

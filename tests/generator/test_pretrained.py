@@ -13,8 +13,8 @@ from torch import nn
 from torch.utils.data import DataLoader
 
 from arbiview_aug import RetargetedDataset, RigRetarget, collate
+from arbiview_aug.__main__ import main
 from arbiview_aug.cli.bench.timing import peak_mib
-from arbiview_aug.cli.convert.command import main as convert
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.frame_writer import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
@@ -171,7 +171,9 @@ def test_a_pipeline_from_disk_completes_frames_everywhere(
     common = ["--data", str(tmp_path / "data"), "--target", str(tmp_path / "target.yaml"), "--images", "png"]
     ways = {"seen": ["--holes", "black"], "done": ["--path", "diffusion", "--generator", str(pipeline), "--steps", "1"]}
     for name, way in ways.items():
-        assert convert([*common, *way, "--workers", "1", "--report", "0", "--output", str(tmp_path / name)]) == 0
+        assert (
+            main(["convert", *common, *way, "--workers", "1", "--report", "0", "--output", str(tmp_path / name)]) == 0
+        )
     assert_completed(written(tmp_path / "done"), written(tmp_path / "seen"))
 
 
@@ -205,7 +207,7 @@ def test_convert_takes_a_pipeline_and_a_script(pipeline: Path, lama: Path, tmp_p
     common = ["--data", str(tmp_path / "data"), "--target", str(tmp_path / "up.yaml"), "--path", "diffusion"]
     for generator, file in ((pipeline, "unet/config.json"), (lama, "lama.pt")):
         output = tmp_path / file.partition("/")[0]
-        assert convert([*common, "--generator", str(generator), "--steps", "1", "--output", str(output)]) == 0
+        assert main(["convert", *common, "--generator", str(generator), "--steps", "1", "--output", str(output)]) == 0
         assert len(FrameFolder(output)) == 1
         (settings,) = output.rglob("settings.json")
         assert file in settings.read_text()

@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from arbiview_aug.cli.parsers import train
 from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.correspondence import Correspondence
@@ -26,7 +27,6 @@ from arbiview_aug.generator.training.measure import mean_hole_psnr, sampled
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
 from arbiview_aug.generator.training.step import without_attention
 from arbiview_aug.generator.training.trainer import Trainer
-from arbiview_aug.train import parser
 
 _AS_WRITTEN = (
     "pseudo_views.transplanted=0",
@@ -124,7 +124,7 @@ def text_of(table: dict[str, dict[str, Any]]) -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Train, score and print the table."""
-    arguments = parser().parse_args(argv)
+    arguments = train().parse_args(argv)
     config = overridden(CONFIGS[arguments.config](), arguments.set)
     frames = open_frames(
         arguments.data or "synthetic", config.generator.image_size, scenes=config.scenes, seed=config.seed

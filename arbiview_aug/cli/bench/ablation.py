@@ -7,11 +7,11 @@ frame.
 
 from __future__ import annotations
 
+import argparse
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,8 +19,8 @@ import torch
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reduce, SurfaceName
-from arbiview_aug.cli.arguments import add_data
-from arbiview_aug.cli.bench.study import benchmark, benchmark_parser, study
+from arbiview_aug.cli.arguments import output_file
+from arbiview_aug.cli.bench.study import benchmark, study
 from arbiview_aug.cli.bench.timing import machine_line, quartiles, show
 from arbiview_aug.datasets import open_data, reduced_rig
 from arbiview_aug.datasets.depth_folder import WANTED
@@ -161,28 +161,16 @@ NOTES = (
 )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Measure, print the table, write the JSON."""
-    parser = benchmark_parser(
-        "ablation",
-        "Each stage and setting on and off: accuracy, milliseconds on one thread, and what a ms buys.",
-        reduce=True,
-        output="output/ablation.json",
-        example="--data FOLDER",
-    )
-    add_data(parser, "a synthetic street", nargs="+", default=[])
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the synthetic street")
-    parser.add_argument("--only", metavar="TEXT", default="", help="steps whose names contain it")
-    arguments = parser.parse_args(argv)
     steps = [name for name in STEPS if arguments.only in name]
     if not steps:
-        parser.error(f"argument --only: expected part of one of {', '.join(STEPS)}")
+        raise DataError(f"--only: expected part of one of {', '.join(STEPS)}")
     if len({*map(data_name, arguments.data)}) < len(arguments.data):
-        parser.error("argument --data: expected folders of different names")
+        raise DataError("--data: expected folders of different names")
+    path = output_file(arguments.output)
     report = measure(arguments.data, steps, reduce=arguments.reduce, seed=arguments.seed)
-    table = f"{markdown(report)}\n\n{machine_line(report)}"
-    show(table, report, Path(arguments.output))
-    return 0
+    show(f"{markdown(report)}\n\n{machine_line(report)}", report, path)
 
 
 @benchmark

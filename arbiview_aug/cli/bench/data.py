@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,8 +29,6 @@ from arbiview_aug.scene.depth_maps import motion_camera
 from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.temporal.learned_depth import LearnedDepth, dense_depth
 from arbiview_aug.temporal.motion_depth import MotionDepth
-
-REDUCES: tuple[Reduce, ...] = get_args(Reduce)
 
 SOURCES_OVER_VIEWS = 2  # size of synthetic images relative to the views, so that decoding at half size pays
 

@@ -18,9 +18,9 @@ from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.arguments import add_target, count, seed
+from arbiview_aug.cli.arguments import output_file
 from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, lifted, recorded
-from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
+from arbiview_aug.cli.bench.study import benchmark
 from arbiview_aug.cli.bench.timing import machine_line, memory_mib, quartiles, show
 from arbiview_aug.datasets import RetargetedDataset, WithDepth, open_data
 from arbiview_aug.datasets.depth_folder import FOLDERS
@@ -48,28 +48,13 @@ class Repeated(Dataset[Any]):
         return lifted(self.dataset[index], lap * _APART_M)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Measure, print the table, write the JSON."""
-    parser = benchmark_parser(
-        "loader",
-        "Frames per second of a DataLoader with and without retargeting, and memory per worker.",
-        data="synthetic streets, written as JPEGs",
-        view_size=SIZE,
-        reduce=True,
-        output="output/loader.json",
-        example="--data FOLDER --workers 0 2",
-    )
-    add_target(parser)
-    parser.add_argument("--workers", type=seed, nargs="+", default=[0, 1, 2], metavar="N", help="workers")
-    parser.add_argument("--surface", nargs="+", choices=tuple(SURFACES), default=["street", "auto"], help="geometry")
-    parser.add_argument("--frames", type=count, default=48, metavar="N", help="frames in an epoch")
-    parser.add_argument("--epochs", type=count, default=3, metavar="N", help="epochs to measure")
-    arguments = parser.parse_args(argv)
+    path = output_file(arguments.output)
     h, w = (SOURCES_OVER_VIEWS * side for side in arguments.size)
     with recorded(arguments.data, size=(h, w)) as data:
         report = measure(data, arguments)
-    show(table(report), report, Path(arguments.output))
-    return 0
+    show(table(report), report, path)
 
 
 @benchmark

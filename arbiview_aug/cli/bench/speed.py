@@ -12,15 +12,17 @@ or lowered. *Depth maps* from motion and from a network cost the same; these say
 LiDAR point. *Fused* is LiDAR with two maps. *Held*: the calibration comes back, and with it the plan; every other call
 plans anew. Images are decoded at half size where they are then still larger than the views. They lie channels-last in
 one block, as this package's readers give them; contiguous ones are planes, torch's usual layout. Holes stay black
-unless they are *filled*.
+unless they are *filled*. With ``--device`` the floor is a copy there of as many bytes as rendering must move; the clock
+of a GPU is its events.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import count, cycle
 from pathlib import Path
@@ -30,23 +32,24 @@ import cv2
 import numpy as np
 import torch
 
+from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import Holes, Reduce, SurfaceName
-from arbiview_aug.cli.arguments import add_data, device_named, size
+from arbiview_aug.cli.arguments import device_named, output_file
 from arbiview_aug.cli.bench.data import Recorded, lidar_maps, lifted, recorded
-from arbiview_aug.cli.bench.device import YAW_DEG, device_table, measure_device
-from arbiview_aug.cli.bench.neighbours import lowered
-from arbiview_aug.cli.bench.study import SIZE, benchmark, benchmark_parser
-from arbiview_aug.cli.bench.timing import machine_line, quartiles, show, timed_rounds
+from arbiview_aug.cli.bench.study import benchmark
+from arbiview_aug.cli.bench.timing import clock_of, machine_line, quartiles, show, timed_rounds
+from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import without_masks
+from arbiview_aug.image_ops import resized
 from arbiview_aug.render.harmonise import Harmonise
-from arbiview_aug.render.plan import compile_kernels
+from arbiview_aug.render.plan import RenderPlan, build_plan, compile_kernels
+from arbiview_aug.render.torch_backend import maps_on, render_torch
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
-FULL_SIZE = (900, 1600)
 BOXES = (10, 30, 75, 150)
 BOUNDS: Mapping[tuple[int, int], Mapping[str, float]] = {
     SIZE: {
@@ -61,41 +64,23 @@ BOUNDS: Mapping[tuple[int, int], Mapping[str, float]] = {
 
 _FLOOR = "bare cv2.remap"
 _ENOUGH_MS = 1500.0
-_TRAVEL_M = 1.2  # between neighbouring frames
+_TRAVEL_M, _MOST_NEIGHBOURS = 1.2, 8  # between neighbouring frames, and their number
+_DTYPES = {"uint8": torch.uint8, "bf16": torch.bfloat16, "fp32": torch.float32}
+_BATCH = {"cuda": 8, "cpu": 1}  # frames
+YAW_DEG = 22.0
 _STEP_M, _STEPS = 1e-4, 200
 
 Sample = Mapping[str, Any]
 Calls = dict[str, Callable[[], Any]]
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Measure, print the table, write the JSON."""
-    parser = benchmark_parser(
-        "speed",
-        "Milliseconds of RigRetarget on one thread, and ratios to bare cv2.remap calls of the same views.",
-        repeats=5,
-        output="output/speed.json",
-        example="--device cuda",
-    )
-    add_data(parser, "nuscenes-one below ARBIVIEW_DATA where that is, else a synthetic street")
-    sizes = [SIZE, FULL_SIZE]
-    parser.add_argument("--size", type=size, nargs="+", default=sizes, metavar="HxW", help="of views (default: both)")
-    parser.add_argument(
-        "--device",
-        metavar="NAME",
-        help="render batches by torch on cpu, cuda, cuda:1, ...: milliseconds, and the share of copy bandwidth",
-    )
-    arguments = parser.parse_args(argv)
+    path = output_file(arguments.output)
+    device = None if arguments.device is None else device_named(arguments.device)
     with recorded(arguments.data or default_data(), size=FULL_SIZE) as data:
-        if arguments.device is None:
-            report = measure(data, arguments.repeats, arguments.size)
-            text = table(report)
-        else:
-            device, sample = device_named(arguments.device), _sample(data, 1)
-            report = measure_device(sample["rig"], list(sample["images"]), data.name, device, arguments.repeats)
-            text = device_table(report)
-    show(text, report, Path(arguments.output))
-    return 0
+        report = measure(data, arguments.repeats, arguments.size, arguments.only, device)
+    show(table(report), report, path)
 
 
 def default_data() -> Path | None:
@@ -106,31 +91,55 @@ def default_data() -> Path | None:
 
 
 @benchmark
-def measure(data: Recorded, repeats: int, sizes: Sequence[tuple[int, int]]) -> dict[str, Any]:
-    """Time the calls on the first frame, for views of each size (h, w)."""
+def measure(
+    data: Recorded,
+    repeats: int,
+    sizes: Sequence[tuple[int, int]],
+    only: str = "",
+    device: torch.device | None = None,
+) -> dict[str, Any]:
+    """Time the calls on the first frame whose names contain ``only``, for views of each size (h, w).
+
+    With a device, times batches that torch renders there instead (``_batches``).
+    """
     start = time.process_time()
     compile_kernels()
     ready_s = time.process_time() - start
-    waymo, fisheye = without_masks(load_rig("waymo")), without_masks(load_rig("fisheye_surround"))
-    targets = {"pinhole": waymo.undistorted(), "radtan": waymo, "fisheye": fisheye}
     full, half = _sample(data, 1), _sample(data, 2)
     rows = []
     for h, w in sizes:
-        is_small = 2 * h <= full["rig"][0].height_px and 2 * w <= full["rig"][0].width_px
-        sample = half if is_small else full
-        calls = {name: (len(rig), _calls(sample, rig.resized((h, w)))) for name, rig in targets.items()}
-        if is_small:
-            for name, to in (("squashed", waymo.resized((h, w))), ("cropped", waymo.resized((h, w), "crop"))):
-                calls["radtan"][1].update(_both_layouts(f"street, held, {name} from full size", full, to))
-            calls["own"] = len(full["rig"]), _own(sample, (h, w))
-        for name, (views, runs) in calls.items():
-            runs = {_FLOOR: remap_floor(sample["images"][:views], (h, w)), **runs}
-            times = timed_rounds(runs, repeats, f"{w}x{h} {name}", enough_ms=_ENOUGH_MS)
-            for call, taken in times.items():
-                ratio = statistics.median(a / b for a, b in zip(taken, times[_FLOOR], strict=False))
-                row = {"size": [h, w], "target": name, "name": call, **quartiles(taken)._asdict()}
-                rows.append(row | {"ratio": ratio, "bound": BOUNDS.get((h, w), {}).get(call)})
+        for target, (floor, runs) in (
+            _calls_of(full, half, (h, w)) if device is None else _batches(full, (h, w), device)
+        ):
+            chosen = {name: call for name, call in runs.items() if only in name}
+            if not chosen:
+                continue
+            times = timed_rounds(
+                {**floor, **chosen}, repeats, f"{w}x{h} {target}", enough_ms=_ENOUGH_MS, clock=clock_of(device)
+            )
+            for name, taken in times.items():
+                ratio = statistics.median(a / b for a, b in zip(taken, times[next(iter(floor))], strict=False))
+                row = {"size": [h, w], "target": target, "name": name, **quartiles(taken)._asdict(), "ratio": ratio}
+                rows.append(row | {"bound": BOUNDS.get((h, w), {}).get(name)})
+    if not rows:
+        raise DataError(f"--only {only}: expected part of a call's name, such as boxes or neighbour")
     return {"data": data.name, "rounds": repeats, "ready_s": ready_s, "measures": rows}
+
+
+def _calls_of(full: Sample, half: Sample, size: tuple[int, int]) -> Iterator[tuple[str, tuple[Calls, Calls]]]:
+    """Yield targets at (h, w), each with its floor and its calls."""
+    waymo, fisheye = (without_masks(load_rig(name)).resized(size) for name in ("waymo", "fisheye_surround"))
+    is_small = all(2 * side <= of_camera for side, of_camera in zip(size, full["rig"].sizes[0], strict=True))
+    sample = half if is_small else full
+    for name, rig in {"pinhole": waymo.undistorted(), "radtan": waymo, "fisheye": fisheye}.items():
+        calls = _calls(sample, rig)
+        if is_small and name == "radtan":
+            cropped = without_masks(load_rig("waymo")).resized(size, "crop")
+            calls |= _both_layouts("street, held, squashed from full size", full, waymo)
+            calls |= _both_layouts("street, held, cropped from full size", full, cropped)
+        yield name, ({_FLOOR: remap_floor(sample["images"][: len(rig)], size)}, calls)
+    if is_small:
+        yield "own", ({_FLOOR: remap_floor(sample["images"], size)}, _own(sample, size))
 
 
 def table(report: Mapping[str, Any]) -> str:
@@ -162,20 +171,58 @@ def _calls(sample: Sample, target: Rig) -> Calls:
 
 def _own(sample: Sample, views: tuple[int, int]) -> Calls:
     """Turned cameras, which have holes, and lowered ones, which neighbouring frames fill."""
-    rig = sample["rig"]
+    rig, boxes = sample["rig"], {"boxes_3d": boxes_around(75)}
     turned, low = rig.turned(yaw_deg=YAW_DEG).resized(views), lowered(rig, views)
-    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
-    poses[1:, 0, 3] = torch.tensor([-_TRAVEL_M, _TRAVEL_M])
-    frame, *neighbours = ({**sample, "ego2world": pose} for pose in poses)
-    boxes = {"boxes_3d": boxes_around(75)}
-    with_boxes = frame | boxes | {"neighbours": [neighbour | boxes for neighbour in neighbours]}
+    poses = torch.eye(4, dtype=torch.float64).repeat(1 + _MOST_NEIGHBOURS, 1, 1)
+    poses[1:, 0, 3] = torch.tensor([_TRAVEL_M * (1 + k // 2) * (-1) ** k for k in range(_MOST_NEIGHBOURS)])
+    frame, *others = ({**sample, "ego2world": pose} for pose in poses)
+    with_boxes = frame | boxes | {"neighbours": [other | boxes for other in others[:2]]}
     return {
         "street, held, turned": _held(sample, turned),
         "street, held, turned, filled": _held(sample, turned, holes="fill"),
         "street, held, turned, harmonised": _held(sample, turned, harmonise=True),
-        "street, two neighbours": _anew(frame | {"neighbours": neighbours}, low, "street"),
+        "street, no neighbours": _anew(frame, low, "street"),
+        "street, one neighbour": _anew(frame | {"neighbours": others[:1]}, low, "street"),
+        "street, two neighbours": _anew(frame | {"neighbours": others[:2]}, low, "street"),
+        "street, eight neighbours": _anew(frame | {"neighbours": others}, low, "street"),
         "75 boxes, two neighbours": _anew(with_boxes, low, "objects"),
     }
+
+
+def lowered(rig: Rig, size: tuple[int, int]) -> Rig:
+    """Raise a rig by 0.6 m, pitch it down by 15 degrees and widen it to 100: it sees road that no camera sees."""
+    h, w = size
+    f = w / 2 / np.tan(np.radians(100.0 / 2))
+    K = np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
+    poses = {c.name: c.turned(pitch_deg=-15.0).shifted(z_m=0.6).cam2ego for c in rig}
+    cameras = [Camera(name=name, width_px=w, height_px=h, K=K, cam2ego=pose) for name, pose in poses.items()]
+    return Rig(cameras, ground_z_m=rig.ground_z_m, name="lowered")
+
+
+def _batches(sample: Sample, size: tuple[int, int], device: torch.device) -> Iterator[tuple[str, tuple[Calls, Calls]]]:
+    """Yield batches of images on a device by type, for turned cameras at (h, w); the floor copies as many bytes there.
+
+    The bytes are the least that must move: each source image and each map position read once, each view written once.
+    """
+    rig, batch = sample["rig"].resized(size), _BATCH[device.type]
+    plan = build_plan(rig, rig.turned(yaw_deg=YAW_DEG))
+    small = [resized(image, size) for image in sample["images"]]
+    for name, dtype in _DTYPES.items():
+        typed = [image if dtype == torch.uint8 else (image.float() / 255).to(dtype) for image in small]
+        batches = [image.to(device).repeat(batch, 1, 1, 1) for image in typed]
+        # Each copy reads and writes its own buffers: smaller ones could fit a cache.
+        one, two = (torch.zeros(bytes_moved(plan, batches) // 2, dtype=torch.uint8, device=device) for _ in range(2))
+        render = torch.no_grad()(partial(render_torch, plan, batches))
+        yield f"{name} on {device}", ({"copy": partial(one.copy_, two)}, {f"batch of {batch} by torch": render})
+
+
+def bytes_moved(plan: RenderPlan, images: Sequence[torch.Tensor]) -> int:
+    """Least number of bytes that rendering images (B, 3, H, W) moves."""
+    read = sum(images[k].nbytes for k in {slot.source for slot in plan.layout.slots})
+    maps = maps_on(plan, images[0].device)
+    grids = sum(view.grid.nbytes + (0 if view.blend is None else view.blend.grid.nbytes) for view in maps)
+    pixels = sum(view.source.numel() for view in maps)
+    return read + grids + pixels * 3 * images[0].shape[0] * images[0].element_size()
 
 
 def _both_layouts(name: str, sample: Sample, target: Rig) -> Calls:

@@ -1,21 +1,17 @@
-"""The runner that the benchmarks share: options, scores and times of a list of ``Method``, and recommendations."""
+"""The runner that the benchmarks share: scores and times of a list of ``Method``, and recommendations."""
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
-from pathlib import Path
 from typing import Any, ParamSpec
 
 from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.arguments import add_data, command_parser, count, size
-from arbiview_aug.cli.bench.data import REDUCES
 from arbiview_aug.cli.bench.timing import Clock, Quartiles, machine, process_ms
 from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.evaluate.agreement import OverlapScore, summary, target_consistency
@@ -24,42 +20,10 @@ from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import Method, Sample
 from arbiview_aug.evaluate.metrics import mean_of
 
-SIZE = (256, 704)
 LEAST_GAIN_DB = 0.2  # smaller differences are noise on single frames
 
 Row = Mapping[str, Any]
 P = ParamSpec("P")
-
-
-def benchmark_parser(
-    name: str,
-    description: str,
-    *,
-    data: str | None = None,
-    view_size: tuple[int, int] | None = None,
-    reduce: bool = False,
-    repeats: int | None = None,
-    output: str,
-    example: str = "",
-) -> argparse.ArgumentParser:
-    """Create a parser with the options that benchmarks share.
-
-    ``data`` describes the default of ``--data``; ``view_size`` (h, w) and ``repeats`` are defaults of ``--size`` and
-    ``--repeats``. With None an option is left out. ``output`` is a file or a folder.
-    """
-    parser = command_parser(f"bench {name}", description, example)
-    if data is not None:
-        add_data(parser, data)
-    if view_size is not None:
-        of_views = f"of every view (default: {view_size[0]}x{view_size[1]})"
-        parser.add_argument("--size", type=size, default=view_size, metavar="HxW", help=of_views)
-    if reduce:
-        parser.add_argument("--reduce", type=int, choices=REDUCES, default=2, help="decode the images at 1/N")
-    if repeats is not None:
-        parser.add_argument("--repeats", type=count, default=repeats, metavar="N", help="rounds of timing")
-    kind = "file" if Path(output).suffix else "folder"
-    parser.add_argument("--output", default=output, metavar=kind.upper(), help=f"{kind} to write to")
-    return parser
 
 
 def benchmark(measure: Callable[P, dict[str, Any]]) -> Callable[P, dict[str, Any]]:

@@ -50,9 +50,9 @@ def process_ms(run: Callable[[], Any]) -> float:
     return 1e3 * (time.process_time() - start)
 
 
-def clock_of(device: torch.device) -> Clock:
+def clock_of(device: torch.device | None) -> Clock:
     """Clock of a device: CUDA events on a GPU, else the process's CPU time."""
-    if device.type != "cuda":
+    if device is None or device.type != "cuda":
         return process_ms
 
     def clock(run: Callable[[], Any]) -> float:

@@ -3,31 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
-from arbiview_aug.atomic_io import Link, inside, remove_parts
-from arbiview_aug.cameras.framing import Fit
+from arbiview_aug.atomic_io import inside, remove_parts
 from arbiview_aug.cameras.rig import load_rig
-from arbiview_aug.choices import Holes, OnError
-from arbiview_aug.cli.arguments import (
-    add_data,
-    add_reduce,
-    add_rendering,
-    add_target,
-    command_parser,
-    count,
-    seed,
-    size,
-    writable_folder,
-)
+from arbiview_aug.cli.arguments import writable_folder
 from arbiview_aug.cli.convert.job import Done, Jobs, State
 from arbiview_aug.cli.convert.ray_runner import ray_results
 from arbiview_aug.cli.convert.report import write_report
@@ -42,19 +29,15 @@ from arbiview_aug.errors import ArbiviewError, DataError, OutputError
 from arbiview_aug.scene.scene import SURFACES
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Convert this shard's missing samples; the shard that completes them all finishes the output.
 
     Returns:
         0; 1 if samples could not be read or rendered (unless skipped), or files could not be written.
     """
-    parser = _parser()
-    arguments = parser.parse_args(argv)
-    if arguments.shard_index >= arguments.num_shards:
-        parser.error(f"argument --shard-index: expected less than {arguments.num_shards}, got {arguments.shard_index}")
     if arguments.motion_depth is not None and not FOLDERS.keys() & SURFACES[arguments.surface].reads:
         fitting = "auto, motion, fused or learned"
-        parser.error(f"argument --depth: expected it with --surface {fitting}, got {arguments.surface}")
+        raise DataError(f"--depth: expected it with --surface {fitting}, got {arguments.surface}")
     settings = _settings(arguments)
     check_output(settings)
     if arguments.verify:
@@ -76,86 +59,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     _finish(jobs, facts, arguments.report, arguments.num_shards)
     return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "convert",
-        "Write a data set as another vehicle's cameras would have recorded it, in the source's format: nuScenes "
-        "tables, or frame folders. Files that are there are left as they are: run it again to go on.",
-        "--data nuscenes:ROOT --target argoverse2 --output converted --size 256x704",
-    )
-    add_data(parser)
-    parser.add_argument("--version", metavar="NAME", help="nuScenes' folder of tables (default: v1.0-mini, -trainval)")
-    add_target(parser, required=True)
-    parser.add_argument("--output", required=True, metavar="DIR", help="folder to write to")
-    add_rendering(parser)
-    parser.add_argument(
-        "--holes",
-        choices=get_args(Holes),
-        default="fill",
-        help="what no camera saw, with --path favs: continued from its borders (default), the mean colour, or black",
-    )
-    parser.add_argument(
-        "--generator",
-        type=Path,
-        metavar="PATH",
-        help="of --path diffusion: a generator's folder, a folder of diffusers, a TorchScript file (default: the own)",
-    )
-    parser.add_argument("--steps", type=count, metavar="N", help="steps of the generator (default: its own)")
-    parser.add_argument(
-        "--size", type=size, metavar="HxW", help="height and width of every view (default: the target's own)"
-    )
-    parser.add_argument(
-        "--fit",
-        choices=get_args(Fit),
-        default="crop",
-        help="with --size: cut at the top and the sides (default), add black bars there, or stretch",
-    )
-    add_reduce(parser)
-    parser.add_argument(
-        "--neighbours",
-        type=seed,
-        default=0,
-        metavar="N",
-        help="let N frames of the drive before and after each fill holes (default: none)",
-    )
-    parser.add_argument(
-        "--depth",
-        "--motion-depth",
-        dest="motion_depth",
-        type=Path,
-        metavar="DIR",
-        help="what the depth command wrote, for --surface motion or learned (default: its folder in the data)",
-    )
-    parser.add_argument("--images", choices=("jpg", "png"), default="jpg", help="jpg: quality 96, 4:4:4; png: lossless")
-    parser.add_argument("--shard-index", type=seed, default=0, metavar="I", help="this shard, from 0")
-    parser.add_argument("--num-shards", type=count, default=1, metavar="N", help="number of shards")
-    parser.add_argument("--runner", choices=("local", "ray"), default="local", help="processes here, or Ray actors")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    parser.add_argument(
-        "--workers", type=count, default=cores, metavar="N", help="processes or actors (default: one a core)"
-    )
-    parser.add_argument(
-        "--on-error",
-        choices=get_args(OnError),
-        default="report",
-        help="samples that cannot be converted: report them and do not finish (default), leave them out, or stop",
-    )
-    parser.add_argument(
-        "--link",
-        choices=get_args(Link),
-        default="hard",
-        help="how points, maps and other kept files come along: hard links where the disk allows them (default), "
-        "copies, or symbolic links, which readers of this package refuse",
-    )
-    parser.add_argument(
-        "--verify",
-        action="store_true",
-        help="write nothing: compare sources and outputs with the checksums that were recorded",
-    )
-    parser.add_argument("--report", type=seed, default=2, metavar="N", help="number of frames in report.html")
-    return parser
 
 
 def _settings(arguments: argparse.Namespace) -> Settings:

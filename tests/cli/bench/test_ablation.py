@@ -120,7 +120,7 @@ def test_a_street_tells_the_surfaces_apart() -> None:
 @pytest.mark.slow
 def test_command(nuscenes_root: Path, fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "new" / "ablation.json"
-    arguments = ["bench", "ablation", "--reduce", "4", "--output", str(path)]
+    arguments = ["bench", "ablation", "--downscale", "4", "--output", str(path)]
     assert main([*arguments, "--data", str(nuscenes_root), "--only", "harmonising"]) == 0
     report = json.loads(path.read_text())
     assert list(report["data"]) == ["nuscenes-one"] and "| harmonising " in capsys.readouterr().out

@@ -83,7 +83,7 @@ def test_rates(samples: ModuleType) -> None:
 def test_command(tmp_path: Path, nuscenes_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "new" / "loader.json"
     arguments = ["bench", "loader", "--data", str(nuscenes_root), "--surface", "street", "--size", "32x88"]
-    tiny = ["--reduce", "4", "--workers", "0", "1", "--frames", "3", "--epochs", "1"]
+    tiny = ["--downscale", "4", "--workers", "0", "1", "--frames", "3", "--epochs", "1"]
     assert main([*arguments, *tiny, "--output", str(path)]) == 0
     report = json.loads(path.read_text())
     assert report["data"] == "nuscenes-one" and report["target"] == "waymo" and report["size"] == [32, 88]
@@ -103,7 +103,7 @@ def test_depth_on_disk_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str
     tiny = [
         "--size",
         "24x48",
-        "--reduce",
+        "--downscale",
         "1",
         "--workers",
         "0",

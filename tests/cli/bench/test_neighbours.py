@@ -1,23 +1,17 @@
-"""``python -m arbiview_aug bench neighbours``; and what frames without neighbours cost: nothing."""
+"""What frames without neighbours cost: nothing."""
 
 from __future__ import annotations
 
-import json
 import statistics
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from arbiview_aug import RigRetarget
-from arbiview_aug.__main__ import main
-from arbiview_aug.cli.bench.neighbours import COLUMNS, lowered, nearest, travel_m
+from arbiview_aug.cli.bench.speed import lowered
 from arbiview_aug.cli.bench.timing import timed_rounds
-from arbiview_aug.datasets import Neighbours
-from arbiview_aug.datasets.frame_writer import write_drive
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import one_thread
 from arbiview_aug.temporal import fill
@@ -26,50 +20,6 @@ from tests.helpers import street_sample
 
 TOLERANCE = 0.02
 ROUNDS = 121
-QUICK = ["--size", "32x88", "--reduce", "1", "--repeats", "1"]
-
-
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four frames, 1.5 m apart; most neighbours has the third."""
-    root = tmp_path_factory.mktemp("drive")
-    wanted = Neighbours(count=2, step_m=1.5)
-    sample = SyntheticDrive(demo_source_rig((32, 88)), num_frames=1, lidar=False, neighbours=wanted)[0]
-    write_drive(root, [sample, *sample["neighbours"][:3]])
-    return root
-
-
-@pytest.mark.slow
-def test_command(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "new" / "neighbours.json"
-    arguments = ["bench", "neighbours", *QUICK, "--surface", "street", "--output", str(path)]
-    assert main([*arguments, "--data", str(drive), "--counts", "0", "1", "8"]) == 0
-    report, printed = json.loads(path.read_text()), capsys.readouterr().out
-    none, one, three = report["costs"]
-    assert [cost["neighbours"] for cost in (none, one, three)] == [0, 1, 3]  # there are no more
-    assert [cost["name"] for cost in (none, one)] == ["street, no neighbours", "street, 1 neighbour"]
-    np.testing.assert_allclose(report["travel_m"], [1.5, 1.5, 3.0], atol=1e-6)
-    assert none["filled"] == 0 < one["filled"] < three["filled"]
-    assert none["ratio"] == 1 and all(cost[part][0] >= 0 for cost in (one, three) for part in ("plan", "fill", "frame"))
-    assert all(heading in printed for heading, _ in COLUMNS) and f"report: {path}" in printed
-    assert "neighbours up to 3.0 m away" in printed and report["machine"]["cpu"] and report["versions"]["torch"]
-
-
-def test_frames_of_no_drive(ddad_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "neighbours", *QUICK, "--data", str(ddad_root)]) == 2
-    assert "expected frames of a drive that moves, got none with neighbours" in capsys.readouterr().err
-    with pytest.raises(SystemExit, match="2"):
-        main(["bench", "neighbours", "--step-m", "0"])
-
-
-def test_the_nearest_come_first() -> None:
-    def at(x_m: float) -> dict[str, Any]:
-        pose = np.eye(4)
-        pose[0, 3] = x_m
-        return {"ego2world": pose}
-
-    sample = at(5.0) | {"neighbours": [at(3.0), at(1.0), at(6.5), at(9.5)]}
-    assert [travel_m(sample, n) for n in nearest(sample)] == [1.5, 2.0, 4.0, 4.5]
 
 
 # --- without neighbours -----------------------------------------------------------------------------------------------

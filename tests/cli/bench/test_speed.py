@@ -13,8 +13,11 @@ import torch
 
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.bench.data import recorded
-from arbiview_aug.cli.bench.speed import BOUNDS, BOXES, FULL_SIZE, default_data, measure, table
-from arbiview_aug.cli.bench.study import SIZE
+from arbiview_aug.cli.bench.speed import BOUNDS, BOXES, bytes_moved, default_data, measure, table
+from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
+from arbiview_aug.favs.config import favs_config
+from arbiview_aug.render.plan import build_plan
+from tests.helpers import street_sample
 
 ATTEMPTS = 3
 ALLOWED = {
@@ -63,9 +66,51 @@ def test_command_writes_the_report(
 def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "speed", "--data", str(tmp_path)]) == 2
     assert "expected a frame folder (calib.json" in capsys.readouterr().err
-    for arguments in (["speed", "--repeats", "0"], ["beauty"], ["--repeats", "0"]):
+    for arguments in (["speed", "--repeats", "0"], ["--repeats", "0"]):
         with pytest.raises(SystemExit, match="2"):
             main(["bench", *arguments])
+    assert main(["bench", "beauty"]) == 2 and "expected one of pareto, speed" in capsys.readouterr().err
+    for wrong in ("abacus", "cuda:99", "meta"):
+        assert main(["bench", "speed", "--device", wrong]) == 2
+        assert "--device: expected cpu" in capsys.readouterr().err
+    assert main(["bench", "speed", "--output", str(tmp_path)]) == 2
+    assert "expected a file, got a folder" in capsys.readouterr().err
+
+
+# --- on a device ------------------------------------------------------------------------------------------------------
+def test_bytes() -> None:
+    """By hand: six images, six views, and a grid of two float32 a pixel; a view without a source costs its pixels."""
+    sample = street_sample(lidar=False)
+    rig = sample["rig"]
+    images = [image[None].repeat(2, 1, 1, 1) for image in sample["images"]]
+    pixels = 64 * 176
+    plan = build_plan(rig, rig, config=favs_config("draft"))
+    assert bytes_moved(plan, images) == 6 * pixels * (2 * 3 + 2 * 4 + 2 * 3)
+    floats = [image.float() for image in images]
+    assert bytes_moved(plan, floats) == 6 * pixels * (2 * 12 + 8 + 2 * 12)
+    one = rig.with_cameras([rig[0]])
+    assert bytes_moved(build_plan(rig, one, config=favs_config("draft")), images) == pixels * (2 * 3 + 8 + 2 * 3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cpu", "cuda"])
+def test_batches_on_a_device(name: str) -> None:
+    if name == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no GPU")
+    sizes = [(32, 88), (64, 176)]
+    with recorded(None, size=(64, 176)) as data:
+        report = json.loads(json.dumps(measure(data, 1, sizes, device=torch.device(name))))
+    rows = report["measures"]
+    kinds = [f"{kind} on {name}" for kind in ("uint8", "bf16", "fp32")]
+    assert [(tuple(row["size"]), row["target"]) for row in rows[::2]] == [
+        (size, kind) for size in sizes for kind in kinds
+    ]
+    assert all(row["name"] == "copy" and row["ratio"] == 1 for row in rows[::2])
+    assert all(
+        row["ratio"] == pytest.approx(row["median_ms"] / copy["median_ms"])
+        for copy, row in zip(rows[::2], rows[1::2], strict=True)
+    )
+    assert "uint8 on" in table(report)
 
 
 @pytest.fixture(scope="module")

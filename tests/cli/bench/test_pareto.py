@@ -14,7 +14,7 @@ import torch
 
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.bench.data import recorded
-from arbiview_aug.cli.bench.trade import Setting, settings, table
+from arbiview_aug.cli.bench.pareto import Setting, settings, table
 from arbiview_aug.datasets.synthetic import demo_source_rig
 
 SIZE = (64, 176)
@@ -34,11 +34,11 @@ def test_settings_differ_and_leave_out_what_is_the_same() -> None:
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    folder = tmp_path_factory.mktemp("trade")
-    only = ["--quality", "draft", "fast", "--surface", "far", "street", "objects", "--reduce", "1", "2"]
+    folder = tmp_path_factory.mktemp("pareto")
+    only = ["--quality", "draft", "fast", "--surface", "far", "street", "objects", "--downscale", "1", "2"]
     tiny = ["--size", "{}x{}".format(*SIZE), "--repeats", "2", "--budget-ms", "1000", "--output", str(folder)]
     assert main(["bench", *only, *tiny]) == 0
-    return json.loads((folder / "trade.json").read_text())
+    return json.loads((folder / "pareto.json").read_text())
 
 
 @pytest.mark.slow
@@ -82,10 +82,21 @@ def test_every_generator_fills_holes(tmp_path: Path, capsys: pytest.CaptureFixtu
 
     script = str(tmp_path / "grey.pt")
     torch.jit.script(Grey()).save(script)
-    only = ["--quality", "draft", "--surface", "street", "--reduce", "2", "--execution", "opencv", "--size", "64x176"]
+    only = [
+        "--quality",
+        "draft",
+        "--surface",
+        "street",
+        "--downscale",
+        "2",
+        "--execution",
+        "opencv",
+        "--size",
+        "64x176",
+    ]
     command = ["bench", *only, "--repeats", "1", "--generator", script, "--output", str(tmp_path)]
     assert main([*command, "--budget-ms", "0.01"]) == 1
-    report = json.loads((tmp_path / "trade.json").read_text())
+    report = json.loads((tmp_path / "pareto.json").read_text())
     fills = {row["name"]: row for row in report["fills"]}
     assert fills[script]["calls"] >= 1 and fills[script]["hole_psnr_db"] > fills["black"]["hole_psnr_db"]
     assert not any(row["kept"] for row in fills.values())
@@ -95,8 +106,19 @@ def test_every_generator_fills_holes(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 @pytest.mark.slow
 def test_what_nothing_keeps_to_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    only = ["--quality", "draft", "--surface", "objects", "--reduce", "1", "--execution", "opencv", "--size", "32x88"]
-    assert main(["bench", "trade", *only, "--repeats", "1", "--min-psnr", "90", "--output", str(tmp_path)]) == 1
+    only = [
+        "--quality",
+        "draft",
+        "--surface",
+        "objects",
+        "--downscale",
+        "1",
+        "--execution",
+        "opencv",
+        "--size",
+        "32x88",
+    ]
+    assert main(["bench", "pareto", *only, "--repeats", "1", "--min-psnr", "90", "--output", str(tmp_path)]) == 1
     printed = capsys.readouterr().out
     assert "No recommendation: nothing reaches 90 dB: the best has" in printed
     assert "| draft, objects, 1/1, opencv | step |" in printed
@@ -108,7 +130,7 @@ def test_static_surfaces_are_recommended_where_cameras_only_turn(
 ) -> None:
     demo_source_rig((32, 88)).turned(yaw_deg=10).save(tmp_path / "turned.yaml")
     demo_source_rig((32, 88)).shifted(z_m=0.6).save(tmp_path / "raised.yaml")
-    only = ["--quality", "draft", "--surface", "street", "--reduce", "4", "--execution", "opencv", "--size", "32x88"]
+    only = ["--quality", "draft", "--surface", "street", "--downscale", "4", "--execution", "opencv", "--size", "32x88"]
     command = ["bench", *only, "--repeats", "1", "--budget-ms", "5000", "--output", str(tmp_path)]
     assert main([*command, "--target", str(tmp_path / "turned.yaml")]) == 0
     printed = capsys.readouterr().out
@@ -139,14 +161,14 @@ def test_real_frames_are_scored_by_points_that_nobody_read(nuscenes_root: Path) 
 @pytest.mark.release
 def test_the_trade_on_a_real_frame(nuscenes_root: Path, tmp_path: Path, report_bound: Callable[..., None]) -> None:
     """Steps to choose from, a budget that LiDAR keeps, decoding dearer than rendering."""
-    only = ["--reduce", "2", "--execution", "opencv", "--budget-ms", f"{BUDGET_MS}", "--output", str(tmp_path)]
+    only = ["--downscale", "2", "--execution", "opencv", "--budget-ms", f"{BUDGET_MS}", "--output", str(tmp_path)]
     command = ["bench", "--data", str(nuscenes_root), *only]
     assert main(command) == 0
-    report = json.loads((tmp_path / "trade.json").read_text())
+    report = json.loads((tmp_path / "pareto.json").read_text())
     for _ in range(ATTEMPTS - 1):  # noise hides steps, it never makes any
         if len(report["steps"]) < STEPS:
             assert main(command) == 0
-            report = json.loads((tmp_path / "trade.json").read_text())
+            report = json.loads((tmp_path / "pareto.json").read_text())
     rows = {row["name"]: row for row in report["settings"]}
     print(table(report))
     assert len(rows) >= 8

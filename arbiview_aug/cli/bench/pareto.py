@@ -1,4 +1,4 @@
-"""``python -m arbiview_aug bench [trade]``: speed against accuracy of all settings, on the user's data or synthetic.
+"""``python -m arbiview_aug bench [pareto]``: speed against accuracy of all settings, on the user's data or synthetic.
 
 Sweeps quality, surface, decoded size, execution and cached depth from overlap; marks the Pareto front, and
 recommends a setting for ``--budget-ms`` or ``--min-psnr``, measured again. Static surfaces are not recommended
@@ -25,21 +25,21 @@ from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reduce, SurfaceName
-from arbiview_aug.cli.arguments import add_target, count, positive, writable_folder
-from arbiview_aug.cli.bench.data import REDUCES, SOURCES_OVER_VIEWS, Recorded, as_of_another_frame, recorded
+from arbiview_aug.cli.arguments import writable_folder
+from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, as_of_another_frame, recorded
 from arbiview_aug.cli.bench.speed import remap_floor
 from arbiview_aug.cli.bench.study import (
     LEAST_GAIN_DB,
-    SIZE,
     Row,
     advice,
     benchmark,
-    benchmark_parser,
     distinct_steps,
     pareto_front,
     study,
 )
 from arbiview_aug.cli.bench.timing import Quartiles, machine_line, peak_mib, quartiles, show, timed_rounds
+from arbiview_aug.cli.parsers import EXECUTIONS
+from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.evaluate.methods import Method, Sample, views_of
 from arbiview_aug.evaluate.report.tables import metric_table
@@ -52,7 +52,6 @@ from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 Execution = Literal["opencv", "torch", "cuda"]
 
-REPEATS = 9
 REFERENCE: Reduce = 2  # decoding factor of the images whose colours score
 _ENOUGH_MS = 1000.0  # keeps a sweep of 63 settings at three minutes
 
@@ -110,7 +109,7 @@ def settings(
     surfaces: Sequence[SurfaceName],
     *,
     qualities: Sequence[Quality] = get_args(Quality),
-    reduces: Sequence[Reduce] = REDUCES,
+    reduces: Sequence[Reduce] = get_args(Reduce),
     executions: Sequence[Execution] = ("opencv", "torch"),
 ) -> list[Setting]:
     """List all combinations that differ: ``paper`` is always far and on the CPU; ``accurate`` needs overlap depth."""
@@ -127,43 +126,19 @@ def settings(
     return found
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Measure, print the tables, write the JSON; return 1 if no harmless setting keeps the limit."""
-    arguments = _parser().parse_args(argv)
     folder = writable_folder(Path(arguments.output), arguments.output)
+    is_there = torch.cuda.is_available()
+    if "cuda" in (arguments.execution or ()) and not is_there:
+        raise DataError("--execution cuda: expected a CUDA device that is there, found none")
+    arguments.execution = arguments.execution or EXECUTIONS[: 2 + is_there]
     arguments.generator = {path: load_generator(path) for path in arguments.generator}
     h, w = (SOURCES_OVER_VIEWS * side for side in arguments.size)
     with recorded(arguments.data, frames=arguments.frames, size=(h, w)) as data:
         report = measure(data, arguments)
-    show(table(report), report, folder / "trade.json")
+    show(table(report), report, folder / "pareto.json")
     return 0 if report["advice"] is None or report["advice"]["setting"] else 1
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = benchmark_parser(
-        "trade",
-        "Speed against accuracy: every quality, surface, decoded size and execution, for one target rig.",
-        data="synthetic streets",
-        view_size=SIZE,
-        repeats=REPEATS,
-        output="output",
-        example="--data FOLDER --budget-ms 20",
-    )
-    add_target(parser)
-    executions = [*get_args(Execution)] if torch.cuda.is_available() else ["opencv", "torch"]
-    surfaces = [name for name in SURFACES if name != "auto"]
-    parser.add_argument("--frames", type=count, default=1, metavar="N", help="frames for accuracy")
-    qualities = [*get_args(Quality)]
-    parser.add_argument("--quality", nargs="+", choices=qualities, default=qualities, help="presets")
-    parser.add_argument("--surface", nargs="+", choices=surfaces, help="(default: what the samples offer)")
-    parser.add_argument("--reduce", nargs="+", type=int, choices=REDUCES, default=[*REDUCES], help="decode at 1/N")
-    parser.add_argument("--execution", nargs="+", choices=executions, default=executions, help="backends")
-    of = "also fill holes by a generator's folder, a folder of diffusers or a TorchScript file"
-    parser.add_argument("--generator", nargs="+", default=[], metavar="PATH", help=of)
-    limit = parser.add_mutually_exclusive_group()
-    limit.add_argument("--budget-ms", type=positive, metavar="MS", help="recommend the most accurate within it")
-    limit.add_argument("--min-psnr", type=positive, metavar="DB", help="recommend the fastest that reaches it")
-    return parser
 
 
 @benchmark

@@ -1,0 +1,324 @@
+"""Command lines: the options of every command, without imports that take time."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import get_args
+
+from arbiview_aug.atomic_io import Link
+from arbiview_aug.cameras.framing import Fit
+from arbiview_aug.cameras.shipped import shipped_rigs
+from arbiview_aug.choices import TARGET_SETS, TRAINING_PRESETS, Holes, OnError, Reduce, Reference, SurfaceName
+from arbiview_aug.cli.arguments import (
+    add_data,
+    add_downscale,
+    add_frames,
+    add_output,
+    add_reading,
+    add_rendering,
+    add_target,
+    command_parser,
+    count,
+    degrees,
+    kinds_text,
+    positive,
+    seed,
+    size,
+)
+from arbiview_aug.datasets.registry import READERS
+from arbiview_aug.favs.config import Quality
+
+SIZE, FULL_SIZE = (256, 704), (900, 1600)
+"""Sizes (h, w) of the views that benchmarks render."""
+
+EXECUTIONS = ("opencv", "torch", "cuda")
+"""Backends of ``bench pareto``: ``opencv`` or ``torch`` on the CPU, or ``cuda``: torch on a GPU."""
+
+_GENERATOR = "folder of a generator or of diffusers, TorchScript file, or OWNER/NAME on the Hugging Face Hub"
+
+_FIXED = {
+    "paper": ("target", "target_set", "yaws", "quality", "surface", "path", "steps", "seed", "reduce", "clean_masks"),
+    "figure": ("target", "target_set", "yaws", "quality", "surface", "path", "steps", "frames"),
+    "displaced": ("target", "target_set", "yaws", "seed", "size"),
+}
+"""Options that the modes of ``evaluate`` fix."""
+
+
+def check() -> argparse.ArgumentParser:
+    parser = command_parser(
+        "check",
+        "Look for silent mistakes: yaw in degrees, other columns or axes, points in the LiDAR's frame, a wrong road, "
+        "K of another resolution, specks in masks, keys that are not read. Draws boxes and points into the images.",
+        "/data/frames --frames 5",
+    )
+    text = f"real frames, by their path alone or with their kind, or a rig file. {kinds_text()}"
+    parser.add_argument("data", metavar="[KIND:]PATH", help=text)
+    parser.add_argument("--frames", type=count, default=3, metavar="N", help="number of frames, spread over the data")
+    add_reading(parser)
+    add_output(parser, "folder for the pictures")
+    return parser
+
+
+def convert() -> argparse.ArgumentParser:
+    parser = command_parser(
+        "convert",
+        "Write a data set as another vehicle's cameras would have recorded it, in the source's format: nuScenes "
+        "tables, or frame folders. Files that are there are left as they are: run it again to go on.",
+        "--data nuscenes:ROOT --target argoverse2 --output converted --size 256x704",
+    )
+    add_data(parser)
+    add = parser.add_argument
+    add("--version", metavar="NAME", help="nuScenes' folder of tables (default: v1.0-mini, -trainval)")
+    add_target(parser, required=True)
+    add("--output", required=True, metavar="DIR", help="folder to write to")
+    add_rendering(parser)
+    holes = "what no camera saw, with --path favs: continued from its borders (default), the mean colour, or black"
+    add("--holes", choices=get_args(Holes), default="fill", help=holes)
+    add("--generator", type=Path, metavar="PATH", help=f"of --path diffusion: {_GENERATOR} (default: the own)")
+    add("--steps", type=count, metavar="N", help="steps of the generator (default: its own)")
+    add("--size", type=size, metavar="HxW", help="height and width of every view (default: the target's own)")
+    fit = "with --size: cut at the top and the sides (default), add black bars there, or stretch"
+    add("--fit", choices=get_args(Fit), default="crop", help=fit)
+    add_reading(parser)
+    neighbours = "let N frames of the drive before and after each fill holes (default: none)"
+    add("--neighbours", type=seed, default=0, metavar="N", help=neighbours)
+    depth = "what the depth command wrote, for --surface motion or learned (default: its folder in the data)"
+    add("--depth", dest="motion_depth", type=Path, metavar="DIR", help=depth)
+    add("--images", choices=("jpg", "png"), default="jpg", help="jpg: quality 96, 4:4:4; png: lossless")
+    add("--shard-index", type=seed, default=0, metavar="I", help="this shard, from 0")
+    add("--num-shards", type=count, default=1, metavar="N", help="number of shards")
+    add("--runner", choices=("local", "ray"), default="local", help="processes here, or Ray actors")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    add("--workers", type=count, default=cores, metavar="N", help="processes or actors (default: one a core)")
+    on_error = "samples that cannot be converted: report them and do not finish (default), leave them out, or stop"
+    add("--on-error", choices=get_args(OnError), default="report", help=on_error)
+    link = (
+        "how points, maps and other kept files come along: hard links where the disk allows them (default), copies, or "
+        "symbolic links, which readers of this package refuse"
+    )
+    add("--link", choices=get_args(Link), default="hard", help=link)
+    verify = "write nothing: compare sources and outputs with the checksums that were recorded"
+    add("--verify", action="store_true", help=verify)
+    add("--report", type=seed, default=2, metavar="N", help="number of frames in report.html")
+    return parser
+
+
+def demo() -> argparse.ArgumentParser:
+    parser = command_parser(
+        "demo",
+        "Retarget a synthetic street, or real frames, to another vehicle's cameras: the plan in words, metrics, time, "
+        "and one contact sheet.",
+        "--data FOLDER --target waymo",
+    )
+    add_data(parser, "a synthetic street")
+    add_target(parser)
+    add_output(parser, "folder for demo.png, or a picture file ending in .png or .jpg")
+    add_rendering(parser)
+    add_frames(parser, 1)
+    parser.add_argument("--width", type=count, default=1800, metavar="PX", help="width of the contact sheet")
+    parser.set_defaults(target_set=None, yaws=None, reduce=1, clean_masks=False)
+    return parser
+
+
+def depth() -> argparse.ArgumentParser:
+    parser = command_parser(
+        "depth",
+        "Compute the depth of every frame of a drive: from motion, for surface='motion', or with --model by a network, "
+        "for surface='learned'. Frames whose depth is there, of the same origin, are left as they are: run it again to "
+        "go on.",
+        "--data nuscenes:ROOT --workers 4",
+    )
+    add_data(parser)
+    add = parser.add_argument
+    output = "where to write (default: motion_depth or learned_depth beside the data)"
+    add("--output", metavar="FOLDER", help=output)
+    add("--workers", type=count, default=1, metavar="N", help="processes")
+    add("--model", metavar="ID_OR_PATH", help="depth model of transformers: a folder, or a name on its Hub")
+    fit = "instead of --model: a small network that learns from this drive alone (2000 steps without a number)"
+    add("--fit", type=count, nargs="?", const=2000, metavar="STEPS", help=fit)
+    add("--device", metavar="NAME", help="cpu, cuda, cuda:1, ... (default: the GPU, if there is one)")
+    add("--batch", type=count, default=8, metavar="N", help="images that the model sees at once")
+    references = list(get_args(Reference))
+    reference = "what scale and shift of the model are fitted to, the first that a camera has"
+    add("--reference", nargs="+", choices=references, default=references, help=reference)
+    return parser
+
+
+def evaluate() -> argparse.ArgumentParser:
+    parser = command_parser(
+        "evaluate",
+        "Measure the quality of rendered views: sparse LiDAR metrics, overlap and consistency on real frames, truth on "
+        "synthetic streets. Writes tables, evaluate.json, pictures, and a self-contained report.html.",
+        "--data FOLDER --target waymo --surface auto street",
+    )
+    add_data(parser, "synthetic streets")
+    target = parser.add_mutually_exclusive_group()
+    add_target(target)
+    sets = "instead of --target: paper (its six configurations), yaw (5 turns), vehicles, or truck (1 m higher)"
+    target.add_argument("--target-set", choices=TARGET_SETS, help=sets)
+    yaws = "instead of --target: the source rig turned, as in --yaws=-11,11"
+    target.add_argument("--yaws", metavar="DEG,...", type=degrees, help=yaws)
+    add_rendering(parser, several=True)
+    add = parser.add_argument
+    generator = f"of --path diffusion, --paper and --figure, which score held-out frames of its training: {_GENERATOR}"
+    add("--generator", metavar="PATH", help=generator)
+    add("--steps", nargs="+", type=count, default=[None], metavar="N", help="steps of the generator (default: its own)")
+    add_frames(parser, None, "number of frames (default: 1; --paper: 3 synthetic ones; --displaced: all)")
+    add_reading(parser)
+    add_output(parser)
+    mode = parser.add_mutually_exclusive_group()
+    displaced = (
+        "photographs as truth: of the frames' `truth` camera (docs/formats.md), else of the next frame of the drive; "
+        "with NEXT of this frame folder's first frame. Surfaces: a copy, and all that the data offers"
+    )
+    mode.add_argument("--displaced", nargs="?", const=True, metavar="NEXT", help=displaced)
+    paper = (
+        "the paper's Tables 1 and 2: baselines, the published stages and ours; without --data on nuscenes-one and "
+        "ddad-one below ARBIVIEW_DATA and on synthetic streets; quarter of an hour"
+    )
+    mode.add_argument("--paper", action="store_true", help=paper)
+    figure = "the paper's Figures 2 to 6 from the first frame, as PNG files"
+    mode.add_argument("--figure", action="store_true", help=figure)
+    return parser
+
+
+def inspect() -> argparse.ArgumentParser:
+    parser = command_parser("inspect", "Show rigs: tables, differences, a picture.", "nuscenes waymo")
+    rigs = (
+        f"a shipped rig ({', '.join(shipped_rigs())}), a rig file (YAML or JSON), or data as other commands' --data "
+        "takes it: the rig of its first frame"
+    )
+    parser.add_argument("rigs", nargs="+", metavar="RIG", help=rigs)
+    parser.add_argument("--output", default="inspect.png", metavar="FILE", help="the picture")
+    return parser
+
+
+def train() -> argparse.ArgumentParser:
+    parser = command_parser(
+        "",
+        "CVC-SSL: train a generator to reconstruct real views from pseudo views beside them. The same command with the "
+        "same --output goes on where it stopped. Several GPUs: accelerate launch -m arbiview_aug.train …, or torchrun "
+        "--nproc_per_node N -m arbiview_aug.train …",
+        "--data nuscenes:ROOT --output output/tiny --set steps=100",
+        program="python -m arbiview_aug.train",
+    )
+    add = parser.add_argument
+    add("command", nargs="?", choices=("train", "evaluate"), default="train", help="what to do (default: %(default)s)")
+    add("--config", choices=TRAINING_PRESETS, default="tiny", help="preset of all settings")
+    kinds = " or ".join(f"{kind}:PATH" for kind in READERS)
+    data = f"synthetic, or real frames with their kind: {kinds} (default: synthetic; evaluate: the run's)"
+    add("--data", metavar="DATA", help=data)
+    add_output(parser, "folder of the run")
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting, such as steps=100 or loss.geo=0")
+    add("--stage", choices=("all", "autoencoder"), default="all", help="autoencoder: that alone, if the config has one")
+    weights = "config paper or inpaint: Stable Diffusion 1.5, or its inpainting model: a folder or hub id"
+    add("--weights", metavar="DIR", help=weights)
+    add("--vgg-weights", metavar="FILE", help="torchvision's vgg16 weights (default: cache or download)")
+    add("--views", type=count, default=64, metavar="N", help="number of held-out views to score")
+    add("--seeds", type=count, default=1, metavar="N", help="evaluate: targets a scene")
+    add("--steps", type=count, metavar="N", help="evaluate: steps of a sample (default: the run's own)")
+    add("--quiet", action="store_true", help="no progress bars")
+    return parser
+
+
+# --- benchmarks -------------------------------------------------------------------------------------------------------
+def pareto() -> argparse.ArgumentParser:
+    parser = command_parser(
+        "bench pareto",
+        "Speed against accuracy: every quality, surface, decoded size and execution, for one target rig.",
+        "--data FOLDER --budget-ms 20",
+    )
+    add_data(parser, "synthetic streets")
+    add = parser.add_argument
+    add("--size", type=size, default=SIZE, metavar="HxW", help="of every view")
+    add("--repeats", type=count, default=9, metavar="N", help="rounds of timing")
+    add_output(parser)
+    add_target(parser)
+    surfaces = [name for name in get_args(SurfaceName) if name != "auto"]
+    add("--frames", type=count, default=1, metavar="N", help="frames for accuracy")
+    add("--quality", nargs="+", choices=get_args(Quality), default=[*get_args(Quality)], help="presets")
+    add("--surface", nargs="+", choices=surfaces, help="(default: what the samples offer)")
+    reduces = [*get_args(Reduce)]
+    add("--downscale", dest="reduce", nargs="+", type=int, choices=reduces, default=reduces, help="decode at 1/N")
+    executions = "backends (default: those of this machine)"
+    add("--execution", nargs="+", choices=EXECUTIONS, help=executions)
+    add("--generator", nargs="+", default=[], metavar="PATH", help=f"also fill holes by a {_GENERATOR}")
+    limit = parser.add_mutually_exclusive_group()
+    limit.add_argument("--budget-ms", type=positive, metavar="MS", help="recommend the most accurate within it")
+    limit.add_argument("--min-psnr", type=positive, metavar="DB", help="recommend the fastest that reaches it")
+    return parser
+
+
+def speed() -> argparse.ArgumentParser:
+    parser = command_parser(
+        "bench speed",
+        "Milliseconds of RigRetarget on one thread, and ratios to bare cv2.remap calls of the same views.",
+        "--device cuda",
+    )
+    add_data(parser, "nuscenes-one below ARBIVIEW_DATA where that is, else a synthetic street")
+    add = parser.add_argument
+    add("--size", type=size, nargs="+", default=[SIZE, FULL_SIZE], metavar="HxW", help="of views (default: both)")
+    add("--repeats", type=count, default=5, metavar="N", help="rounds of timing")
+    add("--only", metavar="TEXT", default="", help="calls whose names contain it")
+    device = "instead: batches that torch renders on cpu, cuda, cuda:1, ..., as ratios to a copy of the same bytes"
+    add("--device", metavar="NAME", help=device)
+    add("--output", default="output/speed.json", metavar="FILE", help="file to write to")
+    return parser
+
+
+def ablation() -> argparse.ArgumentParser:
+    parser = command_parser(
+        "bench ablation",
+        "Each stage and setting on and off: accuracy, milliseconds on one thread, and what a ms buys.",
+        "--data FOLDER",
+    )
+    add_data(parser, "a synthetic street", nargs="+", default=[])
+    add = parser.add_argument
+    add_downscale(parser, 2)
+    add("--seed", type=seed, default=0, metavar="N", help="seed of the synthetic street")
+    add("--only", metavar="TEXT", default="", help="steps whose names contain it")
+    add("--output", default="output/ablation.json", metavar="FILE", help="file to write to")
+    return parser
+
+
+def loader() -> argparse.ArgumentParser:
+    parser = command_parser(
+        "bench loader",
+        "Frames per second of a DataLoader with and without retargeting, and memory per worker.",
+        "--data FOLDER --workers 0 2",
+    )
+    add_data(parser, "synthetic streets, written as JPEGs")
+    add = parser.add_argument
+    add("--size", type=size, default=SIZE, metavar="HxW", help="of every view")
+    add_downscale(parser, 2)
+    add_target(parser)
+    add("--workers", type=seed, nargs="+", default=[0, 1, 2], metavar="N", help="workers")
+    add("--surface", nargs="+", choices=get_args(SurfaceName), default=["street", "auto"], help="geometry")
+    add("--frames", type=count, default=48, metavar="N", help="frames in an epoch")
+    add("--epochs", type=count, default=3, metavar="N", help="epochs to measure")
+    add("--output", default="output/loader.json", metavar="FILE", help="file to write to")
+    return parser
+
+
+# --- options that exclude each other ----------------------------------------------------------------------------------
+def check_together(name: str, parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    """Refuse options of a command that do not fit together, as argparse refuses others."""
+    if name == "convert" and given.shard_index >= given.num_shards:
+        parser.error(f"argument --shard-index: expected less than {given.num_shards}, got {given.shard_index}")
+    if name == "demo" and given.quality == "paper" and given.surface not in ("auto", "far"):
+        parser.error(f"argument --surface: quality paper knows the far surface alone, got {given.surface}")
+    if name == "depth":
+        if given.model and given.fit:
+            parser.error("argument --fit: expected it without --model")
+        if given.device and not (given.model or given.fit):
+            parser.error("argument --device: expected it with --model alone: depth from motion is computed on the CPU")
+    if name == "evaluate":
+        for mode, fixed in _FIXED.items():
+            for option in fixed:
+                if getattr(given, mode) and getattr(given, option) != parser.get_default(option):
+                    flag = "downscale" if option == "reduce" else option.replace("_", "-")
+                    parser.error(f"argument --{flag}: --{mode} has its own; expected none")
+        if given.displaced and given.data is None:
+            parser.error("argument --displaced: expected --data FOLDER with it, found none")
