@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import gc
+import os
 import platform
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
+from hashlib import sha256
 from importlib import import_module, metadata
+from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 from arbiview_aug.errors import MissingPackageError, warn
@@ -86,37 +92,127 @@ def compiled(function: Any) -> Any:
     """
     from numba import njit
 
-    try:
-        return njit(error_model="numpy", nogil=True, cache=True)(function)
-    except RuntimeError:  # no locator available: neither the package's folder nor the user's can be written
-        return njit(error_model="numpy", nogil=True)(function)
+    _compilation()
+    kernel: Any = njit(error_model="numpy", nogil=True)(function)
+    with suppress(RuntimeError):  # no locator available: neither the package's folder nor the user's can be written
+        kernel._cache = _kernel_cache()(function)
+    return kernel
+
+
+def inlined(function: Any) -> Any:
+    """Let numba compile a function within its callers: for parts of few kernels, which are then compiled once."""
+    from numba import njit
+
+    return njit(error_model="numpy", nogil=True, inline="always")(function)
 
 
 @contextmanager
 def compilation_announced() -> Iterator[None]:
-    """Say once, on stderr, that functions are being compiled, where numba's cache does not hold them."""
-    from numba.core import event
-
-    with event.install_listener("numba:compile", _announcement()):
+    """Say on stderr that kernels are compiled, where numba's cache does not hold them, and how long it took."""
+    compilation = _compilation()
+    before_s, outer = compilation.seconds, compilation.is_announced
+    compilation.is_announced = True
+    try:
         yield
+    finally:
+        compilation.is_announced = outer
+        if not outer and compilation.seconds > before_s:
+            print(f"arbiview_aug: kernels compiled in {compilation.seconds - before_s:.1f} s", file=sys.stderr)
+
+
+def working_s() -> float:
+    """Read a clock, in seconds, that stands still while kernels are compiled."""
+    return time.perf_counter() - _compilation().seconds
 
 
 @cache
-def _announcement() -> Any:
+def _compilation() -> Any:
+    """The listener that measures how long this process compiled kernels."""
     from numba.core import event
 
-    class Announcement(event.Listener):  # type: ignore[misc]
-        said = False
+    class Compilation(event.Listener):  # type: ignore[misc]
+        seconds, is_announced, said = 0.0, False, False
+        depth, start_s, collects = 0, 0.0, False
 
         def on_start(self, event: Any) -> None:
-            if not self.said:
-                print("arbiview_aug: compiling kernels, once for each installation (half a minute)", file=sys.stderr)
-            self.said = True
+            if not self.depth and not event.data["dispatcher"].py_func.__module__.startswith("arbiview_aug."):
+                return
+            if not self.depth:
+                if self.is_announced and not self.said:
+                    self.said = True
+                    print("arbiview_aug: compiling kernels, once for each installation", file=sys.stderr)
+                self.start_s, self.collects = time.perf_counter(), gc.isenabled()
+                gc.disable()  # the compiler's many small objects would be searched for garbage over and over
+            self.depth += 1
 
         def on_end(self, event: Any) -> None:
-            pass
+            self.depth -= self.depth > 0
+            if not self.depth and self.start_s:
+                self.seconds, self.start_s = self.seconds + time.perf_counter() - self.start_s, 0.0
+                if self.collects:
+                    gc.enable()
 
-    return Announcement()
+    listener = Compilation()
+    event.register("numba:compile", listener)
+    return listener
+
+
+@cache
+def _kernel_cache() -> type:
+    """numba's cache of one kernel, which throws damaged files away and notices when kernels that it calls change."""
+    from numba.core.caching import FunctionCache, IndexDataCacheFile
+
+    class Files(IndexDataCacheFile):  # type: ignore[misc]
+        """The files of a kernel; each ends in its SHA-256, as numba runs what it reads."""
+
+        def _load_index(self) -> Any:
+            return super()._load_index() if _is_intact(Path(self._index_path)) else {}
+
+        def _load_data(self, name: str) -> Any:
+            path = self._data_path(name)
+            if not _is_intact(Path(path)):
+                raise FileNotFoundError(path)  # it is compiled anew
+            return super()._load_data(name)
+
+        @contextmanager
+        def _open_for_write(self, path: str) -> Iterator[BytesIO]:
+            content = BytesIO()
+            yield content
+            with super()._open_for_write(path) as file:
+                file.write(content.getvalue() + sha256(content.getvalue()).digest())
+
+    class KernelCache(FunctionCache):  # type: ignore[misc]
+        def __init__(self, function: Any) -> None:
+            super().__init__(function)
+            kernels = [one for one in function.__globals__.values() if hasattr(one, "py_func")]
+            called = sorted({kernel.py_func.__code__.co_filename for kernel in kernels})
+            stamps = self._impl.locator.get_source_stamp(), *((s.st_mtime, s.st_size) for s in map(os.stat, called))
+            self._cache_file = Files(self._cache_path, f"{self._impl.filename_base}.sha256", stamps)
+
+        def save_overload(self, signature: Any, data: Any) -> None:
+            with suppress(OSError):  # a full disk, or a folder that cannot be written any more
+                super().save_overload(signature, data)
+
+    return KernelCache
+
+
+def _is_intact(path: Path) -> bool:
+    """Check a file that ends in its SHA-256; delete it if it is damaged."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return False
+    if sha256(content[:-32]).digest() == content[-32:]:
+        return True
+    with suppress(OSError):
+        path.unlink()
+    _say_damaged(path.parent)
+    return False
+
+
+@cache
+def _say_damaged(folder: Path) -> None:
+    print(f"arbiview_aug: damaged kernels in {folder} are deleted and compiled anew", file=sys.stderr)
 
 
 @contextmanager

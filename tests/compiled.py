@@ -6,7 +6,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from arbiview_aug.__main__ import main
-from arbiview_aug.render.plan import compile_kernels
+from arbiview_aug.transforms.warm_up import compile_kernels
 from tests.cli.convert.drives import command, write_frames
 
 if __name__ == "__main__":

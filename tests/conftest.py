@@ -27,8 +27,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_setupnodes(config: pytest.Config) -> None:
     """Compile the kernels once, while the processes of ``-n`` collect: each would compile them for itself."""
-    command = "from arbiview_aug.render.plan import compile_kernels; compile_kernels()"
-    config.stash[COMPILER] = subprocess.Popen([sys.executable, "-c", command], cwd=config.rootpath)
+    config.stash[COMPILER] = subprocess.Popen([sys.executable, "-m", "tests.compiled"], cwd=config.rootpath)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.cameras.lens import MIN_DEPTH
-from arbiview_aug.environment import compiled
+from arbiview_aug.environment import compiled, inlined
 
 Row = Any  # float32 (n,): kernels are typed by numba
 
@@ -35,7 +35,7 @@ _ATAN = tuple(np.float32(c) for c in (8.05374449538e-2, -1.38776856032e-1, 1.997
 _A0, _A1, _A2, _A3 = _ATAN
 
 
-@compiled
+@inlined
 def pinhole_rays_row(P: Row, v: float, first: int, rx: Row, ry: Row, rz: Row) -> None:
     """Unit rays of the pixels of row ``v`` from column ``first`` on, camera frame."""
     y = (np.float32(v) - P[4]) / P[3]
@@ -76,11 +76,12 @@ def cell_cones(planes: Row, P: Row, size: Row, step: int, cones: Row) -> None:
     h, w = size
     _, ny, nx = cones.shape
     lines = np.empty((3, 3, w), np.float32)  # of rays: the cells' first, middle and last row
+    first = np.int64(0)  # a literal would compile ``rays_row`` once more
     for j in range(ny):
         top, bottom = j * step, min(j * step + step, h) - 1
-        rays_row(planes, P, top, 0, lines[0, 0], lines[0, 1], lines[0, 2])
-        rays_row(planes, P, (top + bottom) // 2, 0, lines[1, 0], lines[1, 1], lines[1, 2])
-        rays_row(planes, P, bottom, 0, lines[2, 0], lines[2, 1], lines[2, 2])
+        rays_row(planes, P, top, first, lines[0, 0], lines[0, 1], lines[0, 2])
+        rays_row(planes, P, (top + bottom) // 2, first, lines[1, 0], lines[1, 1], lines[1, 2])
+        rays_row(planes, P, bottom, first, lines[2, 0], lines[2, 1], lines[2, 2])
         for i in range(nx):
             left, right = i * step, min(i * step + step, w) - 1
             m = (left + right) // 2
@@ -93,7 +94,10 @@ def cell_cones(planes: Row, P: Row, size: Row, step: int, cones: Row) -> None:
                 least = min(least, a * a + b * b + c * c)
             if least <= _HALF:
                 rays = planes[:, top : bottom + 1, left : right + 1]
-                x, y, z = rays[0].sum(), rays[1].sum(), rays[2].sum()
+                x, y, z = _ZERO, _ZERO, _ZERO
+                for row in range(rays.shape[1]):
+                    for column in range(rays.shape[2]):
+                        x, y, z = x + rays[0, row, column], y + rays[1, row, column], z + rays[2, row, column]
                 length, most = np.sqrt(x * x + y * y + z * z), _NO_CONE
                 if length > _ZERO:
                     x, y, z = x / length, y / length, z / length
@@ -178,7 +182,7 @@ def angle_row(r: Row, z: Row, out: Row) -> None:
         out[i] = _PI - angle if z[i] < _ZERO else angle
 
 
-@compiled
+@inlined
 def _fisheye_row(x: Row, y: Row, z: Row, P: Row, scale: Row, r: Row) -> None:
     """theta_d / r (n,) of a Kannala-Brandt lens, -2 past its fold and on the axis behind the camera."""
     k1, k2, k3, k4, fold = P[6], P[7], P[8], P[9], P[5]

@@ -25,12 +25,13 @@ from arbiview_aug.cli.arguments import device_named, gathered_warnings, writable
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.depth_folder import FOLDER, LEARNED_FOLDER, WANTED, DepthFolder
 from arbiview_aug.datasets.registry import open_data, split_kind
+from arbiview_aug.environment import compilation_announced
 from arbiview_aug.errors import ArbiviewError, WarnOnce, described
 from arbiview_aug.sample.inputs import read_frames, read_scene
 from arbiview_aug.sample.neighbours import Neighbour, read_neighbours, warn_lost
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, DepthModel, learned_depth
-from arbiview_aug.temporal.motion_depth import compile_matching, motion_depth
+from arbiview_aug.temporal.motion_depth import motion_depth, warm_up
 from arbiview_aug.temporal.self_supervised import FittedDepth, fit_to_drive, size_for
 from arbiview_aug.temporal.transformers_depth import TransformersDepth
 
@@ -152,7 +153,8 @@ def run(arguments: argparse.Namespace) -> int:
                 model = _fitted_network(data, depths.root / FITTED_FILE, arguments.fit, device, arguments.workers)
             done = list(_learned(model, data, depths, DepthFolder(inside(root, FOLDER, "depth")), arguments))
         else:
-            compile_matching()
+            with compilation_announced():
+                warm_up()  # here, once, and not in every worker
             frames = _Frames(data, data.tokens, depths)
             done = list(results(frames, arguments.workers, "depth from motion"))
     for line in warned:

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
-from arbiview_aug.environment import one_thread
+from arbiview_aug.environment import one_thread, working_s
 
 Result = TypeVar("Result")
 
@@ -45,6 +45,8 @@ def with_progress(
 ) -> Iterator[Result]:
     """Yield ``count`` results as they come, behind a progress bar with frames/s and the remaining time."""
     with tqdm(total=count, unit="frame", desc=label) as bar:
+        bar._time = working_s
+        bar.reset()
         for one in done:
             if note is not None:
                 bar.set_postfix_str(note(one), refresh=False)

@@ -9,11 +9,10 @@ import torch
 from torch.utils.data import Dataset, IterableDataset
 
 from arbiview_aug.errors import DataError, SampleTypeError
-from arbiview_aug.render.plan import compile_kernels
 from arbiview_aug.scene.scene import SURFACES
-from arbiview_aug.temporal.motion_depth import compile_matching
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import is_number
+from arbiview_aug.transforms.warm_up import compile_kernels
 
 Retarget = Callable[[Any], Any]
 
@@ -134,7 +133,5 @@ def _checked_retarget(retarget: Any, name: str) -> Retarget:
     if not callable(retarget):
         raise SampleTypeError(f"{name}: expected a callable such as RigRetarget, got {type(retarget).__name__}")
     if isinstance(retarget, RigRetarget):
-        compile_kernels()  # here, once, and not in every worker
-        if SURFACES[retarget.surface].needs == "motion":
-            compile_matching()
+        compile_kernels(matching=SURFACES[retarget.surface].needs == "motion")  # here, once, and not in every worker
     return retarget  # type: ignore[no-any-return]

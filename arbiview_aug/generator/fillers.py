@@ -64,7 +64,7 @@ def fill_holes(
         how: ``fill``: paint tops in their objects' colours, and continue objects from objects, background from
             background. ``mean``: set all to the mean colour of the frame's covered pixels. ``black``: none.
     """
-    from arbiview_aug.render.kernels import paint as put_paint
+    from arbiview_aug.inpaint.kernels import paint as put_paint
 
     seen = [of_view.cpu().numpy() for of_view in coverage]
     if how == "black" or all(of_view.all() for of_view in seen):
@@ -123,7 +123,7 @@ def object_colours(views: Sequence[npt.NDArray[Any]], paint: Sequence[Paint | No
 # --- one view ---------------------------------------------------------------------------------------------------------
 def _fill(view: npt.NDArray[Any], seen: npt.NDArray[Any], layers: npt.NDArray[np.uint8], mean: Colour) -> None:
     """Continue the background: what is hidden from beside it, what lies outside the images from columns, too."""
-    from arbiview_aug.render.kernels import continue_columns, put_cells, sum_cells
+    from arbiview_aug.inpaint.kernels import continue_columns, put_cells, sum_cells
 
     cell, rounding = _cell_px(seen.shape), 0.5 if view.dtype == np.uint8 else 0.0
     known = seen & (layers < OBJECT)
@@ -140,7 +140,7 @@ def _fill(view: npt.NDArray[Any], seen: npt.NDArray[Any], layers: npt.NDArray[np
 
 def _completed(cells: Cells, mean: Colour, wide: int) -> None:
     """Complete cells in place, by the mean colour where nothing is known; the first ``wide`` steps keep the rows."""
-    from arbiview_aug.render.kernels import complete, halve, smooth
+    from arbiview_aug.inpaint.kernels import complete, halve, smooth
 
     ny, nx = cells.shape[1:]
     if ny == nx == 1:

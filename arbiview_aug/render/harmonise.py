@@ -205,19 +205,19 @@ def estimate_gains(
     Returns:
         The gains, or gains of 1 and the reason.
     """
-    from arbiview_aug.render.kernels import pair_ratios, tone
+    from arbiview_aug.render.photometry_kernels import tone
 
     config = config or HarmoniseConfig()
     overlaps = find_overlaps(rig, config) if overlaps is None else overlaps
     none = (1.0,) * len(rig)
     if not overlaps.pairs.size:
         return PhotometricReport(none, False, "no two cameras overlap enough")
-    pixels, found = _read([images[k] for k in overlaps.order], overlaps), np.empty((overlaps.pairs.shape[1], 3))
-    pair_ratios(pixels, overlaps.fitted, config.dark, config.bright, found)
-    enough = _STEP_PX**2 * found[:, 0] >= config.min_pixels
+    pixels = _read([images[k] for k in overlaps.order], overlaps)
+    ratios = pair_ratios(pixels, overlaps.fitted, config.dark, config.bright)
+    enough = _STEP_PX**2 * ratios[:, 0] >= config.min_pixels
     if not enough.any():
         return PhotometricReport(none, False, "too few pixels in the overlaps are neither dark nor saturated")
-    limit, (number, ratio, spread) = np.log(config.max_gain), found[enough].T
+    limit, (number, ratio, spread) = np.log(config.max_gain), ratios[enough].T
     # Neighbouring pixels err together: a fitted tile (8 x 8) counts once.
     tiles = number * (2 * _STEP_PX / _TILE_PX) ** 2
     variance = spread**2 / tiles + config.pair_log_error**2
@@ -236,7 +236,7 @@ def estimate_gains(
 
 def _read(images: Sequence[torch.Tensor], overlaps: Overlaps) -> _Pixels:
     """All readings (K, 3) of images (3, H, W), float32 in [0, 1]."""
-    from arbiview_aug.render.kernels import read_pixels
+    from arbiview_aug.render.photometry_kernels import read_pixels
 
     dtype, scale = (torch.uint8, 1 / 255) if images[0].dtype == torch.uint8 else (torch.float32, 1.0)
     pixels = np.empty((len(overlaps.at), 3), np.float32)
@@ -248,6 +248,23 @@ def _read(images: Sequence[torch.Tensor], overlaps: Overlaps) -> _Pixels:
             rows, columns = torch.from_numpy(at).to(image.device).unbind(1)
             pixels[first:end] = (image[:, rows, columns].T.float() * scale).nan_to_num(0, 0, 0).cpu()
     return pixels
+
+
+def pair_ratios(pixels: _Pixels, reads: npt.NDArray[np.int64], dark: float, bright: float) -> npt.NDArray[np.float64]:
+    """Number (P, 3) of each pair's pixels that count, and the median and spread of their log-ratios.
+
+    Arguments are as in ``photometry_kernels.log_ratios``.
+    """
+    from arbiview_aug.render.photometry_kernels import log_ratios
+
+    ratios, counts = np.empty(reads.shape[1:]), np.empty(reads.shape[1], np.int64)
+    log_ratios(pixels, reads, dark, bright, ratios, counts)
+    measured = np.zeros((len(counts), 3))
+    for row, ratio, count in zip(measured, ratios, counts.tolist(), strict=True):
+        if count:
+            middle = np.median(ratio[:count])
+            row[:] = count, middle, 1.4826 * np.median(np.abs(ratio[:count] - middle))
+    return measured
 
 
 def _solve(
@@ -275,7 +292,7 @@ def _solve(
 
 def _held_out_db(pixels: _Pixels, overlaps: Overlaps) -> float:
     """PSNR in dB between the two readings of held-out pixels, mean over pairs."""
-    from arbiview_aug.render.kernels import pair_errors
+    from arbiview_aug.render.photometry_kernels import pair_errors
 
     errors = np.empty(overlaps.held_out.shape[1])
     pair_errors(pixels, overlaps.held_out, errors)

@@ -1,4 +1,4 @@
-"""Compiled inner loops of planning, which cells a source may see, its pixels, and who wins them; and of filling holes.
+"""Compiled inner loops of planning: which cells a source may see, its pixels, and who wins them.
 
 A target is worked on row by row; every loop over a row writes one array, so that it becomes vector instructions.
 """
@@ -8,9 +8,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from arbiview_aug.cameras.kernels import edge_distance_row, project_row, rays_row, turn_row
-from arbiview_aug.environment import compiled
+from arbiview_aug.environment import compiled, inlined
 from arbiview_aug.render.atlas import OUTSIDE
 from arbiview_aug.scene.kernels import upsampled_row
 from arbiview_aug.scene.shapes import PIECES
@@ -26,7 +27,6 @@ SAME_OBJECT_M = np.float32(0.15)
 WHOLE = 0.97
 """Share of an object's nodes, among those of the source that sees most, from which a source sees it whole."""
 
-_LEAST_KNOWN = np.float32(0.25)  # a cell of less known area says nothing of its column
 _BORDER_PX = np.float32(1.0)  # maps bulge between the corners of a cell
 _OUTSIDE = np.int32((OUTSIDE << 16) | (OUTSIDE & 0xFFFF))  # both coordinates of a packed position
 _WORK_ROWS = 11  # of scratch memory in ``_evaluate_row``
@@ -115,8 +115,8 @@ def cells_in_view(
                 a[i] = max(np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i]), _TINY)
             for i in range(nx):
                 forward[i] = max(forward[i], z[i] / a[i])
-            if c == 0:
-                first_x[:], first_y[:], first_z[:] = x / a, y / a, z / a
+            for i in range(nx if c == 0 else 0):
+                first_x[i], first_y[i], first_z[i] = x[i] / a[i], y[i] / a[i], z[i] / a[i]
             for i in range(nx):
                 together[i] = min(together[i], (first_x[i] * x[i] + first_y[i] * y[i] + first_z[i] * z[i]) / a[i])
         columns[j, 0] = columns[j, 1] = 0
@@ -186,14 +186,14 @@ def measure_nodes(
 
 
 @compiled
-def node_winners(
+def keep_objects_whole(
     scores: Any, parallax: Any, boxes: Any, center: Any, R: Any, rays: Any, axis: Any, node_rad: float, winner: Any
 ) -> None:  # fmt: skip
-    """Which source has the largest weight on each node, but for labelled objects that a seam would cross.
+    """Give the nodes of each labelled object that a seam would cross to one source, where that sees it.
 
-    A seam repeats or cuts what it crosses. Such an object is read from one source, where that sees it: of the sources
-    that see it whole, the one of the least parallax. Nearer objects decide last. Objects that a source shows exactly,
-    from the target's own centre, stay as they are.
+    A seam repeats or cuts what it crosses. Of the sources that see the object whole, the one of the least parallax is
+    read. Nearer objects decide last. Objects that a source shows exactly, from the target's own centre, stay as they
+    are.
 
     Args:
         scores: (K, ny, nx) weight of each source, 0 where it sees nothing.
@@ -204,34 +204,32 @@ def node_winners(
         rays: (3, ny, nx) of the nodes.
         axis: (4,) middle of a cone around the target's rays, camera frame, and its half angle.
         node_rad: Angle between nodes: objects are wider by it.
-        winner: (ny, nx) int8, written: the first of the best sources, -1 for none.
+        winner: (ny, nx) int8 the source of the largest weight, -1 for none; updated.
     """
     K, ny, nx = scores.shape
     n = ny * nx
-    score, error, ray = scores.reshape(K, n), parallax.reshape(K, n), rays.reshape(3, n)
+    score, error, ray, own = scores.reshape(K, n), parallax.reshape(K, n), rays.reshape(3, n), winner.reshape(n)
     x, y, z = ray[0], ray[1], ray[2]
-    first, best, own = np.empty(n, np.int8), np.zeros(n, np.float32), winner.reshape(n)
-    first[:] = -1
-    for k in range(K):
-        for i in range(n):
-            first[i] = np.int8(k) if score[k, i] > best[i] else first[i]
-        for i in range(n):
-            best[i] = max(best[i], score[k, i])
-    own[:] = first
-    near, inside, along = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.float32)
-    axes, to_box, across, count, total = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(K), np.empty(K)
+    first, near, inside = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
+    along, vectors, count, total = np.empty(n, np.float32), np.empty((7, 3)), np.empty(K), np.empty(K)
+    axes, to_box, across, away, half = vectors[:3], vectors[3], vectors[4], vectors[5], vectors[6]
+    for i in range(n):
+        first[i] = own[i]
     for b in range(boxes.shape[0]):
-        c, s, away, half = np.cos(boxes[b, 6]), np.sin(boxes[b, 6]), boxes[b, :3] - center, boxes[b, 3:6] / 2
-        far = np.sqrt((away**2).sum())
+        c, s = np.cos(boxes[b, 6]), np.sin(boxes[b, 6])
+        for i in range(3):
+            away[i], half[i] = boxes[b, i] - center[i], boxes[b, 3 + i] / 2
+        far = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2)
         margin = node_rad * far
-        reach = np.sqrt((half**2).sum()) + 2 * margin
+        reach = np.sqrt(half[0] ** 2 + half[1] ** 2 + half[2] ** 2) + 2 * margin
         for i in range(3):
             axes[0, i], axes[1, i], axes[2, i] = c * R[0, i] + s * R[1, i], c * R[1, i] - s * R[0, i], R[2, i]
             to_box[i] = R[0, i] * away[0] + R[1, i] * away[1] + R[2, i] * away[2]
         for i in range(3):
             across[i] = axes[i, 0] * to_box[0] + axes[i, 1] * to_box[1] + axes[i, 2] * to_box[2]
         outside = far > reach
-        if outside and (to_box * axis[:3]).sum() < far * np.cos(min(axis[3] + np.arcsin(reach / far), np.pi)):
+        off_axis = to_box[0] * axis[0] + to_box[1] * axis[1] + to_box[2] * axis[2]
+        if outside and off_axis < far * np.cos(min(axis[3] + np.arcsin(reach / far), np.pi)):
             continue
         ax, ay, az = np.float32(to_box[0]), np.float32(to_box[1]), np.float32(to_box[2])
         bound = np.float32(np.sqrt(far**2 - reach**2)) if outside else -_MOST
@@ -248,38 +246,40 @@ def node_winners(
                 middle, less, more = across[k] * inverse, half[k] * abs(inverse), (half[k] + margin) * abs(inverse)
                 enter, leave = max(enter, middle - less), min(leave, middle + less)
                 enter_wide, leave_wide = max(enter_wide, middle - more), min(leave_wide, middle + more)
+            best = first[i]
             if leave_wide >= enter_wide and enter_wide > 0:
                 near[around] = i
                 around += 1
-                low, high = min(low, first[i] if first[i] >= 0 else K), max(high, first[i])
+                low, high = min(low, best if best >= 0 else K), max(high, best)
             if leave >= enter and enter > 0:
                 inside[within] = i
                 within += 1
-                exact = exact or best[i] > _ONE
+                exact = exact or (best >= 0 and score[best, i] > _ONE)
         if exact or low >= high:
             continue
-        count[:] = 0
-        total[:] = 0
+        most = 0.0
         for k in range(K):
+            count[k], total[k] = 0.0, 0.0
             for j in range(within):
                 count[k] += score[k, inside[j]] > _ZERO
                 total[k] += error[k, inside[j]]
+            most = max(most, count[k])
         one = -1
         for k in range(K):
-            if count[k] > 0 and count[k] >= WHOLE * count.max() and (one < 0 or total[k] < total[one]):
+            if count[k] > 0 and count[k] >= WHOLE * most and (one < 0 or total[k] < total[one]):
                 one = k
         for j in range(around if one >= 0 else 0):
             if score[one, near[j]] > _ZERO:
                 own[near[j]] = one
 
 
-@compiled
+@inlined
 def _fixed(value: Any) -> Any:
     """32nds of a pixel."""
     return np.int32(np.rint(min(max(value, -MAP_LIMIT_PX), MAP_LIMIT_PX) * np.float32(32)))
 
 
-@compiled
+@inlined
 def _occlude_row(
     q: Any, face: Any, px: Any, py: Any, pz: Any, u: Any, v: Any, column: Any, row: Any, hides: Any, place: Any,
     scale: float, before_m: Any, shadow: Any, solid: Any, guess: bool, seen: Any,
@@ -340,7 +340,7 @@ def _occlude_row(
         seen[i] = seen[i] & (hides[i] <= pz[i])
 
 
-@compiled
+@inlined
 def _evaluate_row(
     planes: Any, target: Any, q: Any, face: Any, source: Any, y: int, x0: int, n: int, work: Any, inside: Any, seen: Any
 ) -> None:  # fmt: skip
@@ -354,8 +354,8 @@ def _evaluate_row(
     rays_row(planes, target, y, x0, rx, ry, rz)
     turn_row(rx, ry, rz, q[y, x0 : x0 + n], A, o, px, py, pz)
     if kind < 0:
-        u[:] = given[0, y, x0 : x0 + n]
-        v[:] = given[1, y, x0 : x0 + n]
+        for i in range(n):
+            u[i], v[i] = given[0, y, x0 + i], given[1, y, x0 + i]
     else:
         project_row(px, py, pz, kind, P, a, b, u, v)
     low_u, low_v, high_u, high_v = bounds[0], bounds[1], bounds[2], bounds[3]
@@ -393,7 +393,7 @@ def put_source(
     shared: Any, best: Any, winner: Any, xy: Any, frac: Any, in_image: Any,
     next_best: Any, second: Any, next_xy: Any, next_frac: Any,
 ) -> None:  # fmt: skip
-    """Let a source win the pixels that it sees with more weight than the best so far.
+    """Let a source win the pixels that it sees with more weight than the best so far; see also ``seen_image``.
 
     Args:
         planes: (3, h, w) the target's rays; (3, 0, 0) for a pinhole.
@@ -407,6 +407,7 @@ def put_source(
         columns: (ny, 2) first and last (exclusive) cell of each row of cells that it may see.
         shared: (ny, nx) bool, cells in which the second-best source is kept.
         best: (h, w) float32 largest weight so far, below 0 where there is none; updated, as are all that follow.
+            If it is (0, 0), ``in_image`` becomes 255 where the source sees a pixel, and nothing else is written.
         winner: (h, w) int8.
         xy: (h, w) int32, two int16: whole pixels in the source.
         frac: (h, w) uint16, 32nds of a pixel.
@@ -416,7 +417,7 @@ def put_source(
         next_xy: (h, w) int32 where it is read.
         next_frac: (h, w) uint16.
     """
-    h, w = best.shape
+    h, w = in_image.shape
     work, share = np.empty((_WORK_ROWS, w), np.float32), np.empty(w, np.float32)
     inside, seen = np.empty(w, np.int32), np.empty(w, np.int32)
     fu, fv = np.empty(w, np.int32), np.empty(w, np.int32)
@@ -429,6 +430,10 @@ def put_source(
         if n <= 0:
             continue
         _evaluate_row(planes, target, q, face, source, y, x0, n, work, inside[:n], seen[:n])
+        if not best.shape[0]:
+            for i in range(n):
+                in_image[y, x0 + i] = np.uint8(255) if seen[i] else in_image[y, x0 + i]
+            continue
         u, v = work[0, :n], work[1, :n]
         upsampled_row(weight, step, y, x0, row, share[:n])
         for i in range(n):
@@ -469,6 +474,17 @@ def put_source(
             image[i] = np.uint8(255) if inside[i] else image[i]
         for i in range(n):
             held[i] = max(share[i], held[i])
+
+
+def seen_image(planes: Any, target: Any, q: Any, face: Any, source: Any) -> npt.NDArray[np.bool_]:
+    """Find the pixels (h, w) that a source sees; arguments as in ``put_source``, whose compiled code it runs."""
+    no_weight, no_name, no_place, no_fraction = (np.zeros((0, 0), t) for t in ("f4", "i1", "i4", "u2"))
+    columns, seen = np.array([[0, 1]]), np.zeros(q.shape, np.uint8)
+    put_source(
+        planes, target, q, face, source, (0, 0, 0), no_weight, max(q.shape), columns,
+        no_weight > 0, no_weight, no_name, no_place, no_fraction, seen, no_weight, no_name, no_place, no_fraction,
+    )  # fmt: skip
+    return seen > 0
 
 
 @compiled
@@ -539,18 +555,6 @@ def cut_bands(
                 band_frac[at] = frac[y, x] if adds else 0
                 weight[at] = share[y, x] if adds else _ZERO
                 at += 1
-
-
-@compiled
-def seen_image(planes: Any, target: Any, q: Any, face: Any, source: Any, visible: Any) -> None:
-    """Whether a source sees each pixel (h, w); arguments as in ``put_source``."""
-    h, w = visible.shape
-    work = np.empty((_WORK_ROWS, w), np.float32)
-    inside, seen = np.empty(w, np.int32), np.empty(w, np.int32)
-    for y in range(h):
-        _evaluate_row(planes, target, q, face, source, y, np.int64(0), w, work, inside, seen)
-        for x in range(w):
-            visible[y, x] = seen[x] != 0
 
 
 @compiled
@@ -661,7 +665,7 @@ def upsample_where(nodes: Any, step: int, winner: Any, number: int, out: Any) ->
     h, w = winner.shape
     row, values = np.empty(nodes.shape[1], np.float32), np.empty(w, np.float32)
     for y in range(h):
-        upsampled_row(nodes, step, y, 0, row, values)
+        upsampled_row(nodes, step, y, np.int64(0), row, values)
         for x in range(w):
             if winner[y, x] == number:
                 out[y, x] = np.uint8(np.rint(values[x]))
@@ -698,273 +702,3 @@ def read_ahead(atlas: Any, pixel: int, packed: Any, winner: Any) -> int:
                     for at in range(left * pixel, min((right + 2) * pixel, atlas.shape[1]), 64):
                         found ^= atlas[row, at]
     return found  # else nothing would be read
-
-
-# --- exposures --------------------------------------------------------------------------------------------------------
-@compiled
-def read_pixels(image: Any, at: Any, scale: Any, pixels: Any) -> None:
-    """Read an image (3, h, w) at (n, 2) rows and columns, times a scale, into (n, 3) float32; no number is 0."""
-    for k in range(len(at)):
-        for c in range(3):
-            value = np.float32(image[c, at[k, 0], at[k, 1]]) * scale
-            pixels[k, c] = value if np.isfinite(value) else _ZERO
-
-
-@compiled
-def pair_ratios(pixels: Any, reads: Any, dark: float, bright: float, found: Any) -> None:
-    """How much brighter one camera of each pair reads shared pixels than the other.
-
-    Args:
-        pixels: (K, 3) float32 readings.
-        reads: (2, P, L) two readings of each pixel; K after a pair's last one.
-        dark: Pixels count above this mean value,
-        bright: and below this value in every channel.
-        found: (P, 3) float64, written: number of pixels that count, median and spread of their log-ratios.
-    """
-    ratio = np.empty(reads.shape[2])
-    for p in range(reads.shape[1]):
-        n = 0
-        for j in range(reads.shape[2]):
-            if reads[0, p, j] == len(pixels):
-                break
-            one, two = pixels[reads[0, p, j]], pixels[reads[1, p, j]]
-            light, other = one[0] + one[1] + one[2], two[0] + two[1] + two[2]
-            most = max(one[0], one[1], one[2], two[0], two[1], two[2])
-            if min(light, other) > 3 * dark and most < bright:
-                ratio[n] = np.log(np.float64(light) / np.float64(other))
-                n += 1
-        found[p] = n
-        if n > 0:
-            ordered = np.sort(ratio[:n])
-            found[p, 1] = (ordered[(n - 1) // 2] + ordered[n // 2]) / 2
-            ordered = np.sort(np.abs(ordered - found[p, 1]))
-            found[p, 2] = 1.4826 * (ordered[(n - 1) // 2] + ordered[n // 2]) / 2
-
-
-@compiled
-def pair_errors(pixels: Any, reads: Any, errors: Any) -> None:
-    """Mean squared difference (P,) between the two readings of each pair's pixels; arguments as in ``pair_ratios``."""
-    for p in range(reads.shape[1]):
-        total, n = 0.0, 0
-        for j in range(reads.shape[2]):
-            if reads[0, p, j] == len(pixels):
-                break
-            for c in range(3):
-                total += np.float64(pixels[reads[0, p, j], c] - pixels[reads[1, p, j], c]) ** 2
-            n += 3
-        errors[p] = total / n
-
-
-@compiled
-def tone(values: Any, runs: Any, curves: Any, top: Any, rounding: Any) -> None:
-    """Put the pixels of a view through the tone curves of their sources.
-
-    Args:
-        values: (3 n,) uint8 or float32, changed.
-        runs: (r, 3) first pixel, end and source of each run of pixels.
-        curves: (s, 2) float32 of each source, as ``harmonise.tone_curves`` makes them.
-        top: Largest value.
-        rounding: Added before the fraction is cut off.
-    """
-    for r in range(len(runs)):
-        start, end, source = runs[r, 0], runs[r, 1], runs[r, 2]
-        gain, slope = curves[source, 0], curves[source, 1]
-        if gain == _ONE:
-            continue
-        part, offset = values[3 * start : 3 * end], top * (_ONE - slope)
-        if gain > _ONE:
-            for j in range(len(part)):
-                x = np.float32(part[j])
-                part[j] = min(x * gain, x * slope + offset) + rounding
-        else:
-            for j in range(len(part)):
-                x = np.float32(part[j])
-                part[j] = max(x * gain, x * slope + offset) + rounding
-
-
-# --- filling holes ----------------------------------------------------------------------------------------------------
-@compiled
-def sum_cells(view: Any, known: Any, cell: int, sums: Any) -> None:
-    """Mean over each cell of its known pixels' colours, the others counting as 0, and the known share.
-
-    Args:
-        view: (3, h, w), of any type.
-        known: (h, w) uint8, 1 where a pixel is known, else 0.
-        cell: Side of a cell, pixels.
-        sums: (4, ny, nx) float32, written.
-    """
-    h, w = known.shape
-    ny, nx = sums.shape[1:]
-    row, per_pixel = np.empty(w, np.float32), _ONE / np.float32(cell * cell)
-    for c in range(4):
-        for j in range(ny):
-            for x in range(w):
-                row[x] = _ZERO
-            for y in range(j * cell, min(j * cell + cell, h)):
-                mark = known[y]
-                if c < 3:
-                    plane = view[c, y]
-                    for x in range(w):
-                        row[x] += np.float32(plane[x]) * np.float32(mark[x])
-                else:
-                    for x in range(w):
-                        row[x] += np.float32(mark[x])
-            for i in range(nx):
-                total = _ZERO
-                for x in range(i * cell, min(i * cell + cell, w)):
-                    total += row[x]
-                sums[c, j, i] = total * per_pixel
-
-
-@compiled
-def halve(fine: Any, tall: int, coarse: Any) -> None:
-    """Add up cells (4, ny, nx) by ``tall`` (1 or 2) rows and 2 columns, at most to full cells."""
-    ny, nx = fine.shape[1:]
-    share, whole = _ONE / np.float32(2 // tall), nx // 2
-    for j in range(coarse.shape[1]):
-        y, below = j * tall, min(j * tall + tall, ny) - 1
-        lower = _ONE if below > y else _ZERO
-        for c in range(4):
-            one, two, out = fine[c, y], fine[c, below], coarse[c, j]
-            for i in range(whole):
-                out[i] = share * ((one[2 * i] + one[2 * i + 1]) + lower * (two[2 * i] + two[2 * i + 1]))
-            if nx % 2:
-                out[whole] = share * (one[nx - 1] + lower * two[nx - 1])
-        for i in range(coarse.shape[2]):
-            known = coarse[3, j, i]
-            if known > _ONE:
-                for c in range(4):
-                    coarse[c, j, i] /= known
-
-
-@compiled
-def complete(coarse: Any, tall: int, fine: Any) -> None:
-    """Complete what cells (4, ny, nx) do not know by coarser ones, complete themselves; see ``halve``."""
-    ny, nx = fine.shape[1:]
-    rows, columns = coarse.shape[1:]
-    for j in range(ny):
-        at = min(max((np.float32(j) + _HALF) / np.float32(tall) - _HALF, _ZERO), np.float32(rows - 1))
-        j0 = int(at)
-        j1, s = min(j0 + 1, rows - 1), at - np.float32(j0)
-        for i in range(nx):
-            missing = _ONE - fine[3, j, i]
-            if missing <= _ZERO:
-                continue
-            at = min(max((np.float32(i) + _HALF) * _HALF - _HALF, _ZERO), np.float32(columns - 1))
-            i0 = int(at)
-            i1, t = min(i0 + 1, columns - 1), at - np.float32(i0)
-            for c in range(4):
-                above = coarse[c, j0, i0] + t * (coarse[c, j0, i1] - coarse[c, j0, i0])
-                below = coarse[c, j1, i0] + t * (coarse[c, j1, i1] - coarse[c, j1, i0])
-                fine[c, j, i] += missing * (above + s * (below - above))
-
-
-@compiled
-def smooth(known: Any, sweeps: int, cells: Any) -> None:
-    """Draw complete cells (4, ny, nx) towards the mean of their neighbours, as far as they are not ``known``.
-
-    It takes away the steps at the borders of what is known. Gauss-Seidel sweeps, forwards and backwards in turn.
-    """
-    ny, nx = known.shape[1:]
-    quarter = np.float32(0.25)
-    for sweep in range(sweeps):
-        back = sweep % 2
-        for y in range(ny):
-            j = ny - 1 - y if back else y
-            up, down = max(j - 1, 0), min(j + 1, ny - 1)
-            for x in range(nx):
-                i = nx - 1 - x if back else x
-                missing = _ONE - known[3, j, i]
-                if missing > _ZERO:
-                    left, right = max(i - 1, 0), min(i + 1, nx - 1)
-                    for c in range(3):
-                        around = (cells[c, up, i] + cells[c, down, i]) + (cells[c, j, left] + cells[c, j, right])
-                        cells[c, j, i] = known[c, j, i] + missing * quarter * around
-
-
-@compiled
-def continue_columns(sums: Any, complete: Any, reach: float, out: Any) -> None:
-    """Continue the nearest known cells of each column, fading into the complete ones within ``reach`` cells.
-
-    Args:
-        sums: (4, ny, nx) of ``sum_cells``.
-        complete: (4, ny, nx) complete cells.
-        reach: Distance at which both weigh the same.
-        out: (4, ny, nx) float32, written.
-    """
-    ny, nx = sums.shape[1:]
-    above = np.empty(ny, np.int64)
-    for i in range(nx):
-        last = -1
-        for j in range(ny):
-            last = j if sums[3, j, i] > _LEAST_KNOWN else last
-            above[j] = last
-        below = ny
-        for j in range(ny - 1, -1, -1):
-            below = j if sums[3, j, i] > _LEAST_KNOWN else below
-            if sums[3, j, i] >= _ONE:
-                for c in range(4):
-                    out[c, j, i] = sums[c, j, i]
-                continue
-            up = _ONE / np.float32(max(j - above[j], 1)) if above[j] >= 0 else _ZERO
-            down = _ONE / np.float32(max(below - j, 1)) if below < ny else _ZERO
-            weight = np.float32(reach) / (_ONE + np.float32(reach) * (up + down))
-            for c in range(4):
-                value = complete[c, j, i] * (_ONE - weight * (up + down))
-                if above[j] >= 0:
-                    value += weight * up * sums[c, above[j], i] / sums[3, above[j], i]
-                if below < ny:
-                    value += weight * down * sums[c, below, i] / sums[3, below, i]
-                out[c, j, i] = value
-
-
-@compiled
-def put_cells(cells: Any, cell: int, chosen: Any, rounding: float, view: Any) -> None:
-    """Interpolate cells (4, ny, nx) into the chosen pixels (h, w) uint8 of a view (3, h, w); add ``rounding``."""
-    (h, w), (ny, nx) = chosen.shape, cells.shape[1:]
-    rows, left, share = np.empty((3, nx + 1), np.float32), np.empty(w, np.int32), np.empty(w, np.float32)
-    for x in range(w):
-        at = min(max((np.float32(x) + _HALF) / np.float32(cell) - _HALF, _ZERO), np.float32(nx - 1))
-        left[x], share[x] = np.int32(at), at - np.float32(np.int32(at))
-    for y in range(h):
-        found = np.uint8(0)
-        for x in range(w):
-            found |= chosen[y, x]
-        if not found:
-            continue
-        at = min(max((np.float32(y) + _HALF) / np.float32(cell) - _HALF, _ZERO), np.float32(ny - 1))
-        j0 = int(at)
-        j1, s = min(j0 + 1, ny - 1), at - np.float32(j0)
-        for c in range(3):
-            row, above, below = rows[c], cells[c, j0], cells[c, j1]
-            for i in range(nx):
-                row[i] = above[i] + s * (below[i] - above[i]) + np.float32(rounding)
-            row[nx] = row[nx - 1]
-        for x in range(w):
-            if chosen[y, x]:
-                i, t = left[x], share[x]
-                for c in range(3):
-                    view[c, y, x] = rows[c, i] + t * (rows[c, i + 1] - rows[c, i])
-
-
-@compiled
-def paint(pixel: Any, part: Any, beside: Any, table: Any, seen: Any, view: Any) -> None:
-    """Paint the unseen pixels of a view: by the pixel beside them, else in their part's colour where it is known.
-
-    Args:
-        pixel: (n,) into the flattened view; as are ``part`` and ``beside`` an attribute of ``view_plan.Paint``.
-        part: (n,).
-        beside: (n,).
-        table: (P, 3) float32 colours of the parts; the first is negative where unknown.
-        seen: (h w,) bool.
-        view: (3, h w), painted.
-    """
-    for k in range(pixel.shape[0]):
-        at, source, own = pixel[k], beside[k], part[k]
-        if seen[at]:
-            continue
-        for c in range(3):
-            if source >= 0:
-                view[c, at] = view[c, source]
-            elif own < table.shape[0] and table[own, 0] >= _ZERO:
-                view[c, at] = table[own, c]

@@ -41,7 +41,8 @@ def render_opencv(
         M views (3, h, w) of the images' type, black where no source sees; slices of one (M, 3, h, w) block where all
         targets have one size.
     """
-    from arbiview_aug.render.kernels import read_ahead, tone
+    from arbiview_aug.render.kernels import read_ahead
+    from arbiview_aug.render.photometry_kernels import tone
 
     scratch = scratch or Scratch()
     dtype = images[0].dtype

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from dataclasses import dataclass, field, fields, replace
-from functools import cache
 from typing import Any, cast
 
 import numpy as np
@@ -90,10 +89,9 @@ def build_plan(
         return _built(source, target.in_frame_of(source), surface, config or FavsConfig(), scene or Scene(), maps)
 
 
-@cache
-def compile_kernels() -> None:
-    """Compile what plans call, or load it from numba's cache: in the parent process, before workers are forked."""
-    from arbiview_aug.render import kernels
+def warm_up() -> None:
+    """Compile the kernels of cameras, scenes and plans, or load them from numba's cache."""
+    from arbiview_aug.render.kernels import read_ahead
 
     views = [
         Camera.looking(
@@ -112,21 +110,7 @@ def compile_kernels() -> None:
     seen_through(wall, wall, target[0].center_m)
     for surface in ("ground", "objects", "lidar"):
         plan = build_plan(source, target, surface=surface, config=config, scene=scene)
-    kernels.read_ahead(np.zeros((1, 3), np.uint8), 3, plan.targets[0].at.packed, plan.targets[0].source_camera)
-    cells, pixel, colours = np.ones((2, 4, 2, 2), np.float32), np.zeros(1, np.int32), np.ones((1, 3), np.float32)
-    read, seen = np.zeros((2, 1, 1), np.int64), np.ones((1, 3), np.float32)
-    kernels.pair_ratios(seen, read, 0.0, 2.0, np.empty((1, 3)))
-    kernels.pair_errors(seen, read, np.empty(1))
-    kernels.halve(cells[0], 2, cells[1])
-    kernels.complete(cells[0], 2, cells[1])
-    kernels.continue_columns(cells[0], cells[0], 1.0, cells[1])
-    for view in (np.zeros((3, 2, 2), np.uint8), np.zeros((3, 2, 2), np.float32)):
-        for layout in (view, view.transpose(0, 2, 1)):  # planes, and channels last
-            kernels.read_pixels(layout, read[0].repeat(2, 1), np.float32(1), seen)
-        kernels.tone(view.reshape(-1), np.zeros((1, 3), np.int64), cells[0, 0], cells[0, 0, 0, 0], cells[0, 0, 0, 0])
-        kernels.sum_cells(view, np.zeros((2, 2), np.uint8), 1, cells[0])
-        kernels.put_cells(cells[0], 1, np.zeros((2, 2), np.uint8), 0.5, view)
-        kernels.paint(pixel, pixel, pixel, colours, np.zeros(4, bool), view.reshape(3, 4))
+    read_ahead(np.zeros((1, 3), np.uint8), 3, plan.targets[0].at.packed, plan.targets[0].source_camera)
 
 
 def _built(

@@ -167,8 +167,7 @@ class ViewPlanner:
 
         whole = _whole_cells(region.score > 1)  # no weight of a source elsewhere exceeds 1
         # Borders, masks and image circles may lie between nodes.
-        visible = np.zeros(self.camera.size, bool)
-        seen_image(*self._target(region), region.kernel, visible)
+        visible = seen_image(*self._target(region), region.kernel)
         most, least = np.empty(whole.shape, np.float32), np.empty(whole.shape, np.float32)
         depth_range(visible.astype(np.float32), self.step, most, least)
         whole &= least > 0
@@ -278,10 +277,9 @@ class ViewPlanner:
         most = np.sort(resolution[seen][::4])
         level = halvings(most[len(most) // 5], source.size) if self.config.antialias and len(most) else 0
         kernel = self._kernel(source, level, geometry, A, o, P)
-        visible = np.zeros(seen.shape, bool)
         given = np.ascontiguousarray(kernel[-1][(slice(None), *self.at_nodes)]) if kind < 0 else kernel[-1]
         on_nodes = self.node_rays, self.rays.parameters, geometry.on_nodes, geometry.face_on_nodes
-        seen_image(*on_nodes, (*kernel[:-1], given), visible)
+        visible = seen_image(*on_nodes, (*kernel[:-1], given))
         self.counters[f"pairs_{name}"] += 1
         score = (
             distance_weight(edge_px, min(source.size) / 2, self.config.distance_gamma)
@@ -394,25 +392,24 @@ class ViewPlanner:
 
     def _weights(self) -> list[npt.NDArray[np.float32]]:
         """Weights of the sources on the nodes: their scores, for one source or hard seams."""
-        from arbiview_aug.render.kernels import node_winners
+        from arbiview_aug.render.kernels import keep_objects_whole
 
         scores, width_px = [region.score for region in self.regions], self.config.seam_width * self.camera.width_px
         if width_px == 0 or len(scores) < 2:
             return scores
-        winner = np.empty(scores[0].shape, np.int8)
-        stacked, boxes, cone = np.stack(scores), np.zeros((0, 7)), np.zeros(4)
-        parallax = stacked  # unused without boxes
+        stacked = np.stack(scores)
+        winner = np.where(stacked.any(axis=0), stacked.argmax(axis=0), -1).astype(np.int8)
         labelled = self.scene.boxes if "boxes" in SURFACES[self.surface].reads else None
         if labelled is not None and len(labelled):
             near_last = np.argsort(-np.linalg.norm(labelled[:, :3] - self.camera.center_m, axis=-1), kind="stable")
-            boxes, cone = labelled[near_last, :7], self.rays.cone
             parallax = np.stack([region.parallax for region in self.regions])
-        pose = np.ascontiguousarray(self.camera.center_m), np.ascontiguousarray(self.camera.cam2ego[:3, :3])
-        node_rad = self.step / float(self.camera.K[0, 0])
-        node_winners(stacked, parallax, boxes, *pose, self.node_rays, cone, node_rad, winner)
+            pose = np.ascontiguousarray(self.camera.center_m), np.ascontiguousarray(self.camera.cam2ego[:3, :3])
+            node_rad = self.step / float(self.camera.K[0, 0])
+            boxes = labelled[near_last, :7]
+            keep_objects_whole(stacked, parallax, boxes, *pose, self.node_rays, self.rays.cone, node_rad, winner)
         return seam_weights(winner, [region.border_px for region in self.regions], self._seam_radius, width_px)
 
-    def _target(self, region: _Region) -> tuple[Any, ...]:
+    def _target(self, region: _Region) -> tuple[Any, Any, Any, Any]:
         return self.rays.planes, self.rays.parameters, region.geometry.q, region.geometry.face
 
     def _interpolation(self, won_px: Counter[int]) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.cameras.kernels import angle_row
-from arbiview_aug.environment import compiled
+from arbiview_aug.environment import compiled, inlined
 from arbiview_aug.scene import panorama
 from arbiview_aug.scene.kernels import upsampled_row
 from arbiview_aug.scene.panorama import NEAREST_M
@@ -191,7 +191,7 @@ def complete(
     _average_sides(r, q, high, low, smooth, layers[0], layers[1], layers[2])
 
 
-@compiled
+@inlined
 def spread(code: Any) -> None:
     """Find every cell's nearest seed; codes (h + 4, w + 4) int32 are those of ``_NO_SEED``, two around the cells."""
     h, w = code.shape
@@ -217,13 +217,13 @@ def spread(code: Any) -> None:
                 row[x] = last
 
 
-@compiled
+@inlined
 def seed(code: int) -> tuple[int, int]:
     """Rows and columns from a cell to its nearest seed."""
     return ((code >> 7) & 127) - 64, (code & 127) - 64
 
 
-@compiled
+@inlined
 def _average_sides(r: Any, q: Any, high: Any, low: Any, smooth: int, near: Any, far: Any, share: Any) -> None:
     """Average residuals over ``SMOOTH_RAD`` on both sides of steps; sides are told apart over twice that window.
 
@@ -282,7 +282,7 @@ def _average_sides(r: Any, q: Any, high: Any, low: Any, smooth: int, near: Any, 
             out[x] = flat[x] if flat[x] == flat[x] else one
 
 
-@compiled
+@inlined
 def _slide(row: Any, oldest: Any, total: Any) -> None:
     """Replace the oldest row of windows' sums (m,) by those of a new row, and update their total over rows."""
     m = total.shape[0]
@@ -326,7 +326,7 @@ def _window_max(a: Any, rows: int, columns: int) -> None:
         size += step
 
 
-@compiled
+@inlined
 def _hidden_below(known: Any) -> Any:
     """The evaluation protocol's tolerance, in inverse distance: nearer by a tenth of the distance and 0.3 m."""
     known = max(known, _ZERO)
@@ -346,7 +346,7 @@ def hidden_depths(layers: Any, base: Any, step: int, shrink: int, out: Any) -> N
     _window_max(silent, side, side)
     static, known = np.empty(w, np.float32), np.empty(w, np.float32)
     for y in range(h):
-        upsampled_row(base, step, y, 0, line, static)
+        upsampled_row(base, step, y, np.int64(0), line, static)
         one, two, part = near[y], far[y], share[y]
         for x in range(w):
             known[x] = static[x] + (one[x] if part[x] > _HALF else two[x])
@@ -382,7 +382,7 @@ def _blocks_row(rows: Any, columns: Any, h: int, w: int, first: Any, down: Any, 
         right[x] = a - np.floor(min(a, last_column))
 
 
-@compiled
+@inlined
 def _mixed(layer: Any, i: Any, w: Any, s: float, t: float) -> float:
     """Bilinear value in the 2 x 2 cells from flat index ``i`` on, in rows of ``w``."""
     i, one, w = np.uint64(i), np.uint64(1), np.uint64(w)  # signed sums are slower

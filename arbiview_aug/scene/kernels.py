@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.cameras.kernels import rays_row
-from arbiview_aug.environment import compiled
+from arbiview_aug.environment import compiled, inlined
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
@@ -41,7 +41,7 @@ def static_image(planes: Any, P: Any, R: Any, kind: int, S: Any, q: Any) -> None
     )
     per_height, ox, oy, c = S[0], S[3], S[4], S[5]
     for y in range(h):
-        rays_row(planes, P, y, 0, rx, ry, rz)
+        rays_row(planes, P, y, np.int64(0), rx, ry, rz)
         e, f, g = R[0, 0] * S[1], R[0, 1] * S[1], R[0, 2] * S[1]
         for i in range(w):
             dx[i] = e * rx[i] + f * ry[i] + g * rz[i]
@@ -198,7 +198,7 @@ def sum_silhouettes(
                         sums[numbers[k]] += weight[y, x0 + x]
 
 
-@compiled
+@inlined
 def columns_of_piece(b: Any, cones: Any, near: Any, step: int, w: int) -> tuple[int, int]:
     """First column and number of columns of the cells in a row that hold rays which may meet a piece; 0 for none.
 
@@ -225,7 +225,7 @@ def columns_of_piece(b: Any, cones: Any, near: Any, step: int, w: int) -> tuple[
     return first * step, max(min(last * step, w) - first * step, 0)
 
 
-@compiled
+@inlined
 def through_row(b: Any, rx: Any, ry: Any, rz: Any, enter: Any, leave: Any) -> None:
     """Inverse distances (n,) at which rays enter and leave a piece; those that enter before they leave meet it."""
     before = int(b[24])
@@ -256,7 +256,7 @@ def through_row(b: Any, rx: Any, ry: Any, rz: Any, enter: Any, leave: Any) -> No
                 leave[x] = max(max(max(one, two), c0 * rx[x] + c1 * ry[x] + c2 * rz[x]), _ZERO)
 
 
-@compiled
+@inlined
 def first_face_row(
     b: Any, rx: Any, ry: Any, rz: Any, enter: Any, leave: Any, first: int, near: Any, which: Any
 ) -> None:
@@ -293,7 +293,7 @@ def planes_of(box: Any, profile: Any, planes: Any) -> None:
             n[3] = n[3] + n[0] * box[0] + n[1] * box[1] + n[2] * box[2] if high > low else -1e6  # nothing
 
 
-@compiled
+@inlined
 def beside(planes: Any, point: Any) -> float:
     """By how many metres a point (3,) lies outside pieces (n, 6, 4), less than 0 within."""
     nearest = np.inf
@@ -362,8 +362,9 @@ def upsampled_row(nodes: Any, step: int, y: int, x0: int, row: Any, out: Any) ->
 @compiled
 def points_in(boxes: Any, points: Any, air: float) -> Any:
     """Pairs (2, n) of a box (B, 7) and a point (P, 3) in it, widened by ``air`` on all sides, in the points' order."""
-    center, reach = boxes[:, :2].T.copy(), np.empty(boxes.shape[0])
+    center, reach = np.empty((2, boxes.shape[0])), np.empty(boxes.shape[0])
     for k in range(boxes.shape[0]):
+        center[0, k], center[1, k] = boxes[k, 0], boxes[k, 1]
         reach[k] = np.hypot(boxes[k, 3], boxes[k, 4]) / 2 + 2 * air
     found, n = np.empty((2, 1024), np.int64), 0
     for i in range(points.shape[0]):
@@ -379,7 +380,9 @@ def points_in(boxes: Any, points: Any, air: float) -> Any:
             c, s = np.cos(boxes[k, 6]), np.sin(boxes[k, 6])
             if abs(c * x + s * y) <= boxes[k, 3] / 2 + air and abs(c * y - s * x) <= boxes[k, 4] / 2 + air:
                 if n == found.shape[1]:
-                    found = np.concatenate((found, np.empty_like(found)), axis=1)
+                    found, fewer = np.empty((2, 2 * n), np.int64), found
+                    for j in range(n):
+                        found[0, j], found[1, j] = fewer[0, j], fewer[1, j]
                 found[0, n], found[1, n] = k, i
                 n += 1
     return found[:, :n]

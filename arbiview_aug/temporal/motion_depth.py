@@ -203,9 +203,8 @@ def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer) -> _Es
     return _Estimate(q, clear & (step <= STEP * q + _STEP_PER_M) & (np.max(visible, 0) > 0))
 
 
-@compilation_announced()
-def compile_matching() -> None:
-    """Compile the kernels, or load them from numba's cache: in the parent process, before workers are forked."""
+def warm_up() -> None:
+    """Compile the kernels of matching, or load them from numba's cache."""
     camera = Camera.looking(name="small", azimuth_deg=0, width_px=16, height_px=16, horizontal_fov_deg=90)
     image = SweptImage(camera, np.zeros((16, 16), np.float32), 0.0)
     _match(image, [image], WALLS[:2])

@@ -19,7 +19,7 @@ from arbiview_aug.cameras.framing import Fit, framing
 from arbiview_aug.cameras.random_rig import RandomRig
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import Holes, RenderPath, SurfaceName
-from arbiview_aug.environment import warn_about_cv2_wheels
+from arbiview_aug.environment import compilation_announced, warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
 from arbiview_aug.favs.renderer import PaperRendering, check_settings, render_paper
@@ -291,7 +291,7 @@ class RigRetarget(torch.nn.Module):
             run = torch.compiler.disable(run)
         # Under another default device, numbers of plans would be made there, or nowhere (meta).
         is_cpu = torch.empty(0).device.type == "cpu"  # get_default_device of torch 2.6 misses contexts
-        with nullcontext() if is_cpu else torch.device("cpu"):
+        with nullcontext() if is_cpu else torch.device("cpu"), compilation_announced():
             return run(sample, params)
 
     def _retargeted(self, sample: Mapping[str, Any], params: Mapping[str, float] | None) -> dict[str, Any]:

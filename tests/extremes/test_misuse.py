@@ -18,8 +18,8 @@ from arbiview_aug import ArbiviewError, Camera, FavsConfig, PaperConfig, RandomR
 from arbiview_aug import check as find_mistakes
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.errors import CalibrationError, SampleError, SampleTypeError
-from arbiview_aug.render.plan import compile_kernels
 from arbiview_aug.sample.batching import is_readable
+from arbiview_aug.transforms.warm_up import compile_kernels
 from tests.extremes import misuse
 from tests.extremes.conftest import Worst
 from tests.helpers import examples, limited

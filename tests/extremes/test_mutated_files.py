@@ -24,8 +24,8 @@ from arbiview_aug.errors import ArbiviewError, DataError, GeneratorError
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.training.checkpointing import saved_config
 from arbiview_aug.generator.training.config import TrainConfig
-from arbiview_aug.render.plan import compile_kernels
 from arbiview_aug.temporal.motion_depth import MotionDepth
+from arbiview_aug.transforms.warm_up import compile_kernels
 from tests.cli.convert.drives import FRAMES, command, tree, write_frames
 from tests.generator.small import small_config
 from tests.helpers import examples

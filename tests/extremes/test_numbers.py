@@ -25,8 +25,8 @@ from arbiview_aug.favs.stage2_features import (
 )
 from arbiview_aug.favs.stage4_fusion import fuse
 from arbiview_aug.render.harmonise import LEVELS, SHARES, HarmoniseConfig, estimate_gains, tone_curves
-from arbiview_aug.render.kernels import tone
 from arbiview_aug.render.opencv_backend import render_opencv
+from arbiview_aug.render.photometry_kernels import tone
 from arbiview_aug.render.plan import build_plan
 from arbiview_aug.render.torch_backend import render_torch
 from tests.extremes import reference

@@ -24,10 +24,11 @@ from arbiview_aug.render.harmonise import (
     PhotometricReport,
     estimate_gains,
     find_overlaps,
+    pair_ratios,
     tone_curves,
 )
-from arbiview_aug.render.kernels import pair_errors, pair_ratios, tone
 from arbiview_aug.render.opencv_backend import render_opencv
+from arbiview_aug.render.photometry_kernels import pair_errors, tone
 from arbiview_aug.render.plan import build_plan
 from arbiview_aug.render.torch_backend import render_torch
 from arbiview_aug.render.view_plan import ViewPlan
@@ -223,8 +224,7 @@ def test_pairs_are_compared_by_their_usable_pixels() -> None:
     for p, count in enumerate((80, 33, 2)):
         reads[:, p, :count] = rng.integers(0, 200, (2, count))
     pixels[reads[:, 2, :2]] = 0.001  # dark
-    found, errors = np.empty((3, 3)), np.empty(3)
-    pair_ratios(pixels, reads, 0.2, 0.9, found)
+    found, errors = pair_ratios(pixels, reads, 0.2, 0.9), np.empty(3)
     pair_errors(pixels, reads, errors)
     for (number, middle, spread), error, (one, two) in zip(found, errors, reads.swapaxes(0, 1), strict=True):
         one, two = (pixels[side[side < 200]].astype(np.float64) for side in (one, two))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -24,9 +23,10 @@ from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.depth_folder import FOLDERS
 from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.registry import split_kind
-from arbiview_aug.environment import one_thread, versions
+from arbiview_aug.environment import one_thread, versions, working_s
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError
 from arbiview_aug.scene.scene import SURFACES
+from arbiview_aug.transforms.warm_up import compile_kernels
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -44,14 +44,14 @@ def run(arguments: argparse.Namespace) -> int:
         return _verify(_jobs(settings, settings.open(), arguments), arguments)
     jobs, facts = _begin(settings, settings.open(), arguments)
     found: list[Done] = []
-    started_s = time.perf_counter()
+    started_s = working_s()
     for done in _run(jobs, arguments):
         found.append(done)
         if done.state == "stopped" or (done.state == "failed" and arguments.on_error == "fatal"):
             break
     for line in dict.fromkeys(line for done in found if done.is_converted for line in done.messages):
         print(f"note: {line}", file=sys.stderr)
-    print(_summary(settings.output, found, time.perf_counter() - started_s))
+    print(_summary(settings.output, found, working_s() - started_s))
     for done in found:
         if not done.is_converted:
             print(f"  {done.token}: {done.state}: {'; '.join(done.messages)}", file=sys.stderr)
@@ -132,6 +132,8 @@ def _run(jobs: Jobs, arguments: argparse.Namespace) -> Iterator[Done]:
         yield from ray_results(jobs, arguments.workers, "convert", _note)
     else:
         with one_thread():
+            if min(arguments.workers, len(jobs)) > 1:
+                compile_kernels(matching=False)  # here, once, and not in every worker
             yield from results(jobs, min(arguments.workers, len(jobs)), "convert", _note)
 
 

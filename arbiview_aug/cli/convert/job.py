@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache
 from importlib import import_module
@@ -23,7 +22,7 @@ from arbiview_aug.cli.convert.writer import Converted, Writer
 from arbiview_aug.datasets.depth_folder import WithDepth
 from arbiview_aug.datasets.drive import Recording, WritableRecording
 from arbiview_aug.datasets.registry import find_reader
-from arbiview_aug.environment import repeatable_opencv
+from arbiview_aug.environment import repeatable_opencv, working_s
 from arbiview_aug.errors import DataError, OutputError, described
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
@@ -83,14 +82,14 @@ class Jobs(Dataset[Done]):
         if record is not None and self._is_current(index, record):
             return Done(token, "kept", float(np.mean(record["coverage"])))
         warned: list[str] = []
-        started_s = time.perf_counter()
+        started_s = working_s()
         with gathered_warnings(warned), repeatable_opencv():
             sample = self.samples[index]
-            read_s = time.perf_counter()
+            read_s = working_s()
             out = self.retarget(sample)
-            rendered_s = time.perf_counter()
+            rendered_s = working_s()
             coverage = self._write(index, sample, out)
-        seconds = read_s - started_s, rendered_s - read_s, time.perf_counter() - rendered_s
+        seconds = read_s - started_s, rendered_s - read_s, working_s() - rendered_s
         return Done(token, "made", coverage, seconds, tuple(warned))
 
     def _failed(self, token: str, index: int, message: str) -> Done:

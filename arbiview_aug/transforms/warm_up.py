@@ -1,0 +1,24 @@
+"""Kernels compiled ahead: in the parent process, before workers are forked, or before anything is timed."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from arbiview_aug.environment import compilation_announced
+
+
+@cache
+def compile_kernels(*, matching: bool = True) -> None:
+    """Compile all kernels, or load them from numba's cache: each file that has kernels warms its own up.
+
+    Args:
+        matching: With those of depth from motion.
+    """
+    from arbiview_aug.inpaint import kernels as inpaint
+    from arbiview_aug.render import photometry_kernels as photometry
+    from arbiview_aug.render import plan
+    from arbiview_aug.temporal import motion_depth
+
+    with compilation_announced():
+        for module in (plan, photometry, inpaint, *((motion_depth,) if matching else ())):
+            module.warm_up()

@@ -1,0 +1,94 @@
+"""Kernels: damaged caches, folders that cannot be written, and the time that compiling takes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from numba.core import caching, config
+
+from arbiview_aug.environment import compilation_announced, compiled, working_s
+
+
+def _garbled(content: bytes) -> bytes:
+    middle = len(content) // 2
+    return content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+
+
+DAMAGE: dict[str, Callable[[bytes], bytes]] = {
+    "emptied": lambda content: b"",
+    "cut": lambda content: content[: len(content) // 2],
+    "garbled": _garbled,
+}
+
+
+def twice(x: int) -> int:
+    return 2 * x
+
+
+@pytest.fixture
+def kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Any]:
+    """A kernel as a new process has it, whose cache lies below ``tmp_path``."""
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(twice, "__module__", "arbiview_aug.environment")
+    return lambda: compiled(twice)
+
+
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+@pytest.mark.parametrize("how", DAMAGE)
+def test_damaged_kernels_are_compiled_anew(
+    kernel: Callable[[], Any], suffix: str, how: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert kernel()(3) == 6
+    (path,) = tmp_path.rglob(f"*.{suffix}")
+    path.write_bytes(DAMAGE[how](path.read_bytes()))
+    capsys.readouterr()
+    assert kernel()(4) == 8
+    words = f"arbiview_aug: damaged kernels in {path.parent} are deleted and compiled anew\n"
+    assert capsys.readouterr().err == words
+    third = kernel()
+    assert third(5) == 10 and sum(third.stats.cache_hits.values()) == 1
+    assert capsys.readouterr().err == ""
+
+
+def test_kernels_are_cached_where_their_folder_can_be_written_only(
+    kernel: Callable[[], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = kernel()
+    (folder,) = (tmp_path / "cache").iterdir()
+    folder.rmdir()
+    folder.write_text("")
+    assert one(3) == 6
+    monkeypatch.setattr(caching.CacheImpl, "_locator_classes", [])
+    assert kernel()(4) == 8 and not list(tmp_path.rglob("*.nbi"))
+
+
+def test_kernels_are_compiled_anew_when_one_that_they_call_changes(
+    kernel: Callable[[], Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    file, scope = tmp_path / "other.py", dict[str, Any]()
+    file.write_text("def other(x):\n    return x\n")
+    exec(compile(file.read_text(), str(file), "exec"), scope)
+    monkeypatch.setitem(globals(), "other", compiled(scope["other"]))
+    assert kernel()(3) == 6
+    again = kernel()
+    assert again(3) == 6 and again.stats.cache_hits
+    file.write_text("def other(x):\n    return x + 1\n")
+    third = kernel()
+    assert third(3) == 6 and not third.stats.cache_hits
+
+
+def test_compiling_is_announced_and_not_timed(kernel: Callable[[], Any], capsys: pytest.CaptureFixture[str]) -> None:
+    start_s, working = time.perf_counter(), working_s()
+    with compilation_announced():
+        assert kernel()(3) == 6
+    assert time.perf_counter() - start_s > working_s() - working
+    first, second = capsys.readouterr().err.splitlines()[-2:]
+    assert first == "arbiview_aug: compiling kernels, once for each installation"
+    assert second.startswith("arbiview_aug: kernels compiled in ") and second.endswith(" s")
+    with compilation_announced():
+        assert kernel()(3) == 6
+    assert capsys.readouterr().err == ""
