@@ -75,7 +75,6 @@ TINY = {
     "depth --data FOLDER": ["--output", "depth"],
     "depth --model ID_OR_PATH --data FOLDER": ["--output", "depth"],
     "depth --model ID_OR_PATH --data FOLDER --reference motion road": ["--output", "depth"],
-    "depth --fit --data FOLDER": ["--output", "depth", "--fit", "2"],
     "evaluate --data FOLDER --target waymo --surface learned street": ["--downscale", "4", "--surface", "street"],
     "bench ablation --data FOLDER": ["--downscale", "4", "--only", "street, not far"],
     "train --output output/tiny": ["--quiet", *SMALLER],
@@ -85,7 +84,6 @@ TINY = {
 SLOW = (
     "bench",
     "depth --model",
-    "depth --fit",
     "evaluate --paper",
     "evaluate --figure",
     "evaluate --data FOLDER --target waymo --surface learned",
@@ -211,7 +209,7 @@ def test_the_commands_run(
 ) -> None:
     arguments = shlex.split(command)
     if "FOLDER" in arguments:
-        root = request.getfixturevalue("kitti_root" if {"--displaced", "--fit"} & {*arguments} else "nuscenes_root")
+        root = request.getfixturevalue("kitti_root" if "--displaced" in arguments else "nuscenes_root")
         arguments[arguments.index("FOLDER")] = str(root)
     if "ID_OR_PATH" in arguments:
         arguments[arguments.index("ID_OR_PATH")] = str(saved_depth_model(tmp_path / "model"))

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 import torch
 from torch.utils.data import Dataset
-from tqdm import tqdm
 
 from arbiview_aug.atomic_io import inside, remove_parts
 from arbiview_aug.choices import Reference
@@ -32,11 +31,7 @@ from arbiview_aug.sample.neighbours import Neighbour, read_neighbours, warn_lost
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, DepthModel, learned_depth
 from arbiview_aug.temporal.motion_depth import motion_depth, warm_up
-from arbiview_aug.temporal.self_supervised import FittedDepth, fit_to_drive, size_for
 from arbiview_aug.temporal.transformers_depth import TransformersDepth
-
-FITTED_FILE = "fitted.pt"
-"""The network of ``--fit``, in the output's folder."""
 
 
 class Done(NamedTuple):
@@ -136,21 +131,16 @@ class _Inputs(Dataset[_Loaded | Done]):
 
 def run(arguments: argparse.Namespace) -> int:
     """Compute and write the depth of every frame that has none yet; return 1 if a frame failed, else 0."""
-    is_learned = arguments.model is not None or arguments.fit is not None
     device = device_named(arguments.device)
     data: Any = open_data(arguments.data, neighbours=None if arguments.model else WANTED)
     _, root = split_kind(arguments.data)
-    folder = Path(arguments.output or inside(root, LEARNED_FOLDER if is_learned else FOLDER, "depth"))
+    folder = Path(arguments.output or inside(root, LEARNED_FOLDER if arguments.model else FOLDER, "depth"))
     depths = DepthFolder(writable_folder(folder, str(folder)))
     remove_parts(folder, lambda owner: False)
     warned: list[str] = []
     with gathered_warnings(warned):
-        if is_learned:
-            model: DepthModel
-            if arguments.model:
-                model = TransformersDepth(arguments.model, device)
-            else:
-                model = _fitted_network(data, depths.root / FITTED_FILE, arguments.fit, device, arguments.workers)
+        if arguments.model:
+            model = TransformersDepth(arguments.model, device)
             done = list(_learned(model, data, depths, DepthFolder(inside(root, FOLDER, "depth")), arguments))
         else:
             with compilation_announced():
@@ -185,22 +175,6 @@ def _learned(
         if sum(len(loaded.inputs.rig) for loaded in waiting) >= arguments.batch:
             yield from written()
     yield from written()
-
-
-def _fitted_network(data: Any, path: Path, steps: int, device: torch.device, workers: int) -> FittedDepth:
-    """The network that was fitted to this drive before, else one that is fitted now."""
-    torch.manual_seed(0)
-    model = FittedDepth(size_for(data[0]["rig"][0]), device)
-    if path.is_file():
-        print(f"{path}: fitted before; delete it to fit anew")
-        model.load(path)
-        return model
-    with tqdm(total=steps, unit="step", desc="fit") as bar:
-        for loss in fit_to_drive(model, data, steps, workers if workers > 1 else 0):
-            bar.set_postfix_str(f"loss {loss:.4f}", refresh=False)
-            bar.update()
-    model.save(path)
-    return model
 
 
 def _summary(done: Sequence[Done], depths: DepthFolder) -> int:

@@ -136,8 +136,6 @@ def depth() -> argparse.ArgumentParser:
     add("--output", metavar="FOLDER", help=output)
     add("--workers", type=count, default=1, metavar="N", help="processes")
     add("--model", metavar="ID_OR_PATH", help="depth model of transformers: a folder, or a name on its Hub")
-    fit = "instead of --model: a small network that learns from this drive alone (2000 steps without a number)"
-    add("--fit", type=count, nargs="?", const=2000, metavar="STEPS", help=fit)
     add("--device", metavar="NAME", help="cpu, cuda, cuda:1, ... (default: the GPU, if there is one)")
     add("--batch", type=count, default=8, metavar="N", help="images that the model sees at once")
     references = list(get_args(Reference))
@@ -309,11 +307,8 @@ def check_together(name: str, parser: argparse.ArgumentParser, given: argparse.N
         parser.error(f"argument --shard-index: expected less than {given.num_shards}, got {given.shard_index}")
     if name == "demo" and given.quality == "paper" and given.surface not in ("auto", "far"):
         parser.error(f"argument --surface: quality paper knows the far surface alone, got {given.surface}")
-    if name == "depth":
-        if given.model and given.fit:
-            parser.error("argument --fit: expected it without --model")
-        if given.device and not (given.model or given.fit):
-            parser.error("argument --device: expected it with --model alone: depth from motion is computed on the CPU")
+    if name == "depth" and given.device and not given.model:
+        parser.error("argument --device: expected it with --model alone: depth from motion is computed on the CPU")
     if name == "evaluate":
         for mode, fixed in _FIXED.items():
             for option in fixed:

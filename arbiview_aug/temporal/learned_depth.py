@@ -49,7 +49,7 @@ class LearnedDepth(MotionDepth):
         return f"learned depth: {self.density:.0%} of the pixels, {self.words}"
 
 
-Output = Literal["depth", "inverse", "metres"] | None
+Output = Literal["depth", "inverse"] | None
 
 
 class Prediction(NamedTuple):
@@ -57,8 +57,7 @@ class Prediction(NamedTuple):
 
     Attributes:
         values: (h, w) over the whole image, of any size; not finite where unknown.
-        output: ``depth``, ``inverse`` depth, or None if only the fit tells which; ``metres``: inverse depth in 1/m,
-            which is checked and not fitted.
+        output: ``depth``, ``inverse`` depth, or None if only the fit tells which.
         scale_px: Focal length of the image that the network saw, in its pixels. Networks that learned metres from one
             focal length see things twice as near at twice the focal length. None for relative depth.
     """
@@ -250,12 +249,11 @@ def _on_road(camera: Camera, ground_z_m: float, boxes: FloatArray | None) -> Boo
 
 
 # --- fits -------------------------------------------------------------------------------------------------------------
-_Form = Literal["inverse", "metres", "depth", "affine depth"]
-"""Inverse depth is affine in the output, is the output, or is affine in its inverse; or depth is affine in it."""
+_Form = Literal["inverse", "depth", "affine depth"]
+"""Inverse depth is affine in the output, or in its inverse; or depth is affine in it."""
 
 _FORMS: Mapping[str | None, tuple[_Form, ...]] = {
     "inverse": ("inverse",),
-    "metres": ("metres",),
     "depth": ("depth", "affine depth"),
     None: ("inverse", "depth", "affine depth"),
 }
@@ -328,7 +326,7 @@ def fit_depth(values: FloatArray, depth_m: FloatArray, output: Output) -> tuple[
     for form in _FORMS[output]:
         x, y = _feature(form, values), depth_m if form == "affine depth" else 1 / depth_m
         limit = np.minimum(y, _RELATIVE_M) if form == "affine depth" else np.maximum(y, 1 / _RELATIVE_M)
-        scale, shift = (1.0, 0.0) if form == "metres" else _robust_line(x, y, 1 / limit)
+        scale, shift = _robust_line(x, y, 1 / limit)
         if scale > 0:
             residual = float(np.median(np.abs(scale * x + shift - y) / limit))
             found.append((residual, float(np.median(np.abs(np.median(y) - y) / limit)), _Line(form, scale, shift)))
@@ -337,7 +335,7 @@ def fit_depth(values: FloatArray, depth_m: FloatArray, output: Output) -> tuple[
     residual, constant, line = min(found)
     if residual > MAX_RESIDUAL:
         return line, residual, f"it errs by more than {MAX_RESIDUAL:.0%}"
-    if line.form != "metres" and residual > MAX_OF_CONSTANT * constant:  # a fit may turn noise into a constant
+    if residual > MAX_OF_CONSTANT * constant:  # a fit may turn noise into a constant
         return line, residual, "it is hardly better than one depth for all pixels"
     return line, residual, ""
 

@@ -1,6 +1,5 @@
 """``python -m arbiview_aug depth --model``: tiny models of transformers, saved here, through files to views."""
 
-import json
 import os
 import shutil
 import sys
@@ -13,15 +12,14 @@ import torch
 
 from arbiview_aug import RetargetedDataset, RigRetarget
 from arbiview_aug.__main__ import main
-from arbiview_aug.cli.depth import FITTED_FILE
-from arbiview_aug.datasets import FrameFolder, Neighbours, WithDepth
+from arbiview_aug.datasets import FrameFolder, WithDepth
 from arbiview_aug.datasets.depth_folder import LEARNED_FOLDER, DepthFolder
 from arbiview_aug.datasets.frame_writer import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import DataError, SampleError
 from arbiview_aug.temporal.learned_depth import LearnedDepth
 from arbiview_aug.temporal.motion_depth import MotionDepth
-from tests.helpers import Standing, saved_depth_model
+from tests.helpers import saved_depth_model
 
 RIG = demo_source_rig((64, 176))
 RIG = RIG.with_cameras([RIG[0], RIG[1]])
@@ -203,23 +201,3 @@ def test_files_of_unknown_kinds_are_named(tmp_path: Path) -> None:
         np.savez(tmp_path / "y.npz", **{name: file[name] for name in file.files} | {"kind": np.array("dreamt")})
     with pytest.raises(DataError, match=r"y\.npz: expected depth of a frame, got KeyError; delete it"):
         folder.read("y", RIG)
-
-
-@pytest.mark.slow
-def test_a_network_is_fitted_to_the_drive(tmp_path: Path, capsys: Any) -> None:
-    """Once: the next run takes the network that it finds."""
-    drive = Standing(RIG, num_frames=1, seed=3, supersampling=1, neighbours=Neighbours())
-    before, after = drive[0]["neighbours"]
-    for name, frame in (("000", before), ("001", drive[0]), ("002", after)):
-        write_frame(tmp_path / name, {k: frame[k] for k in frame if k != "boxes_3d"})
-        calib = json.loads((tmp_path / name / "calib.json").read_text())
-        (tmp_path / name / "calib.json").write_text(json.dumps(calib | {"ego2world": frame["ego2world"].tolist()}))
-    (tmp_path / "sequence.json").write_text(json.dumps({"frames": ["000", "001", "002"]}))
-    asked = ["depth", "--data", str(tmp_path), "--fit", "4", "--device", "cpu"]
-    assert main([*asked, "--workers", "2"]) == 0
-    assert (tmp_path / LEARNED_FOLDER / FITTED_FILE).is_file() and "of 3 frames have depth" in capsys.readouterr().out
-    assert main([*asked, "--reference", "road"]) == 0 and "fitted before" in capsys.readouterr().out
-    sample = WithDepth(FrameFolder(tmp_path), tmp_path / LEARNED_FOLDER)[1]
-    assert "network fitted to this drive, revision " in sample["learned_depth_words"]
-    with pytest.raises(SystemExit):
-        main([*asked, "--model", "some/model"])

@@ -86,7 +86,6 @@ FORMS = {
     "metric, another focal length": (lambda z: z, "depth", 721.0),
     "depth, scaled and shifted": (lambda z: 0.3 * z + 2, "depth", 721.0),
     "inverse depth, scaled and shifted": (lambda z: 1 / (0.6 / z + 0.004), "depth", 721.0),
-    "metres": (lambda z: 1 / z, "metres", None),
     "inverse depth for one focal length": (lambda z: 1 / z, "inverse", 1000.0),
 }
 
@@ -131,16 +130,6 @@ def test_wrong_networks_are_declined(form: Callable[[np.ndarray], np.ndarray], r
     assert depth.density == 0 and all(fit.declined for fit in fits)
     assert all(re.search(reason, fit.declined) for fit in fits), fits
     assert "front: declined, " in str(depth)
-
-
-def test_metres_are_checked_and_not_fitted() -> None:
-    rng = np.random.default_rng(1)
-    depth_m = rng.uniform(10, 14, 500)
-    noisy = rng.uniform(0.8, 1.2, 500) / depth_m
-    line, residual, declined = fit_depth(noisy, depth_m, "metres")
-    assert line is not None and line[1:] == (1, 0) and not declined and residual == pytest.approx(0.1, abs=0.02)
-    assert fit_depth(noisy, depth_m, "inverse")[2] == "it is hardly better than one depth for all pixels"
-    assert fit_depth(0.7 / depth_m, depth_m, "metres")[2] == "it errs by more than 15%"
 
 
 def test_outliers_do_not_move_a_fit() -> None:
