@@ -8,8 +8,8 @@ surface.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -28,177 +28,81 @@ NEARLY_M = 1e-5
 
 SIZE = (72, 200)
 YAW_DEG, ZOOM, UP_M = 22.0, 1.25, 0.5
-_GEOMETRY = ("points", "boxes_3d", "box_names", "depth_m")
 
 
-@dataclass(frozen=True)
-class Case:
-    """One way to render a sample.
+class Case(NamedTuple):
+    """One way to render a sample."""
 
-    Attributes:
-        sample: Images, rig and what it says of the geometry.
-        target: The rig to render.
-        settings: Arguments of ``RigRetarget`` besides.
-    """
-
-    sample: Mapping[str, Any] = field(repr=False)
+    sample: Mapping[str, Any]
     target: Rig
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, Any] = {}
 
     def retarget(self) -> RigRetarget:
         """A transform that holds nothing yet."""
         return RigRetarget(self.target, holes="black", **self.settings)
 
 
-@dataclass(frozen=True)
-class Situation:
-    """A scene that requires less, and the same without the shortcut.
+class Work(NamedTuple):
+    """Work done for a case."""
 
-    Attributes:
-        name: For tables.
-        spared: What is not required.
-        required: The situation.
-        otherwise: The same, where it cannot be spared.
-    """
-
-    name: str
-    spared: str
-    required: Case
-    otherwise: Case
+    planned_each_frame: bool  # a frame with other points or images needs a plan of its own
+    pairs: dict[str, int]  # of cameras, by surface
+    cells: int  # of 8x8 pixels that were evaluated, summed over the sources of each view
+    dense_pixels: int  # at which measured points were made dense
+    bands: int  # blended rectangles
+    sources: int  # images that are read for each view, summed
+    overlaps: int  # pairs of neighbours matched for depth
 
 
-@dataclass(frozen=True)
-class Counters:
-    """Work done for a case.
-
-    Attributes:
-        planned_each_frame: Whether a frame with other points or images needs a plan of its own.
-        pairs: Pairs of cameras by surface.
-        cells: Cells of 8x8 pixels that were evaluated, summed over the sources of each view.
-        dense_pixels: Pixels at which measured points were made dense.
-        bands: Blended rectangles.
-        sources: Source images that are read for each view, summed.
-        overlaps: Pairs of neighbours matched for depth.
-    """
-
-    planned_each_frame: bool
-    pairs: dict[str, int]
-    cells: int
-    dense_pixels: int
-    bands: int
-    sources: int
-    overlaps: int
-
-
-def counters(case: Case) -> Counters:
+def work(case: Case) -> Work:
     retarget = case.retarget()
     first, second = (retarget.explain(frame) for frame in (case.sample, as_of_another_frame(case.sample)))
     assert isinstance(first, Explanation) and isinstance(second, Explanation)
-    counts, depth = first.plan.counters, first.depth
-    return Counters(
+    counts = first.plan.counters
+    return Work(
         planned_each_frame=second.plan is not first.plan,
         pairs={key.removeprefix("pairs_"): n for key, n in counts.items() if key.startswith("pairs_")},
         cells=counts.get("cells", 0),
         dense_pixels=counts.get("dense_pixels", 0),
         bands=counts["bands"],
         sources=sum(len(view.sources) for view in first.plan.targets),
-        overlaps=0 if depth is None else depth.matched,
+        overlaps=0 if first.planned.overlap is None else first.planned.overlap.matched,
     )
 
 
-def situations(sample: Mapping[str, Any]) -> list[Situation]:
-    """The situations that a frame can be brought into: those about LiDAR where it has points."""
+def situations(sample: Mapping[str, Any]) -> dict[str, tuple[Case, Case]]:
+    """Scenes that require less, and the same without the shortcut."""
     rig = without_masks(sample["rig"])  # of what the own car hides no source sees all
-    bare = {key: value for key, value in sample.items() if key not in _GEOMETRY} | {"rig": rig}
-    turned, cut = rig.turned(yaw_deg=YAW_DEG), zoomed(rig, ZOOM)
-    # The cameras beside theirs, which look everything over, magnify nothing at their own centres: compared is one kind
-    # of reading.
-    bilinear = FavsConfig(interpolation="linear")
+    bare = {"images": sample["images"], "rig": rig}
+    points = bare | {"points": sample["points"]}
+    centred = points | {"rig": at_one_centre(rig)}
+    turned, cut, around = (rig.turned(yaw_deg=YAW_DEG), zoomed(rig), at_one_centre(rig).turned(yaw_deg=YAW_DEG))
+    # Cameras beside theirs magnify nothing at their own centres: compared is one kind of reading.
+    fast, accurate = {"quality": FavsConfig(interpolation="linear")}, favs_config("accurate")
+    accurate_too = {"quality": replace(accurate, interpolation="linear")}
 
-    def over(name: str, target: Rig, frame: Mapping[str, Any], **settings: Any) -> Case:
-        return Case(frame, nearly(target), {"surface": name, **settings})
+    def pair(surface: str, frame: Mapping[str, Any], target: Rig, **settings: Any) -> tuple[Case, Case]:
+        nearly = target.shifted(x_m=NEARLY_M)  # shows the same
+        return Case(frame, target, settings), Case(frame, nearly, {"surface": surface, **settings})
 
-    found = [
-        Situation(
-            f"cameras turned by {YAW_DEG:g} deg",
-            "the own camera needs no surface",
-            Case(bare, turned),
-            over("street", turned, bare),
-        ),
-        Situation(
-            "target = source",
-            "no neighbour is looked at, no seam is blended",
-            Case(bare, rig),
-            over("street", rig, bare),
-        ),
-        Situation(
-            f"one source sees all (zoom {ZOOM:g})",
-            "no neighbour is looked at, no seam is blended",
-            Case(bare, cut, {"quality": bilinear}),
-            over("street", cut, bare, quality=bilinear),
-        ),
-        Situation(
-            "the same, accurate",
-            "no overlap is matched",
-            Case(bare, cut, {"quality": replace(favs_config("accurate"), interpolation="linear")}),
-            over("street", cut, bare, quality=replace(favs_config("accurate"), interpolation="linear")),
-        ),
-    ]
-    if "points" in sample:
-        points = bare | {"points": sample["points"]}
-        shared = points | {"rig": at_one_centre(rig)}
-        found += [
-            Situation(
-                f"LiDAR, turned by {YAW_DEG:g} deg",
-                "points matter only where the own camera does not see",
-                Case(points, turned),
-                over("lidar", turned, points),
-            ),
-            Situation(
-                f"LiDAR, one source sees all (zoom {ZOOM:g})",
-                "no point is read, the plan is held",
-                Case(points, cut, {"quality": bilinear}),
-                over("lidar", cut, points, quality=bilinear),
-            ),
-            Situation(
-                f"LiDAR, all cameras at one centre, turned by {YAW_DEG:g} deg",
-                "no point is read, the plan is held",
-                Case(shared, shared["rig"].turned(yaw_deg=YAW_DEG)),
-                over("lidar", shared["rig"].turned(yaw_deg=YAW_DEG), shared),
-            ),
-        ]
-    apart, together = subsets(rig)
-    if len(apart) > 1:
-        settings: dict[str, Any] = {"quality": "accurate", "harmonise": True}
-        raised = [_only(bare, cameras, settings) for cameras in (apart, together)]
-        found.append(
-            Situation(
-                f"{len(apart)} cameras without overlap, raised by {UP_M:g} m, accurate, harmonised",
-                "nothing is matched, no seam is blended",
-                *raised,
-            )
-        )
-    size = (rig.sizes[0][0] // 2, rig.sizes[0][1] // 2)
-    skipping: dict[str, Any] = {"size": size, "fit": "stretch"}
-    found.append(
-        Situation(
-            "a sample that p skips, at half size",
-            "it is resized",
-            Case(bare, rig, skipping | {"p": 0.0}),
-            Case(bare, rig, skipping),
-        )
-    )
-    return found
+    halved = {"size": (SIZE[0] // 2, SIZE[1] // 2), "fit": "stretch"}
+    apart, together = (_only(bare, cameras) for cameras in subsets(rig))
+    return {
+        "turned": pair("street", bare, turned),
+        "target = source": pair("street", bare, rig),
+        "one source sees all": pair("street", bare, cut, **fast),
+        "one source sees all, accurate": pair("street", bare, cut, **accurate_too),
+        "LiDAR, turned": pair("lidar", points, turned),
+        "LiDAR, one source sees all": pair("lidar", points, cut, **fast),
+        "LiDAR, all cameras at one centre": pair("lidar", centred, around),
+        "cameras without overlap": (apart, together),
+        "skipped by p": (Case(bare, rig, halved | {"p": 0.0}), Case(bare, rig, halved)),
+    }
 
 
-def nearly(rig: Rig) -> Rig:
-    """The rig so little aside that it shows the same, and enough that no centre coincides with another."""
-    return rig.shifted(x_m=NEARLY_M)
-
-
-def zoomed(rig: Rig, factor: float) -> Rig:
+def zoomed(rig: Rig) -> Rig:
     """The middle of every camera's view, at the same size: each sees all of its own."""
-    scale = np.diag([factor, factor, 1.0])
+    scale = np.diag([ZOOM, ZOOM, 1.0])
     cameras = []
     for camera in rig:
         h, w = camera.size
@@ -228,75 +132,64 @@ def subsets(rig: Rig) -> tuple[list[int], list[int]]:
     return apart, around[: len(apart)]
 
 
-def _only(sample: Mapping[str, Any], cameras: Sequence[int], settings: Mapping[str, Any]) -> Case:
+def _only(sample: Mapping[str, Any], cameras: Sequence[int]) -> Case:
     """The frame of some cameras, raised."""
     rig = sample["rig"].with_cameras([sample["rig"][k] for k in cameras])
     images = [sample["images"][k] for k in cameras]
-    return Case({"images": images, "rig": rig}, rig.shifted(z_m=UP_M), {"surface": "street", **settings})
+    settings = {"surface": "street", "quality": "accurate", "harmonise": True}
+    return Case({"images": images, "rig": rig}, rig.shifted(z_m=UP_M), settings)
 
 
 @pytest.fixture(scope="module")
-def sample() -> dict[str, Any]:
-    return street_sample(SIZE)
-
-
-@pytest.fixture(scope="module")
-def found(sample: dict[str, Any]) -> dict[str, tuple[Situation, Counters, Counters]]:
-    result = {}
-    for situation in situations(sample):
-        result[situation.name] = situation, counters(situation.required), counters(situation.otherwise)
-    return result
+def scenes() -> dict[str, tuple[Case, Case]]:
+    return situations(street_sample(SIZE))
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.slow
-def test_what_is_done(found: dict[str, tuple[Situation, Counters, Counters]]) -> None:
-    def of(start: str) -> tuple[Counters, Counters]:
-        (name,) = (name for name in found if name.startswith(start))
-        return found[name][1:]
+def test_what_is_done(scenes: dict[str, tuple[Case, Case]]) -> None:
+    def of(name: str) -> tuple[Work, Work]:
+        spared, otherwise = map(work, scenes[name])
+        return spared, otherwise
 
-    required, otherwise = of("cameras turned")
-    assert required.pairs["far"] == 6 and "far" not in otherwise.pairs and otherwise.pairs["street"] >= 12
+    spared, otherwise = of("turned")
+    assert spared.pairs["far"] == 6 and "far" not in otherwise.pairs and otherwise.pairs["street"] >= 12
 
-    for start in ("target = source", "one source sees all"):
-        required, otherwise = of(start)
-        assert required.pairs == {"far": 6} and required.bands == 0 and required.sources == 6
-        assert otherwise.pairs["street"] > 6 and otherwise.cells > required.cells
+    for name in ("target = source", "one source sees all"):
+        spared, otherwise = of(name)
+        assert spared.pairs == {"far": 6} and spared.bands == 0 and spared.sources == 6
+        assert otherwise.pairs["street"] > 6 and otherwise.cells > spared.cells
 
-    required, otherwise = of("the same, accurate")
-    assert required.overlaps == 0 and not required.planned_each_frame and required.pairs == {"far": 6}
+    spared, otherwise = of("one source sees all, accurate")
+    assert spared.overlaps == 0 and not spared.planned_each_frame and spared.pairs == {"far": 6}
     assert otherwise.overlaps == 6 and otherwise.planned_each_frame
 
-    required, otherwise = of("LiDAR, turned")
+    spared, otherwise = of("LiDAR, turned")
     pixels = 6 * SIZE[0] * SIZE[1]
-    assert 0 < required.dense_pixels < 0.6 * pixels < otherwise.dense_pixels == pixels
-    assert required.pairs["far"] == 6 and "far" not in otherwise.pairs
+    assert 0 < spared.dense_pixels < 0.6 * pixels < otherwise.dense_pixels == pixels
+    assert spared.pairs["far"] == 6 and "far" not in otherwise.pairs
 
-    for start in ("LiDAR, one source", "LiDAR, all cameras"):
-        required, otherwise = of(start)
-        assert set(required.pairs) == {"far"} and required.dense_pixels == 0 and not required.planned_each_frame
+    for name in ("LiDAR, one source sees all", "LiDAR, all cameras at one centre"):
+        spared, otherwise = of(name)
+        assert set(spared.pairs) == {"far"} and spared.dense_pixels == 0 and not spared.planned_each_frame
         assert set(otherwise.pairs) == {"lidar"} and otherwise.dense_pixels > 0 and otherwise.planned_each_frame
 
-    required, otherwise = of("3 cameras without overlap")
-    assert required.overlaps == required.bands == 0 and required.sources == 3 and not required.planned_each_frame
+    spared, otherwise = of("cameras without overlap")
+    assert spared.overlaps == spared.bands == 0 and spared.sources == 3 and not spared.planned_each_frame
     assert otherwise.overlaps == 2 and otherwise.bands > 0 and otherwise.planned_each_frame
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.slow
-def test_sparing_work_changes_no_view(found: dict[str, tuple[Situation, Counters, Counters]]) -> None:
-    """But where a source was exact: there the street, or points, were a guess."""
-    compared = 0
-    for name, (situation, *_) in found.items():
-        if "without overlap" in name or "LiDAR" in name:
-            continue  # other cameras; points hide pixels from sources that do not stand at the target's centre
-        one, two = (case.retarget()(case.sample) for case in (situation.required, situation.otherwise))
-        both = (one["coverage"] & two["coverage"])[:, None].expand_as(one["images"])
-        assert both.float().mean() > 0.7
-        off = (one["images"].double() - two["images"].double()).abs()[both]
-        assert off.quantile(0.9) <= 2, name
-        compared += 1
-    assert compared == 5
+@pytest.mark.parametrize(
+    "name", ["turned", "target = source", "one source sees all", "one source sees all, accurate", "skipped by p"]
+)
+def test_sparing_work_changes_no_view(name: str, scenes: dict[str, tuple[Case, Case]]) -> None:
+    """But where a source was exact: there the street was a guess. (Points hide pixels from other sources.)"""
+    one, two = (case.retarget()(case.sample) for case in scenes[name])
+    both = (one["coverage"] & two["coverage"])[:, None].expand_as(one["images"])
+    assert both.float().mean() > 0.7
+    assert (one["images"].double() - two["images"].double()).abs()[both].quantile(0.9) <= 2
 
 
 def test_subsets() -> None:
