@@ -42,8 +42,7 @@ class Target:
         compile_kernels()
         self.drive, self.output, self.generator = root / "drive", root / "output", root / "generator"
         write_frames(self.drive, 2)
-        self.asked = command(self.drive, self.output, "--neighbours", "1")
-        self.asked[self.asked.index("--size") + 1] = "12x20"
+        self.asked = command(self.drive, self.output, "--neighbours", "1", "--size", "12x20")
         assert main(self.asked) == 0
         self.depths = DepthFolder(root / "depth")
         rig = FrameFolder(self.drive)[0]["rig"]

@@ -40,15 +40,37 @@ def undisturbed(sources: dict[str, Path], tmp_path_factory: pytest.TempPathFacto
     return {kind: tree(root / kind) for kind in sources}
 
 
+class Conversion:
+    """Conversions of the sources into a folder.
+
+    Attributes:
+        root: The folder.
+        said, printed: What the last command printed on standard error and output.
+    """
+
+    def __init__(self, root: Path, sources: dict[str, Path], whole: Any, capsys: Any) -> None:
+        self.root, self._sources, self._whole, self._capsys = root, sources, whole, capsys
+        self.said = self.printed = ""
+
+    def run(self, kind: str, *more: str, source: Path | None = None, name: str = "new") -> int:
+        status = main(command(f"{kind}:{source or self._sources[kind]}", self.root / name, *more))
+        self.printed, self.said = self._capsys.readouterr()
+        assert "Traceback" not in self.said
+        return status
+
+    def is_whole(self, kind: str, name: str = "new") -> bool:
+        """Whether an output is as one that nothing disturbed."""
+        return tree(self.root / name) == self._whole[kind]
+
+
+@pytest.fixture
+def conversion(tmp_path: Path, sources: Any, undisturbed: Any, capsys: pytest.CaptureFixture[str]) -> Conversion:
+    return Conversion(tmp_path, sources, undisturbed, capsys)
+
+
 @pytest.mark.parametrize(("written", "kind"), sampled([0, 3, 40, 95], ["frames", "nuscenes"]))
 def test_a_full_disk(
-    kind: str,
-    written: int,
-    sources: dict[str, Path],
-    undisturbed: dict[str, dict[str, bytes]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    kind: str, written: int, conversion: Conversion, undisturbed: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From the first file on, in the midst of a sample, and in the tables: a message, and what is there is whole."""
     flushed, flush = [0], os.fsync
@@ -59,119 +81,88 @@ def test_a_full_disk(
             raise OSError(errno.ENOSPC, "No space left on device")
         flush(file)
 
-    asked = command(f"{kind}:{sources[kind]}", tmp_path / "new")
     monkeypatch.setattr(os, "fsync", full)
-    assert main(asked) in (1, 2)
-    said = capsys.readouterr().err
-    assert "No space left on device; free some space and run it again" in said and "Traceback" not in said
-    found = tree(tmp_path / "new")
-    assert found.items() <= undisturbed[kind].items() and len(found) < len(undisturbed[kind])
+    assert conversion.run(kind) in (1, 2)
+    assert "No space left on device; free some space and run it again" in conversion.said
+    there = tree(conversion.root / "new")
+    assert there.items() <= undisturbed[kind].items() and len(there) < len(undisturbed[kind])
     monkeypatch.setattr(os, "fsync", flush)
-    assert main(asked) == 0
-    assert tree(tmp_path / "new") == undisturbed[kind]
+    assert conversion.run(kind) == 0 and conversion.is_whole(kind)
 
 
 @pytest.mark.parametrize("code", [errno.EROFS, errno.EACCES, errno.EDQUOT])
-def test_an_output_that_may_not_be_written(
-    code: int,
-    sources: dict[str, Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_an_output_that_may_not_be_written(code: int, conversion: Conversion, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(one: Path, two: Path) -> None:
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(os, "replace", refused)
-    assert main(command(sources["frames"], tmp_path / "new")) == 2
-    assert os.strerror(code) in capsys.readouterr().err
-    assert tree(tmp_path / "new") == {}
+    assert conversion.run("frames") == 2
+    assert os.strerror(code) in conversion.said and tree(conversion.root / "new") == {}
 
 
-def test_an_output_that_cannot_be_a_folder(
-    sources: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").write_text("")
-    assert main(command(sources["frames"], tmp_path / "file" / "new")) == 2
-    assert "expected a folder that can be written to, got Not a directory" in capsys.readouterr().err
+def test_an_output_that_cannot_be_a_folder(conversion: Conversion) -> None:
+    (conversion.root / "file").write_text("")
+    assert conversion.run("frames", name="file/new") == 2
+    assert "expected a folder that can be written to, got Not a directory" in conversion.said
 
 
-def test_a_truncated_image(
-    sources: dict[str, Path],
-    undisturbed: dict[str, dict[str, bytes]],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    shutil.copytree(sources["frames"], tmp_path / "frames")
-    image = tmp_path / "frames" / "0002" / "01.jpg"
+def test_a_truncated_image(conversion: Conversion, sources: dict[str, Path]) -> None:
+    root = conversion.root
+    source = Path(shutil.copytree(sources["frames"], root / "frames"))
+    image = source / "0002" / "01.jpg"
     sound = image.read_bytes()
     image.write_bytes(sound[: len(sound) // 2])
-    reported, skipped, stopped = (command(tmp_path / "frames", tmp_path / name) for name in ("a", "b", "c"))
-    assert main([*stopped, "--on-error", "fatal"]) == 1
-    assert "0002: failed: camera" in capsys.readouterr().err
-    assert not (tmp_path / "c" / "0003").exists() and (tmp_path / "c" / "0001").exists()
-    assert main([*skipped, "--on-error", "skip"]) == 0
-    assert "got a truncated file" in capsys.readouterr().err
-    assert (tmp_path / "b" / "conversion" / "provenance.json").exists() and not (tmp_path / "b" / "0002").exists()
-    assert "0002" not in (tmp_path / "b" / "sequence.json").read_text()
-    assert main(reported) == 1
-    assert "5 samples converted, 1 failed" in capsys.readouterr().out
-    assert not (tmp_path / "a" / "sequence.json").exists()
+    assert conversion.run("frames", "--on-error", "fatal", source=source, name="stopped") == 1
+    assert "0002: failed: camera" in conversion.said
+    assert not (root / "stopped" / "0003").exists() and (root / "stopped" / "0001").exists()
+    assert conversion.run("frames", "--on-error", "skip", source=source, name="skipped") == 0
+    assert "got a truncated file" in conversion.said
+    assert (root / "skipped" / "conversion" / "provenance.json").exists() and not (root / "skipped" / "0002").exists()
+    assert "0002" not in (root / "skipped" / "sequence.json").read_text()
+    assert conversion.run("frames", source=source, name="reported") == 1
+    assert "5 samples converted, 1 failed" in conversion.printed
+    assert not (root / "reported" / "sequence.json").exists()
     image.write_bytes(sound)
-    for asked, folder in ((reported, "a"), (skipped, "b"), (stopped, "c")):
-        assert main(asked) == 0
-        assert tree(tmp_path / folder) == undisturbed["frames"]
+    for name in ("reported", "skipped", "stopped"):
+        assert conversion.run("frames", source=source, name=name) == 0 and conversion.is_whole("frames", name)
 
 
-def test_nothing_that_can_be_converted(
-    sources: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    shutil.copytree(sources["frames"] / "0000", tmp_path / "frame")
-    (tmp_path / "frame" / "00.jpg").write_bytes(b"")
-    assert main(command(tmp_path / "frame", tmp_path / "new", "--on-error", "skip")) == 2
-    assert "expected at least one sample that can be converted" in capsys.readouterr().err
+def test_nothing_that_can_be_converted(conversion: Conversion, sources: dict[str, Path]) -> None:
+    frame = Path(shutil.copytree(sources["frames"] / "0000", conversion.root / "frame"))
+    (frame / "00.jpg").write_bytes(b"")
+    assert conversion.run("frames", "--on-error", "skip", source=frame) == 2
+    assert "expected at least one sample that can be converted" in conversion.said
 
 
-def test_an_interrupt_says_how_to_go_on(
-    sources: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_interrupt_says_how_to_go_on(conversion: Conversion, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(converting, "_run", interrupted)
-    assert main(command(sources["frames"], tmp_path / "new")) == 130
-    assert "run it again to go on" in capsys.readouterr().err
+    assert conversion.run("frames") == 130
+    assert "run it again to go on" in conversion.said
 
 
 @pytest.mark.parametrize("kind", ["frames", "nuscenes"])
-def test_shards_write_the_same_bytes(
-    kind: str,
-    sources: dict[str, Path],
-    undisturbed: dict[str, dict[str, bytes]],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_shards_write_the_same_bytes(kind: str, conversion: Conversion) -> None:
     """In any order; the last one finishes. One that was killed may go on in other shards."""
-    asked = command(f"{kind}:{sources[kind]}", tmp_path / "new")
     for shard in ("2", "0"):
-        assert main([*asked, "--num-shards", "3", "--shard-index", shard]) == 0
-        assert "samples of other shards are missing so far" in capsys.readouterr().out
-    (tmp_path / "new" / "conversion" / "samples" / ".x.json.1-01234567-1-89abcdef.part").write_bytes(b"{")
-    others = tmp_path / "new" / ".x.json.other-01234567-1-89abcdef.part"
+        assert conversion.run(kind, "--num-shards", "3", "--shard-index", shard) == 0
+        assert "samples of other shards are missing so far" in conversion.printed
+    output = conversion.root / "new"
+    (output / "conversion" / "samples" / ".x.json.1-01234567-1-89abcdef.part").write_bytes(b"{")
+    others = output / ".x.json.other-01234567-1-89abcdef.part"
     others.write_bytes(b"another program's")
-    assert main([*asked, "--num-shards", "3", "--shard-index", "1"]) == 0
+    assert conversion.run(kind, "--num-shards", "3", "--shard-index", "1") == 0
     others.unlink()
-    assert tree(tmp_path / "new") == undisturbed[kind]
+    assert conversion.is_whole(kind)
     with pytest.raises(SystemExit):
-        main([*asked, "--num-shards", "3", "--shard-index", "3"])
+        conversion.run(kind, "--num-shards", "3", "--shard-index", "3")
 
 
 @pytest.mark.slow
-def test_processes_write_the_same_bytes(
-    sources: dict[str, Path], undisturbed: dict[str, dict[str, bytes]], tmp_path: Path
-) -> None:
-    assert main(command(f"nuscenes:{sources['nuscenes']}", tmp_path / "new", "--workers", "2")) == 0
-    assert tree(tmp_path / "new") == undisturbed["nuscenes"]
+def test_processes_write_the_same_bytes(conversion: Conversion) -> None:
+    assert conversion.run("nuscenes", "--workers", "2") == 0 and conversion.is_whole("nuscenes")
 
 
 # --- killed -----------------------------------------------------------------------------------------------------------
@@ -288,22 +279,15 @@ def test_killed_with_its_workers_it_goes_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ray_writes_the_same_bytes(
-    sources: dict[str, Path],
-    undisturbed: dict[str, dict[str, bytes]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_ray_writes_the_same_bytes(conversion: Conversion, monkeypatch: pytest.MonkeyPatch) -> None:
     ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'arbiview_aug[distributed]'")
     monkeypatch.setenv("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     try:
-        asked = command(f"nuscenes:{sources['nuscenes']}", tmp_path / "new", "--runner", "ray")
-        asked[asked.index("--workers") + 1] = "2"
-        assert main(asked) == 0
+        assert conversion.run("nuscenes", "--runner", "ray", "--workers", "2") == 0
     finally:
         ray.shutdown()
-    assert tree(tmp_path / "new") == undisturbed["nuscenes"]
+    assert conversion.is_whole("nuscenes")
 
 
 def settled(root: Path) -> dict[str, bytes]:
@@ -321,8 +305,7 @@ def test_ray_killed_goes_on(tmp_path: Path) -> None:
     source = write_frames(tmp_path / "source", MANY)
     assert main(command(source, tmp_path / "whole")) == 0
     expected = tree(tmp_path / "whole")
-    asked = command(source, tmp_path / "new", "--runner", "ray")
-    asked[asked.index("--workers") + 1] = "2"
+    asked = command(source, tmp_path / "new", "--runner", "ray", "--workers", "2")
     environment = {key: value for key, value in os.environ.items() if key != "RAY_ADDRESS"}
     environment["RAY_ENABLE_UV_RUN_RUNTIME_ENV"] = "0"
     with subprocess.Popen([sys.executable, "-m", "arbiview_aug", *asked], env=environment) as running:

@@ -32,9 +32,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def output(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("converted") / "new"
-    asked = command(source, folder, "--images", "png", "--report", "1")
-    asked[asked.index("argoverse2")] = "waymo"  # with lenses
-    assert main(asked) == 0
+    assert main(command(source, folder, "--images", "png", "--report", "1", "--target", "waymo")) == 0  # with lenses
     return folder
 
 
@@ -104,8 +102,7 @@ def test_masks_of_the_targets_own_car(source: Path, tmp_path: Path) -> None:
     mask[20:] = False
     rig = FrameFolder(source)[0]["rig"]
     rig.with_cameras([replace(rig[0], mask=mask), rig[1]]).save(tmp_path / "rig.json")
-    asked = command(source, tmp_path / "new")
-    asked[asked.index("argoverse2")] = str(tmp_path / "rig.json")
+    asked = command(source, tmp_path / "new", "--target", str(tmp_path / "rig.json"))
     del asked[asked.index("--size") : asked.index("--size") + 2]
     assert main(asked) == 0
     found = FrameFolder(tmp_path / "new")[0]["rig"]
@@ -349,8 +346,7 @@ def test_images_are_not_named_as_masks(source: Path, tmp_path: Path) -> None:
     rig = FrameFolder(source)[0]["rig"]
     names = ("a", "a.coverage", "up / down")
     Rig([replace(rig[0], name=name) for name in names]).save(tmp_path / "rig.json")
-    asked = command(source / "0001", tmp_path / "new", "--images", "png")
-    asked[asked.index("argoverse2")] = str(tmp_path / "rig.json")
+    asked = command(source / "0001", tmp_path / "new", "--images", "png", "--target", str(tmp_path / "rig.json"))
     assert main(asked) == 0
     calib = json.loads((tmp_path / "new" / "0001" / "calib.json").read_text())
     files = [camera["file"] for camera in calib["cameras"]]
