@@ -6,6 +6,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from arbiview_aug.choices import RENAMED_OPTIONS
 from arbiview_aug.cli import parsers
 from arbiview_aug.environment import imported, installed_version, warn_about_cv2_wheels
 from arbiview_aug.errors import exit_status
@@ -43,9 +44,6 @@ BENCHMARKS = {
     "loader": Command("frames per second of a DataLoader, memory per worker", "cli.bench.loader"),
 }
 """Commands after ``bench``."""
-
-RENAMED = {"trade": "pareto", "neighbours": "speed --only neighbour"}
-"""Benchmarks of version 0.2."""
 
 
 def usage() -> str:
@@ -99,8 +97,9 @@ def _bench(argv: Sequence[str]) -> int:
         print(f"{_listed(BENCHMARKS)}\n")
     name, *rest = argv if argv and not argv[0].startswith("-") else ["pareto", *argv]
     if name not in BENCHMARKS:
-        new = f"; it is now {program} {RENAMED[name]}" if name in RENAMED else ""
-        print(f"{program}: expected one of {', '.join(BENCHMARKS)}, got {name!r}{new}", file=sys.stderr)
+        new = RENAMED_OPTIONS.get(f"bench {name}")
+        fix = f"; it is now {new}" if new else ""
+        print(f"{program}: expected one of {', '.join(BENCHMARKS)}, got {name!r}{fix}", file=sys.stderr)
         return 2
     return run(program, name, BENCHMARKS[name], rest)
 

@@ -27,3 +27,12 @@ TARGET_SETS = ("paper", "yaw", "vehicles", "truck")
 
 TRAINING_PRESETS = ("paper", "inpaint", "small", "compact", "tiny")
 """Presets of all settings of a training."""
+
+RENAMED_OPTIONS = {
+    "--motion-depth": "--depth",
+    "--reduce": "--downscale",
+    "--yaws SET": "--target-set SET",
+    "bench neighbours": "bench speed --only neighbour",
+    "bench trade": "bench pareto",
+}
+"""Options and benchmarks of version 0.2 on the command line."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, get_args
 from tqdm import tqdm
 
 from arbiview_aug.cameras.shipped import shipped_rigs
-from arbiview_aug.choices import Reduce, RenderPath, SurfaceName
+from arbiview_aug.choices import RENAMED_OPTIONS, Reduce, RenderPath, SurfaceName
 from arbiview_aug.datasets.registry import READERS, kinds_of, split_kind
 from arbiview_aug.errors import DataError
 from arbiview_aug.favs.config import Quality
@@ -24,12 +24,6 @@ if TYPE_CHECKING:
     import torch
 
 REAL_TARGET = "waymo"  # default target rig of real frames
-
-RENAMED = {
-    "--motion-depth": "--depth",
-    "--reduce": "--downscale",
-}
-"""Options of version 0.2."""
 
 
 class _HelpFormatter(argparse.HelpFormatter):
@@ -48,7 +42,7 @@ class _Parser(argparse.ArgumentParser):
     """Parser whose errors give the new names of options that were renamed."""
 
     def error(self, message: str) -> NoReturn:
-        for old, new in RENAMED.items():
+        for old, new in RENAMED_OPTIONS.items():
             if re.search(rf"(?<![\w-]){old}(?![\w-])", message):
                 message += f"; {old} is now {new}"
         super().error(message)

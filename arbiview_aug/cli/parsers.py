@@ -305,8 +305,10 @@ def check_together(name: str, parser: argparse.ArgumentParser, given: argparse.N
     """Refuse options of a command that do not fit together, as argparse refuses others."""
     if name == "convert" and given.shard_index >= given.num_shards:
         parser.error(f"argument --shard-index: expected less than {given.num_shards}, got {given.shard_index}")
-    if name == "demo" and given.quality == "paper" and given.surface not in ("auto", "far"):
-        parser.error(f"argument --surface: quality paper knows the far surface alone, got {given.surface}")
+    if name in ("convert", "demo", "evaluate") and "paper" in given.quality:
+        surfaces = given.surface if isinstance(given.surface, list) else [given.surface]
+        if {*surfaces} - {"auto", "far"}:
+            parser.error(f"argument --surface: quality paper knows the far surface alone, got {', '.join(surfaces)}")
     if name == "depth" and given.device and not given.model:
         parser.error("argument --device: expected it with --model alone: depth from motion is computed on the CPU")
     if name == "evaluate":

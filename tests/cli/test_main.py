@@ -21,7 +21,7 @@ import pytest
 
 from arbiview_aug import __main__, environment, load_rig
 from arbiview_aug.__main__ import BENCHMARKS, COMMANDS, Command, main
-from arbiview_aug.choices import TARGET_SETS, TRAINING_PRESETS, SurfaceName
+from arbiview_aug.choices import RENAMED_OPTIONS, TARGET_SETS, TRAINING_PRESETS, SurfaceName
 from arbiview_aug.evaluate import paper_study
 from arbiview_aug.favs.config import PRESETS, Quality
 from arbiview_aug.generator.training.config import CONFIGS
@@ -142,6 +142,7 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         *((f"bench pareto --budget-ms {ms}", "expected a finite number above 0") for ms in (-1, 0, "nan", "inf")),
         ("bench pareto --generator /nope", "generator /nope: expected a folder of a generator or .*, found none"),
         ("evaluate --path diffusion --generator /nope", "generator /nope: expected a folder of a generator"),
+        ("evaluate --quality paper fast --surface street", "quality paper knows the far surface alone, got street"),
         ("depth --data frame --device nope", "argument --device: expected it with --model alone"),
         ("depth --data frame --model m --device nope", "expected cpu, cuda, cuda:1, ..., got 'nope'"),
     ],
@@ -210,6 +211,11 @@ def test_names_in_options_are_those_of_the_tables() -> None:
     assert {*TRAINING_PRESETS} == {*CONFIGS} and paper_study.SETS == TARGET_SETS
 
 
+def test_the_changelog_names_what_was_renamed() -> None:
+    changes = (Path(__file__).parents[2] / "CHANGELOG.md").read_text()
+    assert all(f"`{old}` is `{new}`" in changes for old, new in RENAMED_OPTIONS.items())
+
+
 @pytest.mark.parametrize(
     ("command", "message"),
     [
@@ -219,8 +225,8 @@ def test_names_in_options_are_those_of_the_tables() -> None:
             "evaluate --yaws vehicles",
             "names of sets are for --target-set",
         ),
-        ("bench trade", "it is now python -m arbiview_aug bench pareto"),
-        ("bench neighbours", "it is now python -m arbiview_aug bench speed --only neighbour"),
+        ("bench trade", "it is now bench pareto"),
+        ("bench neighbours", "it is now bench speed --only neighbour"),
     ],
 )
 def test_old_names_give_the_new_ones(command: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -103,10 +103,10 @@ def measure(
 
     With a device, times batches that torch renders there instead (``_batches``).
     """
+    full, half = _sample(data, 1), _sample(data, 2)
     start = time.process_time()
     compile_kernels()
     ready_s = time.process_time() - start
-    full, half = _sample(data, 1), _sample(data, 2)
     rows = []
     for h, w in sizes:
         for target, (floor, runs) in (
