@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from arbiview_aug.errors import ArbiviewError as ArbiviewError
     from arbiview_aug.errors import CalibrationError as CalibrationError
     from arbiview_aug.errors import DataError as DataError
+    from arbiview_aug.errors import GeometryWarning as GeometryWarning
     from arbiview_aug.errors import SampleError as SampleError
     from arbiview_aug.errors import SampleTypeError as SampleTypeError
-    from arbiview_aug.favs.config import FavsConfig as FavsConfig
     from arbiview_aug.favs.config import PaperConfig as PaperConfig
-    from arbiview_aug.render.refinement import RefinementCache as RefinementCache
+    from arbiview_aug.render.config import RenderConfig as RenderConfig
     from arbiview_aug.sample.boxes_2d import ImageBoxes as ImageBoxes
     from arbiview_aug.sample.boxes_2d import project_boxes_3d as project_boxes_3d
     from arbiview_aug.sample.collate import collate as collate
@@ -29,9 +29,11 @@ if TYPE_CHECKING:
     from arbiview_aug.sample.mistakes import check as check
     from arbiview_aug.sample.training import lift_mask as lift_mask
     from arbiview_aug.sample.training import visible_boxes as visible_boxes
+    from arbiview_aug.transforms.plan_cache import PlanCache as PlanCache
     from arbiview_aug.transforms.resize import CropRig as CropRig
     from arbiview_aug.transforms.resize import ResizeRig as ResizeRig
     from arbiview_aug.transforms.rig_retarget import RigRetarget as RigRetarget
+    from arbiview_aug.transforms.settings import SampleKeys as SampleKeys
 else:
     __getattr__, __dir__, __all__ = lazy_names(
         __name__,
@@ -41,15 +43,17 @@ else:
             "cameras.rig": "Rig load_rig",
             "cameras.shipped": "shipped_rigs",
             "datasets.wrappers": "MixedDataset RetargetedDataset RetargetedIterable",
-            "errors": "ArbiviewError CalibrationError DataError SampleError SampleTypeError",
-            "favs.config": "FavsConfig PaperConfig",
-            "render.refinement": "RefinementCache",
+            "errors": "ArbiviewError CalibrationError DataError GeometryWarning SampleError SampleTypeError",
+            "favs.config": "PaperConfig",
+            "render.config": "RenderConfig",
             "sample.boxes_2d": "ImageBoxes project_boxes_3d",
             "sample.collate": "collate",
             "sample.mistakes": "CheckReport Finding check",
             "sample.training": "lift_mask visible_boxes",
+            "transforms.plan_cache": "PlanCache",
             "transforms.resize": "CropRig ResizeRig",
             "transforms.rig_retarget": "RigRetarget",
+            "transforms.settings": "SampleKeys",
         },
     )
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-SurfaceName = Literal["auto", "far", "ground", "street", "objects", "lidar", "motion", "fused", "learned"]
-"""Names in ``scene.SURFACES``. ``auto`` decides per pair of target and source camera."""
+GeometryName = Literal["auto", "infinity", "ground", "street", "boxes", "lidar", "motion", "fused", "learned"]
+"""Names in ``scene.GEOMETRIES``. ``auto`` decides per pair of target and source camera."""
 
-RenderPath = Literal["favs", "inpaint", "diffusion"]
-
-Holes = Literal["fill", "mean", "black"]
+Holes = Literal["continue", "telea", "mean", "black", "diffusion"]
 """Ways to fill pixels that no source sees."""
 
 Reduce = Literal[1, 2, 4]
@@ -27,12 +25,3 @@ TARGET_SETS = ("paper", "yaw", "vehicles", "truck")
 
 TRAINING_PRESETS = ("paper", "inpaint", "small", "compact", "tiny")
 """Presets of all settings of a training."""
-
-RENAMED_OPTIONS = {
-    "--motion-depth": "--depth",
-    "--reduce": "--downscale",
-    "--yaws SET": "--target-set SET",
-    "bench neighbours": "bench speed --only neighbour",
-    "bench trade": "bench pareto",
-}
-"""Options and benchmarks of version 0.2 on the command line."""

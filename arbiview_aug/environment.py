@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from arbiview_aug.errors import MissingPackageError, warn
+from arbiview_aug.renamed import removed_name
 
 _CV2_WHEELS = ("opencv-python", "opencv-python-headless", "opencv-contrib-python", "opencv-contrib-python-headless")
 
@@ -60,7 +61,7 @@ def lazy_names(
 
     def get(name: str) -> Any:
         if name not in modules:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+            raise removed_name(package, name)
         value = imported(f"arbiview_aug.{modules[name]}:{name}")
         setattr(sys.modules[package], name, value)
         return value

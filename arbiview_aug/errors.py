@@ -116,6 +116,10 @@ class TrainingError(ArbiviewError, RuntimeError):
     """A training run with impossible settings or data, or one that cannot go on."""
 
 
+class GeometryWarning(UserWarning):
+    """Views that too little geometry or too few cameras support."""
+
+
 class WarnOnce:
     """Warnings issued once per topic; ``topics`` are those issued.
 
@@ -128,10 +132,10 @@ class WarnOnce:
         self._built_at = _UNKNOWN if frame is None else (frame.f_code.co_filename, frame.f_lineno)
 
     def __call__(self, topic: str, message: str, category: type[Warning] = UserWarning) -> None:
-        """Warn, unless this topic was warned of before."""
+        """Warn, unless this topic was warned of before. Filters that make it an error do so for every sample."""
         if topic not in self.topics:
-            self.topics.add(topic)
             warn(message, category, otherwise=self._built_at)
+            self.topics.add(topic)
 
 
 _UNKNOWN = ("sys", 1)  # as Python's own warnings without a frame

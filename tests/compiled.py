@@ -14,4 +14,4 @@ if __name__ == "__main__":
     with TemporaryDirectory() as folder:  # those of depth from motion, and of points and boxes in float32
         drive = write_frames(Path(folder) / "drive", 3)
         main(["depth", "--data", str(drive)])
-        main(command(drive, Path(folder) / "new", "--surface", "auto"))
+        main(command(drive, Path(folder) / "new", "--geometry", "auto"))

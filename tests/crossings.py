@@ -23,13 +23,13 @@ from arbiview_aug.scene.depth_maps import motion_camera
 
 PACKAGE = str(Path(arbiview_aug.__file__).parent)
 BOUNDS = {
-    "street, plan cached": (15, 47),
-    "LiDAR + boxes": (35, 1700),
-    "learned depth": (36, 1700),
-    "generated": (36, 3500),
-    "neighbours, all": (44, 5200),
-    "motion": (50, 6000),
-    "paper": (19, 130),
+    "street, plan cached": (18, 47),
+    "LiDAR + boxes": (34, 600),
+    "learned depth": (36, 600),
+    "generated": (33, 1500),
+    "neighbours, all": (45, 2500),
+    "motion": (51, 2550),
+    "paper": (21, 160),
 }
 """Most files and crossings that a call may have."""
 
@@ -72,10 +72,10 @@ def traced_calls() -> dict[str, Tracer]:
     calls = {
         "street, plan cached": (RigRetarget(target), bare),
         "LiDAR + boxes": (RigRetarget(target), sample),
-        "learned depth": (RigRetarget(target, surface="learned"), of_network),
-        "generated": (RigRetarget(target, path="diffusion"), bare),
+        "learned depth": (RigRetarget(target, geometry="learned"), of_network),
+        "generated": (RigRetarget(target, holes="diffusion"), bare),
         "neighbours, all": (RigRetarget(target, neighbours="all"), drive),
-        "motion": (RigRetarget(target, surface="motion"), unmeasured),
+        "motion": (RigRetarget(target, geometry="motion"), unmeasured),
         "paper": (RigRetarget(target, quality="paper"), bare),
     }
     tracers = {}

@@ -16,40 +16,51 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from arbiview_aug import CropRig, RandomRig, RefinementCache, ResizeRig, RigRetarget, load_rig, project_boxes_3d
+from arbiview_aug import (
+    CropRig,
+    PlanCache,
+    RandomRig,
+    ResizeRig,
+    RigRetarget,
+    SampleKeys,
+    load_rig,
+    project_boxes_3d,
+)
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets import FrameFolder, Neighbours, NuScenesDataset
 from arbiview_aug.datasets.synthetic import SyntheticDrive
+from arbiview_aug.inpaint import Telea
 
 ALL = ("source_camera", "source_frame", "confidence")
 SETTINGS: dict[str, dict[str, Any]] = {
     "fast": {},
-    "black": {"holes": "black", "outputs": ALL},
+    "black": {"holes": "black", "keys": SampleKeys(extra=ALL)},
     "mean": {"holes": "mean"},
     "draft": {"quality": "draft"},
-    "accurate": {"quality": "accurate", "surface": "street", "outputs": ALL},
-    "held refinement": {"quality": "accurate", "surface": "street", "refinement": RefinementCache(key=None)},
-    "paper": {"quality": "paper", "outputs": ("source_camera",)},
-    "far": {"surface": "far"},
-    "ground": {"surface": "ground"},
-    "street": {"surface": "street", "outputs": ALL},
-    "objects": {"surface": "objects", "outputs": ALL},
-    "lidar": {"surface": "lidar", "outputs": ALL},
-    "motion": {"surface": "motion", "outputs": ALL},
-    "harmonised": {"harmonise": True},
-    "torch": {"execution": "torch", "outputs": ALL},
-    "inpaint": {"path": "inpaint"},
-    "inpaint doubtful": {"path": "inpaint", "min_confidence": 0.4},
-    "diffusion": {"path": "diffusion", "steps": 1},
-    "all neighbours": {"neighbours": "all", "outputs": ALL},
-    "no neighbours": {"neighbours": None, "outputs": ALL},
-    "target frame": {"label_frame": "target"},
+    "accurate": {"quality": "accurate", "geometry": "street", "keys": SampleKeys(extra=ALL)},
+    "held refinement": {"quality": "accurate", "geometry": "street", "cache": PlanCache(share_overlap=True)},
+    "paper": {"quality": "paper", "keys": SampleKeys(extra=("source_camera",))},
+    "infinity": {"geometry": "infinity"},
+    "ground": {"geometry": "ground"},
+    "street": {"geometry": "street", "keys": SampleKeys(extra=ALL)},
+    "boxes": {"geometry": "boxes", "keys": SampleKeys(extra=ALL)},
+    "lidar": {"geometry": "lidar", "keys": SampleKeys(extra=ALL)},
+    "motion": {"geometry": "motion", "keys": SampleKeys(extra=ALL)},
+    "harmonised": {"match_exposure": True},
+    "torch": {"backend": "torch", "keys": SampleKeys(extra=ALL)},
+    "inpaint": {"holes": "telea"},
+    "inpaint doubtful": {"holes": Telea(min_confidence=0.4)},
+    "diffusion": {"holes": "diffusion"},
+    "all neighbours": {"neighbours": "all", "keys": SampleKeys(extra=ALL)},
+    "no neighbours": {"neighbours": None, "keys": SampleKeys(extra=ALL)},
+    "target frame": {"keys": SampleKeys(frame="target")},
     "cropped": {"size": (64, 96)},
     "padded": {"size": (64, 96), "fit": "pad"},
     "stretched": {"size": (64, 96), "fit": "stretch"},
@@ -110,28 +121,29 @@ def outputs(sample: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     for name, settings in SETTINGS.items():
         if name in ("motion", "all neighbours") and not sample.get("neighbours"):
             continue
-        if (name == "paper" and not pinhole) or (name == "objects" and "boxes_3d" not in sample):
+        if (name == "paper" and not pinhole) or (name == "boxes" and "boxes_3d" not in sample):
             continue
         if name == "lidar" and "points" not in sample:
             continue
-        out = RigRetarget(lifted, label_keys=labels, **settings)(sample)
+        keys = replace(settings.get("keys", SampleKeys()), labels=labels)
+        out = RigRetarget(lifted, **settings | {"keys": keys})(sample)
         yield name, {key: value for key, value in out.items() if key != "sources"}
     yield "words", str(RigRetarget(lifted).explain(sample))
-    yield "waymo", RigRetarget(load_rig("waymo").resized((64, 96)), label_keys=labels)(sample)
+    yield "waymo", RigRetarget(load_rig("waymo").resized((64, 96)), keys=SampleKeys(labels=labels))(sample)
     lenses = load_rig("fisheye_surround").resized((64, 96))
-    yield "fisheye", RigRetarget(lenses, outputs=ALL, label_keys=labels)(sample)
+    yield "fisheye", RigRetarget(lenses, keys=SampleKeys(extra=ALL, labels=labels))(sample)
     torch.manual_seed(0)
     drawn = RandomRig(rig, yaw_deg=10, height_m=(0, 0.5), focal_scale=0.1)
-    random = RigRetarget(drawn, size=(64, 96), p=0.5, label_keys=labels)
+    random = RigRetarget(drawn, size=(64, 96), p=0.5, keys=SampleKeys(labels=labels))
     yield "random", [random(sample) for _ in range(3)]
     if isinstance(sample["images"], torch.Tensor):
         floats = {**sample, "images": sample["images"].float() / 255}
-        yield "float", RigRetarget(lifted, label_keys=labels)(floats)
+        yield "float", RigRetarget(lifted, keys=SampleKeys(labels=labels))(floats)
     small = {k: v for k, v in sample.items() if k != "neighbours"}
-    yield "resized", ResizeRig((45, 80), label_keys=labels)(small)
-    yield "windowed", CropRig(4, 8, (32, 64), label_keys=labels)(small)
+    yield "resized", ResizeRig((45, 80), keys=SampleKeys(labels=labels))(small)
+    yield "windowed", CropRig(4, 8, (32, 64), keys=SampleKeys(labels=labels))(small)
     if "boxes_3d" in sample:
-        boxes = project_boxes_3d(sample["boxes_3d"], RigRetarget(lifted, label_keys=labels)(sample))
+        boxes = project_boxes_3d(sample["boxes_3d"], RigRetarget(lifted, keys=SampleKeys(labels=labels))(sample))
         yield "boxes 2D", [vars(box) if hasattr(box, "__dict__") else box for box in boxes]
 
 
@@ -149,7 +161,7 @@ def commands(data: Path | None) -> Iterator[tuple[str, Any]]:
     with tempfile.TemporaryDirectory() as scratch:
         if data is not None:
             for kind, folder in (("nuscenes", "nuscenes-one"), ("frames", "ddad-one")):
-                for holes in ("fill", "black"):
+                for holes in ("continue", "black"):
                     output = Path(scratch, f"{kind}-{holes}")
                     arguments = ["convert", "--data", f"{kind}:{data / folder}", "--target", "argoverse2"]
                     arguments += ["--size", "64x96", "--downscale", "4", "--workers", "1", "--report", "0"]

@@ -19,7 +19,7 @@ import arbiview_aug
 from arbiview_aug import RigRetarget
 from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import shipped_rigs
-from arbiview_aug.choices import SurfaceName
+from arbiview_aug.choices import GeometryName
 from arbiview_aug.cli.bench import pareto
 from arbiview_aug.cli.bench.ablation import NOTES, ROWS, STEPS, markdown
 from arbiview_aug.datasets import registry
@@ -27,8 +27,8 @@ from arbiview_aug.evaluate import paper_study
 from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.evaluate.methods import study_methods
 from arbiview_aug.evaluate.paper_study import REAL_FRAMES, SETS, SYNTHETIC, Study, paper_report
-from arbiview_aug.favs.config import Quality
 from arbiview_aug.generator.training import command as train_command
+from arbiview_aug.render.config import Quality
 from arbiview_aug.render.requirements import HELPFUL_DATA
 from tests.generator.training.small import frames as drawn_frames
 from tests.generator.training.test_command import SMALLER
@@ -52,7 +52,7 @@ TINY = {
     "demo --data FOLDER --target waymo": ["--size", "64x112"],
     "evaluate --data FOLDER --target-set paper": ["--downscale", "4", "--size", "40x72"],
     "evaluate --data FOLDER --target waymo": ["--downscale", "4", "--size", "40x72"],
-    "evaluate --displaced --data FOLDER": ["--surface", "street", "--downscale", "4", "--frames", "1"],
+    "evaluate --displaced --data FOLDER": ["--geometry", "street", "--downscale", "4", "--frames", "1"],
     "evaluate --paper": ["--size", "16x44", "--frames", "1"],
     "evaluate --figure --data FOLDER": ["--downscale", "4"],
     "check FOLDER": ["--downscale", "4"],
@@ -60,22 +60,22 @@ TINY = {
     "inspect nuscenes waymo": [],
     "inspect nuscenes waymo --output docs/images/rigs.jpg": [],
     "inspect nuscenes truck.yaml": [],
-    "bench --data FOLDER --budget-ms 20": [*TINY_BENCH, "--surface", "far", "lidar", "--budget-ms", "5000"],
-    "bench --data FOLDER --budget-ms 200": [*TINY_BENCH, "--surface", "far", "lidar", "--budget-ms", "5000"],
+    "bench --data FOLDER --budget-ms 20": [*TINY_BENCH, "--geometry", "infinity", "lidar", "--budget-ms", "5000"],
+    "bench --data FOLDER --budget-ms 200": [*TINY_BENCH, "--geometry", "infinity", "lidar", "--budget-ms", "5000"],
     "bench loader --data FOLDER": [
-        *["--surface", "street", "--size", "32x88", "--downscale", "4", "--workers", "0", "1"],
+        *["--geometry", "street", "--size", "32x88", "--downscale", "4", "--workers", "0", "1"],
         *["--frames", "2", "--epochs", "1"],
     ],
     "bench speed --only neighbour": ["--repeats", "1", "--size", "32x88"],
     "bench speed --device cuda": ["--device", "cpu", "--repeats", "1"],
     "bench speed": ["--repeats", "1", "--size", "32x88"],
     "convert --data FOLDER --target argoverse2 --output converted --size 256x704": [
-        *("--size", "24x40", "--downscale", "4", "--workers", "1", "--surface", "street", "--report", "0")
+        *("--size", "24x40", "--downscale", "4", "--workers", "1", "--geometry", "street", "--report", "0")
     ],
     "depth --data FOLDER": ["--output", "depth"],
     "depth --model ID_OR_PATH --data FOLDER": ["--output", "depth"],
     "depth --model ID_OR_PATH --data FOLDER --reference motion road": ["--output", "depth"],
-    "evaluate --data FOLDER --target waymo --surface learned street": ["--downscale", "4", "--surface", "street"],
+    "evaluate --data FOLDER --target waymo --geometry learned street": ["--downscale", "4", "--geometry", "street"],
     "bench ablation --data FOLDER": ["--downscale", "4", "--only", "street, not far"],
     "train --output output/tiny": ["--quiet", *SMALLER],
 }
@@ -86,7 +86,7 @@ SLOW = (
     "depth --model",
     "evaluate --paper",
     "evaluate --figure",
-    "evaluate --data FOLDER --target waymo --surface learned",
+    "evaluate --data FOLDER --target waymo --geometry learned",
     "evaluate --data FOLDER --target-set",
 )
 
@@ -246,7 +246,7 @@ def test_the_trade_is_the_commands() -> None:
     (table,) = re.findall(r"((?:^\|.*\n)+)", block, re.MULTILINE)
     head, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
     assert head == ["", "", *(heading for heading, _ in pareto.COLUMNS)]
-    known = {setting.name for setting in pareto.settings(["far", "ground", "street", "lidar"])}
+    known = {setting.name for setting in pareto.settings(["infinity", "ground", "street", "lidar"])}
     assert {name for name, *_ in rows} <= known and sum(mark == "step" for _, mark, *_ in rows) >= 3
     assert pareto.NOTES in block
     fastest = min(float(row[2]) for row in rows if "lidar" in row[0])  # the others are static, and cameras move
@@ -373,7 +373,7 @@ def test_the_reference_lists_what_is_public() -> None:
 def test_names_are_complete() -> None:
     for page, names in (
         ("rigs.md", shipped_rigs()),
-        ("surfaces.md", [*get_args(SurfaceName), *get_args(Quality)]),
+        ("surfaces.md", [*get_args(GeometryName), *get_args(Quality)]),
     ):
         for name in names:
             assert f"`{name}`" in text_of(ROOT / "docs" / page)

@@ -14,8 +14,8 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "arbiview_aug"
 
 ROOMS = (
-    *("choices", "errors", "environment", "lru_cache", "atomic_io", "image_ops"),
-    *("cameras", "scene", "favs", "sample", "render", "temporal", "inpaint", "generator", "transforms", "datasets"),
+    *("choices", "errors", "renamed", "environment", "lru_cache", "atomic_io", "image_ops"),
+    *("cameras", "scene", "sample", "render", "favs", "temporal", "inpaint", "generator", "transforms", "datasets"),
     *("evaluate", "cli", "generator.training", "__main__", "train", "integrations"),
 )
 """From the ground up: a module imports from its own room and from those before it, within functions too.
@@ -24,7 +24,7 @@ ROOMS = (
 generator's folder: it reads data sets and scores, which the generator does not know of.
 """
 
-MOST_FOLDERS, MOST_FILES = 13, 9
+MOST_FOLDERS, MOST_FILES = 13, 10
 """At the top of the package."""
 
 HEAVY = (

@@ -1,7 +1,8 @@
-"""What a release says of itself is one version, and public names of releases before stay importable."""
+"""What a release says of itself is one version, and its public names are importable."""
 
 from __future__ import annotations
 
+import inspect
 import re
 from importlib import import_module
 from pathlib import Path
@@ -9,12 +10,13 @@ from pathlib import Path
 import pytest
 
 import arbiview_aug
+from arbiview_aug import renamed
 
 ROOT = Path(__file__).parents[1]
-PUBLIC_IN_0_1_0 = {
+PUBLIC = {
     "arbiview_aug": """
-        ArbiviewError CalibrationError Camera CropRig DataError FavsConfig ImageBoxes PaperConfig RandomRig
-        RefinementCache ResizeRig RetargetedDataset RetargetedIterable Rig RigRetarget SampleError SampleTypeError
+        ArbiviewError CalibrationError Camera CropRig DataError RenderConfig ImageBoxes PaperConfig RandomRig
+        PlanCache ResizeRig RetargetedDataset RetargetedIterable Rig RigRetarget SampleError SampleKeys SampleTypeError
         load_rig project_boxes_3d shipped_rigs""",
     "arbiview_aug.datasets": """
         FrameFolder LazyFrame Neighbours NuScenesDataset RetargetedDataset RetargetedIterable WithMotionDepth
@@ -22,13 +24,13 @@ PUBLIC_IN_0_1_0 = {
     "arbiview_aug.datasets.synthetic": """
         GROUND_CLASSES BoxClass RenderedViews Scene SceneClass SyntheticDrive demo_source_rig demo_target_rig
         make_scene""",
-    "arbiview_aug.generator": "Completed CompletedLoader Generator GeneratorConfig compact paper small tiny",
+    "arbiview_aug.generator": "Completed Diffusion Generator GeneratorConfig compact paper small tiny",
 }
 
 
-@pytest.mark.parametrize("module", PUBLIC_IN_0_1_0)
-def test_public_names_of_the_first_release_are_there(module: str) -> None:
-    missing = [name for name in PUBLIC_IN_0_1_0[module].split() if not hasattr(import_module(module), name)]
+@pytest.mark.parametrize("module", PUBLIC)
+def test_public_names_are_there(module: str) -> None:
+    missing = [name for name in PUBLIC[module].split() if not hasattr(import_module(module), name)]
     assert not missing
 
 
@@ -38,16 +40,33 @@ def test_one_version_everywhere() -> None:
     assert cited == newest == arbiview_aug.__version__ and older == ["0.2.0", "0.1.0"]
 
 
-def test_modules_that_the_changelog_names_exist() -> None:
-    (table,) = re.findall(r"### Moved\n(.*?)###", (ROOT / "CHANGELOG.md").read_text(), re.DOTALL)
-    now = re.findall(
-        r"`([a-z0-9_.]+)`", " ".join(row.split("|")[2] for row in table.splitlines() if row.startswith("|"))
-    )
-    named = [name for name in now if "." in name and name != "arbiview_aug."]
-    assert len(named) > 30
-    for name in named:
-        path = ROOT / "arbiview_aug" / name.replace(".", "/")
-        assert path.with_suffix(".py").is_file() or path.is_dir(), name
+def test_the_changelog_lists_what_old_names_became() -> None:
+    (table,) = re.findall(r"### Moving from 0.2\n(.*?)\n#", (ROOT / "CHANGELOG.md").read_text(), re.DOTALL)
+    rows = dict(re.findall(r"^\| (?:the key )?`(.+?)` \| `(.+?)` \|$", table, re.MULTILINE))
+    values = {f'{option}="{old}"': f'{option}="{new}"' for (option, old), new in renamed.VALUES.items()}
+    assert rows == renamed.OPTIONS | values | renamed.KEYS | renamed.NAMES | renamed.FLAGS
+
+
+@pytest.mark.parametrize("option", renamed.OPTIONS)
+def test_an_old_option_raises_an_error_that_gives_the_new_one(option: str) -> None:
+    with pytest.raises(
+        TypeError, match=re.escape(f"RigRetarget: {option!r}: since 0.3 it is {renamed.OPTIONS[option]}")
+    ):
+        arbiview_aug.RigRetarget("waymo", **{option: None})
+
+
+@pytest.mark.parametrize("name", renamed.NAMES)
+def test_an_old_name_raises_an_error_that_gives_the_new_one(name: str) -> None:
+    module, _, old = f"arbiview_aug.{name}".rpartition(".")
+    with pytest.raises(AttributeError, match=re.escape(renamed.NAMES[name])):
+        getattr(import_module(module), old)
+
+
+def test_the_front_door_is_narrow() -> None:
+    parameters = inspect.signature(arbiview_aug.RigRetarget).parameters.values()
+    assert sum(parameter.kind is parameter.KEYWORD_ONLY for parameter in parameters) <= 12
+    assert len((inspect.getdoc(arbiview_aug.RigRetarget) or "").splitlines()) <= 50
+    assert len(inspect.getsource(arbiview_aug.RigRetarget.__init__).splitlines()) <= 40
 
 
 def test_the_sdist_holds_what_its_tests_read() -> None:

@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import RigRetarget, load_rig
+from arbiview_aug import RigRetarget, SampleKeys, load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.environment import repeatable_opencv
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "fast": {},
-    "harmonised": {"harmonise": True},
-    "accurate": {"quality": "accurate", "surface": "street", "outputs": ("confidence",)},
-    "paper": {"quality": "paper", "outputs": ("source_camera",)},
+    "harmonised": {"match_exposure": True},
+    "accurate": {"quality": "accurate", "geometry": "street", "keys": SampleKeys(extra=("confidence",))},
+    "paper": {"quality": "paper", "keys": SampleKeys(extra=("source_camera",))},
 }
 
 

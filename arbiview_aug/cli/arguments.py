@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any, NoReturn, get_args
 from tqdm import tqdm
 
 from arbiview_aug.cameras.shipped import shipped_rigs
-from arbiview_aug.choices import RENAMED_OPTIONS, Reduce, RenderPath, SurfaceName
+from arbiview_aug.choices import GeometryName, Holes, Reduce
 from arbiview_aug.datasets.registry import READERS, kinds_of, split_kind
 from arbiview_aug.errors import DataError
-from arbiview_aug.favs.config import Quality
+from arbiview_aug.renamed import FLAGS
+from arbiview_aug.render.config import Quality
 
 if TYPE_CHECKING:
     import torch
@@ -42,7 +43,7 @@ class _Parser(argparse.ArgumentParser):
     """Parser whose errors give the new names of options that were renamed."""
 
     def error(self, message: str) -> NoReturn:
-        for old, new in RENAMED_OPTIONS.items():
+        for old, new in FLAGS.items():
             if re.search(rf"(?<![\w-]){old}(?![\w-])", message):
                 message += f"; {old} is now {new}"
         super().error(message)
@@ -90,14 +91,12 @@ def add_target(group: argparse._ActionsContainer, *, required: bool = False) -> 
     group.add_argument("--target", metavar="RIG", required=required, help=text)
 
 
-def add_rendering(parser: argparse.ArgumentParser, *, several: bool = False) -> None:
-    """Add ``--quality``, ``--surface`` and ``--path``; with ``several``, each takes one value or more."""
-    quality = "renderer preset; paper: the published stages, without lenses"
-    path = "what fills holes; favs: continued from their borders (docs/holes.md)"
+def add_rendering(parser: argparse.ArgumentParser, holes: str = "continue", *, several: bool = False) -> None:
+    """Add ``--quality``, ``--geometry`` and ``--holes``; with ``several``, each takes one value or more."""
     for name, choices, default, text in (
-        ("--quality", get_args(Quality), "fast", quality),
-        ("--surface", get_args(SurfaceName), "auto", "scene geometry; auto: the best that the data offers"),
-        ("--path", get_args(RenderPath), "favs", path),
+        ("--quality", get_args(Quality), "fast", "renderer preset; paper: the published stages, without lenses"),
+        ("--geometry", get_args(GeometryName), "auto", "scene geometry; auto: the best that the data offers"),
+        ("--holes", get_args(Holes), holes, f"what fills holes (default: {holes}; docs/holes.md)"),
     ):
         options: dict[str, Any] = {"nargs": "+", "default": [default]} if several else {"default": default}
         parser.add_argument(name, choices=choices, help=text, **options)

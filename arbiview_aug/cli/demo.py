@@ -10,7 +10,7 @@ from timeit import timeit
 
 import cv2
 
-from arbiview_aug.choices import RenderPath, SurfaceName
+from arbiview_aug.choices import GeometryName, Holes
 from arbiview_aug.cli.arguments import gathered_warnings, writable_folder
 from arbiview_aug.cli.evaluate import frames_text, measured, open_frames
 from arbiview_aug.environment import working_s
@@ -19,11 +19,11 @@ from arbiview_aug.evaluate.methods import Method, retargeting, views_of
 from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.evaluate.report.sheet import frame_sheet
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
-from arbiview_aug.favs.config import Quality
+from arbiview_aug.render.config import Quality
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 PICTURE_FILE = "demo.png"
-_COMPARED: tuple[SurfaceName, ...] = ("street", "ground", "far")
+_COMPARED: tuple[GeometryName, ...] = ("street", "ground", "infinity")
 _TIMED_CALLS = 5
 _SYNTHETIC_SIZE = (256, 704)
 
@@ -36,13 +36,13 @@ def run(arguments: argparse.Namespace) -> None:
     writable_folder(path.parent, arguments.output)
     if arguments.size is None and arguments.data is None:
         arguments.size = _SYNTHETIC_SIZE
-    data = open_frames(arguments, [arguments.surface], lidar=False)
-    methods = _compared(arguments.quality, arguments.surface, arguments.path)
+    data = open_frames(arguments, [arguments.geometry], lidar=False)
+    methods = _compared(arguments.quality, arguments.geometry, arguments.holes)
     notes: list[str] = []
     done = measured(arguments, data, methods, notes, agreement=False)
     with gathered_warnings(notes):
         (target,), sample = done.targets.values(), data[0]
-        retarget = RigRetarget(target, quality=arguments.quality, surface=arguments.surface, path=arguments.path)
+        retarget = RigRetarget(target, quality=arguments.quality, geometry=arguments.geometry, holes=arguments.holes)
         times_ms = [1e3 * timeit(partial(retarget, sample), timer=working_s, number=1) for _ in range(1 + _TIMED_CALLS)]
         views, explained = views_of(retarget(sample)), retarget.explain(sample)
     for note in dict.fromkeys(notes):
@@ -65,12 +65,11 @@ def run(arguments: argparse.Namespace) -> None:
     print(f"picture: {save_picture(path, sheet)}")
 
 
-def _compared(quality: Quality, surface: SurfaceName, path: RenderPath) -> list[Method]:
-    """The chosen settings, and the surfaces and fills to compare with."""
-    fills: dict[str, RenderPath] = {} if path == "favs" else {"inpainted": "inpaint"}
-    if path == "diffusion":
-        fills["generated"] = path
-    own = "paper" if quality == "paper" else surface
-    filled = [retargeting(quality, surface, f"{own}, {name}", path=fill) for name, fill in fills.items()]
-    others = [retargeting("fast" if quality == "paper" else quality, s, s) for s in _COMPARED if s != own]
-    return [retargeting(quality, surface, own), *others, *filled]
+def _compared(quality: Quality, geometry: GeometryName, holes: Holes) -> list[Method]:
+    """The chosen settings with black holes, other geometries, and what fills the holes."""
+    fills: dict[str, Holes] = {"inpainted": "telea"} if holes in ("telea", "diffusion") else {}
+    fills |= {"generated": "diffusion"} if holes == "diffusion" else {}
+    chosen = "paper" if quality == "paper" else geometry
+    filled = [retargeting(quality, geometry, f"{chosen}, {name}", holes=fill) for name, fill in fills.items()]
+    others = [retargeting("fast" if quality == "paper" else quality, s, s) for s in _COMPARED if s != chosen]
+    return [retargeting(quality, geometry, chosen), *others, *filled]

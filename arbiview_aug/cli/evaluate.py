@@ -18,7 +18,7 @@ from typing import Any
 
 from arbiview_aug.atomic_io import inside
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.choices import SurfaceName
+from arbiview_aug.choices import GeometryName
 from arbiview_aug.cli.arguments import REAL_TARGET, gathered_warnings, named_steps, writable_folder
 from arbiview_aug.datasets import FrameFolder, open_data
 from arbiview_aug.datasets.depth_folder import LEARNED_FOLDER, WANTED, WithDepth
@@ -36,10 +36,12 @@ from arbiview_aug.evaluate.report.sheet import frame_sheet
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
 from arbiview_aug.evaluate.run import Evaluation, evaluate
 from arbiview_aug.evaluate.targets import named_targets, without_masks
-from arbiview_aug.generator import Generator, HoleFiller, load_generator
+from arbiview_aug.generator import Diffusion, load_inpainter
 from arbiview_aug.generator.config import TrainedOn
+from arbiview_aug.inpaint.inpainter import Inpainter
 from arbiview_aug.sample.inputs import LEARNED_KEY
-from arbiview_aug.scene.scene import SURFACES
+from arbiview_aug.scene.scene import GEOMETRIES
+from arbiview_aug.transforms.settings import SampleKeys
 
 _MODES = ("paper", "figure", "displaced")  # their options are no settings of an evaluation
 
@@ -60,14 +62,14 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 # --- frames and targets -----------------------------------------------------------------------------------------------
-def open_frames(arguments: argparse.Namespace, surfaces: Sequence[SurfaceName], *, lidar: bool = True) -> Any:
+def open_frames(arguments: argparse.Namespace, surfaces: Sequence[GeometryName], *, lidar: bool = True) -> Any:
     """Open ``--data``, or a synthetic drive; with neighbours and learned depth where a surface needs them."""
-    neighbours = WANTED if any(SURFACES[name].needs == "motion" for name in surfaces) else None
+    neighbours = WANTED if any(GEOMETRIES[name].needs == "motion" for name in surfaces) else None
     if arguments.data is not None:
         options = {name: getattr(arguments, name) for name in ("reduce", "clean_masks")}
         data = open_data(arguments.data, neighbours=neighbours, **options)
         learned = inside(split_kind(arguments.data)[1], LEARNED_FOLDER, "learned depth")
-        reads = learned.is_dir() and any(LEARNED_KEY in SURFACES[name].reads for name in surfaces)
+        reads = learned.is_dir() and any(LEARNED_KEY in GEOMETRIES[name].reads for name in surfaces)
         return WithDepth(data, learned) if reads else data
     source = demo_source_rig(**({} if arguments.size is None else {"size": arguments.size}))
     frames = arguments.frames or 1
@@ -104,18 +106,14 @@ def scored_frames(data: Any, frames: int, hand_over_points: bool) -> Iterator[tu
 
 def _methods(arguments: argparse.Namespace, **settings: Any) -> list[Method]:
     """All chosen settings, with confidence maps where they have one."""
-    generator = None
-    if "diffusion" in arguments.path:
-        folder = arguments.generator
-        generator = Generator.shipped() if folder is None else load_generator(folder)
     methods = []
-    for quality, surface, path in product(arguments.quality, arguments.surface, arguments.path):
-        outputs = () if quality == "paper" else ("confidence",)
-        make = partial(retargeting, quality, surface, outputs=outputs, path=path, **settings)
-        if path == "diffusion":
-            methods += [make(generator=generator, steps=steps) for steps in arguments.steps]
+    for quality, geometry, holes in product(arguments.quality, arguments.geometry, arguments.holes):
+        extra = () if quality == "paper" else ("confidence",)
+        make = partial(retargeting, quality, geometry, keys=SampleKeys(extra=extra), **settings)
+        if holes == "diffusion":
+            methods += [make(holes=load_inpainter(arguments.generator, steps=steps)) for steps in arguments.steps]
         else:
-            methods.append(make())
+            methods.append(make(holes=holes))
     return methods
 
 
@@ -143,7 +141,7 @@ def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> 
         methods, done = _displaced(arguments, notes)
     else:
         methods = _methods(arguments)
-        done = measured(arguments, open_frames(arguments, arguments.surface), methods, notes)
+        done = measured(arguments, open_frames(arguments, arguments.geometry), methods, notes)
     if not done.views:
         raise DataError("; ".join(done.declined.values()))
     assert done.first is not None
@@ -171,7 +169,7 @@ def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> 
 
 def _displaced(arguments: argparse.Namespace, notes: list[str]) -> tuple[list[Method], Evaluation]:
     """Evaluate a copy and the surfaces on photographs; holes are not read from neighbours."""
-    data, given = open_frames(arguments, ["motion", *arguments.surface]), arguments.displaced
+    data, given = open_frames(arguments, ["motion", *arguments.geometry]), arguments.displaced
     with named_steps(notes) as tick:
         next_frame = FrameFolder(given, reduce=arguments.reduce)[0] if isinstance(given, str) else None
         count_of = min(arguments.frames or len(data), len(data))
@@ -180,8 +178,8 @@ def _displaced(arguments: argparse.Namespace, notes: list[str]) -> tuple[list[Me
         if first is None:
             expected = "a 'truth' camera in calib.json, or a later frame of the drive (sequence.json and ego2world)"
             raise DataError(f"--displaced: {arguments.data}: expected {expected}, found none; see docs/formats.md")
-        if arguments.surface == ["auto"]:
-            arguments.surface = surfaces_for(first[1].sample)
+        if arguments.geometry == ["auto"]:
+            arguments.geometry = surfaces_for(first[1].sample)
         methods = [COPY, *_methods(arguments, neighbours=None)]
         done = evaluate(
             chain([first], frames),
@@ -209,10 +207,10 @@ def _paper(arguments: argparse.Namespace, folder: Path) -> str:
     return f"{paper_report(study)}\n\nnumbers: {folder / 'paper.json'}"
 
 
-def _generator(arguments: argparse.Namespace) -> tuple[Generator | HoleFiller | None, TrainedOn | None]:
+def _generator(arguments: argparse.Namespace) -> tuple[Inpainter | None, TrainedOn | None]:
     """The generator of ``--generator``, if any, and the data that it was trained on, if known."""
-    generator = None if arguments.generator is None else load_generator(arguments.generator)
-    return generator, generator.trained_on if isinstance(generator, Generator) else None
+    inpainter = None if arguments.generator is None else load_inpainter(arguments.generator)
+    return inpainter, inpainter.generator.trained_on if isinstance(inpainter, Diffusion) else None
 
 
 def _figure(arguments: argparse.Namespace, folder: Path) -> str:
@@ -220,7 +218,7 @@ def _figure(arguments: argparse.Namespace, folder: Path) -> str:
     (index,) = unseen_frames(trained_on, arguments.data, 1)
     if trained_on is not None and arguments.data is None and trained_on.unseen(None):
         arguments.frames, arguments.seed = index + 1, trained_on.seed
-    frame = make_frame(open_frames(arguments, arguments.surface)[index], exposures=())
+    frame = make_frame(open_frames(arguments, arguments.geometry)[index], exposures=())
     with gathered_warnings([]):
         files = draw_figures(frame.sample, folder, generator)
     return "\n".join(f"picture: {file}" for file in files)

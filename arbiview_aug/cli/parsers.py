@@ -10,7 +10,7 @@ from typing import get_args
 from arbiview_aug.atomic_io import Link
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.shipped import shipped_rigs
-from arbiview_aug.choices import TARGET_SETS, TRAINING_PRESETS, Holes, OnError, Reduce, Reference, SurfaceName
+from arbiview_aug.choices import TARGET_SETS, TRAINING_PRESETS, GeometryName, OnError, Reduce, Reference
 from arbiview_aug.cli.arguments import (
     add_data,
     add_downscale,
@@ -28,7 +28,7 @@ from arbiview_aug.cli.arguments import (
     size,
 )
 from arbiview_aug.datasets.registry import READERS
-from arbiview_aug.favs.config import Quality
+from arbiview_aug.render.config import Quality
 
 SIZE, FULL_SIZE = (256, 704), (900, 1600)
 """Sizes (h, w) of the views that benchmarks render."""
@@ -39,8 +39,8 @@ EXECUTIONS = ("opencv", "torch", "cuda")
 _GENERATOR = "folder of a generator or of diffusers, TorchScript file, or OWNER/NAME on the Hugging Face Hub"
 
 _FIXED = {
-    "paper": ("target", "target_set", "yaws", "quality", "surface", "path", "steps", "seed", "reduce", "clean_masks"),
-    "figure": ("target", "target_set", "yaws", "quality", "surface", "path", "steps", "frames"),
+    "paper": ("target", "target_set", "yaws", "quality", "geometry", "holes", "steps", "seed", "reduce", "clean_masks"),
+    "figure": ("target", "target_set", "yaws", "quality", "geometry", "holes", "steps", "frames"),
     "displaced": ("target", "target_set", "yaws", "seed", "size"),
 }
 """Options that the modes of ``evaluate`` fix."""
@@ -74,9 +74,7 @@ def convert() -> argparse.ArgumentParser:
     add_target(parser, required=True)
     add("--output", required=True, metavar="DIR", help="folder to write to")
     add_rendering(parser)
-    holes = "what no camera saw, with --path favs: continued from its borders (default), the mean colour, or black"
-    add("--holes", choices=get_args(Holes), default="fill", help=holes)
-    add("--generator", type=Path, metavar="PATH", help=f"of --path diffusion: {_GENERATOR} (default: the own)")
+    add("--generator", type=Path, metavar="PATH", help=f"of --holes diffusion: {_GENERATOR} (default: the own)")
     add("--steps", type=count, metavar="N", help="steps of the generator (default: its own)")
     add("--size", type=size, metavar="HxW", help="height and width of every view (default: the target's own)")
     fit = "with --size: cut at the top and the sides (default), add black bars there, or stretch"
@@ -84,7 +82,7 @@ def convert() -> argparse.ArgumentParser:
     add_reading(parser)
     neighbours = "let N frames of the drive before and after each fill holes (default: none)"
     add("--neighbours", type=seed, default=0, metavar="N", help=neighbours)
-    depth = "what the depth command wrote, for --surface motion or learned (default: its folder in the data)"
+    depth = "what the depth command wrote, for --geometry motion or learned (default: its folder in the data)"
     add("--depth", dest="motion_depth", type=Path, metavar="DIR", help=depth)
     add("--images", choices=("jpg", "png"), default="jpg", help="jpg: quality 96, 4:4:4; png: lossless")
     add("--shard-index", type=seed, default=0, metavar="I", help="this shard, from 0")
@@ -125,8 +123,8 @@ def demo() -> argparse.ArgumentParser:
 def depth() -> argparse.ArgumentParser:
     parser = command_parser(
         "depth",
-        "Compute the depth of every frame of a drive: from motion, for surface='motion', or with --model by a network, "
-        "for surface='learned'. Frames whose depth is there, of the same origin, are left as they are: run it again to "
+        "Compute the depth of every frame of a drive: from motion, for --geometry motion, or with --model by a "
+        "network, for --geometry learned. Frames whose depth is there, of the same origin, stay: run it again to "
         "go on.",
         "--data nuscenes:ROOT --workers 4",
     )
@@ -149,7 +147,7 @@ def evaluate() -> argparse.ArgumentParser:
         "evaluate",
         "Measure the quality of rendered views: sparse LiDAR metrics, overlap and consistency on real frames, truth on "
         "synthetic streets. Writes tables, evaluate.json, pictures, and a self-contained report.html.",
-        "--data FOLDER --target waymo --surface auto street",
+        "--data FOLDER --target waymo --geometry auto street",
     )
     add_data(parser, "synthetic streets")
     target = parser.add_mutually_exclusive_group()
@@ -158,9 +156,9 @@ def evaluate() -> argparse.ArgumentParser:
     target.add_argument("--target-set", choices=TARGET_SETS, help=sets)
     yaws = "instead of --target: the source rig turned, as in --yaws=-11,11"
     target.add_argument("--yaws", metavar="DEG,...", type=degrees, help=yaws)
-    add_rendering(parser, several=True)
+    add_rendering(parser, "black", several=True)
     add = parser.add_argument
-    generator = f"of --path diffusion, --paper and --figure, which score held-out frames of its training: {_GENERATOR}"
+    generator = f"of --holes diffusion, --paper and --figure, which score held-out frames of its training: {_GENERATOR}"
     add("--generator", metavar="PATH", help=generator)
     add("--steps", nargs="+", type=count, default=[None], metavar="N", help="steps of the generator (default: its own)")
     add_frames(parser, None, "number of frames (default: 1; --paper: 3 synthetic ones; --displaced: all)")
@@ -234,10 +232,10 @@ def pareto() -> argparse.ArgumentParser:
     add("--repeats", type=count, default=9, metavar="N", help="rounds of timing")
     add_output(parser)
     add_target(parser)
-    surfaces = [name for name in get_args(SurfaceName) if name != "auto"]
+    surfaces = [name for name in get_args(GeometryName) if name != "auto"]
     add("--frames", type=count, default=1, metavar="N", help="frames for accuracy")
     add("--quality", nargs="+", choices=get_args(Quality), default=[*get_args(Quality)], help="presets")
-    add("--surface", nargs="+", choices=surfaces, help="(default: what the samples offer)")
+    add("--geometry", nargs="+", choices=surfaces, help="(default: what the samples offer)")
     reduces = [*get_args(Reduce)]
     add("--downscale", dest="reduce", nargs="+", type=int, choices=reduces, default=reduces, help="decode at 1/N")
     executions = "backends (default: those of this machine)"
@@ -293,7 +291,7 @@ def loader() -> argparse.ArgumentParser:
     add_downscale(parser, 2)
     add_target(parser)
     add("--workers", type=seed, nargs="+", default=[0, 1, 2], metavar="N", help="workers")
-    add("--surface", nargs="+", choices=get_args(SurfaceName), default=["street", "auto"], help="geometry")
+    add("--geometry", nargs="+", choices=get_args(GeometryName), default=["street", "auto"], help="geometry")
     add("--frames", type=count, default=48, metavar="N", help="frames in an epoch")
     add("--epochs", type=count, default=3, metavar="N", help="epochs to measure")
     add("--output", default="output/loader.json", metavar="FILE", help="file to write to")
@@ -306,9 +304,9 @@ def check_together(name: str, parser: argparse.ArgumentParser, given: argparse.N
     if name == "convert" and given.shard_index >= given.num_shards:
         parser.error(f"argument --shard-index: expected less than {given.num_shards}, got {given.shard_index}")
     if name in ("convert", "demo", "evaluate") and "paper" in given.quality:
-        surfaces = given.surface if isinstance(given.surface, list) else [given.surface]
-        if {*surfaces} - {"auto", "far"}:
-            parser.error(f"argument --surface: quality paper knows the far surface alone, got {', '.join(surfaces)}")
+        surfaces = given.geometry if isinstance(given.geometry, list) else [given.geometry]
+        if {*surfaces} - {"auto", "infinity"}:
+            parser.error(f"argument --geometry: quality paper knows the far surface alone, got {', '.join(surfaces)}")
     if name == "depth" and given.device and not given.model:
         parser.error("argument --device: expected it with --model alone: depth from motion is computed on the CPU")
     if name == "evaluate":

@@ -24,7 +24,7 @@ FOLDER, LEARNED_FOLDER = "motion_depth", "learned_depth"
 """Default names of the folders in a data set's root."""
 
 FOLDERS = {"motion": FOLDER, LEARNED_KEY: LEARNED_FOLDER}
-"""The same, by what a surface needs (``SURFACES``)."""
+"""The same, by what a surface needs (``GEOMETRIES``)."""
 
 WANTED = Neighbours(count=2, step_m=BEST_TRAVEL_M / 2)
 """Neighbours to open a data set with: at half the best travel and at all of it."""
@@ -114,8 +114,8 @@ class DepthFolder:
 class WithDepth(Dataset[dict[str, Any]]):
     """A map-style dataset that adds the ``depth`` command's results to its samples.
 
-    Depth from motion becomes ``motion_depth_m``, for ``RigRetarget(surface="motion")``; learned depth becomes
-    ``learned_depth_m``, for ``surface="learned"``. Samples need a ``token`` and a ``rig`` (or ``source_rig``).
+    Depth from motion becomes ``motion_depth_m``, for ``RigRetarget(geometry="motion")``; learned depth becomes
+    ``learned_depth_m``, for ``geometry="learned"``. Samples need a ``token`` and a ``rig`` (or ``source_rig``).
 
     Args:
         dataset: Map-style dataset of samples.

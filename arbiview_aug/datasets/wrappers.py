@@ -9,7 +9,7 @@ import torch
 from torch.utils.data import Dataset, IterableDataset
 
 from arbiview_aug.errors import DataError, SampleTypeError
-from arbiview_aug.scene.scene import SURFACES
+from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import is_number
 from arbiview_aug.transforms.warm_up import compile_kernels
@@ -133,5 +133,7 @@ def _checked_retarget(retarget: Any, name: str) -> Retarget:
     if not callable(retarget):
         raise SampleTypeError(f"{name}: expected a callable such as RigRetarget, got {type(retarget).__name__}")
     if isinstance(retarget, RigRetarget):
-        compile_kernels(matching=SURFACES[retarget.surface].needs == "motion")  # here, once, and not in every worker
+        compile_kernels(
+            matching=GEOMETRIES[str(retarget.geometry)].needs == "motion"
+        )  # here, once, and not in every worker
     return retarget  # type: ignore[no-any-return]

@@ -107,7 +107,7 @@ def target_consistency(
         seen = views[k].shown
         if not seen.any():
             return np.zeros((*view.size, 3), np.uint8), np.zeros(view.size, bool)
-        plan = build_plan(rig.with_cameras([replace(rig[k], mask=seen)]), rig.with_cameras([view]), surface="street")
+        plan = build_plan(rig.with_cameras([replace(rig[k], mask=seen)]), rig.with_cameras([view]), geometry="street")
         (image,) = as_arrays(render_opencv(plan, as_tensors([views[k].image])))
         return image, plan.coverage[0]
 

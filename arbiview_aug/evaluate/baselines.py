@@ -31,7 +31,7 @@ def own_camera(source: Rig, images: Sequence[Image], target: Rig) -> list[Render
     for camera in target:
         index = own_index(source, camera)
         alone = source.with_cameras([source[index]])
-        plan = build_plan(alone, target.with_cameras([camera]), surface="far")
+        plan = build_plan(alone, target.with_cameras([camera]), geometry="infinity")
         (view,) = as_arrays(render_opencv(plan, as_tensors([images[index]])))
         views.append(RenderedView(view, plan.coverage[0]))
     return views

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import SurfaceName
+from arbiview_aug.choices import GeometryName
 from arbiview_aug.datasets.depth_folder import WithDepth
 from arbiview_aug.datasets.frame_folder import FrameFolder
 from arbiview_aug.errors import DataError
@@ -84,9 +84,9 @@ COPY = Method("copy", _copy, plans=False)
 """The source image itself."""
 
 
-def surfaces_for(sample: Mapping[str, Any]) -> list[SurfaceName]:
+def surfaces_for(sample: Mapping[str, Any]) -> list[GeometryName]:
     """Surfaces that a sample has the geometry for, from the least to the most."""
-    found: list[SurfaceName] = ["ground", "street"]
-    found += ["objects"] if sample.get("boxes_3d") is not None else []
-    measured: list[SurfaceName] = ["lidar"] if sample.get("points") is not None else []
+    found: list[GeometryName] = ["ground", "street"]
+    found += ["boxes"] if sample.get("boxes_3d") is not None else []
+    measured: list[GeometryName] = ["lidar"] if sample.get("points") is not None else []
     return found + measured + ((["motion", "fused"] if measured else ["motion"]) if sample.get("neighbours") else [])

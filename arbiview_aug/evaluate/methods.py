@@ -9,19 +9,20 @@ from functools import lru_cache
 from typing import Any
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import RenderPath, SurfaceName
+from arbiview_aug.choices import GeometryName, Holes
 from arbiview_aug.evaluate.baselines import BASELINES, Renderer
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays
-from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
-from arbiview_aug.generator import Generator, HoleFiller
+from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.generator.generator import has_shipped
-from arbiview_aug.generator.networks import GeneratorNetworks
+from arbiview_aug.inpaint.inpainter import Black, Inpainter
+from arbiview_aug.render.config import Quality, RenderConfig
 from arbiview_aug.render.harmonise import Harmonise, Harmoniser
 from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
-from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.sample.inputs import read_frames, read_scene
-from arbiview_aug.scene.scene import SURFACES, Scene
+from arbiview_aug.scene.scene import GEOMETRIES, Scene
+from arbiview_aug.transforms.plan_cache import PlanCache
 from arbiview_aug.transforms.rig_retarget import RigRetarget
+from arbiview_aug.transforms.settings import inpainter_of, render_config
 
 Sample = Mapping[str, Any]
 
@@ -57,28 +58,27 @@ class Method:
 
 
 def retargeting(
-    quality: Quality | FavsConfig | PaperConfig,
-    surface: SurfaceName = "auto",
+    quality: Quality | RenderConfig | PaperConfig,
+    geometry: GeometryName = "auto",
     name: str = "",
     *,
-    path: RenderPath = "favs",
-    harmonise: Harmonise = False,
+    holes: Holes | Inpainter = "black",
+    match_exposure: Harmonise = False,
     **settings: Any,
 ) -> Method:
-    """Wrap ``RigRetarget`` as a method, with its arguments; ``holes`` are black by default with ``path="favs"``.
+    """Wrap ``RigRetarget`` as a method, with its arguments.
 
-    Exposures stay as recorded by default: metrics compare with them. The name is by default made of quality, surface
-    and path. A source camera alone is never completed.
+    Exposures stay as recorded by default: metrics compare with them. The name is by default made of quality, geometry
+    and what fills holes. A source camera alone is never completed.
     """
-    completes, steps = path != "favs", settings.get("steps")
-    if path == "diffusion" and settings.get("generator") is None:
-        settings["generator"] = Generator.shipped()  # once, not for each target
-    settings = {"holes": "fill" if completes else "black", "cache_bytes": 0} | settings
-    settings |= {"path": path, "harmonise": harmonise}
+    inpainter = inpainter_of(holes)  # once, not for each target
+    fills = not isinstance(inpainter, Black)
+    settings = dict[str, Any](cache=PlanCache(max_bytes=0)) | settings
+    settings |= {"holes": inpainter, "match_exposure": match_exposure}
 
     @lru_cache(_CACHED_TRANSFORMS)
     def transform(target: Rig) -> RigRetarget:
-        return RigRetarget(target, quality=quality, surface=surface, **settings)
+        return RigRetarget(target, quality=quality, geometry=geometry, **settings)
 
     def render(sample: Sample, target: Rig) -> list[RenderedView]:
         return views_of(transform(target)(sample))
@@ -88,31 +88,36 @@ def retargeting(
         if not estimates or estimates[0][0] is not sample:  # several views of a sample are rendered in a row
             estimates[:] = [(sample, *_overlap_estimates(sample, corrected, harmoniser))]
         given, (_, depth, gains) = one_camera(sample, camera), estimates[0]
-        cache = None
-        if depth is not None:
-            cache, found = RefinementCache(), depth
-            cache.get((given["rig"].content_key, None), lambda: found)
-        gain = None if gains is None else gains[camera : camera + 1]
         retarget = RigRetarget(
-            target, quality=quality, surface=surface, harmonise=gain, refinement=cache, cache_bytes=0, holes="black"
+            target,
+            quality=quality,
+            geometry=geometry,
+            match_exposure=False if gains is None else gains[camera : camera + 1],
+            cache=PlanCache(share_overlap=depth is not None, max_bytes=0),
+            holes="black",
         )
+        if depth is not None and retarget.overlaps is not None:
+            known = depth
+            retarget.overlaps.get((given["rig"].content_key, None), lambda: known)
         (view,) = views_of(retarget(given))
         return view
 
-    config = favs_config(quality)
-    label = name or (f"{quality}, {surface}" if isinstance(quality, str) else f"{type(quality).__name__}, {surface}")
-    if not name and path != "favs":
-        label += f", {path}" + (f" {steps}" if steps else "")
-    learns = isinstance(config, FavsConfig) and config.overlap_depth
-    corrected, harmoniser = surface if learns else None, Harmoniser(harmonise)
+    config = render_config(quality)
+    label = name or ", ".join([quality if isinstance(quality, str) else type(quality).__name__, geometry])
+    if not name and fills:
+        steps = getattr(inpainter, "steps", None)
+        label += f", {holes if isinstance(holes, str) else type(holes).__name__}" + (f" {steps}" if steps else "")
+    is_paper = not isinstance(config, RenderConfig)
+    learns = not is_paper and config.overlap_depth
+    corrected, harmoniser = geometry if learns else None, Harmoniser(match_exposure)
     estimates: list[tuple[Sample, OverlapDepth | None, Sequence[float] | None]] = []
-    reads_points = "points" in SURFACES[surface].reads and not isinstance(config, PaperConfig)
-    alone = render_alone if learns or harmoniser.is_on or completes else None
-    return Method(label, render, reads_points, alone, plans=not isinstance(config, PaperConfig))
+    reads_points = "points" in GEOMETRIES[geometry].reads and not is_paper
+    alone = render_alone if learns or harmoniser.is_on or fills else None
+    return Method(label, render, reads_points, alone, plans=not is_paper)
 
 
 def _overlap_estimates(
-    sample: Sample, surface: SurfaceName | None, harmoniser: Harmoniser
+    sample: Sample, surface: GeometryName | None, harmoniser: Harmoniser
 ) -> tuple[OverlapDepth | None, Sequence[float] | None]:
     """Depth (with a surface to correct) and gains (if harmonising is on) from a sample's overlaps."""
     rig, images = sample["rig"], list(sample["images"])
@@ -120,7 +125,7 @@ def _overlap_estimates(
     if surface is None:
         return None, gains
     scene = read_scene(read_frames(sample, None)[0], surface) or Scene()
-    row = SURFACES[scene.best if surface == "auto" else surface]
+    row = GEOMETRIES[scene.best if surface == "auto" else surface]
     boxes = scene.boxes if row.overlap_depth and "boxes" in row.reads else None
     return overlap_depth(rig, images, boxes), gains  # as ``transforms.estimate_depth`` measures it
 
@@ -172,7 +177,7 @@ def paper_stages() -> dict[str, PaperConfig]:
     }
 
 
-def study_methods(generator: GeneratorNetworks | HoleFiller | None = None) -> list[Method]:
+def study_methods(generator: Inpainter | None = None) -> list[Method]:
     """Rows of the paper's tables and ours, from images and poses alone.
 
     The generator's row is of the shipped weights if none is given, and only with diffusers.
@@ -182,16 +187,16 @@ def study_methods(generator: GeneratorNetworks | HoleFiller | None = None) -> li
         *map(baseline, BASELINES),
         *published,
         *(retargeting(quality, "street", quality) for quality in OURS),
-        retargeting("fast", "street", INPAINTED, path="inpaint"),
+        retargeting("fast", "street", INPAINTED, holes="telea"),
         *generating(GENERATED, generator),
     ]
 
 
-def generating(name: str, generator: GeneratorNetworks | HoleFiller | None) -> list[Method]:
+def generating(name: str, generator: Inpainter | None) -> list[Method]:
     """``fast`` with holes by a generator, or by the shipped weights; nothing where these are not installed."""
     if generator is None and not has_generator():
         return []
-    return [retargeting("fast", "street", name, path="diffusion", generator=generator)]
+    return [retargeting("fast", "street", name, holes=generator or "diffusion")]
 
 
 def has_generator() -> bool:

@@ -30,9 +30,8 @@ from arbiview_aug.evaluate.report.pictures import contact_sheet, save_picture
 from arbiview_aug.evaluate.report.sheet import left_to_right
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import TRUCK_UP_M, VEHICLES, YAWS_DEG, named_targets, paper_target, spacing_deg
-from arbiview_aug.generator import HoleFiller
 from arbiview_aug.generator.config import TrainedOn
-from arbiview_aug.generator.networks import GeneratorNetworks
+from arbiview_aug.inpaint.inpainter import Inpainter
 
 REAL_FRAMES = ("nuscenes-one", "ddad-one")
 SYNTHETIC = "synthetic"
@@ -239,7 +238,7 @@ FIGURES: dict[int, tuple[float, ...]] = {2: (0.5, -0.25), 3: (0.2,), 4: (-0.2,),
 """The paper's figures, and the turns of their cameras as shares of the azimuth spacing."""
 
 
-def figure_methods(generator: GeneratorNetworks | HoleFiller | None = None) -> dict[str, Method]:
+def figure_methods(generator: Inpainter | None = None) -> dict[str, Method]:
     """The paper's rows and ours, by caption."""
     methods = {
         "DriveSuprim: crop and slide": baseline("crop and slide"),
@@ -250,9 +249,7 @@ def figure_methods(generator: GeneratorNetworks | HoleFiller | None = None) -> d
     return methods | {method.name: method for method in generating("fast, street, holes generated", generator)}
 
 
-def draw_figures(
-    sample: Mapping[str, Any], folder: Path, generator: GeneratorNetworks | HoleFiller | None = None
-) -> list[Path]:
+def draw_figures(sample: Mapping[str, Any], folder: Path, generator: Inpainter | None = None) -> list[Path]:
     """Write ``figure2.png`` to ``figure6.png`` of a sample; methods that cannot take the rig's lenses have no row."""
     rig: Rig = sample["rig"]
     images: list[Image] = as_arrays(sample["images"])

@@ -8,8 +8,9 @@ baseline with the other presets.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -24,8 +25,10 @@ from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.favs.stage1_geometry import check_pinhole, h_geom_of_visible
 from arbiview_aug.favs.stage2_features import NO_MATCHES, FeatureReport, Region, optimise_transformation, unmatched
-from arbiview_aug.favs.stage3_objects import AlignmentReport, Detection, align_objects, declined, find_objects
+from arbiview_aug.favs.stage3_objects import AlignmentReport, align_objects, declined, find_objects
 from arbiview_aug.favs.stage4_fusion import Float32Image, Warp, adaptive_fusion, source_pixels, warp_perspective
+from arbiview_aug.render.rendered import RenderedFrame, from_winners
+from arbiview_aug.sample.detections import Detection
 
 SAME_CENTER_M = 1e-6  # distance below which two camera centres coincide
 
@@ -107,12 +110,12 @@ def render_paper(
     return PaperRendering(source, target, tuple(views))
 
 
-def check_settings(surface: str, execution: str) -> None:
+def check_settings(geometry: str, backend: str) -> None:
     """Refuse settings of ``RigRetarget`` that the published stages do not have."""
-    if surface not in ("auto", "far"):
-        raise ValueError(f"surface: quality='paper' knows the far surface: expected auto or far, got {surface!r}")
-    if execution == "torch":
-        raise ValueError("execution: quality='paper' runs in OpenCV: expected auto or opencv, got 'torch'")
+    if geometry not in ("auto", "infinity"):
+        raise ValueError(f"geometry: quality='paper' has none: expected auto or infinity, got {geometry!r}")
+    if backend == "torch":
+        raise ValueError("backend: quality='paper' runs in OpenCV: expected auto or opencv, got 'torch'")
 
 
 def primary_camera(sources: Sequence[Camera], target: Camera, candidates: Sequence[int]) -> int:
@@ -233,3 +236,12 @@ def _grey(image: Float32Image) -> npt.NDArray[np.uint8]:
 def _as_tensor(image: Float32Image, dtype: torch.dtype) -> torch.Tensor:
     planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
     return planes.round().clamp(0, 255).to(dtype) if dtype == torch.uint8 else (planes / 255).clamp(0, 1).to(dtype)
+
+
+def as_rendered(rendering: PaperRendering, outputs: Collection[str] = ()) -> RenderedFrame:
+    """Convert a rendering; ``outputs`` as in ``Renderer.render``."""
+    views = rendering.targets
+    winners, labels = [torch.from_numpy(view.source_camera) for view in views], partial(paper_labels, rendering)
+    rendered = from_winners([view.image for view in views], rendering.target, winners, labels, outputs)
+    layers = [view.occluded if view.occluded is None else view.occluded.view(np.uint8) for view in views]
+    return replace(rendered, layers=layers, paint=[None] * len(views))

@@ -22,14 +22,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.favs.stage2_features import REFERENCE_WIDTH_PX, Matches
-
-
-@dataclass(frozen=True)
-class Detection:
-    """Detector's box in a source image, from which objects take their type."""
-
-    box: tuple[float, float, float, float]  # (x0, y0, x1, y1) in source pixels
-    type: str  # class name, weighted by ``PaperConfig.type_weights``
+from arbiview_aug.sample.detections import Detection
 
 
 @dataclass(frozen=True)

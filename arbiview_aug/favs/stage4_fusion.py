@@ -7,8 +7,7 @@ Generation":
 - w⁽ⁱ⁾ = w_distance⁽ⁱ⁾ · w_gradient⁽ⁱ⁾ · w_quality⁽ⁱ⁾ · w_primary⁽ⁱ⁾: ``fusion_weight``, a function per factor.
 - I_target = Σ w⁽ⁱ⁾ I_warped⁽ⁱ⁾ / Σ w⁽ⁱ⁾: ``fuse``.
 
-Render plans (``arbiview_aug.render``) choose their sources by the weights that do not depend on image content:
-distance, quality and primary.
+The weights that do not depend on image content are those of render plans (``arbiview_aug.render.weights``).
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.favs.config import PaperConfig
+from arbiview_aug.render.weights import distance_weight, primary_weight
 
 Float32Image = npt.NDArray[np.float32]
 
@@ -77,31 +77,9 @@ def source_pixels(
 
 
 # --- weights ----------------------------------------------------------------------------------------------------------
-def distance_weight(distance_px: FloatArray, d_max_px: float, gamma: float) -> FloatArray:
-    """w_distance(x, y) = (d(x, y) / d_max)^γ: 0 at the border of a source's coverage, 1 at its middle.
-
-    d (...,) is the distance to the border, negative outside; d_max > 0; γ >= 0.
-    """
-    return np.clip(distance_px / d_max_px, 0.0, 1.0) ** gamma
-
-
 def gradient_weight(gradient_magnitude: FloatArray, sigma: float) -> FloatArray:
     """w_gradient(x, y) = 1 / (1 + ‖∇I(x, y)‖ / σ), with ‖∇I‖ (...,) and σ > 0 in grey levels per pixel."""
     return 1.0 / (1.0 + gradient_magnitude / sigma)
-
-
-def quality_weight(parallax_px: FloatArray, resolution: FloatArray) -> FloatArray:
-    """w_quality in (0, 1] from calibration alone, for render plans; ``fusion_weight`` has that of matched images.
-
-    ``parallax_px`` is the displacement in target pixels that unknown depth may cause, ``resolution`` source pixels per
-    target pixel along the worse axis.
-    """
-    return np.clip(resolution, 0.05, 1.0) / (1.0 + parallax_px)
-
-
-def primary_weight(is_primary: bool, bonus: float) -> float:
-    """w_primary: ``bonus`` for the primary camera, 1 for the others."""
-    return bonus if is_primary else 1.0
 
 
 def fusion_weight(

@@ -5,29 +5,32 @@ Needs diffusers and safetensors, imported where they are used: ``pip install arb
 - ``correspondence``, ``attention``: geometry-guided cross-view attention;
 - ``conditioning``, ``geometry``: conditions and cameras as tensors;
 - ``denoiser``, ``autoencoder``, ``networks``: the networks; ``sampler``: the reverse process;
-- ``completion``: inference on a frame; ``batches``: on the output of transforms;
-- ``generator``: ``Generator``, which loads and saves them; ``fillers``, ``inpainting``: filling without a network;
-- ``pretrained``, ``crops``: inpainting networks that others trained, on windows around the holes.
+- ``completion``: inference on a frame; ``inpainter``: on rendered views, as ``Diffusion``;
+- ``generator``: ``Generator``, which loads and saves them.
 """
 
-from arbiview_aug.generator.batches import CompletedLoader
+from typing import Any
+
 from arbiview_aug.generator.completion import Completed
 from arbiview_aug.generator.config import GeneratorConfig, compact, inpaint, paper, small, tiny
-from arbiview_aug.generator.generator import Generator, load_generator
-from arbiview_aug.generator.pretrained import HoleFiller, PipelineFiller, TorchScriptFiller
+from arbiview_aug.generator.generator import Generator
+from arbiview_aug.generator.inpainter import Diffusion, load_inpainter
+from arbiview_aug.renamed import removed_name
 
 __all__ = [
     "Completed",
-    "CompletedLoader",
+    "Diffusion",
     "Generator",
     "GeneratorConfig",
-    "HoleFiller",
-    "PipelineFiller",
-    "TorchScriptFiller",
     "compact",
     "inpaint",
-    "load_generator",
+    "load_inpainter",
     "paper",
     "small",
     "tiny",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Old names raise an error that gives the new one."""
+    raise removed_name(__name__, name)

@@ -6,7 +6,6 @@ by Telea's method without the denoiser. A frame's others are denoised together, 
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -23,10 +22,11 @@ from arbiview_aug.generator.config import GeneratorConfig
 from arbiview_aug.generator.correspondence import TokenWindow
 from arbiview_aug.generator.denoiser import REGRESSION
 from arbiview_aug.generator.geometry import FrameGeometry, batched, frame_geometry
-from arbiview_aug.generator.inpainting import telea
 from arbiview_aug.generator.networks import GeneratorNetworks
 from arbiview_aug.generator.sampler import guided, noise_schedule, sample
 from arbiview_aug.image_ops import resized
+from arbiview_aug.inpaint.inpainter import check_device, known_and_holes, seeded
+from arbiview_aug.inpaint.telea import telea
 from arbiview_aug.sample.batching import stacked
 
 ALMOST_COMPLETE = 0.995  # share of known pixels from which a view is inpainted: what is left is a seam
@@ -211,27 +211,6 @@ def _settings(generator: GeneratorNetworks, steps: int | None, guidance: float |
     return config
 
 
-def check_device(generator: Any) -> None:
-    """Raise GeneratorError for a generator on a GPU in a DataLoader worker."""
-    if generator.device.type == "cuda" and torch.utils.data.get_worker_info() is not None:
-        raise GeneratorError(
-            "a generator on a GPU cannot run in DataLoader workers: use num_workers=0, keep the generator on the "
-            "CPU, or complete batches after they are collated"
-        )
-
-
-def known_and_holes(
-    targets: Rig, coverage: Maps, confidence: Maps, min_confidence: float
-) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
-    """Pixels (h, w) of each view that are seen with enough confidence, and the others that are not the own car."""
-    known = [seen & (c >= min_confidence) for seen, c in zip(coverage, confidence, strict=True)]
-    masks = [camera.mask for camera in targets]
-    holes = [
-        ~k if mask is None else ~k & torch.tensor(mask, device=k.device) for k, mask in zip(known, masks, strict=True)
-    ]
-    return known, holes
-
-
 def denoised(
     generator: GeneratorNetworks,
     config: GeneratorConfig,
@@ -329,12 +308,6 @@ def _noise(config: GeneratorConfig, seed: int, frame: str | int, camera: str) ->
     """(C, h, w) standard normal of a (frame, camera), drawn on the CPU: the same on every device."""
     rng = seeded(seed, str(frame), camera)
     return torch.randn(config.autoencoder.latent_channels, *config.latent_size, generator=rng)
-
-
-def seeded(*key: object) -> torch.Generator:
-    """A CPU generator seeded by a key of plain values."""
-    digest = hashlib.sha256(repr(key).encode()).digest()
-    return torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1)
 
 
 def _check_sizes(views: Maps, coverage: Maps, targets: Rig) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import re
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -13,20 +11,17 @@ import torch
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator.autoencoder import Autoencoder
-from arbiview_aug.generator.batches import complete_batch
 from arbiview_aug.generator.checkpoint import CONFIG_FILE, load_weights, read_checkpoint, read_config, write_checkpoint
 from arbiview_aug.generator.completion import complete
 from arbiview_aug.generator.conditioning import input_channels
 from arbiview_aug.generator.config import GeneratorConfig, TrainedOn, from_plain, paper
 from arbiview_aug.generator.denoiser import Denoiser
 from arbiview_aug.generator.networks import GeneratorNetworks
-from arbiview_aug.generator.pretrained import HoleFiller, PipelineFiller, TorchScriptFiller
 from arbiview_aug.generator.sampler import noise_schedule
 from arbiview_aug.generator.stable_diffusion import PLAIN_UNET, load_part
 from arbiview_aug.generator.stable_diffusion import empty_prompt as embedded_empty_prompt
 
 _SHIPPED = Path(__file__).with_name("weights")
-_HUB_ID = re.compile(r"\w[\w.-]*/[\w.-]+")
 
 
 def has_shipped() -> bool:
@@ -154,22 +149,3 @@ class Generator(GeneratorNetworks):
 
     # --- use ----------------------------------------------------------------------------------------------------------
     complete_views = complete
-    complete_batch = complete_batch
-
-
-def load_generator(where: str | Path) -> Generator | HoleFiller:
-    """Load what completes views: a generator's folder, a TorchScript file, or an inpainting pipeline of diffusers.
-
-    Raises:
-        GeneratorError: None of these.
-    """
-    path = Path(where)
-    if os.path.isfile(path):
-        return TorchScriptFiller(path)
-    is_there = os.path.isdir(path)
-    if not is_there and not _HUB_ID.fullmatch(str(where)):
-        expected = "a folder of a generator or of diffusers, a TorchScript file, or OWNER/NAME on the Hugging Face Hub"
-        raise GeneratorError(f"generator {where}: expected {expected}, found none")
-    if not is_there or (path / "model_index.json").is_file():
-        return PipelineFiller.from_pretrained(where)
-    return Generator.from_pretrained(path)

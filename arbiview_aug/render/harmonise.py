@@ -25,8 +25,8 @@ from arbiview_aug.cameras.overlap import adjacent_pairs, half_way_view, odd_tile
 from arbiview_aug.cameras.projection import ego_rays, project_rays
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.errors import SampleError
-from arbiview_aug.favs.config import check_ranges
 from arbiview_aug.lru_cache import LRUCache
+from arbiview_aug.render.config import check_ranges
 from arbiview_aug.render.view_plan import ViewPlan
 from arbiview_aug.scene.static import Street
 
@@ -299,8 +299,8 @@ def _held_out_db(pixels: _Pixels, overlaps: Overlaps) -> float:
     return float(np.mean(-10 * np.log10(np.maximum(errors, 1e-10))))
 
 
-Harmonise = bool | HarmoniseConfig | Sequence[float] | None
-"""A user's choice: None, True or a config to estimate gains for every frame, given gains, or False for none."""
+Harmonise = bool | HarmoniseConfig | Sequence[float]
+"""A user's choice: True or a config to estimate gains for every frame, gains for each camera, or False for none."""
 
 
 class Harmoniser:
@@ -313,9 +313,9 @@ class Harmoniser:
         ValueError: Anything else, or gains that are no positive numbers up to a thousand.
     """
 
-    def __init__(self, choice: Harmonise = None) -> None:
+    def __init__(self, choice: Harmonise = True) -> None:
         self.config = choice if isinstance(choice, HarmoniseConfig) else HarmoniseConfig()
-        self.estimates = choice is None or choice is True or isinstance(choice, HarmoniseConfig)
+        self.estimates = choice is True or isinstance(choice, HarmoniseConfig)
         self.gains = None if self.estimates or choice is False else _checked_gains(choice)
         self.is_on = self.estimates or self.gains is not None
         self._overlaps: LRUCache[bytes, Overlaps] = LRUCache(_CACHED_RIGS)
@@ -329,10 +329,12 @@ class Harmoniser:
         """The gains of a frame, and why; SampleError if the number of given gains is not that of cameras."""
         if self.gains is not None:
             if len(self.gains) != len(rig):
-                raise SampleError(f"harmonise: expected a gain for each of {len(rig)} cameras, got {len(self.gains)}")
+                raise SampleError(
+                    f"match_exposure: expected a gain for each of {len(rig)} cameras, got {len(self.gains)}"
+                )
             return PhotometricReport(self.gains, True, "given")
         if not self.estimates:
-            return PhotometricReport((1.0,) * len(rig), False, "harmonise is off")
+            return PhotometricReport((1.0,) * len(rig), False, "match_exposure is off")
         overlaps = self._overlaps.get(rig.content_key, lambda: find_overlaps(rig, self.config))
         return estimate_gains(rig, images, self.config, overlaps=overlaps)
 
@@ -366,7 +368,7 @@ def _checked_gains(choice: object) -> tuple[float, ...]:
         gains = ()
     if not gains or not all(1 / _MAX_GIVEN_GAIN <= gain <= _MAX_GIVEN_GAIN for gain in gains):  # NaN fails too
         raise ValueError(
-            "harmonise: expected None, a bool, a HarmoniseConfig or for each camera a gain from "
+            "match_exposure: expected a bool, a HarmoniseConfig or for each camera a gain from "
             f"{1 / _MAX_GIVEN_GAIN:g} to {_MAX_GIVEN_GAIN:g}, got {choice!r}"
         )
     return gains

@@ -19,8 +19,8 @@ from arbiview_aug.cameras.lens import LENSES, BoolArray, LensName
 from arbiview_aug.cameras.rays import CameraMaps
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.environment import compilation_announced
-from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.render.atlas import AtlasLayout
+from arbiview_aug.render.config import RenderConfig
 from arbiview_aug.render.view_plan import ViewPlan
 from arbiview_aug.render.view_planner import ViewPlanner
 from arbiview_aug.scene.point_cloud import seen_through
@@ -54,7 +54,7 @@ class RenderPlan:
         return [t.coverage for t in self.targets]
 
 
-def plan_key(source: Rig, target: Rig, surface: str, config: FavsConfig, scene: Scene | None = None) -> bytes:
+def plan_key(source: Rig, target: Rig, surface: str, config: RenderConfig, scene: Scene | None = None) -> bytes:
     """Content key of a plan: calibrations, scene, surface and settings, without names."""
     settings = tuple(getattr(config, f.name) for f in fields(config))
     geometry = (scene or Scene()).key
@@ -65,8 +65,8 @@ def build_plan(
     source: Rig,
     target: Rig,
     *,
-    surface: str = "auto",
-    config: FavsConfig | None = None,
+    geometry: str = "auto",
+    config: RenderConfig | None = None,
     scene: Scene | None = None,
     maps: CameraMaps | None = None,
 ) -> RenderPlan:
@@ -75,8 +75,8 @@ def build_plan(
     Args:
         source: The rig that recorded the images.
         target: The rig to render, in its own ego frame: the two roads are made to coincide.
-        surface: ``far``, ``ground``, ``street``, ``objects`` (needs boxes), ``lidar`` (needs points); or ``auto``: for
-            each pair of cameras ``far`` where their centres coincide or the worst-case parallax is below
+        geometry: A name in ``GEOMETRIES``; ``auto``: for each pair of cameras ``infinity`` where their centres
+            coincide or the worst-case parallax is below
             ``config.far_parallax_px``, else the scene's best.
         config: Settings; the ``fast`` preset by default.
         scene: Known geometry, in the source's ego frame.
@@ -86,7 +86,7 @@ def build_plan(
         The plan. Targets that no source sees have zero coverage.
     """
     with compilation_announced():
-        return _built(source, target.in_frame_of(source), surface, config or FavsConfig(), scene or Scene(), maps)
+        return _built(source, target.in_frame_of(source), geometry, config or RenderConfig(), scene or Scene(), maps)
 
 
 def warm_up() -> None:
@@ -106,15 +106,15 @@ def warm_up() -> None:
         [replace(camera, mask=np.eye(32, dtype=bool) < 1) for camera in views if not camera.name.endswith("0")]
     )
     target = Rig([camera for camera in views if camera.name.endswith("0")])
-    scene, config = Scene(boxes=boxes, points=wall), FavsConfig(certainty=True)
+    scene, config = Scene(boxes=boxes, points=wall), RenderConfig(certainty=True)
     seen_through(wall, wall, target[0].center_m)
-    for surface in ("ground", "objects", "lidar"):
-        plan = build_plan(source, target, surface=surface, config=config, scene=scene)
+    for surface in ("ground", "boxes", "lidar"):
+        plan = build_plan(source, target, geometry=surface, config=config, scene=scene)
     read_ahead(np.zeros((1, 3), np.uint8), 3, plan.targets[0].at.packed, plan.targets[0].source_camera)
 
 
 def _built(
-    source: Rig, target: Rig, surface: str, config: FavsConfig, scene: Scene, maps: CameraMaps | None
+    source: Rig, target: Rig, surface: str, config: RenderConfig, scene: Scene, maps: CameraMaps | None
 ) -> RenderPlan:
     counters: Counter[str] = Counter()
     order = content_order(source.cameras)

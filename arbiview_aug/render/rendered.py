@@ -14,7 +14,6 @@ import torch
 from arbiview_aug.cameras.framing import Fit, framing
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
-from arbiview_aug.favs.renderer import PaperRendering, paper_labels
 from arbiview_aug.image_ops import Scratch, nearest_resized, resized
 from arbiview_aug.render.confidence import confidence
 from arbiview_aug.render.labels import render_labels
@@ -25,7 +24,7 @@ from arbiview_aug.render.view_plan import Paint
 from arbiview_aug.sample.batching import barred, covered, framed, stacked
 from arbiview_aug.sample.inputs import Frame
 
-Execution = Literal["auto", "opencv", "torch"]
+Backend = Literal["auto", "opencv", "torch"]
 
 Maps = torch.Tensor | list[torch.Tensor]
 """Maps of M views: (M, h, w) where their sizes agree, else a list of (h, w)."""
@@ -103,12 +102,12 @@ class Renderer:
     """Executes render plans.
 
     Args:
-        execution: ``opencv`` (CPU), ``torch`` (any device, differentiable), or ``auto``: OpenCV for CPU images that
+        backend: ``opencv`` (CPU), ``torch`` (any device, differentiable), or ``auto``: OpenCV for CPU images that
             need no gradient.
     """
 
-    def __init__(self, execution: Execution = "auto") -> None:
-        self.execution = execution
+    def __init__(self, backend: Backend = "auto") -> None:
+        self.backend = backend
         self._scratch = Scratch()
 
     def render(
@@ -127,7 +126,7 @@ class Renderer:
             outputs: The requested of ``source_camera``, ``source_frame`` and ``confidence``.
 
         Raises:
-            SampleError: ``execution="opencv"``, and an image is on another device or needs gradients.
+            SampleError: ``backend="opencv"``, and an image is on another device or needs gradients.
         """
         with_seams = "confidence" in outputs
         rendered: dict[int, RenderedFrame] = {}
@@ -163,9 +162,9 @@ class Renderer:
 
     def _uses_torch(self, images: Sequence[torch.Tensor]) -> bool:
         needed = any(image.device.type != "cpu" or image.requires_grad for image in images)
-        if self.execution == "opencv" and needed:
-            raise SampleError("execution='opencv': expected CPU images without gradients; use execution='torch'")
-        return self.execution == "torch" or (self.execution == "auto" and needed)
+        if self.backend == "opencv" and needed:
+            raise SampleError("backend='opencv': expected CPU images without gradients; use backend='torch'")
+        return self.backend == "torch" or (self.backend == "auto" and needed)
 
 
 def _rendered(
@@ -177,7 +176,7 @@ def _rendered(
 ) -> RenderedFrame:
     views, on_device = plan.targets, plan.on_devices.get(images[0].device)
     winners = [view.source for view in on_device or ()] or [torch.from_numpy(view.source_camera) for view in views]
-    rendered = _from_winners(images, plan.target, winners, partial(render_labels, plan), outputs)
+    rendered = from_winners(images, plan.target, winners, partial(render_labels, plan), outputs)
     layers, paint = [view.layers for view in views], [view.paint for view in views]
     rendered = replace(rendered, layers=layers, paint=paint, curves=curves)
     if "confidence" not in outputs:
@@ -187,7 +186,7 @@ def _rendered(
     return replace(rendered, confidence=confidence_of(rendered))
 
 
-def _from_winners(
+def from_winners(
     images: list[torch.Tensor],
     rig: Rig,
     winners: Sequence[torch.Tensor],
@@ -209,16 +208,6 @@ def confidence_of(rendered: RenderedFrame) -> Maps:
     """Compute the confidence of a frame's views from their certainty, seams and contrast."""
     of_views = zip(rendered.images, rendered.certainty, rendered.coverage, rendered.seams, strict=True)
     return stacked([confidence(*of_view) for of_view in of_views])
-
-
-# --- by the published stages ------------------------------------------------------------------------------------------
-def as_rendered(rendering: PaperRendering, outputs: Collection[str] = ()) -> RenderedFrame:
-    """Convert the rendering of ``quality="paper"``; ``outputs`` as in ``Renderer.render``."""
-    views = rendering.targets
-    winners, labels = [torch.from_numpy(view.source_camera) for view in views], partial(paper_labels, rendering)
-    rendered = _from_winners([view.image for view in views], rendering.target, winners, labels, outputs)
-    layers = [view.occluded if view.occluded is None else view.occluded.view(np.uint8) for view in views]
-    return replace(rendered, layers=layers, paint=[None] * len(views))
 
 
 # --- resized only -----------------------------------------------------------------------------------------------------

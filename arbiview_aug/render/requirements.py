@@ -14,9 +14,9 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.projection import look_apart
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.favs.config import FavsConfig
-from arbiview_aug.favs.stage4_fusion import distance_weight
-from arbiview_aug.scene.scene import SURFACES
+from arbiview_aug.render.config import RenderConfig
+from arbiview_aug.render.weights import distance_weight
+from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.scene.static import NEAREST_SCENE_M, worst_parallax_px
 
 SAME_CENTER_M = 1e-6
@@ -27,7 +27,7 @@ MOVED_M = 0.2
 
 HELPFUL_DATA = (
     "'points', 'depth_m' or 'boxes_3d' in the samples, or depth from the frames before and after (`python -m "
-    "arbiview_aug depth --data FOLDER`, then surface='motion')"
+    "arbiview_aug depth --data FOLDER`, then geometry='motion')"
 )
 """Data that keeps the shape of objects if cameras move, for messages."""
 
@@ -43,7 +43,7 @@ def baselines_m(source: Rig, target: Rig) -> FloatArray:
     return np.asarray(np.linalg.norm(target.cam2ego[:, None, :3, 3] - source.cam2ego[None, :, :3, 3], axis=-1))
 
 
-def needs_geometry(source: Rig, target: Rig, surface: str, config: FavsConfig) -> bool:
+def needs_geometry(source: Rig, target: Rig, surface: str, config: RenderConfig) -> bool:
     """Whether the source position of any target pixel depends on the distance of the scene.
 
     Args:
@@ -68,7 +68,7 @@ def needs_geometry(source: Rig, target: Rig, surface: str, config: FavsConfig) -
     return False
 
 
-def static_harm(source: Rig, target: Rig, surface: str, config: FavsConfig) -> str | None:
+def static_harm(source: Rig, target: Rig, surface: str, config: RenderConfig) -> str | None:
     """Explain how a detector suffers from cameras that move over a static surface; None if it does not.
 
     Objects are projected onto the road or the house behind them. A detector trained on such views alone was 3 to 5
@@ -80,7 +80,7 @@ def static_harm(source: Rig, target: Rig, surface: str, config: FavsConfig) -> s
         surface: The surface that is rendered over, not ``auto``.
         config: Settings.
     """
-    if not SURFACES[surface].is_static:
+    if not GEOMETRIES[surface].is_static:
         return None
     moved_m = float(baselines_m(source, target).min(axis=1).max())
     if moved_m <= MOVED_M or not needs_geometry(source, target, "auto", config):
@@ -98,7 +98,7 @@ def harm_remedies(source: Rig, target: Rig) -> str:
     return f"{HELPFUL_DATA}; or mixing with untouched samples ({mixing})"
 
 
-def covers_target_exactly(source: Camera, target: Camera, config: FavsConfig) -> bool:
+def covers_target_exactly(source: Camera, target: Camera, config: RenderConfig) -> bool:
     """Whether one source certainly wins every pixel of a target camera, so that the others can be skipped.
 
     It must share the target's centre, see all of it, and outweigh every other source. Decided by the corners, so for

@@ -18,11 +18,10 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.projection import look_apart
 from arbiview_aug.cameras.rays import CELL_PX, CameraMaps, relative_pose, source_pixels
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.favs.config import FavsConfig
-from arbiview_aug.favs.stage4_fusion import distance_weight, primary_weight, quality_weight
 from arbiview_aug.image_ops import at_level, level_size
 from arbiview_aug.render.atlas import AtlasLayout, FixedMap
 from arbiview_aug.render.confidence import certainty
+from arbiview_aug.render.config import RenderConfig
 from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.render.seams import SecondBest, seam_weights
 from arbiview_aug.render.view_plan import (
@@ -33,8 +32,9 @@ from arbiview_aug.render.view_plan import (
     ViewPlan,
     nearer_cells,
 )
+from arbiview_aug.render.weights import source_weight
 from arbiview_aug.scene.point_cloud import occlusion_level
-from arbiview_aug.scene.scene import SURFACES, Scene
+from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 
@@ -112,7 +112,7 @@ class ViewPlanner:
         camera: Camera,
         surface: str,
         scene: Scene,
-        config: FavsConfig,
+        config: RenderConfig,
         counters: Counter[str],
         maps: CameraMaps,
     ) -> None:
@@ -123,7 +123,7 @@ class ViewPlanner:
         self.rays = maps.rays(camera)
         # From outside, the far wall is a narrow strip with edges, which cells could step over.
         coarse = min(camera.size) >= SMALL_SIDE_PX
-        coarse &= is_within_wall(camera.center_m) or not SURFACES[surface].has_wall
+        coarse &= is_within_wall(camera.center_m) or not GEOMETRIES[surface].has_wall
         self.step = config.grid_step_px if coarse else 1
         corners = [np.minimum(np.arange(0, n + self.step, self.step), n - 1) for n in camera.size]
         # The outermost nodes lie half a cell inside: a magnified source does not see the outermost pixels.
@@ -154,11 +154,11 @@ class ViewPlanner:
     def _choose_surface(self, index: int) -> tuple[str, str]:
         baseline_m, worst = self.baselines_m[index], self.parallax_px[index]
         if baseline_m < SAME_CENTER_M:
-            return "far", "centres coincide: exact"
+            return "infinity", "centres coincide: exact"
         if self.surface != "auto":
             return self.surface, "asked for"
         if worst < self.config.far_parallax_px:
-            return "far", f"worst-case parallax {worst:.2f} px"
+            return "infinity", f"worst-case parallax {worst:.2f} px"
         return self.scene.best, f"centres {baseline_m:.2f} m apart"
 
     def _around_unseen(self, region: _Region) -> BoolArray:
@@ -281,11 +281,9 @@ class ViewPlanner:
         on_nodes = self.node_rays, self.rays.parameters, geometry.on_nodes, geometry.face_on_nodes
         visible = seen_image(*on_nodes, (*kernel[:-1], given))
         self.counters[f"pairs_{name}"] += 1
-        score = (
-            distance_weight(edge_px, min(source.size) / 2, self.config.distance_gamma)
-            * quality_weight(parallax, resolution)
-            * primary_weight(baseline_m < SAME_CENTER_M, self.config.primary_bonus)
-        )
+        of_config = self.config.distance_gamma, self.config.primary_bonus
+        is_primary = baseline_m < SAME_CENTER_M
+        score = source_weight(edge_px, min(source.size) / 2, parallax, resolution, is_primary, *of_config)
         certain = 255 * certainty(parallax_rad, resolution) if self.config.certainty else None
         return _Region(
             source=index,
@@ -379,7 +377,7 @@ class ViewPlanner:
         """Complete a view's layers where sources elsewhere show what is near."""
         from arbiview_aug.render.kernels import farthest_occluded, mark_objects
 
-        near = next((region for region in self.regions if region.surface != "far"), None)
+        near = next((region for region in self.regions if region.surface != "infinity"), None)
         if near is None:
             return None
         geometry = near.geometry
@@ -399,7 +397,7 @@ class ViewPlanner:
             return scores
         stacked = np.stack(scores)
         winner = np.where(stacked.any(axis=0), stacked.argmax(axis=0), -1).astype(np.int8)
-        labelled = self.scene.boxes if "boxes" in SURFACES[self.surface].reads else None
+        labelled = self.scene.boxes if "boxes" in GEOMETRIES[self.surface].reads else None
         if labelled is not None and len(labelled):
             near_last = np.argsort(-np.linalg.norm(labelled[:, :3] - self.camera.center_m, axis=-1), kind="stable")
             parallax = np.stack([region.parallax for region in self.regions])

@@ -48,8 +48,8 @@ def project_boxes_3d(boxes_3d: Any, cameras: Rig | Mapping[str, Any]) -> list[Im
 
     Args:
         boxes_3d: (B, >= 7) centre x y z, length, width, height in metres, yaw in radians, in the cameras' ego frame.
-        cameras: A rig, or an unbatched sample, such as ``RigRetarget`` returns, whose ``coverage`` and ``ignore`` mask
-            pixels.
+        cameras: A rig, or an unbatched sample, such as ``RigRetarget`` returns, whose ``coverage`` and ``ego_mask``
+            mask pixels.
 
     Returns:
         An entry for each camera.

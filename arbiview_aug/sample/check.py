@@ -27,7 +27,7 @@ PIXEL_BOUND_KEYS = (
 )
 """Keys bound to the source's pixels; they are dropped, as they would be stale in the target's views."""
 
-EGO_KEYS = ("points", "boxes_3d", "ego2world")  # they pass, or move with ``label_frame="target"``
+EGO_KEYS = ("points", "boxes_3d", "ego2world")  # they pass, or move with ``SampleKeys(frame="target")``
 _MAX_ENTRIES = 64  # checked per list: longer lists are tokens or numbers
 
 
@@ -44,8 +44,14 @@ def check_other_keys(
     """
     absent = [key for key in label_keys if key not in sample]
     if absent:
-        raise SampleError(f"label_keys: expected {', '.join(absent)} in the sample, got {', '.join(map(str, sample))}")
+        raise SampleError(
+            f"SampleKeys.labels: expected {', '.join(absent)} in the sample, got {', '.join(map(str, sample))}"
+        )
     labels = list(label_keys)
+    if "ignore" in sample and "ignore" not in (*label_keys, *pass_keys):
+        raise SampleError(
+            "ignore: since 0.3 masks of the own car are 'ego_mask'; rename the key, or keep it by SampleKeys"
+        )
     for key, value in sample.items():
         if key in (*CALIBRATION_KEYS, *PIXEL_BOUND_KEYS, *EGO_KEYS, *labels, *pass_keys):
             continue
@@ -56,12 +62,12 @@ def check_other_keys(
         for leaf in _leaves(value):
             if kind := _tv_tensor(leaf):
                 stale = f"{key}: a tv_tensors.{kind} is bound to the source's pixels and would be stale"
-                raise SampleError(f"{stale}; drop it, or name it in pass_keys=({key!r},)")
+                raise SampleError(f"{stale}; drop it, or name it in SampleKeys(keep=({key!r},))")
             shape = tuple(getattr(leaf, "shape", ()))
             if any(pair in sizes for pair in pairwise(shape)):
                 raise SampleError(
                     f"{key}: shape {shape} looks like a map over the source's pixels and would be stale; name it in "
-                    f"label_keys=({key!r},) to render it, or in pass_keys=({key!r},) to keep it as it is"
+                    f"SampleKeys(labels=({key!r},)) to render it, or in SampleKeys(keep=({key!r},)) to keep it as it is"
                 )
     return labels
 
@@ -101,7 +107,9 @@ def warn_of_misnamed(
     for found, meant in misnamed(sample, ("neighbours", *lenses, *geometry)).items():
         if found not in (*named, *PIXEL_BOUND_KEYS):
             message = f"the sample's {found!r} is not read; did you mean {meant!r}?"
-            warn(f"key {found}", f"{message} Rename it, as RigRetarget documents it, or name it in pass_keys")
+            warn(
+                f"key {found}", f"{message} Rename it, as RigRetarget documents it, or name it in SampleKeys(keep=...)"
+            )
 
 
 def warn_of_rims(frames: Iterable[Frame], warn: Callable[[str, str], None]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,17 @@ import numpy as np
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import SampleError, SampleTypeError
-from arbiview_aug.favs.stage3_objects import Detection
 from arbiview_aug.sample.boxes_2d import outline
 from arbiview_aug.sample.inputs import Frame, numbers, read_scene
+
+
+@dataclass(frozen=True)
+class Detection:
+    """Detector's box in a source image, from which objects take their type."""
+
+    box: tuple[float, float, float, float]  # (x0, y0, x1, y1) in source pixels
+    type: str  # class name, weighted by ``PaperConfig.type_weights``
+
 
 UNNAMED_TYPE = "upright"  # type of labelled boxes without names
 OfCameras = Mapping[int, Sequence[Detection]]  # the detections of a frame, by the index of its camera
@@ -31,7 +40,7 @@ def read_detections(frame: Frame) -> OfCameras:
         return _of_cameras(_of_frame("detections", frame), frame)
     if sample.get("boxes_3d") is None:
         return {}
-    scene = read_scene(frame, "objects")
+    scene = read_scene(frame, "boxes")
     assert scene is not None and scene.boxes is not None
     boxes = scene.boxes
     names = [UNNAMED_TYPE] * len(boxes)

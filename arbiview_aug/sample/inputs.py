@@ -20,7 +20,7 @@ from arbiview_aug.sample.images import check_container, checked_images
 from arbiview_aug.scene.boxes import checked_boxes
 from arbiview_aug.scene.depth_maps import believed, motion_camera, points_of_depth
 from arbiview_aug.scene.point_cloud import checked_points
-from arbiview_aug.scene.scene import SURFACES, Scene
+from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.scene.surface import Points
 
 MOTION_KEY, LEARNED_KEY = "motion_depth_m", "learned_depth_m"
@@ -37,7 +37,7 @@ CALIBRATION_KEYS = (
     "lens",
     "ground_z_m",
     "coverage",
-    "ignore",
+    "ego_mask",
     "neighbours",
     MOTION_KEY,
     LEARNED_KEY,
@@ -143,12 +143,12 @@ def read_scene(frame: Frame, surface: str) -> Scene | None:
 
     Args:
         frame: The frame.
-        surface: A name in ``SURFACES``.
+        surface: A name in ``GEOMETRIES``.
 
     Raises:
         SampleError: The sample lacks what the surface needs, or it is impossible.
     """
-    row, sample = SURFACES[surface], frame.sample
+    row, sample = GEOMETRIES[surface], frame.sample
     arrays: dict[str, Points] = {}
     for name in row.reads:
         array = _geometry(name, frame, arrays, name == "motion" and LEARNED_KEY in row.reads)
@@ -157,7 +157,7 @@ def read_scene(frame: Frame, surface: str) -> Scene | None:
         elif name == row.needs and name != "motion" and (name != "points" or sample.get("depth_m") is None):
             # Neighbouring frames may still give depth from motion.
             expected, keys = _EXPECTED.get(name, f"{name!r} in the sample, got none"), _SAMPLE_KEYS.get(name, (name,))
-            raise SampleError(f"surface={surface!r}: expected {expected}{hint(sample, keys)}")
+            raise SampleError(f"geometry={surface!r}: expected {expected}{hint(sample, keys)}")
     if not arrays:
         return None
     fields: dict[str, Any] = {name: arrays.pop(name) for name in _SAMPLE_KEYS if name in arrays}
@@ -178,7 +178,7 @@ _CHECKS: dict[str, Callable[[Points], Points]] = {"boxes_3d": checked_boxes, "po
 
 
 def _geometry(name: str, frame: Frame, arrays: Mapping[str, Points], is_doubted: bool) -> Points | None:
-    """The array of a name in ``SurfaceRow.reads``, beside the ``arrays`` read before; None without any.
+    """The array of a name in ``GeometryRow.reads``, beside the ``arrays`` read before; None without any.
 
     Depth from motion that ``is_doubted`` is left out where a network's maps, if there are any, contradict it.
     """
@@ -326,9 +326,9 @@ def _lens(name: Any, index: tuple[int, ...]) -> str:
 
 
 def _with_masks(rig: Rig, sample: Mapping[str, Any], lead: tuple[int, ...], index: tuple[int, ...]) -> Rig:
-    """The rig, masked where an earlier retargeting saw nothing (``coverage``) or its own car (``ignore``)."""
+    """The rig, masked where an earlier retargeting saw nothing (``coverage``) or its own car (``ego_mask``)."""
     masks: list[BoolArray | None] = [camera.mask for camera in rig]
-    for key in ("coverage", "ignore"):
+    for key in ("coverage", "ego_mask"):
         if sample.get(key) is None:
             continue
         try:

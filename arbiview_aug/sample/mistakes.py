@@ -100,7 +100,7 @@ def check(sample: Mapping[str, Any], source_rig: Rig | None = None) -> CheckRepo
     found = list(_key_findings(sample, source_rig is not None or sample.get("rig") is not None))
     for frame, of_frame, cloud in zip(frames, boxes, points, strict=True):
         # Holes of an earlier retargeting are masks too, of any shape.
-        own_masks = sample.get("coverage") is None and sample.get("ignore") is None
+        own_masks = sample.get("coverage") is None and sample.get("ego_mask") is None
         found += check_rig(frame.rig, masks=own_masks)
         found += _image_findings(frame)
         found += _label_findings(frame.rig, of_frame, cloud)

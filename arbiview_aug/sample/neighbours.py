@@ -1,4 +1,4 @@
-"""Checked neighbouring frames of a drive; unusable ones are left out with a warning. See ``temporal.fill``."""
+"""Checked neighbouring frames of a drive; unusable ones are left out with a warning. See ``inpaint.neighbours``."""
 
 from __future__ import annotations
 
@@ -159,6 +159,15 @@ def points_of_neighbours(rig: Rig, points: Points, neighbours: Sequence[Neighbou
         if others is not None:
             found.append(others[~seen_through(points, others, origin)])
     return np.concatenate(found) if found else None
+
+
+def neighbour_images(neighbour: Neighbour, like: Sequence[torch.Tensor], warn: Warn) -> tuple[torch.Tensor, ...] | None:
+    """Read a neighbour's images; None, with a warning that names it, if they cannot be read."""
+    try:
+        return neighbour.images(like)
+    except (ArbiviewError, OSError) as error:
+        warn_lost(warn, neighbour.name, error)
+        return None
 
 
 def warn_lost(warn: Warn, name: str, error: Exception) -> None:

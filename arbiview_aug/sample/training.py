@@ -41,7 +41,7 @@ def lift_mask(sample: Mapping[str, Any], stride: int, least: float = 0.5) -> tor
     """Feature cells that saw something real, to lift no others into a bird's-eye view.
 
     Args:
-        sample: An output of ``RigRetarget``; its ``coverage`` is read, and ``ignore`` if there is one.
+        sample: An output of ``RigRetarget``; its ``coverage`` is read, and ``ego_mask`` if there is one.
         stride: Pixels of an image along a side of a cell.
         least: Share of a cell's pixels that must be covered.
 
@@ -56,7 +56,7 @@ def lift_mask(sample: Mapping[str, Any], stride: int, least: float = 0.5) -> tor
         raise ValueError(f"stride: expected a number of pixels from 1, got {stride!r}")
     if sample.get("coverage") is None:
         raise SampleError("lift_mask: expected an output of RigRetarget with 'coverage', got none")
-    coverage, ignore = sample["coverage"], sample.get("ignore")
+    coverage, ignore = sample["coverage"], sample.get("ego_mask")
     if isinstance(coverage, list):
         masks = [None] * len(coverage) if ignore is None else ignore
         return [_pooled(*of_camera, stride, least) for of_camera in zip(coverage, masks, strict=True)]

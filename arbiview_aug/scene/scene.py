@@ -1,4 +1,4 @@
-"""The geometry of a sample, and the table ``SURFACES`` of all surfaces made of it."""
+"""The geometry of a sample, and the table ``GEOMETRIES`` of all surfaces made of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.choices import SurfaceName
+from arbiview_aug.choices import GeometryName
 from arbiview_aug.scene.boxes import BoxSurface
 from arbiview_aug.scene.corrected import CorrectedSurface, Correction
 from arbiview_aug.scene.point_cloud import PointCloudSurface, PointCloudWithBoxes
@@ -30,7 +30,7 @@ class Scene:
         points: (P, 3) measured points, metres.
         motion: (P, 3) points of depth from motion, metres.
         sweeps: (P, 3) points of neighbouring frames beside ``points``, metres.
-        further: Arrays of other sample keys that a row of ``SURFACES`` reads.
+        further: Arrays of other sample keys that a row of ``GEOMETRIES`` reads.
         corrections: Corrections of the street's distances by depth from overlap.
         known: Surface whose distances are known, in place of all others but ``far``.
     """
@@ -45,7 +45,7 @@ class Scene:
     _surfaces: dict[tuple[str, float], Surface] = field(default_factory=dict, init=False, repr=False)
 
     def geometry(self, name: str) -> Points | None:
-        """The array of a name in ``SurfaceRow.reads``; None if there is none."""
+        """The array of a name in ``GeometryRow.reads``; None if there is none."""
         other = {"points": "depth_m", "motion": "learned_depth_m"}.get(name)  # what may stand in its place
         if other is not None and getattr(self, name) is None:
             return self.further.get(other)
@@ -66,12 +66,12 @@ class Scene:
         return ", ".join(f"{len(array)} {name}" for name, array in arrays.items() if array is not None and len(array))
 
     @cached_property
-    def best(self) -> SurfaceName:
+    def best(self) -> GeometryName:
         """The surface that ``auto`` uses: made of the most accurate geometry."""
         motion = self.motion is not None and len(self.motion) > 0
         if any(array is not None and len(array) for array in (self.points, self.further.get("depth_m"))):
             return "fused" if motion else "lidar"
-        return "motion" if motion else "street" if self.boxes is None else "objects"
+        return "motion" if motion else "street" if self.boxes is None else "boxes"
 
     @property
     def key(self) -> bytes:
@@ -88,11 +88,11 @@ class Scene:
 
     def surface(self, name: str, ground_z_m: float) -> Surface:
         """A surface by name, over a road at ``ground_z_m``; cached."""
-        if self.known is not None and name != "far":
+        if self.known is not None and name != "infinity":
             return self.known
         key = name, ground_z_m
         if key not in self._surfaces:
-            row = SURFACES.get(name)
+            row = GEOMETRIES.get(name)
             if row is None or (row.needs is not None and self.geometry(row.needs) is None):
                 raise ValueError(f"surface: {name!r} is unknown, or the scene has no geometry for it")
             self._surfaces[key] = row.make(self, ground_z_m)
@@ -100,8 +100,8 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class SurfaceRow:
-    """A row of ``SURFACES``.
+class GeometryRow:
+    """A row of ``GEOMETRIES``.
 
     Attributes:
         make: Makes the surface of a scene, over a road at a height in metres.
@@ -141,37 +141,37 @@ def _point_cloud(scene: Scene, ground_z_m: float, points: Points | None, *maps: 
     # One type and layout: kernels are compiled for each.
     street, together = _street(scene, ground_z_m), np.ascontiguousarray(np.concatenate(parts), np.float32)
     if len(together) == 0:
-        return scene.surface("street" if boxes is None else "objects", ground_z_m)
+        return scene.surface("street" if boxes is None else "boxes", ground_z_m)
     mapped, swept = len(together) - len(parts[0]) - len(parts[1]), len(parts[1]) > 0
     if boxes is None:
         return PointCloudSurface(street, together, mapped, swept)
     return PointCloudWithBoxes.among(street, together, boxes, mapped, swept)
 
 
-SURFACES: dict[str, SurfaceRow] = {
-    "auto": SurfaceRow(
+GEOMETRIES: dict[str, GeometryRow] = {
+    "auto": GeometryRow(
         lambda scene, z_m: scene.surface(scene.best, z_m), ("boxes", "points", "depth_m", "motion"), overlap_depth=True
     ),
-    "far": SurfaceRow(lambda scene, z_m: Far(), has_wall=False),
-    "ground": SurfaceRow(lambda scene, z_m: Ground(ground_z_m=z_m)),
-    "street": SurfaceRow(_street, overlap_depth=True),
-    "objects": SurfaceRow(_boxes, ("boxes",), "boxes", overlap_depth=True),
-    "lidar": SurfaceRow(
+    "infinity": GeometryRow(lambda scene, z_m: Far(), has_wall=False),
+    "ground": GeometryRow(lambda scene, z_m: Ground(ground_z_m=z_m)),
+    "street": GeometryRow(_street, overlap_depth=True),
+    "boxes": GeometryRow(_boxes, ("boxes",), "boxes", overlap_depth=True),
+    "lidar": GeometryRow(
         lambda scene, z_m: _point_cloud(scene, z_m, scene.points, scene.further.get("depth_m")),
         ("boxes", "points", "depth_m"),
         "points",
     ),
-    "motion": SurfaceRow(
+    "motion": GeometryRow(
         lambda scene, z_m: _point_cloud(scene, z_m, None, scene.motion), ("boxes", "motion"), "motion"
     ),
-    "fused": SurfaceRow(
+    "fused": GeometryRow(
         lambda scene, z_m: _point_cloud(
             scene, z_m, scene.points, *map(scene.further.get, ("depth_m", "learned_depth_m")), scene.motion
         ),
         ("boxes", "points", "depth_m", "motion", "learned_depth_m"),
         "motion",
     ),
-    "learned": SurfaceRow(
+    "learned": GeometryRow(
         lambda scene, z_m: _point_cloud(scene, z_m, None, scene.further["learned_depth_m"]),
         ("boxes", "learned_depth_m"),
         "learned_depth_m",

@@ -9,7 +9,7 @@ import numpy as np
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import pose_mistake
-from arbiview_aug.errors import SampleError, UnreachableError, WarnOnce
+from arbiview_aug.errors import GeometryWarning, UnreachableError, WarnOnce
 from arbiview_aug.render.requirements import harm_remedies
 
 Coverages = Sequence[BoolArray | float]
@@ -44,19 +44,13 @@ def check_reach(source: Rig, target: Rig, coverages: Coverages, unseen: str, war
     if poor:
         cause = f"{_likely_cause(source, target)}. " if np.mean(shares) < _SUSPICIOUS else ""
         covered = f"covered are {', '.join(poor)}. {cause}{unseen}"
-        warn("unreachable", f"{lost}: {covered} Or choose another target")
+        warn("unreachable", f"{lost}: {covered} Or choose another target", GeometryWarning)
 
 
-def warn_of_harm(harm: str, source: Rig, target: Rig, strict: bool, warn: WarnOnce) -> None:
-    """Warn once that ``auto`` falls back to the static street although cameras move, which harms a detector.
-
-    Raises:
-        SampleError: ``strict`` is set.
-    """
-    message = f"{harm}. Better: {harm_remedies(source, target)}; surface='street' accepts it"
-    if strict:
-        raise SampleError(f"strict=True: {message}")
-    warn("static", message)
+def warn_of_harm(harm: str, source: Rig, target: Rig, warn: WarnOnce) -> None:
+    """Warn once that ``auto`` falls back to the static street although cameras move, which harms a detector."""
+    message = f"{harm}. Better: {harm_remedies(source, target)}; geometry='street' accepts it"
+    warn("static", message, GeometryWarning)
 
 
 def _likely_cause(source: Rig, target: Rig) -> str:

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.favs.renderer import PaperRendering, SourceReport
+from arbiview_aug.inpaint.neighbours import Fills
 from arbiview_aug.render.harmonise import PhotometricReport
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.requirements import harm_remedies
 from arbiview_aug.render.view_plan import SourceUse
-from arbiview_aug.temporal.fill import Fills
-from arbiview_aug.transforms.plans import FramePlan
+from arbiview_aug.transforms.plan_cache import FramePlan
+
+if TYPE_CHECKING:
+    from arbiview_aug.favs.renderer import PaperRendering, SourceReport
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ class PaperExplanation:
         return {
             "camera": camera.name,
             "share": report.share,
-            "surface": "far",
+            "surface": "infinity",
             "primary": report.primary,
             "baseline_m": float(np.linalg.norm(camera.center_m - center_m)),
             "matches": report.features.good_matches,

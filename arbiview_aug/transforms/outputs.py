@@ -13,11 +13,12 @@ import torch
 from arbiview_aug.cameras.key_names import hint
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError, SampleTypeError
-from arbiview_aug.generator.batches import SOURCES_KEY
+from arbiview_aug.inpaint.inpainter import SOURCES_KEY
 from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
 from arbiview_aug.sample.batching import gathered, is_readable, lens_names, like, rewrapped, split, stacked
 from arbiview_aug.sample.check import PIXEL_BOUND_KEYS
 from arbiview_aug.sample.inputs import CALIBRATION_KEYS, Frame
+from arbiview_aug.transforms.settings import SampleKeys
 
 
 # --- one sample -------------------------------------------------------------------------------------------------------
@@ -25,13 +26,10 @@ from arbiview_aug.sample.inputs import CALIBRATION_KEYS, Frame
 class SampleWriter:
     """Writes rendered frames as a sample of the form that they were read from."""
 
-    outputs: tuple[str, ...]  # requested keys
+    keys: SampleKeys
     generated: bool  # whether to write ``generated``
     lenses: bool  # ``lens`` and ``distortion``
-    masks: bool  # ``ignore``
-    pass_keys: tuple[str, ...]  # keys to keep although they look bound to the source's pixels
-    label_fill: float  # value of label pixels that no source sees
-    label_frame: str  # ``source`` or ``target``
+    masks: bool  # ``ego_mask``
     warn: Callable[[str, str], None]  # takes a topic and a message
 
     def write(
@@ -59,20 +57,20 @@ class SampleWriter:
         out["ground_z_m"] = ground_z_m
         out["coverage"] = gathered([frame.coverage for frame in rendered], lead)
         if self.masks:
-            out["ignore"] = gathered([part["ignore"] for part in parts], lead)
+            out["ego_mask"] = gathered([part["ego_mask"] for part in parts], lead)
         if self.lenses:
             out["distortion"] = gathered([part["distortion"] for part in parts], lead).to(device)
             out["lens"] = lens_names([part["lens"] for part in parts], lead)
-        for key in ("generated", *self.outputs) if self.generated else self.outputs:
+        for key in ("generated", *self.keys.extra) if self.generated else self.keys.extra:
             if key in MAP_KEYS:
                 out[key] = gathered([getattr(frame, key) for frame in rendered], lead)
-        if SOURCES_KEY in self.outputs:
+        if SOURCES_KEY in self.keys.extra:
             out[SOURCES_KEY] = source_sample(sample["images"], frames, lead)
         for key in labels:
-            out[key] = target_labels(key, sample[key], frames, lead, rendered, self.label_fill)
+            out[key] = target_labels(key, sample[key], frames, lead, rendered, self.keys.ignore_index)
         if params:
             out["retarget_params"] = params
-        if self.label_frame == "target":
+        if self.keys.frame == "target":
             moves = [torch.from_numpy(frame.rig.ego2ego(target)) for frame in frames]
             move_to_target(out, gathered(moves, lead), lead)
             out["ground_z_m"] = torch.full_like(out["ground_z_m"], target.ground_z_m) if lead else target.ground_z_m
@@ -80,10 +78,10 @@ class SampleWriter:
 
     def _passed_on(self, sample: Mapping[str, Any], labels: Sequence[str]) -> dict[str, Any]:
         """The entries that do not depend on the images, as the same objects."""
-        named = (*labels, *self.pass_keys)
+        named = (*labels, *self.keys.keep)
         stale = [key for key in sample if key in PIXEL_BOUND_KEYS and key not in named]
         # The coverage of an earlier retargeting already masks what it generated.
-        dropped = [key for key in stale if key not in self.outputs and key != "generated"]
+        dropped = [key for key in stale if key not in self.keys.extra and key != "generated"]
         if dropped:
             meant = "" if "depth_m" in sample else hint(dropped, ("depth_m",))
             message = f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels{meant}"
@@ -94,7 +92,7 @@ class SampleWriter:
 
 # --- calibration ------------------------------------------------------------------------------------------------------
 def calibration_entries(rig: Rig, device: torch.device, *, lenses: bool = True, masks: bool = True) -> dict[str, Any]:
-    """``K``, ``cam2ego`` and ``ground_z_m`` of a rig, its ``distortion`` and ``lens``, and ``ignore`` on a device."""
+    """``K``, ``cam2ego`` and ``ground_z_m`` of a rig, its ``distortion`` and ``lens``, and ``ego_mask`` on a device."""
     part: dict[str, Any] = {
         "K": torch.from_numpy(rig.K),
         "cam2ego": torch.from_numpy(rig.cam2ego),
@@ -106,14 +104,14 @@ def calibration_entries(rig: Rig, device: torch.device, *, lenses: bool = True, 
         part["lens"] = [c.lens for c in rig]
     if masks:
         ignored = [np.zeros(c.size, bool) if c.mask is None else ~c.mask for c in rig]
-        part["ignore"] = stacked([torch.from_numpy(mask).to(device) for mask in ignored])
+        part["ego_mask"] = stacked([torch.from_numpy(mask).to(device) for mask in ignored])
     return part
 
 
 def source_sample(images: Any, frames: Sequence[Frame], lead: tuple[int, ...]) -> dict[str, Any]:
     """A sample of the source images, their calibration and masks."""
     parts = [calibration_entries(frame.rig, frame.images[0].device) for frame in frames]
-    keys = ("K", "cam2ego", "distortion", "ignore")
+    keys = ("K", "cam2ego", "distortion", "ego_mask")
     entries: dict[str, Any] = {key: gathered([part[key] for part in parts], lead) for key in keys}
     entries["lens"] = lens_names([part["lens"] for part in parts], lead)
     grounds = torch.tensor([part["ground_z_m"] for part in parts], dtype=torch.float64)
@@ -166,7 +164,7 @@ def _checked_fill(key: str, fill: float, dtype: torch.dtype) -> float:
     if not dtype.is_floating_point:
         limits = torch.iinfo(dtype)
         if not limits.min <= fill <= limits.max or fill != int(fill):  # NaN fails the first
-            raise SampleError(f"{key}: label_fill: expected a value of {dtype}, got {fill!r}")
+            raise SampleError(f"{key}: SampleKeys.ignore_index: expected a value of {dtype}, got {fill!r}")
     return fill
 
 
@@ -186,14 +184,14 @@ def move_to_target(out: dict[str, Any], ego2ego: torch.Tensor, lead: tuple[int, 
     if out.get("ego2world") is not None:
         pose = out["ego2world"]
         if tuple(getattr(pose, "shape", (4, 4)))[-2:] != (4, 4):
-            raise SampleError(f"ego2world: label_frame='target': expected shape (..., 4, 4), got {pose.shape}")
+            raise SampleError(f"ego2world: SampleKeys.frame='target': expected shape (..., 4, 4), got {pose.shape}")
         if isinstance(pose, np.ndarray) and pose.dtype.kind in "fiu":
             out["ego2world"] = _before_move(torch.from_numpy(pose.astype(np.float64)), offset_m).numpy()
         elif is_readable(pose) and pose.is_floating_point():
             out["ego2world"] = _before_move(pose, offset_m)
         else:
             kind = pose.dtype if isinstance(pose, torch.Tensor) else type(pose).__name__
-            raise SampleTypeError(f"ego2world: label_frame='target': expected a float tensor, got {kind}")
+            raise SampleTypeError(f"ego2world: SampleKeys.frame='target': expected a float tensor, got {kind}")
 
 
 def _before_move(pose: torch.Tensor, offset_m: torch.Tensor) -> torch.Tensor:
@@ -219,7 +217,7 @@ def _translated(key: str, value: Any, offset_m: torch.Tensor, lead: tuple[int, .
         return _translated(key, torch.tensor(value), offset_m, lead).numpy()
     if not is_readable(value) or not value.is_floating_point():
         kind = value.dtype if isinstance(value, torch.Tensor) else type(value).__name__
-        raise SampleTypeError(f"{key}: label_frame='target': expected a float tensor, got {kind}")
+        raise SampleTypeError(f"{key}: SampleKeys.frame='target': expected a float tensor, got {kind}")
     if not value.numel():  # empty, in any shape
         return value.clone()
     if value.ndim < len(lead) + 1 or value.shape[-1] < 3 or tuple(value.shape[: len(lead)]) != lead:

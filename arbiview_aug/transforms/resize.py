@@ -8,7 +8,7 @@ Lenses use normalised coordinates and stay as they are.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,20 +19,23 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.image_ops import nearest_resized, resized
+from arbiview_aug.renamed import refuse_old_options
 from arbiview_aug.sample.batching import is_readable, like, rewrapped
 from arbiview_aug.sample.check import PIXEL_BOUND_KEYS, check_other_keys
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, numbers, read_frames
+from arbiview_aug.transforms.settings import SampleKeys
 
-_MAPS = ("coverage", "ignore", "source_camera", "source_frame", "confidence", "generated", "depth", "depth_m")
+_MAPS = ("coverage", "ego_mask", "source_camera", "source_frame", "confidence", "generated", "depth", "depth_m")
 """Keys of maps (..., N, H, W) over the images' pixels, which are resized by the nearest pixel."""
 
 
 class _PixelTransform(torch.nn.Module, ABC):
     """Applies one change of pixels to the images of a sample and to everything that follows them."""
 
-    def __init__(self, label_keys: Sequence[str], pass_keys: Sequence[str]) -> None:
+    def __init__(self, keys: SampleKeys, unknown: Mapping[str, Any]) -> None:
         super().__init__()
-        self.label_keys, self.pass_keys = tuple(label_keys), tuple(pass_keys)
+        refuse_old_options(type(self).__name__, unknown)
+        self.keys = keys
         self._warn = WarnOnce()
 
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
@@ -50,14 +53,14 @@ class _PixelTransform(torch.nn.Module, ABC):
         """
         images = sample.get("images")
         sizes = [tuple(image.shape[-2:]) for image in read_frames(sample, None)[0].images]
-        labels = check_other_keys(sample, sizes, self.label_keys, self.pass_keys)
+        labels = check_other_keys(sample, sizes, self.keys.labels, self.keys.keep)
         out = dict(sample)
         for key in (*PIXEL_BOUND_KEYS, MOTION_KEY, LEARNED_KEY, "neighbours"):
-            if key in out and key not in (*_MAPS, *labels, *self.pass_keys):
+            if key in out and key not in (*_MAPS, *labels, *self.keys.keep):
                 del out[key]
                 self._warn(key, f"{type(self).__name__} drops {key}: it speaks of pixels that have moved")
         out["images"] = rewrapped(_each(images, self._image, 3), images)
-        for key in {*_MAPS, *labels} & out.keys() - {*self.pass_keys}:
+        for key in {*_MAPS, *labels} & out.keys() - {*self.keys.keep}:
             out[key] = rewrapped(_each(_checked_maps(key, out[key]), self._map, 2), out[key])
         if isinstance(sample.get("rig"), Rig):
             out["rig"] = sample["rig"].with_cameras([self._camera(camera) for camera in sample["rig"]])
@@ -88,12 +91,11 @@ class ResizeRig(_PixelTransform):
 
     Args:
         size: (h, w) of every output image.
-        label_keys: Keys that hold label maps (..., N, H, W), besides ``tv_tensors.Mask``.
-        pass_keys: Keys to keep although they look bound to pixels.
+        keys: Its ``labels`` and ``keep``, as for ``RigRetarget``.
     """
 
-    def __init__(self, size: tuple[int, int], *, label_keys: Sequence[str] = (), pass_keys: Sequence[str] = ()) -> None:
-        super().__init__(label_keys, pass_keys)
+    def __init__(self, size: tuple[int, int], *, keys: SampleKeys = SampleKeys(), **unknown: Any) -> None:  # noqa: B008 - frozen
+        super().__init__(keys, unknown)
         self.size = _checked_pair("size", size, 1)
 
     def extra_repr(self) -> str:
@@ -119,7 +121,7 @@ class CropRig(_PixelTransform):
         top: First row.
         left: First column.
         size: (h, w) of the window, which must lie within every image.
-        label_keys: As for ``ResizeRig``, like ``pass_keys``.
+        keys: As for ``ResizeRig``.
     """
 
     def __init__(
@@ -128,10 +130,10 @@ class CropRig(_PixelTransform):
         left: int,
         size: tuple[int, int],
         *,
-        label_keys: Sequence[str] = (),
-        pass_keys: Sequence[str] = (),
+        keys: SampleKeys = SampleKeys(),  # noqa: B008 - frozen
+        **unknown: Any,
     ) -> None:
-        super().__init__(label_keys, pass_keys)
+        super().__init__(keys, unknown)
         self.top, self.left = _checked_pair("top, left", (top, left), 0)
         self.size = _checked_pair("size", size, 1)
 

@@ -7,9 +7,9 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import cv2
 import numpy as np
@@ -18,41 +18,43 @@ import torch
 from arbiview_aug.cameras.framing import Fit, framing
 from arbiview_aug.cameras.random_rig import RandomRig
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.choices import Holes, RenderPath, SurfaceName
+from arbiview_aug.choices import GeometryName, Holes
 from arbiview_aug.environment import compilation_announced, warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError, WarnOnce
-from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality, favs_config
 from arbiview_aug.favs.renderer import PaperRendering, check_settings, render_paper
 from arbiview_aug.favs.stage1_geometry import check_pinhole
-from arbiview_aug.generator import Generator, HoleFiller
-from arbiview_aug.generator.batches import complete_frames, frame_names
-from arbiview_aug.generator.fillers import fill_frame
+from arbiview_aug.inpaint.inpainter import Black, Inpainter
+from arbiview_aug.inpaint.neighbours import Fills, Reach, fill_from_neighbours, plan_fills
 from arbiview_aug.lru_cache import LRUCache
+from arbiview_aug.renamed import choice, refuse_old_options
+from arbiview_aug.render.config import Quality, RenderConfig
 from arbiview_aug.render.harmonise import Harmonise, Harmoniser, PhotometricReport
 from arbiview_aug.render.plan import RenderPlan
-from arbiview_aug.render.refinement import RefinementCache
-from arbiview_aug.render.rendered import Execution, RenderedFrame, Renderer, as_rendered, resize_only
+from arbiview_aug.render.rendered import Backend, RenderedFrame, Renderer, resize_only
 from arbiview_aug.sample.check import check_other_keys, warn_of_misnamed, warn_of_rims
 from arbiview_aug.sample.detections import read_detections
 from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, Frame, read_frames, read_scene
 from arbiview_aug.sample.neighbours import points_of_neighbours, read_neighbours
-from arbiview_aug.scene.scene import SURFACES, Scene, SurfaceRow
-from arbiview_aug.temporal.fill import Fills, Reach, fill_from_neighbours, plan_fills
+from arbiview_aug.scene.scene import GEOMETRIES, GeometryRow, Scene
 from arbiview_aug.transforms.checks import check_reach, warn_of_harm
-from arbiview_aug.transforms.estimate_depth import estimate_motion, estimate_overlap, estimates_motion
+from arbiview_aug.transforms.estimate_depth import OverlapCache, estimate_motion, estimate_overlap, estimates_motion
 from arbiview_aug.transforms.explain import Explanation, PaperExplanation
 from arbiview_aug.transforms.outputs import SampleWriter
-from arbiview_aug.transforms.plans import FramePlan, Plans
+from arbiview_aug.transforms.plan_cache import FramePlan, PlanCache, Plans
 from arbiview_aug.transforms.settings import (
-    OUTPUTS,
-    checked_names,
+    SampleKeys,
+    checked_instance,
+    checked_p,
     checked_params,
     checked_size,
-    completion_of,
-    is_number,
-    one_of,
+    inpainter_of,
+    render_config,
     unseen_note,
 )
+
+if TYPE_CHECKING:
+    from arbiview_aug.favs.config import PaperConfig
+    from arbiview_aug.favs.renderer import PaperRendering
 
 _MIXED_P = 0.5
 """At most this share of retargeted samples, views over a static street do not harm a detector
@@ -60,215 +62,152 @@ _MIXED_P = 0.5
 
 
 class RigRetarget(torch.nn.Module):
-    """Re-render a sample's cameras as a target rig's, and keep everything that depends on them consistent.
+    """Re-render a sample's cameras as another vehicle's, and keep everything that depends on them consistent.
 
     A sample is a dict with ``images``, (..., N, 3, H, W) or a list of (..., 3, Hi, Wi), uint8 or float in [0, 1], and
-    its calibration: ``rig`` (wins; carries lenses, masks, names and the road's height), else ``source_rig=``, else
-    ``K`` (..., N, 3, 3) and ``cam2ego`` (..., N, 4, 4), optionally with ``lens``, ``distortion`` and ``ground_z_m``.
-    ``coverage`` and ``ignore`` of an earlier retargeting mask its images.
-
-    The output has the same keys except ``rig``: ``images`` (..., M, 3, h, w) of the input's dtype (a list where target
-    sizes differ), ``K`` and ``cam2ego`` of the target cameras in the source's ego frame with both roads coinciding,
-    ``ground_z_m`` of that frame, and ``coverage`` (..., M, h, w) bool, True where some source sees the pixel. Targets
-    with lenses add ``distortion`` (..., M, 8) and ``lens``; targets with car-body masks add ``ignore`` (..., M, h, w)
-    bool, True on the own car; random settings add ``retarget_params``, plain numbers. A batch shares one draw.
-
-    Label maps are rendered by the winning source's nearest label. ``points`` and ``boxes_3d`` are in the ego frame and
-    stay. Keys bound to the source's pixels (``arbiview_aug.sample.check.PIXEL_BOUND_KEYS``) are dropped. Unknown keys
-    pass as the same objects; maps of the images' height and width raise unless they are named.
+    its calibration: ``rig``, or ``K`` (..., N, 3, 3) and ``cam2ego`` (..., N, 4, 4). The output has M images of the
+    target, their ``K`` and ``cam2ego`` in the source's ego frame, and ``coverage`` (..., M, h, w) bool, True where a
+    camera saw the pixel. Points and boxes are in the ego frame and stay; label maps are rendered too; what depends on
+    the source's pixels is dropped. ``docs/formats.md`` lists all keys.
 
     Args:
-        target_rig: A ``Rig``, the name of a shipped one, a rig file, or a ``RandomRig``.
-        source_rig: The rig of every sample that carries none.
-        path: ``favs``: stitching; ``holes`` says what becomes of pixels that no source sees. ``inpaint``: Telea's
-            inpainting fills them at full size. ``diffusion``: a generator (``arbiview_aug.generator``) fills them.
-        holes: What pixels become that neither a source nor ``neighbours`` show, with ``path="favs"``. ``fill``: the
-            background is continued behind objects, mostly along rows, and outside all source images, mostly along
-            columns; unseen parts of labelled objects take their object's colour, tops that of its top as a source sees
-            it, else of its sides in the frame's light. ``mean``: all get the mean colour of the frame's views.
-            ``black``: they stay black. Filled pixels are True in ``generated`` (..., M, h, w) bool; their ``coverage``
-            stays False, ``confidence`` 0, ``source_camera`` -1 and labels ``label_fill``. Covered pixels are not
-            changed.
-        generator: For ``diffusion``: ``Generator.from_pretrained(DIR)``, ``PipelineFiller.from_pretrained(DIR_OR_ID)``
-            (diffusers' inpainting pipelines) or ``TorchScriptFiller(FILE)`` (LaMa and its kind); None loads the shipped
-            weights, trained on synthetic streets alone. One on a GPU needs ``num_workers=0``, or
-            ``generator.complete_batch`` after collating.
-        steps: Denoising steps: 1 (regression), 4, 10 or 50; the generator's or pipeline's default if None.
-        guidance: Classifier-free guidance, 1 for none; the generator's default if None.
-        min_confidence: τ: pixels seen with less confidence are filled as well.
-        seed: Seed of filled pixels, combined with the frame (its ``token``, else its images) and the camera.
-        quality: ``draft``, ``fast``, ``accurate``, or a ``FavsConfig``; ``paper`` or a ``PaperConfig``: stages 1 to 4
-            as published, on the CPU, for pinhole cameras. Its objects take their types from ``detections`` (for each
-            camera ``{"boxes": (n, 4), "labels": [n names]}`` in source pixels, as torchvision's detectors return them),
-            else from ``boxes_3d`` with ``box_names``.
-        surface: ``far``, ``ground``, ``street``; ``objects``: the sample's ``boxes_3d`` stand on the street; ``lidar``:
-            its ``points`` (ego frame) or ``depth_m`` (..., N, H, W; z-depth in metres, 0 or NaN where unknown), with
-            ``boxes_3d`` for objects of few points; ``motion``: depth estimated from its ``neighbours``
-            (``arbiview_aug.motion``; seconds a frame), or ``motion_depth_m`` of the ``depth`` command, with its
-            ``boxes_3d``, or the street, with a warning, if the estimate is declined; ``fused``: ``lidar`` with
-            ``motion``, ``learned`` or both; ``learned``: its ``learned_depth_m`` (``depth --model``). ``auto``: for
-            each pair of cameras ``far`` where their centres coincide, else the best that the sample offers: ``fused``
-            or ``motion`` (with ``motion_depth_m``), ``lidar``, else ``objects``, else ``street`` (``paper``: always
-            ``far``). Cameras that move over the street alone harm a detector: a warning says so once, unless ``p``
-            leaves half of the samples untouched. Points and boxes need a new plan for every frame.
-        strict: Raise SampleError instead of that warning.
-        harmonise: Bring each view's sources to the exposure of its main one (``arbiview_aug.render.harmonise``). None:
-            gains are estimated from every frame's overlaps, and used where held-out pixels agree better (never with
-            ``paper``). True: the same; a ``HarmoniseConfig`` says how. Numbers: a gain for each camera, in all views.
-            False: exposures as recorded. Samples that ``p`` skips, and views of one source, keep theirs.
-        refinement: Cache for the depth from overlap of ``quality="accurate"``, which depends on the images. None
-            computes depth and plans for every frame; a ``RefinementCache`` reuses both where its key is the same.
-        neighbours: What other frames of the drive (the sample's ``neighbours``, see ``arbiview_aug.sample.neighbours``)
-            may fill: ``ground``, the road near the cameras; ``all``, whatever the surface says; None, nothing. Covered
-            pixels are never replaced. Unless None, their ``points`` also add scan lines to the frame's own. Not used by
-            ``paper``.
-        size: (h, w) of every output image; the target cameras are brought to it by ``fit``, and ``K`` says so.
-        fit: ``crop``: keep the aspect, cut the excess at the top and both sides. ``pad``: keep the aspect, add black
-            bars at the top and both sides; there ``coverage`` is False, ``ignore`` True, labels are ``label_fill``, and
-            nothing is filled. ``stretch``: change the aspect.
-        p: Probability of retargeting. A skipped sample keeps its own cameras, brought to ``size`` by ``fit``, with full
-            coverage, so ``p < 1`` needs ``size`` and equal camera counts (else see ``arbiview_aug.MixedDataset``). The
-            output then always has ``lens``, ``distortion`` and ``ignore``, so that batches collate.
-        rng: Generator of the draws instead of torch's global one; only outside DataLoader workers.
-        label_frame: ``source``: output poses, points and boxes are in the source's ego frame. ``target``: they (and
-            ``ego2world``) are moved into the target's, and ``ego2ego`` (..., 4, 4) is returned.
-        label_keys: Keys that hold label maps (..., N, H, W) or lists of them, besides ``tv_tensors.Mask``.
-        label_fill: Value of label pixels that no source sees (False for bool maps).
-        pass_keys: Keys to keep although they look bound to the source's pixels.
-        outputs: Further outputs, maps (..., M, h, w): ``source_camera`` int8, -1 where uncovered; ``source_frame``
-            int8, 0 for the current frame, n + 1 for number n of the neighbours, -1 where uncovered; ``confidence``
-            float32 in [0, 1], exp(-e / 10) for an expected error of e grey levels of 255, 0 where uncovered
-            (``arbiview_aug.render.confidence``; not with ``paper``). ``sources``: the source images and calibration, a
-            sample for ``Generator.complete_batch``.
-        execution: ``opencv`` (CPU), ``torch`` (any device, differentiable); ``auto`` takes OpenCV for CPU images that
+        target: A ``Rig``, the name of a shipped one, a rig file, or a ``RandomRig``.
+        source: The rig of samples that carry none.
+        geometry: What is known of the scene where cameras move. ``auto`` takes the best that the sample offers.
+            ``infinity``: nothing, right where centres coincide. ``ground``, ``street``: a flat road, with walls.
+            ``boxes``: ``boxes_3d`` on the street. ``lidar``: ``points`` or ``depth_m``, with boxes. ``motion``: depth
+            from ``neighbours``. ``learned``: ``learned_depth_m``. ``fused``: all of these. See ``docs/surfaces.md``.
+        holes: What fills pixels that no camera saw, marked in ``generated``: ``continue``, the background continued
+            behind objects; ``telea``; ``mean``; ``diffusion``, the shipped generator; or an ``Inpainter``. ``black``
+            leaves them. See ``docs/holes.md``.
+        quality: ``draft``, ``fast``, ``accurate`` or a ``RenderConfig``; ``paper`` or a ``PaperConfig``: stages 1 to 4
+            as published.
+        neighbours: What other frames of the drive (``neighbours`` in the sample) may fill: ``road``, the road nearby;
+            ``all``; None, nothing.
+        match_exposure: Bring each view's sources to the exposure of its main one. True estimates gains where held-out
+            pixels agree better; False; a ``HarmoniseConfig``; or a gain for each camera. Never with ``paper``.
+        size: (h, w) of every view.
+        fit: How target cameras come to ``size``: ``crop`` cuts at the top and the sides, ``pad`` adds bars there,
+            ``stretch`` changes the aspect.
+        p: Probability of retargeting. A skipped sample keeps its own cameras at ``size``, with full coverage, so
+            ``p < 1`` needs ``size`` and equal camera counts (else see ``MixedDataset``).
+        keys: Label maps, further outputs and frames: ``SampleKeys``.
+        cache: What is kept from call to call: ``PlanCache``.
+        backend: ``opencv`` (CPU), ``torch`` (any device, differentiable); ``auto`` takes OpenCV for CPU images that
             need no gradient.
-        cache_bytes: Memory for plans; the least recently used go first.
+
+    Draws come from torch's global generator. A batch shares one draw, which ``retarget_params`` tells.
 
     Raises:
         ValueError: Impossible settings.
+        TypeError: Unknown options; those of version 0.2 with their new name.
         CalibrationError: A target rig that cannot be loaded.
+
+    Warns:
+        GeometryWarning: Cameras move and only the street is known, which harms a detector; or the target is hardly
+            covered. ``warnings.simplefilter("error", GeometryWarning)`` makes errors of both.
     """
 
     def __init__(
         self,
-        target_rig: Rig | RandomRig | str | Path,
+        target: Rig | RandomRig | str | Path,
         *,
-        source_rig: Rig | str | Path | None = None,
-        path: RenderPath = "favs",
-        holes: Holes = "fill",
-        generator: Generator | HoleFiller | None = None,
-        steps: int | None = None,
-        guidance: float | None = None,
-        min_confidence: float = 0.0,
-        seed: int = 0,
-        quality: Quality | FavsConfig | PaperConfig = "fast",
-        surface: SurfaceName = "auto",
-        strict: bool = False,
-        harmonise: Harmonise = None,
-        refinement: RefinementCache | None = None,
-        neighbours: Reach | None = "ground",
+        source: Rig | str | Path | None = None,
+        geometry: GeometryName = "auto",
+        holes: Holes | Inpainter = "continue",
+        quality: Quality | RenderConfig | PaperConfig = "fast",
+        neighbours: Reach | None = "road",
+        match_exposure: Harmonise = True,
         size: tuple[int, int] | None = None,
         fit: Fit = "crop",
         p: float = 1.0,
-        rng: torch.Generator | None = None,
-        label_frame: Literal["source", "target"] = "source",
-        label_keys: Sequence[str] = (),
-        label_fill: float = 255,
-        pass_keys: Sequence[str] = (),
-        outputs: Sequence[str] = (),
-        execution: Execution = "auto",
-        cache_bytes: int = 512 * 2**20,
+        keys: SampleKeys = SampleKeys(),  # noqa: B008 - frozen
+        cache: PlanCache = PlanCache(),  # noqa: B008 - frozen
+        backend: Backend = "auto",
+        **unknown: Any,
     ) -> None:
         super().__init__()
+        refuse_old_options("RigRetarget", unknown)
         warn_about_cv2_wheels()
-        one_of("path", path, get_args(RenderPath))
-        one_of("holes", holes, get_args(Holes))
-        if path != "favs" and holes != "fill":
-            raise ValueError(f"holes: path={path!r} fills them itself: expected 'fill', the default, got {holes!r}")
-        one_of("surface", surface, tuple(SURFACES))
-        one_of("fit", fit, get_args(Fit))
-        one_of("label_frame", label_frame, ("source", "target"))
-        one_of("execution", execution, get_args(Execution))
-        if neighbours is not None:
-            one_of("neighbours", neighbours, get_args(Reach))
-        for name in checked_names("outputs", outputs):
-            one_of("outputs", name, OUTPUTS)
-        if not isinstance(strict, bool):
-            raise ValueError(f"strict: expected True or False, got {strict!r}")
-        if not is_number(p) or not 0 <= p <= 1:
-            raise ValueError(f"p: expected a probability from 0 to 1, got {p!r}")
-        if p < 1 and size is None:
-            raise ValueError("p < 1: expected size=(h, w), so that skipped samples collate with retargeted ones")
-        if not is_number(label_fill):
-            raise ValueError(f"label_fill: expected a number, got {label_fill!r}")
-        if not is_number(cache_bytes) or not cache_bytes >= 0:
-            raise ValueError(f"cache_bytes: expected a number of bytes from 0, got {cache_bytes!r}")
-        if rng is not None and not isinstance(rng, torch.Generator):
-            raise ValueError(f"rng: expected a torch.Generator or None, got {type(rng).__name__}")
-        if refinement is not None and not isinstance(refinement, RefinementCache):
-            raise ValueError(f"refinement: expected a RefinementCache or None, got {type(refinement).__name__}")
-        self.target = target_rig if isinstance(target_rig, Rig | RandomRig) else load_rig(target_rig)
-        self.source_rig = source_rig if isinstance(source_rig, Rig) or source_rig is None else load_rig(source_rig)
-        base = self.target.base if isinstance(self.target, RandomRig) else self.target
-        self.config = favs_config(quality)
-        self._needs_confidence = False
-        if isinstance(self.config, PaperConfig):
-            check_pinhole(base)
-            if "confidence" in outputs:
-                raise ValueError("outputs: quality='paper' has no 'confidence': it moves pixels by what it matches")
-            if min_confidence:
-                raise ValueError("min_confidence: quality='paper' has no confidence, expected 0")
-            check_settings(surface, execution)
-        elif "confidence" in outputs or min_confidence or path == "diffusion":
-            self._needs_confidence, self.config = True, replace(self.config, certainty=True)
-        self.path, self.holes, self.p, self.rng = path, holes, float(p), rng
-        self.completion = completion_of(path, generator, steps, guidance, min_confidence, seed)
-        self.generator = None if self.completion is None else self.completion.generator  # moves with this module
-        self.size, self.fit = None if size is None else checked_size(size), fit
-        self.label_frame = label_frame
-        self.label_keys = checked_names("label_keys", label_keys)
-        self.pass_keys, self.outputs = checked_names("pass_keys", pass_keys), tuple(outputs)
+        self.target = target if isinstance(target, Rig | RandomRig) else load_rig(target)
+        self.source = source if isinstance(source, Rig) or source is None else load_rig(source)
+        self.geometry: GeometryName = choice("geometry", geometry, GEOMETRIES)
+        self.neighbours = None if neighbours is None else choice("neighbours", neighbours, get_args(Reach))
+        self.fit, self.p = choice("fit", fit, get_args(Fit)), checked_p(p, size)
+        self.size = None if size is None else checked_size(size)
+        self.keys, self.cache = checked_instance("keys", keys, SampleKeys), checked_instance("cache", cache, PlanCache)
+        self.inpainter = inpainter_of(holes)  # moves with this module
+        self.config = self._checked_config(render_config(quality))
+        self.harmoniser = Harmoniser(False if self._is_paper and match_exposure is True else match_exposure)
+        self.renderer = Renderer(choice("backend", backend, get_args(Backend)))
+        self._check_paper()
+        self.overlaps = OverlapCache.of(cache.share_overlap, self.config)
         self._warn = WarnOnce()
-        # Plans of rigs drawn for each sample are never reused.
-        drawn_anew = isinstance(self.target, RandomRig) and self.target.per == "sample"
-        self.surface, self.reach, self.refinement, self.strict = surface, neighbours, refinement, strict
-        self.harmoniser = Harmoniser(False if harmonise is None and isinstance(self.config, PaperConfig) else harmonise)
-        unseen = unseen_note(path if holes == "fill" else holes)
-        self._check_reach = partial(check_reach, unseen=unseen, warn=self._warn)
-        config = None if isinstance(self.config, PaperConfig) else self.config
-        if config is None and self.harmoniser.is_on:
-            raise ValueError(f"harmonise: quality='paper' is as published: expected None, got {self.harmoniser!r}")
-        max_bytes, keeps_refined = 0 if drawn_anew else cache_bytes, refinement is not None
-        self._plans = Plans(config, surface, max_bytes, keeps_refined, self._check_reach)
-        if refinement is not None and not (config and config.overlap_depth):
-            raise ValueError("refinement: expected quality='accurate' (or overlap_depth=True) with a RefinementCache")
+        self._check_reach = partial(check_reach, unseen=unseen_note(self.inpainter), warn=self._warn)
+        self._plans = self._empty_plans()
         self._fixed_target = self._sized(self.target) if isinstance(self.target, Rig) else None
-        base = base if self.size is None else base.resized(self.size, fit)
-        # The output's keys depend on the settings alone, so that batches collate.
-        self._writer = SampleWriter(
-            self.outputs,
-            generated=self.completion is not None or holes != "black",
-            lenses=p < 1 or any(not camera.is_rectilinear for camera in base),
-            masks=p < 1 or any(camera.mask is not None for camera in base),
-            pass_keys=self.pass_keys,
-            label_fill=label_fill,
-            label_frame=label_frame,
-            warn=self._warn,
-        )
-        self.renderer = Renderer(execution)
-        self._reads_ego_frame = not SURFACES[surface].is_static or label_frame == "target"
         self._checked: dict[str, type] = {}  # keys and types of the sample that was last checked for misnamed keys
         self._limited_process: int | None = None
+
+    def _empty_plans(self) -> Plans:
+        # Plans of rigs drawn for each sample are never reused.
+        drawn_anew = isinstance(self.target, RandomRig) and self.target.per == "sample"
+        max_bytes = 0 if drawn_anew else self.cache.max_bytes
+        config = None if self._is_paper else self.config
+        return Plans(config, self.geometry, max_bytes, self.overlaps is not None, self._check_reach)
+
+    @property
+    def _is_paper(self) -> bool:
+        return not isinstance(self.config, RenderConfig)
+
+    def _checked_config(self, config: Any) -> Any:
+        needs_confidence = "confidence" in self.keys.extra or self.inpainter.needs_confidence
+        if isinstance(config, RenderConfig):
+            return replace(config, certainty=True) if needs_confidence else config
+        if "confidence" in self.keys.extra:
+            raise ValueError(
+                "SampleKeys.extra: quality='paper' has no 'confidence': it moves pixels by what it matches"
+            )
+        if self.inpainter.min_confidence:
+            raise ValueError("holes: quality='paper' has no confidence: expected min_confidence=0")
+        return config
+
+    def _check_paper(self) -> None:
+        if not self._is_paper:
+            return
+
+        check_pinhole(self._base)
+        check_settings(self.geometry, self.renderer.backend)
+        if self.harmoniser.is_on:
+            raise ValueError(
+                f"match_exposure: quality='paper' is as published: expected True or False, got {self.harmoniser!r}"
+            )
+
+    @property
+    def _base(self) -> Rig:
+        return self.target.base if isinstance(self.target, RandomRig) else self.target
+
+    @cached_property
+    def _writer(self) -> SampleWriter:
+        base = self._base if self.size is None else self._base.resized(self.size, self.fit)
+        # The output's keys depend on the settings alone, so that batches collate.
+        return SampleWriter(
+            self.keys,
+            generated=not isinstance(self.inpainter, Black),
+            lenses=self.p < 1 or any(not camera.is_rectilinear for camera in base),
+            masks=self.p < 1 or any(camera.mask is not None for camera in base),
+            warn=self._warn,
+        )
 
     def extra_repr(self) -> str:
         """Target and settings, for ``repr``."""
         target = self.target if isinstance(self.target, RandomRig) else (self.target.name or "unnamed rig")
         settings = (
-            f"path={self.path}, holes={self.holes}, surface={self.surface}, harmonise={self.harmoniser}, "
+            f"geometry={self.geometry}, holes={type(self.inpainter).__name__}, match_exposure={self.harmoniser}, "
             f"size={self.size}, fit={self.fit}, p={self.p:g}"
         )
-        refinement = "" if self.refinement is None else f"refinement={self.refinement!r}, "
-        return f"target={target}, {settings}, {refinement}{self.config}"
+        cache = "" if self.overlaps is None else f"{self.cache!r}, "
+        return f"target={target}, {settings}, {cache}{self.config}"
 
     # --- the transform --------------------------------------------------------------------------------------------
     def forward(self, sample: Mapping[str, Any], params: Mapping[str, float] | None = None) -> dict[str, Any]:
@@ -296,11 +235,11 @@ class RigRetarget(torch.nn.Module):
 
     def _retargeted(self, sample: Mapping[str, Any], params: Mapping[str, float] | None) -> dict[str, Any]:
         self._limit_threads()
-        frames = read_frames(sample, self.source_rig)
+        frames = read_frames(sample, self.source)
         labels = self._check_keys(sample, frames)
         target, skip, draws = self._make_params(frames, params)
         if skip and self.size is not None:
-            rendered = [resize_only(frame, self.size, self.fit, self.outputs) for frame in frames]
+            rendered = [resize_only(frame, self.size, self.fit, self.keys.extra) for frame in frames]
         else:
             rendered = self._inpainted(self._rendered(frames, target), frames)
         return self._writer.write(frames, rendered, labels, target, draws)
@@ -310,25 +249,26 @@ class RigRetarget(torch.nn.Module):
         sizes = {tuple(image.shape[-2:]) for frame in frames for image in frame.images}
         types = {key: type(value) for key, value in sample.items()}
         if types != self._checked:
-            calibrated = sample.get("rig") is not None or self.source_rig is not None
-            named = (*self.label_keys, *self.pass_keys)
-            warn_of_misnamed(sample, calibrated, not self._reads_ego_frame, named, self._warn)
+            calibrated = sample.get("rig") is not None or self.source is not None
+            named = (*self.keys.labels, *self.keys.keep)
+            reads_ego_frame = not self._row.is_static or self.keys.frame == "target"
+            warn_of_misnamed(sample, calibrated, not reads_ego_frame, named, self._warn)
             warn_of_rims(frames, self._warn)
             self._checked = types
-        return check_other_keys(sample, list(sizes), self.label_keys, self.pass_keys)
+        return check_other_keys(sample, list(sizes), self.keys.labels, self.keys.keep)
 
     # --- stages -------------------------------------------------------------------------------------------------------
     def plan_frame(self, frame: Frame, target: Rig) -> FramePlan:
         """Read a frame's scene, estimate the depth that its geometry asks for, and plan how it is rendered."""
         pair = self._plans.pair(frame.rig, target)
-        has_neighbours, fills = frame.sample.get("neighbours") is not None, self.reach is not None
-        from_motion = self._row.needs == "motion" and pair.needs_geometry and estimates_motion(frame, self.surface)
+        has_neighbours, fills = frame.sample.get("neighbours") is not None, self.neighbours is not None
+        from_motion = self._row.needs == "motion" and pair.needs_geometry and estimates_motion(frame, self.geometry)
         neighbours = read_neighbours(frame, self._warn) if has_neighbours and (fills or from_motion) else []
-        reads_scene = pair.needs_geometry or self.surface != "auto" or bool(neighbours)  # objects limit what they fill
-        scene = (reads_scene and read_scene(frame, self.surface)) or pair.road
+        reads_scene = pair.needs_geometry or self.geometry != "auto" or bool(neighbours)  # objects limit what they fill
+        scene = (reads_scene and read_scene(frame, self.geometry)) or pair.road
         overlap = motion = None
-        if pair.needs_geometry and isinstance(self.config, FavsConfig) and self.config.overlap_depth:
-            overlap = estimate_overlap(frame, scene, self.surface, self.refinement)
+        if pair.needs_geometry and self.config.overlap_depth:
+            overlap = estimate_overlap(frame, scene, self.geometry, self.overlaps)
         if from_motion:
             motion = estimate_motion(frame, scene, neighbours, self._warn)
         if overlap is not None:
@@ -338,32 +278,33 @@ class RigRetarget(torch.nn.Module):
         if self._row.needs == "motion" and scene.motion is None:
             points = motion.points(frame.rig, scene.geometry("points")) if motion else np.zeros((0, 3))
             scene = replace(scene, motion=points)
-        surface = scene.best if self.surface == "auto" else self.surface
+        surface = scene.best if self.geometry == "auto" else self.geometry
         plan = self._plans.plan(pair, scene)
         return FramePlan(frame, pair, scene, surface, plan, neighbours if fills else (), overlap, motion)
 
     def plan_fills(self, planned: FramePlan) -> Fills | None:
         """Plan what a frame's neighbours fill."""
-        if self.reach is None or not planned.neighbours:
+        if self.neighbours is None or not planned.neighbours:
             return None
-        assert isinstance(self.config, FavsConfig)
-        settings = planned.surface, self.config, self.reach, self._plans.maps
+        settings = planned.surface, self.config, self.neighbours, self._plans.maps
         return plan_fills(planned.plan, planned.neighbours, planned.scene, *settings)
 
     def _warn_of_harm(self, planned: Sequence[FramePlan]) -> None:
-        if self.surface != "auto" or self.p <= _MIXED_P or (not self.strict and "static" in self._warn.topics):
+        if self.geometry != "auto" or self.p <= _MIXED_P or "static" in self._warn.topics:
             return
         for one in planned:
             if one.harm is not None:
-                warn_of_harm(one.harm, one.frame.rig, one.pair.target, self.strict, self._warn)
+                warn_of_harm(one.harm, one.frame.rig, one.pair.target, self._warn)
 
     def _rendered(self, frames: Sequence[Frame], target: Rig) -> list[RenderedFrame]:
         """Render the frames; what sources do not see is filled from neighbouring frames alone."""
-        if isinstance(self.config, PaperConfig):
-            return [as_rendered(self._published(frame, target), self.outputs) for frame in frames]
+        if self._is_paper:
+            from arbiview_aug.favs.renderer import as_rendered
+
+            return [as_rendered(self._published(frame, target), self.keys.extra) for frame in frames]
         planned = [self.plan_frame(frame, target) for frame in frames]
         self._warn_of_harm(planned)
-        outputs = (*self.outputs, "confidence") if self._needs_confidence else self.outputs
+        outputs = (*self.keys.extra, "confidence") if self.config.certainty else self.keys.extra
         curves = [self.harmoniser.curves(one.frame.rig, one.frame.images, one.plan.targets) for one in planned]
         rendered = self.renderer.render([one.plan for one in planned], frames, curves, outputs)
         for k, one in enumerate(planned):
@@ -373,7 +314,7 @@ class RigRetarget(torch.nn.Module):
 
     def _published(self, frame: Frame, target: Rig) -> PaperRendering:
         """Render a frame by the paper's stages."""
-        assert isinstance(self.config, PaperConfig)
+
         pair, sample = self._plans.pair(frame.rig, target), frame.sample
         has_detections = any(sample.get(key) is not None for key in ("detections", "boxes_3d"))
         detections = read_detections(frame) if self.config.use_detections and has_detections else {}
@@ -383,29 +324,23 @@ class RigRetarget(torch.nn.Module):
 
     def _inpainted(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
         """Fill what no frame shows."""
-        if self.completion is None:
-            rendered = [fill_frame(of_frame, self.holes) for of_frame in rendered]
+        filled = self.inpainter.fill(rendered, frames)
         if self.size is not None and self.fit == "pad":
-            rendered = [of_frame.between_bars(self.size) for of_frame in rendered]
-        if self.completion is None:
-            return list(rendered)
-        names = frame_names(frames, frames, self.completion)
-        return complete_frames(rendered, frames, names, self.completion)
+            return [of_frame.between_bars(self.size) for of_frame in filled]
+        return filled
 
     def _make_params(
         self, frames: Sequence[Frame], params: Mapping[str, float] | None
     ) -> tuple[Rig, bool, dict[str, float]]:
         """Draw the target rig and whether to skip; return both, and the parameters that replay them."""
-        if self.rng is not None and torch.utils.data.get_worker_info() is not None:
-            raise SampleError("rng: a generator repeats itself in every DataLoader worker; leave rng=None there")
         given = None if params is None else checked_params(params)
         draws: dict[str, float] = {}
         if self.p < 1 and given is None:
-            draws["skipped"] = float(torch.rand((), generator=self.rng).item() >= self.p)
+            draws["skipped"] = float(torch.rand(()).item() >= self.p)
         elif self.p < 1 and given is not None:
             draws["skipped"] = given.pop("skipped", 0.0)
         if isinstance(self.target, RandomRig):
-            rig_params = self.target.draw_for(frames[0].sample, self.rng) if given is None else given
+            rig_params = self.target.draw_for(frames[0].sample) if given is None else given
             target = self._sized(self.target.rig(rig_params))
             draws.update(rig_params)
         else:
@@ -434,8 +369,8 @@ class RigRetarget(torch.nn.Module):
         return self._plans.cache
 
     @property
-    def _row(self) -> SurfaceRow:
-        return SURFACES[self.surface]
+    def _row(self) -> GeometryRow:
+        return GEOMETRIES[self.geometry]
 
     def plan(self, source: Rig, target: Rig, scene: Scene | None = None) -> RenderPlan:
         """The cached render plan of a pair of rigs in a scene.
@@ -449,19 +384,19 @@ class RigRetarget(torch.nn.Module):
         """Build the plan for a source rig before DataLoader workers fork: they share its memory.
 
         Args:
-            source: The rig of the samples; ``source_rig`` by default.
+            source: The rig of the samples; the transform's ``source`` by default.
 
         Raises:
             ValueError: No source rig, a random target, ``quality="paper"``, or a surface that every frame has anew.
         """
-        source = source or self.source_rig
+        source = source or self.source
         if source is None or self._fixed_target is None:
             raise ValueError("prepare: expected a source rig and a fixed target rig")
         pair = self._plans.pair(source, self._fixed_target)
         if self._row.needs is not None and pair.needs_geometry:
             raise ValueError(
-                f"prepare: expected a surface whose plans come back, got {self.surface!r}: boxes, points or depth need "
-                "a new plan for every frame"
+                f"prepare: expected a geometry whose plans come back, got {self.geometry!r}: boxes, points or depth "
+                "need a new plan for every frame"
             )
         return self.plan(source, self._fixed_target)
 
@@ -472,9 +407,9 @@ class RigRetarget(torch.nn.Module):
         With ``quality="paper"``: what each stage made of each source. A random target is explained for one draw. Like a
         call, it fills the caches, issues warnings once, and advances the RNG.
         """
-        frame = read_frames(sample, self.source_rig)[0]
+        frame = read_frames(sample, self.source)[0]
         target, _, _ = self._make_params([frame], None)
-        if isinstance(self.config, PaperConfig):
+        if self._is_paper:
             return PaperExplanation(self._published(frame, target))
         planned = self.plan_frame(frame, target)
         gains = self.harmonisation(sample) if self.harmoniser.is_on else None
@@ -484,7 +419,7 @@ class RigRetarget(torch.nn.Module):
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
         """The gains that a sample's source images would get, and why; for a batch, its first frame's."""
-        frame = read_frames(sample, self.source_rig)[0]
+        frame = read_frames(sample, self.source)[0]
         return self.harmoniser.report(frame.rig, frame.images)
 
     # --- processes --------------------------------------------------------------------------------------------------

@@ -1,84 +1,126 @@
-"""Checks of a transform's settings."""
+"""Settings of transforms, checked."""
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Sequence
+from dataclasses import dataclass
 from numbers import Real
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.errors import SampleError
-from arbiview_aug.generator import Generator, HoleFiller
-from arbiview_aug.generator.batches import SOURCES_KEY, Completion
+from arbiview_aug.inpaint.continued import Continue, Mean
+from arbiview_aug.inpaint.inpainter import SOURCES_KEY, Black, Inpainter
+from arbiview_aug.inpaint.telea import Telea
+from arbiview_aug.renamed import choice
+from arbiview_aug.render.config import PRESETS, RenderConfig
 
-OUTPUTS = ("source_camera", "source_frame", "confidence", SOURCES_KEY)  # further keys of the output, on request
+T = TypeVar("T")
 
-
-def completion_of(
-    path: str,
-    generator: Generator | HoleFiller | None,
-    steps: int | None,
-    guidance: float | None,
-    min_confidence: float,
-    seed: int,
-) -> Completion | None:
-    """Checked settings of inpainting or a generator, else ValueError; None for ``path="favs"``."""
-    if path != "diffusion" and any(value is not None for value in (generator, steps, guidance)):
-        raise ValueError(f"generator, steps, guidance: they are for path='diffusion', got path={path!r}")
-    if path == "favs":
-        if min_confidence or seed:
-            raise ValueError("min_confidence, seed: they are for path='inpaint' or 'diffusion', got path='favs'")
-        return None
-    if generator is not None and not isinstance(generator, Generator | HoleFiller):
-        expected = "Generator.from_pretrained(DIR), a PipelineFiller or a TorchScriptFiller"
-        raise ValueError(f"generator: expected {expected}, got {type(generator).__name__}")
-    if steps is not None and (not isinstance(steps, int) or isinstance(steps, bool) or steps < 1):
-        raise ValueError(f"steps: expected a whole number from 1, got {steps!r}")
-    if guidance is not None and not is_number(guidance):
-        raise ValueError(f"guidance: expected a number, got {guidance!r}")
-    if not is_number(min_confidence) or not 0 <= min_confidence <= 1:
-        raise ValueError(f"min_confidence: expected a number from 0 to 1, got {min_confidence!r}")
-    if not isinstance(seed, int):
-        raise ValueError(f"seed: expected a whole number, got {seed!r}")
-    if path == "diffusion" and generator is None:
-        generator = Generator.shipped()
-    return Completion(
-        generator=generator, steps=steps, guidance=guidance, min_confidence=float(min_confidence), seed=seed
-    )
+EXTRA_KEYS = ("source_camera", "source_frame", "confidence", SOURCES_KEY)
 
 
-def unseen_note(filler: str) -> str:
-    """What becomes of pixels that no source sees, by ``path`` or ``holes``, and what to do about them in training."""
-    if filler == "black":
-        return "The rest stays black: train with 'coverage' as a mask."
-    return f"The rest is {_FILLED[filler]} and marked in 'generated': leave it out of losses that compare pixels."
+@dataclass(frozen=True, kw_only=True)
+class SampleKeys:
+    """How a transform treats the keys of a sample.
+
+    Attributes:
+        labels: Keys of label maps (..., N, H, W), or lists of them, to render besides ``tv_tensors.Mask``.
+        ignore_index: Value of label pixels that no source sees (False for bool maps).
+        keep: Keys to keep although they look bound to the source's pixels.
+        extra: Further maps (..., M, h, w) of the output: ``source_camera`` int8, -1 where uncovered; ``source_frame``
+            int8, 0 for the current frame, n + 1 for number n of the neighbours; ``confidence`` float32 in [0, 1],
+            exp(-e / 10) for an expected error of e grey levels of 255 (``arbiview_aug.render.confidence``). Also
+            ``sources``: the source images and calibration, for ``Inpainter.complete_batch``.
+        frame: Ego frame of output poses, points and boxes. ``target`` moves them, and ``ego2world``, into the target's
+            and adds ``ego2ego`` (..., 4, 4).
+
+    Raises:
+        ValueError: Impossible values.
+    """
+
+    labels: tuple[str, ...] = ()
+    ignore_index: float = 255
+    keep: tuple[str, ...] = ()
+    extra: tuple[str, ...] = ()
+    frame: Literal["source", "target"] = "source"
+
+    def __post_init__(self) -> None:
+        for name in ("labels", "keep", "extra"):
+            value = getattr(self, name)
+            if not isinstance(value, list | tuple) or not all(isinstance(key, str) for key in value):
+                raise ValueError(f"SampleKeys.{name}: expected names in a list or tuple, got {value!r}")
+            object.__setattr__(self, name, tuple(value))
+        for key in self.extra:
+            choice("SampleKeys.extra", key, EXTRA_KEYS)
+        if not is_number(self.ignore_index):
+            raise ValueError(f"SampleKeys.ignore_index: expected a number, got {self.ignore_index!r}")
+        choice("SampleKeys.frame", self.frame, ("source", "target"))
 
 
-_FILLED = {
-    "favs": "filled in from its surroundings",
-    "mean": "given the mean colour of the views",
-    "inpaint": "inpainted",
-    "diffusion": "made up by the generator",
-}
+def render_config(quality: Any) -> Any:
+    """Look up a preset by name; a ``RenderConfig`` or ``PaperConfig`` is passed through.
+
+    Raises:
+        ValueError: Anything else.
+    """
+    if isinstance(quality, RenderConfig):
+        return quality
+    if isinstance(quality, str) and quality in PRESETS:
+        return PRESETS[quality]
+    from arbiview_aug.favs.config import PaperConfig
+
+    if quality == "paper":
+        return PaperConfig()
+    if not isinstance(quality, PaperConfig):
+        names = ", ".join((*PRESETS, "paper"))
+        raise ValueError(f"quality: expected one of {names}, a RenderConfig or a PaperConfig, got {quality!r}")
+    return quality
 
 
-def one_of(name: str, value: Any, choices: Sequence[str]) -> None:
-    """Raise ValueError unless ``value`` is one of the choices."""
-    if not isinstance(value, str) or value not in choices:
-        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+def inpainter_of(holes: Any) -> Inpainter:
+    """The inpainter of a name, or the inpainter itself; ValueError for anything else."""
+    if isinstance(holes, Inpainter):
+        return holes
+    name = choice("holes", holes, (*_INPAINTERS, "diffusion")) if isinstance(holes, str) else None
+    if name is None:
+        raise ValueError(f"holes: expected a name or an arbiview_aug.inpaint.Inpainter, got {type(holes).__name__}")
+    if name != "diffusion":
+        return _INPAINTERS[name]()
+    from arbiview_aug.generator.inpainter import Diffusion
+
+    return Diffusion()
 
 
-def checked_names(name: str, value: Any) -> tuple[str, ...]:
-    """Names as a tuple; ValueError for anything else, a single string too."""
-    if not isinstance(value, list | tuple) or not all(isinstance(entry, str) for entry in value):
-        raise ValueError(f"{name}: expected names in a list or tuple, got {value!r}")
-    return tuple(value)
+_INPAINTERS: dict[str, type[Inpainter]] = {"continue": Continue, "telea": Telea, "mean": Mean, "black": Black}
+
+
+def unseen_note(inpainter: Inpainter) -> str:
+    """What becomes of pixels that no source sees, and what to do about them in training."""
+    if isinstance(inpainter, Black):
+        return f"The rest is {inpainter.outcome}."
+    return f"The rest is {inpainter.outcome} and marked in 'generated': leave it out of losses that compare pixels."
 
 
 def is_number(value: Any) -> bool:
     """Whether it is a real number, and not a bool."""
     return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def checked_instance(name: str, value: Any, kind: type[T]) -> T:
+    """``value``, of a class; ValueError for anything else."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{name}: expected a {kind.__name__}, got {type(value).__name__}")
+    return value
+
+
+def checked_p(p: Any, size: Any) -> float:
+    """A probability; ValueError for anything else, or where samples are skipped and ``size`` is None."""
+    if not is_number(p) or not 0 <= p <= 1:
+        raise ValueError(f"p: expected a probability from 0 to 1, got {p!r}")
+    if p < 1 and size is None:
+        raise ValueError("p < 1: expected size=(h, w), so that skipped samples collate with retargeted ones")
+    return float(p)
 
 
 def checked_params(params: Any) -> dict[str, float]:

@@ -35,9 +35,9 @@ _FORMAT = 1
 NEIGHBOURS = Neighbours()
 """One frame before and one after, 1.2 m away."""
 
-_COMPLETING = ("arbiview_aug.generator", "arbiview_aug.generator.batches", "arbiview_aug.transforms.settings")
+_COMPLETING = ("arbiview_aug.generator", "arbiview_aug.inpaint.batches", "arbiview_aug.transforms.settings")
 _UNUSED: dict[str, tuple[str, ...]] = {
-    "black": (*_COMPLETING, "arbiview_aug.generator.fillers"),
+    "black": (*_COMPLETING, "arbiview_aug.inpaint.continued"),
     "fill": _COMPLETING,
     "generator": (),
 }

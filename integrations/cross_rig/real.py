@@ -143,7 +143,7 @@ class RecordedSource(Source):
         start = time.process_time()
         sample = recording(self.data)[index]
         rig = sample["rig"]
-        shrink = RigRetarget(small_rig(rig, self.size, road=rig.ground_z_m), surface="far", holes="black")
+        shrink = RigRetarget(small_rig(rig, self.size, road=rig.ground_z_m), geometry="infinity", holes="black")
         out = shrink({"images": sample["images"], "rig": rig})
         boxes, points = vehicles_of(sample, self.data)
         boxes[:, 2] -= rig.ground_z_m

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from arbiview_aug.choices import SurfaceName
+from arbiview_aug.choices import GeometryName
 
 Kind = Literal["raw", "oracle", "row_split", "retarget"]
 Geometry = Literal["points", "boxes_3d", "depth_m", "learned_depth_m", "neighbours"]
@@ -45,7 +45,7 @@ class Variant:
     name: str
     title: str
     kind: Kind
-    surface: SurfaceName = "auto"
+    surface: GeometryName = "auto"
     reads: tuple[Geometry, ...] = ()
     mixed: bool = False
     augmented: bool = False

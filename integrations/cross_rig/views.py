@@ -12,9 +12,9 @@ import torch
 from arbiview_aug import Camera, RandomRig, Rig, RigRetarget, visible_boxes
 from arbiview_aug.evaluate.baselines import row_split
 from arbiview_aug.evaluate.images import as_arrays
+from arbiview_aug.inpaint.neighbours import Reach
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.sample.neighbours import read_neighbours
-from arbiview_aug.temporal.fill import Reach
 from arbiview_aug.temporal.motion_depth import motion_depth
 from integrations.cross_rig.cache import Arrays
 from integrations.cross_rig.variant import RANDOM, Variant
@@ -40,13 +40,13 @@ class ViewMaker:
         self.variant, self.source, self.target = variant, source, target
         self.random = RandomRig(target, **RANDOM) if variant.random else None
         # Motion is asked for distances alone, so that the variant shows what these do.
-        reach: Reach | None = None if variant.surface in ("motion", "fused") else "ground"
+        reach: Reach | None = None if variant.surface in ("motion", "fused") else "road"
         self.retarget = RigRetarget(
             self.random or target,
-            source_rig=source,
-            surface=variant.surface,
+            source=source,
+            geometry=variant.surface,
             neighbours=reach,
-            holes="fill" if variant.holes == "fill" else "black",  # the generator completes black views
+            holes="continue" if variant.holes == "fill" else "black",  # the generator completes black views
         )
 
     def __call__(self, index: int, frame: Mapping[str, Any]) -> Arrays:

@@ -22,7 +22,7 @@ def torchvision_pipeline() -> v2.Compose:
     """Ours inside ``v2.Compose``: photometric transforms after it see a ``tv_tensors.Image``."""
     return v2.Compose(
         [
-            RigRetarget(load_rig("waymo").undistorted(), size=(160, 352), surface="objects"),
+            RigRetarget(load_rig("waymo").undistorted(), size=(160, 352), geometry="boxes"),
             CropRig(32, 0, (128, 352)),  # the sky
             v2.ColorJitter(brightness=0.3, contrast=0.3, saturation=0.3),
             v2.GaussianBlur(3, sigma=(0.1, 0.8)),
@@ -38,7 +38,7 @@ def kornia_pipeline() -> torch.nn.Sequential:
         K.RandomGaussianNoise(std=0.02, p=0.5),
     )
     return torch.nn.Sequential(
-        RigRetarget(load_rig("waymo").undistorted(), size=(256, 704), surface="objects"),
+        RigRetarget(load_rig("waymo").undistorted(), size=(256, 704), geometry="boxes"),
         ResizeRig((128, 352)),
         OnImages(colours),
     )

@@ -57,7 +57,7 @@ def main() -> int:
     data = RetargetDataModule(
         SyntheticDrive(demo_source_rig(SIZE), num_frames=4, lidar=False),
         SyntheticDrive(target, num_frames=2, seed=1, lidar=False),
-        RigRetarget(target, surface="objects"),
+        RigRetarget(target, geometry="boxes"),
         batch_size=2,
     )
     model = NearestBox()

@@ -16,21 +16,21 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from arbiview_aug import PlanCache
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import SurfaceName
+from arbiview_aug.choices import GeometryName
 from arbiview_aug.datasets.synthetic import GROUND_CLASSES, SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.agreement import overlap_scores
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
 from arbiview_aug.evaluate.lidar import coloured_points, sparse_metrics
 from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.evaluate.targets import UP_M, YAWS_DEG
-from arbiview_aug.favs.config import Quality
+from arbiview_aug.render.config import Quality
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.overlap_depth import overlap_depth
 from arbiview_aug.render.plan import build_plan
-from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.surface import Surface
 from arbiview_aug.transforms.rig_retarget import RigRetarget
@@ -53,7 +53,7 @@ class Frame(ProtocolFrame):
     """Rendered and scored."""
 
     def render(self, target: Rig, quality: Quality) -> tuple[list[Image], BoolArray]:
-        retarget = RigRetarget(target, source_rig=self.rig, quality=quality, harmonise=False, holes="black")
+        retarget = RigRetarget(target, source=self.rig, quality=quality, match_exposure=False, holes="black")
         out = retarget({"images": as_tensors(self.images)})
         return as_arrays(out["images"]), out["coverage"].numpy()
 
@@ -65,7 +65,7 @@ class Frame(ProtocolFrame):
                 return surface
 
         def render(view: Camera, k: int) -> tuple[Image, BoolArray]:
-            plan = build_plan(self.rig.with_cameras([self.rig[k]]), Rig([view]), surface="street", scene=Known())
+            plan = build_plan(self.rig.with_cameras([self.rig[k]]), Rig([view]), geometry="street", scene=Known())
             (image,) = as_arrays(render_opencv(plan, as_tensors(self.images[k : k + 1])))
             return image, plan.targets[0].coverage
 
@@ -178,9 +178,9 @@ def test_the_next_frame_as_truth(referee: ModuleType, data_root: Path) -> None:
 Truth = dict[tuple[str, str, str], np.ndarray]
 """(streets, 3) PSNR in dB of all covered pixels, near objects and labelled ones, by move, surface and quality."""
 
-METHODS: tuple[tuple[SurfaceName, Quality], ...] = (
+METHODS: tuple[tuple[GeometryName, Quality], ...] = (
     *(("street", quality) for quality in ("draft", *QUALITIES)),
-    *(("objects", quality) for quality in QUALITIES),
+    *(("boxes", quality) for quality in QUALITIES),
 )
 
 
@@ -193,13 +193,12 @@ def streets(request: pytest.FixtureRequest) -> Truth:
     """20 streets, three moves; of each street two cameras next to each other in the rig's order."""
     start, source = time.process_time(), demo_source_rig(SIZE)
     pairs = [moved(source.with_cameras([source[k], source[k + 1]])) for k in (0, 2, 4)]
-    refinements = RefinementCache(key="seed")
     retargets = {
         (pair, move, surface, quality): RigRetarget(
             target,
             quality=quality,
-            surface=surface,
-            refinement=refinements if quality == "accurate" else None,
+            geometry=surface,
+            cache=PlanCache(share_overlap="seed" if quality == "accurate" else False),
             holes="black",
         )
         for pair, targets in enumerate(pairs)
@@ -248,5 +247,5 @@ def test_slower_is_better_around_boxes(streets: Truth, move: str) -> None:
 
     It was 0.01 where a box covered all of its object: wheels and mirrors stand out of shapes, over what is measured.
     """
-    fast, accurate = (np.nanmean(streets[move, "objects", quality], axis=0) for quality in QUALITIES)
+    fast, accurate = (np.nanmean(streets[move, "boxes", quality], axis=0) for quality in QUALITIES)
     assert (accurate >= fast - [0, 0, 0.03]).all()

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug.choices import SurfaceName
+from arbiview_aug import SampleKeys
+from arbiview_aug.choices import GeometryName
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.render.confidence import EXPECTED_ERROR_LEVELS
 from arbiview_aug.transforms.rig_retarget import RigRetarget
@@ -24,7 +25,7 @@ pytestmark = pytest.mark.timeout(1800)
 
 SEEDS = few_or_all(1, 5)
 SIZE = (256, 704)
-SURFACES: tuple[SurfaceName, ...] = ("street", "objects")
+GEOMETRIES: tuple[GeometryName, ...] = ("street", "boxes")
 MOVES = {
     "0.7 m higher": ({"z_m": 0.7}, 0.0),
     "1 m sideways": ({"y_m": 1.0}, 0.0),
@@ -90,7 +91,7 @@ def row(name: str, found: Calibration) -> str:
 def all_pixels(request: pytest.FixtureRequest) -> dict[tuple[str, str], Pixels]:
     """By surface and vehicle change."""
     source = demo_source_rig(SIZE)
-    parts: dict[tuple[str, str], list[Pixels]] = {(surface, move): [] for surface in SURFACES for move in MOVES}
+    parts: dict[tuple[str, str], list[Pixels]] = {(surface, move): [] for surface in GEOMETRIES for move in MOVES}
     for seed in range(request.param):
         drive = SyntheticDrive(source, num_frames=1, seed=seed, lidar=False)
         sample = drive[0]
@@ -98,15 +99,17 @@ def all_pixels(request: pytest.FixtureRequest) -> dict[tuple[str, str], Pixels]:
             target = source.turned(yaw_deg=yaw_deg).shifted(**shift)
             truth = drive.render(0, target).images
             assert isinstance(truth, torch.Tensor)
-            for surface in SURFACES:
-                out = RigRetarget(target, surface=surface, outputs=("confidence",), holes="black")(sample)
+            for surface in GEOMETRIES:
+                out = RigRetarget(target, geometry=surface, keys=SampleKeys(extra=("confidence",)), holes="black")(
+                    sample
+                )
                 error = (out["images"].float() - truth.float()).abs().mean(1)
                 seen = out["coverage"]
                 parts[surface, move].append(Pixels(out["confidence"][seen].numpy(), error[seen].numpy()))
     return {key: Pixels(*(np.concatenate(p) for p in zip(*part, strict=True))) for key, part in parts.items()}
 
 
-@pytest.fixture(scope="module", params=SURFACES)
+@pytest.fixture(scope="module", params=GEOMETRIES)
 def pixels(request: pytest.FixtureRequest, all_pixels: dict[tuple[str, str], Pixels]) -> dict[str, Pixels]:
     """By vehicle change, for one surface; printed as a table."""
     found = {move: all_pixels[request.param, move] for move in MOVES}

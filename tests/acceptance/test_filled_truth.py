@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Camera, Rig, RigRetarget
+from arbiview_aug import Camera, Rig, RigRetarget, SampleKeys
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import RenderedViews, SceneClass, SyntheticDrive, demo_source_rig
 from tests.helpers import Standing
@@ -62,7 +62,7 @@ def rendered(sample: dict[str, Any], target: Rig, *keys: str) -> dict[str, Any]:
     unwanted = {"points", "boxes_3d"} - set(keys)
     known = {k: v for k, v in sample.items() if k not in unwanted}
     known["neighbours"] = [{k: n[k] for k in n if k not in unwanted} for n in sample["neighbours"]]
-    return RigRetarget(target, outputs=("source_frame",), holes="black")(known)
+    return RigRetarget(target, keys=SampleKeys(extra=("source_frame",)), holes="black")(known)
 
 
 def db(squares: list[np.ndarray]) -> float:
@@ -154,7 +154,7 @@ def test_confidence_knows_how_far_away_a_fill_was_recorded() -> None:
         drive = SyntheticDrive(rig, num_frames=1, seed=seed, neighbours=Neighbours(count=4, step_m=2.0))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what no camera sees
-            out = RigRetarget(target, outputs=("confidence", "source_frame"), holes="black")(drive[0])
+            out = RigRetarget(target, keys=SampleKeys(extra=("confidence", "source_frame")), holes="black")(drive[0])
         truth = drive.render(0, target).images
         assert isinstance(truth, torch.Tensor)
         error = (out["images"].float() - truth.float()).abs().mean(1)

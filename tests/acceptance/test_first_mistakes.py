@@ -40,7 +40,10 @@ ERRORS: dict[str, tuple[Callable[[Sample], Sample], str]] = {
     "coefficients without a lens": (lambda s: tensors(s, distortion=torch.ones(6, 4) * 0.01), "lens"),
     "ROS axes": (MISTAKES["ROS axes"][0], "ROS.*multiply cam2ego"),
     "positions in millimetres": (poses(millimetres), "millimetres: divide"),
-    "a mask of 0 and 255": (lambda s: {**s, "ignore": torch.zeros(6, 64, 176, dtype=torch.uint8)}, "ignore: .*bool"),
+    "a mask of 0 and 255": (
+        lambda s: {**s, "ego_mask": torch.zeros(6, 64, 176, dtype=torch.uint8)},
+        "ego_mask: .*bool",
+    ),
     "images under another key": (lambda s: {**without("images")(s), "imgs": s["images"]}, "did you mean 'images'"),
 }
 WARNINGS: dict[str, tuple[Callable[[Sample], Sample], str]] = {
@@ -62,7 +65,7 @@ def test_an_error_names_the_fix(mistake: str, street: Sample) -> None:
     make, message = ERRORS[mistake]
     with warnings.catch_warnings(), pytest.raises(ArbiviewError, match=message):
         warnings.simplefilter("ignore")
-        RigRetarget("waymo", size=(32, 64), surface="street")(make(street))
+        RigRetarget("waymo", size=(32, 64), geometry="street")(make(street))
 
 
 @pytest.mark.parametrize("mistake", WARNINGS)

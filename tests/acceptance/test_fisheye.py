@@ -53,7 +53,7 @@ def test_synthetic_fisheyes_give_the_true_pinhole_views() -> None:
     sample, truth = drive[0], drive.render(0, target).images
 
     def score(sample: dict) -> list[float]:
-        out = RigRetarget(target, surface="far", holes="black")(sample)  # centres coincide: exact
+        out = RigRetarget(target, geometry="infinity", holes="black")(sample)  # centres coincide: exact
         assert out["coverage"].float().mean() > 0.99
         squares = (out["images"].float() - truth).square().mean(1)
         return [psnr_db(float(s[seen].mean())) for s, seen in zip(squares, out["coverage"], strict=True)]

@@ -16,7 +16,7 @@ import torch
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.evaluate.metrics import psnr_db
-from arbiview_aug.favs.config import Quality
+from arbiview_aug.render.config import Quality
 from arbiview_aug.scene.static import Ground, Street
 from arbiview_aug.scene.surface import StaticSurface
 from arbiview_aug.transforms.rig_retarget import RigRetarget
@@ -58,7 +58,7 @@ def photographs(surface: StaticSurface, rig: Rig) -> torch.Tensor:
 
 def scores_db(images: torch.Tensor, truth: torch.Tensor, move: str, quality: Quality) -> np.ndarray:
     """(cameras, 1 + parts) of each view, and of its parts from left to right."""
-    retarget = RigRetarget(TARGETS[move], source_rig=SOURCE, quality=quality, surface="street", holes="black")
+    retarget = RigRetarget(TARGETS[move], source=SOURCE, quality=quality, geometry="street", holes="black")
     out = retarget({"images": images})
     squares = (out["images"].float() - truth.float()).square().mean(1).numpy()
     scores = []

@@ -67,7 +67,7 @@ def test_gain_over_ground(frame: str, referee: ModuleType, data_root: Path) -> N
     def ours(targets: list[Any]) -> list[Image]:
         target = Rig([as_camera(*view) for view in targets], ground_z_m=ground_z_m)
         return as_arrays(
-            RigRetarget(target, source_rig=rig, surface="lidar", harmonise=False, holes="black")(sample)["images"]
+            RigRetarget(target, source=rig, geometry="lidar", match_exposure=False, holes="black")(sample)["images"]
         )
 
     reference = referee.reference_renderer(cameras, "ground", ground_z=ground_z_m)
@@ -120,7 +120,7 @@ def shifts(request: pytest.FixtureRequest) -> dict[tuple[str, str], np.ndarray]:
         for move, by in STREET_MOVES.items():
             truth = drive.render(0, rig.shifted(**by))
             for surface in ("lidar", "street"):
-                plan = build_plan(rig, rig.shifted(**by), surface=surface, scene=scene)
+                plan = build_plan(rig, rig.shifted(**by), geometry=surface, scene=scene)
                 found.setdefault((move, surface), []).extend(vehicle_shifts(plan, source, truth))
     for (move, surface), values in found.items():
         half, more, most = np.percentile(values, [50, 75, 90])

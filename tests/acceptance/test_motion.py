@@ -71,7 +71,7 @@ def right(index: int, depth: MotionDepth) -> tuple[int, int, int]:
 def gain_db(index: int, move: str, sample: dict[str, Any], depth: MotionDepth) -> float:
     """PSNR over the static street's, where both cover."""
     outs = [
-        RigRetarget(MOVES[move], surface=surface, neighbours=None, holes="black")(
+        RigRetarget(MOVES[move], geometry=surface, neighbours=None, holes="black")(
             sample | {MOTION_KEY: list(map(torch.from_numpy, depth.depth_m))}
         )
         for surface in ("motion", "street")
@@ -126,7 +126,7 @@ def test_the_next_frame_as_truth(ddad_root: Path) -> None:
     outs = {}
     for surface in ("motion", "lidar", "fused", "street"):
         sample = now | {"neighbours": [ahead]}
-        outs[surface] = RigRetarget(target, surface=surface, neighbours=None, holes="black")(sample)
+        outs[surface] = RigRetarget(target, geometry=surface, neighbours=None, holes="black")(sample)
     then = [
         cv2.resize(image.numpy().transpose(1, 2, 0), camera.size[::-1], interpolation=cv2.INTER_AREA).astype(float)
         for camera, image in zip(target, ahead["images"], strict=True)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Camera, Rig, RigRetarget
+from arbiview_aug import Camera, Rig, RigRetarget, SampleKeys
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.lidar import coloured_points, colours_at, equalised, visible_points
@@ -32,8 +32,8 @@ def test_the_frame_ahead_adds_all_that_it_sees(ddad_root: Path) -> None:
     now = FrameFolder(ddad_root, load_points=False)[0]
     ahead = FrameFolder(ddad_root.parent / "ddad-next", load_points=False)[0]
     target = lowered(now["rig"])
-    alone = RigRetarget(target, surface="street", neighbours=None, holes="black")(now)
-    filled = RigRetarget(target, surface="street", holes="black")(now | {"neighbours": [ahead]})
+    alone = RigRetarget(target, geometry="street", neighbours=None, holes="black")(now)
+    filled = RigRetarget(target, geometry="street", holes="black")(now | {"neighbours": [ahead]})
     ego2ego = np.linalg.solve(now["ego2world"].numpy(), ahead["ego2world"].numpy())
     possible, gained = [], []
     for camera, before, after in zip(target, alone["coverage"], filled["coverage"], strict=True):
@@ -67,7 +67,9 @@ def test_the_filled_road_is_as_right_as_the_current_one(ddad_root: Path) -> None
         frame["images"] = [torch.from_numpy(image.transpose(2, 0, 1).copy()) for image in images]
     now, ahead = frames
     target = lowered(now["rig"])
-    out = RigRetarget(target, surface="street", outputs=("source_frame",), holes="black")(now | {"neighbours": [ahead]})
+    out = RigRetarget(target, geometry="street", keys=SampleKeys(extra=("source_frame",)), holes="black")(
+        now | {"neighbours": [ahead]}
+    )
     ego2ego = np.linalg.solve(now["ego2world"].numpy(), ahead["ego2world"].numpy())
     found_db = []
     for number, (frame, of_frame, move) in enumerate(zip(frames, points, (np.eye(4), ego2ego), strict=True)):

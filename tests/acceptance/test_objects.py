@@ -42,7 +42,7 @@ SIZE = (256, 704)
 SOURCES = ("front", "front_left", "front_right")
 TARGETS = ("front", "front_left")
 MOVES = {"0.7 m higher": {"z_m": 0.7}, "1 m to the left": {"y_m": 1.0}}
-WORLDS, SURFACES = ("shapes", "blocks"), ("objects", "street")
+WORLDS, GEOMETRIES = ("shapes", "blocks"), ("boxes", "street")
 LEAST_PX = 100
 """Visible pixels of an object whose edges are measured."""
 ROAD_AND_OBJECTS = (SceneClass.GROUND, SceneClass.SIDEWALK, SceneClass.VEHICLE, SceneClass.PEDESTRIAN)
@@ -125,14 +125,14 @@ def measure(seed: int, found: dict[tuple[str, str, str], Found]) -> None:
     for world in WORLDS:
         drive._scene = (0, blocks(scene) if world == "blocks" else scene)
         if world == "blocks":
-            geometry._surfaces["objects", rig.ground_z_m] = of_blocks
+            geometry._surfaces["boxes", rig.ground_z_m] = of_blocks
         recorded = drive.render(0)
         depth_m, instances = recorded.depth_m.numpy(), recorded.instances.numpy()
         for move, shift in MOVES.items():
             target = rig.with_cameras([rig[TARGETS[seed % 2]].shifted(**shift)])
             truth = drive.render(0, target)
             seen, hidden = sight(source, (depth_m, instances), target, truth.depth_m.numpy())
-            plans = {surface: build_plan(source, target, surface=surface, scene=geometry) for surface in SURFACES}
+            plans = {surface: build_plan(source, target, geometry=surface, scene=geometry) for surface in GEOMETRIES}
             for surface, plan in plans.items():
                 into = found[world, move, surface]
                 labels = render_labels(plan, list(recorded.instances.long()), -2)
@@ -202,7 +202,7 @@ def found(request: pytest.FixtureRequest) -> dict[tuple[str, str, str], Found]:
 @pytest.mark.parametrize("move", MOVES)
 @pytest.mark.parametrize("world", WORLDS)
 def test_objects_keep_their_place_and_height(found: dict, world: str, move: str) -> None:
-    here = found[world, move, "objects"]
+    here = found[world, move, "boxes"]
     assert here.median("top") <= 1.5 and here.median("bottom") <= 1.5
     assert here.share("top columns shown", "top columns") > 0.9  # holes have no displacement
 
@@ -210,13 +210,13 @@ def test_objects_keep_their_place_and_height(found: dict, world: str, move: str)
 @pytest.mark.parametrize("move", MOVES)
 @pytest.mark.parametrize("world", WORLDS)
 def test_no_colour_of_an_object_leaves_its_box(found: dict, world: str, move: str) -> None:
-    assert found[world, move, "objects"].share("outside box", "vehicle") < 0.001
+    assert found[world, move, "boxes"].share("outside box", "vehicle") < 0.001
 
 
 @pytest.mark.parametrize("move", MOVES)
 def test_what_blocks_hid_and_nothing_else_is_a_hole(found: dict, move: str) -> None:
     """Profiles are not the vehicles themselves: for ``shapes`` the printed table says how much is missed."""
-    here = found["blocks", move, "objects"]
+    here = found["blocks", move, "boxes"]
     assert here.share("right", "marked") >= 0.95
     assert here.share("within 2 px", "hidden") >= 0.95
 
@@ -224,6 +224,6 @@ def test_what_blocks_hid_and_nothing_else_is_a_hole(found: dict, move: str) -> N
 @pytest.mark.parametrize("move", MOVES)
 def test_holes_of_vehicles_are_not_their_boxes(found: dict, move: str) -> None:
     """Six streets: precision and recall 0.85, 0.88 from above, 0.82, 0.79 from the left; of boxes 0.53 to 0.58."""
-    here = found["shapes", move, "objects"]
+    here = found["shapes", move, "boxes"]
     assert here.share("right", "marked") >= 0.78
     assert here.share("within 2 px", "hidden") >= 0.75

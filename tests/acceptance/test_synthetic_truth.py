@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import SurfaceName
+from arbiview_aug.choices import GeometryName
 from arbiview_aug.datasets.synthetic import GROUND_CLASSES, SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.transforms.rig_retarget import RigRetarget
@@ -24,8 +24,8 @@ pytestmark = pytest.mark.timeout(1800)
 
 SEEDS = few_or_all(2, 20)
 SIZE = (256, 704)
-SINGLE: tuple[SurfaceName, ...] = ("street", "ground", "far")
-SURFACES: tuple[SurfaceName, ...] = ("auto", *SINGLE)
+SINGLE: tuple[GeometryName, ...] = ("street", "ground", "infinity")
+GEOMETRIES: tuple[GeometryName, ...] = ("auto", *SINGLE)
 MOVES = ("0.6 m higher", "0.5 m forward", "turned by 20°")
 GAIN_OVER_FAR_DB = 3.0
 LARGEST_LOSS_DB = 0.1
@@ -55,7 +55,7 @@ def scores(request: pytest.FixtureRequest) -> Scores:
     start, source = time.perf_counter(), demo_source_rig(SIZE)
     targets = {move: moved(source, move) for move in MOVES}
     retargets = {
-        (m, s): RigRetarget(target, surface=s, holes="black") for m, target in targets.items() for s in SURFACES
+        (m, s): RigRetarget(target, geometry=s, holes="black") for m, target in targets.items() for s in GEOMETRIES
     }
     rows: dict[tuple[str, str], list[tuple[float, float]]] = {key: [] for key in retargets}
     with warnings.catch_warnings():
@@ -80,10 +80,10 @@ def table(field: str, found: Scores) -> str:
     """Means over the streets; in brackets, by how much the worst street is below the best single surface."""
     title = f"PSNR in dB, {field} pixels (worst of {len(found[MOVES[0], SINGLE[0]].ground)} streets)"
     lines = [f"{title:<52}" + "".join(f"{move:>18}" for move in MOVES)]
-    for surface in SURFACES:
+    for surface in GEOMETRIES:
         cells = []
         for move in MOVES:
-            values = {s: getattr(found[move, s], field) for s in SURFACES}
+            values = {s: getattr(found[move, s], field) for s in GEOMETRIES}
             best = np.max([values[s] for s in SINGLE], axis=0)
             cells.append(f"{values[surface].mean():.2f} ({(values[surface] - best).min():+.2f})")
         lines.append(f"  {surface:<50}" + "".join(f"{cell:>18}" for cell in cells))
@@ -93,7 +93,7 @@ def table(field: str, found: Scores) -> str:
 @pytest.mark.parametrize("move", MOVES)
 @pytest.mark.parametrize("surface", ["ground", "street"])
 def test_a_road_beats_far_on_the_ground(scores: Scores, move: str, surface: str) -> None:
-    gain = scores[move, surface].ground - scores[move, "far"].ground
+    gain = scores[move, surface].ground - scores[move, "infinity"].ground
     assert gain.mean() >= GAIN_OVER_FAR_DB
     assert gain.min() > 0
 

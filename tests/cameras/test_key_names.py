@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import CalibrationError, Camera, Rig, RigRetarget, SampleError, load_rig
+from arbiview_aug import CalibrationError, Camera, Rig, RigRetarget, SampleError, SampleKeys, load_rig
 from arbiview_aug.cameras.key_names import USUAL_NAMES, meant_by, misnamed
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
@@ -67,13 +67,13 @@ def test_a_key_that_nobody_reads_is_named_once(key: str, value: Any, meant: str)
     ("more", "settings"),
     [
         ({"gt_boxes": BOXES, "boxes_3d": BOXES}, {}),  # the right key is there as well
-        ({"gt_boxes": BOXES}, {"pass_keys": ("gt_boxes",)}),  # the user knows
-        ({"gt_boxes": BOXES}, {"surface": "street"}),  # nothing would read it
+        ({"gt_boxes": BOXES}, {"keys": SampleKeys(keep=("gt_boxes",))}),  # the user knows
+        ({"gt_boxes": BOXES}, {"geometry": "street"}),  # nothing would read it
         ({"boxes": torch.rand(3, 4)}, {}),  # torchvision's, in pixels
         ({"boxes": [torch.rand(3, 4)]}, {}),
         ({"boxes": 3, "lidar": "0001.bin", "depth_map": "0001.png"}, {}),
         ({"lenses": ["radtan"], "ground_z": 1.0, "rig": RIG}, {}),  # the rig says it
-        ({"lenses": ["radtan"], "ground_z": 1.0}, {"source_rig": RIG}),
+        ({"lenses": ["radtan"], "ground_z": 1.0}, {"source": RIG}),
         ({"token": "a", "timestamp": 1, "time_s": 0.1, "labels": [1], "labels_3d": [1], "boxes_2d": []}, {}),
         ({"gt_names": ["car"], "box_names": ["car"], "keypoints": 1, "joints": 1, "ego2cam": 1, "lidar2ego": 1}, {}),
     ],
@@ -89,14 +89,14 @@ def test_depth_that_is_dropped_is_named() -> None:
 
 
 def test_labels_that_would_not_be_moved_are_named() -> None:
-    (words,) = warned(sample(gt_boxes=BOXES), surface="street", label_frame="target")
+    (words,) = warned(sample(gt_boxes=BOXES), geometry="street", keys=SampleKeys(frame="target"))
     assert "'boxes_3d'" in words
 
 
 def test_our_own_samples_are_understood() -> None:
     drive = SyntheticDrive(demo_source_rig((16, 44)), num_frames=1)
     first = drive[0]
-    out = RigRetarget(first["rig"].turned(yaw_deg=3), outputs=("confidence", "source_camera"))(first)
+    out = RigRetarget(first["rig"].turned(yaw_deg=3), keys=SampleKeys(extra=("confidence", "source_camera")))(first)
     for given in (first, out):
         assert not misnamed(given, (*USUAL_NAMES,))
 
@@ -121,10 +121,10 @@ def test_errors_name_what_was_found_instead(change: dict[str, str], words: str) 
 
 
 def test_surfaces_that_lack_their_geometry_name_it() -> None:
-    for surface, key, words in (("objects", "gt_boxes", "'boxes_3d'"), ("lidar", "pts", "'points'")):
+    for surface, key, words in (("boxes", "gt_boxes", "'boxes_3d'"), ("lidar", "pts", "'points'")):
         with pytest.raises(SampleError, match=f"found '{key}': did you mean {words}"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            RigRetarget(RIG.shifted(z_m=1), surface=surface)(sample(**{key: BOXES}))  # type: ignore[arg-type]
+            RigRetarget(RIG.shifted(z_m=1), geometry=surface)(sample(**{key: BOXES}))  # type: ignore[arg-type]
 
 
 def test_the_table_is_of_other_names() -> None:

@@ -21,9 +21,9 @@ def numbers(printed: str, surface: str) -> list[float]:
 def test_synthetic_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demo", "--size", "64x176", "--output", str(tmp_path), "--width", "900"]) == 0
     printed = capsys.readouterr().out
-    assert "sedan -> van: 6 cameras to 5" in printed and "over the objects surface" in printed
+    assert "sedan -> van: 6 cameras to 5" in printed and "over the boxes surface" in printed
     assert "Against the true views" in printed and "(5 cameras, 1 frame)" in printed and "ms a frame" in printed
-    auto, far = numbers(printed, "auto"), numbers(printed, "far")
+    auto, far = numbers(printed, "auto"), numbers(printed, "infinity")
     seen, psnr, ground, _, _, mae, ssim, *_, whole = auto
     assert 80 < seen < 100 and whole < psnr and 0 < mae < 50 and 0.2 < ssim < 1
     # 0.6 m higher, the road is where a plane says it is and not infinitely far away.
@@ -36,7 +36,7 @@ def test_synthetic_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
 
 @pytest.mark.slow
 def test_holes_filled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["demo", "--size", "40x104", "--output", str(tmp_path), "--width", "600", "--path", "inpaint"]) == 0
+    assert main(["demo", "--size", "40x104", "--output", str(tmp_path), "--width", "600", "--holes", "telea"]) == 0
     printed = capsys.readouterr().out
     plain, filled = (numbers(printed, name)[-1] for name in ("auto", "auto, inpainted"))
     assert filled > plain + 1, "whole views, holes and all"
@@ -54,7 +54,7 @@ def test_real_keyframe(reader: str, nuscenes_root: Path, tmp_path: Path, capsys:
     printed = capsys.readouterr().out
     assert "6 cameras to 5" in printed and "LiDAR points" in printed and "(5 cameras, 1 frame)" in printed
     seen, _, even, covered, ground, *_ = numbers(printed, "auto")
-    assert seen > 95 and even > 15 and covered >= even and ground > numbers(printed, "far")[4] + 5
+    assert seen > 95 and even > 15 and covered >= even and ground > numbers(printed, "infinity")[4] + 5
     assert cv2.imread(str(picture)) is not None
 
 
@@ -69,20 +69,20 @@ def test_the_published_method_beside_fast(nuscenes_root: Path, tmp_path: Path, c
     assert main(["demo", *options, "--size", "64x112", "--data", str(nuscenes_root)]) == 0  # waymo's lenses undistorted
     assert numbers(capsys.readouterr().out, "paper")[0] > 80
     with pytest.raises(SystemExit, match="2"):
-        main(["demo", *options, "--surface", "street"])
+        main(["demo", *options, "--geometry", "street"])
     assert "quality paper knows the far surface alone" in capsys.readouterr().err
 
 
 def test_lenses_without_points(fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--target", "ddad", "--size", "120x200", "--output", str(tmp_path), "--surface", "far"]
+    arguments = ["--target", "ddad", "--size", "120x200", "--output", str(tmp_path), "--geometry", "infinity"]
     assert main(["demo", "--data", str(fisheye_root), *arguments]) == 0
     printed = capsys.readouterr().out
     assert "no truth and no LiDAR points" in printed
-    assert numbers(printed, "far")[0] > 80 and numbers(printed, "ground")[0] > 80
+    assert numbers(printed, "infinity")[0] > 80 and numbers(printed, "ground")[0] > 80
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--size", "704"], ["--size", "0x3"], ["--seed", "-1"], ["--frames", "0"], ["--surface", "flat"]]
+    "arguments", [["--size", "704"], ["--size", "0x3"], ["--seed", "-1"], ["--frames", "0"], ["--geometry", "flat"]]
 )
 def test_wrong_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import DataError, RetargetedDataset, Rig, RigRetarget
+from arbiview_aug import DataError, RetargetedDataset, Rig, RigRetarget, SampleKeys
 from arbiview_aug.__main__ import main
 from arbiview_aug.atomic_io import _host
 from arbiview_aug.datasets import FrameFolder, Neighbours, WithDepth, WithMotionDepth
@@ -87,9 +87,9 @@ def test_samples_carry_it(made: Path, recorded: Path) -> None:
     sample = data[1]
     assert len(data) == 4 and sample["motion_depth_m"].shape == (2, 64, 176)
     assert sample["motion_depth_m"].dtype == torch.float32 and (sample["motion_depth_m"] > 0).float().mean() > 0.3
-    motion = RigRetarget(RIG.shifted(y_m=0.5), surface="motion", outputs=("source_camera",))
+    motion = RigRetarget(RIG.shifted(y_m=0.5), geometry="motion", keys=SampleKeys(extra=("source_camera",)))
     out = RetargetedDataset(data, motion)[1]
-    street = RigRetarget(RIG.shifted(y_m=0.5), surface="street")(sample)
+    street = RigRetarget(RIG.shifted(y_m=0.5), geometry="street")(sample)
     assert not torch.equal(out["images"], street["images"]) and "motion_depth_m" not in out
     online = motion(FrameFolder(recorded, neighbours=Neighbours())[1])
     both = (out["coverage"] & online["coverage"])[:, None].expand_as(out["images"])

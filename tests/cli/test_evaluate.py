@@ -25,12 +25,12 @@ def run(arguments: list[str], folder: Path) -> dict:
 
 
 def test_synthetic_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = run(["--size", "48x132", "--quality", "fast", "draft", "--surface", "street", "far"], tmp_path)
+    found = run(["--size", "48x132", "--quality", "fast", "draft", "--geometry", "street", "infinity"], tmp_path)
     printed = capsys.readouterr().out
     assert "Against the true views" in printed and "Agreement of neighbours" in printed
-    rows = ["fast, street", "fast, far", "draft, street", "draft, far"]
+    rows = ["fast, street", "fast, infinity", "draft, street", "draft, infinity"]
     assert list(found["means"]) == list(found["agreement"]) == rows
-    street, far = found["means"]["fast, street"], found["means"]["fast, far"]
+    street, far = found["means"]["fast, street"], found["means"]["fast, infinity"]
     assert street["true_covered_ground_psnr_db"] > far["true_covered_ground_psnr_db"] + 3
     assert {"true_hole_object_share", "true_covered_sky_psnr_db", "seen"} <= set(street)
     assert "raw_psnr_db" not in street, "where the truth is known, LiDAR need not score"
@@ -48,7 +48,7 @@ def test_numbers_agree_with_the_protocol(
     referee: ModuleType, nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The command's sparse figures, against the protocol's metrics of the same renderings."""
-    common = ["--data", str(nuscenes_root), "--downscale", "2", "--surface", "street"]
+    common = ["--data", str(nuscenes_root), "--downscale", "2", "--geometry", "street"]
     found = run([*common, "--yaws", "22"], tmp_path)
     assert "every other degree" not in capsys.readouterr().out
     sample = FrameFolder(nuscenes_root, reduce=2)[0]
@@ -63,7 +63,7 @@ def test_numbers_agree_with_the_protocol(
         def render(targets: list, protocol: dict = protocol) -> list[np.ndarray]:
             images = as_tensors([c["image"] for c in protocol.values()])
             return as_arrays(
-                RigRetarget(rig.turned(yaw_deg=22), surface="street", holes="black", harmonise=False)(
+                RigRetarget(rig.turned(yaw_deg=22), geometry="street", holes="black", match_exposure=False)(
                     {**sample, "images": images}
                 )["images"]
             )
@@ -83,8 +83,8 @@ def test_points_that_methods_may_read_do_not_score(
     nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     common = ["--data", str(nuscenes_root), "--downscale", "4", "--target", "waymo", "--size", "80x144"]
-    whole = run([*common, "--surface", "street"], tmp_path / "street")
-    held = run([*common, "--surface", "auto"], tmp_path / "auto")
+    whole = run([*common, "--geometry", "street"], tmp_path / "street")
+    held = run([*common, "--geometry", "auto"], tmp_path / "auto")
     assert held["scored_on_other_points"] and not whole["scored_on_other_points"]
     assert "Methods get the points of every other degree of azimuth" in capsys.readouterr().out
     ratio = held["means"]["fast, auto"]["raw_points"] / whole["means"]["fast, street"]["raw_points"]
@@ -98,14 +98,14 @@ def test_degrees_of_yaw(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         "--size",
         "24x66",
         "--yaws=-11,11",
-        "--surface",
-        "far",
+        "--geometry",
+        "infinity",
         "--output",
         str(tmp_path),
     ]
     assert main(arguments) == 0
     printed = json.loads((tmp_path / "evaluate.json").read_text())
-    assert list(printed["means"]) == ["fast, far: yaw -11", "fast, far: yaw +11", "fast, far: all"]
+    assert list(printed["means"]) == ["fast, infinity: yaw -11", "fast, infinity: yaw +11", "fast, infinity: all"]
     first, second, both = (row["true_psnr_db"] for row in printed["means"].values())
     assert both == pytest.approx((first + second) / 2)
 
@@ -114,10 +114,10 @@ def test_degrees_of_yaw(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 def test_lenses_that_a_method_cannot_take(
     fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["--data", str(fisheye_root), "--target", "ddad", "--size", "60x100", "--surface", "far"]
+    arguments = ["--data", str(fisheye_root), "--target", "ddad", "--size", "60x100", "--geometry", "infinity"]
     found = run([*arguments, "--quality", "fast", "paper"], tmp_path)
     printed = capsys.readouterr().out
-    assert list(found["means"]) == ["fast, far"] and "note: paper, far: " in printed and "pinhole" in printed
+    assert list(found["means"]) == ["fast, infinity"] and "note: paper, infinity: " in printed and "pinhole" in printed
     assert "no truth and no LiDAR points" in printed
     assert main(["evaluate", *arguments, "--quality", "paper", "--output", str(tmp_path)]) == 2
     assert "pinhole" in capsys.readouterr().err
@@ -140,7 +140,7 @@ def test_figures(nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixt
         ["--target", "waymo", "--target-set", "paper"],
         ["--paper", "--figure"],
         ["--paper", "--target-set", "yaw"],
-        ["--figure", "--surface", "far"],
+        ["--figure", "--geometry", "infinity"],
         ["--displaced"],
         ["--displaced", "--target", "waymo", "--data", "."],
     ],

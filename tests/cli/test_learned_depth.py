@@ -81,21 +81,21 @@ def test_from_the_command_to_views(recorded: Path, knowing: Path, street: Synthe
     ask = (sample["learned_depth_m"] > 0) & (true < 60)
     assert ask.float().mean() > 0.7
     assert torch.quantile((sample["learned_depth_m"] / true - 1).abs()[ask], 0.95) < 0.02
-    retarget = RigRetarget(TARGET, surface="learned", neighbours=None, holes="black")
+    retarget = RigRetarget(TARGET, geometry="learned", neighbours=None, holes="black")
     views = RetargetedDataset(data, retarget)[0]
     assert "learned_depth_m" not in views and "learned_depth_words" not in views
     words = str(retarget.explain(sample))
     assert "learned depth: " in words and "knowing, revision " in words and "licence apache-2.0" in words
     assert "front: fitted to " in words and "points of LiDAR, residual 0." in words
-    flat = RigRetarget(TARGET, surface="street", neighbours=None, holes="black")(sample)
+    flat = RigRetarget(TARGET, geometry="street", neighbours=None, holes="black")(sample)
     wanted = street.render(0, TARGET).images.float()
     both = (views["coverage"] & flat["coverage"])[:, None].expand_as(wanted)
     psnr = [float(-10 * ((one["images"].float() - wanted)[both] ** 2).mean().log10()) for one in (views, flat)]
     assert psnr[0] > psnr[1] + 2, psnr
-    report = ["--data", str(recorded), "--surface", "learned", "street", "--output", str(recorded / "report")]
+    report = ["--data", str(recorded), "--geometry", "learned", "street", "--output", str(recorded / "report")]
     assert main(["evaluate", *report, "--yaws=5"]) == 0 and "learned" in capsys.readouterr().out
     converted = ["--target", "waymo", "--size", "32x48", "--workers", "1", "--output", str(recorded.parent / "new")]
-    assert main(["convert", "--data", str(recorded), *converted, "--surface", "learned"]) == 0
+    assert main(["convert", "--data", str(recorded), *converted, "--geometry", "learned"]) == 0
     before = {path: path.stat().st_mtime_ns for path in (recorded / LEARNED_FOLDER).iterdir()}
     assert main(asked) == 0 and "2 were there before" in capsys.readouterr().out
     assert before == {path: path.stat().st_mtime_ns for path in (recorded / LEARNED_FOLDER).iterdir()}
@@ -129,8 +129,8 @@ def test_samples_carry_both_kinds(recorded: Path) -> None:
     sample = WithDepth(FrameFolder(recorded), recorded)[0]
     assert {"motion_depth_m", "learned_depth_m"} < sample.keys()
     assert sample["learned_depth_words"] == "learned depth: 100% of the pixels, m"
-    with pytest.raises(SampleError, match=r"surface='learned': expected 'learned_depth_m' in the sample, got none"):
-        RigRetarget(TARGET, surface="learned")(FrameFolder(recorded)[0])
+    with pytest.raises(SampleError, match=r"geometry='learned': expected 'learned_depth_m' in the sample, got none"):
+        RigRetarget(TARGET, geometry="learned")(FrameFolder(recorded)[0])
 
 
 @pytest.mark.slow
@@ -140,8 +140,8 @@ def test_a_random_model_is_declined(transformers: Any, recorded: Path, tmp_path:
     out = capsys.readouterr().out
     assert "0 of 2 frames have depth" in out and "front: 0 of 2 frames fitted" in out and "declined in 2" in out
     data = WithDepth(FrameFolder(recorded), recorded / LEARNED_FOLDER)
-    learned = RigRetarget(TARGET, surface="learned", neighbours=None)
-    street = RigRetarget(TARGET, surface="street", neighbours=None)(data[0])
+    learned = RigRetarget(TARGET, geometry="learned", neighbours=None)
+    street = RigRetarget(TARGET, geometry="street", neighbours=None)(data[0])
     assert torch.equal(learned(data[0])["images"], street["images"])
     assert "declined, " in str(learned.explain(data[0]))
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import DataError, Rig, RigRetarget
+from arbiview_aug import DataError, Rig, RigRetarget, SampleKeys
 from arbiview_aug.datasets import FrameFolder, LazyFrame, Neighbours, NuScenesDataset
 from arbiview_aug.datasets.drive import Drive, parts_of_clock, travelled_m
 from arbiview_aug.datasets.frame_writer import write_drive
@@ -141,7 +141,7 @@ def test_folders_fill_the_road(recorded: Path) -> None:
     assert [len(folder[k]["neighbours"]) for k in range(3)] == [1, 2, 1]
     sample = folder[1]
     assert sample["time_s"] == 0 and [n["token"] for n in sample["neighbours"]] == ["0000", "0002"]
-    out = RigRetarget(low(sample["rig"]), outputs=("source_frame",))(sample)
+    out = RigRetarget(low(sample["rig"]), keys=SampleKeys(extra=("source_frame",)))(sample)
     alone = RigRetarget(low(sample["rig"]), neighbours=None)(sample)
     gained = out["coverage"] & ~alone["coverage"]
     assert gained.float().mean() > 0.03 and ((out["source_frame"] > 0) == gained).all()
@@ -161,7 +161,7 @@ def test_a_broken_neighbour_is_named_and_left_out(recorded: Path, tmp_path: Path
         calib = json.loads((root / "0002" / "calib.json").read_text())
         calib["cameras"][0]["K"] = [[0, 0, 0]] * 3
         (root / "0002" / "calib.json").write_text(json.dumps(calib))
-    retarget, sample = RigRetarget(low(folder[1]["rig"]), outputs=("source_frame",)), folder[1]
+    retarget, sample = RigRetarget(low(folder[1]["rig"]), keys=SampleKeys(extra=("source_frame",))), folder[1]
     with pytest.warns(UserWarning, match="neighbour '0002' is left out: .*rendered without it"):
         out = retarget(sample)
     assert set(out["source_frame"].unique().tolist()) == {-1, 0, 1}

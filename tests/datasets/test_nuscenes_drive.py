@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Rig, RigRetarget
+from arbiview_aug import Rig, RigRetarget, SampleKeys
 from arbiview_aug.datasets import Neighbours, NuScenesDataset
 from arbiview_aug.datasets.nuscenes import reader
 from arbiview_aug.datasets.synthetic import SceneClass, demo_source_rig
@@ -124,7 +124,7 @@ def test_images_are_read_where_they_fill(root: Path, monkeypatch: pytest.MonkeyP
     assert len(read) == 6
     RigRetarget(sample["rig"])(sample)
     assert len(read) == 6  # nothing is missing
-    out = RigRetarget(sample["rig"].turned(pitch_deg=-12), outputs=("source_frame",))(sample)
+    out = RigRetarget(sample["rig"].turned(pitch_deg=-12), keys=SampleKeys(extra=("source_frame",)))(sample)
     filled = sorted({*out["source_frame"].unique().tolist()} - {-1, 0})
     assert filled and len(read) % 6 == 0 and len(read) >= 6 * (1 + len(filled))
 
@@ -309,7 +309,7 @@ def test_sweeps_that_were_never_copied(root: Path, tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         sample = dataset.by_token("goes-sample-2")
-        out = RigRetarget(sample["rig"].turned(pitch_deg=-12), outputs=("source_frame",))(sample)
+        out = RigRetarget(sample["rig"].turned(pitch_deg=-12), keys=SampleKeys(extra=("source_frame",)))(sample)
     assert [n["token"] for n in sample["neighbours"]] == [f"goes-sample-{k}" for k in (1, 0, 3, 4)]
     assert (out["source_frame"] > 0).any()
 
@@ -394,7 +394,7 @@ def test_the_road_is_filled_with_the_road(tmp_path: Path) -> None:
     write_views(tmp_path, rig, street, {*keyframe, *files_of(near[0]), *files_of(near[1])})
     sample = dataset.by_token("goes-sample-1")
     low: Rig = sample["rig"].turned(pitch_deg=-12)
-    out = RigRetarget(low, outputs=("source_frame",))(sample)
+    out = RigRetarget(low, keys=SampleKeys(extra=("source_frame",)))(sample)
     there = out["source_frame"] > 0
     assert there.float().mean() > 0.04
     truth = Renderer(supersampling=1, device="cpu").render(street.at(0.5), low.cameras, 0.0)

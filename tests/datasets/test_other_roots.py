@@ -42,9 +42,9 @@ def test_one_vehicles_data_becomes_anothers(vehicles: tuple[Path, Path], tmp_pat
     assert before["rig"].names == sorted(NAMES)
     NuScenesDataset(small, compensate_ego_motion=False)[0]["rig"].save(tmp_path / "small.yaml")
     target = load_rig(tmp_path / "small.yaml")
-    asked = ["--data", f"nuscenes:{tall}", "--target", str(tmp_path / "small.yaml"), "--surface", "street"]
+    asked = ["--data", f"nuscenes:{tall}", "--target", str(tmp_path / "small.yaml"), "--geometry", "street"]
     assert main(["demo", *asked, "--output", str(tmp_path / "demo")]) == 0
-    retarget = RigRetarget(target, surface="street")
+    retarget = RigRetarget(target, geometry="street")
     (batch,) = DataLoader(RetargetedDataset(open_data(tall), retarget), batch_size=2, collate_fn=collate)
     assert batch["images"].shape == (2, 6, 3, *SIZE)
     converting = command(tall, tmp_path / "new", "--images", "png")

@@ -190,9 +190,9 @@ def test_other_lenses_and_broken_logs_are_named(root: Path, tmp_path: Path) -> N
 
 
 def test_demo_loader_and_convert(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    asked = ["--target", "argoverse2", "--size", "24x40", "--surface", "street", "--output", str(tmp_path / "demo")]
+    asked = ["--target", "argoverse2", "--size", "24x40", "--geometry", "street", "--output", str(tmp_path / "demo")]
     assert main(["demo", "--data", f"py123d:{root}", *asked]) == 0
-    retarget = RigRetarget(load_rig("argoverse2"), size=(24, 40), surface="street")
+    retarget = RigRetarget(load_rig("argoverse2"), size=(24, 40), geometry="street")
     loader = DataLoader(RetargetedDataset(open_data(root), retarget), batch_size=3, collate_fn=collate)
     (batch,) = loader
     assert batch["images"].shape == (3, 7, 3, 24, 40) and len(batch["boxes_3d"]) == 3

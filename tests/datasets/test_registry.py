@@ -47,7 +47,7 @@ def test_one_row_adds_a_kind(toy: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert open_data(toy).by_token("street")["token"] == "street"
     with pytest.raises(DataError, match="expected the token of one of 1 samples, got 'lane'; they are street"):
         open_data(toy).by_token("lane")
-    rendered = ["--target", "waymo", "--size", "32x56", "--surface", "far", "--output", str(tmp_path / "out")]
+    rendered = ["--target", "waymo", "--size", "32x56", "--geometry", "infinity", "--output", str(tmp_path / "out")]
     assert main(["demo", "--data", f"toy:{toy}", *rendered]) == 0
     assert main(["evaluate", "--data", f"toy:{toy}", *rendered]) == 0
     assert main(["inspect", f"toy:{toy}", "waymo", "--output", str(tmp_path / "rigs.png")]) == 0
@@ -78,7 +78,7 @@ def test_a_folder_of_two_kinds(nuscenes_root: Path, tmp_path: Path, capsys: pyte
     for data in (f"frames:{nuscenes_root}", f"nuscenes:{nuscenes_root}"):
         assert main(["inspect", data, *picture]) == 0
         assert not capsys.readouterr().err
-    options = ["--target", "argoverse2", "--size", "32x40", "--surface", "far", "--downscale", "4"]
+    options = ["--target", "argoverse2", "--size", "32x40", "--geometry", "infinity", "--downscale", "4"]
     assert main(["evaluate", "--data", str(nuscenes_root), *options, "--output", str(tmp_path)]) == 0
     note = f"--data {nuscenes_root}: taken as a frame folder (calib.json in it or in its folders); otherwise: "
     assert f"{note}--data nuscenes:{nuscenes_root}\n" in capsys.readouterr().err

@@ -58,7 +58,7 @@ def same_rotation(source: Rig, images: torch.Tensor, size: tuple[int, int], repe
     H = torch.from_numpy(np.stack([h_geom(one, two) for one, two in zip(source, target, strict=True)])).float()
     floats = images.float().contiguous() / 255
     plans = [
-        build_plan(source.with_cameras([one]), target.with_cameras([two]), surface="far")
+        build_plan(source.with_cameras([one]), target.with_cameras([two]), geometry="infinity")
         for one, two in zip(source, target, strict=True)
     ]
     whole, scratch = build_plan(source, target), Scratch()

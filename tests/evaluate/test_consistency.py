@@ -62,7 +62,7 @@ def test_only_what_both_cover_counts() -> None:
 
 def test_sources_alone_at_their_half_way_view() -> None:
     sample = {"rig": RIG, "images": as_tensors([world(c) for c in RIG])}
-    method = retargeting("fast", "far")
+    method = retargeting("fast", "infinity")
     (pair,) = source_overlap(sample, method, size=SIZE)
     assert pair.raw_psnr_db is not None and pair.raw_psnr_db > 35
     dim = {**sample, "images": [sample["images"][0], sample["images"][1] // 2]}

@@ -46,7 +46,7 @@ def stereo(root: Path, metres: float, count: int) -> Path:
 
 
 def test_a_camera_that_is_the_source_itself(tmp_path: Path) -> None:
-    found = run(stereo(tmp_path / "data", 0.0, 1), tmp_path / "out", "--surface", "far")
+    found = run(stereo(tmp_path / "data", 0.0, 1), tmp_path / "out", "--geometry", "infinity")
     for row in found["means"].values():
         assert row["true_covered_psnr_db"] == pytest.approx(SAME_DB, abs=0.1) and row["spread_db"] == 0
 
@@ -104,7 +104,7 @@ def test_real_stereo_pairs(kitti_root: Path, referee: ModuleType, tmp_path: Path
     assert psnr["fast, motion"] > psnr["fast, street"] + 5.0
     *_, truth = referee.load_displaced(str(kitti_root / "frame_010"))
     frames = FrameFolder(kitti_root)
-    out = RigRetarget(frames.truth(0)["rig"], surface="street", holes="black")(frames[0])
+    out = RigRetarget(frames.truth(0)["rig"], geometry="street", holes="black")(frames[0])
     want = referee.displaced_metrics(as_arrays(out["images"])[0], out["coverage"][0].numpy(), truth["image"])
     (row,) = (r for r in found["views"] if r["frame"] == "frame_010" and r["method"] == "fast, street")
     got = [row[key] for key in ("true_covered_psnr_db", "true_psnr_db", "seen")]

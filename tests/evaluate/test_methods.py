@@ -27,7 +27,7 @@ def sample() -> dict:
 def test_retargeting_is_the_transform(sample: dict) -> None:
     target = sample["rig"].turned(yaw_deg=10)
     views = retargeting("fast", "street").render(sample, target)
-    out = RigRetarget(target, surface="street", holes="black")(sample)
+    out = RigRetarget(target, geometry="street", holes="black")(sample)
     for view, image, coverage in zip(views, as_arrays(out["images"]), out["coverage"], strict=True):
         np.testing.assert_array_equal(view.image, image)
         np.testing.assert_array_equal(view.coverage, coverage)
@@ -103,7 +103,7 @@ def test_a_camera_alone_knows_the_depth_that_all_together_use(monkeypatch: pytes
         return overlap_depth(rig, images, boxes)
 
     monkeypatch.setattr(methods, "overlap_depth", spied)
-    for surface in ("street", "objects", "auto"):
+    for surface in ("street", "boxes", "auto"):
         method = retargeting("accurate", surface)
         for _ in range(2):  # found once
             method.alone(sample, 0, view)
@@ -117,11 +117,11 @@ def test_a_camera_alone_has_the_gain_that_all_together_give_it() -> None:
     sample["images"][0] //= 2  # the others are twice as bright
     rig: Rig = sample["rig"]
     view = rig.with_cameras([half_way_view(rig[0], rig[1], (28, 50))])
-    harmonised = retargeting("fast", "street", harmonise=True)
-    gains = RigRetarget(rig, harmonise=True).harmonisation(sample).gains
+    harmonised = retargeting("fast", "street", match_exposure=True)
+    gains = RigRetarget(rig, match_exposure=True).harmonisation(sample).gains
     assert gains[0] > 1.2 * gains[1]
     for k in (0, 1):
-        out = RigRetarget(view, surface="street", harmonise=[gains[k]], holes="black")(one_camera(sample, k))
+        out = RigRetarget(view, geometry="street", match_exposure=[gains[k]], holes="black")(one_camera(sample, k))
         np.testing.assert_array_equal(harmonised.alone(sample, k, view).image, as_arrays(out["images"])[0])
     as_it_is = retargeting("fast", "street").alone(sample, 0, view).image
     assert harmonised.alone(sample, 0, view).image.mean() > 1.2 * as_it_is.mean()

@@ -109,7 +109,7 @@ def test_real_frames(nuscenes_root: Path, monkeypatch: pytest.MonkeyPatch) -> No
 def test_lenses_are_told(fisheye_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(paper_study, "SETS", ("truck",))
     monkeypatch.setattr(paper_study, "REDUCE", 4)
-    study = measure_paper(fisheye_root, methods=[baseline("row split"), retargeting("draft", "far", "draft")])
+    study = measure_paper(fisheye_root, methods=[baseline("row split"), retargeting("draft", "infinity", "draft")])
     assert list(study.means["surround-fisheye"]) == ["draft"]
     assert "expected pinhole cameras" in study.declined["surround-fisheye, row split"]
     assert "surround-fisheye, row split: row_split: expected pinhole cameras" in paper_report(study)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Container
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from hypothesis import strategies as st
 
-from arbiview_aug import Camera, FavsConfig, PaperConfig, Rig
-from arbiview_aug.render.refinement import RefinementCache
+from arbiview_aug import Camera, PaperConfig, PlanCache, RenderConfig, Rig, SampleKeys
 from tests.mutations import NUMBERS, TEXT_JUNK, mutated
 
 SIZE = (18, 24)
@@ -103,7 +103,7 @@ OPTIONAL: dict[str, Callable[[], Any]] = {
     "box_names": lambda: ["vehicle.car", "pedestrian"],
     "detections": lambda: [{"boxes": torch.tensor([[2.0, 2, 9, 9]]), "labels": ["car"]} for _ in range(2)],
     "coverage": lambda: torch.ones(2, *SIZE, dtype=torch.bool),
-    "ignore": lambda: torch.zeros(2, *SIZE, dtype=torch.bool),
+    "ego_mask": lambda: torch.zeros(2, *SIZE, dtype=torch.bool),
     "ego2world": lambda: torch.eye(4, dtype=torch.float64),
     "token": lambda: "t",
 }
@@ -147,26 +147,26 @@ def settings(draw: st.DrawFn, keys: Container[str]) -> dict[str, Any]:
     quality = one_of("fast", "fast", "fast", "fast", "draft", "accurate", "accurate", "paper")
     chosen: dict[str, Any] = {
         "quality": quality,
-        "label_frame": one_of("source", "source", "target"),
-        "label_keys": ("labels",),
+        "keys": SampleKeys(frame=one_of("source", "source", "target"), labels=("labels",)),
         **one_of({}, {}, {}, {}, {"size": (12, 16), "p": 0.5}),
     }
     if quality == "paper":
         return chosen
-    surfaces = ["auto", "auto", "far", "ground", "street"]
-    surfaces += ["objects"] * ("boxes_3d" in keys) + ["lidar"] * ("points" in keys or "depth_m" in keys)
-    chosen["surface"] = one_of(*surfaces)
-    chosen["harmonise"] = one_of(None, None, True, False, (1.1, 0.9))
-    chosen["execution"] = one_of("auto", "auto", "auto", "torch")
-    chosen["outputs"] = one_of((), (), ("confidence",), ("confidence", "source_camera"))
+    surfaces = ["auto", "auto", "infinity", "ground", "street"]
+    surfaces += ["boxes"] * ("boxes_3d" in keys) + ["lidar"] * ("points" in keys or "depth_m" in keys)
+    chosen["geometry"] = one_of(*surfaces)
+    chosen["match_exposure"] = one_of(True, True, True, False, (1.1, 0.9))
+    chosen["backend"] = one_of("auto", "auto", "auto", "torch")
+    extra = one_of((), (), ("confidence",), ("confidence", "source_camera"))
+    chosen["keys"] = replace(chosen["keys"], extra=extra)
     if quality == "accurate" and draw(st.booleans()):
-        chosen["refinement"] = RefinementCache(key="scene")
+        chosen["cache"] = PlanCache(share_overlap="scene")
     return chosen
 
 
 SETTING_NAMES = (
-    *("path", "quality", "surface", "harmonise", "refinement", "size", "p", "rng", "label_frame", "label_keys"),
-    *("label_fill", "pass_keys", "outputs", "execution", "cache_bytes", "source_rig"),
+    *("source", "geometry", "holes", "quality", "neighbours", "match_exposure"),
+    *("size", "fit", "p", "keys", "cache", "backend"),
 )
 
 SETTING_JUNK: tuple[Callable[[], Any], ...] = (
@@ -177,7 +177,7 @@ SETTING_JUNK: tuple[Callable[[], Any], ...] = (
     lambda: [8, 9],
     lambda: ["fast"],
     lambda: {"quality": "fast"},
-    lambda: FavsConfig(grid_step_px=1),
+    lambda: RenderConfig(grid_step_px=1),
     lambda: PaperConfig(use_feature_matching=False),
     lambda: (1.0, "x"),
     lambda: (0.0, 1.0),

@@ -111,7 +111,7 @@ def rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 def inverse_distance(surface: str, origin: np.ndarray, directions: np.ndarray, ground_z_m: float) -> np.ndarray:
     """1/m (...,) at which unit rays meet the road, the wall, or both."""
-    if surface == "far":
+    if surface == "infinity":
         return np.zeros(directions.shape[:-1])
     height = origin[2] - ground_z_m
     road = np.maximum(-directions[..., 2] / height, 0) if height > 0 else np.zeros(directions.shape[:-1])

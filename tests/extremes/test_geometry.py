@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Camera, Rig, RigRetarget, SampleError
+from arbiview_aug import Camera, Rig, RigRetarget, SampleError, SampleKeys
 from arbiview_aug.cameras.projection import ego_rays, project_rays
-from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.render.config import RenderConfig
 from arbiview_aug.render.plan import RenderPlan, build_plan
 from arbiview_aug.scene.scene import Scene
 from tests import helpers
@@ -27,10 +27,10 @@ MAP_TOLERANCE_PX = 1 / 32
 BOXES = np.array([[12.0, 1.0, 0.8, 4.5, 1.9, 1.6, 0.3], [-8.0, -3.0, 1.0, 4.0, 2.0, 2.0, 1.5]])
 POINTS = np.random.default_rng(0).normal(size=(2000, 3)) * (20, 20, 1) + (0, 0, 1)
 SCENES = {
-    "far": Scene(),
+    "infinity": Scene(),
     "ground": Scene(),
     "street": Scene(),
-    "objects": Scene(boxes=BOXES),
+    "boxes": Scene(boxes=BOXES),
     "lidar": Scene(points=POINTS),
 }
 
@@ -113,7 +113,7 @@ def check(plan: RenderPlan, surface: str, scene: Scene, worst: Worst) -> None:
 def test_targets_at_the_edges(name: str, surface: str, worst: Worst) -> None:
     source, target, scene = ring(), TARGETS[name](), SCENES[surface]
     with no_numpy_warnings():
-        plan = build_plan(source, Rig([target]), surface=surface, scene=scene, config=FavsConfig(certainty=True))
+        plan = build_plan(source, Rig([target]), geometry=surface, scene=scene, config=RenderConfig(certainty=True))
     check(plan, surface, scene, worst)
 
 
@@ -142,7 +142,7 @@ SOURCES: dict[str, Callable[[], Rig]] = {
 def test_sources_at_the_edges(name: str, surface: str, worst: Worst) -> None:
     scene, target = SCENES[surface], Rig([camera("t0"), camera("t1", azimuth_deg=70.0, position_m=(0.0, 0.6, 1.9))])
     with no_numpy_warnings():
-        plan = build_plan(SOURCES[name](), target, surface=surface, scene=scene)
+        plan = build_plan(SOURCES[name](), target, geometry=surface, scene=scene)
     check(plan, surface, scene, worst)
 
 
@@ -159,7 +159,9 @@ def test_pixels_are_finite_and_in_range(name: str, dtype: torch.dtype, quality: 
     shape = (len(source), 3, *source[0].size)
     images = torch.rand(shape, generator=torch.Generator().manual_seed(0))
     images = (images * 255).to(dtype) if dtype == torch.uint8 else images.to(dtype)
-    retarget = RigRetarget(Rig([camera("t")]), quality=quality, surface="street", outputs=("confidence",))
+    retarget = RigRetarget(
+        Rig([camera("t")]), quality=quality, geometry="street", keys=SampleKeys(extra=("confidence",))
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         warnings.filterwarnings("ignore", message="the target rig")
@@ -201,13 +203,13 @@ def test_points_on_the_image_plane(lens: str) -> None:
     assert np.isfinite(behind.uv).all() and (behind.valid == (lens == "fisheye")).all()
 
 
-@pytest.mark.parametrize("surface", ["far", "ground", "street", "lidar"])
+@pytest.mark.parametrize("surface", ["infinity", "ground", "street", "lidar"])
 @pytest.mark.parametrize("lens", LENSES)
 def test_a_column_of_pixels_on_the_image_plane(lens: str, surface: str, worst: Worst) -> None:
     """The target looks at right angles to the source: its middle column shows what lies in the source's image plane."""
     source, target = exact("s", FORWARD, 10.0, **LENSES[lens]), exact("t", LEFT, 30.0)
     with no_numpy_warnings():
-        plan = build_plan(Rig([source]), Rig([target]), surface=surface, scene=SCENES[surface])
+        plan = build_plan(Rig([source]), Rig([target]), geometry=surface, scene=SCENES[surface])
     check(plan, surface, SCENES[surface], worst)
     coverage = plan.targets[0].coverage
     if lens == "fisheye":
@@ -224,22 +226,22 @@ def test_rays_just_beside_a_lens(shift_px: float) -> None:
         "t", azimuth_deg=90 - np.degrees(shift_px + np.arctan2(40, 30)), K=[[30, 0, 43.5], [0, 30, 35.5], [0, 0, 1]]
     )
     with no_numpy_warnings():
-        plan = build_plan(Rig([source]), Rig([target]), surface="far", config=FavsConfig(certainty=True))
+        plan = build_plan(Rig([source]), Rig([target]), geometry="infinity", config=RenderConfig(certainty=True))
     assert plan.targets[0].coverage.any()
 
 
-@pytest.mark.parametrize("surface", ["far", "ground", "street"])
+@pytest.mark.parametrize("surface", ["infinity", "ground", "street"])
 def test_a_horizon_exactly_on_a_row(surface: str, worst: Worst) -> None:
     """Rays of row 36 are level to the last bit: they meet the wall, or nothing, and never the road."""
     source, target = exact("s", FORWARD, 50.0), exact("t", FORWARD, 50.0).shifted(z_m=0.7)
-    plan = build_plan(Rig([source]), Rig([target]), surface=surface)
+    plan = build_plan(Rig([source]), Rig([target]), geometry=surface)
     check(plan, surface, Scene(), worst)
     view = plan.targets[0]
     directions = target.unproject(target.pixel_grid()).directions
     assert (directions[36, :, 2] == 0).all()
     assert view.coverage[35:38].all()
     rise_px = 36 - view.at.to_float()[35:38, 48, 1]
-    distance_m = np.inf if surface == "far" else 41.0  # the wall straight ahead: 40 m from 1 m before the origin
+    distance_m = np.inf if surface == "infinity" else 41.0  # the wall straight ahead: 40 m from 1 m before the origin
     assert rise_px[1] == pytest.approx(50.0 * 0.7 / distance_m, abs=MAP_TOLERANCE_PX)
     assert np.abs(np.diff(rise_px) + 1).max() <= 2 * MAP_TOLERANCE_PX + 1e-3, "the rows beside it continue it"
 
@@ -253,7 +255,7 @@ def test_a_rotation_off_by_1e_7(worst: Worst) -> None:
         pose = c.cam2ego.copy()
         pose[:3, :3] += rng.uniform(-1e-7, 1e-7, (3, 3))
         noisy.append(Camera(name=c.name, width_px=1600, height_px=900, K=c.K, cam2ego=pose))
-    one, two = (build_plan(r, Rig([target]), surface="street").targets[0] for r in (rig, Rig(noisy)))
+    one, two = (build_plan(r, Rig([target]), geometry="street").targets[0] for r in (rig, Rig(noisy)))
     assert np.array_equal(one.coverage, two.coverage)
     error = np.abs(one.at.to_float() - two.at.to_float())[one.source_camera == two.source_camera].max()
     worst("px, rotations off by 1e-7", error)

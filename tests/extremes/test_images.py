@@ -44,11 +44,11 @@ def sample(kind: str) -> dict[str, torch.Tensor | Rig]:
 
 @pytest.mark.parametrize("kind", ["blank", "grey", "saturated", "repeating", "night", "noise"])
 def test_harmonise_declines_and_says_why(kind: str) -> None:
-    harmonised = RigRetarget(TARGET, harmonise=True, surface="street")
+    harmonised = RigRetarget(TARGET, match_exposure=True, geometry="street")
     report = harmonised.harmonisation(sample(kind))
     assert not report.accepted and report.gains == (1.0,) * len(RIG)
     assert "colours as recorded" in str(harmonised.explain(sample(kind))) and report.reason
-    plain = RigRetarget(TARGET, harmonise=False, surface="street")
+    plain = RigRetarget(TARGET, match_exposure=False, geometry="street")
     assert torch.equal(harmonised(sample(kind))["images"], plain(sample(kind))["images"])
 
 
@@ -87,8 +87,8 @@ def test_every_quality_keeps_the_range_of_the_images(kind: str, how: tuple[Any, 
     retarget = RigRetarget(
         target,
         quality=quality,
-        surface="auto" if quality == "paper" else "street",
-        harmonise=harmonise,
+        geometry="auto" if quality == "paper" else "street",
+        match_exposure=harmonise,
         holes="black",
     )
     out = retarget({"images": values, "rig": rig})
@@ -125,10 +125,10 @@ def test_a_constant_gradient_says_where_it_was_read(move: str, quality: Any, exe
     )
     target = MOVES[move](source)
     surface = "auto" if quality == "paper" else "street"
-    retarget = RigRetarget(Rig([target]), quality=quality, surface=surface, execution=execution)
+    retarget = RigRetarget(Rig([target]), quality=quality, geometry=surface, backend=execution)
     out = retarget({"images": coordinates(source)[None], "rig": Rig([source])})
     pixel = 160 // target.width_px if quality != "paper" else 1
-    found = reference.seen(source, target, "street" if move == "moved" else "far", 0.0)
+    found = reference.seen(source, target, "street" if move == "moved" else "infinity", 0.0)
     (h, w), half = source.size, (pixel - 1) / 2
     inner = out["coverage"][0].numpy() & ((found.uv >= half) & (found.uv <= np.array([w - 1, h - 1]) - half)).all(-1)
     assert inner.mean() > 0.4

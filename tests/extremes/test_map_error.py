@@ -70,7 +70,7 @@ def errors(plan: RenderPlan, surface: str, scene: Scene, at_most: int, edges: bo
         for pair in view.pairs:
             won = winner == pair.source
             source, offset_m = plan.source[pair.source], camera.center_m - plan.source[pair.source].center_m
-            name = "far" if np.linalg.norm(offset_m) < 1e-6 else surface
+            name = "infinity" if np.linalg.norm(offset_m) < 1e-6 else surface
             rays, valid = ego_rays(camera, np.stack([x[won], y[won]], -1).astype(np.float64))
             q = inverse_distance(scene.surface(name, plan.source.ground_z_m), camera.center_m, rays, pixel_rad)
             uv, ahead = project_rays(source, rays, q, offset_m)
@@ -104,10 +104,10 @@ def rig_pairs(scale: float, views: slice = slice(None)) -> Iterator[tuple[str, R
 def sweep(scale: float, surfaces: tuple[str, ...], at_most: int, views: slice = slice(None)) -> None:
     """Print and hold the worst error."""
     for surface in surfaces:
-        scene = Scene(boxes=BOXES) if surface == "objects" else Scene()
+        scene = Scene(boxes=BOXES) if surface == "boxes" else Scene()
         worst, where, count = 0.0, "", 0
         for pair, source, target in rig_pairs(scale, views):
-            off = errors(build_plan(source, target, surface=surface, scene=scene), surface, scene, at_most).px
+            off = errors(build_plan(source, target, geometry=surface, scene=scene), surface, scene, at_most).px
             count += len(off)
             if off.max(initial=0.0) > worst:
                 worst, where = float(off.max()), pair
@@ -115,14 +115,14 @@ def sweep(scale: float, surfaces: tuple[str, ...], at_most: int, views: slice = 
         assert worst <= TOLERANCE_PX, f"{surface} at {scale:.0%}, {where}: {worst:.4f} px"
 
 
-SURFACES = ("street", "ground", "far", "objects")
+GEOMETRIES = ("street", "ground", "infinity", "boxes")
 
 
 @pytest.mark.slow
 def test_small_images() -> None:
     """12 % of the recorded sizes: the street's join of road and wall is as narrow as the coarse grid there."""
     sweep(0.12, ("street",), at_most=10**6, views=slice(None, None, 3))
-    sweep(0.12, SURFACES[1:], at_most=3000, views=slice(None, None, 4))
+    sweep(0.12, GEOMETRIES[1:], at_most=3000, views=slice(None, None, 4))
 
 
 @pytest.mark.release
@@ -137,13 +137,13 @@ def test_small_images() -> None:
     ],
 )
 def test_all_sizes(scale: float, at_most: int, views: slice) -> None:
-    sweep(scale, SURFACES, at_most, views)
+    sweep(scale, GEOMETRIES, at_most, views)
 
 
 def test_placeholders_of_rays_that_are_none_reach_no_pixel() -> None:
     """Nodes beyond a lens's image have no ray; what is interpolated beside them, diagonally too, must not know."""
     source, target = load_rig("nuplan").resized(0.3), load_rig("nuplan").resized(0.06).shifted(-0.35, -0.09, 0.59)
-    assert errors(build_plan(source, target, surface="street"), "street", Scene(), 10**6).px.max() <= TOLERANCE_PX
+    assert errors(build_plan(source, target, geometry="street"), "street", Scene(), 10**6).px.max() <= TOLERANCE_PX
 
 
 @pytest.mark.parametrize(
@@ -156,7 +156,7 @@ def test_measured_points(boxes: FloatArray | None) -> None:
     points = checked_points(SyntheticDrive(num_frames=1, seed=0, rig=rig).points(0).numpy())
     scene = Remembering(boxes=boxes, points=points)
     for move, target in {"up": rig.shifted(z_m=0.6), "fisheye": load_rig("fisheye_surround").resized(0.3)}.items():
-        off = errors(build_plan(rig, target, surface="lidar", scene=scene), "lidar", scene, 10**6, edges=True)
+        off = errors(build_plan(rig, target, geometry="lidar", scene=scene), "lidar", scene, 10**6, edges=True)
         for where, px in {"between outlines": off.px[~off.on_edge], "on outlines": off.px[off.on_edge]}.items():
             over = np.count_nonzero(px > TOLERANCE_PX)
             print(f"{move}, {where}: {over} of {len(px)} pixels over 1/32 px, worst {px.max():.4f} px")

@@ -14,7 +14,17 @@ import pytest
 import torch
 from hypothesis import strategies as st
 
-from arbiview_aug import ArbiviewError, Camera, FavsConfig, PaperConfig, RandomRig, Rig, RigRetarget, load_rig
+from arbiview_aug import (
+    ArbiviewError,
+    Camera,
+    PaperConfig,
+    PlanCache,
+    RandomRig,
+    RenderConfig,
+    Rig,
+    RigRetarget,
+    load_rig,
+)
 from arbiview_aug import check as find_mistakes
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.errors import CalibrationError, SampleError, SampleTypeError
@@ -136,17 +146,13 @@ def test_huge_entries_are_no_rotation() -> None:
         ({"p": "x"}, "p: expected"),
         ({"p": [0.5]}, "p: expected"),
         ({"quality": ["fast"]}, "quality: expected"),
-        ({"surface": ["far"]}, "surface: expected"),
+        ({"geometry": ["infinity"]}, "geometry: expected"),
         ({"size": (10.5, 20)}, "size: expected"),
         ({"size": (40_000, 20)}, "size: expected"),
-        ({"outputs": "confidence"}, "outputs: expected names"),
-        ({"label_keys": "labels"}, "label_keys: expected names"),
-        ({"pass_keys": 3}, "pass_keys: expected names"),
-        ({"label_fill": "x"}, "label_fill"),
-        ({"cache_bytes": None}, "cache_bytes"),
-        ({"rng": 7}, "rng"),
-        ({"refinement": "scene", "quality": "accurate"}, "refinement"),
-        ({"harmonise": torch.zeros(0)}, "harmonise"),
+        ({"keys": "confidence"}, "keys: expected a SampleKeys"),
+        ({"cache": {"max_bytes": 3}}, "cache: expected a PlanCache"),
+        ({"match_exposure": torch.zeros(0)}, "match_exposure"),
+        ({"holes": 3}, "holes: expected a name or an"),
     ],
 )
 def test_settings_refuse_by_name(values: dict[str, Any], match: str) -> None:
@@ -155,8 +161,12 @@ def test_settings_refuse_by_name(values: dict[str, Any], match: str) -> None:
 
 
 def test_configs_refuse_by_name() -> None:
-    with pytest.raises(ValueError, match=r"FavsConfig\.seam_width"):
-        FavsConfig(seam_width="a")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"PlanCache\.max_bytes"):
+        PlanCache(max_bytes=None)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"PlanCache\.share_overlap"):
+        PlanCache(share_overlap=3)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"RenderConfig\.seam_width"):
+        RenderConfig(seam_width="a")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"PaperConfig\.beta"):
         PaperConfig(beta=None)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="yaw_deg"):
@@ -178,7 +188,7 @@ def test_tensors_that_cannot_be_read(change: Callable[[torch.Tensor], torch.Tens
     with pytest.raises(SampleTypeError, match=r"images\[0\]"):
         RigRetarget(TARGET)({"images": change(right), "rig": cameras})
     sample = {"images": right, "rig": cameras, "points": change(torch.rand(20, 3)), "boxes_3d": torch.zeros(0, 7)}
-    retarget = RigRetarget(TARGET, surface="lidar")
+    retarget = RigRetarget(TARGET, geometry="lidar")
     with suppress(SampleTypeError):  # 8 bit floats can be read as numbers
         assert retarget(sample)["images"].isfinite().all()
     with pytest.raises(SampleError, match="points"):

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from arbiview_aug import Camera, FavsConfig, PaperConfig, Rig, RigRetarget
+from arbiview_aug import Camera, PaperConfig, RenderConfig, Rig, RigRetarget
 from arbiview_aug.favs.renderer import render_paper
 from arbiview_aug.favs.stage1_geometry import check_homography, h_geom
 from arbiview_aug.favs.stage2_features import (
@@ -139,7 +139,7 @@ def test_the_published_stages_show_nothing_from_behind(azimuth_deg: float, fov_d
     source = camera("s", horizontal_fov_deg=fov_deg)
     target = camera("t", horizontal_fov_deg=150.0, azimuth_deg=azimuth_deg)
     coverage = render_paper(Rig([source]), Rig([target]), [torch.ones(3, *source.size)]).targets[0].coverage
-    uv, valid, *_ = reference.seen(source, target, "far", 0.0)
+    uv, valid, *_ = reference.seen(source, target, "infinity", 0.0)
     uv = np.where(valid[..., None], uv, -9.0)
     last = np.array([source.width_px - 1, source.height_px - 1])
     assert not coverage[~((uv >= -1e-3) & (uv <= last + 1e-3)).all(-1)].any()
@@ -164,9 +164,9 @@ def test_fused_pixels_lie_between_those_that_count(weights: np.ndarray, scale: f
     assert np.allclose(fuse(images, usual)[0], fuse(images, scale * usual)[0], rtol=1e-12)
 
 
-def shaded(rig: Rig, target: Rig, config: FavsConfig, execution: str) -> tuple[np.ndarray, np.ndarray, Any]:
+def shaded(rig: Rig, target: Rig, config: RenderConfig, execution: str) -> tuple[np.ndarray, np.ndarray, Any]:
     """A view of sources that are each of one shade, its coverage and its plan."""
-    plan = build_plan(rig, target, surface="street", config=config)
+    plan = build_plan(rig, target, geometry="street", config=config)
     images = [torch.full((3, *c.size), s) for c, s in zip(rig, np.linspace(0.2, 1, len(rig)).tolist(), strict=True)]
     if execution == "opencv":
         return render_opencv(plan, images)[0].numpy()[0], plan.targets[0].coverage, plan
@@ -178,9 +178,9 @@ def shaded(rig: Rig, target: Rig, config: FavsConfig, execution: str) -> tuple[n
 def test_coverage_does_not_depend_on_weights(weight: float, execution: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Weights of nothing, or nearly: the same pixels are covered, by shades of the sources that see them."""
     rig, target = ring(8), Rig([camera("t", azimuth_deg=20.0, position_m=(0.1, 0.2, 1.7))])
-    config = FavsConfig(seam_width=0.1)
+    config = RenderConfig(seam_width=0.1)
     _, covered, _ = shaded(rig, target, config, execution)
-    monkeypatch.setattr("arbiview_aug.render.view_planner.distance_weight", lambda d, *_: np.full(d.shape, weight))
+    monkeypatch.setattr("arbiview_aug.render.weights.distance_weight", lambda d, *_: np.full(d.shape, weight))
     with no_numpy_warnings():
         image, still, plan = shaded(rig, target, config, execution)
     assert np.array_equal(still, covered) and np.isfinite(image).all()
@@ -193,8 +193,8 @@ def test_coverage_does_not_depend_on_weights(weight: float, execution: str, monk
 def test_coverage_does_not_depend_on_settings(gamma: float, bonus: float) -> None:
     """(d / d_max) ** 16 is subnormal near the border; the published stages too cover what any source sees."""
     rig, target = ring(8), Rig([camera("t", azimuth_deg=20.0, position_m=tuple(ring(8)[0].center_m))])
-    _, covered, _ = shaded(rig, target, FavsConfig(), "opencv")
-    _, still, _ = shaded(rig, target, FavsConfig(distance_gamma=gamma, primary_bonus=bonus, seam_width=0.5), "opencv")
+    _, covered, _ = shaded(rig, target, RenderConfig(), "opencv")
+    _, still, _ = shaded(rig, target, RenderConfig(distance_gamma=gamma, primary_bonus=bonus, seam_width=0.5), "opencv")
     assert np.array_equal(still, covered)
     images = [torch.rand(3, *c.size) for c in rig]
     usual = render_paper(rig, target, images).targets[0].coverage
@@ -223,7 +223,7 @@ def test_blending_across_a_seam_has_no_step(worst: Worst) -> None:
     )
     target = Rig([rig[0].turned(yaw_deg=overlap_deg / 2 - 30)])
     for execution in ("opencv", "torch"):
-        image, covered, _ = shaded(rig, target, FavsConfig(seam_width=0.3), execution)
+        image, covered, _ = shaded(rig, target, RenderConfig(seam_width=0.3), execution)
         rows = image[30:70]
         assert covered[30:70].all()
         steps = np.abs(np.diff(rows, axis=1))
@@ -255,7 +255,9 @@ def test_gains_at_the_clamp(dtype: torch.dtype, execution: str, max_gain: float)
     assert report.accepted and report.gains[2] == pytest.approx(max_gain, rel=1e-12), str(report)
     assert all(1 / max_gain <= gain <= max_gain for gain in report.gains)
     with no_numpy_warnings():
-        out = RigRetarget(rig.turned(yaw_deg=25), harmonise=config, execution=execution)({"images": images, "rig": rig})
+        out = RigRetarget(rig.turned(yaw_deg=25), match_exposure=config, backend=execution)(
+            {"images": images, "rig": rig}
+        )
     views = out["images"].float() / (255 if dtype == torch.uint8 else 1)
     assert views.isfinite().all() and views.min() >= 0 and views.max() <= 1
 
@@ -280,8 +282,8 @@ def test_curves_stay_in_range_and_rise(gain: float, knee: float, worst: Worst) -
 
 @pytest.mark.parametrize("gain", [0.0, -1.0, 1e-320, 1e4, 1e300, float("inf"), float("nan")])
 def test_impossible_gains_are_refused(gain: float) -> None:
-    with pytest.raises(ValueError, match=r"harmonise: expected .* a gain from 0.001 to 1000, got"):
-        RigRetarget(ring(), harmonise=(1.0, gain))
+    with pytest.raises(ValueError, match=r"match_exposure: expected .* a gain from 0.001 to 1000, got"):
+        RigRetarget(ring(), match_exposure=(1.0, gain))
 
 
 # --- half precision ---------------------------------------------------------------------------------------------------
@@ -293,7 +295,7 @@ def test_half_precision_shows_what_float32_shows(quality: Any, dtype: torch.dtyp
     rig = ring()
     images = [image.to(dtype) for image in pictures(rig)]
     surface: Any = "auto" if quality == "paper" else "street"
-    retarget = RigRetarget(rig.turned(yaw_deg=20), quality=quality, surface=surface, holes="black")
+    retarget = RigRetarget(rig.turned(yaw_deg=20), quality=quality, geometry=surface, holes="black")
     half = retarget({"images": images, "rig": rig})["images"]
     single = retarget({"images": [image.float() for image in images], "rig": rig})["images"]
     assert half.dtype == dtype
@@ -321,12 +323,12 @@ def test_few_or_broken_points(name: str, quality: Any) -> None:
     images = torch.stack(pictures(rig))
     points = torch.as_tensor(POINTS[name], dtype=torch.float32)
     sample = {"images": images, "rig": rig, "points": points}
-    retarget = RigRetarget(Rig([camera("t", position_m=(1.5, 0.3, 1.9))]), quality=quality, surface="lidar")
+    retarget = RigRetarget(Rig([camera("t", position_m=(1.5, 0.3, 1.9))]), quality=quality, geometry="lidar")
     with no_numpy_warnings():
         out = retarget(sample)
     assert out["images"].isfinite().all() and 0 <= out["images"].min() <= out["images"].max() <= 1
     if name in ("none", "NaN alone"):  # nothing was measured: the street
-        street = RigRetarget(Rig([camera("t", position_m=(1.5, 0.3, 1.9))]), quality=quality, surface="street")
+        street = RigRetarget(Rig([camera("t", position_m=(1.5, 0.3, 1.9))]), quality=quality, geometry="street")
         assert torch.equal(out["images"], street(sample)["images"])
 
 
@@ -335,7 +337,7 @@ def test_broken_points_among_good_ones_change_nothing() -> None:
     good = rng.normal(size=(2000, 3)) * (20, 20, 1) + (0, 0, 1)
     broken = np.concatenate([good, np.full((50, 3), NAN), [[float("inf"), 0, 0]]])
     rig = ring()
-    retarget = RigRetarget(rig.shifted(z_m=0.4), surface="lidar")
+    retarget = RigRetarget(rig.shifted(z_m=0.4), geometry="lidar")
     images = torch.stack(pictures(rig))
     views = [retarget({"images": images, "rig": rig, "points": torch.from_numpy(p)})["images"] for p in (good, broken)]
     assert torch.equal(*views)

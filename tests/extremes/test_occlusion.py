@@ -28,8 +28,8 @@ def views(rows: int, side: float) -> tuple[Rig, Rig]:
 def test_boxes_hide_boxes_and_the_street(rows: int, side: float) -> None:
     source, target = views(rows, side)
     boxes = np.array([NEAR, FAR])
-    coverage = build_plan(source, target, surface="objects", scene=Scene(boxes=boxes)).targets[0].coverage
-    found = reference.seen(source[0], target[0], "objects", 0.0, boxes)
+    coverage = build_plan(source, target, geometry="boxes", scene=Scene(boxes=boxes)).targets[0].coverage
+    found = reference.seen(source[0], target[0], "boxes", 0.0, boxes)
     directions, _ = reference.rays(target[0])
     near, far = (reference.box_distance(box, target[0].center_m, directions) for box in boxes)
     inside = found.valid & source[0].contains(found.uv)
@@ -56,7 +56,7 @@ def wall(x: float, half_width: float, height: float) -> np.ndarray:
 def test_measured_walls_hide_measured_walls(rows: int, side: float) -> None:
     source, target = views(rows, side)
     points = np.concatenate([wall(8.0, 2.0, 3.0), wall(14.0, 9.0, 4.0)])
-    coverage = build_plan(source, target, surface="lidar", scene=Scene(points=points)).targets[0].coverage
+    coverage = build_plan(source, target, geometry="lidar", scene=Scene(points=points)).targets[0].coverage
     eye = target[0].center_m
     directions, _ = reference.rays(target[0])
     with np.errstate(divide="ignore"):

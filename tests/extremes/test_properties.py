@@ -10,7 +10,7 @@ import torch
 from hypothesis import assume
 from hypothesis import strategies as st
 
-from arbiview_aug import Camera, FavsConfig, Rig, load_rig
+from arbiview_aug import Camera, RenderConfig, Rig, load_rig
 from arbiview_aug.cameras.camera import UNPROJECT_TOLERANCE_PX
 from arbiview_aug.cameras.rotations import rotation_x, rotation_z
 from arbiview_aug.render.opencv_backend import render_opencv
@@ -27,11 +27,11 @@ BOXES = np.array([[12.03, 1.0, 0.807, 2.5, 1.9, 1.613, 0.3], [-8.0, -3.0, 1.01, 
 MAP_TOLERANCE_PX = 1 / 32
 ROUNDING_PX = 1e-3  # the slack that maps allow at an image's border
 BLEND_ERROR = 1e-4  # cv2.blendLinear adds 1e-5 to the sum of its weights, once for every band
-UNBLENDED = FavsConfig(seam_width=0.0, interpolation="linear")
+UNBLENDED = RenderConfig(seam_width=0.0, interpolation="linear")
 
 
 def scene_of(surface: str, boxes: np.ndarray = BOXES) -> Scene:
-    return Scene(boxes=boxes) if surface == "objects" else Scene()
+    return Scene(boxes=boxes) if surface == "boxes" else Scene()
 
 
 def noise(rig: Rig) -> list[torch.Tensor]:
@@ -73,7 +73,7 @@ def must_see(source: Camera, found: reference.Seen, level: int) -> np.ndarray:
     15,
     60,
     pair=drawn.pairs(),
-    surface=st.sampled_from(["far", "ground", "street", "objects"]),
+    surface=st.sampled_from(["infinity", "ground", "street", "boxes"]),
     seam_width=st.sampled_from([0.0, 0.03, 0.3]),
     execution=st.sampled_from(["opencv", "torch"]),
 )
@@ -83,7 +83,7 @@ def test_only_what_a_source_truly_sees(
     """Each source is painted in a shade of its own: a pixel's shade lies between those of the sources that see it."""
     source, target = pair
     plan = build_plan(
-        source, target, surface=surface, scene=scene_of(surface), config=FavsConfig(seam_width=seam_width)
+        source, target, geometry=surface, scene=scene_of(surface), config=RenderConfig(seam_width=seam_width)
     )
     shades = np.linspace(0.2, 1, len(source)).tolist()
     plain = rendered(plan, [torch.full((3, *c.size), s) for c, s in zip(source, shades, strict=True)], execution)
@@ -94,13 +94,13 @@ def test_only_what_a_source_truly_sees(
         levels = {report.source: report.level for report in view.pairs}
         low, high = np.full(camera.size, np.inf), np.full(camera.size, -np.inf)
         for k, recorded in enumerate(source):
-            name = "far" if np.linalg.norm(camera.center_m - recorded.center_m) < 1e-6 else surface
-            boxes = BOXES if name == "objects" else None
+            name = "infinity" if np.linalg.norm(camera.center_m - recorded.center_m) < 1e-6 else surface
+            boxes = BOXES if name == "boxes" else None
             found = reference.seen(recorded, camera, name, source.ground_z_m, boxes)
             sees = may_see(recorded, found, boxes, levels.get(k, 0))
             low = np.where(sees, np.minimum(low, shades[k]), low)
             high = np.where(sees, np.maximum(high, shades[k]), high)
-            if recorded.mask is None and name != "objects":
+            if recorded.mask is None and name != "boxes":
                 assert view.coverage[must_see(recorded, found, levels.get(k, 3))].all(), f"{recorded.name} sees more"
             won = view.source_camera == k
             if not won.any():
@@ -151,7 +151,7 @@ def moved(rig: Rig, ego2ego: np.ndarray) -> Rig:
     10,
     40,
     pair=drawn.pairs(masked=False),
-    surface=st.sampled_from(["far", "ground", "street", "objects"]),
+    surface=st.sampled_from(["infinity", "ground", "street", "boxes"]),
     yaw_deg=st.floats(-180, 180),
     pitch_deg=st.floats(-90, 90),
     shift_m=st.tuples(*[st.floats(-100, 100)] * 3),
@@ -171,7 +171,7 @@ def test_rigs_moved_together_with_the_world_render_the_same(
     source, target = pair
     assume(len({c.cam2ego[:3, 2:].round(3).tobytes() for c in source}) == len(source))
     T = np.eye(4)
-    if surface == "far":
+    if surface == "infinity":
         T[:3, :3], T[:3, 3] = rotation_z(yaw_deg) @ rotation_x(pitch_deg), shift_m
     else:
         T[:3, :3] = rotation_z(180.0)
@@ -180,8 +180,8 @@ def test_rigs_moved_together_with_the_world_render_the_same(
     boxes = BOXES.copy()
     boxes[:, :3] = boxes[:, :3] @ T[:3, :3].T + T[:3, 3]
     boxes[:, 6] += np.pi
-    plan = build_plan(source, target, surface=surface, scene=scene_of(surface))
-    again = build_plan(moved(source, T), moved(target, T), surface=surface, scene=scene_of(surface, boxes))
+    plan = build_plan(source, target, geometry=surface, scene=scene_of(surface))
+    again = build_plan(moved(source, T), moved(target, T), geometry=surface, scene=scene_of(surface, boxes))
     for one, two in zip(plan.targets, again.targets, strict=True):
         same = one.source_camera == two.source_camera
         # Positions that lie exactly on a border are rounded to either side.
@@ -198,7 +198,7 @@ def test_rigs_moved_together_with_the_world_render_the_same(
             assert difference_px <= MAP_TOLERANCE_PX  # one step of a fixed-point map
 
 
-@examples(10, 30, pair=drawn.pairs(), surface=st.sampled_from(["far", "street", "objects"]), data=st.data())
+@examples(10, 30, pair=drawn.pairs(), surface=st.sampled_from(["infinity", "street", "boxes"]), data=st.data())
 def test_permuted_cameras_permute_the_views(pair: tuple[Rig, Rig], surface: str, data: st.DataObject) -> None:
     """Bit for bit: the order of targets orders the views, the order of sources changes nothing."""
     source, target = pair
@@ -206,11 +206,11 @@ def test_permuted_cameras_permute_the_views(pair: tuple[Rig, Rig], surface: str,
     new = data.draw(st.permutations(range(len(source))))
     views = data.draw(st.permutations(range(len(target))))
     images = noise(source)
-    plan = build_plan(source, target, surface=surface, scene=scene_of(surface))
+    plan = build_plan(source, target, geometry=surface, scene=scene_of(surface))
     permuted = build_plan(
         source.with_cameras([source[k] for k in new]),
         target.with_cameras([target[k] for k in views]),
-        surface=surface,
+        geometry=surface,
         scene=scene_of(surface),
     )
     before, after = render_opencv(plan, images), render_opencv(permuted, [images[k] for k in new])
@@ -266,7 +266,7 @@ def read_inside(plan: RenderPlan, k: int) -> np.ndarray:
     return inside
 
 
-@examples(10, 40, pair=drawn.pairs(masked=False), surface=st.sampled_from(["far", "ground", "street"]))
+@examples(10, 40, pair=drawn.pairs(masked=False), surface=st.sampled_from(["infinity", "ground", "street"]))
 def test_resizing_k_and_the_image_together_changes_nothing(worst: Worst, pair: tuple[Rig, Rig], surface: str) -> None:
     """On constant gradients, which averaging over areas keeps, in pixels of the image that is read.
 
@@ -277,9 +277,9 @@ def test_resizing_k_and_the_image_together_changes_nothing(worst: Worst, pair: t
     source, fine = small.resized(2.0), target.resized(2.0)
     images = [coordinates(c) for c in source]
     halved = [torch.nn.functional.avg_pool2d(image, 2) for image in images]
-    plan = build_plan(source, target, surface=surface, config=UNBLENDED)
-    plan_of_small = build_plan(small, target, surface=surface, config=UNBLENDED)
-    plan_of_fine = build_plan(source, fine, surface=surface, config=UNBLENDED)
+    plan = build_plan(source, target, geometry=surface, config=UNBLENDED)
+    plan_of_small = build_plan(small, target, geometry=surface, config=UNBLENDED)
+    plan_of_fine = build_plan(source, fine, geometry=surface, config=UNBLENDED)
     once = render_opencv(plan, images)
     of_small, of_fine = render_opencv(plan_of_small, halved), render_opencv(plan_of_fine, images)
     for k, view in enumerate(plan.targets):

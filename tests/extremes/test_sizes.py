@@ -33,7 +33,7 @@ def test_twelve_8k_cameras_with_one_centre_in_any_order(worst: Worst) -> None:
     winner = two.targets[0].source_camera
     assert np.array_equal(one.targets[0].source_camera, np.where(winner >= 0, order[winner], -1))
     assert one.targets[0].coverage.any()
-    check(one, "far", Scene(), worst)
+    check(one, "infinity", Scene(), worst)
 
 
 def views_of(rig: Rig) -> Rig:
@@ -44,7 +44,7 @@ def views_of(rig: Rig) -> Rig:
 def check_shades(rig: Rig, images: list[torch.Tensor], **settings: Any) -> None:
     """Each view shows the camera whose middle it is: no position is lost between the atlas's columns."""
     for execution in settings.pop("executions", ("opencv",)):
-        out = RigRetarget(views_of(rig), execution=execution, **settings)({"images": images, "rig": rig})
+        out = RigRetarget(views_of(rig), backend=execution, **settings)({"images": images, "rig": rig})
         assert out["coverage"].all()
         for view, shade in zip(out["images"], shades(len(rig)), strict=True):
             assert (view == shade).all()
@@ -97,7 +97,7 @@ def test_images_of_a_row_or_a_pixel(which: str, size: tuple[int, int], how: tupl
     images = [0.25 + 0.5 * torch.rand(3, *c.size, generator=generator) for c in source]
     surface = "auto" if quality == "paper" else "street"
     for rig in (target, source):
-        retarget = RigRetarget(rig, quality=quality, surface=surface, execution=execution)
+        retarget = RigRetarget(rig, quality=quality, geometry=surface, backend=execution)
         try:
             with no_numpy_warnings():
                 out = retarget({"images": images, "rig": source})

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 import torch
 
-from arbiview_aug import RigRetarget
+from arbiview_aug import PlanCache, RigRetarget
 from arbiview_aug.lru_cache import LRUCache
-from arbiview_aug.render.refinement import RefinementCache
+from arbiview_aug.transforms.estimate_depth import OverlapCache
 from tests.extremes import misuse
 
 
@@ -36,31 +36,31 @@ def sample(k: int) -> dict[str, Any]:
 @pytest.mark.parametrize(
     "settings",
     [
-        {"cache_bytes": 2**30},
-        {"cache_bytes": 20_000},  # plans are dropped all the time
+        {"cache": PlanCache(max_bytes=2**30)},
+        {"cache": PlanCache(max_bytes=20_000)},  # plans are dropped all the time
         pytest.param(
-            {"harmonise": True, "quality": "accurate", "refinement": RefinementCache(key="scene", max_bytes=1)},
+            {"match_exposure": True, "quality": "accurate", "cache": PlanCache(share_overlap="scene", max_bytes=1)},
             marks=pytest.mark.slow,
         ),
     ],
 )
 def test_threads_do_not_disturb_each_other(settings: dict[str, Any]) -> None:
-    retarget = RigRetarget(misuse.rig().shifted(z_m=0.2), surface="street", **settings)
+    retarget = RigRetarget(misuse.rig().shifted(z_m=0.2), geometry="street", **settings)
     count = 70 if "quality" not in settings else 20
-    fresh = RigRetarget(misuse.rig().shifted(z_m=0.2), surface="street", **{**settings, "refinement": None})
+    fresh = RigRetarget(misuse.rig().shifted(z_m=0.2), geometry="street", **{**settings, "cache": PlanCache()})
     with ThreadPoolExecutor(4) as threads:
         rendered = list(threads.map(lambda k: retarget(sample(k % 35))["images"], range(count)))
     for k, images in enumerate(rendered):
         assert torch.equal(images, fresh(sample(k % 35))["images"])
     assert retarget.plans.hits + retarget.plans.misses == count
-    assert retarget.plans.size <= settings.get("cache_bytes", 2**30) or len(retarget.plans) == 1
+    assert retarget.plans.size <= retarget.cache.max_bytes or len(retarget.plans) == 1
 
 
-@pytest.mark.parametrize("cache", [LRUCache(20, attrgetter("nbytes")), RefinementCache(max_bytes=20)])
+@pytest.mark.parametrize("cache", [LRUCache(20, attrgetter("nbytes")), OverlapCache(None)])
 def test_caches_keep_count(cache: Any) -> None:
     def get(k: int) -> int:
         key = bytes([k * k % 7])
-        name = (key, None) if isinstance(cache, RefinementCache) else key
+        name = (key, None) if isinstance(cache, OverlapCache) else key
         return int(cache.get(name, lambda: SimpleNamespace(nbytes=5, key=key)).key == key)
 
     with ThreadPoolExecutor(4) as threads:

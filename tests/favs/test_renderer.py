@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import CalibrationError, PaperConfig, Rig, RigRetarget, SampleError, load_rig
+from arbiview_aug import CalibrationError, PaperConfig, Rig, RigRetarget, SampleError, SampleKeys, load_rig
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.favs.renderer import PaperRendering, paper_labels, primary_camera, render_paper
 from arbiview_aug.favs.stage1_geometry import h_geom
@@ -101,7 +101,7 @@ def test_coverage_is_that_of_the_far_surface() -> None:
     images = [torch.randint(0, 255, (3, *c.size), dtype=torch.uint8) for c in rig]
     for target in (rig, rig.turned(yaw_deg=22), rig.turned(pitch_deg=-10).resized(0.5)):
         rendering = render_paper(rig, target, images, GEOMETRIC)
-        for ours, far in zip(rendering.coverage, build_plan(rig, target, surface="far").coverage, strict=True):
+        for ours, far in zip(rendering.coverage, build_plan(rig, target, geometry="infinity").coverage, strict=True):
             assert (ours != far).mean() < 2e-3
 
 
@@ -142,7 +142,7 @@ def test_the_own_car_never_contributes(pair_images) -> None:
         image[:, torch.from_numpy(~mask)] = 255 - image[:, torch.from_numpy(~mask)]
     clean, other = (render_paper(rig, MIDDLE, images).targets[0] for images in (pair_images, dirty))
     assert torch.equal(clean.image, other.image)
-    far = build_plan(rig, MIDDLE, surface="far").coverage[0]
+    far = build_plan(rig, MIDDLE, geometry="infinity").coverage[0]
     assert (clean.coverage != far).mean() < 0.02 and clean.coverage.mean() < 0.97
     assert not clean.image[:, torch.from_numpy(~clean.coverage)].any()
 
@@ -207,7 +207,7 @@ def test_rig_retarget_renders_the_published_stages(pair_images) -> None:
         "token": "a",
     }
     retarget = RigRetarget(
-        MIDDLE, quality="paper", holes="black", outputs=("source_camera",), label_keys=("segmentation",)
+        MIDDLE, quality="paper", holes="black", keys=SampleKeys(extra=("source_camera",), labels=("segmentation",))
     )
     out = retarget(sample)
     direct = render_paper(PAIR, MIDDLE, pair_images).targets[0]
@@ -249,8 +249,8 @@ def test_detections_in_the_sample_give_types(pair_images) -> None:
 
 def test_messages(pair_images) -> None:
     for settings, message in [
-        ({"surface": "street"}, "surface: quality='paper' knows the far surface: expected auto or far"),
-        ({"execution": "torch"}, "execution: quality='paper' runs in OpenCV"),
+        ({"geometry": "street"}, "geometry: quality='paper' has none: expected auto or infinity"),
+        ({"backend": "torch"}, "backend: quality='paper' runs in OpenCV"),
     ]:
         with pytest.raises(ValueError, match=message):
             RigRetarget(MIDDLE, quality="paper", **settings)
@@ -294,6 +294,6 @@ def test_real_frame(nuscenes_root) -> None:
     print(f"nuscenes-one, yaw, raw: {psnr:.2f} dB")
     assert abs(psnr - 22.5) < 1.5
     for rendering in rendered:
-        far = build_plan(rig, rendering.target, surface="far").coverage
+        far = build_plan(rig, rendering.target, geometry="infinity").coverage
         difference = [(a != b).mean() for a, b in zip(rendering.coverage, far, strict=True)]
         assert np.mean(difference) < 0.01

@@ -7,7 +7,6 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.favs.stage2_features import NO_MATCHES, Matches
 from arbiview_aug.favs.stage3_objects import (
-    Detection,
     align_objects,
     aligned,
     clusters,
@@ -17,6 +16,7 @@ from arbiview_aug.favs.stage3_objects import (
     geometric_type,
     mean_offset,
 )
+from arbiview_aug.sample.detections import Detection
 
 EYE = np.eye(3)
 CONFIG = PaperConfig()

@@ -6,13 +6,11 @@ import numpy as np
 
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.favs.stage4_fusion import (
-    distance_weight,
     fuse,
     fusion_weight,
     gradient_weight,
-    primary_weight,
-    quality_weight,
 )
+from arbiview_aug.render.weights import distance_weight, primary_weight, quality_weight
 
 OFF = PaperConfig(**{f.name: False for f in fields(PaperConfig) if f.name.startswith("use_")})
 

@@ -17,7 +17,7 @@ import arbiview_aug.generator
 from arbiview_aug import RigRetarget
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.targets import named_targets
-from arbiview_aug.generator import Generator, compact
+from arbiview_aug.generator import Diffusion, Generator, compact
 from arbiview_aug.generator.checkpoint import read_checkpoint
 from arbiview_aug.generator.training.data import open_frames
 from arbiview_aug.generator.training.held_out import gains, held_out_scores
@@ -71,7 +71,7 @@ def test_diffusion_works_out_of_the_box() -> None:
     sample = SyntheticDrive(demo_source_rig((48, 84)), num_frames=1, lidar=False)[0]
     target = named_targets("yaw", sample["rig"])["yaw +22"]
     seen = RigRetarget(target)(sample)
-    made = RigRetarget(target, path="diffusion")(sample)
+    made = RigRetarget(target, holes="diffusion")(sample)
     holes = ~seen["coverage"]
     assert holes.any() and torch.equal(made["generated"], holes)
     assert torch.equal(made["images"].movedim(1, -1)[~holes], seen["images"].movedim(1, -1)[~holes])
@@ -81,11 +81,11 @@ def test_diffusion_works_out_of_the_box() -> None:
 def test_more_steps_than_one_are_warned_of_once() -> None:
     generator, rig = Generator.shipped(), demo_source_rig((48, 84))
     with pytest.warns(UserWarning, match=r"steps=4: generator 'compact' was trained for one step; more add noise"):
-        RigRetarget(rig, path="diffusion", generator=generator, steps=4)
+        RigRetarget(rig, holes=Diffusion(generator, steps=4))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        RigRetarget(rig, path="diffusion", generator=generator, steps=10)
-        RigRetarget(rig, path="diffusion", generator=generator)
+        RigRetarget(rig, holes=Diffusion(generator, steps=10))
+        RigRetarget(rig, holes=Diffusion(generator))
 
 
 @pytest.mark.timeout(1800)
@@ -103,7 +103,7 @@ def test_one_step_beats_the_default_fill_outside_the_images(streets: int) -> Non
         for name, given, target in (("drawn", images, drawn), ("raised", sample, sample["rig"].shifted(z_m=0.7))):
             truth = torch.stack(list(drive.render(k, target).images)).float()
             db = []
-            for how in ({"path": "diffusion", "generator": generator, "steps": 1}, {}):
+            for how in ({"holes": Diffusion(generator, steps=1)}, {}):
                 out = RigRetarget(target, **how)(given)  # type: ignore[arg-type]
                 hole = out["generated"]
                 db.append(-10 * np.log10((out["images"].float() - truth).square().mean(1)[hole].mean().item()))

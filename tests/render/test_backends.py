@@ -11,17 +11,18 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.favs.config import FavsConfig, favs_config
 from arbiview_aug.favs.stage1_geometry import h_geom
 from arbiview_aug.image_ops import Scratch
 from arbiview_aug.render.atlas import AtlasLayout, FixedMap
+from arbiview_aug.render.config import RenderConfig
 from arbiview_aug.render.kernels import read_ahead
 from arbiview_aug.render.labels import render_labels
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import RenderPlan, build_plan
 from arbiview_aug.render.torch_backend import maps_on, render_torch
+from arbiview_aug.transforms.settings import render_config
 
-SURFACES = ["far", "ground", "street", "auto"]
+GEOMETRIES = ["infinity", "ground", "street", "auto"]
 
 
 def noise_images(rig: Rig, seed: int = 0, grain_px: int = 8) -> list[torch.Tensor]:
@@ -47,11 +48,11 @@ def differences(a: list[torch.Tensor], b: list[torch.Tensor]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["nuscenes", "waymo", "fisheye_surround"])
-@pytest.mark.parametrize("surface", SURFACES)
+@pytest.mark.parametrize("surface", GEOMETRIES)
 def test_target_equal_to_source_gives_the_source_back(name: str, surface: str) -> None:
     rig = load_rig(name).resized(0.25)
     images = noise_images(rig)
-    plan = build_plan(rig, rig, surface=surface)
+    plan = build_plan(rig, rig, geometry=surface)
     views = [by(execution, plan, images) for execution in ("opencv", "torch")]
     for camera, image, target, *both in zip(rig, images, plan.targets, *views, strict=True):
         # Where the lens can be inverted: past its fold a pixel has no ray.
@@ -79,7 +80,7 @@ def check_warp(rig: Rig, images: list[torch.Tensor]) -> None:
     target = rig.turned(yaw_deg=14, pitch_deg=-3, roll_deg=2)
     for k in range(len(rig)):
         one = rig.with_cameras([rig[k]])
-        plan = build_plan(one, target.with_cameras([target[k]]), surface="far")
+        plan = build_plan(one, target.with_cameras([target[k]]), geometry="infinity")
         view = render_opencv(plan, [images[k]])[0].permute(1, 2, 0).numpy()
         h, w = target[k].size
         warped = cv2.warpPerspective(images[k].permute(1, 2, 0).numpy(), h_geom(rig[k], target[k]), (w, h))
@@ -92,14 +93,14 @@ def check_warp(rig: Rig, images: list[torch.Tensor]) -> None:
 @pytest.mark.parametrize("quality", ["draft", "fast"])
 def test_executions_agree_on_real_images(nuscenes_root, ddad_root, quality: str, reduce: int) -> None:
     from arbiview_aug.datasets import FrameFolder
-    from arbiview_aug.favs.config import favs_config
+    from arbiview_aug.transforms.settings import render_config
 
     for root in (nuscenes_root, ddad_root):
         sample = FrameFolder(root, reduce=reduce)[0]
         rig, images = sample["rig"], list(sample["images"])
         lifted = rig.resized((256, 704)).shifted(z_m=0.5)
         for target in (rig.turned(yaw_deg=22), load_rig("waymo").resized(0.3 / reduce), lifted):
-            plan = build_plan(rig, target, config=favs_config(quality))
+            plan = build_plan(rig, target, config=render_config(quality))
             error = differences(by("opencv", plan, images), by("torch", plan, images))
             assert error.mean() <= 0.05 and np.quantile(error, 0.999) <= 1
 
@@ -236,7 +237,7 @@ def test_seams_are_blended_and_draft_does_not() -> None:
         return float(np.abs(np.diff(row)).max())
 
     target = rig.turned(yaw_deg=22)
-    assert largest_step(build_plan(rig, target, config=favs_config("draft"))) >= 30
+    assert largest_step(build_plan(rig, target, config=render_config("draft"))) >= 30
     assert largest_step(build_plan(rig, target)) <= 30
 
 
@@ -261,11 +262,11 @@ def test_halving_when_minifying_beats_direct_sampling(nuscenes_root) -> None:
     rig, images = sample["rig"], list(sample["images"])
     small = rig.turned(yaw_deg=4).resized((256, 704))
     fine = render_opencv(
-        build_plan(rig, small.resized((1024, 2816)), config=FavsConfig(interpolation="linear")), images
+        build_plan(rig, small.resized((1024, 2816)), config=RenderConfig(interpolation="linear")), images
     )
 
     def psnr(antialias: bool) -> float:
-        plan = build_plan(rig, small, config=FavsConfig(antialias=antialias, interpolation="linear"))
+        plan = build_plan(rig, small, config=RenderConfig(antialias=antialias, interpolation="linear"))
         errors = []
         for view, truth, target in zip(render_opencv(plan, images), fine, plan.targets, strict=True):
             mean = cv2.resize(truth.permute(1, 2, 0).numpy(), (704, 256), interpolation=cv2.INTER_AREA)
@@ -291,7 +292,9 @@ def test_only_magnified_views_are_read_by_cubics(factor: float, expected: str) -
     rig = load_rig("nuscenes").resized(0.25)
     target = zoomed(rig, factor).turned(yaw_deg=3)
     assert {view.interpolation for view in build_plan(rig, target).targets} == {expected}
-    assert {view.interpolation for view in build_plan(rig, target, config=favs_config("draft")).targets} == {"nearest"}
+    assert {view.interpolation for view in build_plan(rig, target, config=render_config("draft")).targets} == {
+        "nearest"
+    }
 
 
 @pytest.mark.slow
@@ -302,7 +305,7 @@ def test_magnified_views_are_sharper() -> None:
     streets = [(list(drive[k]["images"]), drive.render(k, target).images.float()) for k in range(len(drive))]
     psnr = []
     for interpolation in ("linear", "cubic"):
-        plan = build_plan(rig, target, config=FavsConfig(interpolation=interpolation))
+        plan = build_plan(rig, target, config=RenderConfig(interpolation=interpolation))
         views = [torch.stack(render_opencv(plan, images)).float() for images, _ in streets]
         errors = [(view - truth).square().mean().item() for view, (_, truth) in zip(views, streets, strict=True)]
         psnr.append(10 * np.log10(255**2 / np.mean(errors)))
@@ -320,7 +323,7 @@ def test_cubics_do_not_reach_beyond_a_source_or_onto_its_mask(execution: str) ->
     images = [torch.full((3, *mask.shape), colour, dtype=torch.uint8) for colour in colours]
     for image in images:
         image[:, torch.from_numpy(~mask)] = 255 - image[0, 0, 0]
-    plan = build_plan(rig, zoomed(rig, 1.3).turned(yaw_deg=20), surface="far", config=FavsConfig(seam_width=0))
+    plan = build_plan(rig, zoomed(rig, 1.3).turned(yaw_deg=20), geometry="infinity", config=RenderConfig(seam_width=0))
     for view, target in zip(by(execution, plan, images), plan.targets, strict=True):
         assert target.interpolation == "cubic" and target.edge is not None and len(target.edge.pixel) > 50
         assert len(target.sources) > 1 and not target.coverage.all()

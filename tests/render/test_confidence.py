@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Rig, RigRetarget
+from arbiview_aug import Rig, RigRetarget, SampleKeys
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.render.confidence import certainty, confidence
 from arbiview_aug.scene.boxes import BoxSurface
@@ -23,7 +23,7 @@ def sample() -> dict:
 
 
 def retargeted(sample: dict, target: Rig, **settings) -> dict:
-    settings = {"outputs": ("confidence",)} | settings
+    settings = {"keys": SampleKeys(extra=("confidence",))} | settings
     return RigRetarget(target, **settings)(sample)
 
 
@@ -98,9 +98,9 @@ def test_units_and_batches_do_not_matter() -> None:
 
 
 # --- the transform ----------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("surface", ["auto", "street", "far", "objects"])
+@pytest.mark.parametrize("surface", ["auto", "street", "infinity", "boxes"])
 def test_identity_is_certain(sample: dict, surface: str) -> None:
-    out = retargeted(sample, sample["rig"], surface=surface)
+    out = retargeted(sample, sample["rig"], geometry=surface)
     assert out["confidence"].dtype == torch.float32 and out["confidence"].shape == (6, *SIZE)
     assert out["confidence"].eq(1).all()
 
@@ -116,13 +116,13 @@ def test_range_and_holes(sample: dict) -> None:
 def test_more_change_is_less_confidence(sample: dict) -> None:
     means = []
     for height_m in (0.0, 0.1, 0.3, 1.0):
-        out = retargeted(sample, sample["rig"].shifted(z_m=height_m), surface="street")
+        out = retargeted(sample, sample["rig"].shifted(z_m=height_m), geometry="street")
         means.append(float(out["confidence"][out["coverage"]].mean()))
     assert means[0] == 1 and np.all(np.diff(means) < -0.02)
 
 
 def test_exact_sources_are_surer_than_displaced_ones(sample: dict) -> None:
-    out = retargeted(sample, sample["rig"].turned(yaw_deg=20), outputs=("confidence", "source_camera"))
+    out = retargeted(sample, sample["rig"].turned(yaw_deg=20), keys=SampleKeys(extra=("confidence", "source_camera")))
     own = out["source_camera"] == torch.arange(6)[:, None, None].to(torch.int8)
     other = out["coverage"] & ~own
     assert out["confidence"][own].mean() > 0.9 > 0.7 > out["confidence"][other].mean()
@@ -130,7 +130,7 @@ def test_exact_sources_are_surer_than_displaced_ones(sample: dict) -> None:
 
 def test_both_executions_agree(sample: dict) -> None:
     target = sample["rig"].turned(yaw_deg=15).shifted(z_m=0.3)
-    one, two = (retargeted(sample, target, execution=execution)["confidence"] for execution in ("opencv", "torch"))
+    one, two = (retargeted(sample, target, backend=execution)["confidence"] for execution in ("opencv", "torch"))
     difference = (one - two).abs()
     assert difference.max() < 0.03 and difference.mean() < 5e-4  # their views differ by up to one grey level
 
@@ -145,13 +145,13 @@ def test_the_same_twice_and_images_untouched(sample: dict) -> None:
 
 def test_batches_and_plans(sample: dict) -> None:
     target = sample["rig"].shifted(z_m=0.4)
-    with_it, without = RigRetarget(target, outputs=("confidence",)), RigRetarget(target)
+    with_it, without = RigRetarget(target, keys=SampleKeys(extra=("confidence",))), RigRetarget(target)
     pair = {"images": sample["images"].expand(2, -1, -1, -1, -1), "rig": sample["rig"]}
     one = {"images": sample["images"], "rig": sample["rig"]}
     for execution in ("opencv", "torch"):
-        both = retargeted(pair, target, execution=execution)["confidence"]
+        both = retargeted(pair, target, backend=execution)["confidence"]
         assert both.shape == (2, 6, *SIZE)
-        torch.testing.assert_close(both[1], retargeted(one, target, execution=execution)["confidence"])
+        torch.testing.assert_close(both[1], retargeted(one, target, backend=execution)["confidence"])
     plans = [retarget.plan(sample["rig"], target) for retarget in (with_it, without)]
     assert all(t.certainty is None for t in plans[1].targets)
     assert plans[0].nbytes - plans[1].nbytes == 6 * SIZE[0] * SIZE[1]
@@ -183,5 +183,5 @@ def test_gradients_pass_by(sample: dict) -> None:
 
 
 def test_the_published_method_has_none(sample: dict) -> None:
-    with pytest.raises(ValueError, match=r"outputs: quality='paper' has no 'confidence'"):
-        RigRetarget(sample["rig"], quality="paper", outputs=("confidence",))
+    with pytest.raises(ValueError, match=r"SampleKeys\.extra: quality='paper' has no 'confidence'"):
+        RigRetarget(sample["rig"], quality="paper", keys=SampleKeys(extra=("confidence",)))

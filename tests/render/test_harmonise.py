@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Camera, Rig, RigRetarget, load_rig
+from arbiview_aug import Camera, Rig, RigRetarget, SampleKeys, load_rig
 from arbiview_aug.cameras.projection import ego_rays
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.synthetic import SyntheticDrive
@@ -66,7 +66,7 @@ def overlap_db(
     """Raw overlap PSNR of each adjacent pair, by the package's own renderer."""
 
     def render(view: Camera, source: int) -> tuple[np.ndarray, np.ndarray]:
-        plan = build_plan(rig.with_cameras([rig[source]]), rig.with_cameras([view]), surface="street")
+        plan = build_plan(rig.with_cameras([rig[source]]), rig.with_cameras([view]), geometry="street")
         curves = None if gains is None else tone_curves([[gains[source]]])
         image = render_opencv(plan, [images[source]], None, curves)[0]
         return image.permute(1, 2, 0).numpy(), plan.targets[0].coverage
@@ -99,7 +99,7 @@ def test_an_exposure_is_recovered_by_truth(gain: float, least: float, mean: floa
     """
     rig = load_rig("nuscenes").undistorted().resized(SIZE)
     target = rig.turned(yaw_deg=20)
-    plan = build_plan(rig, target, surface="street")
+    plan = build_plan(rig, target, geometry="street")
     covered = torch.from_numpy(np.stack(plan.coverage))[:, None].expand(-1, 3, -1, -1)
     shares, errors = [], []
     for seed in range(3):
@@ -145,7 +145,7 @@ def test_without_overlap_nothing_happens(street) -> None:
     report = estimate_gains(apart, [images[0], images[0] // 2])
     assert not report.accepted and "overlap" in report.reason and report.raw_db_before is None
     pair = [images[0], images[0] // 2]
-    assert torch.equal(retargeted(apart, pair, harmonise=True), retargeted(apart, pair, harmonise=False))
+    assert torch.equal(retargeted(apart, pair, match_exposure=True), retargeted(apart, pair, match_exposure=False))
     one = rig.with_cameras([rig[0]])
     assert estimate_gains(one, images[:1]).gains == (1.0,)
 
@@ -160,7 +160,7 @@ def test_harmful_gains_are_declined(street) -> None:
     report = estimate_gains(rig, spoiled, strict, overlaps=overlaps)
     assert not report.accepted and report.gains == (1.0,) * 6 and "would not help" in report.reason
     assert report.raw_db_after > report.raw_db_before  # what it would have been
-    assert torch.equal(retargeted(rig, spoiled, harmonise=strict), retargeted(rig, spoiled, harmonise=False))
+    assert torch.equal(retargeted(rig, spoiled, match_exposure=strict), retargeted(rig, spoiled, match_exposure=False))
     # Where fitted pixels lie, the first camera reads a brighter image: a lie that the others uncover.
     told = np.zeros(len(overlaps.at) + 1, np.uint8)
     told[overlaps.fitted[0]], told[overlaps.fitted[1]] = 120, 60
@@ -305,14 +305,14 @@ def test_the_transform(street) -> None:
     spoiled = exposed(images, 0, 1.3)
     sample = {"images": torch.stack(spoiled), "rig": rig}
     target = rig.turned(yaw_deg=20)
-    plain, estimating = RigRetarget(target, harmonise=False), RigRetarget(target)
+    plain, estimating = RigRetarget(target, match_exposure=False), RigRetarget(target)
     report = estimating.harmonisation(sample)
     assert isinstance(report, PhotometricReport) and report == estimate_gains(rig, spoiled)
     out = estimating(sample)["images"]
-    assert torch.equal(RigRetarget(target, harmonise=True)(sample)["images"], out)
+    assert torch.equal(RigRetarget(target, match_exposure=True)(sample)["images"], out)
     again = pickle.loads(pickle.dumps(estimating))
     assert torch.equal(again(sample)["images"], out) and set(again(sample)) == set(plain(sample))
-    fixed = RigRetarget(target, harmonise=report.gains)
+    fixed = RigRetarget(target, match_exposure=report.gains)
     everywhere = render_opencv(build_plan(rig, target), spoiled, None, tone_curves([report.gains] * 6))
     covered = fixed(sample)["coverage"]
     assert torch.equal(fixed(sample)["images"].movedim(1, -1)[covered], torch.stack(everywhere).movedim(1, -1)[covered])
@@ -320,14 +320,14 @@ def test_the_transform(street) -> None:
     batch = {"images": torch.stack([torch.stack(spoiled), torch.stack(images)]), "K": torch.from_numpy(rig.K)}
     batch["K"], batch["cam2ego"] = (torch.from_numpy(np.stack([m, m])) for m in (rig.K, rig.cam2ego))
     for execution in ("opencv", "torch"):
-        both = RigRetarget(target, execution=execution)(batch)["images"]
+        both = RigRetarget(target, backend=execution)(batch)["images"]
         assert ((both[0].int() - out.int()).abs().float().mean()) <= 0.05
     words = str(estimating.explain(sample))
     assert f"gains {report.gains[0]:.2f}, " in words and "dB on held-out tiles" in words
-    assert "gains" not in str(plain.explain(sample)) and plain.harmonisation(sample).reason == "harmonise is off"
+    assert "gains" not in str(plain.explain(sample)) and plain.harmonisation(sample).reason == "match_exposure is off"
     assert fixed.harmonisation(sample).reason == "given"
-    assert "harmonise=off" in repr(plain) and "max_gain" in repr(estimating)
-    assert "harmonise=off" in repr(RigRetarget(rig, quality="paper"))
+    assert "match_exposure=off" in repr(plain) and "max_gain" in repr(estimating)
+    assert "match_exposure=off" in repr(RigRetarget(rig, quality="paper"))
 
 
 @pytest.mark.parametrize("gain", [0.7, 1.3])
@@ -336,9 +336,9 @@ def test_each_view_keeps_the_exposure_of_its_main_source(street, execution: str,
     rig, images = street
     sample = {"images": torch.stack(exposed(images, 0, gain)), "rig": rig}
     target = rig.turned(yaw_deg=20)
-    settings = {"execution": execution, "outputs": ("source_camera",), "holes": "black"}
-    out, recorded = (RigRetarget(target, harmonise=choice, **settings)(sample) for choice in (None, False))
-    truth = RigRetarget(target, harmonise=False, **settings)({**sample, "images": torch.stack(images)})["images"]
+    settings = {"backend": execution, "keys": SampleKeys(extra=("source_camera",)), "holes": "black"}
+    out, recorded = (RigRetarget(target, match_exposure=choice, **settings)(sample) for choice in (True, False))
+    truth = RigRetarget(target, match_exposure=False, **settings)({**sample, "images": torch.stack(images)})["images"]
     for view, kept, true, winner, plan in zip(
         out["images"], recorded["images"], truth, out["source_camera"], build_plan(rig, target).targets, strict=True
     ):
@@ -355,17 +355,17 @@ def test_each_view_keeps_the_exposure_of_its_main_source(street, execution: str,
             assert errors[0] < 0.35 * errors[1], "others come to the main source's exposure"
     # Nothing is to be harmonised where every view has one source.
     for one in (rig, rig.resized((90, 160))):
-        views = [RigRetarget(one, harmonise=choice, **settings)(sample)["images"] for choice in (None, False)]
+        views = [RigRetarget(one, match_exposure=choice, **settings)(sample)["images"] for choice in (True, False)]
         assert torch.equal(*views)
 
 
 def test_messages(street) -> None:
     rig, images = street
     for wrong in ("yes", [], [1, -1], [float("nan")], 1.3):
-        with pytest.raises(ValueError, match="harmonise: expected None, a bool"):
-            RigRetarget(rig, harmonise=wrong)
+        with pytest.raises(ValueError, match="match_exposure: expected a bool"):
+            RigRetarget(rig, match_exposure=wrong)
     with pytest.raises(SampleError, match="a gain for each of 6 cameras, got 2"):
-        RigRetarget(rig, harmonise=[1.0, 1.1])({"images": torch.stack(images), "rig": rig})
+        RigRetarget(rig, match_exposure=[1.0, 1.1])({"images": torch.stack(images), "rig": rig})
     with pytest.raises(ValueError, match=r"HarmoniseConfig\.knee: expected 0.05 to 0.99, got 2"):
         HarmoniseConfig(knee=2)
 

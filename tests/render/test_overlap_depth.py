@@ -9,22 +9,24 @@ import numpy as np
 import pytest
 import torch
 
+from arbiview_aug import PlanCache
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.overlap import half_way_view
 from arbiview_aug.cameras.projection import ego_rays, project_rays
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
-from arbiview_aug.favs.config import favs_config
 from arbiview_aug.render.overlap_depth import LIMITS, MIN_RISE_DB, OverlapDepth, overlap_depth
 from arbiview_aug.render.plan import build_plan
-from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.corrected import CorrectedSurface, Correction
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.static import Street
 from arbiview_aug.scene.surface import StaticSurface
+from arbiview_aug.transforms import estimate_depth
+from arbiview_aug.transforms.estimate_depth import OverlapCache
 from arbiview_aug.transforms.rig_retarget import RigRetarget
+from arbiview_aug.transforms.settings import render_config
 from tests import helpers
 from tests.helpers import in_atlas
 
@@ -85,7 +87,7 @@ def test_helps_at_the_target(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
     truth = photographs(NEARER, TARGET).float()
 
     def mse(quality: str) -> float:
-        out = RigRetarget(TARGET, source_rig=RIG, surface="street", quality=quality)({"images": images})  # type: ignore[arg-type]
+        out = RigRetarget(TARGET, source=RIG, geometry="street", quality=quality)({"images": images})  # type: ignore[arg-type]
         seen = out["coverage"][:, None].expand_as(truth)
         return float((out["images"].float() - truth)[seen].square().mean())
 
@@ -127,9 +129,9 @@ USELESS = {
 def test_declines_what_says_nothing(name: str) -> None:
     """Bit for bit the unrefined picture, and a reason."""
     sample = {"images": USELESS[name]}
-    refining = RigRetarget(TARGET, source_rig=RIG, surface="street", quality="accurate")
+    refining = RigRetarget(TARGET, source=RIG, geometry="street", quality="accurate")
     plain = RigRetarget(
-        TARGET, source_rig=RIG, surface="street", quality=replace(favs_config("accurate"), overlap_depth=False)
+        TARGET, source=RIG, geometry="street", quality=replace(render_config("accurate"), overlap_depth=False)
     )
     assert torch.equal(refining(sample)["images"], plain(sample)["images"])
     (report,) = refining.explain(sample).planned.overlap.reports  # type: ignore[union-attr]
@@ -161,9 +163,9 @@ def test_not_where_every_pixel_is_exact(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr("arbiview_aug.transforms.estimate_depth.overlap_depth", refuse)
     one = Rig([camera("left", 25, 0), camera("right", -25, 0)])
     sample = {"images": noise(0)}
-    RigRetarget(one.turned(yaw_deg=5), source_rig=one, quality="accurate")(sample)
-    for surface in ("far", "ground"):
-        RigRetarget(TARGET, source_rig=RIG, quality="accurate", surface=surface)(sample)  # type: ignore[arg-type]
+    RigRetarget(one.turned(yaw_deg=5), source=one, quality="accurate")(sample)
+    for surface in ("infinity", "ground"):
+        RigRetarget(TARGET, source=RIG, quality="accurate", geometry=surface)(sample)  # type: ignore[arg-type]
 
 
 def test_the_order_of_cameras_does_not_matter(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
@@ -197,8 +199,8 @@ def test_labelled_objects_are_not_measured(nearer: tuple[torch.Tensor, OverlapDe
 def test_boxes_matter_where_they_are_solids(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
     images, _ = nearer
     sample = {"images": images, "boxes_3d": np.array([[12.0, 0.0, 0.0, 1, 40, 40, 0]])}
-    for surface, accepted in (("objects", False), ("auto", False), ("street", True)):
-        depth = RigRetarget(TARGET, source_rig=RIG, quality="accurate", surface=surface).explain(sample).planned.overlap  # type: ignore[arg-type]
+    for surface, accepted in (("boxes", False), ("auto", False), ("street", True)):
+        depth = RigRetarget(TARGET, source=RIG, quality="accurate", geometry=surface).explain(sample).planned.overlap  # type: ignore[arg-type]
         assert depth is not None and depth.reports[0].accepted is accepted
 
 
@@ -230,7 +232,7 @@ def test_a_correction_belongs_to_the_scene_not_to_a_ray() -> None:
 
 def test_maps_over_corrections_are_exact(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
     scene = Scene(corrections=nearer[1].corrections)
-    plan = build_plan(RIG, TARGET, surface="street", scene=scene)
+    plan = build_plan(RIG, TARGET, geometry="street", scene=scene)
     surface = scene.surface("street", RIG.ground_z_m)
     for view, target in zip(plan.targets, plan.target, strict=True):
         rays, _ = ego_rays(target, target.pixel_grid())
@@ -255,8 +257,11 @@ def test_two_corrections_count_by_their_shares() -> None:
 # --- reuse ------------------------------------------------------------------------------------------------------------
 def test_a_cache_computes_each_scene_once(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
     images, _ = nearer
-    cache = RefinementCache(key="token")
-    retarget = RigRetarget(TARGET, source_rig=RIG, surface="street", quality="accurate", refinement=cache)
+    retarget = RigRetarget(
+        TARGET, source=RIG, geometry="street", quality="accurate", cache=PlanCache(share_overlap="token")
+    )
+    cache = retarget.overlaps
+    assert cache is not None
     first = retarget({"images": images, "token": "a"})["images"]
     again = retarget({"images": images, "token": "a"})["images"]
     assert (cache.hits, cache.misses, len(retarget.plans)) == (1, 1, 1)
@@ -273,9 +278,10 @@ def test_a_cache_computes_each_scene_once(nearer: tuple[torch.Tensor, OverlapDep
     assert pickle.loads(pickle.dumps(cache)).key == "token"
 
 
-def test_a_cache_forgets_the_oldest(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
+def test_a_cache_forgets_the_oldest(nearer: tuple[torch.Tensor, OverlapDepth], monkeypatch: pytest.MonkeyPatch) -> None:
     _, depth = nearer
-    cache = RefinementCache(max_bytes=2 * depth.nbytes)
+    monkeypatch.setattr(estimate_depth, "_OVERLAP_BYTES", 2 * depth.nbytes)
+    cache = OverlapCache(None)
     for name in "abca":
         cache.get((b"", name), lambda: depth)
     assert cache.misses == 4
@@ -283,7 +289,7 @@ def test_a_cache_forgets_the_oldest(nearer: tuple[torch.Tensor, OverlapDepth]) -
 
 def test_a_cache_needs_something_to_hold() -> None:
     with pytest.raises(ValueError, match="accurate"):
-        RigRetarget(TARGET, refinement=RefinementCache())
+        RigRetarget(TARGET, cache=PlanCache(share_overlap=True))
 
 
 def test_the_plan_knows_its_corrections(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
@@ -293,4 +299,4 @@ def test_the_plan_knows_its_corrections(nearer: tuple[torch.Tensor, OverlapDepth
 
 
 def test_the_preset() -> None:
-    assert favs_config("accurate").overlap_depth and MIN_RISE_DB > 0
+    assert render_config("accurate").overlap_depth and MIN_RISE_DB > 0

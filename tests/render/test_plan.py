@@ -10,8 +10,8 @@ import pytest
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.projection import ego_rays, project_rays
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.lru_cache import LRUCache
+from arbiview_aug.render.config import RenderConfig
 from arbiview_aug.render.plan import RenderPlan, build_plan, plan_key
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.scene import Scene
@@ -31,7 +31,7 @@ def reference(plan: RenderPlan, k: int, surface: str, source: int) -> tuple[np.n
 
 def surface_of(plan: RenderPlan, k: int, source: int, asked: str) -> str:
     baseline_m = np.linalg.norm(plan.target[k].center_m - plan.source[source].center_m)
-    return "far" if baseline_m < 1e-6 else asked
+    return "infinity" if baseline_m < 1e-6 else asked
 
 
 def half_size(name: str) -> Rig:
@@ -53,10 +53,10 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(("case", "surface"), sampled(CASES, ["far", "ground", "street"]))
+@pytest.mark.parametrize(("case", "surface"), sampled(CASES, ["infinity", "ground", "street"]))
 def test_maps_and_coverage_agree_with_the_float64_reference(case: str, surface: str) -> None:
     source_name, target = CASES[case]
-    plan = build_plan(half_size(source_name), target(), surface=surface)
+    plan = build_plan(half_size(source_name), target(), geometry=surface)
     for k, view in enumerate(plan.targets):
         positions = view.at.to_float().astype(np.float64)
         seen_by_any = np.zeros(view.coverage.shape, bool)
@@ -91,7 +91,7 @@ def border_band(covered: np.ndarray) -> np.ndarray:
 def test_coarse_grid_equals_pixel_by_pixel_evaluation() -> None:
     source, target = half_size("nuscenes"), half_size("waymo")
     coarse = build_plan(source, target)
-    exact = build_plan(source, target, config=FavsConfig(grid_step_px=1))
+    exact = build_plan(source, target, config=RenderConfig(grid_step_px=1))
     for a, b in zip(coarse.targets, exact.targets, strict=True):
         same = a.source_camera == b.source_camera
         assert same.mean() > 0.99  # seams lie where weights on different grids cross
@@ -103,7 +103,7 @@ def test_auto_decides_for_each_pair_not_for_the_rig() -> None:
     plan = build_plan(source, source.turned(yaw_deg=22))
     for k, view in enumerate(plan.targets):
         surfaces = {pair.source: pair.surface for pair in view.pairs}
-        assert surfaces.pop(k) == "far"  # its own centre
+        assert surfaces.pop(k) == "infinity"  # its own centre
         assert set(surfaces.values()) == {"street"}  # the neighbours sit at other centres
 
 
@@ -111,14 +111,14 @@ def test_auto_takes_far_where_parallax_cannot_be_seen() -> None:
     source = half_size("nuscenes")
     plan = build_plan(source, source.shifted(x_m=1e-3))
     own = [next(p for p in view.pairs if p.source == k) for k, view in enumerate(plan.targets)]
-    assert {p.surface for p in own} == {"far"} and all("parallax" in p.reason for p in own)
+    assert {p.surface for p in own} == {"infinity"} and all("parallax" in p.reason for p in own)
 
 
 def test_only_what_the_scene_requires_is_evaluated() -> None:
     source = half_size("nuscenes")
     one_center = source.with_cameras([source[0]])
     plan = build_plan(one_center, one_center.turned(yaw_deg=10))
-    assert plan.counters["pairs_far"] == 1
+    assert plan.counters["pairs_infinity"] == 1
     assert plan.counters["bands"] == 0
 
 
@@ -131,9 +131,9 @@ def test_no_cell_outside_an_image_circle_is_evaluated() -> None:
 
 def test_exact_source_wins_wherever_it_sees() -> None:
     source = half_size("nuscenes")
-    plan = build_plan(source, source.turned(yaw_deg=22), surface="street")
+    plan = build_plan(source, source.turned(yaw_deg=22), geometry="street")
     for k, view in enumerate(plan.targets):
-        _, visible = reference(plan, k, "far", k)
+        _, visible = reference(plan, k, "infinity", k)
         seam_px = 0.02 * view.coverage.shape[1]
         inner = cv2.erode(visible.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=int(2 * seam_px)) > 0
         assert np.all(view.source_camera[inner] == k)
@@ -148,8 +148,8 @@ def test_a_seam_passes_beside_a_labelled_object() -> None:
     source, target, box = Rig([eye(1.0), eye(-1.0)]), Rig([eye(0.0)]), np.array([[9.0, 0.3, 1, 2, 2, 2, 0.2]])
     shown = draw_boxes(target[0], box)[1] == 0
     crossed, beside = (
-        build_plan(source, target, surface=surface, scene=Scene(boxes=box)).targets[0].source_camera
-        for surface in ("street", "objects")
+        build_plan(source, target, geometry=surface, scene=Scene(boxes=box)).targets[0].source_camera
+        for surface in ("street", "boxes")
     )
     assert set(np.unique(crossed[shown])) == {0, 1} == set(np.unique(beside))
     assert len(np.unique(beside[shown])) == 1
@@ -226,7 +226,7 @@ def test_plans_pickle_and_the_cache_is_bounded() -> None:
     keys = []
     for yaw in (1, 2, 3, 1):
         target = source.turned(yaw_deg=yaw)
-        keys.append(plan_key(source, target, "auto", FavsConfig()))
+        keys.append(plan_key(source, target, "auto", RenderConfig()))
         cache.get(keys[-1], lambda target=target: build_plan(source, target))
     assert keys[0] == keys[3] and len(cache) == 2 and cache.size <= cache.limit and cache.misses == 4
     assert len(pickle.loads(pickle.dumps(cache))) == 0
@@ -236,11 +236,11 @@ def test_plan_key_knows_content_not_names() -> None:
     rig = load_rig("nuscenes")
     cameras = [Camera(**{**vars_of(c), "name": c.name + "x"}) for c in rig]
     renamed = Rig(cameras, ground_z_m=rig.ground_z_m, name="other")
-    config = FavsConfig()
+    config = RenderConfig()
     assert plan_key(rig, renamed, "auto", config) == plan_key(renamed, rig, "auto", config)
     for other in (
         plan_key(rig, rig.shifted(x_m=1e-9), "auto", config),
-        plan_key(rig, rig, "far", config),
-        plan_key(rig, rig, "auto", FavsConfig(seam_width=0.01)),
+        plan_key(rig, rig, "infinity", config),
+        plan_key(rig, rig, "auto", RenderConfig(seam_width=0.01)),
     ):
         assert other != plan_key(rig, rig, "auto", config)

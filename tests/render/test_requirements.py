@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.favs.config import FavsConfig, favs_config
+from arbiview_aug.render.config import RenderConfig
 from arbiview_aug.render.plan import RenderPlan, build_plan
 from arbiview_aug.render.requirements import MOVED_M, baselines_m, covers_target_exactly, needs_geometry, static_harm
 from arbiview_aug.render.view_planner import ViewPlanner
+from arbiview_aug.transforms.settings import render_config
 
-FAST = FavsConfig()
+FAST = RenderConfig()
 
 
 def ring(size: tuple[int, int] = (90, 160)) -> Rig:
@@ -31,7 +32,7 @@ def zoomed(camera: Camera, factor: float, size: tuple[int, int] | None = None) -
     return changed if size is None else changed.resize(size)
 
 
-def built_without(source: Rig, target: Rig, config: FavsConfig, monkeypatch: pytest.MonkeyPatch) -> RenderPlan:
+def built_without(source: Rig, target: Rig, config: RenderConfig, monkeypatch: pytest.MonkeyPatch) -> RenderPlan:
     """The plan for which every source was looked at."""
     with monkeypatch.context() as patch:
         patch.setattr(ViewPlanner, "_around_unseen", lambda self, region: np.ones_like(self._open))
@@ -47,18 +48,18 @@ def same(one: RenderPlan, two: RenderPlan) -> bool:
 
 
 @pytest.mark.parametrize(
-    "config", [FAST, favs_config("draft"), FavsConfig(distance_gamma=1.5)], ids=["fast", "draft", "gamma"]
+    "config", [FAST, render_config("draft"), RenderConfig(distance_gamma=1.5)], ids=["fast", "draft", "gamma"]
 )
 @pytest.mark.parametrize(
     "view", [lambda c: c, lambda c: zoomed(c, 1.2), lambda c: zoomed(c, 1.4).turned(yaw_deg=2, pitch_deg=1)]
 )
 def test_no_pixel_changes_where_one_source_serves_alone(
-    view: Callable[[Camera], Camera], config: FavsConfig, monkeypatch: pytest.MonkeyPatch
+    view: Callable[[Camera], Camera], config: RenderConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig = ring()
     target = rig.with_cameras([view(camera) for camera in rig])
     plan, whole = build_plan(rig, target, config=config), built_without(rig, target, config, monkeypatch)
-    assert plan.counters["pairs_far"] == len(rig)
+    assert plan.counters["pairs_infinity"] == len(rig)
     assert "pairs_street" not in plan.counters and whole.counters["pairs_street"] > 0
     assert same(plan, whole) and all(seen.all() for seen in plan.coverage)
 
@@ -111,7 +112,7 @@ def test_a_source_that_serves_alone_covers_every_pixel(
     event(f"masked {masked}, exact {exact}")
     rig = Rig([source])
     for surface in ("auto", "street"):
-        assert build_plan(rig, rig.with_cameras([target]), surface=surface).targets[0].coverage.all()
+        assert build_plan(rig, rig.with_cameras([target]), geometry=surface).targets[0].coverage.all()
 
 
 def test_what_does_not_serve_alone() -> None:
@@ -126,8 +127,8 @@ def test_what_does_not_serve_alone() -> None:
         (source, source.turned(yaw_deg=180), FAST),
         (source, zoomed(source, 1.5).shifted(x_m=2e-6), FAST),  # another centre
         (replace(source, mask=hidden), zoomed(source, 1.5), FAST),
-        (source, source, FavsConfig(primary_bonus=1.0)),  # exactness counts for nothing
-        (source, source, FavsConfig(distance_gamma=8.0)),  # at the border others weigh more
+        (source, source, RenderConfig(primary_bonus=1.0)),  # exactness counts for nothing
+        (source, source, RenderConfig(distance_gamma=8.0)),  # at the border others weigh more
         (fish, fish, FAST),  # past its fold a lens sees nothing
         (ring((91, 161))[0], ring((91, 161))[0].resize((45, 80)), FAST),  # halving drops the last row and column
     ):
@@ -141,7 +142,7 @@ def test_two_sources_at_one_centre_share_the_view() -> None:
     rig = Rig([wide, replace(zoomed(wide, 3.0), name="tele"), replace(wide.shifted(y_m=0.5), name="beside")])
     target = Rig([zoomed(wide, 1.5)])
     plan = build_plan(rig, target)
-    assert plan.counters == plan.counters | {"pairs_far": 2} and "pairs_street" not in plan.counters
+    assert plan.counters == plan.counters | {"pairs_infinity": 2} and "pairs_street" not in plan.counters
     assert set(np.unique(plan.targets[0].source_camera)) == {0, 1}
 
 
@@ -183,11 +184,11 @@ def test_baselines_align_the_roads() -> None:
 
 def test_a_static_surface_harms_where_cameras_move_and_pixels_depend_on_the_street() -> None:
     rig = ring()
-    for surface in ("far", "ground", "street"):
+    for surface in ("infinity", "ground", "street"):
         assert "stand up to 0.60 m" in str(static_harm(rig, rig.shifted(z_m=0.6), surface, FAST))
         assert static_harm(rig, rig.shifted(z_m=0.9 * MOVED_M), surface, FAST) is None
         assert static_harm(rig, rig.turned(yaw_deg=20), surface, FAST) is None
-    for surface in ("objects", "lidar", "motion"):
+    for surface in ("boxes", "lidar", "motion"):
         assert static_harm(rig, rig.shifted(z_m=0.6), surface, FAST) is None
     one = Rig([rig[0]])
     assert static_harm(one, one.turned(yaw_deg=180).shifted(z_m=0.6), "street", FAST) is None  # nothing is seen

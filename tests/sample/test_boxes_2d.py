@@ -87,7 +87,7 @@ def test_a_retargeted_sample_knows_its_own_boxes() -> None:
     rig = demo_source_rig((64, 176))
     sample = SyntheticDrive(rig, num_frames=1, lidar=False)[0]
     target = rig.turned(yaw_deg=20).shifted(z_m=0.3)
-    out = RigRetarget(target, surface="street")(sample)
+    out = RigRetarget(target, geometry="street")(sample)
     of_sample, of_rig = project_boxes_3d(out["boxes_3d"], out), project_boxes_3d(out["boxes_3d"], target)
     for one, two in zip(of_sample, of_rig, strict=True):
         assert one.rows.tolist() == two.rows.tolist() and np.allclose(one.boxes, two.boxes, atol=1e-6)

@@ -29,13 +29,13 @@ def test_lenses_of_a_batch() -> None:
     """A name for each camera, over the frames where they differ: what a loader gives can be retargeted again."""
     plain = demo_source_rig((36, 64))
     bent = plain.with_cameras([replace(c, lens="radtan", distortion=(-0.1, 0.01, 0, 0)) for c in plain])
-    step = RigRetarget(bent, size=(36, 64), p=0.5, surface="street")
+    step = RigRetarget(bent, size=(36, 64), p=0.5, geometry="street")
     sample = SyntheticDrive(plain, num_frames=1)[0]
     skipped, done = (step(sample, params={"skipped": value}) for value in (1.0, 0.0))
     assert collate([done, done])["lens"] == done["lens"] == ["radtan"] * len(plain)
     mixed = collate([skipped, done])
     assert mixed["lens"] == [["pinhole", "radtan"]] * len(plain)
-    back = RigRetarget(plain, surface="street")
+    back = RigRetarget(plain, geometry="street")
     again = back(mixed)
     for k, single in enumerate((skipped, done)):
         assert torch.equal(again["images"][k], back(single)["images"])

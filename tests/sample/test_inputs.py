@@ -135,7 +135,7 @@ CALIBRATION: dict[str, tuple[dict[str, Any], str]] = {
     "swapped": (sample(images=torch.zeros(2, 3, W, H), rig=rig()), r"'c0': .* got \(64, 36\); height and width"),
     "swapped, no rig": (sample(images=torch.zeros(2, 3, W, H)), r"K\[0\]: .*; height and width are swapped"),
     "coverage": (sample(coverage=0.7), "coverage: expected a bool map of the size of each image, .* rename the key"),
-    "ignore": (sample(ignore=torch.zeros(2, 5, 5, dtype=torch.bool)), "ignore: expected a bool map of the size"),
+    "ego_mask": (sample(ego_mask=torch.zeros(2, 5, 5, dtype=torch.bool)), "ego_mask: expected a bool map of the size"),
 }
 
 

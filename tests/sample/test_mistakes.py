@@ -164,7 +164,7 @@ def test_what_was_retargeted_has_no_findings(target: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for holes in ("fill", "black"):
-            out = RigRetarget(rig.resized(0.1), surface="street", holes=holes)(right_street())
+            out = RigRetarget(rig.resized(0.1), geometry="street", holes=holes)(right_street())
             assert check(out).ok, check(out)
 
 

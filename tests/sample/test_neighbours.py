@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Rig, RigRetarget, SampleError, SampleTypeError
+from arbiview_aug import Rig, RigRetarget, SampleError, SampleKeys, SampleTypeError
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.sample.inputs import read_frames
@@ -141,7 +141,7 @@ def test_too_many_are_refused(sample: dict[str, Any]) -> None:
 
 
 def test_a_batch_has_a_list_for_each_frame(sample: dict[str, Any]) -> None:
-    retarget = RigRetarget(RIG.turned(pitch_deg=-10), outputs=("source_frame",))
+    retarget = RigRetarget(RIG.turned(pitch_deg=-10), keys=SampleKeys(extra=("source_frame",)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         one, alone = retarget(sample), retarget(sample | {"neighbours": []})
@@ -202,7 +202,7 @@ def test_what_numpy_would_trip_over_is_named(sample: dict[str, Any], key: str, v
 
 
 def test_frames_of_two_leading_dimensions(sample: dict[str, Any]) -> None:
-    retarget = RigRetarget(demo_target_rig((64, 176)), surface="street", outputs=("source_frame",))
+    retarget = RigRetarget(demo_target_rig((64, 176)), geometry="street", keys=SampleKeys(extra=("source_frame",)))
     alone = retarget(sample)
     batch = {key: sample[key].expand(2, 3, *sample[key].shape) for key in ("images", "ego2world")}
     batch |= {"rig": RIG, "time_s": torch.full((2, 3), float(sample["time_s"]))}
@@ -266,7 +266,7 @@ def test_scan_lines_of_other_frames_fill_the_gaps(sample: dict[str, Any]) -> Non
         RigRetarget(retarget.target, neighbours=None)(given | {"neighbours": [unread]})["images"],
         RigRetarget(retarget.target, neighbours=None)(given)["images"],
     )
-    RigRetarget(retarget.target, surface="street")(given | {"neighbours": [unread]})
+    RigRetarget(retarget.target, geometry="street")(given | {"neighbours": [unread]})
     with pytest.warns(UserWarning, match=r"points of neighbour '.*' are left out: points: expected a tensor"):
         out = retarget(given | {"neighbours": [unread]})
     assert torch.equal(out["images"], retarget(given | {"neighbours": [{**then, "points": None}]})["images"])

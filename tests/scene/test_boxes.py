@@ -13,7 +13,8 @@ from arbiview_aug import Rig, RigRetarget, SampleError
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import pixel_rays
 from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig
-from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.errors import GeometryWarning
+from arbiview_aug.render.config import RenderConfig
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import build_plan
 from arbiview_aug.scene.boxes import BoxSurface, checked_boxes
@@ -130,7 +131,7 @@ def test_extreme_boxes_render_finite_maps(boxes: np.ndarray, size: tuple[int, in
         name="c", azimuth_deg=0, position_m=(0.0, 0.0, 1.5), width_px=size[1], height_px=size[0], horizontal_fov_deg=80
     )
     rig = Rig([camera])
-    plan = build_plan(rig, rig.shifted(y_m=0.3, z_m=0.4), surface="objects", scene=Scene(checked_boxes(boxes)))
+    plan = build_plan(rig, rig.shifted(y_m=0.3, z_m=0.4), geometry="boxes", scene=Scene(checked_boxes(boxes)))
     image = torch.full((3, *size), 200, dtype=torch.uint8)
     view = render_opencv(plan, [image])[0]
     assert bool((view[:, torch.from_numpy(plan.coverage[0])] == 200).all())
@@ -167,12 +168,14 @@ def test_vehicles_are_truer_than_over_a_static_surface(street: tuple[SyntheticDr
         truth = drive.render(i, rig.shifted(**move))
         vehicle = truth.classes.numpy() == SceneClass.VEHICLE
         error = {}
-        for surface in ("street", "objects"):
-            plan = build_plan(rig, rig.shifted(**move), surface=surface, scene=Scene(checked_boxes(sample["boxes_3d"])))
+        for surface in ("street", "boxes"):
+            plan = build_plan(
+                rig, rig.shifted(**move), geometry=surface, scene=Scene(checked_boxes(sample["boxes_3d"]))
+            )
             views = torch.stack(render_opencv(plan, list(sample["images"]))).float()
             squared = ((views - truth.images.float()) ** 2).mean(1).numpy()
             error[surface] = squared[vehicle & np.stack(plan.coverage)].mean()
-        gain.append(10 * np.log10(error["street"] / error["objects"]))
+        gain.append(10 * np.log10(error["street"] / error["boxes"]))
     assert min(gain) > 3 and np.mean(gain) > 5
 
 
@@ -185,7 +188,7 @@ def test_what_a_car_hid_is_a_hole_and_not_its_colour() -> None:
     directions = camera.unproject(camera.pixel_grid()).directions
     hit = solids_ahead(CAR, solids(CAR), camera.center_m, directions)[0] > 0
     image = np.where(hit[..., None], np.array([220, 20, 20]), np.array([90, 90, 90])).astype(np.uint8)
-    plan = build_plan(rig, rig.shifted(z_m=1.5), surface="objects", scene=Scene(CAR))
+    plan = build_plan(rig, rig.shifted(z_m=1.5), geometry="boxes", scene=Scene(CAR))
     view = render_opencv(plan, [torch.from_numpy(image).permute(2, 0, 1)])[0].permute(1, 2, 0).numpy()
     target, coverage = plan.target[0], plan.coverage[0]
     rays = target.unproject(target.pixel_grid()).directions
@@ -206,8 +209,8 @@ def test_coarse_grid_equals_pixel_by_pixel_evaluation(size: tuple[int, int]) -> 
     source = demo_source_rig((128, 352))
     boxes = checked_boxes(SyntheticDrive(source, num_frames=1, seed=0, lidar=False).scene(0).boxes_ego(0.0))
     target = source.shifted(z_m=0.7).resized(size)
-    coarse = build_plan(source, target, surface="objects", scene=Scene(boxes))
-    exact = build_plan(source, target, surface="objects", scene=Scene(boxes), config=FavsConfig(grid_step_px=1))
+    coarse = build_plan(source, target, geometry="boxes", scene=Scene(boxes))
+    exact = build_plan(source, target, geometry="boxes", scene=Scene(boxes), config=RenderConfig(grid_step_px=1))
     for a, b in zip(coarse.targets, exact.targets, strict=True):
         assert (a.coverage != b.coverage).mean() < 0.001
         same = (a.source_camera == b.source_camera) & a.coverage
@@ -221,16 +224,16 @@ def test_in_a_sample() -> None:
     images = torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8)
     sample = {"images": images, "rig": rig, "boxes_3d": torch.zeros(0, 7)}
     lifted = rig.shifted(z_m=0.5)
-    empty = RigRetarget(lifted, surface="objects")(sample)
+    empty = RigRetarget(lifted, geometry="boxes")(sample)
     # That there is no object makes the street less uncertain: weights of the seams differ, and nothing else.
-    assert torch.equal(empty["coverage"], RigRetarget(lifted, surface="street")(sample)["coverage"])
-    retarget = RigRetarget(lifted, surface="objects")
+    assert torch.equal(empty["coverage"], RigRetarget(lifted, geometry="street")(sample)["coverage"])
+    retarget = RigRetarget(lifted, geometry="boxes")
     with_car = retarget(sample | {"boxes_3d": torch.from_numpy(CAR).float()})
     assert with_car["coverage"].sum() < empty["coverage"].sum()
-    assert "objects surface" in str(retarget.explain(sample | {"boxes_3d": torch.from_numpy(CAR)}))
+    assert "boxes surface" in str(retarget.explain(sample | {"boxes_3d": torch.from_numpy(CAR)}))
     batch = {"images": images.expand(2, 6, 3, 64, 176), "rig": rig, "boxes_3d": torch.from_numpy(CAR).expand(2, 1, 7)}
     assert torch.equal(retarget(batch)["images"][1], with_car["images"])
-    with pytest.raises(SampleError, match=r"surface='objects': expected 'boxes_3d'"):
+    with pytest.raises(SampleError, match=r"geometry='boxes': expected 'boxes_3d'"):
         retarget({"images": images, "rig": rig})
     with pytest.raises(SampleError, match=r"boxes_3d: expected shape \(B, >= 7\)"):
         retarget(sample | {"boxes_3d": torch.zeros(2, 5)})
@@ -246,10 +249,10 @@ def test_auto_takes_boxes_where_there_are_some_and_warns_where_cameras_move_with
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert torch.equal(
-            lifted(sample | boxes)["images"], RigRetarget(lifted.target, surface="objects")(sample | boxes)["images"]
+            lifted(sample | boxes)["images"], RigRetarget(lifted.target, geometry="boxes")(sample | boxes)["images"]
         )
         RigRetarget(rig.shifted(z_m=0.1))(sample)  # little harm
-        RigRetarget(rig.shifted(z_m=0.5), surface="street")(sample)  # asked for
+        RigRetarget(rig.shifted(z_m=0.5), geometry="street")(sample)  # asked for
     ahead = RigRetarget(rig.shifted(x_m=0.5))
     with pytest.warns(UserWarning, match=r"target cameras stand up to 0\.50 m from the nearest source camera") as said:
         bare = ahead(sample)
@@ -257,7 +260,7 @@ def test_auto_takes_boxes_where_there_are_some_and_warns_where_cameras_move_with
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         ahead(sample)  # said once
-    assert torch.equal(bare["images"], RigRetarget(ahead.target, surface="street")(sample)["images"])
+    assert torch.equal(bare["images"], RigRetarget(ahead.target, geometry="street")(sample)["images"])
 
 
 @pytest.mark.parametrize("change", ["narrow", "lower", "higher", "turned"])
@@ -280,27 +283,25 @@ def test_auto_renders_the_target_that_was_asked_for(change: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert torch.equal(retarget(sample)["images"], out["images"])  # said once
-        assert torch.equal(RigRetarget(target, surface="street")(sample)["images"], out["images"])
+        assert torch.equal(RigRetarget(target, geometry="street")(sample)["images"], out["images"])
     assert np.allclose(out["cam2ego"], target.cam2ego) and np.allclose(out["K"], target.K)
 
 
-def test_strict_refuses_what_auto_warns_of() -> None:
+def test_a_filter_makes_errors_of_what_auto_warns_of() -> None:
     rig = demo_source_rig((64, 176))
     sample = {"images": torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8), "rig": rig}
-    strict = RigRetarget(rig.shifted(z_m=0.5), strict=True)
-    for _ in range(2):  # not once: no sample passes
-        with pytest.raises(SampleError, match=r"strict=True: target cameras stand up to 0\.50 m .* Better: 'points'"):
-            strict(sample)
-    assert "objects lean and stretch" in str(strict.explain(sample))  # that says why, and does not raise
+    raised = RigRetarget(rig.shifted(z_m=0.5))
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        strict(sample | {"boxes_3d": torch.from_numpy(CAR)})
-        RigRetarget(rig.shifted(z_m=0.1), strict=True)(sample)
-        RigRetarget(rig.turned(yaw_deg=20), strict=True)(sample)
-        RigRetarget(rig.shifted(z_m=0.5), surface="street", strict=True)(sample)  # asked for
-        RigRetarget(rig.shifted(z_m=0.5), size=(64, 176), p=0.5, strict=True)(sample, params={"skipped": 0.0})
-    with pytest.raises(ValueError, match="strict: expected True or False, got 'yes'"):
-        RigRetarget(rig, strict="yes")  # type: ignore[arg-type]
+        warnings.simplefilter("error", GeometryWarning)
+        for _ in range(2):  # not once: no sample passes
+            with pytest.raises(GeometryWarning, match=r"target cameras stand up to 0\.50 m .* Better: 'points'"):
+                raised(sample)
+        assert "objects lean and stretch" in str(raised.explain(sample))  # that says why, and does not raise
+        raised(sample | {"boxes_3d": torch.from_numpy(CAR)})
+        RigRetarget(rig.shifted(z_m=0.1))(sample)
+        RigRetarget(rig.turned(yaw_deg=20))(sample)
+        RigRetarget(rig.shifted(z_m=0.5), geometry="street")(sample)  # asked for
+        RigRetarget(rig.shifted(z_m=0.5), size=(64, 176), p=0.5)(sample, params={"skipped": 0.0})
 
 
 def test_the_warning_names_the_mixing_that_works() -> None:

@@ -15,7 +15,7 @@ from arbiview_aug import RigRetarget, SampleError, load_rig
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import pixel_rays
 from arbiview_aug.datasets.synthetic import demo_source_rig
-from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.render.config import RenderConfig
 from arbiview_aug.render.plan import build_plan
 from arbiview_aug.scene.depth_maps import points_of_depth
 from arbiview_aug.scene.panorama import REACH_RAD
@@ -249,7 +249,7 @@ def test_ten_million_points_for_six_cameras(report_bound: Callable[..., None]) -
     del azimuth, elevation, radius, level
     boxes = np.concatenate([rng.uniform(-40, 40, (60, 2)), np.tile([0.8, 4.5, 1.9, 1.6, 0.3], (60, 1))], 1)
     sample = {"images": torch.zeros(6, 3, 256, 704, dtype=torch.uint8), "rig": rig, "points": points}
-    retarget = RigRetarget(rig.shifted(z_m=0.6), surface="lidar")
+    retarget = RigRetarget(rig.shifted(z_m=0.6), geometry="lidar")
     for more in ({}, {"boxes_3d": torch.from_numpy(boxes)}):
         tracemalloc.start()
         start = time.process_time()
@@ -325,7 +325,7 @@ def test_coarse_grid_equals_pixel_by_pixel_evaluation() -> None:
     rig = demo_source_rig((128, 352))
     scene = Scene(points=np.concatenate([NEAR, FAR]))
     plans = [
-        build_plan(rig, rig.shifted(z_m=0.7), surface="lidar", scene=scene, config=FavsConfig(grid_step_px=step))
+        build_plan(rig, rig.shifted(z_m=0.7), geometry="lidar", scene=scene, config=RenderConfig(grid_step_px=step))
         for step in (8, 1)
     ]
     for a, b in zip(*(plan.targets for plan in plans), strict=True):

@@ -11,15 +11,15 @@ import torch
 
 from arbiview_aug import Camera, Rig, RigRetarget
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.choices import SurfaceName
+from arbiview_aug.choices import GeometryName
 from arbiview_aug.errors import SampleError
 from arbiview_aug.scene.depth_maps import anchored
-from arbiview_aug.scene.scene import SURFACES, Scene, SurfaceRow
+from arbiview_aug.scene.scene import GEOMETRIES, GeometryRow, Scene
 from arbiview_aug.scene.surface import StaticSurface
 
 
 def test_names_of_the_type_are_those_of_the_table() -> None:
-    assert get_args(SurfaceName) == tuple(SURFACES)
+    assert get_args(GeometryName) == tuple(GEOMETRIES)
 
 
 def test_auto_takes_all_that_was_measured() -> None:
@@ -28,11 +28,11 @@ def test_auto_takes_all_that_was_measured() -> None:
     assert Scene(points=some, motion=some).best == Scene(motion=some, further=maps).best == "fused"
     assert Scene(points=some, motion=none).best == Scene(boxes, further=maps).best == "lidar"
     assert Scene(boxes, none, some).best == Scene(motion=some).best == "motion"
-    assert Scene(boxes, none, none).best == "objects" and Scene(motion=none).best == "street"
+    assert Scene(boxes, none, none).best == "boxes" and Scene(motion=none).best == "street"
 
 
 @pytest.mark.parametrize("surface", ["auto", "fused", "lidar", "motion"])
-def test_points_and_depth_from_motion_are_fused(surface: SurfaceName) -> None:
+def test_points_and_depth_from_motion_are_fused(surface: GeometryName) -> None:
     """A near wall that only LiDAR saw, left, and one that only motion saw, right."""
     camera = Camera.looking(name="front", azimuth_deg=0, width_px=96, height_px=64, horizontal_fov_deg=80)
     target = Rig([camera.shifted(z_m=0.5)])
@@ -41,7 +41,7 @@ def test_points_and_depth_from_motion_are_fused(surface: SurfaceName) -> None:
     depth[:, 24:40, 52:90] = 8.0
     points = torch.from_numpy(np.stack([np.full_like(y, 8.0), y, z], -1))
     sample = {"images": torch.rand(1, 3, 64, 96), "rig": Rig([camera]), "points": points, "motion_depth_m": depth}
-    explained = RigRetarget(target, surface=surface).explain(sample)
+    explained = RigRetarget(target, geometry=surface).explain(sample)
     (plan,) = explained.plan.targets
     away_px = np.arange(64)[:, None] - plan.at.to_float()[..., 1]
     near_px = 0.5 / 8 * camera.K[1, 1]
@@ -50,8 +50,8 @@ def test_points_and_depth_from_motion_are_fused(surface: SurfaceName) -> None:
     assert f"geometry: {len(points)} points" in str(explained) or surface == "motion"
     assert "points of depth from motion; the street elsewhere" in str(explained) or surface == "lidar"
     lacking = {key: value for key, value in sample.items() if key != "motion_depth_m"}
-    with pytest.raises(SampleError, match="surface='fused': expected 'neighbours' in the sample, or 'motion_depth_m'"):
-        RigRetarget(target, surface="fused")(lacking)
+    with pytest.raises(SampleError, match="geometry='fused': expected 'neighbours' in the sample, or 'motion_depth_m'"):
+        RigRetarget(target, geometry="fused")(lacking)
 
 
 def test_learned_depth_follows_what_was_measured() -> None:
@@ -71,7 +71,7 @@ def test_learned_depth_follows_what_was_measured() -> None:
     rig, target = Rig([camera]), Rig([camera.shifted(z_m=0.5)])
     sample = {"images": torch.rand(1, 3, 64, 96), "rig": rig, "points": torch.from_numpy(points)}
     sample["learned_depth_m"] = depth[None]
-    (plan,) = RigRetarget(target, surface="fused").explain(sample).plan.targets
+    (plan,) = RigRetarget(target, geometry="fused").explain(sample).plan.targets
     away_px = np.arange(64)[:, None] - plan.at.to_float()[..., 1]
     assert np.allclose(away_px[30, 26:70], 0.5 / 8 * camera.K[1, 1], atol=0.1)
     assert (away_px[30, [12, 16, 80, 84]] < 1).all()
@@ -87,13 +87,13 @@ def test_a_network_overrules_motion_where_they_contradict_each_other() -> None:
     sample |= {"learned_depth_m": network[None], "motion_depth_m": motion[None]}
 
     def depth_m(given: dict[str, object], row: int, column: int) -> float:
-        (plan,) = RigRetarget(Rig([camera.shifted(z_m=0.5)]), surface="fused").explain(given).plan.targets
+        (plan,) = RigRetarget(Rig([camera.shifted(z_m=0.5)]), geometry="fused").explain(given).plan.targets
         return float(0.5 * camera.K[1, 1] / (row - plan.at.to_float()[row, column, 1]))
 
     assert depth_m(sample, 36, 45) == pytest.approx(5.0, rel=0.03)
     assert depth_m(sample, 30, 80) == pytest.approx(10.0, rel=0.02)
     batch = {key: torch.stack([value] * 2) for key, value in sample.items() if key != "rig"} | {"rig": sample["rig"]}
-    torch.testing.assert_close(*RigRetarget(Rig([camera.shifted(z_m=0.5)]), surface="fused")(batch)["images"])
+    torch.testing.assert_close(*RigRetarget(Rig([camera.shifted(z_m=0.5)]), geometry="fused")(batch)["images"])
     agreed = sample | {"learned_depth_m": torch.minimum(network, motion * 0.9)[None]}
     agreed["learned_depth_m"][0][car] = 7.5
     assert depth_m(agreed, 36, 45) == pytest.approx(8.0, rel=0.04)
@@ -121,10 +121,10 @@ def test_a_surface_is_added_by_its_row_alone(monkeypatch: pytest.MonkeyPatch) ->
     rig = Rig([camera])
     target = Rig([camera.shifted(z_m=0.5)])
     sample = {"images": torch.rand(1, 3, 64, 96), "rig": rig, "slope": torch.tensor([0.1])}
-    with pytest.raises(ValueError, match=r"surface: expected one of auto, far, .*, got 'ramp'"):
-        RigRetarget(target, surface="ramp")  # type: ignore[arg-type]
-    monkeypatch.setitem(SURFACES, "ramp", SurfaceRow(ramp, reads=("slope",), needs="slope", has_wall=False))
-    retarget = RigRetarget(target, surface="ramp")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"geometry: expected one of auto, infinity, .*, got 'ramp'"):
+        RigRetarget(target, geometry="ramp")  # type: ignore[arg-type]
+    monkeypatch.setitem(GEOMETRIES, "ramp", GeometryRow(ramp, reads=("slope",), needs="slope", has_wall=False))
+    retarget = RigRetarget(target, geometry="ramp")  # type: ignore[arg-type]
     rows = {slope: retarget({**sample, "slope": torch.tensor([slope])}) for slope in (0.0, 0.1)}
     assert not torch.equal(rows[0.0]["images"], rows[0.1]["images"])
     # A plane over a plane: the homography of the road as it rises.
@@ -136,7 +136,7 @@ def test_a_surface_is_added_by_its_row_alone(monkeypatch: pytest.MonkeyPatch) ->
     expected = camera.project(origin + distance_m * ray).uv
     np.testing.assert_allclose(plan.at.to_float()[50, 48], expected, atol=1 / 16)
     del sample["slope"]
-    with pytest.raises(SampleError, match="surface='ramp': expected 'slope' in the sample, got none"):
+    with pytest.raises(SampleError, match="geometry='ramp': expected 'slope' in the sample, got none"):
         retarget(sample)
-    with pytest.raises(ValueError, match="prepare: expected a surface whose plans come back, got 'ramp'"):
+    with pytest.raises(ValueError, match="prepare: expected a geometry whose plans come back, got 'ramp'"):
         retarget.prepare(rig)

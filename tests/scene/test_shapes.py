@@ -124,7 +124,7 @@ def test_faces_tell_their_object_and_whether_they_are_roofs_or_bonnets() -> None
     assert not BoxSurface(Street(), small, solids(small)).face_is_top.any()
 
 
-@pytest.mark.parametrize("surface", ["objects", "lidar"])
+@pytest.mark.parametrize("surface", ["boxes", "lidar"])
 def test_a_roof_that_no_source_saw_is_a_hole(surface: str) -> None:
     low = Camera.looking(
         name="low", azimuth_deg=0, position_m=(0.0, 0.0, 1.3), width_px=320, height_px=160, horizontal_fov_deg=60
@@ -133,7 +133,7 @@ def test_a_roof_that_no_source_saw_is_a_hole(surface: str) -> None:
     points = surface_points(planes, CAR[0])
     points = points[points[:, 2] < 1.3] if surface == "lidar" else np.zeros((0, 3))
     rig = Rig([low])
-    plan = build_plan(rig, rig.shifted(z_m=1.2), surface=surface, scene=Scene(CAR, points))
+    plan = build_plan(rig, rig.shifted(z_m=1.2), geometry=surface, scene=Scene(CAR, points))
     target, among = plan.target[0], PointCloudWithBoxes.among(Street(), points, CAR)
     faces = solids_ahead(CAR, among.solids, target.center_m, target.unproject(target.pixel_grid()).directions)[1]
     inner = cv2.erode(np.isin(faces, [5, 11]).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -181,7 +181,7 @@ def true_holes(rig: Rig, depth: np.ndarray, target: Rig, far: np.ndarray) -> np.
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("surface", "least"), [("objects", (0.72, 0.60)), ("lidar", (0.80, 0.84))])
+@pytest.mark.parametrize(("surface", "least"), [("boxes", (0.72, 0.60)), ("lidar", (0.80, 0.84))])
 def test_holes_are_the_true_ones(surface: str, least: tuple[float, float]) -> None:
     """Streets of shaped cars seen from 0.7 m higher: precision and recall of holes, and hidden objects called covered.
 
@@ -193,7 +193,7 @@ def test_holes_are_the_true_ones(surface: str, least: tuple[float, float]) -> No
     for i in range(2):
         sample, view = drive[i], drive.render(i, target)
         scene = Scene(np.asarray(sample["boxes_3d"], np.float64)[:, :7], np.asarray(sample["points"]))
-        holes = ~np.stack(build_plan(rig, target, surface=surface, scene=scene).coverage)
+        holes = ~np.stack(build_plan(rig, target, geometry=surface, scene=scene).coverage)
         true = true_holes(rig, np.asarray(drive.render(i).depth_m), target, np.asarray(view.depth_m))
         counts += [(holes & true).sum(), holes.sum(), true.sum()]
         on_object = true & (np.asarray(view.instances) >= 0)

@@ -13,7 +13,7 @@ import sys
 import numpy as np
 import torch
 
-from arbiview_aug import RigRetarget
+from arbiview_aug import RigRetarget, SampleKeys
 from arbiview_aug.cli.arguments import command_parser, count, size
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.agreement import target_consistency
@@ -30,7 +30,9 @@ def main(argv: list[str] | None = None) -> int:
     source = demo_source_rig(arguments.size)
     drive = SyntheticDrive(source, num_frames=arguments.frames, seed=HELD_OUT_SEED, lidar=False)
     target = wide_target(source)
-    render = RigRetarget(target, surface="street", holes="black", outputs=("confidence",), harmonise=False)
+    render = RigRetarget(
+        target, geometry="street", holes="black", keys=SampleKeys(extra=("confidence",)), match_exposure=False
+    )
     for steps in arguments.steps:
         gains: dict[str, list[float]] = {"agreement": [], "holes": []}
         for k in range(arguments.frames):

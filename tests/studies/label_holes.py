@@ -196,7 +196,7 @@ def _psnr_db(square: Floats) -> float:
 
 def figures(streets: Sequence[Street], surface: str, seed: int) -> dict[str, float]:
     """All columns of one surface over one target's streets."""
-    retarget = RigRetarget(streets[0].rig, surface=surface, neighbours=None)
+    retarget = RigRetarget(streets[0].rig, geometry=surface, neighbours=None)
     views, rings, true_rings, controls, true_controls, errors = [], [], [], [], [], []
     found = np.zeros(5)  # true positives, false positives, false negatives, hidden pixels of objects, those covered
     for street in streets:
@@ -245,7 +245,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--streets", type=count, default=20, metavar="N")
     parser.add_argument("--seed", type=int, default=50, metavar="N", help="of the streets and the probe")
     parser.add_argument("--targets", nargs="+", choices=TARGETS, default=list(TARGETS))
-    parser.add_argument("--surfaces", nargs="+", default=["auto", "objects"], metavar="NAME")
+    parser.add_argument("--surfaces", nargs="+", default=["auto", "boxes"], metavar="NAME")
     add_output(parser)
     arguments = parser.parse_args(argv)
     folder = writable_folder(Path(arguments.output), arguments.output)

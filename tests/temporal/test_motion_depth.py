@@ -120,13 +120,13 @@ def test_labelled_objects_are_left_out(sample: dict[str, Any], exact: MotionDept
 
 def test_as_a_surface(drive: SyntheticDrive, sample: dict[str, Any], exact: MotionDepth) -> None:
     target = SIDE.shifted(y_m=1.0)
-    motion = RigRetarget(target, surface="motion", neighbours=None)
+    motion = RigRetarget(target, geometry="motion", neighbours=None)
     online = motion(sample)
     offline = motion({**sample, "neighbours": [], "motion_depth_m": torch.from_numpy(np.stack(exact.depth_m))})
     assert torch.equal(online["images"], offline["images"])
     assert "motion_depth_m" not in offline and "neighbours" not in online
     true = drive.render(1, target).images.float()
-    static = RigRetarget(target, surface="street")(sample)
+    static = RigRetarget(target, geometry="street")(sample)
     both = (online["coverage"] & static["coverage"])[:, None]
     errors = [float(((out["images"] - true) ** 2 * both).sum()) for out in (online, static)]
     assert errors[0] < 0.6 * errors[1]  # 2.2 dB
@@ -136,10 +136,10 @@ def test_as_a_surface(drive: SyntheticDrive, sample: dict[str, Any], exact: Moti
 
 def test_the_street_replaces_declined_depth_with_a_warning(sample: dict[str, Any]) -> None:
     target = SIDE.shifted(y_m=0.5)
-    motion = RigRetarget(target, surface="motion")
+    motion = RigRetarget(target, geometry="motion")
     with pytest.warns(UserWarning, match="depth from motion: none, no frame .* the static street stands"):
         out = motion({**sample, "neighbours": []})
-    assert torch.equal(out["images"], RigRetarget(target, surface="street")(sample | {"neighbours": []})["images"])
+    assert torch.equal(out["images"], RigRetarget(target, geometry="street")(sample | {"neighbours": []})["images"])
 
 
 @pytest.mark.parametrize("size", [(1, 8), (8, 1)])
@@ -150,10 +150,10 @@ def test_images_of_one_pixel_are_declined(size: tuple[int, int]) -> None:
 
 def test_messages(sample: dict[str, Any]) -> None:
     bare = {key: value for key, value in sample.items() if key != "neighbours"}
-    motion = RigRetarget(SIDE.shifted(y_m=0.5), surface="motion")
-    with pytest.raises(SampleError, match=r"surface='motion': expected 'neighbours' .* 'motion_depth_m'"):
+    motion = RigRetarget(SIDE.shifted(y_m=0.5), geometry="motion")
+    with pytest.raises(SampleError, match=r"geometry='motion': expected 'neighbours' .* 'motion_depth_m'"):
         motion(bare)
     with pytest.raises(SampleError, match=r"motion_depth_m: camera 'front': expected a map of \(96, 256\)"):
         motion({**bare, "motion_depth_m": torch.zeros(2, 10, 10)})
-    same = RigRetarget(SIDE, surface="motion")(bare)  # nothing depends on distances: nothing is needed
+    same = RigRetarget(SIDE, geometry="motion")(bare)  # nothing depends on distances: nothing is needed
     assert torch.equal(same["images"], sample["images"])

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from arbiview_aug import RandomRig, Rig, RigRetarget, load_rig
-from arbiview_aug.choices import SurfaceName
+from arbiview_aug.choices import GeometryName
 from arbiview_aug.transforms.explain import Explanation
 
 
@@ -32,7 +32,7 @@ def test_entries_are_plain_data_and_add_up() -> None:
         shares = [source["share"] for source in entry["sources"]]
         assert shares == sorted(shares, reverse=True)
         own = next(source for source in entry["sources"] if source["camera"] == nuscenes().names[k])
-        assert own["surface"] == "far" and own["reason"] == "centres coincide: exact"
+        assert own["surface"] == "infinity" and own["reason"] == "centres coincide: exact"
         assert own["baseline_m"] < 1e-6 and own["parallax_px"] < 1e-3
         others = [source for source in entry["sources"] if source is not own]
         assert others and {other["surface"] for other in others} == {"street"}
@@ -49,13 +49,13 @@ def test_text() -> None:
     assert repr(explained(ahead)) == text
 
 
-@pytest.mark.parametrize("surface", ["auto", "street", "far"])
-def test_harm_of_a_static_street_is_explained_with_remedies(surface: SurfaceName) -> None:
+@pytest.mark.parametrize("surface", ["auto", "street", "infinity"])
+def test_harm_of_a_static_street_is_explained_with_remedies(surface: GeometryName) -> None:
     source = nuscenes()
     sample = {"images": [torch.zeros((3, *size), dtype=torch.uint8) for size in source.sizes], "rig": source}
 
     def text(target: Rig, **more: torch.Tensor) -> str:
-        return str(RigRetarget(target, surface=surface, harmonise=False).explain(sample | more))
+        return str(RigRetarget(target, geometry=surface, match_exposure=False).explain(sample | more))
 
     _, harm, better, *_ = text(source.shifted(z_m=0.6)).splitlines()
     assert harm.startswith("  target cameras stand up to 0.60 m from the nearest source camera")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Camera, CropRig, ResizeRig, Rig, RigRetarget, SampleError
+from arbiview_aug import Camera, CropRig, ResizeRig, Rig, RigRetarget, SampleError, SampleKeys
 
 SIZE = (60, 100)
 RIG = Rig(
@@ -62,7 +62,7 @@ def test_maps_and_masks_follow(transform: torch.nn.Module) -> None:
     """Each row of a map holds its own number: after, the row of the image that the camera's mask of it comes from."""
     rows = torch.arange(60)[:, None].expand(2, 60, 100)
     sample = sample_of(coverage=rows < 50, labels=rows.to(torch.uint8), token="x")
-    transform.label_keys = ("labels",)
+    transform.keys = SampleKeys(labels=("labels",))
     out = transform(sample)
     transform.label_keys = ()
     assert torch.equal(out["coverage"], out["labels"] < 50) and out["token"] == "x"
@@ -73,12 +73,14 @@ def test_maps_and_masks_follow(transform: torch.nn.Module) -> None:
 
 def test_resizing_before_or_after_is_the_same_calibration() -> None:
     target = RIG.turned(yaw_deg=12).undistorted()
-    before = RigRetarget(target.resized((30, 50)), surface="far", holes="black")(sample_of())
-    after = ResizeRig((30, 50))(RigRetarget(target, surface="far", holes="black")(sample_of()))
+    before = RigRetarget(target.resized((30, 50)), geometry="infinity", holes="black")(sample_of())
+    after = ResizeRig((30, 50))(RigRetarget(target, geometry="infinity", holes="black")(sample_of()))
     assert torch.allclose(before["K"], after["K"]) and after["coverage"].shape == (2, 30, 50)
     both = before["coverage"] & after["coverage"]
     assert (before["images"] - after["images"]).abs().mean(1)[both].mean() < 0.005
-    again = RigRetarget(target.resized((30, 50)), surface="far", holes="black")(after)  # an output is an input again
+    again = RigRetarget(target.resized((30, 50)), geometry="infinity", holes="black")(
+        after
+    )  # an output is an input again
     assert torch.allclose(again["images"], after["images"], atol=0.02)
 
 

@@ -18,9 +18,10 @@ from arbiview_aug.cameras.overlap import adjacent_pairs
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.bench.data import as_of_another_frame
 from arbiview_aug.evaluate.targets import without_masks
-from arbiview_aug.favs.config import FavsConfig, favs_config
+from arbiview_aug.render.config import RenderConfig
 from arbiview_aug.transforms.explain import Explanation
 from arbiview_aug.transforms.rig_retarget import RigRetarget
+from arbiview_aug.transforms.settings import render_config
 from tests.helpers import street_sample
 
 NEARLY_M = 1e-5
@@ -78,7 +79,7 @@ def situations(sample: Mapping[str, Any]) -> dict[str, tuple[Case, Case]]:
     centred = points | {"rig": at_one_centre(rig)}
     turned, cut, around = (rig.turned(yaw_deg=YAW_DEG), zoomed(rig), at_one_centre(rig).turned(yaw_deg=YAW_DEG))
     # Cameras beside theirs magnify nothing at their own centres: compared is one kind of reading.
-    fast, accurate = {"quality": FavsConfig(interpolation="linear")}, favs_config("accurate")
+    fast, accurate = {"quality": RenderConfig(interpolation="linear")}, render_config("accurate")
     accurate_too = {"quality": replace(accurate, interpolation="linear")}
 
     def pair(surface: str, frame: Mapping[str, Any], target: Rig, **settings: Any) -> tuple[Case, Case]:
@@ -136,7 +137,7 @@ def _only(sample: Mapping[str, Any], cameras: Sequence[int]) -> Case:
     """The frame of some cameras, raised."""
     rig = sample["rig"].with_cameras([sample["rig"][k] for k in cameras])
     images = [sample["images"][k] for k in cameras]
-    settings = {"surface": "street", "quality": "accurate", "harmonise": True}
+    settings = {"geometry": "street", "quality": "accurate", "match_exposure": True}
     return Case({"images": images, "rig": rig}, rig.shifted(z_m=UP_M), settings)
 
 
@@ -153,25 +154,25 @@ def test_what_is_done(scenes: dict[str, tuple[Case, Case]]) -> None:
         return spared, otherwise
 
     spared, otherwise = of("turned")
-    assert spared.pairs["far"] == 6 and "far" not in otherwise.pairs and otherwise.pairs["street"] >= 12
+    assert spared.pairs["infinity"] == 6 and "infinity" not in otherwise.pairs and otherwise.pairs["street"] >= 12
 
     for name in ("target = source", "one source sees all"):
         spared, otherwise = of(name)
-        assert spared.pairs == {"far": 6} and spared.bands == 0 and spared.sources == 6
+        assert spared.pairs == {"infinity": 6} and spared.bands == 0 and spared.sources == 6
         assert otherwise.pairs["street"] > 6 and otherwise.cells > spared.cells
 
     spared, otherwise = of("one source sees all, accurate")
-    assert spared.overlaps == 0 and not spared.planned_each_frame and spared.pairs == {"far": 6}
+    assert spared.overlaps == 0 and not spared.planned_each_frame and spared.pairs == {"infinity": 6}
     assert otherwise.overlaps == 6 and otherwise.planned_each_frame
 
     spared, otherwise = of("LiDAR, turned")
     pixels = 6 * SIZE[0] * SIZE[1]
     assert 0 < spared.dense_pixels < 0.6 * pixels < otherwise.dense_pixels == pixels
-    assert spared.pairs["far"] == 6 and "far" not in otherwise.pairs
+    assert spared.pairs["infinity"] == 6 and "infinity" not in otherwise.pairs
 
     for name in ("LiDAR, one source sees all", "LiDAR, all cameras at one centre"):
         spared, otherwise = of(name)
-        assert set(spared.pairs) == {"far"} and spared.dense_pixels == 0 and not spared.planned_each_frame
+        assert set(spared.pairs) == {"infinity"} and spared.dense_pixels == 0 and not spared.planned_each_frame
         assert set(otherwise.pairs) == {"lidar"} and otherwise.dense_pixels > 0 and otherwise.planned_each_frame
 
     spared, otherwise = of("cameras without overlap")

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import Reduce, SurfaceName
+from arbiview_aug.choices import GeometryName, Reduce
 from arbiview_aug.cli.arguments import output_file
 from arbiview_aug.cli.bench.study import benchmark, study
 from arbiview_aug.cli.bench.timing import machine_line, quartiles, show
@@ -33,11 +33,12 @@ from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import Method, Sample, paper_stages, retargeting
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import UP_M, named_targets, shifted_target
-from arbiview_aug.favs.config import FavsConfig, PaperConfig, Quality
-from arbiview_aug.render.refinement import RefinementCache
+from arbiview_aug.favs.config import PaperConfig
+from arbiview_aug.render.config import Quality, RenderConfig
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
 from arbiview_aug.scene.depth_maps import motion_camera
 from arbiview_aug.transforms.explain import Explanation
+from arbiview_aug.transforms.plan_cache import PlanCache
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 SYNTHETIC = "synthetic street"
@@ -64,8 +65,8 @@ class Row(NamedTuple):
     ``cached`` caches depth from overlap, ``reduce`` shrinks the targets by a factor.
     """
 
-    quality: Quality | FavsConfig | PaperConfig
-    surface: SurfaceName = "street"
+    quality: Quality | RenderConfig | PaperConfig
+    surface: GeometryName = "street"
     reads: tuple[str, ...] = ()
     harmonise: bool = False
     cached: bool = False
@@ -73,9 +74,8 @@ class Row(NamedTuple):
 
     def method(self, name: str) -> Method:
         """Create the method, with empty caches."""
-        refinement = RefinementCache() if self.cached else None
-        given = self.quality, self.surface, name
-        method = retargeting(*given, harmonise=self.harmonise, refinement=refinement)
+        cache = PlanCache(share_overlap=self.cached, max_bytes=0)
+        method = retargeting(self.quality, self.surface, name, match_exposure=self.harmonise, cache=cache)
         hidden = {*GEOMETRY.values(), "neighbours"}.difference(self.reads)
 
         def render(sample: Sample, target: Rig) -> list[RenderedView]:
@@ -95,15 +95,15 @@ class Row(NamedTuple):
 
 
 ROWS: dict[str, Row] = {
-    **{name: Row(config, "far") for name, config in paper_stages().items()},
-    **{f"stages 1 and 4 without w_{w}": Row(without_weights(_STAGES_1_AND_4, w), "far") for w in WEIGHTS},
-    "stage 1": Row(without_weights(_STAGES_1_AND_4, *WEIGHTS), "far"),
+    **{name: Row(config, "infinity") for name, config in paper_stages().items()},
+    **{f"stages 1 and 4 without w_{w}": Row(without_weights(_STAGES_1_AND_4, w), "infinity") for w in WEIGHTS},
+    "stage 1": Row(without_weights(_STAGES_1_AND_4, *WEIGHTS), "infinity"),
     "draft": Row("draft"),
-    "fast without blended seams": Row(FavsConfig(seam_width=0.0)),
+    "fast without blended seams": Row(RenderConfig(seam_width=0.0)),
     "fast": Row("fast"),
-    "fast, far": Row("fast", "far"),
+    "fast, far": Row("fast", "infinity"),
     "fast, ground": Row("fast", "ground"),
-    "fast, objects": Row("fast", "objects", (GEOMETRY["boxes"],)),
+    "fast, objects": Row("fast", "boxes", (GEOMETRY["boxes"],)),
     "fast, LiDAR": Row("fast", "lidar", (GEOMETRY["LiDAR"],)),
     "fast, LiDAR, boxes": Row("fast", "lidar", (GEOMETRY["LiDAR"], GEOMETRY["boxes"])),
     "fast, motion": Row("fast", "motion", (MOTION_KEY,)),
@@ -114,7 +114,7 @@ ROWS: dict[str, Row] = {
         for kind, key in GEOMETRY.items()
     },
     "fast, a quarter as large": Row("fast", reduce=4),
-    "fast, a quarter as large, aliased": Row(FavsConfig(antialias=False), reduce=4),
+    "fast, a quarter as large, aliased": Row(RenderConfig(antialias=False), reduce=4),
     "fast, harmonised": Row("fast", harmonise=True),
     "accurate": Row("accurate"),
     "accurate, held": Row("accurate", cached=True),
@@ -227,7 +227,7 @@ def _frames(data: Sequence[str], reduce: Reduce, seed: int, size: tuple[int, int
 def _motion(sample: Mapping[str, Any]) -> list[torch.Tensor]:
     """Depth from motion, without the labels."""
     frames = [{key: frame[key] for key in frame if key != "boxes_3d"} for frame in (sample, *sample["neighbours"])]
-    raised = RigRetarget(shifted_target(sample["rig"], z_m=UP_M), surface="motion", neighbours=None)
+    raised = RigRetarget(shifted_target(sample["rig"], z_m=UP_M), geometry="motion", neighbours=None)
     explained = raised.explain(frames[0] | {"neighbours": frames[1:]})
     assert isinstance(explained, Explanation) and explained.planned.motion is not None
     return [torch.from_numpy(depth) for depth in explained.planned.motion.depth_m]

@@ -27,7 +27,7 @@ from arbiview_aug.datasets.depth_folder import FOLDERS
 from arbiview_aug.datasets.registry import split_kind
 from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.report.tables import metric_table
-from arbiview_aug.scene.scene import SURFACES
+from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 PLAIN = "read only"
@@ -65,13 +65,13 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     plain: Dataset[Any] = Repeated(opened, arguments.frames)
     datasets: dict[str, Dataset[Any]] = {PLAIN: plain}
     rig: Rig = data.sample(0, arguments.reduce)["rig"]
-    for surface in arguments.surface:
-        retarget, source = RigRetarget(target, surface=surface), plain
-        if surface != "auto" and FOLDERS.keys() & SURFACES[surface].reads:
+    for surface in arguments.geometry:
+        retarget, source = RigRetarget(target, geometry=surface), plain
+        if surface != "auto" and FOLDERS.keys() & GEOMETRIES[surface].reads:
             source = Repeated(
                 WithDepth(opened, split_kind(data.root)[1]), arguments.frames
             )  # what the depth command wrote
-        if SURFACES[surface].needs is None:
+        if GEOMETRIES[surface].needs is None:
             retarget.prepare(rig)  # workers share static plans
         datasets[f"retargeted, {surface}"] = RetargetedDataset(source, retarget)
     return {

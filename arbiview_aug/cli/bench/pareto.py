@@ -23,8 +23,9 @@ from typing import Any, Literal, get_args
 import torch
 from tqdm import tqdm
 
+from arbiview_aug import PlanCache
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import Reduce, SurfaceName
+from arbiview_aug.choices import GeometryName, Reduce
 from arbiview_aug.cli.arguments import writable_folder
 from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, as_of_another_frame, recorded
 from arbiview_aug.cli.bench.speed import remap_floor
@@ -43,11 +44,10 @@ from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.evaluate.methods import Method, Sample, views_of
 from arbiview_aug.evaluate.report.tables import metric_table
-from arbiview_aug.favs.config import FavsConfig, Quality
-from arbiview_aug.generator import load_generator
-from arbiview_aug.render.refinement import RefinementCache
+from arbiview_aug.generator import load_inpainter
+from arbiview_aug.render.config import Quality, RenderConfig
 from arbiview_aug.render.requirements import HELPFUL_DATA, static_harm
-from arbiview_aug.scene.scene import SURFACES
+from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 Execution = Literal["opencv", "torch", "cuda"]
@@ -59,7 +59,7 @@ _ENOUGH_MS = 1000.0  # keeps a sweep of 63 settings at three minutes
 @dataclass(frozen=True)
 class Setting:
     quality: Quality
-    surface: SurfaceName
+    surface: GeometryName
     reduce: Reduce  # images are decoded at 1 / this
     execution: Execution  # ``opencv`` or ``torch`` on the CPU, or ``cuda``: torch on a GPU
     cached: bool = False  # whether depth from overlap is cached
@@ -74,11 +74,10 @@ class Setting:
         return RigRetarget(
             target,
             quality=self.quality,
-            surface=self.surface,
-            execution="torch" if self.execution == "cuda" else self.execution,
-            refinement=RefinementCache() if self.cached else None,
-            cache_bytes=0,
-            **(filling or {"holes": "black"}),
+            geometry=self.surface,
+            backend="torch" if self.execution == "cuda" else self.execution,
+            cache=PlanCache(share_overlap=self.cached, max_bytes=0),
+            **filling or {"holes": "black"},
         )
 
     def method(self, target: Rig, **filling: Any) -> Method:
@@ -106,7 +105,7 @@ class Setting:
 
 
 def settings(
-    surfaces: Sequence[SurfaceName],
+    surfaces: Sequence[GeometryName],
     *,
     qualities: Sequence[Quality] = get_args(Quality),
     reduces: Sequence[Reduce] = get_args(Reduce),
@@ -116,12 +115,12 @@ def settings(
     found = []
     for quality, reduce, execution in itertools.product(qualities, reduces, executions):
         if quality == "paper":
-            found += [Setting(quality, "far", reduce, execution)] if execution == "opencv" else []
+            found += [Setting(quality, "infinity", reduce, execution)] if execution == "opencv" else []
             continue
         for surface in surfaces:
             if quality != "accurate":
                 found.append(Setting(quality, surface, reduce, execution))
-            elif SURFACES[surface].overlap_depth:
+            elif GEOMETRIES[surface].overlap_depth:
                 found += [Setting(quality, surface, reduce, execution, cached) for cached in (False, True)]
     return found
 
@@ -133,7 +132,7 @@ def run(arguments: argparse.Namespace) -> int:
     if "cuda" in (arguments.execution or ()) and not is_there:
         raise DataError("--execution cuda: expected a CUDA device that is there, found none")
     arguments.execution = arguments.execution or EXECUTIONS[: 2 + is_there]
-    arguments.generator = {path: load_generator(path) for path in arguments.generator}
+    arguments.generator = {path: load_inpainter(path) for path in arguments.generator}
     h, w = (SOURCES_OVER_VIEWS * side for side in arguments.size)
     with recorded(arguments.data, frames=arguments.frames, size=(h, w)) as data:
         report = measure(data, arguments)
@@ -154,7 +153,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
         return data.frame(index, reduce, REFERENCE)
 
     wanted = settings(
-        [s for s in _surfaces(frame(0, REFERENCE).scored_sample) if not arguments.surface or s in arguments.surface],
+        [s for s in _surfaces(frame(0, REFERENCE).scored_sample) if not arguments.geometry or s in arguments.geometry],
         qualities=arguments.quality,
         reduces=arguments.reduce,
         executions=arguments.execution,
@@ -168,7 +167,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
         rows.append(
             {"name": one.name, **asdict(one), "peak_mib": memory, "seen": means["seen"]}
             | {"psnr_db": means[f"{prefix}_covered_psnr_db"], "whole_psnr_db": means[f"{prefix}_psnr_db"]}
-            | {"harm": static_harm(source, target, one.surface, FavsConfig())}
+            | {"harm": static_harm(source, target, one.surface, RenderConfig())}
         )
     calls = {one.name: one.call(target, frame(0, one.reduce).scored_sample) for one in wanted}
     h, w = target.sizes[0]
@@ -213,22 +212,21 @@ def measure_fills(
     setting: Setting, target: Rig, frames: Sequence[ScoredFrame], arguments: argparse.Namespace
 ) -> list[dict[str, Any]]:
     """Score and time what fills the holes of one setting's views."""
-    fillings: dict[str, dict[str, Any]] = {how: {"holes": how} for how in ("black", "fill")}
-    fillings["inpaint"] = {"path": "inpaint"}
-    for path, generator in arguments.generator.items():
-        fillings[path] = {"path": "diffusion", "generator": generator}
+    fillings: dict[str, dict[str, Any]] = {how: {"holes": how} for how in ("black", "continue")}
+    fillings["telea"] = {"holes": "telea"}
+    fillings |= {path: {"holes": inpainter} for path, inpainter in arguments.generator.items()}
     sample = frames[0].scored_sample
     calls = {name: setting.call(target, sample, **how) for name, how in fillings.items()}
     rows = []
     for name, how in fillings.items():
-        generator = how.get("generator")
+        network = getattr(how["holes"], "generator", how["holes"])  # counts its calls, if it is one
         memory = peak_mib(calls[name])
-        before = 0 if generator is None else generator.calls
+        before = getattr(network, "calls", None)
         (found,) = study([setting.method(target, **how)], frames, {"target": [target]}, repeats=0).values()
         means, prefix = found["target"], "even" if frames[0].truth is None else "true"
         row = {"name": name, "peak_mib": memory, "whole_psnr_db": means[f"{prefix}_psnr_db"]}
         row |= {"hole_psnr_db": means["true_hole_psnr_db"]} if "true_hole_psnr_db" in means else {}
-        rows.append(row | ({} if generator is None else {"calls": (generator.calls - before) / len(frames)}))
+        rows.append(row | ({} if before is None else {"calls": (network.calls - before) / len(frames)}))
     times = timed_rounds(calls, arguments.repeats, "fills", enough_ms=_ENOUGH_MS)
     for row in rows:
         row |= quartiles(times[row["name"]])._asdict()
@@ -236,10 +234,10 @@ def measure_fills(
     return rows
 
 
-def _surfaces(sample: Sample) -> list[SurfaceName]:
+def _surfaces(sample: Sample) -> list[GeometryName]:
     """Surfaces that a sample has the geometry for."""
-    needs: dict[SurfaceName, str] = {"far": "rig", "ground": "rig", "street": "rig"}
-    needs |= {"objects": "boxes_3d", "lidar": "points"}
+    needs: dict[GeometryName, str] = {"infinity": "rig", "ground": "rig", "street": "rig"}
+    needs |= {"boxes": "boxes_3d", "lidar": "points"}
     return [surface for surface, key in needs.items() if key in sample]
 
 
@@ -304,7 +302,7 @@ def advice_line(advice: Mapping[str, Any]) -> str:
     """The recommendation, why static surfaces were left out, and the data that helps."""
     without = ""
     if advice["left_out"] is not None:
-        static = ", ".join(name for name, row in SURFACES.items() if row.is_static)
+        static = ", ".join(name for name, row in GEOMETRIES.items() if row.is_static)
         without = f" Static surfaces ({static}) are not recommended here: {advice['left_out']}. "
         without += f"Better: {HELPFUL_DATA}."
     if advice["setting"] is None:

@@ -32,9 +32,10 @@ import cv2
 import numpy as np
 import torch
 
+from arbiview_aug import PlanCache
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.choices import Holes, Reduce, SurfaceName
+from arbiview_aug.choices import GeometryName, Holes, Reduce
 from arbiview_aug.cli.arguments import device_named, output_file
 from arbiview_aug.cli.bench.data import Recorded, lidar_maps, lifted, recorded
 from arbiview_aug.cli.bench.study import benchmark
@@ -160,9 +161,9 @@ def table(report: Mapping[str, Any]) -> str:
 def _calls(sample: Sample, target: Rig) -> Calls:
     return {
         **_both_layouts("street, held", sample, target),
-        "street, held, filled": _held(sample, target, holes="fill"),
+        "street, held, filled": _held(sample, target, holes="continue"),
         "street": _anew(sample, target, "street"),
-        **{f"{n} boxes": _anew({**sample, "boxes_3d": boxes_around(n)}, target, "objects") for n in BOXES},
+        **{f"{n} boxes": _anew({**sample, "boxes_3d": boxes_around(n)}, target, "boxes") for n in BOXES},
         "LiDAR": _anew(sample, target, "lidar"),
         "LiDAR, 75 boxes": _anew({**sample, "boxes_3d": boxes_around(75)}, target, "lidar"),
         "depth maps": _anew(sample, target, "learned"),
@@ -180,13 +181,13 @@ def _own(sample: Sample, views: tuple[int, int]) -> Calls:
     with_boxes = frame | boxes | {"neighbours": [other | boxes for other in others[:2]]}
     return {
         "street, held, turned": _held(sample, turned),
-        "street, held, turned, filled": _held(sample, turned, holes="fill"),
+        "street, held, turned, filled": _held(sample, turned, holes="continue"),
         "street, held, turned, harmonised": _held(sample, turned, harmonise=True),
         "street, no neighbours": _anew(frame, low, "street"),
         "street, one neighbour": _anew(frame | {"neighbours": others[:1]}, low, "street"),
         "street, two neighbours": _anew(frame | {"neighbours": others[:2]}, low, "street"),
         "street, eight neighbours": _anew(frame | {"neighbours": others}, low, "street"),
-        "75 boxes, two neighbours": _anew(with_boxes, low, "objects"),
+        "75 boxes, two neighbours": _anew(with_boxes, low, "boxes"),
     }
 
 
@@ -232,12 +233,12 @@ def _both_layouts(name: str, sample: Sample, target: Rig) -> Calls:
 
 
 def _held(sample: Sample, target: Rig, holes: Holes = "black", harmonise: Harmonise = False) -> Callable[[], Any]:
-    return partial(RigRetarget(target, surface="street", holes=holes, harmonise=harmonise), sample)
+    return partial(RigRetarget(target, geometry="street", holes=holes, match_exposure=harmonise), sample)
 
 
-def _anew(sample: Sample, target: Rig, surface: SurfaceName) -> Callable[[], Any]:
+def _anew(sample: Sample, target: Rig, surface: GeometryName) -> Callable[[], Any]:
     """Call with the geometry, over the street the rig, always a little elsewhere, so that no plan comes back."""
-    retarget = RigRetarget(target, surface=surface, harmonise=False, holes="black", cache_bytes=0)
+    retarget = RigRetarget(target, geometry=surface, match_exposure=False, holes="black", cache=PlanCache(max_bytes=0))
     ways_m = count(_STEP_M, _STEP_M)
     rigs = cycle([sample["rig"].shifted(x_m=k * _STEP_M) for k in range(_STEPS if surface == "street" else 1)])
     return lambda: retarget(lifted({**sample, "rig": next(rigs)}, next(ways_m)))

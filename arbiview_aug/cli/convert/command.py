@@ -25,7 +25,7 @@ from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.registry import split_kind
 from arbiview_aug.environment import one_thread, versions, working_s
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError
-from arbiview_aug.scene.scene import SURFACES
+from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.warm_up import compile_kernels
 
 
@@ -35,9 +35,9 @@ def run(arguments: argparse.Namespace) -> int:
     Returns:
         0; 1 if samples could not be read or rendered (unless skipped), or files could not be written.
     """
-    if arguments.motion_depth is not None and not FOLDERS.keys() & SURFACES[arguments.surface].reads:
+    if arguments.motion_depth is not None and not FOLDERS.keys() & GEOMETRIES[arguments.geometry].reads:
         fitting = "auto, motion, fused or learned"
-        raise DataError(f"--depth: expected it with --surface {fitting}, got {arguments.surface}")
+        raise DataError(f"--depth: expected it with --geometry {fitting}, got {arguments.geometry}")
     settings = _settings(arguments)
     check_output(settings)
     if arguments.verify:
@@ -65,14 +65,14 @@ def _settings(arguments: argparse.Namespace) -> Settings:
     kind, root = split_kind(arguments.data)
     root = root.absolute()  # Ray's actors have a working directory of their own
     depth = arguments.motion_depth
-    needed = SURFACES[arguments.surface].needs
+    needed = GEOMETRIES[arguments.geometry].needs
     if depth is None and needed in FOLDERS:
         default = inside(root, FOLDERS[needed], "depth")
         depth = default if default.is_dir() else None
         if depth is None and not (needed == "motion" and arguments.neighbours):
             model, motion = (" --model MODEL", "") if needed != "motion" else ("", ", or estimate it (--neighbours 2)")
             raise DataError(
-                f"--surface {arguments.surface}: expected depth in {default}, found none; make it with "
+                f"--geometry {arguments.geometry}: expected depth in {default}, found none; make it with "
                 f"python -m arbiview_aug depth --data DIR{model}, or name its folder (--depth){motion}"
             )
     return Settings(
@@ -86,7 +86,7 @@ def _settings(arguments: argparse.Namespace) -> Settings:
         link=arguments.link,
         **{
             name: getattr(arguments, name)
-            for name in ("version", *RETARGET_OPTIONS, "reduce", "clean_masks", "neighbours")
+            for name in ("version", *RETARGET_OPTIONS, "holes", "steps", "reduce", "clean_masks", "neighbours")
         },
     )
 

@@ -35,7 +35,7 @@ def ray_results(jobs: Jobs, workers: int, label: str, note: Callable[[Done], str
     data = optional_package("ray.data", "distributed")
     ray.init(ignore_reinit_error=True, include_dashboard=False, log_to_driver=False)
     data.DataContext.get_current().enable_progress_bars = False
-    gpus = float(ray.cluster_resources().get("GPU", 0)) if jobs.settings.path == "diffusion" else 0.0
+    gpus = float(ray.cluster_resources().get("GPU", 0)) if jobs.settings.holes == "diffusion" else 0.0
     rows = data.range(len(jobs), override_num_blocks=max(1, min(len(jobs), 4 * workers)))
     done = rows.map(
         Actor,

@@ -21,7 +21,7 @@ from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.report.html import html_report
 from arbiview_aug.evaluate.report.tables import evaluation_tables
 from arbiview_aug.evaluate.run import Evaluation, evaluate
-from arbiview_aug.scene.scene import SURFACES
+from arbiview_aug.scene.scene import GEOMETRIES
 
 CONVERTED = "converted"  # name of the written views in tables
 
@@ -30,7 +30,7 @@ def converted(settings: Settings) -> Method:
     """Wrap the written views as a method; for other rigs than the target it renders anew."""
     # Scored frames hold their points back, and depth on disk is not read again.
     anew = retargeting(
-        settings.quality, "auto" if SURFACES[settings.surface].needs in ("points", *FOLDERS) else settings.surface
+        settings.quality, "auto" if GEOMETRIES[settings.geometry].needs in ("points", *FOLDERS) else settings.geometry
     )
     manifest, target = Manifest(settings.output), settings.sized_target
     kind = settings.kind if settings.kind in kinds_of(settings.output) else None  # logs become frame folders
@@ -58,9 +58,9 @@ def write_report(settings: Settings, data: Recording, tokens: Sequence[str], cou
     done = evaluate(frames, lambda _: {target.name or "target": target}, [converted(settings)])
     title = f"{data.root.resolve().name} as {target.name or 'the target'} would have seen it"
     notes = [f"{len(picked)} of {len(tokens)} frames, as they were written to {settings.output}."]
-    if settings.path != "favs" or settings.holes != "black":
+    if settings.holes != "black":
         notes.append("Pixels that no camera saw are scored as filled; covered figures leave them out.")
-    if "points" in SURFACES[settings.surface].reads:
+    if "points" in GEOMETRIES[settings.geometry].reads:
         notes.append("LiDAR points score views that were made with them: evaluate holds half of them out.")
     notes += [f"Not everything could be scored: {words}." for words in done.declined.values()]
     page = html_report(title, done, [CONVERTED], evaluation_tables(done, [CONVERTED]), notes)

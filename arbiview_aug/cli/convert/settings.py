@@ -10,15 +10,17 @@ from typing import Any, Literal
 from arbiview_aug.atomic_io import Link, checksum, is_part
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import Holes, Reduce, RenderPath, SurfaceName
+from arbiview_aug.choices import GeometryName, Holes, Reduce
 from arbiview_aug.datasets.drive import Neighbours, Recording
 from arbiview_aug.datasets.registry import open_data
 from arbiview_aug.errors import DataError
-from arbiview_aug.favs.config import Quality
-from arbiview_aug.generator import load_generator
+from arbiview_aug.generator import load_inpainter
+from arbiview_aug.inpaint.inpainter import Inpainter
+from arbiview_aug.render.config import Quality
 from arbiview_aug.transforms.rig_retarget import RigRetarget
+from arbiview_aug.transforms.settings import SampleKeys
 
-RETARGET_OPTIONS = ("path", "holes", "steps", "quality", "surface", "size", "fit")  # as ``RigRetarget`` names them
+RETARGET_OPTIONS = ("quality", "geometry", "size", "fit")  # as ``RigRetarget`` names them
 FOLDER = "conversion"  # subfolder of an output with manifest, provenance and report
 
 
@@ -36,12 +38,11 @@ class Settings:
     version: str | None = None
     target: Rig
     output: Path
-    path: RenderPath = "favs"
-    holes: Holes = "fill"
+    holes: Holes = "continue"
     generator: Path | None = None
     steps: int | None = None
     quality: Quality = "fast"
-    surface: SurfaceName = "auto"
+    geometry: GeometryName = "auto"
     size: tuple[int, int] | None = None
     fit: Fit = "crop"
     reduce: Reduce = 1
@@ -65,17 +66,24 @@ class Settings:
         """The transform; each process or actor makes one."""
         return RigRetarget(
             self.target,
-            generator=None if self.generator is None else load_generator(self.generator),
-            outputs=() if self.quality == "paper" else ("confidence",),
+            holes=self._inpainter(),
+            keys=SampleKeys(extra=() if self.quality == "paper" else ("confidence",)),
             **{name: getattr(self, name) for name in RETARGET_OPTIONS},
         )
+
+    def _inpainter(self) -> Holes | Inpainter:
+        if self.holes != "diffusion":
+            if self.generator is not None or self.steps is not None:
+                raise ValueError(f"--generator, --steps: they are for --holes diffusion, got --holes {self.holes}")
+            return self.holes
+        return load_inpainter(self.generator, steps=self.steps)
 
     def rendering(self) -> dict[str, Any]:
         """All settings that decide the pixels, as plain data."""
         target = self.target.to_dict()
         for entry, camera in zip(target["cameras"], self.target, strict=True):
             entry["content"] = camera.content_key.hex()  # of its mask too
-        names = ("path", "holes", "steps", "quality", "surface", "size", "reduce", "neighbours", "suffix")
+        names = ("holes", "steps", "quality", "geometry", "size", "reduce", "neighbours", "suffix")
         of = self.generator or Path()
         files = [] if self.generator is None else [of] if of.is_file() else sorted(filter(Path.is_file, of.rglob("*")))
         return {

@@ -15,7 +15,7 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.image_io import encoded, encoded_image
 
-MASKS = {"coverage": "coverage", "confidence": "confidence", "generated": "generated", "ignore": "mask"}
+MASKS = {"coverage": "coverage", "confidence": "confidence", "generated": "generated", "ego_mask": "mask"}
 """Outputs of a retargeted sample and the names of their files, ``<image>.<name>.png``. ``coverage``: 255 where some
 source saw the pixel; ``confidence``: scaled to 255; ``generated``: 255 for inpainted pixels; ``mask``: 255 for the
 scene, 0 for the target's own car, as in frame folders."""
@@ -48,5 +48,5 @@ def coverage_of(image: Path) -> BoolArray:
 def _as_bytes(key: str, values: torch.Tensor) -> Any:
     """Scale a mask to 0…255; ten times as fast as torch for a full-size mask."""
     if values.dtype == torch.bool:
-        return (~values if key == "ignore" else values).numpy().view(np.uint8) * 255
+        return (~values if key == "ego_mask" else values).numpy().view(np.uint8) * 255
     return cv2.convertScaleAbs(values.numpy(), alpha=255)  # rounds

@@ -25,11 +25,11 @@ from arbiview_aug.evaluate.lidar import visible_points
 from arbiview_aug.evaluate.metrics import errors, spectrum_distance_db
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import valid_pixels
-from arbiview_aug.generator.inpainting import telea
 from arbiview_aug.generator.training.data import Frames, TrainingFrame
 from arbiview_aug.generator.training.masks import mask_bank, one_of, retarget
 from arbiview_aug.generator.training.measure import Interval, bootstrap, hole_psnr
 from arbiview_aug.generator.training.pseudo_views import Rendered, favs
+from arbiview_aug.inpaint.telea import telea
 from arbiview_aug.scene.point_cloud import own_car
 
 MIN_HOLES = 0.05  # smallest share of holes in a drawn target

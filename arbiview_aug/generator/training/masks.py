@@ -56,7 +56,7 @@ def mask_bank(rig: Rig, count: int, seed: int) -> torch.Tensor:
         for _ in range(_TRIES):
             camera = retarget(rig[one_of(rng, len(rig))], rng)
             target = Rig([replace(camera, mask=None)], ground_z_m=rig.ground_z_m)
-            covered = build_plan(rig, target, surface="far").coverage[0]
+            covered = build_plan(rig, target, geometry="infinity").coverage[0]
             if _MIN_HOLES <= 1 - covered.mean() <= _MAX_HOLES:
                 break
         else:  # the rig covers everything or almost nothing: a hole at the side

@@ -27,21 +27,21 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.favs.renderer import render_paper
 from arbiview_aug.generator.completion import Conditions, nearest_sources, seeded, valid_pixels
 from arbiview_aug.generator.config import GeneratorConfig
 from arbiview_aug.generator.geometry import FrameGeometry, batched, frame_geometry
-from arbiview_aug.generator.inpainting import telea
 from arbiview_aug.generator.training.config import PseudoQuality, PseudoViewConfig
 from arbiview_aug.generator.training.data import Frames
 from arbiview_aug.generator.training.masks import one_of, uniform, with_focal
+from arbiview_aug.inpaint.telea import telea
+from arbiview_aug.render.config import RenderConfig
 from arbiview_aug.render.plan import build_plan
 from arbiview_aug.render.rendered import Renderer
 from arbiview_aug.sample.inputs import Frame
 
 _VIRTUAL_YAW_DEG, _VIRTUAL_PITCH_DEG = 20.0, 8.0
-_FAVS = FavsConfig(certainty=True)
+_FAVS = RenderConfig(certainty=True)
 
 
 class Batch(NamedTuple):
@@ -100,7 +100,7 @@ def favs(
         covered = torch.from_numpy(np.stack(published.coverage)).to(images[0].device)
         return Rendered(_unit([view.image for view in published.targets]).to(covered.device), covered, covered.float())
     is_moved = any(abs(c.center_m - rig[k].center_m).max() > 1e-6 for c in targets for k in nearest_sources(c, rig)[:1])
-    plan = build_plan(rig, target, surface="street" if is_moved else "far", config=_FAVS)
+    plan = build_plan(rig, target, geometry="street" if is_moved else "infinity", config=_FAVS)
     (rendered,) = Renderer().render([plan], [Frame(tuple(images), rig)], [None], ("confidence",))
     assert isinstance(rendered.coverage, torch.Tensor) and isinstance(rendered.confidence, torch.Tensor)  # one size
     return Rendered(_unit(rendered.images), rendered.coverage, rendered.confidence)

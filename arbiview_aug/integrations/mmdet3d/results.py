@@ -52,7 +52,7 @@ SHAPE_KEYS = ("img_shape", "ori_shape", "pad_shape")
 _MAX_PADDING_PX = 64
 """Images are padded at the right and below to multiples of 32 or 64."""
 
-TARGET_OUTPUTS = ("coverage", "ignore", "confidence", "generated", "source_camera", "source_frame", "retarget_params")
+TARGET_OUTPUTS = ("coverage", "ego_mask", "confidence", "generated", "source_camera", "source_frame", "retarget_params")
 """Entries of a retargeted sample that the results get besides, as arrays."""
 
 

@@ -49,7 +49,7 @@ def loaded(given: Recording) -> dict[str, Any]:
 
 def test_matrices_images_and_geometry(given: Recording) -> None:
     sample = loaded(given)
-    transform = RigRetargetMultiViewImages(TARGET, lidar2ego=LIDAR2EGO, surface="objects")
+    transform = RigRetargetMultiViewImages(TARGET, lidar2ego=LIDAR2EGO, geometry="boxes")
     changed = transform(sample, context=None)
     merged = sample | changed
     assert merged["img"].shape == (5, 3, *SIZE) and merged["img"].dtype == np.float32 and merged["img"].max() <= 1
@@ -72,7 +72,7 @@ def test_matrices_images_and_geometry(given: Recording) -> None:
 
 def test_levels_and_messages(given: Recording) -> None:
     sample = loaded(given)
-    transform = RigRetargetMultiViewImages(TARGET, lidar2ego=LIDAR2EGO, surface="street")
+    transform = RigRetargetMultiViewImages(TARGET, lidar2ego=LIDAR2EGO, geometry="street")
     whole = {**sample, "img": np.rint(sample["img"] * 255).astype(np.uint8)}
     assert np.abs(transform(whole)["img"] / 255.0 - transform(sample)["img"]).max() < 1e-6
     with pytest.raises(SampleError, match="lidar2cam: expected after LoadMultiViewImagesFromFiles, found none"):
@@ -89,5 +89,5 @@ def test_config_of_the_readme(given: Recording, tmp_path: Path, monkeypatch: pyt
     _, node = yaml.safe_load(text)
     assert node.pop("_convert_") == "all"
     module, name = node.pop("_target_").rsplit(".", 1)
-    transform = getattr(import_module(module), name)(**node, surface="street")
+    transform = getattr(import_module(module), name)(**node, geometry="street")
     assert transform(loaded(given))["img"].shape == (5, 3, 256, 704)

@@ -100,5 +100,5 @@ def test_frames_are_made_anew_when_the_renderer_changes(tmp_path, monkeypatch):
         Source(root=tmp_path, size=(24, 64), split="train", change="up70", variant=VARIANTS[name]).store()
         rendering = {"arbiview_aug.render.kernels", "arbiview_aug.scene.shapes", "arbiview_aug.transforms.rig_retarget"}
         assert (rendering <= read) == (name != "row_split") and "arbiview_aug.datasets.synthetic.street" in read
-        assert ("arbiview_aug.generator.fillers" in read) == (name == "auto_fill")
+        assert ("arbiview_aug.inpaint.continued" in read) == (name == "auto_fill")
         code_hash.cache_clear()

@@ -25,7 +25,7 @@ def sample() -> dict:
 
 def test_inside_v2_compose(sample: dict) -> None:
     """A solarising curve is known for each pixel: each image is ours with that curve, K and boxes are ours."""
-    ours = RigRetarget(TARGET, surface="far")
+    ours = RigRetarget(TARGET, geometry="infinity")
     out = v2.Compose([ours, v2.RandomSolarize(threshold=0, p=1.0)])(sample)
     expected = ours(sample)
     assert type(out["images"]) is tv_tensors.Image and torch.equal(out["images"], 255 - expected["images"])
@@ -41,17 +41,17 @@ def _known(rig):
 
 def test_v2s_own_resize_leaves_k_wrong(sample: dict) -> None:
     """The trap: nothing fails."""
-    out = v2.Compose([RigRetarget(TARGET, surface="far"), v2.Resize((32, 88))])(sample)
+    out = v2.Compose([RigRetarget(TARGET, geometry="infinity"), v2.Resize((32, 88))])(sample)
     assert out["images"].shape[-2:] == (32, 88) and torch.allclose(out["K"], torch.from_numpy(TARGET.K))
-    right = v2.Compose([RigRetarget(TARGET, surface="far"), ResizeRig((32, 88))])(sample)
+    right = v2.Compose([RigRetarget(TARGET, geometry="infinity"), ResizeRig((32, 88))])(sample)
     assert torch.allclose(right["K"], torch.from_numpy(TARGET.resized((32, 88), "crop").K))
 
 
 def test_kornias_image_sequential(sample: dict) -> None:
     """Known again by inverting; black holes stay black; one draw for all cameras where it is asked for."""
-    expected = RigRetarget(TARGET, surface="far", holes="black")(sample)
+    expected = RigRetarget(TARGET, geometry="infinity", holes="black")(sample)
     invert = torch.nn.Sequential(
-        RigRetarget(TARGET, surface="far", holes="black"), OnImages(K.ImageSequential(K.RandomInvert(p=1.0)))
+        RigRetarget(TARGET, geometry="infinity", holes="black"), OnImages(K.ImageSequential(K.RandomInvert(p=1.0)))
     )
     out = invert(sample)
     seen = out["coverage"].unsqueeze(1).expand_as(out["images"])
@@ -96,7 +96,7 @@ def test_example(tmp_path, capsys) -> None:
 
 
 def test_what_was_filled_stays(sample: dict) -> None:
-    filled = RigRetarget(TARGET, surface="far", path="inpaint")(sample)
+    filled = RigRetarget(TARGET, geometry="infinity", holes="telea")(sample)
     out = OnImages(K.ImageSequential(K.RandomInvert(p=1.0)))(filled)
     shown = (out["coverage"] | out["generated"]).unsqueeze(1).expand_as(out["images"])
     assert out["generated"].any()

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torchvision import tv_tensors
 
-from arbiview_aug import RigRetarget, SampleError
+from arbiview_aug import RigRetarget, SampleError, SampleKeys
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.integrations.lightning.batches import ON_HOST, on_device, packed, unpacked
 from arbiview_aug.sample.collate import collate
@@ -23,9 +23,9 @@ def samples() -> list[dict]:
     return [drive[0], drive[1]]
 
 
-@pytest.mark.parametrize("surface", ["street", "objects"])
+@pytest.mark.parametrize("surface", ["street", "boxes"])
 def test_a_batch_is_its_frames(samples: list[dict], surface: str) -> None:
-    retarget = RigRetarget(TARGET, surface=surface)
+    retarget = RigRetarget(TARGET, geometry=surface)
     out = retarget(collate(samples))
     assert out["images"].shape == (2, 6, 3, 48, 128)
     for k, sample in enumerate(samples):
@@ -41,7 +41,7 @@ def test_frames_of_different_rigs(samples: list[dict]) -> None:
     other = {**samples[1], "rig": moved, "cam2ego": torch.from_numpy(moved.cam2ego)}
     batch = collate([samples[0], other])
     assert "rig" not in batch and batch["ground_z_m"].tolist() == [0, 0]
-    out, alone = RigRetarget(TARGET, surface="street")(batch), RigRetarget(TARGET, surface="street")(other)
+    out, alone = RigRetarget(TARGET, geometry="street")(batch), RigRetarget(TARGET, geometry="street")(other)
     assert torch.equal(out["images"][1], alone["images"])
     lens = moved.with_cameras([replace(moved[0], lens="radtan", distortion=(0.01, 0, 0, 0)), *moved.cameras[1:]])
     with pytest.raises(SampleError, match="camera 'front': rigs that differ within a batch"):
@@ -65,7 +65,7 @@ def test_maps_over_the_images_stay_with_their_frames(samples: list[dict], count:
         depth_m = torch.rand(6, 48, 128, generator=rng) * 50 + 1
         more = {"labels": tv_tensors.Mask(labels), "classes": labels + 1, "depth_m": depth_m}
         frames.append({**{key: value for key, value in samples[k % 2].items() if key != "points"}, **more})
-    retarget = RigRetarget(TARGET, surface="lidar", label_keys=("classes",))
+    retarget = RigRetarget(TARGET, geometry="lidar", keys=SampleKeys(labels=("classes",)))
     out = retarget(collate(frames))
     for k, frame in enumerate(frames):
         alone = retarget(frame)
@@ -86,7 +86,7 @@ def test_lenses_without_a_rig(samples: list[dict]) -> None:
     for sample in samples:
         bare = {key: value for key, value in sample.items() if key != "rig"}
         frames.append({**bare, "lens": names, "distortion": distortion})
-    retarget = RigRetarget(TARGET, surface="street")
+    retarget = RigRetarget(TARGET, geometry="street")
     out = retarget(collate(frames))
     for k, frame in enumerate(frames):
         assert torch.equal(out["images"][k], retarget(frame)["images"])
@@ -101,7 +101,7 @@ def test_what_lightning_is_not_to_touch(samples: list[dict]) -> None:
         for key, value in packed(batch).items()
     }
     assert set(moved) == {"images", "labels", ON_HOST}
-    retarget = RigRetarget(TARGET, surface="objects", label_keys=("labels",))
+    retarget = RigRetarget(TARGET, geometry="boxes", keys=SampleKeys(labels=("labels",)))
     out, expected = on_device(retarget(unpacked(moved)), torch.device("cpu")), retarget(batch)
     assert set(out) == set(expected)
     for key in ("images", "coverage", "K", "cam2ego", "labels"):

@@ -46,7 +46,7 @@ def test_neighbours_and_precisions(precision):
             seen.append((batch["K"], batch["cam2ego"], batch["boxes_3d"]))
             return self.head(torch.ones(1, 8, dtype=self.head.weight.dtype)).sum()
 
-    data = RetargetDataModule(drive, drive, RigRetarget(rig.turned(pitch_deg=-10), surface="street"), batch_size=2)
+    data = RetargetDataModule(drive, drive, RigRetarget(rig.turned(pitch_deg=-10), geometry="street"), batch_size=2)
     trainer = lightning.Trainer(
         max_epochs=1,
         limit_val_batches=0,

@@ -78,8 +78,8 @@ def test_projection_is_the_new_rigs(given: Recording, form: str) -> None:
 def test_images_are_those_of_the_true_poses(given: Recording, form: str) -> None:
     """Not of the mounting alone, with which a camera is up to 0.36 m off; of geometry in the LiDAR's frame, moved."""
     sample = in_key_frame(given) if form == "BEVDet" else given.sample
-    after = step(surface="objects")(FORMS[form](given))
-    expected = RigRetarget(TARGET, surface="objects")(sample)
+    after = step(geometry="boxes")(FORMS[form](given))
+    expected = RigRetarget(TARGET, geometry="boxes")(sample)
     same = after["coverage"] & expected["coverage"].numpy()
     level = psnr(pixels(after)[same], expected["images"].permute(0, 2, 3, 1).numpy()[same])
     print(f"{form}: {level:.1f} dB")
@@ -170,7 +170,7 @@ def test_bevdet_takes_augmented_images_and_gives_untouched_ones(given: Recording
     assert torch.equal(ego2globals, results["img_inputs"][2][1].expand(6, 4, 4))
     size = tuple(results["img_inputs"][0].shape[-2:])
     known = CropRig(12, 0, size)(ResizeRig((48, 132))(in_key_frame(given)))
-    expected = RigRetarget(SOURCE, surface="street")(known)
+    expected = RigRetarget(SOURCE, geometry="street")(known)
     assert np.mean(after["coverage"] == expected["coverage"].numpy()) > 0.999
     views = zip(pixels(after), expected["images"].permute(0, 2, 3, 1).numpy(), after["coverage"], strict=True)
     levels = [psnr(one[seen], two[seen]) for one, two, seen in views]

@@ -47,7 +47,7 @@ def grey(images: torch.Tensor) -> np.ndarray:
 @pytest.mark.filterwarnings("ignore:retarget. drops")
 @pytest.mark.parametrize("form", QUEUES)
 def test_projections_of_three_frames_are_the_new_rigs(drive: list[Recording], form: str) -> None:
-    step = RigRetargetMultiView(TARGET, lidar2ego=LIDAR2EGO, surface="street")
+    step = RigRetargetMultiView(TARGET, lidar2ego=LIDAR2EGO, geometry="street")
     results = QUEUES[form](drive)
     after = through(step, results)
     frames = frames_of(after)
@@ -65,7 +65,7 @@ def test_one_draw_for_all_frames(drive: list[Recording], form: str) -> None:
     torch.manual_seed(3)
     target = RandomRig(SOURCE, yaw_deg=10, height_m=0.2)
     key = "aug_config" if form == "Sparse4D" else None
-    step = RigRetargetMultiView(target, lidar2ego=LIDAR2EGO, surface="street", p=0.5, size=SIZE, sequence_key=key)
+    step = RigRetargetMultiView(target, lidar2ego=LIDAR2EGO, geometry="street", p=0.5, size=SIZE, sequence_key=key)
     skipped = set()
     for begun in range(8):
         results = QUEUES[form](drive)
@@ -90,7 +90,7 @@ def test_one_draw_for_all_frames(drive: list[Recording], form: str) -> None:
 @pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_bevdet4d(drive: list[Recording]) -> None:
     """As each frame by itself, in BEVDet4D's order; what its model makes of the poses leads to the target's cameras."""
-    step = RigRetargetMultiView(TARGET, surface="objects")
+    step = RigRetargetMultiView(TARGET, geometry="boxes")
     after = step(QUEUES["BEVDet4D"](drive))
     images, sensor2egos, ego2globals, intrins, post_rots, post_trans, _ = after["img_inputs"]
     views, frames = len(TARGET), len(drive)
@@ -113,7 +113,7 @@ def test_bevdet4d(drive: list[Recording]) -> None:
 @pytest.mark.parametrize("form", ["StreamPETR", "BEVFormer"])
 def test_queues_are_their_frames(drive: list[Recording], form: str) -> None:
     """Pixels of each frame are those of the frame by itself; poses of the vehicle stay; rims are no pixels."""
-    step = RigRetargetMultiView(TARGET, lidar2ego=LIDAR2EGO, surface="street")
+    step = RigRetargetMultiView(TARGET, lidar2ego=LIDAR2EGO, geometry="street")
     given = QUEUES[form](drive)
     after = step(given)
     assert after["img"].shape == (3, 5, 3, *SIZE) and after["coverage"].shape == (3, 5, *SIZE)
@@ -143,7 +143,7 @@ def test_data_containers_stay(drive: list[Recording]) -> None:
             self.data, self.stack, self.padding_value = data, stack, padding_value
             self.cpu_only, self.pad_dims = cpu_only, pad_dims
 
-    step = RigRetargetMultiView(TARGET, lidar2ego=LIDAR2EGO, surface="street")
+    step = RigRetargetMultiView(TARGET, lidar2ego=LIDAR2EGO, geometry="street")
     plain = QUEUES["BEVFormer"](drive)
     held = {
         "img": DataContainer(plain["img"], stack=True),
@@ -157,7 +157,7 @@ def test_data_containers_stay(drive: list[Recording]) -> None:
 @pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_nested_lists_and_levels(drive: list[Recording]) -> None:
     """Queues that are loaded and no more: lists of lists, or one array (T, N, h, w, 3)."""
-    step = RigRetargetMultiView(TARGET, lidar2ego=LIDAR2EGO, surface="street")
+    step = RigRetargetMultiView(TARGET, lidar2ego=LIDAR2EGO, geometry="street")
     metas = [{"lidar2img": list(one.K @ one.lidar2cam)} for one in drive]
     listed = step({"img": [one.arrays for one in drive], "img_metas": metas})
     assert len(listed["img"]) == 3 and listed["img"][2][4].dtype == np.uint8
@@ -167,7 +167,7 @@ def test_nested_lists_and_levels(drive: list[Recording]) -> None:
 
 @pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_sparse4d_after_its_adaptor(drive: list[Recording]) -> None:
-    step = RigRetargetMultiView(TARGET, surface="street")
+    step = RigRetargetMultiView(TARGET, geometry="street")
     given = QUEUES["Sparse4D"](drive)[1]
     after = step(given)
     loaded = step(sparse4d(drive[1]))
@@ -190,7 +190,7 @@ def test_frames_of_a_drive_share_a_draw(drive: list[Recording]) -> None:
     """Where each passes the pipeline by itself, as BEVFormer's and StreamPETR's datasets do."""
     target = RandomRig(SOURCE.resized(SIZE), yaw_deg=10, per="sequence")
     for step in (
-        RigRetargetMultiView(target, lidar2ego=LIDAR2EGO, surface="street"),
+        RigRetargetMultiView(target, lidar2ego=LIDAR2EGO, geometry="street"),
         RigRetargetMultiView(RandomRig(target.base, yaw_deg=10), lidar2ego=LIDAR2EGO, sequence_key="scene_token"),
     ):
         one, same, other = (
@@ -203,7 +203,7 @@ def test_frames_of_a_drive_share_a_draw(drive: list[Recording]) -> None:
 
 
 def test_messages(drive: list[Recording]) -> None:
-    step = RigRetargetMultiView(TARGET, lidar2ego=LIDAR2EGO, surface="street")
+    step = RigRetargetMultiView(TARGET, lidar2ego=LIDAR2EGO, geometry="street")
     given = QUEUES["BEVFormer"](drive)
     with pytest.raises(SampleError, match="img_metas: expected a dict for each of the 3 frames of 'img', got 2"):
         step({**given, "img_metas": list(given["img_metas"].values())[:2]})

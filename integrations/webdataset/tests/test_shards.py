@@ -60,7 +60,7 @@ def test_a_shard_read_by_hand_retargets_as_the_sample(sample: dict, tmp_path) ->
             entries.setdefault(key, {"__key__": key})[ending] = file.read()
     assert list(entries) == ["000-000000", "000-000001"]
     target = sample["rig"].turned(yaw_deg=15).undistorted()
-    one, two = (RigRetarget(target, surface="objects")(s) for s in (to_sample(entries["000-000001"]), sample))
+    one, two = (RigRetarget(target, geometry="boxes")(s) for s in (to_sample(entries["000-000001"]), sample))
     assert torch.equal(one["coverage"], two["coverage"])
     assert (one["images"].float() - two["images"].float()).abs().mean() < 2
 

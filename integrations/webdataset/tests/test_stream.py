@@ -18,7 +18,7 @@ def test_each_frame_comes_once_and_retargeted(tmp_path, workers):
     rig = demo_source_rig((48, 128))
     drive = SyntheticDrive(rig, num_frames=4, lidar=False)
     urls = [str(write_shard(tmp_path / f"{k}.tar", [drive[2 * k], drive[2 * k + 1]])) for k in range(2)]
-    retarget = RigRetarget(rig.turned(yaw_deg=20), surface="street")
+    retarget = RigRetarget(rig.turned(yaw_deg=20), geometry="street")
     samples = list(DataLoader(stream(urls, retarget), batch_size=None, num_workers=workers))
     by_token = {sample["token"]: sample for sample in samples}
     assert len(samples) == 4 and set(by_token) == {drive[k]["token"] for k in range(4)}

@@ -12,13 +12,14 @@ from arbiview_aug.cli.bench import ablation
 from arbiview_aug.cli.bench.ablation import NOTES, ROWS, STEPS, SYNTHETIC, Step, markdown, measure, step_figures
 from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.evaluate.methods import Method
-from arbiview_aug.favs.config import PaperConfig, favs_config
+from arbiview_aug.favs.config import PaperConfig
+from arbiview_aug.transforms.settings import render_config
 
 
 def test_no_two_rows_are_alike_and_steps_need_all() -> None:
     assert len(set(ROWS.values())) == len(ROWS)
     assert {row for step in STEPS.values() for row in (step.row, step.without)} == set(ROWS)
-    configs = [favs_config(row.quality) for row in ROWS.values()]
+    configs = [render_config(row.quality) for row in ROWS.values()]
     switched = {name for name in PaperConfig.__dataclass_fields__ if name.startswith("use_")}
     off = {name for c in configs for name in switched if isinstance(c, PaperConfig) and not getattr(c, name)}
     assert off == switched - {"use_detections"}, "each stage and weight of the paper is off somewhere"
@@ -43,7 +44,7 @@ def test_no_two_rows_are_alike_and_steps_need_all() -> None:
 )
 def test_a_step_changes_one_thing(step: str, changed: set[str]) -> None:
     one, two = (ROWS[name] for name in (STEPS[step].row, STEPS[step].without))
-    configs = [vars(favs_config(row.quality)) for row in (one, two)]
+    configs = [vars(render_config(row.quality)) for row in (one, two)]
     found = {name for name, value in configs[0].items() if value != configs[1][name]}
     found |= {name for name in one._fields if name != "quality" and getattr(one, name) != getattr(two, name)}
     assert found == changed

@@ -29,7 +29,7 @@ def test_another_frame() -> None:
 @pytest.mark.slow
 def test_nothing_estimated_for_one_frame_serves_another() -> None:
     sample = SyntheticDrive(demo_source_rig((64, 176)), num_frames=1, lidar=False)[0]
-    retarget = RigRetarget(sample["rig"].shifted(z_m=0.5), quality="accurate", surface="street")
+    retarget = RigRetarget(sample["rig"].shifted(z_m=0.5), quality="accurate", geometry="street")
     one, two, again = (retarget.explain(frame) for frame in (sample, as_of_another_frame(sample), sample))
     assert one.planned.overlap.corrections and one.planned.plan is not two.planned.plan is not again.planned.plan
 

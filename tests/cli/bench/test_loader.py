@@ -82,7 +82,7 @@ def test_rates(samples: ModuleType) -> None:
 
 def test_command(tmp_path: Path, nuscenes_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "new" / "loader.json"
-    arguments = ["bench", "loader", "--data", str(nuscenes_root), "--surface", "street", "--size", "32x88"]
+    arguments = ["bench", "loader", "--data", str(nuscenes_root), "--geometry", "street", "--size", "32x88"]
     tiny = ["--downscale", "4", "--workers", "0", "1", "--frames", "3", "--epochs", "1"]
     assert main([*arguments, *tiny, "--output", str(path)]) == 0
     report = json.loads(path.read_text())
@@ -114,7 +114,7 @@ def test_depth_on_disk_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str
         "--output",
         str(tmp_path / "a.json"),
     ]
-    arguments = ["bench", "loader", "--data", str(root), "--surface", "motion", "fused", *tiny]
+    arguments = ["bench", "loader", "--data", str(root), "--geometry", "motion", "fused", *tiny]
     assert main(arguments) == 2
     assert "depth" in capsys.readouterr().err
     assert main(["depth", "--data", str(root)]) == 0
@@ -129,7 +129,7 @@ def test_two_workers_against_one(
 ) -> None:
     """Four 800x450 images a frame to four of 704x256."""
     source = samples.rig((450, 800))
-    retarget = RigRetarget(source.turned(yaw_deg=20), source_rig=source, size=(256, 704))
+    retarget = RigRetarget(source.turned(yaw_deg=20), source=source, size=(256, 704))
     retarget.prepare()
     dataset = RetargetedDataset(samples.Frames(FRAMES, (450, 800)), retarget)
     load, machine = os.getloadavg()[0], [counted(2) / counted(1)]
@@ -167,7 +167,7 @@ class Drifting(Dataset[dict[str, Any]]):
 def test_rates_against_reading(nuscenes_root: Path, tmp_path: Path, report_bound: Callable[..., None]) -> None:
     """Two workers, a plan a frame over LiDAR and boxes; and the street, whose plan is held."""
     path = tmp_path / "loader.json"
-    arguments = ["--data", f"nuscenes:{nuscenes_root}", "--workers", "2", "--surface", "street", "lidar"]
+    arguments = ["--data", f"nuscenes:{nuscenes_root}", "--workers", "2", "--geometry", "street", "lidar"]
     assert main(["bench", "loader", *arguments, "--output", str(path)]) == 0
     _, street, lidar = json.loads(path.read_text())["rates"]
     report_bound("rate over the street by that of reading", street["of_reading"], at_least=0.85)
@@ -179,7 +179,7 @@ def test_rates_against_reading(nuscenes_root: Path, tmp_path: Path, report_bound
 def test_soak(report_bound: Callable[..., None]) -> None:
     """2,000 frames in two workers with a new plan each, over LiDAR and boxes: the workers' memory stays."""
     sample = street_sample()
-    retarget = RigRetarget(demo_target_rig((64, 176)), surface="lidar")
+    retarget = RigRetarget(demo_target_rig((64, 176)), geometry="lidar")
     loader = DataLoader(RetargetedDataset(Drifting(sample, SOAKED), retarget), batch_size=None, num_workers=2)
     before = set(multiprocessing.active_children())
     used_mib: list[list[float]] = []

@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from arbiview_aug import RigRetarget
+from arbiview_aug import RigRetarget, SampleKeys
 from arbiview_aug.cli.bench.speed import lowered
 from arbiview_aug.cli.bench.timing import timed_rounds
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import one_thread
-from arbiview_aug.temporal import fill
+from arbiview_aug.inpaint import neighbours as fill
 from arbiview_aug.transforms import rig_retarget
 from tests.helpers import street_sample
 
@@ -29,13 +29,13 @@ def sample() -> dict[str, Any]:
 
 
 @pytest.mark.filterwarnings("ignore:target cameras")
-@pytest.mark.parametrize("surface", ["street", "objects"])
+@pytest.mark.parametrize("surface", ["street", "boxes"])
 def test_without_neighbours_nothing_of_fills_is_built_or_called(
     sample: dict[str, Any], surface: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither where a sample has none, nor where they are not wanted, nor where a list of them is empty."""
     target = lowered(sample["rig"], (32, 88))
-    expected = RigRetarget(target, surface=surface, neighbours=None)(sample)
+    expected = RigRetarget(target, geometry=surface, neighbours=None)(sample)
     for module, names in ((rig_retarget, ("plan_fills",)), (fill, ("build_plan", "merged"))):
         for name in names:
             monkeypatch.setattr(module, name, lambda *_, **__: pytest.fail("fills are made"))
@@ -45,9 +45,9 @@ def test_without_neighbours_nothing_of_fills_is_built_or_called(
         (sample, {}),
         (sample | {"neighbours": []}, {}),
         (sample | {"neighbours": [{"images": None}]}, {"neighbours": None}),
-        (sample, {"outputs": outputs}),
+        (sample, {"keys": SampleKeys(extra=outputs)}),
     ):
-        out = RigRetarget(target, surface=surface, **settings)(frame)
+        out = RigRetarget(target, geometry=surface, **settings)(frame)
         assert all((out[key] == expected[key]).all() for key in ("images", "coverage"))
 
 

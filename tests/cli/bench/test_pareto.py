@@ -22,12 +22,12 @@ STEPS, ATTEMPTS, BUDGET_MS = 4, 3, 400
 
 
 def test_settings_differ_and_leave_out_what_is_the_same() -> None:
-    found = settings(["far", "street", "lidar"])
+    found = settings(["infinity", "street", "lidar"])
     assert len({setting.name for setting in found}) == len(found)
     assert {s.surface for s in found if s.quality == "accurate"} == {"street"}
     assert {s.cached for s in found if s.quality == "accurate"} == {True, False}
     assert not any(s.cached for s in found if s.quality != "accurate")
-    assert {(s.surface, s.execution) for s in found if s.quality == "paper"} == {("far", "opencv")}
+    assert {(s.surface, s.execution) for s in found if s.quality == "paper"} == {("infinity", "opencv")}
     assert {s.reduce for s in found} == {1, 2, 4} and {s.execution for s in found} == {"opencv", "torch"}
     assert Setting("accurate", "street", 2, "torch", True).name == "accurate, street, depth held, 1/2, torch"
 
@@ -35,7 +35,7 @@ def test_settings_differ_and_leave_out_what_is_the_same() -> None:
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder = tmp_path_factory.mktemp("pareto")
-    only = ["--quality", "draft", "fast", "--surface", "far", "street", "objects", "--downscale", "1", "2"]
+    only = ["--quality", "draft", "fast", "--geometry", "infinity", "street", "boxes", "--downscale", "1", "2"]
     tiny = ["--size", "{}x{}".format(*SIZE), "--repeats", "2", "--budget-ms", "1000", "--output", str(folder)]
     assert main(["bench", *only, *tiny]) == 0
     return json.loads((folder / "pareto.json").read_text())
@@ -51,13 +51,13 @@ def test_the_sweep(report: dict[str, Any]) -> None:
         assert 0.5 < row["seen"] <= 1 and row["psnr_db"] >= row["whole_psnr_db"] > 10
         same = rows[row["name"].replace("torch", "opencv")]
         assert row["psnr_db"] == pytest.approx(same["psnr_db"], abs=0.1), "both executions render the same"
-    assert rows["fast, street, 1/2, opencv"]["psnr_db"] > rows["fast, far, 1/2, opencv"]["psnr_db"] + 1
+    assert rows["fast, street, 1/2, opencv"]["psnr_db"] > rows["fast, infinity, 1/2, opencv"]["psnr_db"] + 1
     assert rows["fast, street, 1/2, opencv"]["psnr_db"] > rows["draft, street, 1/2, opencv"]["psnr_db"]
     front = {name for name, row in rows.items() if row["front"]}
     assert max(rows, key=lambda name: rows[name]["psnr_db"]) in front and set(report["steps"]) <= front
     assert report["steps"] and any(rows[name]["surface"] == "street" for name in front)
     # The target stands higher than the source: whatever they measure, static surfaces are not for training.
-    best = max((row for row in rows.values() if row["surface"] == "objects"), key=lambda row: row["psnr_db"])
+    best = max((row for row in rows.values() if row["surface"] == "boxes"), key=lambda row: row["psnr_db"])
     assert report["advice"]["setting"] == best["name"]
     assert report["advice"]["again"]["median_ms"] > 0
     printed = table(report)
@@ -67,8 +67,8 @@ def test_the_sweep(report: dict[str, Any]) -> None:
     assert "than one trained on untouched images (integrations/cross_rig). Better: 'points', 'depth_m' or" in printed
     assert "more settings, none of them on the front" in printed
     fills = {row["name"]: row for row in report["fills"]}
-    assert report["filled"] == best["name"] and list(fills) == ["black", "fill", "inpaint"]
-    for name in ("fill", "inpaint"):
+    assert report["filled"] == best["name"] and list(fills) == ["black", "continue", "telea"]
+    for name in ("continue", "telea"):
         assert fills[name]["whole_psnr_db"] > fills["black"]["whole_psnr_db"] and fills[name]["kept"]
         assert f"| {name} " in printed
     assert "Nearest to the whole view within the budget: " in printed
@@ -85,7 +85,7 @@ def test_every_generator_fills_holes(tmp_path: Path, capsys: pytest.CaptureFixtu
     only = [
         "--quality",
         "draft",
-        "--surface",
+        "--geometry",
         "street",
         "--downscale",
         "2",
@@ -109,8 +109,8 @@ def test_what_nothing_keeps_to_is_said(tmp_path: Path, capsys: pytest.CaptureFix
     only = [
         "--quality",
         "draft",
-        "--surface",
-        "objects",
+        "--geometry",
+        "boxes",
         "--downscale",
         "1",
         "--execution",
@@ -130,7 +130,18 @@ def test_static_surfaces_are_recommended_where_cameras_only_turn(
 ) -> None:
     demo_source_rig((32, 88)).turned(yaw_deg=10).save(tmp_path / "turned.yaml")
     demo_source_rig((32, 88)).shifted(z_m=0.6).save(tmp_path / "raised.yaml")
-    only = ["--quality", "draft", "--surface", "street", "--downscale", "4", "--execution", "opencv", "--size", "32x88"]
+    only = [
+        "--quality",
+        "draft",
+        "--geometry",
+        "street",
+        "--downscale",
+        "4",
+        "--execution",
+        "opencv",
+        "--size",
+        "32x88",
+    ]
     command = ["bench", *only, "--repeats", "1", "--budget-ms", "5000", "--output", str(tmp_path)]
     assert main([*command, "--target", str(tmp_path / "turned.yaml")]) == 0
     printed = capsys.readouterr().out

@@ -12,9 +12,9 @@ import cv2
 import pytest
 import torch
 
+from arbiview_aug import PlanCache
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.render.overlap_depth import overlap_depth
-from arbiview_aug.render.refinement import RefinementCache
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 pytestmark = pytest.mark.release
@@ -63,8 +63,8 @@ def test_a_frame_is_refined_fast_enough(sample: dict[str, Any], report_bound: Ca
 def test_reused_it_costs_little(sample: dict[str, Any], report_bound: Callable[..., None]) -> None:
     """Both qualities in turn, each from a plan it already has."""
     target = sample["rig"].turned(yaw_deg=22).shifted(z_m=0.6)
-    fast = RigRetarget(target, surface="street")
-    accurate = RigRetarget(target, surface="street", quality="accurate", refinement=RefinementCache())
+    fast = RigRetarget(target, geometry="street")
+    accurate = RigRetarget(target, geometry="street", quality="accurate", cache=PlanCache(share_overlap=True))
     assert all((retarget(sample)["images"].shape[-2:] == (900, 1600)) for retarget in (fast, accurate))
     ratios = []
     for _ in range(ATTEMPTS):

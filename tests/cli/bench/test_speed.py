@@ -15,8 +15,8 @@ from arbiview_aug.__main__ import main
 from arbiview_aug.cli.bench.data import recorded
 from arbiview_aug.cli.bench.speed import BOUNDS, BOXES, bytes_moved, default_data, measure, table
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
-from arbiview_aug.favs.config import favs_config
 from arbiview_aug.render.plan import build_plan
+from arbiview_aug.transforms.settings import render_config
 from tests.helpers import street_sample
 
 ATTEMPTS = 3
@@ -84,12 +84,12 @@ def test_bytes() -> None:
     rig = sample["rig"]
     images = [image[None].repeat(2, 1, 1, 1) for image in sample["images"]]
     pixels = 64 * 176
-    plan = build_plan(rig, rig, config=favs_config("draft"))
+    plan = build_plan(rig, rig, config=render_config("draft"))
     assert bytes_moved(plan, images) == 6 * pixels * (2 * 3 + 2 * 4 + 2 * 3)
     floats = [image.float() for image in images]
     assert bytes_moved(plan, floats) == 6 * pixels * (2 * 12 + 8 + 2 * 12)
     one = rig.with_cameras([rig[0]])
-    assert bytes_moved(build_plan(rig, one, config=favs_config("draft")), images) == pixels * (2 * 3 + 8 + 2 * 3)
+    assert bytes_moved(build_plan(rig, one, config=render_config("draft")), images) == pixels * (2 * 3 + 8 + 2 * 3)
 
 
 @pytest.mark.slow

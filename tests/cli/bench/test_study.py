@@ -108,7 +108,9 @@ def test_a_row_is_one_method() -> None:
     frame = make_frame(drive[0], truth=partial(drive.render, 0), exposures=())
     rig = frame.sample["rig"]
     toy = Method("toy", grey)
-    found = study([retargeting("fast", "far", "far"), toy], [frame], {"same": [rig], "turned": [rig.turned(yaw_deg=5)]})
+    found = study(
+        [retargeting("fast", "infinity", "far"), toy], [frame], {"same": [rig], "turned": [rig.turned(yaw_deg=5)]}
+    )
     assert list(found) == ["far", "toy"]
     for row in found.values():
         assert len(row["ms"]) == len(row["plan_ms"]) == 2 and min(row["ms"]) >= 0

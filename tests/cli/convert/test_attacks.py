@@ -162,7 +162,7 @@ def test_frame_folders_refuse_names(key: str, name: Any, frames: Home) -> None:
     shutil.copy(original, frames.root / "in" / "secret.png")  # it could be read
     frames.calibrate(key, name.format(root=frames.root) if isinstance(name, str) else name)
     data = FrameFolder(frames.source)
-    wrapped = RetargetedDataset(data, RigRetarget(load_rig("argoverse2"), size=(24, 40), surface="street"))
+    wrapped = RetargetedDataset(data, RigRetarget(load_rig("argoverse2"), size=(24, 40), geometry="street"))
     assert {"points", "images"} < set(data[0])
     for of in (data, wrapped):
         with pytest.raises(ValueError, match=r"0001.*: expected") as caught:
@@ -271,7 +271,7 @@ def test_depth_is_not_written_elsewhere(frames: Home) -> None:
     (frames.source / "motion_depth").symlink_to(frames.root / "in" / "folder")
     assert frames.run("depth", "--data", str(frames.source)) == 2
     assert "links must not leave the folder" in frames.said
-    assert frames.convert("--surface", "motion") == 2
+    assert frames.convert("--geometry", "motion") == 2
     told = frames.root / "in" / "folder"
     assert main(["depth", "--data", str(frames.source), "--output", str(told)]) == 0  # as it was told
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Rig, RigRetarget, load_rig
+from arbiview_aug import Rig, RigRetarget, SampleKeys, load_rig
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.convert import command as command_module
 from arbiview_aug.cli.convert.views import coverage_of
@@ -39,7 +39,7 @@ def output(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_reader_finds_what_was_rendered(source: Path, output: Path) -> None:
     old, new = FrameFolder(source), FrameFolder(output)
     assert new.tokens == old.tokens == ["0000", "0001", "0002"]
-    retarget = RigRetarget(load_rig("waymo"), size=(24, 40), surface="street", outputs=("confidence",))
+    retarget = RigRetarget(load_rig("waymo"), size=(24, 40), geometry="street", keys=SampleKeys(extra=("confidence",)))
     for before, after in zip((old[k] for k in range(3)), (new[k] for k in range(3)), strict=True):
         out = retarget(before)
         assert torch.equal(after["images"], out["images"])
@@ -68,7 +68,7 @@ def test_points_are_the_same_file(source: Path, output: Path) -> None:
 def test_provenance_names_versions_settings_and_sources(source: Path, output: Path) -> None:
     said = json.loads((output / "conversion" / "provenance.json").read_text())
     assert said["versions"]["torch"] == torch.__version__.split("+")[0] or said["versions"]["torch"]
-    assert said["settings"]["quality"] == "fast" and said["settings"]["holes"] == "fill"
+    assert said["settings"]["quality"] == "fast" and said["settings"]["holes"] == "continue"
     assert said["settings"]["target"]["name"] == "waymo"
     sums = said["sources"]["0002"]
     assert set(sums) == {"0002/calib.json", "0002/00.jpg", "0002/01.jpg", "0002/lidar.npy"}
@@ -117,7 +117,7 @@ def test_cleaned_masks_are_a_setting(source: Path, tmp_path: Path, capsys: pytes
 
 
 def test_what_was_made_up_is_said(source: Path, tmp_path: Path) -> None:
-    assert main(command(source / "0001", tmp_path / "new", "--path", "inpaint")) == 0
+    assert main(command(source / "0001", tmp_path / "new", "--holes", "telea")) == 0
     calib = json.loads((tmp_path / "new" / "0001" / "calib.json").read_text())
     for camera in calib["cameras"]:
         made_up = cv2.imread(str(tmp_path / "new" / "0001" / camera["generated"]), cv2.IMREAD_GRAYSCALE) > 0
@@ -128,16 +128,18 @@ def test_what_was_made_up_is_said(source: Path, tmp_path: Path) -> None:
 
 def test_depth_from_motion_is_read(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(source, tmp_path / "drive")
-    asked = command(tmp_path / "drive", tmp_path / "new", "--images", "png", "--surface", "motion")
-    assert main(asked) == 2 and "--surface motion: expected depth in" in capsys.readouterr().err
+    asked = command(tmp_path / "drive", tmp_path / "new", "--images", "png", "--geometry", "motion")
+    assert main(asked) == 2 and "--geometry motion: expected depth in" in capsys.readouterr().err
     depths = DepthFolder(tmp_path / "drive" / "motion_depth")
     old = FrameFolder(tmp_path / "drive")
     for k, token in enumerate(old.tokens):
         rig = old[k]["rig"]
         depths.write(token, rig, MotionDepth(tuple(np.full(c.size, 6.0 + k, np.float32) for c in rig), "made"))
     assert main(asked) == 0
-    retarget = RigRetarget(load_rig("argoverse2"), size=(24, 40), surface="motion", outputs=("confidence",))
-    static = RigRetarget(load_rig("argoverse2"), size=(24, 40), surface="street")
+    retarget = RigRetarget(
+        load_rig("argoverse2"), size=(24, 40), geometry="motion", keys=SampleKeys(extra=("confidence",))
+    )
+    static = RigRetarget(load_rig("argoverse2"), size=(24, 40), geometry="street")
     new, samples = FrameFolder(tmp_path / "new"), WithDepth(old, depths.root)
     for k in range(len(old)):
         assert torch.equal(new[k]["images"], retarget(samples[k])["images"])
@@ -146,16 +148,17 @@ def test_depth_from_motion_is_read(source: Path, tmp_path: Path, capsys: pytest.
     assert "motion_depth/0001.npz" in read
     depths.path("0002").unlink()
     (tmp_path / "drive" / "motion_depth").rename(tmp_path / "elsewhere")
-    moved = command(tmp_path / "drive", tmp_path / "newer", "--surface", "motion")
-    assert main([*moved, "--motion-depth", str(tmp_path / "elsewhere")]) == 1
+    moved = command(tmp_path / "drive", tmp_path / "newer", "--geometry", "motion")
+    assert main([*moved, "--depth", str(tmp_path / "elsewhere")]) == 1
     assert "expected depth of frame '0002', found none" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main(command(source, tmp_path / "other", "--motion-depth", str(tmp_path / "elsewhere")))
-    assert "expected it with --surface auto, motion, fused or learned" in capsys.readouterr().err
+    assert (
+        main(command(source, tmp_path / "other", "--geometry", "street", "--depth", str(tmp_path / "elsewhere"))) == 2
+    )
+    assert "expected it with --geometry auto, motion, fused or learned" in capsys.readouterr().err
 
 
 def test_impossible_settings(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for asked in (["--path", "diffusion", "--generator", str(tmp_path / "none")], ["--size", "40000x8"]):
+    for asked in (["--holes", "diffusion", "--generator", str(tmp_path / "none")], ["--size", "40000x8"]):
         assert main(command(source, tmp_path / "new", *asked)) == 2
         assert "expected" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
@@ -247,7 +250,7 @@ def test_a_report_of_surfaces_that_read_what_scores(source: Path, tmp_path: Path
         rig = old[k]["rig"]
         depth = MotionDepth(tuple(np.full(c.size, 6.0, np.float32) for c in rig), "made")
         DepthFolder(tmp_path / "drive" / "motion_depth").write(token, rig, depth)
-    asked = command(tmp_path / "drive", tmp_path / "new", "--surface", surface, "--report", "1")
+    asked = command(tmp_path / "drive", tmp_path / "new", "--geometry", surface, "--report", "1")
     assert main(asked) == 0
     page = (tmp_path / "new" / "conversion" / "report.html").read_text()
     assert "ring_front_center" in page and "Not everything could be scored" not in page

@@ -34,7 +34,7 @@ def output(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_reader_finds_what_was_rendered(source: Path, output: Path) -> None:
     old, new = NuScenesDataset(source), NuScenesDataset(output)
     assert new.tokens == old.tokens and new.channels == sorted(load_rig("argoverse2").names)
-    retarget = RigRetarget(load_rig("argoverse2"), size=(24, 40), surface="street")
+    retarget = RigRetarget(load_rig("argoverse2"), size=(24, 40), geometry="street")
     order = [load_rig("argoverse2").names.index(channel) for channel in new.channels]
     for index in (0, 4):
         before, after = old[index], new[index]

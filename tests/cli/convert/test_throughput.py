@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from arbiview_aug import load_rig
-from arbiview_aug.choices import SurfaceName
+from arbiview_aug.choices import GeometryName
 from arbiview_aug.cli.convert.job import Done, Jobs
 from arbiview_aug.cli.convert.settings import Settings
 from arbiview_aug.cli.parallel import results
@@ -64,7 +64,7 @@ def test_two_processes_and_the_share_of_retargeting(
     cores = {processes: counting(processes) for processes in (1, 2)}
     for processes in (1, 2):
         target, output = load_rig("waymo").undistorted(), tmp_path / str(processes)
-        settings = Settings(root=source, kind="frames", target=target, output=output, size=SIZE, surface="street")
+        settings = Settings(root=source, kind="frames", target=target, output=output, size=SIZE, geometry="street")
         with one_thread():
             jobs = results(Timed(settings, settings.open(), range(SAMPLES), "report"), processes, "convert")
             first, *others = [(one, time.monotonic()) for one in jobs]
@@ -94,7 +94,7 @@ def test_two_processes_and_the_share_of_retargeting(
     ids=["street", "lidar", "lidar, full size"],
 )
 def test_what_calibrations_of_their_own_cost(
-    surface: SurfaceName,
+    surface: GeometryName,
     size: tuple[int, int] | None,
     nuscenes_root: Path,
     tmp_path: Path,
@@ -112,7 +112,7 @@ def test_what_calibrations_of_their_own_cost(
             camera["cam2ego"][0][3] += 1e-3 * k
         (source / str(k) / "calib.json").write_text(json.dumps(calib))
     target, output = load_rig("waymo").undistorted(), tmp_path / "converted"
-    settings = Settings(root=source, kind="frames", target=target, output=output, size=size, surface=surface)
+    settings = Settings(root=source, kind="frames", target=target, output=output, size=size, geometry=surface)
     with one_thread():
         _, *others = results(Timed(settings, settings.open(), range(OWN_PLANS), "report"), 1, "convert")
     assert all(one.state == "made" for one in others)

@@ -14,7 +14,7 @@ import torch
 
 from arbiview_aug.__main__ import main as package_main
 from arbiview_aug.evaluate import paper_study
-from arbiview_aug.generator import Generator, load_generator
+from arbiview_aug.generator import Diffusion, load_inpainter
 from arbiview_aug.generator.checkpoint import read_checkpoint
 from arbiview_aug.generator.config import GeneratorConfig, TrainedOn
 from arbiview_aug.generator.training import command
@@ -95,14 +95,14 @@ def test_from_pretrained_weights_to_filled_holes(
     printed = capsys.readouterr().out
     assert f"synthetic, 2 steps, guidance {settings.generator.guidance:g}" in printed and "  sample " in printed
     # --- used as a filler
-    generator = load_generator(tmp_path / "whole" / "generator")
-    assert isinstance(generator, Generator)
+    inpainter = load_inpainter(tmp_path / "whole" / "generator")
+    assert isinstance(inpainter, Diffusion)
     split = Frames(real, (32, 48), [str(k) for k in range(5)]).split()
-    assert generator.trained_on == TrainedOn(data="synthetic", seed=0, held_out=tuple(split.held_out))
+    assert inpainter.generator.trained_on == TrainedOn(data="synthetic", seed=0, held_out=tuple(split.held_out))
     sample = real[split.held_out[0]]
     target = sample["rig"].turned(pitch_deg=12)
     seen = RigRetarget(target, holes="black")(sample)
-    filled = RigRetarget(target, path="diffusion", generator=generator)(sample)
+    filled = RigRetarget(target, holes=inpainter)(sample)
     holes = ~seen["coverage"]
     assert torch.equal(filled["generated"], holes) and bool(holes.any())
     known = seen["coverage"][:, None].expand_as(seen["images"])

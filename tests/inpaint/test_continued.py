@@ -11,9 +11,9 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, default_collate
 
-from arbiview_aug import Rig, RigRetarget
-from arbiview_aug.generator import fillers as holes_module
-from arbiview_aug.generator.fillers import fill_holes, mean_colour, object_colours
+from arbiview_aug import Rig, RigRetarget, SampleKeys
+from arbiview_aug.inpaint import continued as holes_module
+from arbiview_aug.inpaint.continued import fill_holes, mean_colour, object_colours
 from arbiview_aug.render.kernels import farthest_occluded, mark_objects
 from arbiview_aug.render.plan import build_plan
 from arbiview_aug.render.view_plan import BACKGROUND, OBJECT, OCCLUDED, Paint
@@ -21,7 +21,7 @@ from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.transforms.resize import CropRig, ResizeRig
 from tests.helpers import camera, ring, street_sample
 
-SETTINGS = ("fill", "mean", "black")
+SETTINGS = ("continue", "mean", "black")
 MAPS = ("source_camera", "source_frame", "confidence")
 
 
@@ -47,7 +47,7 @@ def gradient(height: int, width: int) -> torch.Tensor:
 def test_only_holes_differ_and_they_are_marked(street: dict[str, Any], dtype: torch.dtype, execution: str) -> None:
     images = street["images"] if dtype == torch.uint8 else (street["images"].float() / 255).to(dtype)
     outs = {
-        how: RigRetarget(raised(street), surface="objects", holes=how, outputs=MAPS, execution=execution)(  # type: ignore[arg-type]
+        how: RigRetarget(raised(street), geometry="boxes", holes=how, keys=SampleKeys(extra=MAPS), backend=execution)(  # type: ignore[arg-type]
             street | {"images": images}
         )
         for how in SETTINGS
@@ -56,7 +56,7 @@ def test_only_holes_differ_and_they_are_marked(street: dict[str, Any], dtype: to
     hole = ~black["coverage"]
     pixels = hole[:, None].expand_as(images)
     assert hole.any(dim=(1, 2)).all() and not black["images"][pixels].any() and "generated" not in black
-    for how in ("fill", "mean"):
+    for how in ("continue", "mean"):
         out = outs[how]
         assert torch.equal(out["generated"], hole) and out["images"].dtype == dtype
         assert torch.equal(out["images"][~pixels], black["images"][~pixels])
@@ -67,7 +67,7 @@ def test_only_holes_differ_and_they_are_marked(street: dict[str, Any], dtype: to
     assert (made == made[0]).all()
     expected = black["images"].movedim(1, -1)[~hole].float().mean(0)
     assert (made[0] - expected).abs().max() < (1.5 if dtype == torch.uint8 else 0.01)
-    assert outs["fill"]["images"][pixels].float().std() > 0
+    assert outs["continue"]["images"][pixels].float().std() > 0
 
 
 @pytest.mark.slow
@@ -82,16 +82,16 @@ def test_filled_holes_are_nearer_to_the_truth_than_black_ones() -> None:
         truth = drive.render(0, target).images
         assert isinstance(truth, torch.Tensor)
         for how in SETTINGS:
-            out = RigRetarget(target, surface="objects", holes=how)(sample)  # type: ignore[arg-type]
+            out = RigRetarget(target, geometry="boxes", holes=how)(sample)  # type: ignore[arg-type]
             hole = ~out["coverage"][:, None].expand_as(truth)
             errors[how] += float((out["images"].float() - truth.float())[hole].square().mean())
-    assert errors["fill"] < 0.6 * errors["mean"] < 0.6 * errors["black"]
+    assert errors["continue"] < 0.6 * errors["mean"] < 0.6 * errors["black"]
 
 
 def test_beyond_the_sources_views_columns_go_on_and_fade() -> None:
     source = Rig([camera(size=(64, 64))])
     upwards = source.turned(pitch_deg=40)
-    out = RigRetarget(upwards, holes="fill")({"images": gradient(64, 64), "rig": source})
+    out = RigRetarget(upwards, holes="continue")({"images": gradient(64, 64), "rig": source})
     image, seen = out["images"][0].float(), out["coverage"][0]
     column = seen[:, 32]
     border = int(column.nonzero().min())
@@ -125,7 +125,7 @@ def test_occluded_pixels_are_those_that_an_image_contains(size: tuple[int, int],
     mask[100:] = False
     source = Rig([replace(camera(size=(128, 160), lens=lens, distortion=distortion), mask=mask)])
     target = Rig([camera(size=size, azimuth_deg=15)]).turned(pitch_deg=-10)
-    (view,) = build_plan(source, target, surface="far").targets
+    (view,) = build_plan(source, target, geometry="infinity").targets
     v, u = np.indices(size, dtype=np.float64)
     rays, _ = target[0].unproject_cam(np.stack([u, v], -1))
     points = rays @ target[0].cam2ego[:3, :3].T @ source[0].cam2ego[:3, :3]
@@ -136,8 +136,8 @@ def test_occluded_pixels_are_those_that_an_image_contains(size: tuple[int, int],
 
 
 def test_what_objects_hide_is_occluded_and_what_nobody_looks_at_is_not(street: dict[str, Any]) -> None:
-    for surface in ("objects", "lidar"):
-        out = RigRetarget(raised(street), surface=surface)  # type: ignore[arg-type]
+    for surface in ("boxes", "lidar"):
+        out = RigRetarget(raised(street), geometry=surface)  # type: ignore[arg-type]
         plan = out.plan_frame(read_frames(street, None)[0], raised(street)).plan
         for view in plan.targets:
             assert view.layers is None or not ((view.layers == OCCLUDED) & view.coverage).any()
@@ -162,7 +162,7 @@ def test_a_whole_target_asks_for_no_filling(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize("execution", ["opencv", "torch"])
 def test_frames_of_a_batch_are_filled_as_alone(street: dict[str, Any], execution: str) -> None:
-    retarget = RigRetarget(raised(street), surface="street", execution=execution)  # type: ignore[arg-type]
+    retarget = RigRetarget(raised(street), geometry="street", backend=execution)  # type: ignore[arg-type]
     frames = [street | {"images": images} for images in (street["images"], street["images"].flip(-1))]
     keys = ("images", "K", "cam2ego")
     rig = street["rig"]
@@ -180,7 +180,7 @@ def test_frames_of_a_batch_are_filled_as_alone(street: dict[str, Any], execution
 
 @pytest.mark.parametrize("how", SETTINGS)
 def test_skipped_samples_collate_and_have_nothing_made_up(street: dict[str, Any], how: Any) -> None:
-    retarget = RigRetarget(raised(street), surface="street", size=(48, 132), p=0.5, holes=how)
+    retarget = RigRetarget(raised(street), geometry="street", size=(48, 132), p=0.5, holes=how)
     outs = [retarget(street, params={"skipped": skipped}) for skipped in (0.0, 1.0)]
     for out in outs:
         out.pop("retarget_params")
@@ -196,7 +196,7 @@ def test_gradients_of_seen_pixels_stay() -> None:
     target = source.turned(yaw_deg=30)
     out = RigRetarget(target)({"images": images, "rig": source})
     gradients = []
-    for how in ("fill", "black"):
+    for how in ("continue", "black"):
         out = RigRetarget(target, holes=how)({"images": images, "rig": source})  # type: ignore[arg-type]
         weights = torch.arange(out["images"].numel()).reshape(out["images"].shape) % 7
         gradients.append(torch.autograd.grad((out["images"] * weights).sum(), images)[0])
@@ -227,10 +227,10 @@ class _Frames(torch.utils.data.Dataset[Any]):
 
 
 def test_in_workers_and_after_pickling(street: dict[str, Any]) -> None:
-    retarget = RigRetarget(raised(street), surface="street")
+    retarget = RigRetarget(raised(street), geometry="street")
     expected = retarget(street)
     again = pickle.loads(pickle.dumps(retarget))
-    assert again.holes == "fill" and "holes=fill" in repr(again)
+    assert "holes=Continue" in repr(again)
     assert torch.equal(again(street)["images"], expected["images"])
     for batch in DataLoader(_Frames(street, retarget), num_workers=1):
         assert torch.equal(batch["images"][0], expected["images"])
@@ -238,26 +238,23 @@ def test_in_workers_and_after_pickling(street: dict[str, Any]) -> None:
 
 
 def test_made_up_pixels_are_never_sources(street: dict[str, Any]) -> None:
-    first = RigRetarget(raised(street), surface="street")(street)
+    first = RigRetarget(raised(street), geometry="street")(street)
     other = dict(first) | {"images": torch.where(first["generated"][:, None], 255, first["images"])}
-    back = RigRetarget(street["rig"], surface="street", holes="black")
+    back = RigRetarget(street["rig"], geometry="street", holes="black")
     out, changed = back(first), back(other)
     assert torch.equal(out["images"], changed["images"]) and "generated" not in out
 
 
 def test_marks_follow_resizing_and_cropping(street: dict[str, Any]) -> None:
-    out = RigRetarget(raised(street), surface="street")(street)
+    out = RigRetarget(raised(street), geometry="street")(street)
     small = CropRig(0, 8, (24, 72))(ResizeRig((32, 88))(out))
     assert small["generated"].shape == small["coverage"].shape == (6, 24, 72) and small["generated"].any()
     assert not (small["generated"] & small["coverage"]).any()
 
 
-def test_settings_that_contradict_each_other() -> None:
-    with pytest.raises(ValueError, match="holes: expected one of fill, mean, black, got 'grey'"):
+def test_unknown_names_are_refused() -> None:
+    with pytest.raises(ValueError, match="holes: expected one of continue, telea, mean, black, diffusion, got 'grey'"):
         RigRetarget(ring(), holes="grey")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="holes: path='inpaint' fills them itself: expected 'fill', the default"):
-        RigRetarget(ring(), path="inpaint", holes="black")
-    assert RigRetarget(ring(), path="inpaint", holes="fill").path == "inpaint"
 
 
 # --- the functions ----------------------------------------------------------------------------------------------------
@@ -266,7 +263,7 @@ def test_the_mean_colour_is_that_of_what_is_seen_in_all_views() -> None:
     seen = [torch.zeros((8, 8), dtype=torch.bool), torch.ones((8, 8), dtype=torch.bool)]
     seen[0][:4] = True
     np.testing.assert_allclose(mean_colour([view.numpy() for view in views], [part.numpy() for part in seen]), 60)
-    (first, second) = fill_holes([view.clone() for view in views], seen, [None] * 2, [None] * 2, "mean")
+    (first, second) = fill_holes([view.clone() for view in views], seen, [None] * 2, [None] * 2, only_mean=True)
     assert (first[:, 4:] == 60).all() and not first[:, :4].any() and torch.equal(second, views[1])
 
 
@@ -277,7 +274,7 @@ def test_any_size_and_any_hole_is_filled(size: tuple[int, int]) -> None:
         seen = torch.from_numpy(rng.random(size) < share)
         view = torch.full((3, *size), 77, dtype=torch.uint8) * seen
         for layers in (None, (~seen).numpy().view(np.uint8), rng.integers(0, 3, size, np.uint8)):
-            (out,) = fill_holes([view.clone()], [seen], [layers], [None], "fill")
+            (out,) = fill_holes([view.clone()], [seen], [layers], [None])
             assert (out[:, ~seen] == (77 if seen.any() else 128)).all() and (out[:, seen] == 77).all()
 
 
@@ -288,7 +285,7 @@ def test_the_nearer_side_is_never_smeared_into_what_it_hides() -> None:
     layers = np.zeros((64, 96), np.uint8)
     layers[30:, 20:70], layers[10:30, 20:70] = OBJECT, OCCLUDED
     seen = torch.from_numpy(layers != OCCLUDED)
-    (out,) = fill_holes([view * seen], [seen], [layers], [None], "fill")
+    (out,) = fill_holes([view * seen], [seen], [layers], [None])
     assert torch.equal(out[:, seen], view[:, seen]) and ((out[:, ~seen].int() - 120).abs() <= 1).all()
 
 
@@ -298,7 +295,7 @@ def test_fills_change_evenly_away_from_what_is_known() -> None:
     layers = np.zeros((64, 64), np.uint8)
     layers[30:40, 10:54], layers[40:, 10:54] = OCCLUDED, OBJECT
     seen = torch.from_numpy(layers != OCCLUDED)
-    (out,) = fill_holes([view * seen], [seen], [layers], [None], "fill")
+    (out,) = fill_holes([view * seen], [seen], [layers], [None])
     steps = np.diff(out[0, 29:40, 32].numpy().astype(int))  # from what is above to what is beside
     assert steps[0] < 20 and (steps > 0).all() and (np.diff(steps) <= 1).all()
 
@@ -341,10 +338,10 @@ def test_tops_take_the_brightest_colours_of_their_objects() -> None:
         colours = object_colours([view.numpy()], [paint])
         np.testing.assert_array_equal(colours[:, 0], [40, 80, 100, expected])
         layers = np.full(seen.shape, OBJECT, np.uint8)
-        (out,) = fill_holes([view.clone()], [seen], [layers], [paint], "fill")
+        (out,) = fill_holes([view.clone()], [seen], [layers], [paint])
         assert (out[:, ~seen] == expected).all() and torch.equal(out[:, seen], view[:, seen])
         of_float, paint, _ = painted(top_seen, 1 / 255)
-        (out,) = fill_holes([of_float], [seen], [layers], [paint], "fill")
+        (out,) = fill_holes([of_float], [seen], [layers], [paint])
         torch.testing.assert_close(out[:, ~seen], torch.full_like(out[:, ~seen], expected / 255))
 
 
@@ -356,19 +353,19 @@ def test_cracks_in_objects_take_the_colour_beside_them() -> None:
     seen[:, 20] = False
     view[:, ~seen] = 0
     paint = Paint.of(face, np.where(seen.numpy(), 0, -1).astype(np.int8), PARTS)
-    (out,) = fill_holes([view], [seen], [np.full((64, 64), OBJECT, np.uint8)], [paint], "fill")
+    (out,) = fill_holes([view], [seen], [np.full((64, 64), OBJECT, np.uint8)], [paint])
     assert torch.equal(out[:, 30, 20], expected)
 
 
 @pytest.mark.slow
 def test_both_executions_and_types_fill_alike_with_held_plans(street: dict[str, Any]) -> None:
     as_float = street | {"images": street["images"].float() / 255}
-    for surface in ("objects", "lidar"):
-        retarget = RigRetarget(raised(street), surface=surface)  # type: ignore[arg-type]
+    for surface in ("boxes", "lidar"):
+        retarget = RigRetarget(raised(street), geometry=surface)  # type: ignore[arg-type]
         first = retarget(street)
         assert torch.equal(pickle.loads(pickle.dumps(retarget))(street)["images"], first["images"])
         assert torch.equal(retarget(street)["images"], first["images"])  # by the plan that is held
-        of_torch = RigRetarget(raised(street), surface=surface, execution="torch")(street)  # type: ignore[arg-type]
+        of_torch = RigRetarget(raised(street), geometry=surface, backend="torch")(street)  # type: ignore[arg-type]
         made = first["generated"]
         assert torch.equal(of_torch["generated"], made)
         for other in (of_torch["images"].float(), 255 * retarget(as_float)["images"]):

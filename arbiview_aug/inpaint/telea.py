@@ -1,10 +1,16 @@
-"""Inpainting of holes from their borders: the classical baseline, and the generator's starting point."""
+"""Inpainting by Telea's fast marching: the classical baseline, and the generator's starting point."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 import torch
+
+from arbiview_aug.inpaint.inpainter import Inpainter, checked_settings, holes_of, put
+from arbiview_aug.render.rendered import RenderedFrame
+from arbiview_aug.sample.inputs import Frame
 
 RADIUS_PX = 3.0  # radius of Telea's neighbourhood, from OpenCV's example
 _MARGIN_PX = 8  # margin around holes that Telea's method reads
@@ -31,3 +37,25 @@ def telea(image: torch.Tensor, hole: torch.Tensor) -> torch.Tensor:
     filled = image.detach().clone()
     filled[:, box[0], box[1]] = torch.where(marks, values if is_uint8 else (values.float() / 255).to(image.dtype), part)
     return filled
+
+
+class Telea(Inpainter):
+    """Fills holes by Telea's method; seen pixels of low confidence too, by ``min_confidence``."""
+
+    def __init__(self, *, min_confidence: float = 0.0) -> None:
+        self.min_confidence, _ = checked_settings(min_confidence)
+
+    def inpaint(
+        self, views: Sequence[torch.Tensor], holes: Sequence[torch.Tensor], seeds: Sequence[int]
+    ) -> list[torch.Tensor]:
+        return [telea(view, hole) for view, hole in zip(views, holes, strict=True)]
+
+    @torch.no_grad()
+    def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
+        """Fill rendered frames; the own car, which is black, does not bleed into holes."""
+        filled = []
+        for frame in rendered:
+            known, holes = holes_of(frame, self.min_confidence)
+            views = self.inpaint(frame.images, [~of_view for of_view in known], ())
+            filled.append(put(frame, views, holes))
+        return filled

@@ -1,4 +1,4 @@
-"""Render plans of calibrations and scenes: what follows from a pair of rigs, and the cache of plans."""
+"""Render plans and their cache, and what follows from a pair of rigs."""
 
 from __future__ import annotations
 
@@ -11,17 +11,43 @@ import numpy as np
 
 from arbiview_aug.cameras.rays import CameraMaps
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import SurfaceName
-from arbiview_aug.favs.config import FavsConfig
+from arbiview_aug.choices import GeometryName
 from arbiview_aug.lru_cache import LRUCache
+from arbiview_aug.render.config import RenderConfig
 from arbiview_aug.render.overlap_depth import OverlapDepth
 from arbiview_aug.render.plan import RenderPlan, build_plan, plan_key
 from arbiview_aug.render.requirements import needs_geometry, static_harm
 from arbiview_aug.sample.inputs import Frame
 from arbiview_aug.sample.neighbours import Neighbour
-from arbiview_aug.scene.scene import SURFACES, Scene
+from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.temporal.motion_depth import MotionDepth
 from arbiview_aug.transforms.checks import Coverages
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanCache:
+    """What a transform keeps from call to call. Pickles and copies are empty: each DataLoader worker fills its own.
+
+    Attributes:
+        max_bytes: Memory for plans of calibrations that come back; the least recently used go first.
+        share_overlap: Frames that share the depth from overlap of ``quality="accurate"``, which depends on the images:
+            False, none; a key of the sample, such as a scene token, those with the same value and calibration; True,
+            all of a calibration, which is right for a vehicle at rest alone.
+
+    Raises:
+        ValueError: Impossible values.
+    """
+
+    max_bytes: int = 512 * 2**20
+    share_overlap: bool | str = False
+
+    def __post_init__(self) -> None:
+        is_number = isinstance(self.max_bytes, int | float) and not isinstance(self.max_bytes, bool)
+        if not is_number or not self.max_bytes >= 0:
+            raise ValueError(f"PlanCache.max_bytes: expected a number of bytes from 0, got {self.max_bytes!r}")
+        if not isinstance(self.share_overlap, bool | str):
+            raise ValueError(f"PlanCache.share_overlap: expected a bool or a sample key, got {self.share_overlap!r}")
+
 
 _MAX_RIG_PAIRS = 64  # one or two kilobytes each, beside the target's cameras
 
@@ -29,7 +55,7 @@ _MAX_RIG_PAIRS = 64  # one or two kilobytes each, beside the target's cameras
 class RigPair:
     """A source rig, a target rig in the source's ego frame, and what follows from their calibrations alone."""
 
-    def __init__(self, source: Rig, target: Rig, surface: SurfaceName, config: FavsConfig | None) -> None:
+    def __init__(self, source: Rig, target: Rig, surface: GeometryName, config: RenderConfig | None) -> None:
         self.source, self.target = source, target.in_frame_of(source)
         self.road = Scene()  # nothing else is known
         self.needs_geometry = config is not None and needs_geometry(source, self.target, surface, config)
@@ -69,7 +95,7 @@ class FramePlan:
     frame: Frame
     pair: RigPair
     scene: Scene
-    surface: SurfaceName
+    surface: GeometryName
     plan: RenderPlan
     neighbours: Sequence[Neighbour] = ()
     overlap: OverlapDepth | None = None
@@ -78,7 +104,7 @@ class FramePlan:
     @property
     def harm(self) -> str | None:
         """Why a detector suffers from cameras that move over a static surface; None if it does not."""
-        return self.pair.harm if SURFACES[self.surface].is_static else None
+        return self.pair.harm if GEOMETRIES[self.surface].is_static else None
 
 
 class Plans:
@@ -86,7 +112,7 @@ class Plans:
 
     Args:
         config: Settings; None for the paper's stages, which depend on every image and have no plans.
-        surface: A name in ``SURFACES``.
+        surface: A name in ``GEOMETRIES``.
         max_bytes: Memory for plans; the least recently used go first.
         keep_refined: Whether plans over a street that depth from overlap corrected come back.
         check_reach: Called with the source, the target and its coverage for each new plan.
@@ -98,8 +124,8 @@ class Plans:
 
     def __init__(
         self,
-        config: FavsConfig | None,
-        surface: SurfaceName,
+        config: RenderConfig | None,
+        surface: GeometryName,
         max_bytes: int,
         keep_refined: bool,
         check_reach: Callable[[Rig, Rig, Coverages], None],
@@ -132,9 +158,9 @@ class Plans:
 
     def _built(self, pair: RigPair, scene: Scene) -> RenderPlan:
         source, target = pair.source, pair.target
-        plan = build_plan(source, target, surface=self.surface, config=self.config, scene=scene, maps=self.maps)
+        plan = build_plan(source, target, geometry=self.surface, config=self.config, scene=scene, maps=self.maps)
         coverage = plan.coverage
         if not scene.is_empty and not any(map(np.any, coverage)):  # objects may hide all of a frame's target
-            coverage = build_plan(source, target, surface="street", config=self.config, maps=self.maps).coverage
+            coverage = build_plan(source, target, geometry="street", config=self.config, maps=self.maps).coverage
         self.check_reach(source, target, coverage)
         return plan

@@ -12,17 +12,18 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader
 
-from arbiview_aug import RetargetedDataset, RigRetarget, collate
+from arbiview_aug import RetargetedDataset, RigRetarget, SampleKeys, collate
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.bench.timing import peak_mib
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.frame_writer import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import GeneratorError
-from arbiview_aug.generator import CompletedLoader, PipelineFiller, TorchScriptFiller, load_generator
-from arbiview_aug.generator.inpainting import telea
-from tests.generator.tiny_pipeline import save_tiny_pipeline
+from arbiview_aug.generator import Diffusion, load_inpainter
+from arbiview_aug.inpaint import CompletedLoader, PipelineInpainter, TorchScriptInpainter
+from arbiview_aug.inpaint.telea import telea
 from tests.helpers import ring
+from tests.inpaint.tiny_pipeline import save_tiny_pipeline
 
 SIZE = (96, 160)
 
@@ -88,9 +89,9 @@ def wide(done: dict[str, Any]) -> torch.Tensor:
 @pytest.mark.slow
 def test_a_script_fills_a_frame_and_a_batch(lama: Path, drive: SyntheticDrive) -> None:
     target = drive.rig.shifted(z_m=0.5)
-    filler = TorchScriptFiller(lama, size=64)
-    completing = RigRetarget(target, path="diffusion", generator=filler)
-    black = RigRetarget(target, holes="black", outputs=("sources",))
+    filler = TorchScriptInpainter(lama, size=64)
+    completing = RigRetarget(target, holes=filler)
+    black = RigRetarget(target, holes="black", keys=SampleKeys(extra=("sources",)))
     alone = []
     for sample in (drive[0], drive[1]):
         alone.append(completing(sample))
@@ -112,20 +113,20 @@ def test_a_script_fills_a_frame_and_a_batch(lama: Path, drive: SyntheticDrive) -
 def test_only_what_holes_need_is_computed(lama: Path, size: int, change: dict[str, float], holes: float) -> None:
     rig = ring(size=(192, 336), horizontal_fov_deg=70.0)
     sample = {"images": torch.randint(256, (6, 3, 192, 336), dtype=torch.uint8), "rig": rig}
-    filler = TorchScriptFiller(lama, size=size)
-    out = RigRetarget(rig.turned(**change), path="diffusion", generator=filler)(sample)
+    filler = TorchScriptInpainter(lama, size=size)
+    out = RigRetarget(rig.turned(**change), holes=filler)(sample)
     assert float(out["generated"].float().mean()) == pytest.approx(holes, abs=0.005)
     assert filler.pixels <= 0.25 * out["generated"].numel()
     calls, pixels = filler.calls, filler.pixels
-    assert not RigRetarget(rig, path="diffusion", generator=filler)(sample)["generated"].any()
+    assert not RigRetarget(rig, holes=filler)(sample)["generated"].any()
     assert (filler.calls, filler.pixels) == (calls, pixels), "whole views cost nothing"
 
 
 def test_cracks_cost_no_call(lama: Path) -> None:
-    filler = TorchScriptFiller(lama, size=64)
+    filler = TorchScriptInpainter(lama, size=64)
     view, hole = torch.rand(3, 64, 64), torch.zeros(64, 64, dtype=torch.bool)
     hole[20:24], hole[:, 40:44] = True, True
-    (done,) = filler.fill([view], [hole], [0])
+    (done,) = filler.inpaint([view], [hole], [0])
     assert filler.calls == 0 and torch.equal(done, telea(view, hole))
 
 
@@ -138,17 +139,17 @@ def test_a_pipeline_from_disk_completes_frames_everywhere(
     target = rig.turned(pitch_deg=2)
     images = torch.randint(256, (6, 3, 128, 224), dtype=torch.uint8)
     frames = [{"images": images.roll(k, -1), "rig": rig, "token": f"frame {k}"} for k in range(2)]
-    seen = [RigRetarget(target, holes="black", outputs=("sources",))(frame) for frame in frames]
-    filler = PipelineFiller.from_pretrained(pipeline, size=128)
+    seen = [RigRetarget(target, holes="black", keys=SampleKeys(extra=("sources",)))(frame) for frame in frames]
+    filler = PipelineInpainter.from_pretrained(pipeline, size=128, steps=1)
     given: list[tuple[int, ...]] = []
-    inpaint = filler.inpaint
+    run = filler.run
 
     def watched(images: torch.Tensor, *others: Any) -> torch.Tensor:
         given.append(tuple(images.shape))
-        return inpaint(images, *others)
+        return run(images, *others)
 
-    filler.inpaint = watched  # type: ignore[method-assign]
-    retarget = RigRetarget(target, path="diffusion", generator=filler, steps=1)
+    filler.run = watched  # type: ignore[method-assign]
+    retarget = RigRetarget(target, holes=filler)
     alone = []
     grown = peak_mib(lambda: alone.append(retarget(frames[0])))
     assert_completed(alone[0], seen[0])
@@ -161,7 +162,7 @@ def test_a_pipeline_from_disk_completes_frames_everywhere(
     assert 0 < filler.calls <= 2 and share <= 0.25
     # Memory: a call sees no more than ``batch`` images of ``size``, however many frames there are.
     loader = DataLoader(seen, batch_size=2, collate_fn=collate)  # type: ignore[arg-type]
-    (batch,) = CompletedLoader(loader, filler, steps=1)
+    (batch,) = CompletedLoader(loader, filler)
     for k, one in enumerate(seen):
         assert_completed({key: batch[key][k] for key in ("images", "coverage", "generated")}, one)
     assert all(count <= filler.batch and max(h, w) <= filler.size for count, _, h, w in given)
@@ -169,7 +170,10 @@ def test_a_pipeline_from_disk_completes_frames_everywhere(
     write_frame(tmp_path / "data" / "frame", frames[0])
     target.save(tmp_path / "target.yaml")
     common = ["--data", str(tmp_path / "data"), "--target", str(tmp_path / "target.yaml"), "--images", "png"]
-    ways = {"seen": ["--holes", "black"], "done": ["--path", "diffusion", "--generator", str(pipeline), "--steps", "1"]}
+    ways = {
+        "seen": ["--holes", "black"],
+        "done": ["--holes", "diffusion", "--generator", str(pipeline), "--steps", "1"],
+    }
     for name, way in ways.items():
         assert (
             main(["convert", *common, *way, "--workers", "1", "--report", "0", "--output", str(tmp_path / name)]) == 0
@@ -181,21 +185,22 @@ def test_a_pipeline_from_disk_completes_frames_everywhere(
 def test_a_pipeline_fills_six_views_the_same_way_each_time(pipeline: Path) -> None:
     drive = SyntheticDrive(demo_source_rig((40, 64)), num_frames=1)
     target = drive.rig.shifted(z_m=0.5)
-    filler = PipelineFiller.from_pretrained(pipeline, size=64)
+    filler = PipelineInpainter.from_pretrained(pipeline, size=64, steps=2, seed=3)
     assert (filler.multiple, filler.size, filler.device.type) == (2, 64, "cpu")
-    retarget = RigRetarget(target, path="diffusion", generator=filler, steps=2, seed=3)
+    retarget = RigRetarget(target, holes=filler)
     seen = RigRetarget(target, holes="black")(drive[0])
     one, two = retarget(drive[0]), retarget(drive[0])
     assert_completed(one, seen)
     assert torch.equal(one["images"], two["images"])
-    other = RigRetarget(target, path="diffusion", generator=filler, steps=2, seed=4)(drive[0])
+    filler.seed = 4
+    other = retarget(drive[0])
     assert not torch.equal(one["images"], other["images"])
 
 
 def test_the_published_stages_take_a_generator(lama: Path, drive: SyntheticDrive) -> None:
     target = drive.rig.turned(yaw_deg=20)
     seen = RigRetarget(target, quality="paper", holes="black")(drive[0])
-    done = RigRetarget(target, quality="paper", path="diffusion", generator=TorchScriptFiller(lama))(drive[0])
+    done = RigRetarget(target, quality="paper", holes=TorchScriptInpainter(lama))(drive[0])
     assert_completed(done, seen)
 
 
@@ -204,7 +209,7 @@ def test_convert_takes_a_pipeline_and_a_script(pipeline: Path, lama: Path, tmp_p
     small = SyntheticDrive(demo_source_rig((40, 64)), num_frames=1)
     write_frame(tmp_path / "data" / "frame", small[0])
     small.rig.shifted(z_m=0.3).save(tmp_path / "up.yaml")
-    common = ["--data", str(tmp_path / "data"), "--target", str(tmp_path / "up.yaml"), "--path", "diffusion"]
+    common = ["--data", str(tmp_path / "data"), "--target", str(tmp_path / "up.yaml"), "--holes", "diffusion"]
     for generator, file in ((pipeline, "unet/config.json"), (lama, "lama.pt")):
         output = tmp_path / file.partition("/")[0]
         assert main(["convert", *common, "--generator", str(generator), "--steps", "1", "--output", str(output)]) == 0
@@ -218,15 +223,15 @@ def test_what_is_no_network_is_refused(lama: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken.pt"
     broken.write_bytes(b"no script")
     with pytest.raises(GeneratorError, match=r"broken.pt: expected a TorchScript file"):
-        TorchScriptFiller(broken)
+        TorchScriptInpainter(broken)
     (tmp_path / "empty").mkdir()
     with pytest.raises(GeneratorError, match="expected an inpainting pipeline of diffusers"):
-        PipelineFiller.from_pretrained(tmp_path / "empty")
+        PipelineInpainter.from_pretrained(tmp_path / "empty")
     with pytest.raises(GeneratorError, match="expected a generator's folder"):
-        load_generator(tmp_path / "empty")
-    assert isinstance(load_generator(lama), TorchScriptFiller)
-    with pytest.raises(ValueError, match=r"generator: expected .*PipelineFiller"):
-        RigRetarget("waymo", path="diffusion", generator=nn.Identity())  # type: ignore[arg-type]
+        load_inpainter(tmp_path / "empty")
+    assert isinstance(load_inpainter(lama), TorchScriptInpainter)
+    with pytest.raises(ValueError, match=r"generator: expected a Generator, got Identity"):
+        RigRetarget("waymo", holes=Diffusion(nn.Identity()))  # type: ignore[arg-type]
 
 
 class Broken(nn.Module):
@@ -237,10 +242,10 @@ class Broken(nn.Module):
 @pytest.mark.parametrize("how", ["nan", "shape"])
 def test_what_a_network_must_not_return(tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     torch.jit.script(Broken()).save(str(tmp_path / "broken.pt"))
-    filler = TorchScriptFiller(tmp_path / "broken.pt", size=64)
+    filler = TorchScriptInpainter(tmp_path / "broken.pt", size=64)
     if how == "shape":
-        monkeypatch.setattr(filler, "inpaint", lambda images, *_: images[..., 1:])
+        monkeypatch.setattr(filler, "run", lambda images, *_: images[..., 1:])
     hole = torch.zeros(64, 64, dtype=torch.bool)
     hole[20:30, 20:30] = True
     with pytest.raises(GeneratorError, match="expected finite images" if how == "nan" else "expected images"):
-        filler.fill([torch.rand(3, 64, 64)], [hole], [0])
+        filler.inpaint([torch.rand(3, 64, 64)], [hole], [0])

@@ -3,7 +3,7 @@
 Pixels that the current frame sees never change. By default only the near road is filled; its distances come from the
 current frame's surface. A neighbour's pixel is rejected where a labelled object hides the point from its camera, in
 either frame. Unlabelled scenes, and places beside moved objects, need the agreement of several frames
-(``arbiview_aug.temporal.merge``).
+(``arbiview_aug.inpaint.merge``).
 """
 
 from __future__ import annotations
@@ -22,22 +22,21 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import CameraMaps, PixelRays
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.errors import ArbiviewError
-from arbiview_aug.favs.config import FavsConfig
 from arbiview_aug.image_ops import FRESH, Memory
+from arbiview_aug.inpaint.merge import Candidate, merged
+from arbiview_aug.render.config import RenderConfig
 from arbiview_aug.render.plan import RenderPlan, build_plan
 from arbiview_aug.render.rendered import Maps, RenderedFrame, Renderer, confidence_of
 from arbiview_aug.render.view_plan import ViewPlan
-from arbiview_aug.sample.neighbours import Neighbour, Warn, warn_lost
+from arbiview_aug.sample.neighbours import Neighbour, Warn, neighbour_images
 from arbiview_aug.scene.boxes import BoxSurface
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.shapes import whole
 from arbiview_aug.scene.static import Street
 from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Surface
 from arbiview_aug.temporal.change import BOX_MARGIN_M, ChangeRisk, change_risks
-from arbiview_aug.temporal.merge import Candidate, merged
 
-Reach = Literal["ground", "all"]
+Reach = Literal["road", "all"]
 """Area that neighbours may fill: the near road, or everything that the surface covers."""
 
 NEAR_M = 15.0
@@ -173,7 +172,7 @@ def plan_fills(
     neighbours: Sequence[Neighbour],
     scene: Scene,
     surface: str,
-    config: FavsConfig,
+    config: RenderConfig,
     reach: Reach,
     maps: CameraMaps,
 ) -> Fills | None:
@@ -200,7 +199,7 @@ def plan_fills(
         boxes = neighbour.labelled + np.array([0, 0, 0, 2 * BOX_MARGIN_M, 2 * BOX_MARGIN_M, 0, 0])
         objects = BoxSurface(Street(), boxes, whole(boxes)) if len(boxes) else None
         known = Scene(known=_HoleSurface(holes, full, objects))
-        views = build_plan(neighbour.rig, rig, surface=surface, config=config, scene=known, maps=maps)
+        views = build_plan(neighbour.rig, rig, geometry=surface, config=config, scene=known, maps=maps)
         shown = [_shown(hole, view, neighbour) for hole, view in zip(holes, views.targets, strict=True)]
         if any((hole.free & one.shows).any() for hole, one in zip(holes, shown, strict=True)):
             fills.append(Fill(neighbour, views, shown))
@@ -211,12 +210,12 @@ def _hole(plan: RenderPlan, index: int, surface: Surface, reach: Reach, maps: Ca
     camera, covered = plan.target[index], plan.targets[index].coverage
     empty = ~covered if camera.mask is None else ~covered & camera.mask
     height_m = camera.center_m[2] - plan.source.ground_z_m
-    if not empty.any() or (reach == "ground" and height_m <= 0):
+    if not empty.any() or (reach == "road" and height_m <= 0):
         return None
     rays = maps.rays(camera)
     local = rays.at(*map(np.arange, camera.size))
     up = np.tensordot(camera.cam2ego[2, :3].astype(np.float32), local, 1)
-    allowed = np.asarray(up < -1 / np.hypot(1, NEAR_M / height_m) if reach == "ground" else local.any(axis=0))
+    allowed = np.asarray(up < -1 / np.hypot(1, NEAR_M / height_m) if reach == "road" else local.any(axis=0))
     free = empty & allowed
     if not free.any():
         return None
@@ -226,7 +225,7 @@ def _hole(plan: RenderPlan, index: int, surface: Surface, reach: Reach, maps: Ca
     camera = camera.crop(rows.start, columns.start, size)
     rays = maps.rays(camera, rays.crop(rows.start, columns.start, size))
     q, allowed = surface.image(camera, rays), allowed[box]
-    if reach == "ground":
+    if reach == "road":
         allowed &= (q > 0) & (np.abs(height_m + up[box] / np.maximum(q, np.float32(1e-9))) < _ROAD_TOLERANCE_M)
     free = free[box] & allowed
     if not free.any():
@@ -305,15 +304,6 @@ def fill_from_neighbours(
             _write(certain if target.certainty is not None else None, hole, taken, target.certainty)
     rendered = replace(rendered, images=views, certainty=certain)
     return rendered if rendered.confidence is None else replace(rendered, confidence=confidence_of(rendered))
-
-
-def neighbour_images(neighbour: Neighbour, like: Sequence[torch.Tensor], warn: Warn) -> tuple[torch.Tensor, ...] | None:
-    """Read a neighbour's images; None, with a warning that names it, if they cannot be read."""
-    try:
-        return neighbour.images(like)
-    except (ArbiviewError, OSError) as error:
-        warn_lost(warn, neighbour.name, error)
-        return None
 
 
 def _write(maps: Maps | None, hole: Hole, where: BoolArray, value: Any) -> None:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Rig, RigRetarget
+from arbiview_aug import Rig, RigRetarget, SampleKeys
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig
+from arbiview_aug.inpaint.merge import Candidate, merged
 from arbiview_aug.temporal.change import ChangeRisk
-from arbiview_aug.temporal.merge import Candidate, merged
 
 RIG = demo_source_rig((96, 256))
 
@@ -33,12 +33,14 @@ def sample(drive: SyntheticDrive) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def filled(sample: dict[str, Any]) -> dict[str, Any]:
-    return RigRetarget(low(), outputs=("source_frame", "source_camera", "confidence"))(sample)
+    return RigRetarget(low(), keys=SampleKeys(extra=("source_frame", "source_camera", "confidence")))(sample)
 
 
 @pytest.fixture(scope="module")
 def alone(sample: dict[str, Any]) -> dict[str, Any]:
-    return RigRetarget(low(), neighbours=None, outputs=("source_frame", "source_camera", "confidence"))(sample)
+    return RigRetarget(low(), neighbours=None, keys=SampleKeys(extra=("source_frame", "source_camera", "confidence")))(
+        sample
+    )
 
 
 def test_the_current_frame_is_never_repainted(filled: dict[str, Any], alone: dict[str, Any]) -> None:
@@ -70,7 +72,7 @@ def test_filled_pixels_are_the_roads(drive: SyntheticDrive, filled: dict[str, An
 
 
 def test_both_executions_fill_alike(sample: dict[str, Any], filled: dict[str, Any]) -> None:
-    out = RigRetarget(low(), execution="torch", outputs=("source_frame",))(sample)
+    out = RigRetarget(low(), backend="torch", keys=SampleKeys(extra=("source_frame",)))(sample)
     same = out["source_frame"] == filled["source_frame"]
     assert same.float().mean() > 0.999
     off = (out["images"].int() - filled["images"].int()).abs().amax(1)[same]
@@ -241,8 +243,11 @@ def test_labels_stand_in_holes_where_nothing_else_needs_geometry() -> None:
     ahead = torch.tensor([[7.0, -5.0, 0.9, 4.5, 2.0, 1.8, 0.0]])  # in the hole, on the road that a neighbour shows
     sample |= {"boxes_3d": ahead, "neighbours": [dict(one) | {"boxes_3d": ahead[:0]} for one in sample["neighbours"]]}
     by_auto, by_boxes = (
-        RigRetarget(target, surface=surface, outputs=("source_frame",))(sample) for surface in ("auto", "objects")
+        RigRetarget(target, geometry=surface, keys=SampleKeys(extra=("source_frame",)))(sample)
+        for surface in ("auto", "boxes")
     )
-    empty = RigRetarget(target, surface="objects", outputs=("source_frame",))(sample | {"boxes_3d": ahead[:0]})
+    empty = RigRetarget(target, geometry="boxes", keys=SampleKeys(extra=("source_frame",)))(
+        sample | {"boxes_3d": ahead[:0]}
+    )
     assert torch.equal(by_auto["source_frame"], by_boxes["source_frame"])
     assert (empty["source_frame"] > 0).sum() > (by_auto["source_frame"] > 0).sum() > 0

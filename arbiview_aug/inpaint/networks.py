@@ -5,7 +5,7 @@ They see windows around the holes alone (``crops``); seen pixels stay as they ar
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,14 +18,15 @@ import torch
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError
-from arbiview_aug.generator.crops import Canvas, drawn, packed, windows
-from arbiview_aug.generator.inpainting import telea
+from arbiview_aug.inpaint.crops import Canvas, drawn, packed, windows
+from arbiview_aug.inpaint.inpainter import Inpainter, check_device, checked_settings
+from arbiview_aug.inpaint.telea import telea
 
 NARROW_PX = 5  # holes narrower than this are inpainted by Telea's method: half of the pixels around objects
 _SEED = 2**31
 
 
-class HoleFiller(torch.nn.Module, ABC):
+class NetworkInpainter(Inpainter, torch.nn.Module):
     """A network that inpaints images.
 
     Args:
@@ -33,13 +34,26 @@ class HoleFiller(torch.nn.Module, ABC):
         size: Longest side of an image that it sees, pixels; a multiple of ``multiple``.
         multiple: Sides that it sees are multiples of it.
         batch: Images that it sees at once.
+        min_confidence: As for every ``Inpainter``, like ``seed``.
 
     Attributes:
         calls, pixels: How often it ran, and on how many pixels in all.
     """
 
-    def __init__(self, network: torch.nn.Module, size: int, multiple: int, batch: int) -> None:
+    is_random = True
+
+    def __init__(
+        self,
+        network: torch.nn.Module,
+        size: int,
+        multiple: int,
+        batch: int,
+        *,
+        min_confidence: float = 0.0,
+        seed: int = 0,
+    ) -> None:
         super().__init__()
+        self.min_confidence, self.seed = checked_settings(min_confidence, seed)
         if size < multiple or size % multiple or batch < 1:
             raise ValueError(f"size, batch: expected a multiple of {multiple}, and 1 or more, got {size} and {batch}")
         self.network = network.eval()
@@ -54,29 +68,15 @@ class HoleFiller(torch.nn.Module, ABC):
         return next((tensor.device for tensor in self.network.state_dict().values()), torch.device("cpu"))
 
     @abstractmethod
-    def inpaint(
-        self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int], steps: int | None, guidance: float | None
-    ) -> torch.Tensor:
+    def run(self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int]) -> torch.Tensor:
         """Inpaint images (B, 3, h, w) in [0, 1], black in their holes (B, h, w) bool; the same shape comes back."""
 
     @torch.no_grad()
-    def fill(
-        self,
-        views: Sequence[torch.Tensor],
-        holes: Sequence[torch.Tensor],
-        seeds: Sequence[int],
-        steps: int | None = None,
-        guidance: float | None = None,
+    def inpaint(
+        self, views: Sequence[torch.Tensor], holes: Sequence[torch.Tensor], seeds: Sequence[int]
     ) -> list[torch.Tensor]:
-        """Fill the holes (h, w) of views (3, h, w), uint8 or float in [0, 1], of any frames together.
-
-        Args:
-            views: Views.
-            holes: bool; other pixels do not change.
-            seeds: A seed for each view.
-            steps: Steps of a pipeline; None: its own.
-            guidance: Guidance of a pipeline; None: its own.
-        """
+        """Fill the holes of views in windows around them; pixels outside the holes do not change."""
+        check_device(self)
         tops = [255.0 if view.dtype == torch.uint8 else 1.0 for view in views]
         # The network sees narrow holes inpainted, and they stay so.
         pixels = [telea(v, hole).float().cpu().numpy() / top for v, hole, top in zip(views, holes, tops, strict=True)]
@@ -87,7 +87,7 @@ class HoleFiller(torch.nn.Module, ABC):
                 alike[canvas.size].append(canvas)
             for canvases in alike.values():
                 for start in range(0, len(canvases), self.batch):
-                    self._fill(canvases[start : start + self.batch], pixels, left, seeds, steps, guidance)
+                    self._fill(canvases[start : start + self.batch], pixels, left, seeds)
         filled = []
         for view, hole, own, top in zip(views, holes, pixels, tops, strict=True):
             values = torch.from_numpy(own * top).to(view.device)
@@ -101,14 +101,12 @@ class HoleFiller(torch.nn.Module, ABC):
         pixels: Sequence[np.ndarray],
         left: Sequence[np.ndarray],
         seeds: Sequence[int],
-        steps: int | None,
-        guidance: float | None,
     ) -> None:
         """Inpaint canvases of one size, and put their pixels where they belong; their holes are no longer left."""
         images, holes = zip(*(drawn(canvas, pixels, left) for canvas in canvases), strict=True)
         given = torch.from_numpy(np.stack(images)).to(self.device), torch.from_numpy(np.stack(holes)).to(self.device)
         own = [seeds[canvas.windows[0][0].view] for canvas in canvases]
-        found = self.inpaint(*given, own, steps, guidance)
+        found = self.run(*given, own)
         if found.shape != given[0].shape:
             raise GeneratorError(f"inpainting: expected images {tuple(given[0].shape)}, got {tuple(found.shape)}")
         if not bool(torch.isfinite(found).all()):
@@ -128,19 +126,42 @@ def _wide(hole: BoolArray) -> BoolArray:
     return cv2.morphologyEx(hole.astype(np.uint8), cv2.MORPH_OPEN, np.ones((NARROW_PX,) * 2, np.uint8)).astype(bool)
 
 
-class PipelineFiller(HoleFiller):
+class PipelineInpainter(NetworkInpainter):
     """One of diffusers' inpainting pipelines, by ``from_pretrained``."""
 
-    def __init__(self, pipeline: Any, size: int, multiple: int, batch: int, prompt: str) -> None:
+    def __init__(
+        self,
+        pipeline: Any,
+        size: int,
+        multiple: int,
+        batch: int,
+        prompt: str,
+        *,
+        steps: int | None = None,
+        guidance: float | None = None,
+        min_confidence: float = 0.0,
+        seed: int = 0,
+    ) -> None:
         parts = {name: part for name, part in pipeline.components.items() if isinstance(part, torch.nn.Module)}
-        super().__init__(torch.nn.ModuleDict(parts), size, multiple, batch)
-        self.pipeline, self.prompt = pipeline, prompt
+        super().__init__(torch.nn.ModuleDict(parts), size, multiple, batch, min_confidence=min_confidence, seed=seed)
+        checked_settings(min_confidence, seed, steps, guidance)
+        self.pipeline, self.prompt, self.steps, self.guidance = pipeline, prompt, steps, guidance
         pipeline.set_progress_bar_config(disable=True)
 
     @classmethod
     def from_pretrained(
-        cls, where: str | Path, *, size: int | None = None, batch: int = 4, prompt: str = "", **settings: Any
-    ) -> PipelineFiller:
+        cls,
+        where: str | Path,
+        *,
+        size: int | None = None,
+        batch: int = 4,
+        prompt: str = "",
+        steps: int | None = None,
+        guidance: float | None = None,
+        min_confidence: float = 0.0,
+        seed: int = 0,
+        **settings: Any,
+    ) -> PipelineInpainter:
         """Load what ``AutoPipelineForInpainting`` knows: Stable Diffusion, SDXL, Flux and others.
 
         Args:
@@ -148,6 +169,9 @@ class PipelineFiller(HoleFiller):
             size: Longest side of an image that it sees; None: the pipeline's own.
             batch: Images that it sees at once.
             prompt: What fills the holes.
+            steps: Steps of the pipeline; None: its own.
+            guidance: Guidance of the pipeline; None: its own.
+            min_confidence: As for every ``Inpainter``, like ``seed``.
             settings: Of diffusers' ``from_pretrained``, such as ``torch_dtype`` or ``revision``.
 
         Raises:
@@ -164,13 +188,12 @@ class PipelineFiller(HoleFiller):
         multiple = int(pipeline.vae_scale_factor)
         core = getattr(pipeline, "unet", None) or pipeline.transformer
         own = int(getattr(core.config, "sample_size", None) or 64) * multiple
-        return cls(pipeline, own if size is None else size, multiple, batch, prompt)
+        of_inpainter = {"steps": steps, "guidance": guidance, "min_confidence": min_confidence, "seed": seed}
+        return cls(pipeline, own if size is None else size, multiple, batch, prompt, **of_inpainter)  # type: ignore[arg-type]
 
-    def inpaint(
-        self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int], steps: int | None, guidance: float | None
-    ) -> torch.Tensor:
+    def run(self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int]) -> torch.Tensor:
         h, w = images.shape[-2:]
-        settings = {"num_inference_steps": steps, "guidance_scale": guidance}
+        settings = {"num_inference_steps": self.steps, "guidance_scale": self.guidance}
         done = self.pipeline(
             prompt=[self.prompt] * len(images),
             image=images,
@@ -184,7 +207,7 @@ class PipelineFiller(HoleFiller):
         return done.images
 
 
-class TorchScriptFiller(HoleFiller):
+class TorchScriptInpainter(NetworkInpainter):
     """A TorchScript file of LaMa's kind.
 
     It takes images (B, 3, h, w) in [0, 1] and masks (B, 1, h, w), 1 in holes, and returns images.
@@ -194,21 +217,29 @@ class TorchScriptFiller(HoleFiller):
         size: Longest side of an image that it sees.
         multiple: Of which sides are multiples.
         batch: Images that it sees at once.
+        min_confidence: As for every ``Inpainter``, like ``seed``.
 
     Raises:
         GeneratorError: No such file, or no TorchScript.
     """
 
-    def __init__(self, path: str | Path, *, size: int = 512, multiple: int = 8, batch: int = 4) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        size: int = 512,
+        multiple: int = 8,
+        batch: int = 4,
+        min_confidence: float = 0.0,
+        seed: int = 0,
+    ) -> None:
         try:
             network = torch.jit.load(str(path), map_location="cpu")
         except (RuntimeError, ValueError, OSError) as error:
             text = " ".join(str(error).split())[:300]
             raise GeneratorError(f"{path}: expected a TorchScript file: {text}") from None
-        super().__init__(network, size, multiple, batch)
+        super().__init__(network, size, multiple, batch, min_confidence=min_confidence, seed=seed)
 
-    def inpaint(
-        self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int], steps: int | None, guidance: float | None
-    ) -> torch.Tensor:
+    def run(self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int]) -> torch.Tensor:
         done: torch.Tensor = self.network(images, holes[:, None].to(images.dtype))
         return done

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from arbiview_aug.choices import Holes
-from arbiview_aug.generator.inpainting import GREY
+from arbiview_aug.inpaint.inpainter import Inpainter
+from arbiview_aug.inpaint.telea import GREY
 from arbiview_aug.render.rendered import RenderedFrame
 from arbiview_aug.render.view_plan import BACKGROUND, OBJECT, Paint
 from arbiview_aug.sample.batching import stacked
+from arbiview_aug.sample.inputs import Frame
 
 CELLS = 64  # cells along a view's shorter side
 
@@ -38,12 +39,36 @@ Colour = npt.NDArray[np.float32]
 """(3,) in the images' unit."""
 
 
-def fill_frame(rendered: RenderedFrame, how: Holes) -> RenderedFrame:
-    """Fill the holes of a rendered frame by ``fill_holes``, in place where possible."""
-    if how == "black":
-        return rendered
-    images = fill_holes(rendered.images, list(rendered.coverage), rendered.layers, rendered.paint, how)
-    return replace(rendered, images=images, generated=stacked([~seen for seen in rendered.coverage]))
+class Continue(Inpainter):
+    """Continues the background behind objects, mostly along rows, and outside all source images mostly along columns.
+
+    Unseen parts of labelled objects take their object's colour: tops that of its top as a source sees it, else of its
+    sides in the frame's light. Covered pixels do not change.
+    """
+
+    outcome: ClassVar[str] = "filled in from its surroundings"
+    only_mean: ClassVar[bool] = False
+
+    def inpaint(
+        self, views: Sequence[torch.Tensor], holes: Sequence[torch.Tensor], seeds: Sequence[int]
+    ) -> list[torch.Tensor]:
+        none = [None] * len(views)
+        return fill_holes([view.clone() for view in views], [~hole for hole in holes], none, none, self.only_mean)
+
+    def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
+        """Fill rendered frames, in place where possible."""
+        return [self._filled(frame) for frame in rendered]
+
+    def _filled(self, frame: RenderedFrame) -> RenderedFrame:
+        images = fill_holes(frame.images, list(frame.coverage), frame.layers, frame.paint, self.only_mean)
+        return replace(frame, images=images, generated=stacked([~seen for seen in frame.coverage]))
+
+
+class Mean(Continue):
+    """Gives holes the mean colour of the frame's views."""
+
+    outcome = "given the mean colour of the views"
+    only_mean = True
 
 
 def fill_holes(
@@ -51,7 +76,7 @@ def fill_holes(
     coverage: Sequence[torch.Tensor],
     layers: Sequence[npt.NDArray[np.uint8] | None],
     paint: Sequence[Paint | None],
-    how: Holes,
+    only_mean: bool = False,
 ) -> list[torch.Tensor]:
     """Fill uncovered pixels; covered ones are unchanged and keep their gradients.
 
@@ -61,22 +86,22 @@ def fill_holes(
         coverage: (h, w) bool of each.
         layers: (h, w) uint8 of each as in ``ViewPlan``, or None: all uncovered pixels lie outside the images.
         paint: Of each as in ``ViewPlan``, or None.
-        how: ``fill``: paint tops in their objects' colours, and continue objects from objects, background from
-            background. ``mean``: set all to the mean colour of the frame's covered pixels. ``black``: none.
+        only_mean: Set all to the mean colour of the frame's covered pixels. Else paint tops in their objects' colours,
+            and continue objects from objects, background from background.
     """
     from arbiview_aug.inpaint.kernels import paint as put_paint
 
     seen = [of_view.cpu().numpy() for of_view in coverage]
-    if how == "black" or all(of_view.all() for of_view in seen):
+    if all(of_view.all() for of_view in seen):
         return list(views)
     arrays = [_as_array(view) for view in views]
-    needs_mean = how == "mean" or not all(of_view.any() for of_view in seen)
+    needs_mean = only_mean or not all(of_view.any() for of_view in seen)
     mean = mean_colour(arrays, seen) if needs_mean else np.zeros(3, np.float32)
     colours = object_colours(arrays, paint)
     for view, known, layer, tops in zip(arrays, seen, layers, paint, strict=True):
         if known.all():
             continue
-        if how == "mean":
+        if only_mean:
             _put(view, ~known, mean)
             continue
         of_view = np.zeros(known.shape, np.uint8) if layer is None else layer

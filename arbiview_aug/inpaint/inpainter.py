@@ -1,0 +1,205 @@
+"""The protocol of all that fills pixels of rendered views that no source shows."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from numbers import Real
+from typing import Any, ClassVar
+
+import torch
+
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.errors import GeneratorError, SampleError
+from arbiview_aug.render.rendered import MAP_KEYS, Maps, RenderedFrame
+from arbiview_aug.sample.batching import gathered, leading_shape, rewrapped, split, stacked
+from arbiview_aug.sample.inputs import Frame, read_frames
+
+SOURCES_KEY = "sources"
+"""Sample key of the source images and calibration, for inpainting after collating."""
+
+
+class Inpainter(ABC):
+    """Fills the holes of rendered views. A new one defines ``inpaint``; ``RigRetarget(holes=...)`` takes it.
+
+    Attributes:
+        min_confidence: Pixels that sources show with less confidence are filled too, 0 to 1.
+        seed: Seed of random pixels, combined with the frame (its ``token``, else its images) and the camera.
+        outcome: What becomes of holes, for warnings: "The rest is ...".
+        is_random: Whether ``inpaint`` reads its seeds.
+        needs_confidence: Whether frames must bring their confidence.
+    """
+
+    min_confidence: float = 0.0
+    seed: int = 0
+    outcome: ClassVar[str] = "inpainted"
+    is_random: ClassVar[bool] = False
+
+    @property
+    def needs_confidence(self) -> bool:
+        return self.min_confidence > 0
+
+    @abstractmethod
+    def inpaint(
+        self, views: Sequence[torch.Tensor], holes: Sequence[torch.Tensor], seeds: Sequence[int]
+    ) -> list[torch.Tensor]:
+        """Fill the holes (h, w) bool of views (3, h, w), uint8 or float in [0, 1], of any frames together.
+
+        Args:
+            views: Views, black where no source shows a pixel; they may differ in size and are not modified.
+            holes: Pixels to fill; all others of the result are ignored.
+            seeds: A seed for each view.
+        """
+
+    @torch.no_grad()
+    def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
+        """Fill rendered ``frames``.
+
+        Filled pixels are no longer covered: ``coverage`` False, ``confidence`` 0, ``source_camera`` and
+        ``source_frame`` -1. Gradients of the others stay.
+        """
+        holes = [holes_of(frame, self.min_confidence)[1] for frame in rendered]
+        names = frame_names(frames) if self.is_random else [""] * len(frames)
+        seeds = [
+            seeded(self.seed, name, str(k)).initial_seed() if self.is_random else 0
+            for name, frame in zip(names, rendered, strict=True)
+            for k in range(len(frame.rig))
+        ]
+        views = [view for frame in rendered for view in frame.images]
+        filled = iter(self.inpaint(views, [hole for of_frame in holes for hole in of_frame], seeds))
+        frames_and_holes = zip(rendered, holes, strict=True)
+        return [put(frame, [next(filled) for _ in of_frame], of_frame) for frame, of_frame in frames_and_holes]
+
+    def complete_batch(self, batch: Mapping[str, Any]) -> dict[str, Any]:
+        """Fill collated samples, on the device of a network: DataLoader workers cannot use a GPU.
+
+        The pixels are those of ``RigRetarget(holes=self)``, but for rounding: frames are computed together.
+
+        Args:
+            batch: From ``RigRetarget(..., keys=SampleKeys(extra=("sources", "confidence")))``: a sample or a batch.
+
+        Returns:
+            A new dict without ``sources``, with ``generated``.
+
+        Raises:
+            SampleError: The batch lacks the sources, the coverage or the confidence.
+            GeneratorError: Impossible settings.
+        """
+        missing = [key for key in ("images", "coverage", "confidence", SOURCES_KEY) if batch.get(key) is None]
+        if missing:
+            raise SampleError(
+                f"complete: expected {', '.join(missing)} in the batch: retarget with "
+                "keys=SampleKeys(extra=('sources', 'confidence'))"
+            )
+        sources = read_frames(batch[SOURCES_KEY], None)
+        views = read_frames({key: value for key, value in batch.items() if key != "coverage"}, None)
+        lead = leading_shape(batch["images"])
+        if len(sources) != len(views):
+            raise SampleError(f"complete: expected sources of {len(views)} frames, got {len(sources)}")
+        maps = {key: split(batch[key], lead) for key in MAP_KEYS if key in batch}
+        is_filled = maps.pop("generated", None) is not None  # by ``holes`` of the transform
+        rendered = []
+        for b, view in enumerate(views):
+            images = list(view.images)
+            if is_filled:
+                images = [torch.where(seen, image, 0) for seen, image in zip(maps["coverage"][b], images, strict=True)]
+            rendered.append(RenderedFrame(images, view.rig, **{key: frames[b] for key, frames in maps.items()}))
+        if batch.get("token") is not None:
+            sources = [replace(frame, sample={**frame.sample, "token": batch["token"]}) for frame in sources]
+        done = self.fill(rendered, sources)
+        out = {key: value for key, value in batch.items() if key != SOURCES_KEY}
+        for key in (*maps, "generated"):
+            out[key] = gathered([getattr(frame, key) for frame in done], lead)
+        out["images"] = rewrapped(gathered([stacked(frame.images) for frame in done], lead), batch["images"])
+        return out
+
+
+class Black(Inpainter):
+    """Leaves holes black; ``generated`` is not written."""
+
+    outcome = "black: train with 'coverage' as a mask"
+
+    def inpaint(
+        self, views: Sequence[torch.Tensor], holes: Sequence[torch.Tensor], seeds: Sequence[int]
+    ) -> list[torch.Tensor]:
+        return list(views)
+
+    def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
+        return list(rendered)
+
+
+# --- holes ------------------------------------------------------------------------------------------------------------
+def holes_of(frame: RenderedFrame, min_confidence: float) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """Pixels (h, w) of each view that are seen with enough confidence, and the others that are not the own car."""
+    trust = frame.coverage if frame.confidence is None else frame.confidence
+    return known_and_holes(frame.rig, frame.coverage, trust, min_confidence)
+
+
+def known_and_holes(
+    targets: Rig, coverage: Maps | Sequence[torch.Tensor], confidence: Any, min_confidence: float
+) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """As ``holes_of``, of coverage (h, w) bool and confidence (h, w) of each target camera."""
+    known = [seen & (c >= min_confidence) for seen, c in zip(coverage, confidence, strict=True)]
+    masks = [camera.mask for camera in targets]
+    holes = [
+        ~k if mask is None else ~k & torch.tensor(mask, device=k.device) for k, mask in zip(known, masks, strict=True)
+    ]
+    return known, holes
+
+
+def put(rendered: RenderedFrame, images: Sequence[torch.Tensor], holes: Sequence[torch.Tensor]) -> RenderedFrame:
+    """The frame with images (3, h, w) in the holes (h, w) of its views, marked as generated."""
+
+    def without_holes(maps: Sequence[torch.Tensor], empty: int) -> torch.Tensor | list[torch.Tensor]:
+        return stacked([m.masked_fill(hole, empty) for m, hole in zip(maps, holes, strict=True)])
+
+    pixels = zip(holes, images, rendered.images, strict=True)
+    views = [torch.where(hole, filled, view) for hole, filled, view in pixels]
+    return replace(rendered.with_maps(without_holes), images=views, generated=stacked(list(holes)))
+
+
+# --- randomness -------------------------------------------------------------------------------------------------------
+def frame_names(frames: Sequence[Frame]) -> list[str]:
+    """Names of frames for seeds: their ``token``, else a digest of their images (33 ms for six of 1600 x 900)."""
+    return [f.name("token") if f.sample.get("token") is not None else _digest(f.images) for f in frames]
+
+
+def _digest(images: Sequence[torch.Tensor]) -> str:
+    digest = hashlib.blake2b()
+    for image in images:
+        digest.update(image.detach().cpu().contiguous().view(torch.uint8).numpy().tobytes())  # bfloat16 too
+    return digest.hexdigest()
+
+
+def seeded(*key: object) -> torch.Generator:
+    """A CPU generator seeded by a key of plain values."""
+    digest = hashlib.sha256(repr(key).encode()).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1)
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+def checked_settings(
+    min_confidence: float, seed: int = 0, steps: int | None = None, guidance: float | None = None
+) -> tuple[float, int]:
+    """Check settings of an inpainter; ValueError for impossible ones."""
+    if steps is not None and (not isinstance(steps, int) or isinstance(steps, bool) or steps < 1):
+        raise ValueError(f"steps: expected a whole number from 1, got {steps!r}")
+    if guidance is not None and (not isinstance(guidance, Real) or isinstance(guidance, bool)):
+        raise ValueError(f"guidance: expected a number, got {guidance!r}")
+    is_number = isinstance(min_confidence, Real) and not isinstance(min_confidence, bool)
+    if not is_number or not 0 <= min_confidence <= 1:
+        raise ValueError(f"min_confidence: expected a number from 0 to 1, got {min_confidence!r}")
+    if not isinstance(seed, int) or isinstance(seed, bool):
+        raise ValueError(f"seed: expected a whole number, got {seed!r}")
+    return float(min_confidence), seed
+
+
+def check_device(network: Any) -> None:
+    """Raise GeneratorError for a network on a GPU in a DataLoader worker."""
+    if network.device.type == "cuda" and torch.utils.data.get_worker_info() is not None:
+        raise GeneratorError(
+            "a generator on a GPU cannot run in DataLoader workers: use num_workers=0, keep the generator on the "
+            "CPU, or complete batches after they are collated"
+        )
