@@ -65,6 +65,36 @@ def ring(
     return Rig(cameras)
 
 
+def smooth_images(rig: Rig, dtype: torch.dtype = torch.uint8, seed: int = 0) -> Any:
+    """Smooth random pictures, so that a small shift makes a small difference; a list where sizes differ."""
+    generator = torch.Generator().manual_seed(seed)
+    images = []
+    for one in rig:
+        coarse = torch.rand((1, 3, 5, 7), generator=generator)
+        image = torch.nn.functional.interpolate(coarse, size=one.size, mode="bicubic", align_corners=True)[0]
+        image = image.clamp(0, 1)
+        images.append((image * 255).round().to(torch.uint8) if dtype == torch.uint8 else image.to(dtype))
+    return torch.stack(images) if len(set(rig.sizes)) == 1 else images
+
+
+def sample_of(rig: Rig, dtype: torch.dtype = torch.uint8, seed: int = 0, **more: Any) -> dict[str, Any]:
+    """A sample of smooth images with its calibration in tensors."""
+    calibration = {"K": torch.from_numpy(rig.K), "cam2ego": torch.from_numpy(rig.cam2ego)}
+    return {"images": smooth_images(rig, dtype, seed), **calibration, **more}
+
+
+def same(one: Any, two: Any) -> bool:
+    """Whether nested dicts and lists are equal in types and bits; unknown velocities are NaN."""
+    if isinstance(one, torch.Tensor):
+        alike = type(one) is type(two) and one.dtype == two.dtype and one.shape == two.shape
+        return alike and bool(((one == two) | (one.isnan() & two.isnan())).all())
+    if isinstance(one, dict):
+        return list(one) == list(two) and all(same(one[key], two[key]) for key in one)
+    if isinstance(one, list | tuple):
+        return len(one) == len(two) and all(map(same, one, two))
+    return bool(one == two)
+
+
 def street_sample(size: tuple[int, int] = (64, 176), **settings: Any) -> dict[str, Any]:
     """One frame of the demo rig on a synthetic street; settings are those of ``SyntheticDrive``."""
     return SyntheticDrive(demo_source_rig(size), num_frames=1, **settings)[0]

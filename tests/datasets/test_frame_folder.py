@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import FrameFolder, open_data
 from arbiview_aug.errors import CalibrationError, DataError
 from arbiview_aug.sample.masks import without_specks
+from tests.helpers import camera
 
 Change = Callable[[dict[str, Any]], None]
 
@@ -24,25 +24,13 @@ Change = Callable[[dict[str, Any]], None]
 def frame(folder: Path, change: Change | None = None, *, lidar: bool = True) -> Path:
     """A folder with two cameras of different lenses; ``change`` edits the calibration before it is written."""
     folder.mkdir(parents=True, exist_ok=True)
-    rig = Rig(
-        [
-            Camera.looking(name="front", azimuth_deg=0, width_px=64, height_px=48, horizontal_fov_deg=80),
-            Camera.looking(
-                name="back",
-                azimuth_deg=180,
-                width_px=64,
-                height_px=48,
-                horizontal_fov_deg=120,
-                lens="fisheye",
-                distortion=(0.01, 0.0, 0.0, 0.0),
-            ),
-        ],
-        ground_z_m=-0.3,
-    )
+    lens = {"lens": "fisheye", "distortion": (0.01, 0.0, 0.0, 0.0)}
+    back = camera("back", 180, size=(48, 64), horizontal_fov_deg=120, **lens)
+    rig = Rig([camera("front", size=(48, 64)), back], ground_z_m=-0.3)
     calib = rig.to_dict()
-    for k, camera in enumerate(calib["cameras"]):
-        camera["file"] = f"{camera['name']}.png"
-        cv2.imwrite(str(folder / camera["file"]), np.full((48, 64, 3), (10, 20, 30 + k), np.uint8))
+    for k, entry in enumerate(calib["cameras"]):
+        entry["file"] = f"{entry['name']}.png"
+        cv2.imwrite(str(folder / entry["file"]), np.full((48, 64, 3), (10, 20, 30 + k), np.uint8))
     mask = np.full((48, 64), 255, np.uint8)
     mask[40:] = 0
     cv2.imwrite(str(folder / "mask.png"), mask)
@@ -198,8 +186,8 @@ def test_bad_calibrations(tmp_path: Path, change: Change, error: type[Exception]
 
 def test_swapped_width_and_height(tmp_path: Path) -> None:
     def swap(calib: dict[str, Any]) -> None:
-        for camera in calib["cameras"]:
-            camera.update(width=48, height=64, mask=None)
+        for entry in calib["cameras"]:
+            entry.update(width=48, height=64, mask=None)
 
     with pytest.raises(DataError, match=r"expected 48x64 .*got 64x48; the calibration's width and height look swapped"):
         FrameFolder(frame(tmp_path, swap))[0]

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from hypothesis import strategies as st
 
-from arbiview_aug import Camera, PaperConfig, PlanCache, RenderConfig, Rig, SampleKeys
+from arbiview_aug import PaperConfig, PlanCache, RenderConfig, Rig, SampleKeys
+from tests.helpers import camera
 from tests.mutations import NUMBERS, TEXT_JUNK, mutated
 
 SIZE = (18, 24)
@@ -65,14 +66,7 @@ TENSOR_CHANGES: tuple[Callable[[torch.Tensor], Any], ...] = (
 def rig(names: tuple[str, ...] = ("left", "right"), spread_deg: float = 40.0) -> Rig:
     """Cameras side by side whose views overlap."""
     cameras = [
-        Camera.looking(
-            name=name,
-            azimuth_deg=spread_deg * (0.5 - k),
-            position_m=(1.5, 0.4 * (0.5 - k), 1.5),
-            width_px=SIZE[1],
-            height_px=SIZE[0],
-            horizontal_fov_deg=80.0,
-        )
+        camera(name, spread_deg * (0.5 - k), size=SIZE, position_m=(1.5, 0.4 * (0.5 - k), 1.5))
         for k, name in enumerate(names)
     ]
     return Rig(cameras, name="fuzz")
@@ -198,8 +192,8 @@ def wrong_settings(keys: Container[str]) -> st.SearchStrategy[dict[str, Any]]:
 def calibration() -> dict[str, Any]:
     """A right calib.json, which is a right rig file too."""
     cameras = rig().to_dict()["cameras"]
-    for camera, distortion in zip(cameras, (None, {"model": "fisheye", "coeffs": [0.01, 0.0, 0.0, 0.0]}), strict=True):
-        camera |= {"file": f"{camera['name']}.png", "distortion": distortion}
+    for entry, distortion in zip(cameras, (None, {"model": "fisheye", "coeffs": [0.01, 0.0, 0.0, 0.0]}), strict=True):
+        entry |= {"file": f"{entry['name']}.png", "distortion": distortion}
     cameras[1]["mask"] = "mask.png"
     boxes = [[12.0, 1, 0.8, 4, 2, 1.6, 0.3]]
     return {

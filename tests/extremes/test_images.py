@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Camera, PaperConfig, Rig, RigRetarget, load_rig
+from arbiview_aug import PaperConfig, Rig, RigRetarget, load_rig
 from arbiview_aug.transforms.explain import PaperExplanation
 from tests.extremes import reference
 from tests.extremes.conftest import Worst
 from tests.extremes.test_properties import RAMP, coordinates
-from tests.helpers import sampled
+from tests.helpers import camera, sampled
 
 RIG = load_rig("nuscenes").undistorted().resized((90, 160))
 TARGET = RIG.turned(yaw_deg=15)
@@ -120,9 +120,7 @@ def test_a_constant_gradient_says_where_it_was_read(move: str, quality: Any, exe
 
     A half pixel lost in resizing cameras, in halving images or in an atlas would show as such.
     """
-    source = Camera.looking(
-        name="s", azimuth_deg=20.0, width_px=160, height_px=96, horizontal_fov_deg=80.0, position_m=(1.5, 0.3, 1.6)
-    )
+    source = camera("s", 20.0, size=(96, 160), position_m=(1.5, 0.3, 1.6))
     target = MOVES[move](source)
     surface = "auto" if quality == "paper" else "street"
     retarget = RigRetarget(Rig([target]), quality=quality, geometry=surface, backend=execution)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from arbiview_aug import Camera, PaperConfig, RenderConfig, Rig, RigRetarget
+from arbiview_aug import PaperConfig, RenderConfig, Rig, RigRetarget
 from arbiview_aug.favs.renderer import render_paper
 from arbiview_aug.favs.stage1_geometry import check_homography, h_geom
 from arbiview_aug.favs.stage2_features import (
@@ -208,19 +208,8 @@ def test_blending_across_a_seam_has_no_step(worst: Worst) -> None:
     A share of the second weight alone would leave a step in the middle, where the two weigh the same.
     """
     width_px, overlap_deg = 200, 8.0
-    rig = Rig(
-        [
-            Camera.looking(
-                name=name,
-                azimuth_deg=a,
-                width_px=width_px,
-                height_px=100,
-                horizontal_fov_deg=60.0,
-                position_m=(1, 0, 1.5),
-            )
-            for name, a in (("left", 30 - overlap_deg / 2), ("right", -30 + overlap_deg / 2))
-        ]
-    )
+    one = {"size": (100, width_px), "horizontal_fov_deg": 60.0, "position_m": (1, 0, 1.5)}
+    rig = Rig([camera("left", 30 - overlap_deg / 2, **one), camera("right", overlap_deg / 2 - 30, **one)])
     target = Rig([rig[0].turned(yaw_deg=overlap_deg / 2 - 30)])
     for execution in ("opencv", "torch"):
         image, covered, _ = shaded(rig, target, RenderConfig(seam_width=0.3), execution)

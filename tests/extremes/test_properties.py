@@ -18,6 +18,7 @@ from arbiview_aug.render.plan import RenderPlan, build_plan
 from arbiview_aug.render.torch_backend import render_torch
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.static import WALL_CENTER_M
+from tests import helpers
 from tests.extremes import drawn, reference
 from tests.extremes.conftest import Worst
 from tests.helpers import examples, in_source
@@ -222,23 +223,12 @@ def test_permuted_cameras_permute_the_views(pair: tuple[Rig, Rig], surface: str,
 
 def test_coverage_does_not_depend_on_the_place_in_the_atlas() -> None:
     """A row 0.00099 px above an image belongs to it; in float32, at row 28,000 of an atlas, it would lie higher."""
-    cameras = [
-        Camera.looking(
-            name=f"c{k}",
-            azimuth_deg=9.0 * k,
-            width_px=80,
-            height_px=4000,
-            K=[[2000.0, 0, 39.5], [0, 2000.0, 1999.5], [0, 0, 1]],
-        )
-        for k in range(8)
-    ]
-    up = Camera.looking(
-        name="up",
-        azimuth_deg=0.0,
-        width_px=80,
-        height_px=80,
-        K=[[2000.0, 0, 39.5], [0, 2000.0, 1999.5 + 0.00099], [0, 0, 1]],
-    )
+
+    def narrow(name: str, azimuth_deg: float, size: tuple[int, int], cy: float) -> Camera:
+        return helpers.camera(name, azimuth_deg, size=size, K=[[2000.0, 0, 39.5], [0, 2000.0, cy], [0, 0, 1]])
+
+    cameras = [narrow(f"c{k}", 9.0 * k, (4000, 80), 1999.5) for k in range(8)]
+    up = narrow("up", 0.0, (80, 80), 1999.5 + 0.00099)
     for rig in (cameras, cameras[::-1]):
         view = build_plan(Rig(rig), Rig([up])).targets[0]
         assert view.coverage.all() and len(view.pairs) == 1

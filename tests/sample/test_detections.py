@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Camera, PaperConfig, Rig, RigRetarget, SampleError
+from arbiview_aug import PaperConfig, Rig, RigRetarget, SampleError
 from arbiview_aug.datasets import FrameFolder, NuScenesDataset
 from arbiview_aug.favs.renderer import PaperRendering
 from arbiview_aug.sample.detections import UNNAMED_TYPE, read_detections
 from arbiview_aug.sample.inputs import Frame, read_frames
+from tests.helpers import camera
 
 # 90 degrees over 801 px: focal length 400 px, principal point (400, 200), looking along the ego's x axis.
-FRONT = Camera.looking(
-    name="front", azimuth_deg=0, position_m=(0, 0, 1.0), width_px=801, height_px=401, horizontal_fov_deg=90
-)
+FRONT = camera(size=(401, 801), position_m=(0, 0, 1.0), horizontal_fov_deg=90)
 RIG = Rig([FRONT, replace(FRONT.turned(yaw_deg=180), name="back")])
 IMAGES = torch.zeros(2, 3, 401, 801, dtype=torch.uint8)
 

@@ -15,18 +15,15 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import ArbiviewError, Camera, Rig, RigRetarget, SampleError, SampleTypeError
+from arbiview_aug import ArbiviewError, Rig, RigRetarget, SampleError, SampleTypeError
 from arbiview_aug.sample.inputs import read_frames
+from tests.helpers import camera
 
 H, W = 36, 64
 
 
 def rig(count: int = 2) -> Rig:
-    cameras = [
-        Camera.looking(name=f"c{k}", azimuth_deg=90.0 * k, width_px=W, height_px=H, horizontal_fov_deg=100)
-        for k in range(count)
-    ]
-    return Rig(cameras)
+    return Rig([camera(f"c{k}", 90.0 * k, size=(H, W), horizontal_fov_deg=100) for k in range(count)])
 
 
 def sample(**changes: Any) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader, default_collate
 
 from arbiview_aug import RandomRig, RetargetedDataset, RigRetarget, SampleKeys, load_rig
 from arbiview_aug.datasets import FrameFolder, NuScenesDataset
+from tests.helpers import same
 
 STARTS = [(0, None), (2, "fork"), pytest.param(2, "spawn", marks=pytest.mark.slow)]  # spawned ones import torch anew
 
@@ -29,18 +30,6 @@ def batches(dataset: Any, workers: int, start: str | None = None, **settings: An
     """All batches of an epoch."""
     settings = {"batch_size": 2, **settings}
     return list(DataLoader(dataset, num_workers=workers, multiprocessing_context=start, **settings))
-
-
-def same(one: Any, two: Any) -> bool:
-    """Bitwise equality of nested dicts and lists; unknown velocities are NaN."""
-    if isinstance(one, torch.Tensor):
-        alike = one.shape == two.shape and bool(((one == two) | (one.isnan() & two.isnan())).all())
-        return one.dtype == two.dtype and alike
-    if isinstance(one, dict):
-        return list(one) == list(two) and all(same(one[key], two[key]) for key in one)
-    if isinstance(one, list | tuple):
-        return len(one) == len(two) and all(map(same, one, two))
-    return bool(one == two)
 
 
 def draws(loader: DataLoader[Any], name: str = "yaw_deg") -> list[float]:

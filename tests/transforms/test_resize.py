@@ -8,24 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Camera, CropRig, ResizeRig, Rig, RigRetarget, SampleError, SampleKeys
+from arbiview_aug import CropRig, ResizeRig, Rig, RigRetarget, SampleError, SampleKeys
+from tests.helpers import camera
 
 SIZE = (60, 100)
-RIG = Rig(
-    [
-        Camera.looking(name="a", azimuth_deg=0, width_px=100, height_px=60, horizontal_fov_deg=80),
-        Camera.looking(
-            name="b",
-            azimuth_deg=70,
-            width_px=100,
-            height_px=60,
-            horizontal_fov_deg=80,
-            lens="radtan",
-            distortion=(-0.05, 0.01, 0.0, 0.0),
-            mask=np.arange(60)[:, None].repeat(100, 1) < 48,
-        ),
-    ]
-)
+LENS = {"lens": "radtan", "distortion": (-0.05, 0.01, 0.0, 0.0)}
+MASK = np.arange(60)[:, None].repeat(100, 1) < 48
+RIG = Rig([camera("a", size=SIZE), camera("b", 70, size=SIZE, mask=MASK, **LENS)])
 TRANSFORMS = [ResizeRig((30, 50)), ResizeRig((90, 110)), CropRig(10, 20, (40, 70))]
 
 

@@ -14,9 +14,11 @@ import pytest
 import torch
 from torch.utils.data import default_collate
 
-from arbiview_aug import Camera, RandomRig, Rig, RigRetarget, SampleError, SampleKeys, SampleTypeError, load_rig
+from arbiview_aug import RandomRig, Rig, RigRetarget, SampleError, SampleKeys, SampleTypeError, load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.render.config import RenderConfig
+from tests import helpers
+from tests.helpers import same, sample_of, smooth_images
 
 SIZE = (36, 64)
 EXECUTIONS = ["opencv", "torch"]
@@ -33,67 +35,21 @@ def no_warnings() -> Iterator[None]:
 
 def ring(count: int = 4, size: tuple[int, int] = SIZE, **changes: Any) -> Rig:
     """Cameras all around with overlaps, 1.5 m above the road."""
-    h, w = size
-    cameras = [
-        Camera.looking(
-            name=f"c{k}",
-            azimuth_deg=360 / count * k,
-            position_m=(0.5 * np.cos(2 * np.pi * k / count), 0.5 * np.sin(2 * np.pi * k / count), 1.5),
-            width_px=w,
-            height_px=h,
-            horizontal_fov_deg=360 / count + 30,
-        )
-        for k in range(count)
-    ]
-    return Rig(cameras, name="ring", **changes)
+    return Rig(helpers.ring(count, size=size, horizontal_fov_deg=360 / count + 30).cameras, name="ring", **changes)
 
 
 def with_mask(rig: Rig) -> Rig:
     """The bottom rows of the first camera show the own car."""
     mask = np.ones(rig[0].size, bool)
     mask[-6:] = False
-    cameras = [changed(c, mask=mask) if k == 0 else c for k, c in enumerate(rig)]
+    cameras = [replace(c, mask=mask) if k == 0 else c for k, c in enumerate(rig)]
     return rig.with_cameras(cameras)
-
-
-def changed(camera: Camera, **changes: Any) -> Camera:
-    fields = ("name", "width_px", "height_px", "K", "cam2ego", "lens", "distortion", "mask")
-    return Camera(**{**{f: getattr(camera, f) for f in fields}, **changes})
 
 
 def with_lens(rig: Rig, lens: str = "radtan") -> Rig:
     coefficients = (-0.1, 0.01, 0.001, -0.001, 0.0) if lens == "radtan" else (-0.02, 0.003, 0.0, 0.0)
-    cameras = [changed(c, lens=lens, distortion=coefficients) if k % 2 == 0 else c for k, c in enumerate(rig)]
+    cameras = [replace(c, lens=lens, distortion=coefficients) if k % 2 == 0 else c for k, c in enumerate(rig)]
     return rig.with_cameras(cameras)
-
-
-def pictures(rig: Rig, dtype: torch.dtype = torch.uint8, seed: int = 0) -> Any:
-    """Smooth pictures, so that a small shift makes a small difference; a list where sizes differ."""
-    generator = torch.Generator().manual_seed(seed)
-    images = []
-    for camera in rig:
-        coarse = torch.rand((1, 3, 5, 7), generator=generator)
-        image = torch.nn.functional.interpolate(coarse, size=camera.size, mode="bicubic", align_corners=True)[0]
-        image = image.clamp(0, 1)
-        images.append((image * 255).round().to(torch.uint8) if dtype == torch.uint8 else image.to(dtype))
-    return torch.stack(images) if len(set(rig.sizes)) == 1 else images
-
-
-def sample_of(rig: Rig, dtype: torch.dtype = torch.uint8, seed: int = 0, **more: Any) -> dict[str, Any]:
-    """A sample with its calibration in tensors."""
-    calibration = {"K": torch.from_numpy(rig.K), "cam2ego": torch.from_numpy(rig.cam2ego)}
-    return {"images": pictures(rig, dtype, seed), **calibration, **more}
-
-
-def same(one: Any, two: Any) -> bool:
-    """Equal in content, type and dtype, through dicts and lists."""
-    if isinstance(one, torch.Tensor):
-        return type(one) is type(two) and one.dtype == two.dtype and torch.equal(one, two)
-    if isinstance(one, dict):
-        return list(one) == list(two) and all(same(one[k], two[k]) for k in one)
-    if isinstance(one, list | tuple):
-        return len(one) == len(two) and all(map(same, one, two))
-    return bool(one == two)
 
 
 # --- images and calibration -------------------------------------------------------------------------------------------
@@ -165,11 +121,11 @@ def test_the_rig_wins_and_is_consumed() -> None:
     source, retarget = ring(), RigRetarget(ring().turned(yaw_deg=10))
     expected = retarget(sample_of(source))
     wrong = source.turned(yaw_deg=90)
-    out = retarget({**sample_of(wrong), "images": pictures(source), "rig": source})
+    out = retarget({**sample_of(wrong), "images": smooth_images(source), "rig": source})
     assert "rig" not in out and same(out["images"], expected["images"])
-    by_constructor = RigRetarget(ring().turned(yaw_deg=10), source=source)({"images": pictures(source)})
+    by_constructor = RigRetarget(ring().turned(yaw_deg=10), source=source)({"images": smooth_images(source)})
     assert same(by_constructor["images"], expected["images"])
-    both = RigRetarget(ring().turned(yaw_deg=10), source=wrong)({"images": pictures(source), "rig": source})
+    both = RigRetarget(ring().turned(yaw_deg=10), source=wrong)({"images": smooth_images(source), "rig": source})
     assert same(both["images"], expected["images"])
 
 
@@ -419,7 +375,7 @@ def test_a_batch_of_lists() -> None:
     base = ring()
     source = base.with_cameras([base[0].resize((18, 32)), *base.cameras[1:]])
     target = base.with_cameras([*base.cameras[:3], base[3].resize((18, 32))])
-    singles = [{**sample_of(source, seed=k), "classes": pictures(source, seed=k)} for k in range(2)]
+    singles = [{**sample_of(source, seed=k), "classes": smooth_images(source, seed=k)} for k in range(2)]
     for single in singles:
         single["classes"] = [image[0] for image in single["classes"]]
     retarget = RigRetarget(target, keys=SampleKeys(labels=["classes"]))
@@ -445,7 +401,7 @@ def test_skipped_samples_collate_with_retargeted_ones(masked: str, lensed: str) 
         source, target = (with_lens(source), target) if lensed == "source" else (source, with_lens(target))
     if masked != "neither":
         source, target = (with_mask(source), target) if masked == "source" else (source, with_mask(target))
-    sample = {"images": pictures(source), "rig": source, "classes": torch.ones((4, *SIZE), dtype=torch.uint8)}
+    sample = {"images": smooth_images(source), "rig": source, "classes": torch.ones((4, *SIZE), dtype=torch.uint8)}
     retarget = RigRetarget(target, p=0.5, size=(18, 32), keys=SampleKeys(labels=["classes"], extra=["source_camera"]))
     outs = {flag: retarget(sample, params={"skipped": flag}) for flag in (0.0, 1.0)}
     assert list(outs[0.0]) == list(outs[1.0])
@@ -466,7 +422,7 @@ def test_samples_of_different_vehicles_collate() -> None:
     retarget = RigRetarget(ring().turned(yaw_deg=20), p=0.5, size=SIZE)
     torch.manual_seed(0)
     vehicles = [ring(), with_mask(ring()), with_lens(ring())]
-    outs = [retarget({"images": pictures(rig), "rig": rig}) for rig in vehicles * 4]
+    outs = [retarget({"images": smooth_images(rig), "rig": rig}) for rig in vehicles * 4]
     assert len({tuple(out) for out in outs}) == 1
     default_collate(outs)
     # Retargeted again, some with holes in their coverage.
@@ -492,7 +448,7 @@ def test_a_skipped_sample_is_the_resized_source_in_memory_of_its_own() -> None:
 @pytest.mark.parametrize("size", [(72, 128), (36, 64), (54, 70), (30, 50), (90, 200)])
 def test_skipped_samples_are_as_sharp_as_retargeted_ones(size: tuple[int, int], layout: torch.memory_format) -> None:
     source = ring(4, (72, 128))
-    images = pictures(source).contiguous(memory_format=layout)
+    images = smooth_images(source).contiguous(memory_format=layout)
     for kind in (images, images.float() / 255, images.bfloat16() / 255):
         retarget = RigRetarget(source, p=0.5, size=size)
         outs = [retarget({"images": kind, "rig": source}, params={"skipped": flag})["images"] for flag in (0.0, 1.0)]
@@ -574,7 +530,7 @@ def test_convention_labels_in_the_targets_frame() -> None:
 
 def test_the_roads_height_survives_a_second_retargeting() -> None:
     source = ring(ground_z_m=-0.33)
-    first = RigRetarget(ring())({"images": pictures(source), "rig": source})
+    first = RigRetarget(ring())({"images": smooth_images(source), "rig": source})
     assert first["ground_z_m"] == -0.33
     second = RigRetarget(ring())(first)
     np.testing.assert_allclose(second["cam2ego"], first["cam2ego"])
@@ -639,8 +595,8 @@ def test_prepare_builds_the_plan_that_samples_use() -> None:
     source = ring()
     retarget = RigRetarget(ring().turned(yaw_deg=5), source=source, size=(18, 32))
     retarget.prepare()
-    retarget({"images": pictures(source)})
-    retarget({"images": pictures(source), "rig": ring()})  # an equal rig
+    retarget({"images": smooth_images(source)})
+    retarget({"images": smooth_images(source), "rig": ring()})  # an equal rig
     assert retarget.plans.misses == 1
     for bad in (RigRetarget(ring()), RigRetarget(RandomRig(ring()), source=source)):
         with pytest.raises(ValueError, match="prepare: expected a source rig and a fixed target rig"):
@@ -655,8 +611,8 @@ def test_maps_made_in_inference_mode_take_part_in_training() -> None:
     source = ring()
     retarget = RigRetarget(ring().turned(yaw_deg=5), source=source, backend="torch")
     with torch.inference_mode():
-        retarget({"images": pictures(source)})
-    images = (pictures(source).float() / 255).requires_grad_()
+        retarget({"images": smooth_images(source)})
+    images = (smooth_images(source).float() / 255).requires_grad_()
     retarget({"images": images})["images"].sum().backward()
     assert images.grad is not None and images.grad.abs().sum() > 0
 
@@ -666,7 +622,7 @@ def test_frames_without_objects_move_too() -> None:
     source = ring()
     for frame in ("source", "target"):
         retarget = RigRetarget(ring(ground_z_m=-0.5), source=source, keys=SampleKeys(frame=frame), geometry="street")
-        out = retarget({"images": pictures(source), "boxes_3d": torch.tensor([]), "points": torch.zeros(0, 4)})
+        out = retarget({"images": smooth_images(source), "boxes_3d": torch.tensor([]), "points": torch.zeros(0, 4)})
         assert out["boxes_3d"].shape == (0,) and out["points"].shape == (0, 4)
 
 
@@ -819,7 +775,7 @@ def test_explain_changes_nothing_but_the_random_state() -> None:
 
 def test_a_shipped_rig_by_name() -> None:
     nuscenes = load_rig("nuscenes").resized(0.05)
-    out = RigRetarget("waymo", size=(20, 30))({"images": pictures(nuscenes), "rig": nuscenes})
+    out = RigRetarget("waymo", size=(20, 30))({"images": smooth_images(nuscenes), "rig": nuscenes})
     assert out["images"].shape == (5, 3, 20, 30)
 
 
