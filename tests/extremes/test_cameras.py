@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.errors import CalibrationError
+from tests import helpers
 from tests.helpers import examples
 
 any_float = st.floats(allow_nan=True, allow_infinity=True)
@@ -61,11 +62,10 @@ def test_round_trip_of_reasonable_cameras(
     azimuth_deg: float, elevation_deg: float, fov_deg: float, k1: float, lens: str
 ) -> None:
     try:
-        camera = Camera.looking(
-            name="c",
-            width_px=64,
-            height_px=48,
-            azimuth_deg=azimuth_deg,
+        camera = helpers.camera(
+            "c",
+            azimuth_deg,
+            size=(48, 64),
             elevation_deg=elevation_deg,
             horizontal_fov_deg=fov_deg,
             lens=lens,
@@ -84,15 +84,8 @@ def test_round_trip_of_reasonable_cameras(
 @pytest.mark.parametrize("point", [[np.nan, 0, 0], [np.inf, 0, 0], [-np.inf, np.inf, 0], [1e308, 1e308, 1e308]])
 @pytest.mark.parametrize("lens", ["pinhole", "radtan", "fisheye"])
 def test_points_that_are_not_finite_are_invalid(lens: str, point: list[float]) -> None:
-    camera = Camera.looking(
-        name="c",
-        width_px=64,
-        height_px=48,
-        azimuth_deg=0.0,
-        horizontal_fov_deg=80.0,
-        lens=lens,
-        distortion=() if lens == "pinhole" else (-0.01, 0.0, 0.0, 0.0),
-    )
+    distortion = () if lens == "pinhole" else (-0.01, 0.0, 0.0, 0.0)
+    camera = helpers.camera("c", size=(48, 64), lens=lens, distortion=distortion)
     with np.errstate(all="ignore"):
         projection = camera.project(point)
         assert not projection.valid or np.isfinite(projection.uv).all()
