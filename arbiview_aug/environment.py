@@ -91,20 +91,29 @@ def compiled(function: Any) -> Any:
     Division by zero gives infinity, as in numpy. Operations keep their order, so results do not depend on the number of
     threads or processes; kinds of CPU may differ in the last bit.
     """
-    from numba import njit
+    return _kernel(function)
 
-    _compilation()
-    kernel: Any = njit(error_model="numpy", nogil=True)(function)
-    with suppress(RuntimeError):  # no locator available: neither the package's folder nor the user's can be written
-        kernel._cache = _kernel_cache()(function)
-    return kernel
+
+def called(function: Any) -> Any:
+    """Compile a function as ``compiled`` does, for other kernels alone: Python cannot call it."""
+    return _kernel(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 def inlined(function: Any) -> Any:
-    """Let numba compile a function within its callers: for parts of few kernels, which are then compiled once."""
+    """Let numba compile a function within its callers: for small parts of few kernels."""
     from numba import njit
 
     return njit(error_model="numpy", nogil=True, inline="always")(function)
+
+
+def _kernel(function: Any, **options: Any) -> Any:
+    from numba import njit
+
+    _compilation()
+    kernel: Any = njit(error_model="numpy", nogil=True, **options)(function)
+    with suppress(RuntimeError):  # no locator available: neither the package's folder nor the user's can be written
+        kernel._cache = _kernel_cache()(function)
+    return kernel
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.cameras.lens import MIN_DEPTH
-from arbiview_aug.environment import compiled, inlined
+from arbiview_aug.environment import called, compiled, inlined
 
 Row = Any  # float32 (n,): kernels are typed by numba
 
@@ -50,7 +50,7 @@ def pinhole_rays_row(P: Row, v: float, first: int, rx: Row, ry: Row, rz: Row) ->
         ry[i] = y * rz[i]
 
 
-@compiled
+@called
 def rays_row(planes: Row, P: Row, y: int, x0: int, rx: Row, ry: Row, rz: Row) -> None:
     """Unit rays (n,) of the pixels of row ``y`` from column ``x0`` on, camera frame."""
     if planes.shape[1] == 0:
@@ -79,9 +79,9 @@ def cell_cones(planes: Row, P: Row, size: Row, step: int, cones: Row) -> None:
     first = np.int64(0)  # a literal would compile ``rays_row`` once more
     for j in range(ny):
         top, bottom = j * step, min(j * step + step, h) - 1
-        rays_row(planes, P, top, first, lines[0, 0], lines[0, 1], lines[0, 2])
-        rays_row(planes, P, (top + bottom) // 2, first, lines[1, 0], lines[1, 1], lines[1, 2])
-        rays_row(planes, P, bottom, first, lines[2, 0], lines[2, 1], lines[2, 2])
+        for line in range(3):
+            at = top if line == 0 else (top + bottom) // 2 if line == 1 else bottom
+            rays_row(planes, P, at, first, lines[line, 0], lines[line, 1], lines[line, 2])
         for i in range(nx):
             left, right = i * step, min(i * step + step, w) - 1
             m = (left + right) // 2
@@ -110,7 +110,7 @@ def cell_cones(planes: Row, P: Row, size: Row, step: int, cones: Row) -> None:
             cones[0, j, i], cones[1, j, i], cones[2, j, i], cones[3, j, i] = x, y, z, spread
 
 
-@compiled
+@called
 def turn_row(rx: Row, ry: Row, rz: Row, q: Row, A: Row, o: Row, x: Row, y: Row, z: Row) -> None:
     """Points A r + q o of rays r (n,) in another camera's frame, times their inverse distance q (n,)."""
     a, b, c, d = A[0, 0], A[0, 1], A[0, 2], o[0]
@@ -124,7 +124,7 @@ def turn_row(rx: Row, ry: Row, rz: Row, q: Row, A: Row, o: Row, x: Row, y: Row, 
         z[i] = a * rx[i] + b * ry[i] + c * rz[i] + d * q[i]
 
 
-@compiled
+@called
 def project_row(x: Row, y: Row, z: Row, kind: int, P: Row, a: Row, b: Row, u: Row, v: Row) -> None:
     """Pixels u, v (n,) of camera-frame points; ``FAR_AWAY_PX`` where there is none. ``a`` and ``b`` are scratch."""
     n = u.shape[0]
@@ -167,7 +167,7 @@ def project_row(x: Row, y: Row, z: Row, kind: int, P: Row, a: Row, b: Row, u: Ro
         v[i] = fy * yd + cy if a[i] > _ZERO else FAR_AWAY_PX
 
 
-@compiled
+@called
 def angle_row(r: Row, z: Row, out: Row) -> None:
     """atan2(r, z) (n,) in [0, pi] for r >= 0, by the octant that r and |z| lie in."""
     for i in range(r.shape[0]):

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.kernels import edge_distance_row, project_row, rays_row, turn_row
-from arbiview_aug.environment import compiled, inlined
+from arbiview_aug.environment import called, compiled, inlined
 from arbiview_aug.render.atlas import OUTSIDE
 from arbiview_aug.scene.kernels import upsampled_row
 from arbiview_aug.scene.shapes import PIECES
@@ -29,7 +29,7 @@ WHOLE = 0.97
 
 _BORDER_PX = np.float32(1.0)  # maps bulge between the corners of a cell
 _OUTSIDE = np.int32((OUTSIDE << 16) | (OUTSIDE & 0xFFFF))  # both coordinates of a packed position
-_WORK_ROWS = 11  # of scratch memory in ``_evaluate_row``
+_WORK_ROWS = 10  # of scratch memory in ``_evaluate_row``
 MAP_LIMIT_PX = np.float32(32000)
 _MAX_SIDE_PX = 32767
 _AHEAD_COLUMNS, _MOST_AHEAD = 176, 32  # of a strip at a time; at most so many pixels are read for each of its own
@@ -279,7 +279,7 @@ def _fixed(value: Any) -> Any:
     return np.int32(np.rint(min(max(value, -MAP_LIMIT_PX), MAP_LIMIT_PX) * np.float32(32)))
 
 
-@inlined
+@called
 def _occlude_row(
     q: Any, face: Any, px: Any, py: Any, pz: Any, u: Any, v: Any, column: Any, row: Any, hides: Any, place: Any,
     scale: float, before_m: Any, shadow: Any, solid: Any, guess: bool, seen: Any,
@@ -342,11 +342,12 @@ def _occlude_row(
 
 @inlined
 def _evaluate_row(
-    planes: Any, target: Any, q: Any, face: Any, source: Any, y: int, x0: int, n: int, work: Any, inside: Any, seen: Any
+    planes: Any, target: Any, q: Any, face: Any, source: Any, y: int, x0: int, n: int, work: Any,
+    inside: Any, seen: Any, place: Any,
 ) -> None:  # fmt: skip
     """Positions u, v (rows 0 and 1 of ``work``) in a source of n pixels of a target's row from ``x0`` on.
 
-    ``inside`` (n,) becomes whether its image holds them, ``seen`` (n,) whether it sees them.
+    ``inside`` (n,) becomes whether its image holds them, ``seen`` (n,) whether it sees them; ``place`` is scratch.
     """
     A, o, kind, P, bounds, clean, before_m, shadow, solid, guess, given = source
     u, v, rx, ry, rz = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
@@ -366,7 +367,7 @@ def _evaluate_row(
     if shadow.shape[0]:
         faces = face[y, x0 : x0 + n] if face.shape[0] else face[:, 0]
         _occlude_row(
-            q[y, x0 : x0 + n], faces, px, py, pz, u, v, rx, ry, rz, work[10].view(np.int32), bounds[6], before_m,
+            q[y, x0 : x0 + n], faces, px, py, pz, u, v, rx, ry, rz, place, bounds[6], before_m,
             shadow, solid, guess, seen,
         )  # fmt: skip
     # The outer half pixel of a full image lies outside the halved one: its border pixel is read.
@@ -429,7 +430,7 @@ def put_source(
         n = x1 - x0
         if n <= 0:
             continue
-        _evaluate_row(planes, target, q, face, source, y, x0, n, work, inside[:n], seen[:n])
+        _evaluate_row(planes, target, q, face, source, y, x0, n, work, inside[:n], seen[:n], fu[:n])
         if not best.shape[0]:
             for i in range(n):
                 in_image[y, x0 + i] = np.uint8(255) if seen[i] else in_image[y, x0 + i]

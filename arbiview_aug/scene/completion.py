@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.cameras.kernels import angle_row
-from arbiview_aug.environment import compiled, inlined
+from arbiview_aug.environment import called, compiled, inlined
 from arbiview_aug.scene import panorama
 from arbiview_aug.scene.kernels import upsampled_row
 from arbiview_aug.scene.panorama import NEAREST_M
@@ -25,7 +25,7 @@ _SIDE, _CORNER, _KNIGHT = 1024 << 14, 1434 << 14, 2250 << 14
 _STEP, _STEP_PER_M, LEAST_WEIGHT = np.float32(panorama.STEP), np.float32(panorama.STEP_PER_M), np.float32(1e-3)
 
 
-@compiled
+@called
 def cells_row(x: Any, y: Any, z: Any, place: Any, level: Any, row: Any, column: Any) -> None:
     """Rows and columns (n,) in a panorama (``Window.place``) of ego-frame vectors; ``level`` is scratch."""
     first, lead, low, per_rad, turn = place[0], place[1], place[2], place[3], place[4]
@@ -298,7 +298,7 @@ def _slide(row: Any, oldest: Any, total: Any) -> None:
         total[x] += oldest[x]
 
 
-@compiled
+@called
 def _window_max(a: Any, rows: int, columns: int) -> None:
     """Replace each cell of ``a`` (h, w) by the largest of those up to so many rows and columns on."""
     h, w = a.shape
@@ -367,7 +367,7 @@ def cells_of(rays: Any, R: Any, place: Any, rows: Any, columns: Any) -> None:
         cells_row(work[0], work[1], work[2], place, work[3], rows[y], columns[y])
 
 
-@compiled
+@called
 def _blocks_row(rows: Any, columns: Any, h: int, w: int, first: Any, down: Any, right: Any) -> None:
     """Flat index (n,) of the first of the 2 x 2 cells around each position in (h, w), and what it is off that one."""
     last_row, last_column = np.float32(h - 2), np.float32(w - 2)
@@ -400,7 +400,7 @@ def read_layer(rows: Any, columns: Any, layer: Any, out: Any) -> None:
         out[x] = _mixed(flat, first[x], w, down[x], right[x])
 
 
-@compiled
+@called
 def _between(nodes: Any, step: int, out: Any) -> None:
     """Values (n,) between nodes ``step`` apart; the last ones lie on the last pixel."""
     whole = nodes.shape[0] - 2
@@ -414,7 +414,7 @@ def _between(nodes: Any, step: int, out: Any) -> None:
         last[k] = nodes[whole] + (nodes[whole + 1] - nodes[whole]) * t
 
 
-@compiled
+@called
 def _between_rows(nodes: Any, step: int, y: int, h: int, around: Any, out: Any) -> None:
     """Values (w,) in row ``y`` of h between nodes (ny + 1, nx + 1).
 
@@ -485,7 +485,7 @@ def interpolate_layer(rows: Any, columns: Any, step: int, layer: Any, apart: int
         _between_rows(nodes, apart, y, h, around[2], out[y])
 
 
-@compiled
+@called
 def _turned_row(R: Any, x: Any, y: Any, z: Any, u: Any, v: Any, w: Any) -> None:
     """Vectors (n,) turned by ``R`` (3, 3)."""
     for k, out in enumerate((u, v, w)):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.cameras.kernels import rays_row
-from arbiview_aug.environment import compiled, inlined
+from arbiview_aug.environment import called, compiled, inlined
 from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
@@ -198,7 +198,7 @@ def sum_silhouettes(
                         sums[numbers[k]] += weight[y, x0 + x]
 
 
-@inlined
+@called
 def columns_of_piece(b: Any, cones: Any, near: Any, step: int, w: int) -> tuple[int, int]:
     """First column and number of columns of the cells in a row that hold rays which may meet a piece; 0 for none.
 
@@ -225,7 +225,7 @@ def columns_of_piece(b: Any, cones: Any, near: Any, step: int, w: int) -> tuple[
     return first * step, max(min(last * step, w) - first * step, 0)
 
 
-@inlined
+@called
 def through_row(b: Any, rx: Any, ry: Any, rz: Any, enter: Any, leave: Any) -> None:
     """Inverse distances (n,) at which rays enter and leave a piece; those that enter before they leave meet it."""
     before = int(b[24])
@@ -343,7 +343,7 @@ def fit_profiles(
             is_own[i] |= points[i, 2] > floor and beside(planes[k], points[i]) < air
 
 
-@compiled
+@inlined
 def upsampled_row(nodes: Any, step: int, y: int, x0: int, row: Any, out: Any) -> None:
     """Bilinear values (n,) between nodes (ny + 1, nx + 1) at pixels of row ``y`` from column ``x0`` on, a node's."""
     j = y // step

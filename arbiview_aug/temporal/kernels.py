@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.cameras.kernels import project_row, turn_row
-from arbiview_aug.environment import compiled
+from arbiview_aug.environment import called, compiled, inlined
 
 RADIUS_PX = 3  # of windows of 7 x 7 pixels
 LEVELS = 16  # steps of a grey level
@@ -46,7 +46,12 @@ def match_walls(
     work, at, seen = np.empty((7, w), np.float32), np.empty(w, np.int32), np.empty((h, w), np.uint8)
     u, v, q, x1, y1, z1, scratch = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
     read, sums = np.empty((h, w + 2 * RADIUS_PX), np.int32), np.empty((8, w + 2 * RADIUS_PX), np.int32)
-    touching = [(road[y] / horizontal[y]).min() for y in range(h)]  # 1/radius of the farthest wall before a row's road
+    touching = np.empty(h, np.float32)  # 1/radius of the farthest wall before a row's road
+    for y in range(h):
+        touching[y] = np.inf
+        for x in range(w):
+            one = road[y, x] / horizontal[y, x]
+            touching[y] = one if one < touching[y] or one != one else touching[y]  # NaN once, NaN for ever
     for k in range(walls.shape[0]):
         wall = walls[k]
         rows = h
@@ -55,7 +60,8 @@ def match_walls(
         rows = min(rows + RADIUS_PX, h)
         for y in range(min(rows + RADIUS_PX, h)):
             if lens[0] < 0:
-                u[:], v[:] = lens[2][k, 0, y], lens[2][k, 1, y]
+                for x in range(w):
+                    u[x], v[x] = lens[2][k, 0, y, x], lens[2][k, 1, y, x]
             else:
                 a, b = road[y], horizontal[y]
                 for x in range(w):
@@ -66,10 +72,12 @@ def match_walls(
             _read_row(u, v, other, unmasked, q, scratch, at, line[RADIUS_PX:], seen[y])
             line[:RADIUS_PX], line[w + RADIUS_PX :] = line[RADIUS_PX], line[w + RADIUS_PX - 1]
         _correlate(read, seen, windows, sums, costs[k, :rows])
-        costs[k, rows:] = costs[k - 1, rows:]
+        for y in range(rows, h):
+            for x in range(w):
+                costs[k, y, x] = costs[k - 1, y, x]
 
 
-@compiled
+@called
 def _correlate(read: Any, seen: Any, windows: Any, sums: Any, costs: Any) -> None:
     """Costs of the first rows (n, w) of an image as it was read (h, w + 6); ``sums`` (8, w + 6) is scratch."""
     own, mean, weight = windows
@@ -107,7 +115,7 @@ def _correlate(read: Any, seen: Any, windows: Any, sums: Any, costs: Any) -> Non
             out[x] = np.uint16(np.int32(cost))
 
 
-@compiled
+@called
 def _read_row(u: Any, v: Any, image: Any, mask: Any, s: Any, t: Any, at: Any, row: Any, seen: Any) -> None:
     """Levels at positions (w,), bilinearly, the border's beyond it; and the mask at the nearest pixel."""
     values, unmasked, width, n = image.ravel(), mask.ravel(), np.int32(image.shape[1]), u.shape[0]
@@ -167,7 +175,7 @@ def aggregate(costs: Any) -> Any:
     return total
 
 
-@compiled
+@inlined
 def _follow(path: Any, least: Any, cost: Any, out: Any) -> Any:
     """Continue the best paths (K + 2,) by a pixel's costs (K,) into ``out`` (K + 2,); the least of them."""
     jump, best = np.uint16(least + JUMP), np.uint16(65535)
