@@ -20,10 +20,6 @@ settings.load_profile("reproducible")
 COMPILER = pytest.StashKey[subprocess.Popen]()
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--bounds", action="store_true", help="fail where a measured time misses its bound")
-
-
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_setupnodes(config: pytest.Config) -> None:
     """Compile the kernels once, while the processes of ``-n`` collect: each would compile them for itself."""

@@ -1,11 +1,9 @@
-"""``python -m arbiview_aug bench speed``: that it runs, and, as a release check, its bounds."""
+"""``python -m arbiview_aug bench speed``: that it runs; ``integrations/benchmarks`` measures its bounds."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import pytest
@@ -19,7 +17,6 @@ from arbiview_aug.render.plan import build_plan
 from arbiview_aug.transforms.settings import render_config
 from tests.helpers import street_sample
 
-ATTEMPTS = 3
 ALLOWED = {
     SIZE: [1.2, 3.5, 8, 11, *[5] * len(BOXES), 2, 2, 20, 20],
     FULL_SIZE: [2.5, 3.5, 4, *[3] * len(BOXES)],
@@ -111,53 +108,3 @@ def test_batches_on_a_device(name: str) -> None:
         for copy, row in zip(rows[::2], rows[1::2], strict=True)
     )
     assert "uint8 on" in table(report)
-
-
-@pytest.fixture(scope="module")
-def best_ratios() -> dict[tuple[Any, ...], float]:
-    """The smallest ratio of each measure in up to three runs: a machine with other work can only make it larger."""
-    best: dict[tuple[Any, ...], float] = {}
-    for _ in range(ATTEMPTS):
-        with recorded(default_data(), size=FULL_SIZE) as data:
-            report = measure(data, 5, [SIZE, FULL_SIZE])
-        print(table(report))
-        for m in report["measures"]:
-            key = tuple(m["size"]), m["name"], m["target"]
-            best[key] = min(best.get(key, m["ratio"]), m["ratio"])
-        if all(ratio <= BOUNDS[size].get(name, ratio) for (size, name, _), ratio in best.items()):
-            break
-    return best
-
-
-def _known_miss(name: str, fisheye: bool) -> list[pytest.MarkDecorator]:
-    """The bounds stand; the misses are published in docs/benchmarks.md, and a call that meets its bound passes."""
-    missed = pytest.mark.xfail(reason="plans of every frame, and fisheye cameras, take longer", strict=False)
-    return [missed] if fisheye or "held" not in name else []
-
-
-@pytest.mark.release
-@pytest.mark.parametrize(
-    ("size", "name", "fisheye"),
-    [
-        pytest.param(size, name, fisheye, marks=_known_miss(name, fisheye))
-        for size, bounds in BOUNDS.items()
-        for name in bounds
-        for fisheye in (False, True)
-        if not (fisheye and name.endswith(("contiguous", "two neighbours")))  # measured with one target alone
-    ],
-)
-def test_bounds(
-    size: tuple[int, int],
-    name: str,
-    fisheye: bool,
-    best_ratios: dict[Any, float],
-    report_bound: Callable[..., None],
-) -> None:
-    ratios = {
-        target: ratio
-        for (of_size, call, target), ratio in best_ratios.items()
-        if (of_size, call, target == "fisheye") == (size, name, fisheye)
-    }
-    assert ratios, f"{name} was not measured"
-    for target, ratio in ratios.items():
-        report_bound(f"ratio, {size}, {name}, {target}", ratio, at_most=BOUNDS[size][name])

@@ -1,12 +1,10 @@
-"""What two processes bring, and where a sample's time goes; a release check."""
+"""``convert``: what two processes bring, and where a sample's time goes."""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,17 +18,10 @@ from arbiview_aug.cli.convert.job import Done, Jobs
 from arbiview_aug.cli.convert.settings import Settings
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.environment import one_thread
+from integrations.benchmarks.machine import counting
 
 SAMPLES, OWN_PLANS, SIZE = 40, 6, (256, 704)
 LEAST_SPEEDUP, MOST_RETARGETING, IDLE = 1.8, 0.5, 1.95
-COUNTING = "import time\nend = time.monotonic() + 4\nn = 0\nwhile time.monotonic() < end: n += 1\nprint(n)"
-
-
-def counting(processes: int) -> float:
-    """How far so many processes count together: what two cores are worth while others use them too."""
-    command = [sys.executable, "-c", COUNTING]
-    running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(processes)]
-    return float(sum(int(process.communicate()[0]) for process in running))
 
 
 def _copied(root: Path, frame: Path) -> None:

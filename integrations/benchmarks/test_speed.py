@@ -1,0 +1,132 @@
+"""What calls cost on one thread, against bare ``cv2.remap`` calls, decoding, and stated milliseconds."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import statistics
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from arbiview_aug import RigRetarget
+from arbiview_aug.__main__ import main
+from arbiview_aug.cli.bench import pareto
+from arbiview_aug.cli.bench.data import recorded
+from arbiview_aug.cli.bench.speed import BOUNDS, default_data, measure, table
+from arbiview_aug.cli.bench.timing import timed_rounds
+from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.environment import one_thread
+
+pytestmark = pytest.mark.release
+
+ATTEMPTS, STEPS, BUDGET_MS = 3, 4, 400
+TOLERANCE, ROUNDS = 0.02, 121
+
+
+@pytest.fixture(scope="module")
+def best_ratios() -> dict[tuple[Any, ...], float]:
+    """The smallest ratio of each measure in up to three runs: a machine with other work can only make it larger."""
+    best: dict[tuple[Any, ...], float] = {}
+    for _ in range(ATTEMPTS):
+        with recorded(default_data(), size=FULL_SIZE) as data:
+            report = measure(data, 5, [SIZE, FULL_SIZE])
+        print(table(report))
+        for m in report["measures"]:
+            key = tuple(m["size"]), m["name"], m["target"]
+            best[key] = min(best.get(key, m["ratio"]), m["ratio"])
+        if all(ratio <= BOUNDS[size].get(name, ratio) for (size, name, _), ratio in best.items()):
+            break
+    return best
+
+
+def _known_miss(name: str, fisheye: bool) -> list[pytest.MarkDecorator]:
+    """The bounds stand; the misses are published in docs/benchmarks.md, and a call that meets its bound passes."""
+    missed = pytest.mark.xfail(reason="plans of every frame, and fisheye cameras, take longer", strict=False)
+    return [missed] if fisheye or "held" not in name else []
+
+
+@pytest.mark.parametrize(
+    ("size", "name", "fisheye"),
+    [
+        pytest.param(size, name, fisheye, marks=_known_miss(name, fisheye))
+        for size, bounds in BOUNDS.items()
+        for name in bounds
+        for fisheye in (False, True)
+        if not (fisheye and name.endswith(("contiguous", "two neighbours")))  # measured with one target alone
+    ],
+)
+def test_bounds(
+    size: tuple[int, int],
+    name: str,
+    fisheye: bool,
+    best_ratios: dict[Any, float],
+    report_bound: Callable[..., None],
+) -> None:
+    ratios = {
+        target: ratio
+        for (of_size, call, target), ratio in best_ratios.items()
+        if (of_size, call, target == "fisheye") == (size, name, fisheye)
+    }
+    assert ratios, f"{name} was not measured"
+    for target, ratio in ratios.items():
+        report_bound(f"ratio, {size}, {name}, {target}", ratio, at_most=BOUNDS[size][name])
+
+
+@pytest.mark.filterwarnings("ignore:target cameras")
+def test_fast_costs_the_same_without_neighbours(report_bound: Callable[..., None]) -> None:
+    """A transform that would read neighbours against itself told not to, on a sample that has none: the median of pairs
+    of CPU times, in turn. Of two transforms one may be 7 % the slower, by where its memory lies."""
+    sample = SyntheticDrive(demo_source_rig((450, 800)), num_frames=1, lidar=False)[0]
+    del sample["boxes_3d"]
+    retarget = RigRetarget(sample["rig"].turned(yaw_deg=22))
+
+    def frame(reach: Any) -> None:
+        retarget.neighbours = reach
+        retarget(sample)
+
+    work = {"reading": partial(frame, "road"), "not": partial(frame, None)}
+    with one_thread():
+        times = timed_rounds(work, ROUNDS, "without neighbours")
+    ratio, ms = (statistics.median(of.tolist()) for of in (times["reading"] / times["not"], times["reading"]))
+    name = f"share of time that neighbours cost where there are none, fast, {ms:.1f} ms a frame"
+    report_bound(name, abs(ratio - 1), at_most=TOLERANCE)
+
+
+def test_the_trade_on_a_real_frame(nuscenes_root: Path, tmp_path: Path, report_bound: Callable[..., None]) -> None:
+    """Steps to choose from, a budget that LiDAR keeps, decoding dearer than rendering."""
+    only = ["--downscale", "2", "--execution", "opencv", "--budget-ms", f"{BUDGET_MS}", "--output", str(tmp_path)]
+    command = ["bench", "pareto", "--data", str(nuscenes_root), *only]
+    assert main(command) == 0
+    report = json.loads((tmp_path / "pareto.json").read_text())
+    for _ in range(ATTEMPTS - 1):  # noise hides steps, it never makes any
+        if len(report["steps"]) < STEPS:
+            assert main(command) == 0
+            report = json.loads((tmp_path / "pareto.json").read_text())
+    rows = {row["name"]: row for row in report["settings"]}
+    print(pareto.table(report))
+    assert len(rows) >= 8
+    report_bound("steps to choose from", len(report["steps"]), at_least=STEPS)
+    steps = [rows[name] for name in report["steps"]]
+    for one, two in itertools.pairwise(steps):
+        assert two["psnr_db"] >= one["psnr_db"] + 0.2 and two["q1_ms"] > one["q3_ms"]
+    report_bound("ms, the recommended setting", report["advice"]["again"]["median_ms"], at_most=BUDGET_MS)
+    report_bound("rendering over decoding, fast", rows["fast, street, 1/2, opencv"]["decode_ratio"], at_most=1)
+    assert "lidar" in report["advice"]["setting"]
+
+
+def test_six_cameras_take_less_than_two_cpu_seconds(report_bound: Callable[..., None]) -> None:
+    """CPU time of the best frame on its one thread; 1.1 s on the machine it was written on."""
+    drive = SyntheticDrive(demo_source_rig((256, 704)), num_frames=7)
+    drive[0]  # rays of the cameras
+    seconds = []
+    for index in range(1, 7):
+        start = time.thread_time()
+        drive[index]
+        seconds.append(time.thread_time() - start)
+    report_bound("s of CPU, a synthetic frame of six 704x256 images", min(seconds), at_most=2.0)
