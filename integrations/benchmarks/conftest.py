@@ -1,3 +1,3 @@
-"""Fixtures of the tests: real frames, and a report of what is measured beside its bound."""
+"""Release checks of times, rates and memory against stated bounds (docs/contributing.md); fixtures are the tests'."""
 
 from tests.conftest import data_root, nuscenes_root, report_bound  # noqa: F401

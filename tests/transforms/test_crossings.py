@@ -9,6 +9,7 @@ import pytest
 from tests.crossings import BOUNDS, traced_calls
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="numba 0.60 reports each call of a kernel to tracers there")
 def test_calls_stay_within_their_crossings() -> None:
     for name, tracer in traced_calls().items():
