@@ -109,7 +109,7 @@ class CameraMaps:
         return self._cache.get(_lens_key(camera), lambda: known or pixel_rays(camera))
 
     def of_lens(self, camera: Camera, key: Any, make: Callable[[], Planes]) -> Planes:
-        """What ``make`` gives for the rays of a camera; held."""
+        """Result of ``make`` for the rays of a camera; held."""
         return self._cache.get((_lens_key(camera), key), make)
 
     def clean_pixels(self, camera: Camera, level: int) -> npt.NDArray[np.uint8]:
@@ -128,7 +128,7 @@ class CameraMaps:
 
 
 def _lens_key(camera: Camera) -> Any:
-    """What the rays of a camera's pixels depend on."""
+    """Key of all that the rays of a camera's pixels depend on."""
     return camera.size, camera.lens, camera.distortion, camera.K.tobytes()
 
 

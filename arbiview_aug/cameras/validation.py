@@ -182,7 +182,7 @@ def checked_mask(name: str, value: Any, size: tuple[int, int]) -> BoolArray:
 
 
 def pose_mistake(cam2ego: FloatArray, ground_z_m: float) -> tuple[str, str] | None:
-    """What poses (N, 4, 4) probably are instead, and the fix; None if most cameras stand upright over the road."""
+    """Guess what poses (N, 4, 4) are instead, and name the fix; None if most cameras stand upright over the road."""
     looks_down = cam2ego[:, 2, 2] < -0.8  # such cameras have no lower edge
     if ((_stands(cam2ego) | looks_down) & is_mounted(cam2ego, ground_z_m)).mean() >= 0.5:
         return None

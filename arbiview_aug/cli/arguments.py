@@ -74,7 +74,7 @@ def data(text: str) -> str:
 
 
 def kinds_text() -> str:
-    """What each kind in ``KIND:PATH`` is, for help texts."""
+    """List the kinds in ``KIND:PATH``, for help texts."""
     return "; ".join(f"{kind}: {reader.description}" for kind, reader in READERS.items())
 
 

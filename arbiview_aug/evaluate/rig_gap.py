@@ -21,12 +21,12 @@ _OF_ROW, _OF_PARALLAX = 6.4, 2.6
 """Points of IoU per unit of row and per degree: least squares, without a constant, of what a detector lost under six
 changes (integrations/cross_rig/README.md). Terms of size and of what is unseen do not predict the one left out."""
 _MOST = float(np.log(4.0))
-"""Of a cue: the horizon is at an infinite distance."""
+"""Most that one cue counts, a log ratio: the horizon is at an infinite distance."""
 
 
 @dataclass(frozen=True)
 class RigGap:
-    """What separates a target rig from a source rig, over objects 1.6 m high all around, 5 to 40 m away.
+    """The gap between a target rig and a source rig, over objects 1.6 m high all around, 5 to 40 m away.
 
     Attributes:
         unseen: Share of the objects in the target's images that no source camera sees.
@@ -80,7 +80,7 @@ def rig_gap(source: Rig, target: Rig) -> RigGap:
 
 
 def _mean(parts: list[FloatArray]) -> float:
-    """Of absolute values, cut."""
+    """Mean of absolute values, cut."""
     return float(np.minimum(np.abs(np.concatenate(parts)), _MOST).mean()) if parts else float("nan")
 
 

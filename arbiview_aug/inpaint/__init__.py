@@ -1,4 +1,4 @@
-"""What fills pixels of rendered views that no source shows: one protocol, ``Inpainter``, and its implementations.
+"""Inpainters fill pixels of rendered views that no source shows: one protocol, ``Inpainter``, and its implementations.
 
 - ``continued``: the default, the background continued behind objects, and the mean colour;
 - ``telea``: Telea's fast marching; ``networks``, ``crops``: inpainting networks that others trained;

@@ -1,4 +1,4 @@
-"""What an inpainting network must see of a frame: windows around holes, put together on canvases.
+"""Parts of a frame that an inpainting network must see: windows around holes, put together on canvases.
 
 Windows keep the view's resolution and aspect. Small ones share a canvas; large and bent holes are cut into parts, and
 each part sees what the parts before it filled.

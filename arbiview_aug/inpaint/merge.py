@@ -53,7 +53,7 @@ Levels = npt.NDArray[np.float32]
 
 
 class Candidate(NamedTuple):
-    """What one neighbour shows of a hole.
+    """The part of a hole that one neighbour shows.
 
     Attributes:
         shows: (h, w) bool, the free and seam pixels that it shows.

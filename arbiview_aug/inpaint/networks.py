@@ -64,7 +64,7 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Of the network's weights."""
+        """Device of the network's weights."""
         return next((tensor.device for tensor in self.network.state_dict().values()), torch.device("cpu"))
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""What training from a nuScenes root takes: the reader, the retargeting wrapper, 2D labels for the new views."""
+"""All that training from a nuScenes root takes: the reader, the retargeting wrapper, 2D labels for the new views."""
 
 from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
 from arbiview_aug.datasets.wrappers import RetargetedDataset

@@ -67,7 +67,7 @@ class FixedMap:
 
 @dataclass(frozen=True)
 class Slot:
-    """Where one source image lies in the atlas: halved ``level`` times, first pixel at (``x``, ``y``)."""
+    """Place of one source image in the atlas: halved ``level`` times, first pixel at (``x``, ``y``)."""
 
     source: int
     level: int

@@ -22,7 +22,7 @@ LEAST_INCIDENCE = np.float32(0.05)
 """Sine of the flattest angle at which a source may look along a face: that of the road 30 m from a car's cameras."""
 
 SAME_OBJECT_M = np.float32(0.15)
-"""So much nearer a piece of an object must be to hide another of it: they touch, and are drawn half a pixel wider."""
+"""A piece of an object must be nearer by this share to hide another: they touch, and are drawn half a pixel wider."""
 
 WHOLE = 0.97
 """Share of an object's nodes, among those of the source that sees most, from which a source sees it whole."""
@@ -134,7 +134,7 @@ def measure_nodes(
     rays: Any, q: Any, A: Any, o: Any, kind: int, P: Any, y: Any, x: Any, size: Any, to_mask: Any, cell_px: int,
     offset_m: Any, uncertainty: Any, u: Any, v: Any, resolution: Any, edge_px: Any, parallax_rad: Any,
 ) -> None:  # fmt: skip
-    """What weights depend on, at the nodes of a target.
+    """Compute what weights depend on, at the nodes of a target.
 
     Args:
         rays: (3, ny, nx) of the nodes.

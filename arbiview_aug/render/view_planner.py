@@ -81,7 +81,7 @@ class _Geometry:
 
 @dataclass
 class _Region:
-    """What one source contributes to one target; all arrays on the nodes (ny + 1, nx + 1)."""
+    """Contribution of one source to one target; all arrays on the nodes (ny + 1, nx + 1)."""
 
     source: int
     level: int
@@ -440,7 +440,7 @@ class ViewPlanner:
         return BilinearFallback(y.astype(np.int64) * winner.shape[1] + x, there)
 
     def _reports(self, winner: npt.NDArray[np.int8], won_px: Counter[int]) -> Iterator[SourceUse]:
-        """What each source that wins any pixel does, largest share first."""
+        """Summaries of the sources that win any pixel, largest share first."""
         on_nodes = winner[self.at_nodes]
         for region in sorted(self.regions, key=lambda r: -won_px[r.source]):
             if won_px[region.source] == 0:

@@ -12,7 +12,7 @@ from arbiview_aug.sample.batching import lens_names, rewrapped
 from arbiview_aug.sample.inputs import DEPTH_KEYS
 
 STACKED = ("images", "K", "cam2ego", "coverage", "ego_mask", "distortion", "ego2world", *DEPTH_KEYS)
-"""What has one shape in all frames of a rig, and so have maps over the images. All else is a list: of points and boxes
+"""Keys of one shape in all frames of a rig; so have maps over the images. All else is a list: of points and boxes
 each frame has its own number."""
 
 

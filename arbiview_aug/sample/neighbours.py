@@ -26,7 +26,7 @@ STILL_M, STILL_DEG = 0.1, 0.5
 """A frame with less motion than this sees what the current one sees."""
 
 MAX_SWEEPS = 2
-"""So many neighbours, the nearest, lend their LiDAR points: four win 0.1 dB on synthetic streets, in twice the time."""
+"""Nearest neighbours that lend their LiDAR points: four win 0.1 dB on synthetic streets, in twice the time."""
 
 MAX_TRAVEL_M = 60.0
 """Largest distance to a neighbour: farther on, none of the ground nearby is in view."""

@@ -1,4 +1,4 @@
-"""What a training may believe of a retargeted sample: which boxes are seen, and which feature cells."""
+"""Parts of a retargeted sample that a training may believe: which boxes are seen, and which feature cells."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class BoxSurface(LayeredSurface):
 
     # --- images -------------------------------------------------------------------------------------------------------
     def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
-        """What objects hide from a source; kept for the next target."""
+        """Find what objects hide from a source; kept for the next target."""
         key = camera.content_key
         if key not in self._shadows:
             pixel_rad = float(1 / camera.K[0, 0])

@@ -75,7 +75,7 @@ class Cells(NamedTuple):
 
     @property
     def beyond(self) -> float:
-        """So far below and above all points a window's halo, too, shows the static surface, radians."""
+        """Angle below and above all points beyond which a window's halo shows the static surface too, radians."""
         return (math.ceil(self.reach) + 4 * self.smooth + 1 - self.halo) * self.rad
 
 
@@ -162,7 +162,7 @@ class Window(NamedTuple):
 
 
 class Panorama:
-    """What the points (P, 3) say within a window of the view from ``origin`` (3,), made dense over a static surface.
+    """Depth by the points (P, 3) within a window of the view from ``origin`` (3,), made dense over a static surface.
 
     Nearest point first in each cell, none within ``NEAREST_M``; points that shine through gaps of what is nearer are
     dropped; each cell takes the residual of its nearest point; residuals are averaged, on both sides of a step apart.
@@ -261,7 +261,7 @@ class PointCloudSurface(DenseSurface):
         return q
 
     def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
-        """What is hidden from a source; kept for the next target.
+        """Find what is hidden from a source; kept for the next target.
 
         Points farther by a tenth of their distance and 0.3 m than what was measured, as in the evaluation's visibility,
         and only within measured outlines: nothing hides where the LiDAR is silent. Coarse cells gain 0.2 dB on nuScenes

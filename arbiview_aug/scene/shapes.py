@@ -18,10 +18,10 @@ PIECES = 2
 """Pieces of an object."""
 
 LEAST_POINTS = 20
-"""So many points choose among profiles."""
+"""Points that suffice to choose among profiles."""
 
 AIR_M = 0.2
-"""So far outside an object points are its own."""
+"""Distance outside an object within which points count as its own, m."""
 
 
 class Piece(NamedTuple):
@@ -96,7 +96,7 @@ OF_KIND = np.cumsum(_COUNTS)[:, None] - _COUNTS[:, None] + np.minimum(np.arange(
 
 
 def kinds(boxes: FloatArray) -> npt.NDArray[np.int64]:
-    """What boxes (B, 7) may hold, by their sizes: rows (B,) of ``KIND_M``."""
+    """Shapes that boxes (B, 7) may hold, by their sizes: rows (B,) of ``KIND_M``."""
     sizes = boxes[:, None, 3:6]
     return np.asarray(((sizes >= KIND_M[0]) & (sizes <= KIND_M[1])).all(axis=-1).argmax(axis=-1))
 
@@ -111,7 +111,7 @@ def solids(boxes: FloatArray) -> FloatArray:
 
 
 def solids_among(boxes: FloatArray, points: Points) -> tuple[FloatArray, BoolArray]:
-    """What boxes (B, 7) hold, as ``solids`` gives it, by the points (P, 3) in them; which points (P,) are theirs.
+    """Shapes in boxes (B, 7), as ``solids`` gives it, by the points (P, 3) in them; which points (P,) are theirs.
 
     Of the profiles that fit a box it is the one whose faces lie nearest to its points. Points within ``AIR_M`` of it
     are its own: mirrors, and the noise of points and labels. This far over the box's floor they may be the road's.

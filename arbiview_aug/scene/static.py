@@ -40,7 +40,7 @@ class _RoadAndWall(StaticSurface):
     @property
     @abstractmethod
     def semi_axes_m(self) -> tuple[float, float]:
-        """Of the wall, along the road and across it."""
+        """Semi-axes of the wall along the road and across it, m."""
 
     def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> npt.NDArray[np.float32]:
         """As ``inverse_distance``, compiled."""

@@ -219,7 +219,7 @@ def dense_depth(camera: Camera, points: FloatArray) -> Layer | None:
 
 # --- what is known of the depth ---------------------------------------------------------------------------------------
 def _references(frame: DepthInputs, k: int, view: View, seen: BoolArray) -> Iterator[tuple[Reference, Any, FloatArray]]:
-    """What a camera may be fitted to: its name, pixels (rows, columns) and z-depths."""
+    """Measurements that a camera may be fitted to: its name, pixels (rows, columns) and z-depths."""
     camera = view.camera
     if frame.points is not None:
         pixels, depth_m = _measured(camera, frame.points)

@@ -20,7 +20,7 @@ _OUTPUTS: dict[str, Literal["depth", "inverse"]] = {
     "prompt_depth_anything": "depth",
     "zoedepth": "depth",
 }
-"""What networks put out, by ``model_type``; the configuration of others says it, or the fit tells."""
+"""Kind of output of networks, by ``model_type``; the configuration of others says it, or the fit tells."""
 
 _WEIGHTS = ("*.safetensors", "*.bin")
 

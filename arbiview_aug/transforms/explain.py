@@ -85,7 +85,7 @@ class Explanation:
 
 @dataclass(frozen=True)
 class PaperExplanation:
-    """What the published stages did to a frame; ``str`` prints it, ``as_dict`` gives plain data."""
+    """Record of what the published stages did to a frame; ``str`` prints it, ``as_dict`` gives plain data."""
 
     rendering: PaperRendering
 

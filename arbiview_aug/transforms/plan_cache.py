@@ -26,7 +26,7 @@ from arbiview_aug.transforms.checks import Coverages
 
 @dataclass(frozen=True, kw_only=True)
 class PlanCache:
-    """What a transform keeps from call to call. Pickles and copies are empty: each DataLoader worker fills its own.
+    """Plans that a transform keeps between calls. Pickles and copies are empty: each DataLoader worker fills its own.
 
     Attributes:
         max_bytes: Memory for plans of calibrations that come back; the least recently used go first.

@@ -96,7 +96,7 @@ _INPAINTERS: dict[str, type[Inpainter]] = {"continue": Continue, "telea": Telea,
 
 
 def unseen_note(inpainter: Inpainter) -> str:
-    """What becomes of pixels that no source sees, and what to do about them in training."""
+    """Say what becomes of pixels that no source sees, and what to do about them in training."""
     if isinstance(inpainter, Black):
         return f"The rest is {inpainter.outcome}."
     return f"The rest is {inpainter.outcome} and marked in 'generated': leave it out of losses that compare pixels."

@@ -22,10 +22,10 @@ CHUNK_FRAMES = 20
 """About 10 s of rendering: what a killed process loses at most."""
 
 _MAX_MAPS = 256
-"""Of one set: each holds a file open, of which a process commonly may have 1024."""
+"""Most chunks of one set: each holds a file open, of which a process commonly may have 1024."""
 
 _DIGESTS = "digests.json"
-"""Of a chunk's arrays, by name: what depends on frames is named after what they hold, not after what made them."""
+"""Digests of a chunk's arrays: what depends on frames is named after what they hold, not after what made them."""
 
 Arrays = dict[str, np.ndarray]
 
@@ -65,7 +65,7 @@ def _source(name: str) -> Path | None:
 
 
 def _imports_and_strips(tree: ast.Module) -> set[str]:
-    """What a module imports; in the same walk its docstrings go, and the strings that document constants."""
+    """Find what a module imports; in the same walk its docstrings go, and the strings that document constants."""
     found: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):

@@ -61,7 +61,7 @@ class Run:
         return list({source.store().key: (source, count) for source, count in needed}.values())
 
     def images(self, job: Job) -> Source:
-        """What a job is trained on."""
+        """Frames that a job is trained on."""
         return self.source("train", job.change, job.variant if job.variant.renders else None)
 
     def training_set(self, job: Job) -> FrameSet:
@@ -82,7 +82,7 @@ class Run:
         return FrameSet(images.store(), images.rig, state, counts, boxes, retargeted=own, masked=masked)
 
     def box_store(self, source: Source) -> FrameStore:
-        """Where the boxes of a source's vehicles lie."""
+        """File of the boxes of a source's vehicles."""
         return box_store(source)
 
     def prepare(self) -> None:
@@ -91,7 +91,7 @@ class Run:
             make_boxes(self.source(split), getattr(self.settings, f"{split}_frames"))
 
     def title(self, change: str) -> str:
-        """Of a change, in tables."""
+        """Title of a change in tables."""
         return CHANGES[change].title
 
     def drives(self, change: str) -> list[int] | None:
@@ -99,7 +99,7 @@ class Run:
         return None
 
     def schedule(self, job: Job) -> Schedule:
-        """Of a job's training."""
+        """Schedule of a job's training."""
         return replace(self.settings.schedule, family=job.family)
 
     def draws(self, job: Job) -> Draws:
@@ -114,7 +114,7 @@ class Run:
         return self.settings.changes if job.change is None else (job.change,)
 
     def training_key(self, job: Job) -> str:
-        """Of everything that a training depends on; variants whose frames are the same, bit by bit, share it.
+        """Key of everything that a training depends on; variants whose frames are the same, bit by bit, share it.
 
         The frames must be there.
         """
@@ -141,11 +141,11 @@ class Run:
         )
 
     def _content(self, source: Source, count: int) -> str:
-        """Of a rig's true frames."""
+        """Key of a rig's true frames."""
         return source.store().digest(("images", "state", "height_dm"), count) + source.rig.content_key.hex()
 
     def result_path(self, job: Job, change: str) -> Path:
-        """Where a test's counts lie; the frames must be there."""
+        """File of a test's counts; the frames must be there."""
         s = self.settings
         key = content_hash(
             {

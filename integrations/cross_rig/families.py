@@ -28,7 +28,7 @@ _LIFTED_M = (-1.0, 4.0)
 
 _LAYERS, _POINTS, _HEADS = 3, 4, 4
 _REACH_M = 2.0
-"""Of a query: how far from its reference point it may read."""
+"""Reach of a query: how far from its reference point it may read."""
 
 
 @dataclass(frozen=True)

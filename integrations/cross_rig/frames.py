@@ -71,7 +71,7 @@ class Source:
 
     @property
     def street_seed(self) -> int:
-        """Of the streets' dataset."""
+        """Seed of the streets' dataset."""
         return street_seed(self.split, self.streets)
 
     def drive(self, rig: Rig) -> SyntheticDrive:
@@ -86,7 +86,7 @@ class Source:
         return source_rig(self.size) if self.change is None else CHANGES[self.change].target(self.size)
 
     def store(self) -> FrameStore:
-        """Where they lie."""
+        """Folder of the frames."""
         spec: dict[str, Any] = {
             "format": _FORMAT,
             "rig": self.rig.content_key.hex(),
@@ -141,7 +141,7 @@ class Source:
         return replace(self, variant=None)
 
     def maker(self) -> Callable[[int], Arrays]:
-        """What makes a frame of this set from its index."""
+        """Return the function that makes a frame of this set from its index."""
         if self.variant is None:
             return _TrueFrames(self)
         return _VariantFrames(self) if self.rendered() == self else _ChangedFrames(self)
@@ -203,7 +203,7 @@ def one_thread() -> None:
 
 
 class _TrueFrames:
-    """What a rig really sees: images, labels; A's training frames with their depth."""
+    """Frames that a rig really sees: images, labels; A's training frames with their depth."""
 
     def __init__(self, source: Source) -> None:
         self.source, self.rig = source, source.rig

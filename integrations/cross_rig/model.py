@@ -17,13 +17,13 @@ from integrations.cross_rig.families import FAMILIES, Batch
 from integrations.cross_rig.labels import Grid
 
 _MEAN, _STD = 0.45, 0.25
-"""Of the images in [0, 1]."""
+"""Mean and deviation of the images in [0, 1]."""
 _PRIOR_LOGIT = -3.3
-"""Of the 3.5 % of covered cells that hold a vehicle: training need not find that out first."""
+"""Logit of the 3.5 % of covered cells that hold a vehicle: training need not find that out first."""
 
 
 class Answer(NamedTuple):
-    """What a detector says of a batch.
+    """Output of a detector for a batch.
 
     Attributes:
         occupancy: (B, cells, cells) logits of vehicles.

@@ -44,7 +44,7 @@ LEAST_POINTS = 5
 """nuScenes and Waymo leave out boxes with fewer LiDAR points, or mark them as hard."""
 
 _SHARES = {"val": 0.15, "test": 0.35}
-"""Of B's drives, at least one each; the others and all of A's are for training."""
+"""Shares of B's drives, at least one each; the others and all of A's are for training."""
 
 
 @lru_cache(maxsize=4)
@@ -117,7 +117,7 @@ class RecordedSource(Source):
         return small_rig(first_rig(self.a if self.change is None else self.b), self.size)
 
     def store(self) -> FrameStore:
-        """Where they lie: named after the data set, its samples, the code, and the variant."""
+        """Folder of the frames: named after the data set, its samples, the code, and the variant."""
         spec: dict[str, Any] = {
             "data": str(Path(self.data).resolve()),
             "samples": [recording(self.data).tokens[k] for k in self.frames],
@@ -131,7 +131,7 @@ class RecordedSource(Source):
         return FrameStore(self.root, spec)
 
     def maker(self) -> Callable[[int], Arrays]:
-        """What makes a frame of this set; indices past its end begin anew, to fill the last chunk."""
+        """Function that makes a frame of this set; indices past its end begin anew, to fill the last chunk."""
         make = (
             self._recorded
             if self.variant is None
@@ -226,7 +226,7 @@ class RecordedRun(Run):
         return super()._frames(images, labels, count, own=True, masked=own and masked)
 
     def box_store(self, source: Source) -> FrameStore:
-        """Where the boxes lie: beside the images."""
+        """File of the boxes, beside the images."""
         return source.store()
 
     def prepare(self) -> None:

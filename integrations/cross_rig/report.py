@@ -1,4 +1,4 @@
-"""What the results say: JSON, a Markdown table, a plot."""
+"""Reports of the results: JSON, a Markdown table, a plot."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.worlds import CHANGES
 
 Results = Mapping[str, Mapping[int, Mapping[str, Any]]]
-"""Of one change: by variant and seed."""
+"""Results of one change by variant and seed."""
 
 
 def write_report(setup: Run) -> dict[str, Any]:

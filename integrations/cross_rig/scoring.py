@@ -84,7 +84,7 @@ def interval(value: float, draws: Floats) -> Interval:
 
 
 def t_interval(differences: Floats) -> Interval | None:
-    """Of the mean of paired differences (S,), by Student's distribution; None of fewer than three."""
+    """Interval of the mean of paired differences (S,), by Student's distribution; None of fewer than three."""
     if len(differences) < 3:
         return None
     mean = float(np.mean(differences))

@@ -1,4 +1,4 @@
-"""What to run: sizes, variants, changes, seeds and the schedule; the presets of the command."""
+"""Settings of an experiment: sizes, variants, changes, seeds and the schedule; the presets of the command."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from integrations.cross_rig.model import Answer, Detector
 
 THRESHOLDS = tuple(round(0.05 * k, 2) for k in range(1, 20))
 FIXED_THRESHOLD = 0.3
-"""Of those who have no frames of B to choose one on."""
+"""Threshold for those who have no frames of B to choose one on."""
 
 _EVAL_BATCH = 4
 _BOXES = 0.05
@@ -222,7 +222,7 @@ def best_threshold(probability: np.ndarray, frames: FrameSet) -> tuple[float, fl
 
 @dataclass(frozen=True)
 class Tested:
-    """What a model reached on vehicle B.
+    """Scores that a model reached on vehicle B.
 
     Attributes:
         threshold, val_iou: Of validation.

@@ -68,7 +68,7 @@ class Variant:
         return self.labels == "A" or (self.renders and self.labels is None)
 
     def views_spec(self) -> dict[str, Any]:
-        """What its images depend on, besides rigs and code: variants that differ in how they draw share them."""
+        """Settings that change its images, besides rigs and code: variants that differ in how they draw share them."""
         settings = {"kind": self.kind, "surface": self.surface, "reads": list(self.reads), "holes": self.holes}
         extra: dict[str, Any] = {"random": RANDOM if self.random else None, "stays": self.stays, "truth": self.truth}
         extra |= {"noise": self.noise, "labels": self.labels if self.renders else None}

@@ -25,7 +25,7 @@ EGO2GLOBAL[:3, 3] = 600.0, 1640.0, 0.0
 
 
 class Boxes:
-    """What is read of mmdet3d's ``LiDARInstance3DBoxes``: eight corners a box, in the LiDAR's frame."""
+    """The part that is read of mmdet3d's ``LiDARInstance3DBoxes``: eight corners a box, in the LiDAR's frame."""
 
     def __init__(self, boxes_ego: FloatArray) -> None:
         signs = np.array([[-1, -1, -1], [-1, -1, 1], [-1, 1, 1], [-1, 1, -1], [1, -1, -1], [1, -1, 1], [1, 1, 1]])
@@ -61,7 +61,7 @@ class Recording:
 
     @property
     def rig(self) -> Rig:
-        """Where the cameras were."""
+        """Poses of the cameras."""
         rig: Rig = self.sample["rig"]
         return rig
 
@@ -315,7 +315,7 @@ def bevdet4d(drive: Sequence[Recording]) -> dict[str, Any]:
 
 
 def streampetr(drive: Sequence[Recording]) -> dict[str, Any]:
-    """What StreamPETR's ``CustomNuScenesDataset.union2one`` collects, without ``DataContainer``."""
+    """Collect as StreamPETR's ``CustomNuScenesDataset.union2one`` does, without ``DataContainer``."""
     pictures = [_normalised(given.arrays) for given in drive]
     poses = np.stack([given.ego2global @ LIDAR2EGO for given in drive])
     seconds = 1.5 + 0.5 * np.arange(len(drive))
@@ -339,7 +339,7 @@ def streampetr(drive: Sequence[Recording]) -> dict[str, Any]:
 
 
 def bevformer(drive: Sequence[Recording]) -> dict[str, Any]:
-    """What BEVFormer's ``CustomNuScenesDataset.union2one`` collects, without ``DataContainer``; images are padded."""
+    """Collect as BEVFormer's ``CustomNuScenesDataset.union2one`` does, without ``DataContainer``; images are padded."""
     pictures = [_normalised(given.arrays, divisor=32) for given in drive]
     metas = {}
     for t, (given, (images, shapes)) in enumerate(zip(drive, pictures, strict=True)):

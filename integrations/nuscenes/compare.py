@@ -17,7 +17,7 @@ from arbiview_aug.cameras.rig import Rig
 
 _CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 _MARGIN = 1.0
-"""Of the image's size: boxes farther outside are not compared, since a pixel there is next to nothing in angle."""
+"""Share of the image size: boxes farther outside are not compared, since a pixel there is next to nothing in angle."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Agreement:
 
 
 def devkit_boxes(python: Path, root: Path, version: str, output: Path) -> list[dict[str, Any]]:
-    """What the devkit says of a data set.
+    """Boxes that the devkit gives for a data set.
 
     Args:
         python: An interpreter that has the devkit.

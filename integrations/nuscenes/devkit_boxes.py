@@ -1,4 +1,4 @@
-"""Where nuscenes-devkit sees the annotations: ``python devkit_boxes.py ROOT VERSION OUTPUT.json``.
+"""Write where nuscenes-devkit sees the annotations: ``python devkit_boxes.py ROOT VERSION OUTPUT.json``.
 
 Runs in the devkit's own environment, so it imports nothing of this repository.
 """

@@ -43,7 +43,7 @@ class Writer(ABC):
         """Look for everything that could not be written, before hours of work end with it, and raise DataError."""
 
     def notes(self) -> list[str]:
-        """What the user should know before the conversion starts."""
+        """Notes for the user before the conversion starts."""
         return []
 
     @abstractmethod

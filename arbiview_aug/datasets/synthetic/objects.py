@@ -105,7 +105,7 @@ class Clothes(NamedTuple):
 
 
 def pick_clothes(rng: np.random.Generator) -> Clothes:
-    """What a person wears."""
+    """Colours of a person's clothes."""
     trousers, jacket = pick(rng, _TROUSERS), pick(rng, _CLOTHES)
     skin = pick(rng, ((0.80, 0.62, 0.52), (0.55, 0.38, 0.28), (0.35, 0.24, 0.18)), 0.02)
     return Clothes(trousers, jacket, (jacket[0] * 0.85, jacket[1] * 0.85, jacket[2] * 0.85), skin)

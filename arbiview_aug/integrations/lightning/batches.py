@@ -15,7 +15,7 @@ ON_HOST = "on_host"
 
 
 class OnHost:
-    """What Lightning is not to look into while it moves a batch or rounds it to its precision.
+    """Values that Lightning is not to look into while it moves a batch or rounds it to its precision.
 
     Calibration in bfloat16 is no calibration, rigs are frozen dataclasses, neighbours would be decoded; and plans are
     made on the CPU anyway.
@@ -33,7 +33,7 @@ def packed(batch: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def unpacked(batch: Mapping[str, Any]) -> dict[str, Any]:
-    """What ``packed`` was given, images and maps where they are now."""
+    """The batch that ``packed`` was given, images and maps where they are now."""
     return {**{key: value for key, value in batch.items() if key != ON_HOST}, **batch[ON_HOST].values}
 
 

@@ -22,7 +22,7 @@ from arbiview_aug.integrations.mmdet3d.results import (
 )
 
 MEAN_STD = ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375))
-"""What BEVDet's ``mmlabNormalize`` subtracts and divides by, in the order of the channels it leaves."""
+"""Mean and deviation of BEVDet's ``mmlabNormalize``, in the order of the channels it leaves."""
 
 _PICTURES = "canvas"
 """The images before BEVDet normalised them, for people: dropped silently."""

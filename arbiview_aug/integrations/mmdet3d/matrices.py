@@ -31,7 +31,7 @@ MATRICES = {
     "projection_mat": "lidar2img",
     "cam2global": "cam2global",
 }
-"""What each key holds, for each camera."""
+"""Matrix of each key, for each camera."""
 
 _TOLERANCE = 1e-3
 """Largest difference between ``lidar2img`` and K @ lidar2cam, as a share of their largest entry: float32 leaves 1e-6, a

@@ -111,7 +111,7 @@ def _together(given: Any, values: Sequence[Any]) -> Any:
 
 
 def _content(value: Any) -> Any:
-    """What mmcv's ``DataContainer`` contains; other values as they are."""
+    """Content of mmcv's ``DataContainer``; other values as they are."""
     return value.data if hasattr(value, "cpu_only") and hasattr(value, "data") else value
 
 

@@ -1,4 +1,4 @@
-"""What the variants make of A's frames."""
+"""Views that the variants make of A's frames."""
 
 from dataclasses import replace
 from types import SimpleNamespace

@@ -57,7 +57,7 @@ def test_lists_of_images_and_keys(samples: list[dict]) -> None:
 
 @pytest.mark.parametrize("count", [2, 6])
 def test_maps_over_the_images_stay_with_their_frames(samples: list[dict], count: int) -> None:
-    """Of six frames of six cameras, too: frames and cameras are easily mistaken for each other there."""
+    """Batches of six frames of six cameras, too: frames and cameras are easily mistaken for each other there."""
     rng = torch.Generator().manual_seed(0)
     frames = []
     for k in range(count):

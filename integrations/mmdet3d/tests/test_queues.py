@@ -61,7 +61,7 @@ def test_projections_of_three_frames_are_the_new_rigs(drive: list[Recording], fo
 @pytest.mark.filterwarnings("ignore:retarget. drops")
 @pytest.mark.parametrize("form", QUEUES)
 def test_one_draw_for_all_frames(drive: list[Recording], form: str) -> None:
-    """Of the rig, and of whether to retarget at all."""
+    """One draw of the rig, and of whether to retarget at all."""
     torch.manual_seed(3)
     target = RandomRig(SOURCE, yaw_deg=10, height_m=0.2)
     key = "aug_config" if form == "Sparse4D" else None
@@ -187,7 +187,7 @@ def test_sparse4d_after_its_adaptor(drive: list[Recording]) -> None:
 
 @pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_frames_of_a_drive_share_a_draw(drive: list[Recording]) -> None:
-    """Where each passes the pipeline by itself, as BEVFormer's and StreamPETR's datasets do."""
+    """Each frame passes the pipeline by itself, as BEVFormer's and StreamPETR's datasets do."""
     target = RandomRig(SOURCE.resized(SIZE), yaw_deg=10, per="sequence")
     for step in (
         RigRetargetMultiView(target, lidar2ego=LIDAR2EGO, geometry="street"),
