@@ -252,7 +252,7 @@ def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any
     if missing:
         raise SampleError(
             f"sample: expected calibration, 'rig' or 'K' and 'cam2ego', missing {', '.join(missing)}"
-            f"{hint(sample, missing)}; or pass source_rig= to the transform"
+            f"{hint(sample, missing)}; or pass source= to the transform"
         )
     K, cam2ego = (numbers(key, sample[key], index) for key in ("K", "cam2ego"))
     for key, array, expected in (("K", K, (len(images), 3, 3)), ("cam2ego", cam2ego, (len(images), 4, 4))):

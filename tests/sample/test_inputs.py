@@ -102,7 +102,7 @@ def test_pil_images() -> None:
 HALF = torch.from_numpy(rig().K) * torch.tensor([[0.5], [0.5], [1.0]])
 CALIBRATION: dict[str, tuple[dict[str, Any], str]] = {
     "none": (sample(K=None, cam2ego=None), "expected calibration, 'rig' or 'K' and 'cam2ego', missing K, cam2ego"),
-    "no poses": (sample(cam2ego=None), "missing cam2ego; or pass source_rig= to the transform"),
+    "no poses": (sample(cam2ego=None), "missing cam2ego; or pass source= to the transform"),
     "no rotation": (edited("cam2ego", (1, 0, 0), 2.0), "'camera 1': cam2ego: expected a rotation .* the nearest"),
     "NaN K": (edited("K", (0, 0, 0), torch.nan), "camera 'camera 0': K: expected finite numbers, got NaN"),
     "NaN principal point": (edited("K", (1, 0, 2), torch.nan), "camera 'camera 1': K: expected finite numbers"),

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from arbiview_aug import SampleKeys
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import add_output, command_parser, count, device_named, size, writable_folder
 from arbiview_aug.cli.bench.study import benchmark, study
@@ -20,7 +21,7 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.frames import make_frame
 from arbiview_aug.evaluate.methods import retargeting
 from arbiview_aug.evaluate.report.tables import metric_table
-from arbiview_aug.generator import Generator
+from arbiview_aug.generator import Diffusion, Generator
 
 SIZE = (256, 448)
 STEPS = (1, 4)
@@ -79,15 +80,15 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     drive = SyntheticDrive(source, num_frames=arguments.frames, seed=HELD_OUT_SEED, lidar=False)
     target = wide_target(source)
     frames = [make_frame(drive[k], truth=partial(drive.render, k), exposures=()) for k in range(arguments.frames)]
-    make = partial(retargeting, "fast", "auto", outputs=("confidence",))
+    make = partial(retargeting, "fast", "auto", keys=SampleKeys(extra=("confidence",)))
     methods = [
         make(name="holes black"),
-        make(name="filled", holes="fill"),
-        make(name="inpainted", path="inpaint"),
+        make(name="filled", holes="continue"),
+        make(name="inpainted", holes="telea"),
     ]
     for steps in arguments.steps:
         if steps > 1 or generator.config.one_step:
-            methods.append(make(name=row_name(steps), path="diffusion", generator=generator, steps=steps))
+            methods.append(make(name=row_name(steps), holes=Diffusion(generator, steps=steps)))
     options: dict[str, Any] = {"repeats": arguments.repeats, "clock": clock_of(device), "consistency": True}
     found = study(methods, frames, {"wide": [target]}, label="generator", **options)
     rows = {name: quartiles(np.array(row["ms"]))._asdict() | row["wide"] for name, row in found.items()}

@@ -290,4 +290,4 @@ def _signed(value: float, digits: int) -> str:
 
 def _overlap(frame: ScoredFrame, harmonised: bool) -> dict[str, float]:
     """Agreement of neighbours on the frame as recorded."""
-    return summary("overlap", source_overlap(frame.sample, retargeting("fast", "street", harmonise=harmonised)))
+    return summary("overlap", source_overlap(frame.sample, retargeting("fast", "street", match_exposure=harmonised)))
