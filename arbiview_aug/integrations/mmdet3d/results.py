@@ -241,7 +241,7 @@ def target_views(out: Mapping[str, Any], source: Views, names: Sequence[str]) ->
     if not isinstance(out["images"], torch.Tensor):
         raise SampleError("target: expected images of one size, got several; pass size=(h, w) to the transform")
     if "ego2ego" in out:
-        raise SampleError("label_frame: expected 'source', since points and boxes stay in the LiDAR's frame")
+        raise SampleError("SampleKeys.frame: expected 'source', since points and boxes stay in the LiDAR's frame")
     check_no_lenses(out.get("lens", ()))
     skipped = out.get("retarget_params", {}).get("skipped")
     return Views(

@@ -32,8 +32,8 @@ class RigRetargetMultiView:
         sequence_key: Names the drive in the results (``scene_token``; Sparse4D: ``aug_config``): frames where it is
             equal share one draw, in all workers of a DataLoader's epoch. By default that of a
             ``RandomRig(per="sequence")``; else each dict has a draw of its own.
-        settings: Any of ``RigRetarget``'s: ``size``, ``surface``, ``quality``, ``p``, ``harmonise``, ``holes``,
-            ``outputs``.
+        settings: Any of ``RigRetarget``'s: ``size``, ``geometry``, ``quality``, ``p``, ``match_exposure``,
+            ``holes``, ``keys``.
 
     Raises:
         CalibrationError: A target with lenses, or that cannot be loaded.

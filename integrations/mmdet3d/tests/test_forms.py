@@ -10,7 +10,17 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import CalibrationError, CropRig, ResizeRig, Rig, RigRetarget, SampleError, SampleTypeError, load_rig
+from arbiview_aug import (
+    CalibrationError,
+    CropRig,
+    ResizeRig,
+    Rig,
+    RigRetarget,
+    SampleError,
+    SampleKeys,
+    SampleTypeError,
+    load_rig,
+)
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD
 from arbiview_aug.integrations.mmdet3d.matrices import MATRICES, decomposed, upper_triangular
@@ -31,7 +41,7 @@ def given() -> Recording:
 
 
 def step(target: Rig = TARGET, **settings: Any) -> RigRetargetMultiView:
-    return RigRetargetMultiView(target, lidar2ego=LIDAR2EGO, **{"surface": "street", **settings})
+    return RigRetargetMultiView(target, lidar2ego=LIDAR2EGO, **{"geometry": "street", **settings})
 
 
 def pixels(results: dict) -> np.ndarray:
@@ -187,7 +197,7 @@ def test_bevdet_takes_augmented_images_and_gives_untouched_ones(given: Recording
 @pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_skipped_frames_keep_their_cameras(given: Recording) -> None:
     target = SOURCE.turned(yaw_deg=10)
-    skipping = step(target, p=0.01, size=SIZE, outputs=("confidence",))
+    skipping = step(target, p=0.01, size=SIZE, keys=SampleKeys(extra=("confidence",)))
     torch.manual_seed(1)
     after = skipping(FORMS["mmdet3d"](given))
     assert after["retarget_params"]["skipped"] and after["filename"] == SOURCE.names and after["confidence"].all()
@@ -220,8 +230,8 @@ def test_messages(given: Recording) -> None:
     mixed = Rig([TARGET[0], *(camera.resize((40, 60)) for camera in TARGET.cameras[1:])])
     with pytest.raises(SampleError, match="images of one size"):
         step(mixed)(results)
-    with pytest.raises(SampleError, match="label_frame: expected 'source'"):
-        step(label_frame="target")(results)
+    with pytest.raises(SampleError, match="SampleKeys.frame: expected 'source'"):
+        step(keys=SampleKeys(frame="target"))(results)
     entries = FORMS["BEVDet"](given)["img_inputs"]
     with pytest.raises(SampleError, match=r"whole numbers.*img_norm"):
         step(img_norm=((0, 0, 0), (1, 1, 1)))({"img_inputs": entries})
