@@ -1,7 +1,8 @@
-"""YAML files of strangers: plain data of bounded size, where a number is a number."""
+"""YAML and JSON files of strangers: plain data of bounded size, where a number is a number."""
 
 from __future__ import annotations
 
+import json
 import re
 from typing import Any
 
@@ -23,6 +24,19 @@ _Loader.add_implicit_resolver(
     re.compile(r"^(?:[-+]?(?:[0-9]+\.[0-9]*|\.?[0-9]+)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf)|\.(?:nan|NaN))$"),
     list("-+.0123456789"),
 )
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Data of a JSON document; ValueError for a key that stands twice, of which ``json`` alone takes the last."""
+    return json.loads(text, object_pairs_hook=_without_repeats)
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    data = dict(pairs)
+    if len(data) < len(pairs):
+        key = next(key for k, (key, _) in enumerate(pairs) if key in (name for name, _ in pairs[:k]))
+        raise ValueError(f"the key {key[:80]!r} stands twice")
+    return data
 
 
 def parse_yaml(text: str) -> Any:

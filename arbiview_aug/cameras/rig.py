@@ -29,8 +29,9 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.key_names import hint, misnamed
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.plain_yaml import parse_yaml
+from arbiview_aug.cameras.plain_yaml import parse_json, parse_yaml
 from arbiview_aug.cameras.shipped import shipped_rigs
+from arbiview_aug.cameras.validation import MOST_M
 from arbiview_aug.errors import CalibrationError, shown
 
 MOST_CAMERAS, MOST_BYTES = 128, 1 << 20
@@ -72,9 +73,10 @@ class Rig:
             ground = math.nan if isinstance(self.ground_z_m, bool) else float(self.ground_z_m)
         except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: tensors of several heights
             ground = math.nan
-        if not math.isfinite(ground):
+        if not abs(ground) <= MOST_M:
             raise CalibrationError(
-                f"{where}: ground_z_m: expected a finite height in metres, got {shown(self.ground_z_m)}"
+                f"{where}: ground_z_m: expected a finite height in metres, got {shown(self.ground_z_m)}; at "
+                f"most {MOST_M:g} m"
             )
         object.__setattr__(self, "cameras", cameras)
         object.__setattr__(self, "ground_z_m", ground)
@@ -269,7 +271,7 @@ def load_rig(name_or_path: str | Path) -> Rig:
         raise CalibrationError(f"{where}: expected at most {MOST_CAMERAS} cameras in 1 MiB, got a file of {got} MiB")
     try:
         text = path.read_text()
-        data = json.loads(text) if path.suffix == ".json" else parse_yaml(text)
+        data = parse_json(text) if path.suffix == ".json" else parse_yaml(text)
     except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
         raise CalibrationError(f"{where}: expected plain YAML or JSON, got {' '.join(str(error).split())}") from None
     return Rig.from_dict(data, folder=path.parent, where=where)

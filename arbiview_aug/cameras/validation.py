@@ -20,6 +20,8 @@ ROTATION_TOLERANCE = 1e-4
 
 _MAX_COEFFICIENT = 1e6  # real lenses stay below 1e3, and near 1e300 their polynomials overflow
 _SHORTEST_PX = 1e-6  # focal length; the inverse of 5e-324 is infinite
+_MOST_PX = 1e9  # of K's entries: float32 squares stay finite
+MOST_M = 1e9  # of positions, as far
 
 _FARTHEST_M, _MOST_HEIGHT_M = 20.0, 8.0  # of a vehicle's cameras, from the ego origin and over the road
 
@@ -111,6 +113,8 @@ def checked_intrinsics(name: str, value: Any) -> FloatArray:
     if K[0, 0] < _SHORTEST_PX or K[1, 1] < _SHORTEST_PX:
         expected = f"positive focal lengths, {_SHORTEST_PX:g} px at least"
         raise _error(name, "K", expected, f"fx {K[0, 0]:g}, fy {K[1, 1]:g}")
+    if np.abs(K).max() > _MOST_PX:
+        raise _error(name, "K", f"entries of at most {_MOST_PX:g} px", f"{K.tolist()}")
     if K[1, 0] != 0 or K[2, 0] != 0 or K[2, 1] != 0 or abs(K[2, 2] - 1) > 1e-9:
         fix = "pass K.T" if np.any(K[2, :2]) and not np.any(K[:2, 2]) else "divide K by K[2, 2]"
         raise _error(name, "K", "[[fx, s, cx], [0, fy, cy], [0, 0, 1]]", f"{K.tolist()}", fix)
@@ -134,6 +138,8 @@ def checked_pose(name: str, value: Any) -> FloatArray:
         expected = f"a rotation (|R Rᵀ - I| <= {ROTATION_TOLERANCE:g}, determinant +1)"
         fix = f"the nearest rotation is {nearest_rotation(R).round(9).tolist()}"
         raise _error(name, "cam2ego", expected, f"deviation {deviation:.3g}, determinant {determinant:.6g}", fix)
+    if np.abs(cam2ego[:3, 3]).max() > MOST_M:
+        raise _error(name, "cam2ego", f"a position within {MOST_M:g} m of the ego frame", f"{cam2ego[:3, 3].tolist()}")
     # Residual scale and skew of rounded digits would bend straight lines by a fraction of a pixel.
     if deviation > 1e-12:
         cam2ego = cam2ego.copy()

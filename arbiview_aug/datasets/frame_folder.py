@@ -18,6 +18,7 @@ from arbiview_aug.atomic_io import BROKEN_ARRAY, check_name, inside
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.key_names import hint, misnamed
 from arbiview_aug.cameras.lens import BoolArray
+from arbiview_aug.cameras.plain_yaml import parse_json
 from arbiview_aug.cameras.rig import MOST_CAMERAS, Rig, read_mask
 from arbiview_aug.choices import Reduce
 from arbiview_aug.datasets.drive import (
@@ -35,6 +36,7 @@ from arbiview_aug.datasets.layouts import CALIBRATION_FILE
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, WarnOnce, shown, warn
 from arbiview_aug.sample.masks import image_circle, without_specks
 from arbiview_aug.scene.boxes import checked_boxes
+from arbiview_aug.scene.point_cloud import finite_rows, shape_mistake
 
 SEQUENCE_FILE = "sequence.json"
 POINTS_FILE = "lidar.npy"
@@ -267,7 +269,7 @@ def _read_sequence(root: Path, index: Mapping[str, int]) -> tuple[dict[str, floa
     if not path.is_file():
         return {}, []
     try:
-        given = json.loads(path.read_text(encoding="utf-8"))["frames"]
+        given = parse_json(path.read_text(encoding="utf-8"))["frames"]
         entries = [entry if isinstance(entry, Mapping) else {"name": entry} for entry in given]
         names = [str(entry["name"]) for entry in entries]
         times_s = {str(entry["name"]): float(entry["time_s"]) for entry in entries if "time_s" in entry}
@@ -289,7 +291,7 @@ def _read_calibration(frame: _Frame) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
         _check_count(text.count('"cam2ego"') // 2, path)  # before millions of entries are parsed; notes may name it too
-        calib = json.loads(text)
+        calib = parse_json(text)
     except CalibrationError:
         raise
     except FileNotFoundError:
@@ -360,7 +362,7 @@ def _points_file(calib: Mapping[str, Any], frame: _Frame) -> Path | None:
         raise DataError(f"{frame.where}: lidar: expected {{'file': name}}, got {entry!r}")
     path = frame.file(named or POINTS_FILE, "lidar")
     if not path.is_file():
-        if named is None:
+        if named is None and not os.path.lexists(frame.folder / POINTS_FILE):
             return None
         raise DataError(
             f"{frame.where}: lidar: expected the points {path}, found no file; copy it, remove the key 'lidar', "
@@ -382,10 +384,12 @@ def _read_points(calib: Mapping[str, Any], frame: _Frame) -> torch.Tensor | None
 
 def checked_points(array: Any, where: str) -> torch.Tensor:
     """Check points and convert them to (P, >=3) float32; DataError for another shape or type, or NaN and infinity."""
-    if not isinstance(array, np.ndarray) or array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind != "f":
+    if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
         got = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
         raise DataError(f"points {where}: expected a float array of shape (P, >=3), got {got}")
-    bad = int((~np.isfinite(array[:, :3]).all(axis=1)).sum())
+    if mistake := shape_mistake(array.shape):
+        raise DataError(f"points {where}: {mistake}")
+    bad = int(np.count_nonzero(~finite_rows(array)))
     if bad:
         fix = "drop them: points[np.isfinite(points[:, :3]).all(1)]"
         raise DataError(f"points {where}: expected finite coordinates, got {bad} points with NaN or infinity; {fix}")

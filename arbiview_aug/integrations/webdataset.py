@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.atomic_io import BROKEN_ARRAY
+from arbiview_aug.cameras.plain_yaml import parse_json
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.image_io import encoded, encoded_image
 from arbiview_aug.environment import optional_package
@@ -64,7 +65,7 @@ def to_sample(entry: Mapping[str, Any]) -> dict[str, Any]:
     if "rig.json" not in entry:
         raise DataError(f"{where}: expected rig.json, got {', '.join(map(str, entry))}; write shards with to_entry")
     try:
-        described = json.loads(entry["rig.json"])
+        described = parse_json(entry["rig.json"])
         token = described["token"]
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise DataError(

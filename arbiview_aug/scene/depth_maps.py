@@ -9,6 +9,7 @@ import numpy as np
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.validation import MOST_M
 from arbiview_aug.errors import SampleError
 from arbiview_aug.scene.panorama import CELL_RAD
 from arbiview_aug.scene.surface import Points
@@ -54,9 +55,9 @@ def anchored(camera: Camera, depth_m: FloatArray, points: Points) -> FloatArray:
     ratio = depth_m.reshape(-1)[at] / z[valid]
     agrees = (ratio > 1 - ANCHOR_SHARE) & (ratio < 1 / (1 - ANCHOR_SHARE))
     logarithm = np.log(np.where(agrees, ratio, 1))
-    sigma = ANCHOR_RAD * float(camera.K[0, 0])
+    sigma = min(ANCHOR_RAD * float(camera.K[0, 0]), max(h, w))  # the blur's time grows with it
     total, agreeing, others = (
-        cv2.GaussianBlur(np.bincount(at, weights, h * w).reshape(h, w), (0, 0), sigma)
+        cv2.GaussianBlur(np.bincount(at, weights, h * w).astype(float).reshape(h, w), (0, 0), sigma)
         for weights in (logarithm, agrees.astype(float), (~agrees & (ratio > 0)).astype(float))
     )
     scale = np.exp(total / (agreeing + _UNANCHORED / (2 * math.pi * sigma**2)))
@@ -87,7 +88,7 @@ def points_of_depth(
     step = max(1, int(CELL_RAD * float(camera.K[0, 0])))
     pixels = camera.pixel_grid()[::step, ::step]
     depth = depth_m[::step, ::step]
-    known = np.isfinite(depth) & (depth > 0)
+    known = (depth > 0) & (depth <= MOST_M)
     if camera.mask is not None:
         known &= camera.mask[::step, ::step]
     rays, valid = camera.unproject_cam(pixels[known])

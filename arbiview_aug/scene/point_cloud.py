@@ -16,7 +16,8 @@ import numpy as np
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import PixelRays
-from arbiview_aug.errors import SampleError
+from arbiview_aug.cameras.validation import MOST_M
+from arbiview_aug.errors import SampleError, warn
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene import panorama
 from arbiview_aug.scene.boxes import BoxSurface
@@ -36,6 +37,7 @@ NODES_RAD = 4 * CELL_RAD
 ROOM_CELLS = 5  # cells by which panoramas are wider than what is asked first: later questions fit in
 
 _BLOCK = 1 << 16
+_MOST_FEATURES = 16  # of a point: 3 or 4 rows that are longer are points turned on their side
 
 MEASURED_SPREAD = 0.05
 """Spread of a measured inverse distance, as a share of it: half of STEP, below which densification follows a slope."""
@@ -70,7 +72,7 @@ class Cells(NamedTuple):
 
     def apart(self, camera: Camera) -> int:
         """Pixels between rays along which it is known what hides: a fine cell about, a coarse one at most."""
-        pixels = self.rad * float(camera.K[0, 0])
+        pixels = min(self.rad * float(camera.K[0, 0]), max(camera.size))
         return max(1, round(pixels) if self.rad == CELL_RAD else int(pixels))
 
     @property
@@ -343,7 +345,7 @@ def nodes_of(rays: PixelRays, apart: int) -> Layer:
 
 def directions_of(rays: PixelRays, R: FloatArray) -> tuple[FloatArray, int]:
     """Unit rays (n, 3) in the ego frame that span a view, and the pixels between nodes for its panorama."""
-    step = max(1, int(NODES_RAD * float(rays.parameters[0])))
+    step = max(1, int(min(NODES_RAD * float(rays.parameters[0]), max(rays.size))))  # two nodes span any image
     local = nodes_of(rays, step)
     valid = local.any(axis=0)
     return local[:, valid].T @ R.T, step if valid.all() else 1  # an image circle ends between nodes
@@ -414,17 +416,39 @@ def own_car(points: Points) -> BoolArray:
     return np.asarray((x > x0) & (x < x1) & (y > y0) & (y < y1))
 
 
+def shape_mistake(shape: tuple[int, ...]) -> str | None:
+    """Say what is wrong with the shape of points that should be (P, >= 3); None if nothing is."""
+    expected = "expected shape (P, >= 3), x y z in the ego frame"
+    if len(shape) != 2 or shape[1] < 3:
+        turned = len(shape) == 2 and shape[0] in (3, 4)
+    else:
+        turned = shape[0] in (3, 4) and shape[1] > _MOST_FEATURES
+        if not turned:
+            return None
+    return f"{expected}, got {shape}" + ("; transpose them: points.T" if turned else "")
+
+
+def finite_rows(points: Points) -> BoolArray:
+    """(P,) points (P, >= 3) whose places are numbers within ``MOST_M``."""
+    x, y, z = (np.abs(points[:, k]) <= MOST_M for k in range(3))  # NaN is not
+    return np.asarray(x & y & z)
+
+
 def checked_points(points: Points, key: str = "points") -> Points:
-    """(P, 3) finite points of a sample's (P, >= 3); rows that are not finite are dropped, and nothing is copied if all
-    are.
+    """(P, 3) finite points of a sample's (P, >= 3); nothing is copied if all are.
+
+    LiDARs mark missing returns by NaN: rows that are not finite, or farther than ``MOST_M``, are left out with a
+    warning.
 
     Raises:
         SampleError: Another shape.
     """
     if points.size == 0:
         return np.zeros((0, 3))
-    if points.ndim != 2 or points.shape[1] < 3:
-        raise SampleError(f"{key}: expected shape (P, >= 3), x y z in the ego frame, got {points.shape}")
-    xyz = points[:, :3]
-    finite = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
-    return xyz if finite.all() else xyz[finite]
+    if mistake := shape_mistake(points.shape):
+        raise SampleError(f"{key}: {mistake}")
+    finite = finite_rows(points)
+    if finite.all():
+        return points[:, :3]
+    warn(f"{key}: rows with NaN, infinity or over {MOST_M:g} m are left out as missing returns")
+    return points[finite, :3]

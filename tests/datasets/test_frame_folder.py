@@ -204,7 +204,7 @@ def test_bad_points(tmp_path: Path) -> None:
     frame(tmp_path)
     dataset = FrameFolder(tmp_path)
     for array, message in (
-        (np.zeros((5, 2)), r"points .*expected a float array of shape \(P, >=3\), got float64 \(5, 2\)"),
+        (np.zeros((5, 2)), r"points .*expected shape \(P, >= 3\), x y z in the ego frame, got \(5, 2\)"),
         (np.zeros((5, 3), int), r"got int64 \(5, 3\)"),
         (np.array([[0, 0, np.nan], [1, 1, 1]]), "got 1 points with NaN or infinity"),
     ):

@@ -269,6 +269,9 @@ def test_points_are_checked() -> None:
     assert checked_points(np.zeros(0)).shape == (0, 3)
     with pytest.raises(SampleError, match=r"points: expected shape \(P, >= 3\), x y z in the ego frame, got \(4, 2\)"):
         checked_points(np.zeros((4, 2)))
+    for rows in (3, 4):
+        with pytest.raises(SampleError, match="transpose them"):
+            checked_points(np.zeros((rows, 500)))
 
 
 # --- depth maps and samples -------------------------------------------------------------------------------------------
