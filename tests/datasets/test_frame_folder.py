@@ -4,6 +4,7 @@ import json
 import pickle
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -205,6 +206,7 @@ def test_bad_points(tmp_path: Path) -> None:
     dataset = FrameFolder(tmp_path)
     for array, message in (
         (np.zeros((5, 2)), r"points .*expected shape \(P, >= 3\), x y z in the ego frame, got \(5, 2\)"),
+        (np.zeros((4, 500)), r"got \(4, 500\); transpose them: points\.T"),
         (np.zeros((5, 3), int), r"got int64 \(5, 3\)"),
         (np.array([[0, 0, np.nan], [1, 1, 1]]), "got 1 points with NaN or infinity"),
     ):
@@ -219,6 +221,11 @@ def test_bad_points(tmp_path: Path) -> None:
     (tmp_path / "lidar.npy").write_bytes(data[:1000])
     with pytest.raises(DataError, match=r"lidar\.npy: expected a \.npy array of numbers"):
         dataset[0]
+    for make in (Path.mkdir, partial(Path.symlink_to, target=tmp_path / "gone.npy")):
+        (tmp_path / "lidar.npy").unlink() if (tmp_path / "lidar.npy").is_file() else (tmp_path / "lidar.npy").rmdir()
+        make(tmp_path / "lidar.npy")
+        with pytest.raises(DataError, match=r"lidar: expected the points .*npy, found no file"):
+            dataset[0]
 
 
 def test_folders_that_are_none(tmp_path: Path) -> None:
@@ -230,9 +237,10 @@ def test_folders_that_are_none(tmp_path: Path) -> None:
     dataset = FrameFolder(tmp_path)
     with pytest.raises(IndexError):
         dataset[1]
-    (tmp_path / "calib.json").write_text("{")
-    with pytest.raises(DataError, match=r"calib\.json: expected JSON, got"):
-        dataset[0]
+    for text, got in (("{", ""), ('{"cameras": [], "cameras": []}', " the key 'cameras' stands twice")):
+        (tmp_path / "calib.json").write_text(text)
+        with pytest.raises(DataError, match=rf"calib\.json: expected JSON, got{got}"):
+            dataset[0]
     shutil.rmtree(tmp_path)
     with pytest.raises(DataError, match="expected a calibration, found no file"):
         dataset[0]
