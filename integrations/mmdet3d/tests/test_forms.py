@@ -230,7 +230,7 @@ def test_messages(given: Recording) -> None:
     mixed = Rig([TARGET[0], *(camera.resize((40, 60)) for camera in TARGET.cameras[1:])])
     with pytest.raises(SampleError, match="images of one size"):
         step(mixed)(results)
-    with pytest.raises(SampleError, match="SampleKeys.frame: expected 'source'"):
+    with pytest.raises(SampleError, match=r"SampleKeys\.frame: expected 'source'"):
         step(keys=SampleKeys(frame="target"))(results)
     entries = FORMS["BEVDet"](given)["img_inputs"]
     with pytest.raises(SampleError, match=r"whole numbers.*img_norm"):
