@@ -84,7 +84,7 @@ def situations(sample: Mapping[str, Any]) -> dict[str, tuple[Case, Case]]:
 
     def pair(surface: str, frame: Mapping[str, Any], target: Rig, **settings: Any) -> tuple[Case, Case]:
         nearly = target.shifted(x_m=NEARLY_M)  # shows the same
-        return Case(frame, target, settings), Case(frame, nearly, {"surface": surface, **settings})
+        return Case(frame, target, settings), Case(frame, nearly, {"geometry": surface, **settings})
 
     halved = {"size": (SIZE[0] // 2, SIZE[1] // 2), "fit": "stretch"}
     apart, together = (_only(bare, cameras) for cameras in subsets(rig))
