@@ -225,13 +225,16 @@ class RigRetarget(torch.nn.Module):
             SampleTypeError: Values of a type that is not supported.
             CalibrationError: Impossible K, cam2ego or lens.
         """
-        run = self._retargeted
+        run = self._on_host
         if "torch._dynamo" in sys.modules:  # importing it takes a second; nothing here can be compiled
             run = torch.compiler.disable(run)
+        return run(sample, params)
+
+    def _on_host(self, sample: Mapping[str, Any], params: Mapping[str, float] | None) -> dict[str, Any]:
         # Under another default device, numbers of plans would be made there, or nowhere (meta).
         is_cpu = torch.empty(0).device.type == "cpu"  # get_default_device of torch 2.6 misses contexts
         with nullcontext() if is_cpu else torch.device("cpu"), compilation_announced():
-            return run(sample, params)
+            return self._retargeted(sample, params)
 
     def _retargeted(self, sample: Mapping[str, Any], params: Mapping[str, float] | None) -> dict[str, Any]:
         self._limit_threads()

@@ -60,7 +60,7 @@ def test_the_sweep(report: dict[str, Any]) -> None:
     printed = table(report)
     assert all(f"| {name}" in printed for name, row in rows.items() if row["front"])
     assert f"Recommended, the most accurate within 1000 ms a frame: {best['name']}" in printed
-    assert "Static surfaces (far, ground, street) are not recommended here: target cameras stand up to 0." in printed
+    assert "Static surfaces (infinity, ground, street) are not recommended here: target cameras stand up to 0." in printed
     assert "than one trained on untouched images (integrations/cross_rig). Better: 'points', 'depth_m' or" in printed
     assert "more settings, none of them on the front" in printed
     fills = {row["name"]: row for row in report["fills"]}
@@ -118,7 +118,7 @@ def test_what_nothing_keeps_to_is_said(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["bench", "pareto", *only, "--repeats", "1", "--min-psnr", "90", "--output", str(tmp_path)]) == 1
     printed = capsys.readouterr().out
     assert "No recommendation: nothing reaches 90 dB: the best has" in printed
-    assert "| draft, objects, 1/1, opencv | step |" in printed
+    assert "| draft, boxes, 1/1, opencv | step |" in printed
 
 
 @pytest.mark.slow
@@ -146,7 +146,7 @@ def test_static_surfaces_are_recommended_where_cameras_only_turn(
     assert "not recommended here" not in printed
     assert main([*command, "--target", str(tmp_path / "raised.yaml")]) == 1
     printed = capsys.readouterr().out
-    assert "No recommendation: nothing was measured that may be recommended. Static surfaces (far, ground" in printed
+    assert "No recommendation: nothing was measured that may be recommended. Static surfaces (infinity, ground" in printed
     assert "stand up to 0.60 m" in printed and "or depth from the frames before and after" in printed
 
 
