@@ -14,6 +14,7 @@ from hashlib import sha256
 from importlib import import_module, metadata
 from io import BytesIO
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 from arbiview_aug.errors import MissingPackageError, warn
@@ -120,13 +121,15 @@ def _kernel(function: Any, **options: Any) -> Any:
 def compilation_announced() -> Iterator[None]:
     """Say on stderr that kernels are compiled, where numba's cache does not hold them, and how long it took."""
     compilation = _compilation()
-    before_s, outer = compilation.seconds, compilation.is_announced
-    compilation.is_announced = True
+    before_s = compilation.seconds
+    with compilation.lock:
+        compilation.announcers += 1
     try:
         yield
     finally:
-        compilation.is_announced = outer
-        if not outer and compilation.seconds > before_s:
+        with compilation.lock:
+            compilation.announcers -= 1
+        if not compilation.announcers and compilation.seconds > before_s:
             print(f"arbiview_aug: kernels compiled in {compilation.seconds - before_s:.1f} s", file=sys.stderr)
 
 
@@ -141,14 +144,14 @@ def _compilation() -> Any:
     from numba.core import event
 
     class Compilation(event.Listener):  # type: ignore[misc]
-        seconds, is_announced, said = 0.0, False, False
+        seconds, announcers, said, lock = 0.0, 0, False, Lock()  # threads announce beside each other
         depth, start_s, collects = 0, 0.0, False
 
         def on_start(self, event: Any) -> None:
             if not self.depth and not event.data["dispatcher"].py_func.__module__.startswith("arbiview_aug."):
                 return
             if not self.depth:
-                if self.is_announced and not self.said:
+                if self.announcers and not self.said:
                     self.said = True
                     print("arbiview_aug: compiling kernels, once for each installation", file=sys.stderr)
                 self.start_s, self.collects = time.perf_counter(), gc.isenabled()

@@ -96,3 +96,14 @@ def test_compiling_is_announced_and_not_timed(
     with compilation_announced():
         assert kernel()(3) == 6
     assert capsys.readouterr().err == ""
+
+
+def test_threads_announce_beside_each_other(kernel: Callable[[], Any], capsys: pytest.CaptureFixture[str]) -> None:
+    one, two = compilation_announced(), compilation_announced()
+    one.__enter__()
+    two.__enter__()
+    one.__exit__(None, None, None)
+    two.__exit__(None, None, None)
+    with compilation_announced():
+        assert kernel()(3) == 6
+    assert "kernels compiled in" in capsys.readouterr().err

@@ -310,6 +310,8 @@ def check_together(name: str, parser: argparse.ArgumentParser, given: argparse.N
     if name == "depth" and given.device and not given.model:
         parser.error("argument --device: expected it with --model alone: depth from motion is computed on the CPU")
     if name == "evaluate":
+        if given.generator and not (given.paper or given.figure or "diffusion" in given.holes):
+            parser.error("argument --generator: expected it with --holes diffusion, --paper or --figure")
         for mode, fixed in _FIXED.items():
             for option in fixed:
                 if getattr(given, mode) and getattr(given, option) != parser.get_default(option):

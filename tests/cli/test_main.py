@@ -143,6 +143,7 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("bench pareto --generator /nope", "generator /nope: expected a folder of a generator or .*, found none"),
         ("evaluate --holes diffusion --generator /nope", "generator /nope: expected a folder of a generator"),
         ("evaluate --quality paper fast --geometry street", "quality paper knows the far surface alone, got street"),
+        ("evaluate --generator /nope", "argument --generator: expected it with --holes diffusion, --paper or --figure"),
         ("depth --data frame --device nope", "argument --device: expected it with --model alone"),
         ("depth --data frame --model m --device nope", "expected cpu, cuda, cuda:1, ..., got 'nope'"),
     ],
