@@ -56,7 +56,7 @@ def test_a_stereo_pair(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     data = stereo(tmp_path / "data", 0.5, 2)
     found, printed = run(data, tmp_path / "out"), capsys.readouterr().out
     rows = found["means"]
-    assert list(rows) == ["copy", "fast, ground", "fast, street", "fast, objects", "fast, lidar"]
+    assert list(rows) == ["copy", "fast, ground", "fast, street", "fast, boxes", "fast, lidar"]
     psnr = {name: row["true_covered_psnr_db"] for name, row in rows.items()}
     assert psnr["copy"] < psnr["fast, street"] < psnr["fast, lidar"] and rows["copy"]["seen"] == 1
     frames = FrameFolder(data)

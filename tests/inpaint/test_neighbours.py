@@ -124,7 +124,7 @@ def test_all_fills_more_than_the_ground(sample: dict[str, Any], filled: dict[str
     out = RigRetarget(RIG.turned(yaw_deg=3, pitch_deg=6), neighbours="all")(sample)
     ground = RigRetarget(RIG.turned(yaw_deg=3, pitch_deg=6))(sample)
     assert out["coverage"].float().mean() >= ground["coverage"].float().mean()
-    with pytest.raises(ValueError, match="neighbours: expected one of ground, all"):
+    with pytest.raises(ValueError, match="neighbours: expected one of road, all"):
         RigRetarget(RIG, neighbours="sky")
 
 

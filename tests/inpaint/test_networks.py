@@ -91,7 +91,7 @@ def test_a_script_fills_a_frame_and_a_batch(lama: Path, drive: SyntheticDrive) -
     target = drive.rig.shifted(z_m=0.5)
     filler = TorchScriptInpainter(lama, size=64)
     completing = RigRetarget(target, holes=filler)
-    black = RigRetarget(target, holes="black", keys=SampleKeys(extra=("sources",)))
+    black = RigRetarget(target, holes="black", keys=SampleKeys(extra=("sources", "confidence")))
     alone = []
     for sample in (drive[0], drive[1]):
         alone.append(completing(sample))
@@ -139,7 +139,7 @@ def test_a_pipeline_from_disk_completes_frames_everywhere(
     target = rig.turned(pitch_deg=2)
     images = torch.randint(256, (6, 3, 128, 224), dtype=torch.uint8)
     frames = [{"images": images.roll(k, -1), "rig": rig, "token": f"frame {k}"} for k in range(2)]
-    seen = [RigRetarget(target, holes="black", keys=SampleKeys(extra=("sources",)))(frame) for frame in frames]
+    seen = [RigRetarget(target, holes="black", keys=SampleKeys(extra=("sources", "confidence")))(frame) for frame in frames]
     filler = PipelineInpainter.from_pretrained(pipeline, size=128, steps=1)
     given: list[tuple[int, ...]] = []
     run = filler.run
