@@ -40,7 +40,6 @@ BENCHMARKS = {
     "speed": Command(
         "milliseconds against bare cv2.remap calls; --device: batches by torch against a copy", "cli.bench.speed"
     ),
-    "ablation": Command("each stage and setting on and off: dB and milliseconds", "cli.bench.ablation"),
     "loader": Command("frames per second of a DataLoader, memory per worker", "cli.bench.loader"),
 }
 """Commands after ``bench``."""

@@ -21,7 +21,6 @@ from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import shipped_rigs
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.cli.bench import pareto
-from arbiview_aug.cli.bench.ablation import NOTES, ROWS, STEPS, markdown
 from arbiview_aug.datasets import registry
 from arbiview_aug.evaluate import paper_study
 from arbiview_aug.evaluate.frames import ScoredFrame
@@ -30,10 +29,11 @@ from arbiview_aug.evaluate.paper_study import REAL_FRAMES, SETS, SYNTHETIC, Stud
 from arbiview_aug.generator.training import command as train_command
 from arbiview_aug.render.config import Quality
 from arbiview_aug.render.requirements import HELPFUL_DATA
+from integrations.benchmarks import generator
+from integrations.benchmarks.ablation import NOTES, ROWS, STEPS, markdown
 from tests.generator.training.small import frames as drawn_frames
 from tests.generator.training.test_command import SMALLER
 from tests.helpers import saved_depth_model
-from tests.studies import generator
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted((ROOT / "docs").glob("*.md"))
@@ -76,7 +76,6 @@ TINY = {
     "depth --model ID_OR_PATH --data FOLDER": ["--output", "depth"],
     "depth --model ID_OR_PATH --data FOLDER --reference motion road": ["--output", "depth"],
     "evaluate --data FOLDER --target waymo --geometry learned street": ["--downscale", "4", "--geometry", "street"],
-    "bench ablation --data FOLDER": ["--downscale", "4", "--only", "street, not far"],
     "train --output output/tiny": ["--quiet", *SMALLER],
 }
 """Every command of the README and the pages, and options that make it quick."""
@@ -226,7 +225,7 @@ def test_the_commands_run(
 
 # --- tables -----------------------------------------------------------------------------------------------------------
 def test_the_ablation_is_the_commands() -> None:
-    """``bench ablation --data nuscenes-one ddad-one``: headings and steps, all that frames without boxes can tell."""
+    """Headings and steps, all that frames without boxes can tell."""
     move = {"psnr_db": 1.0, "gain_db": 1.0, "gain_db_per_ms": 1.0}
     figures = {"turned": move, "raised": move, "ms": 1.0, "added_ms": {"median_ms": 1.0}}
     steps = {name: figures for name, step in STEPS.items() if ROWS[step.row].fits(ScoredFrame({}))}

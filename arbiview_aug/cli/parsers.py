@@ -264,21 +264,6 @@ def speed() -> argparse.ArgumentParser:
     return parser
 
 
-def ablation() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "bench ablation",
-        "Each stage and setting on and off: accuracy, milliseconds on one thread, and what a ms buys.",
-        "--data FOLDER",
-    )
-    add_data(parser, "a synthetic street", nargs="+", default=[])
-    add = parser.add_argument
-    add_downscale(parser, 2)
-    add("--seed", type=seed, default=0, metavar="N", help="seed of the synthetic street")
-    add("--only", metavar="TEXT", default="", help="steps whose names contain it")
-    add("--output", default="output/ablation.json", metavar="FILE", help="file to write to")
-    return parser
-
-
 def loader() -> argparse.ArgumentParser:
     parser = command_parser(
         "bench loader",

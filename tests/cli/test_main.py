@@ -98,7 +98,7 @@ def test_errors_are_one_line(
 
 LONG = "x" * 300
 DATA_COMMANDS: dict[str, tuple[str, ...]] = {
-    **{f"{name} --data": () for name in ("bench speed", "bench loader", "bench ablation", "demo", "depth", "evaluate")},
+    **{f"{name} --data": () for name in ("bench speed", "bench loader", "demo", "depth", "evaluate")},
     "convert --data": ("--target", "waymo", "--output", "converted"),
     "check": (),
     "inspect": (),

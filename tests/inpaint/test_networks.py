@@ -139,7 +139,9 @@ def test_a_pipeline_from_disk_completes_frames_everywhere(
     target = rig.turned(pitch_deg=2)
     images = torch.randint(256, (6, 3, 128, 224), dtype=torch.uint8)
     frames = [{"images": images.roll(k, -1), "rig": rig, "token": f"frame {k}"} for k in range(2)]
-    seen = [RigRetarget(target, holes="black", keys=SampleKeys(extra=("sources", "confidence")))(frame) for frame in frames]
+    seen = [
+        RigRetarget(target, holes="black", keys=SampleKeys(extra=("sources", "confidence")))(frame) for frame in frames
+    ]
     filler = PipelineInpainter.from_pretrained(pipeline, size=128, steps=1)
     given: list[tuple[int, ...]] = []
     run = filler.run

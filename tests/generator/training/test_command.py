@@ -12,8 +12,8 @@ from arbiview_aug.__main__ import main as package_main
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.training import command
 from arbiview_aug.train import main
+from integrations.benchmarks import training
 from tests.generator.training.small import frames
-from tests.studies import training
 
 SMALLER = [
     f"--set={setting}"

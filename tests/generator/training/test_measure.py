@@ -20,11 +20,11 @@ from arbiview_aug.generator.training.held_out import case_of, gains, held_out_sc
 from arbiview_aug.generator.training.measure import bootstrap, hole_psnr, picture, sampled
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
 from arbiview_aug.generator.training.step import without_attention
+from integrations.benchmarks import training
+from integrations.benchmarks.training import correct_correspondences, seen_scores, text_of, wrong_rig
 from tests.generator.small import ring, stirred
 from tests.generator.training.small import OneColour, config, frames
 from tests.generator.training.test_pseudo_views import HOLE
-from tests.studies import training
-from tests.studies.training import correct_correspondences, seen_scores, text_of, wrong_rig
 
 
 @pytest.fixture(scope="module")

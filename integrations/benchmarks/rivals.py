@@ -28,7 +28,7 @@ from arbiview_aug.favs.stage1_geometry import h_geom
 from arbiview_aug.image_ops import Scratch
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import RenderPlan, build_plan
-from tests.evaluate.opencv_stitching import opencv_stitching
+from integrations.benchmarks.opencv_stitching import opencv_stitching
 
 YAW_DEG = 22.0
 OURS, ROW_SPLIT, STITCHING = "fast, street", "row split (UniDrive)", "OpenCV stitching"

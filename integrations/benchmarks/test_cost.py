@@ -1,11 +1,11 @@
-"""``python -m tests.studies.cost``: a step's cost follows its settings."""
+"""``python -m integrations.benchmarks.cost``: a step's cost follows its settings."""
 
 from __future__ import annotations
 
 import pytest
 
 from arbiview_aug.generator.training.config import overridden, tiny
-from tests.studies.cost import main, step_cost
+from integrations.benchmarks.cost import main, step_cost
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""``python -m tests.studies.joint``: a line for each number of steps."""
+"""``python -m integrations.benchmarks.joint``: a line for each number of steps."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from tests.studies.joint import main
+from integrations.benchmarks.joint import main
 
 
 @pytest.mark.slow

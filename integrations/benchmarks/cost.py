@@ -1,4 +1,4 @@
-"""``python -m tests.studies.cost --config paper inpaint``: what a training step costs, computed without a GPU.
+"""``python -m integrations.benchmarks.cost --config paper inpaint``: cost of a training step, computed without a GPU.
 
 Networks and tensors lie on torch's meta device, which keeps shapes alone; cameras and pseudo poses are a street's.
 Counted are the FLOP of matrix products and convolutions (a multiplication and an addition are two), and the bytes that

@@ -16,8 +16,8 @@ from arbiview_aug.environment import one_thread
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.metrics import truth_metrics
-from tests.evaluate.opencv_stitching import opencv_stitching
-from tests.evaluate.rivals import (
+from integrations.benchmarks.opencv_stitching import opencv_stitching
+from integrations.benchmarks.rivals import (
     OURS,
     ROW_SPLIT,
     STITCHING,

@@ -1,4 +1,4 @@
-"""``python -m tests.studies.training``: train variants of the settings and score each on held-out streets.
+"""``python -m integrations.benchmarks.training``: train variants of the settings and score each on held-out streets.
 
 Options are those of ``python -m arbiview_aug.train``.
 """

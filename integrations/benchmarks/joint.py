@@ -1,4 +1,4 @@
-"""``python -m tests.studies.joint``: do neighbouring views agree better where they are denoised together?
+"""``python -m integrations.benchmarks.joint``: do neighbouring views agree better where they are denoised together?
 
 Cameras are turned and get wider lenses, so that neighbours share holes. The same views, noise and sources are completed
 together, as ``complete_views`` does it, and each alone. Agreement is PSNR between two neighbours on pixels that both
@@ -20,7 +20,7 @@ from arbiview_aug.evaluate.agreement import target_consistency
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.training.measure import bootstrap
-from tests.studies.generator import HELD_OUT_SEED, wide_target
+from integrations.benchmarks.generator import HELD_OUT_SEED, wide_target
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -69,7 +69,9 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = command_parser("", "Views denoised together, or each alone.", "", program="python -m tests.studies.joint")
+    parser = command_parser(
+        "", "Views denoised together, or each alone.", "", program="python -m integrations.benchmarks.joint"
+    )
     parser.add_argument("--size", type=size, default=(128, 224), metavar="HxW", help="of every view")
     parser.add_argument("--frames", type=count, default=6, metavar="N", help="held-out streets")
     parser.add_argument("--steps", nargs="+", type=count, default=[1, 4], metavar="N", help="(default: 1 4)")

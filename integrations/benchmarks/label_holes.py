@@ -1,4 +1,4 @@
-"""``python -m tests.studies.label_holes``: whether holes draw the labels, on streets whose true holes are known.
+"""``python -m integrations.benchmarks.label_holes``: do holes draw the labels? On streets with known holes.
 
 For every moved rig and surface: rings around labelled objects against the same rings slid sideways (the protocol of
 ``label_leak``), holes against the true ones, fills against the true views, and a probe: a small classifier that learns
@@ -239,7 +239,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "",
         "Whether holes draw the labels, on synthetic streets whose true holes are known.",
         "--streets 20",
-        program="python -m tests.studies.label_holes",
+        program="python -m integrations.benchmarks.label_holes",
     )
     parser.add_argument("--size", type=size, default=(256, 704), metavar="HxW", help="of every view")
     parser.add_argument("--streets", type=count, default=20, metavar="N")

@@ -1,4 +1,4 @@
-"""``python -m arbiview_aug bench ablation``: its rows are settings that work, and its figures tell them apart."""
+"""``python -m integrations.benchmarks.ablation``: its rows are settings that work, and its figures tell them apart."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from arbiview_aug.__main__ import main
-from arbiview_aug.cli.bench import ablation
-from arbiview_aug.cli.bench.ablation import NOTES, ROWS, STEPS, SYNTHETIC, Step, markdown, measure, step_figures
 from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.evaluate.methods import Method
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.transforms.settings import render_config
+from integrations.benchmarks import ablation
+from integrations.benchmarks.ablation import NOTES, ROWS, STEPS, SYNTHETIC, Step, main, markdown, measure, step_figures
 
 
 def test_no_two_rows_are_alike_and_steps_need_all() -> None:
@@ -121,7 +120,7 @@ def test_a_street_tells_the_surfaces_apart() -> None:
 @pytest.mark.slow
 def test_command(nuscenes_root: Path, fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "new" / "ablation.json"
-    arguments = ["bench", "ablation", "--downscale", "4", "--output", str(path)]
+    arguments = ["--downscale", "4", "--output", str(path)]
     assert main([*arguments, "--data", str(nuscenes_root), "--only", "harmonising"]) == 0
     report = json.loads(path.read_text())
     assert list(report["data"]) == ["nuscenes-one"] and "| harmonising " in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""``python -m arbiview_aug bench ablation``: gain of each stage, setting and kind of geometry, in dB and milliseconds.
+"""``python -m integrations.benchmarks.ablation``: dB and milliseconds of each stage, setting and kind of geometry.
 
 All rows render the paper's six configurations and the rig raised by 0.6 m. A step is the difference of two rows. Its
 milliseconds are the median over the targets of their differences, CPU time without plans, unless plans belong to one
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import statistics
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -19,14 +20,14 @@ import torch
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName, Reduce
-from arbiview_aug.cli.arguments import output_file
+from arbiview_aug.cli.arguments import add_data, add_downscale, command_parser, output_file, seed
 from arbiview_aug.cli.bench.study import benchmark, study
 from arbiview_aug.cli.bench.timing import machine_line, quartiles, show
 from arbiview_aug.datasets import open_data, reduced_rig
 from arbiview_aug.datasets.depth_folder import WANTED
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.errors import DataError
+from arbiview_aug.errors import DataError, exit_status
 from arbiview_aug.evaluate.agreement import source_overlap, summary
 from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
 from arbiview_aug.evaluate.images import RenderedView
@@ -41,6 +42,7 @@ from arbiview_aug.transforms.explain import Explanation
 from arbiview_aug.transforms.plan_cache import PlanCache
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
+PROGRAM = "python -m integrations.benchmarks.ablation"
 SYNTHETIC = "synthetic street"
 GEOMETRY = {"boxes": "boxes_3d", "LiDAR": "points", "motion": MOTION_KEY, "learned": LEARNED_KEY}
 """Kinds of geometry, and the sample's keys."""
@@ -161,8 +163,24 @@ NOTES = (
 )
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Measure, print the table, write the JSON."""
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure, print the table, write the JSON; the exit status."""
+    parser = command_parser(
+        "",
+        "Each stage and setting on and off: accuracy, milliseconds on one thread, and what a ms buys.",
+        "--data FOLDER",
+        program=PROGRAM,
+    )
+    add_data(parser, "a synthetic street", nargs="+", default=[])
+    add_downscale(parser, 2)
+    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of the synthetic street")
+    parser.add_argument("--only", metavar="TEXT", default="", help="steps whose names contain it")
+    parser.add_argument("--output", default="output/ablation.json", metavar="FILE", help="file to write to")
+    arguments = parser.parse_args(argv)
+    return exit_status(PROGRAM, lambda: _run(arguments))
+
+
+def _run(arguments: argparse.Namespace) -> None:
     steps = [name for name in STEPS if arguments.only in name]
     if not steps:
         raise DataError(f"--only: expected part of one of {', '.join(STEPS)}")
@@ -291,3 +309,7 @@ def _signed(value: float, digits: int) -> str:
 def _overlap(frame: ScoredFrame, harmonised: bool) -> dict[str, float]:
     """Agreement of neighbours on the frame as recorded."""
     return summary("overlap", source_overlap(frame.sample, retargeting("fast", "street", match_exposure=harmonised)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,4 +1,4 @@
-"""``python -m tests.studies.generator``: cost and accuracy of filled holes on synthetic streets."""
+"""``python -m integrations.benchmarks.generator``: cost and accuracy of filled holes on synthetic streets."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "",
         "Holes left black, inpainted, generated: milliseconds a frame, and PSNR against the true views.",
         "--steps 1 4",
-        program="python -m tests.studies.generator",
+        program="python -m integrations.benchmarks.generator",
     )
     parser.add_argument("--size", type=size, default=SIZE, metavar="HxW", help="of every view")
     parser.add_argument("--repeats", type=count, default=3, metavar="N", help="rounds of timing")

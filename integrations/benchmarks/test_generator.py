@@ -1,4 +1,4 @@
-"""``python -m tests.studies.generator``: every filler in one table and its JSON."""
+"""``python -m integrations.benchmarks.generator``: every filler in one table and its JSON."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.studies.generator import main
+from integrations.benchmarks.generator import main
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""``python -m tests.studies.label_holes``: its protocol is the referee's, its truth is exact, its command runs."""
+"""``python -m integrations.benchmarks.label_holes``: the protocol of the referee, exact truth."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from tests.studies.label_holes import SHARE, area_under_curve, main, make_street, ring_holes, slid
+from integrations.benchmarks.label_holes import SHARE, area_under_curve, main, make_street, ring_holes, slid
 
 
 def test_rings_are_those_of_the_referee(referee: Any) -> None:
