@@ -207,7 +207,7 @@ def _decode_jpeg_in_place(out: ByteArray, path: Path, reduce: int) -> bool:
     return True
 
 
-JPEG_QUALITY = 96  # quality at 4:4:4 chroma; costs at most 0.08 dB (``tests/acceptance/test_converted.py``)
+JPEG_QUALITY = 96  # quality at 4:4:4 chroma; costs at most 0.08 dB (acceptance/test_converted.py)
 
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111)
 

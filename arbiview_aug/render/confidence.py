@@ -4,7 +4,7 @@ A pixel is wrong if the scene differs from the surface along its ray, or if its 
 known when a plan is built (``certainty``). The error of its colour then depends on the contrast of the view around it,
 and on how much two sources disagree at a seam (``confidence``).
 
-Constants were fitted on synthetic streets and hold on others (tests/acceptance/test_confidence.py).
+Constants were fitted on synthetic streets and hold on others (acceptance/test_confidence.py).
 """
 
 from __future__ import annotations
