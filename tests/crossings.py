@@ -23,13 +23,13 @@ from arbiview_aug.scene.depth_maps import motion_camera
 
 PACKAGE = str(Path(arbiview_aug.__file__).parent)
 BOUNDS = {
-    "street, plan cached": (18, 47),
-    "LiDAR + boxes": (34, 600),
-    "learned depth": (36, 600),
-    "generated": (33, 1500),
-    "neighbours, all": (45, 2500),
-    "motion": (51, 2550),
-    "paper": (21, 160),
+    "street, plan cached": (17, 47),
+    "LiDAR + boxes": (32, 600),
+    "learned depth": (34, 600),
+    "generated": (31, 1500),
+    "neighbours, all": (43, 2500),
+    "motion": (49, 2550),
+    "paper": (19, 160),
 }
 """Most files and crossings that a call may have."""
 

@@ -16,8 +16,7 @@ from arbiview_aug.cli.evaluate import frames_text, measured, open_frames
 from arbiview_aug.environment import working_s
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.methods import Method, retargeting, views_of
-from arbiview_aug.evaluate.report.pictures import save_picture
-from arbiview_aug.evaluate.report.sheet import frame_sheet
+from arbiview_aug.evaluate.report.pictures import frame_sheet, save_picture
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
 from arbiview_aug.render.config import Quality
 from arbiview_aug.transforms.rig_retarget import RigRetarget

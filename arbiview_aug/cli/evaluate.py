@@ -31,8 +31,7 @@ from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.methods import Method, retargeting, study_methods
 from arbiview_aug.evaluate.paper_study import draw_figures, measure_paper, paper_report, unseen_frames
 from arbiview_aug.evaluate.report.html import html_report
-from arbiview_aug.evaluate.report.pictures import save_picture
-from arbiview_aug.evaluate.report.sheet import frame_sheet
+from arbiview_aug.evaluate.report.pictures import frame_sheet, save_picture
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
 from arbiview_aug.evaluate.run import Evaluation, evaluate
 from arbiview_aug.evaluate.targets import named_targets, without_masks

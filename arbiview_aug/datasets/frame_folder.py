@@ -31,7 +31,7 @@ from arbiview_aug.datasets.drive import (
     check_neighbours,
     parts_of_clock,
 )
-from arbiview_aug.datasets.image_io import check_reduce, decode_images, reduced_rig
+from arbiview_aug.datasets.image_io import check_reduce, decode_images, encoded_image, reduced_rig
 from arbiview_aug.datasets.layouts import CALIBRATION_FILE
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, WarnOnce, shown, warn
 from arbiview_aug.sample.masks import image_circle, without_specks
@@ -416,3 +416,26 @@ def _pose(value: Any, where: str) -> torch.Tensor:
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise DataError(f"{where}: ego2world: expected 4x4 finite numbers, got {value!r}")
     return torch.from_numpy(pose)
+
+
+def write_frame(folder: Path, sample: Mapping[str, Any]) -> None:
+    """Write a sample's uint8 images as JPEGs, its rig without masks, and its points, boxes and pose if it has them."""
+    rig: Rig = sample["rig"]
+    folder.mkdir(parents=True, exist_ok=True)
+    calib = rig.to_dict()
+    for k, (entry, image) in enumerate(zip(calib["cameras"], sample["images"], strict=True)):
+        entry["file"] = f"{k:02}.jpg"
+        (folder / entry["file"]).write_bytes(encoded_image(image))
+    calib |= {key: sample[key].tolist() for key in ("boxes_3d", "ego2world") if key in sample}
+    if "points" in sample:
+        np.save(folder / POINTS_FILE, sample["points"].numpy())
+    (folder / CALIBRATION_FILE).write_text(json.dumps(calib, indent=1))
+
+
+def write_drive(root: Path, frames: Sequence[Mapping[str, Any]]) -> None:
+    """Write the frames of one drive (with ``ego2world`` and ``time_s``) in order of time, and ``sequence.json``."""
+    entries = []
+    for k, frame in enumerate(sorted(frames, key=lambda frame: float(frame["time_s"]))):
+        entries.append({"name": f"{k:04}", "time_s": float(frame["time_s"])})
+        write_frame(root / f"{k:04}", frame)
+    (root / SEQUENCE_FILE).write_text(json.dumps({"frames": entries}))

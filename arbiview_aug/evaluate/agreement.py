@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray
-from arbiview_aug.cameras.overlap import TILE_PX, VIEW_SIZE, adjacent_pairs, half_way_view, odd_tiles
+from arbiview_aug.cameras.projection import TILE_PX, VIEW_SIZE, adjacent_pairs, half_way_view, odd_tiles
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import UnreachableError
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors

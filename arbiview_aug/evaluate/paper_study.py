@@ -26,8 +26,7 @@ from arbiview_aug.evaluate.frames import Exposure, ScoredFrame, make_frame, scor
 from arbiview_aug.evaluate.images import Image, as_arrays
 from arbiview_aug.evaluate.methods import GENERATED, OURS, Method, baseline, generating, retargeting, study_methods
 from arbiview_aug.evaluate.metrics import mean_of
-from arbiview_aug.evaluate.report.pictures import contact_sheet, save_picture
-from arbiview_aug.evaluate.report.sheet import left_to_right
+from arbiview_aug.evaluate.report.pictures import contact_sheet, left_to_right, save_picture
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import TRUCK_UP_M, VEHICLES, YAWS_DEG, named_targets, paper_target, spacing_deg
 from arbiview_aug.generator.config import TrainedOn

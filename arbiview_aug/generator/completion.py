@@ -20,9 +20,8 @@ from arbiview_aug.generator.autoencoder import Autoencoder
 from arbiview_aug.generator.conditioning import Views
 from arbiview_aug.generator.config import GeneratorConfig
 from arbiview_aug.generator.correspondence import TokenWindow
-from arbiview_aug.generator.denoiser import REGRESSION
+from arbiview_aug.generator.denoiser import REGRESSION, GeneratorNetworks
 from arbiview_aug.generator.geometry import FrameGeometry, batched, frame_geometry
-from arbiview_aug.generator.networks import GeneratorNetworks
 from arbiview_aug.generator.sampler import guided, noise_schedule, sample
 from arbiview_aug.image_ops import resized
 from arbiview_aug.inpaint.inpainter import check_device, known_and_holes, seeded

@@ -20,7 +20,9 @@ from torch.utils.checkpoint import checkpoint
 
 from arbiview_aug.environment import optional_package
 from arbiview_aug.generator.attention import CrossViewAttention
+from arbiview_aug.generator.autoencoder import Autoencoder
 from arbiview_aug.generator.conditioning import PoseContext, Views, input_channels
+from arbiview_aug.generator.config import GeneratorConfig, TrainedOn
 from arbiview_aug.generator.correspondence import LEVELS, TokenWindow
 
 TIMESTEPS = 1000  # diffusion steps in training (Sec. Training Parameters)
@@ -301,3 +303,22 @@ def widen(unet: Any, channels: int) -> None:
     new.bias = nn.Parameter(old.bias.detach())
     unet.conv_in = new
     unet.register_to_config(in_channels=channels)
+
+
+class GeneratorNetworks(nn.Module):
+    """Denoiser and autoencoder of one configuration (Sec. CVC-SSL); ``calls`` counts those of the denoiser."""
+
+    def __init__(self, config: GeneratorConfig, denoiser: Denoiser, autoencoder: Autoencoder) -> None:
+        super().__init__()
+        self.config, self.denoiser, self.autoencoder = config, denoiser, autoencoder
+        if config.frozen_unet:
+            autoencoder.requires_grad_(False)
+            denoiser.requires_grad_(False)
+            for parameter in denoiser.own_parameters():
+                parameter.requires_grad_(True)
+        self.calls = 0
+        self.trained_on: TrainedOn | None = None  # set by the training, and read from a folder
+
+    @property
+    def device(self) -> torch.device:
+        return self.denoiser.regression.weight.device

@@ -15,8 +15,7 @@ from arbiview_aug.generator.checkpoint import CONFIG_FILE, load_weights, read_ch
 from arbiview_aug.generator.completion import complete
 from arbiview_aug.generator.conditioning import input_channels
 from arbiview_aug.generator.config import GeneratorConfig, TrainedOn, from_plain, paper
-from arbiview_aug.generator.denoiser import Denoiser
-from arbiview_aug.generator.networks import GeneratorNetworks
+from arbiview_aug.generator.denoiser import Denoiser, GeneratorNetworks
 from arbiview_aug.generator.sampler import noise_schedule
 from arbiview_aug.generator.stable_diffusion import PLAIN_UNET, load_part
 from arbiview_aug.generator.stable_diffusion import empty_prompt as embedded_empty_prompt

@@ -13,8 +13,8 @@ import torch
 
 from arbiview_aug.errors import GeneratorError, WarnOnce
 from arbiview_aug.generator.completion import FrameViews, complete_together
+from arbiview_aug.generator.denoiser import GeneratorNetworks
 from arbiview_aug.generator.generator import Generator
-from arbiview_aug.generator.networks import GeneratorNetworks
 from arbiview_aug.inpaint.inpainter import Inpainter, checked_settings, frame_names, put
 from arbiview_aug.inpaint.networks import NetworkInpainter, PipelineInpainter, TorchScriptInpainter
 from arbiview_aug.render.rendered import RenderedFrame

@@ -8,9 +8,8 @@
 The diffusion generator's inpainter is ``arbiview_aug.generator.Diffusion``.
 """
 
-from arbiview_aug.inpaint.batches import CompletedLoader
 from arbiview_aug.inpaint.continued import Continue, Mean
-from arbiview_aug.inpaint.inpainter import Black, Inpainter
+from arbiview_aug.inpaint.inpainter import Black, CompletedLoader, Inpainter
 from arbiview_aug.inpaint.networks import NetworkInpainter, PipelineInpainter, TorchScriptInpainter
 from arbiview_aug.inpaint.telea import Telea
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from numbers import Real
 from typing import Any, ClassVar
@@ -203,3 +203,20 @@ def check_device(network: Any) -> None:
             "a generator on a GPU cannot run in DataLoader workers: use num_workers=0, keep the generator on the "
             "CPU, or complete batches after they are collated"
         )
+
+
+class CompletedLoader:
+    """Loader that fills the batches of another one in this process, on the device of the inpainter's network.
+
+    ``loader`` yields batches from ``RigRetarget(..., keys=SampleKeys(extra=("sources", "confidence")))``.
+    """
+
+    def __init__(self, loader: Iterable[Mapping[str, Any]], inpainter: Inpainter) -> None:
+        self.loader, self.inpainter = loader, inpainter
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        for batch in self.loader:
+            yield self.inpainter.complete_batch(batch)
+
+    def __len__(self) -> int:
+        return len(self.loader)  # type: ignore[arg-type]

@@ -21,8 +21,7 @@ import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.overlap import adjacent_pairs, half_way_view, odd_tiles
-from arbiview_aug.cameras.projection import ego_rays, project_rays
+from arbiview_aug.cameras.projection import adjacent_pairs, ego_rays, half_way_view, odd_tiles, project_rays
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.errors import SampleError
 from arbiview_aug.lru_cache import LRUCache

@@ -23,16 +23,8 @@ from arbiview_aug.render.atlas import AtlasLayout, FixedMap
 from arbiview_aug.render.confidence import certainty
 from arbiview_aug.render.config import RenderConfig
 from arbiview_aug.render.requirements import SAME_CENTER_M
-from arbiview_aug.render.seams import SecondBest, seam_weights
-from arbiview_aug.render.view_plan import (
-    NEARER,
-    BilinearFallback,
-    Paint,
-    SourceUse,
-    ViewPlan,
-    nearer_cells,
-)
-from arbiview_aug.render.weights import source_weight
+from arbiview_aug.render.view_plan import NEARER, BilinearFallback, Paint, SourceUse, ViewPlan, nearer_cells
+from arbiview_aug.render.weights import SecondBest, seam_weights, source_weight
 from arbiview_aug.scene.point_cloud import occlusion_level
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.scene.static import is_within_wall, worst_parallax_px

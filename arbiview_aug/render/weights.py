@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
 import numpy as np
+import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.image_ops import Memory
+from arbiview_aug.render.atlas import FixedMap
+from arbiview_aug.render.view_plan import BlendRegion
 
 
 def distance_weight(distance_px: FloatArray, d_max_px: float, gamma: float) -> FloatArray:
@@ -41,3 +49,79 @@ def source_weight(
     """w_distance · w_quality · w_primary (...,); arguments as for its factors."""
     distance = distance_weight(edge_px, d_max_px, gamma)
     return distance * quality_weight(parallax_px, resolution) * primary_weight(is_primary, bonus)
+
+
+Nodes = npt.NDArray[np.float32]
+
+_STRIP_PX = 128
+LEAST_SHARE = 1 / 256  # a source that adds less than this to a pixel cannot change a grey level
+
+
+def seam_weights(winner: npt.NDArray[np.int8], border_px: Sequence[Nodes], radius: int, width_px: float) -> list[Nodes]:
+    """Weights on the nodes: each source's winning area, softened over the seams, fading at its own border.
+
+    Args:
+        winner: (ny, nx) source of each node, -1 for none.
+        border_px: (ny, nx) distance to the border of what it sees, target pixels.
+        radius: Half the width of a seam, in nodes.
+        width_px: Width of a seam, target pixels.
+    """
+    weights: list[Nodes] = []
+    for k, border in enumerate(border_px):
+        # Two passes of a box make a smooth ramp.
+        soft: Any = (winner == k).astype(np.float32)
+        for _ in range(2):
+            soft = cv2.blur(soft, (2 * radius + 1, 2 * radius + 1), borderType=cv2.BORDER_REPLICATE)
+        weights.append(soft * np.clip(border / np.float32(width_px), 0, 1))
+    return weights
+
+
+class SecondBest:
+    """Second-best sources of a view's pixels in cells that several sources have weight in.
+
+    Args:
+        weights: (ny + 1, nx + 1) of each source on the nodes.
+        step: Side of a cell, pixels.
+        size: (h, w) of the view.
+        memory: Memory of images.
+
+    Attributes:
+        shared: (ny, nx) bool, those cells.
+        images: The last four arguments of ``kernels.put_source``, which updates them; (0, 0) without such cells.
+    """
+
+    def __init__(self, weights: Sequence[Nodes], step: int, size: tuple[int, int], memory: Memory) -> None:
+        count = np.zeros([-(-n // step) for n in size], np.uint8)
+        for weight in weights:
+            some = weight > 0
+            count += some[1:, 1:] | some[1:, :-1] | some[:-1, 1:] | some[:-1, :-1]
+        self.shared, self._step = count > 1, step
+        size = size if self.shared.any() else (0, 0)
+        weight, second = memory.full(size, 0, np.float32), memory.full(size, -1, np.int8)
+        self.images = weight, second, memory.empty(size, np.int32), memory.empty(size, np.uint16)
+
+    def blend_regions(self, sources: Sequence[int], best: npt.NDArray[np.float32]) -> list[BlendRegion]:
+        """Rectangles around the pixels that a second source adds to.
+
+        Args:
+            sources: All, in content order: rectangles overlap, and blending rounds.
+            best: (h, w) weight of the winning source.
+        """
+        from arbiview_aug.render.kernels import cut_bands, find_bands
+
+        share, second, *where = self.images
+        if not share.size:
+            return []
+        bands = np.empty((len(sources) * -(-len(share) // _STRIP_PX) * self.shared.shape[1], 5), np.int64)
+        order = np.array(sources)
+        cells = self.shared, self._step
+        bands = bands[: find_bands(*cells, _STRIP_PX, best, share, second, LEAST_SHARE, order, bands)]
+        size = np.stack([bands[:, 2] - bands[:, 1], bands[:, 4] - bands[:, 3]], -1)
+        ends = [0, *np.cumsum(size.prod(axis=1)).tolist()]
+        xy, frac, weight = (np.empty(ends[-1], kind) for kind in (np.int32, np.uint16, np.float32))
+        cut_bands(bands, *cells, share, second, *where, xy, frac, weight)
+        regions = []
+        for (source, y0, _, x0, _), (h, w), a, b in zip(bands.tolist(), size.tolist(), ends, ends[1:], strict=False):
+            at = FixedMap(xy[a:b].view(np.int16).reshape(h, w, 2), frac[a:b].reshape(h, w))
+            regions.append(BlendRegion(y0, x0, source, at, weight[a:b].reshape(h, w)))
+        return regions

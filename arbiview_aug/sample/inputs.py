@@ -15,8 +15,7 @@ from arbiview_aug.cameras.key_names import hint
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, canonical_name
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError, SampleTypeError
-from arbiview_aug.sample.batching import entry, leading_shape, split
-from arbiview_aug.sample.images import check_container, checked_images
+from arbiview_aug.sample.batching import check_container, checked_images, entry, leading_shape, split
 from arbiview_aug.scene.boxes import checked_boxes
 from arbiview_aug.scene.depth_maps import believed, motion_camera, points_of_depth
 from arbiview_aug.scene.point_cloud import checked_points

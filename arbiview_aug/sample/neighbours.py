@@ -14,7 +14,7 @@ import torch
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import ArbiviewError, SampleError, SampleTypeError
-from arbiview_aug.sample.images import check_container, checked_images
+from arbiview_aug.sample.batching import check_container, checked_images
 from arbiview_aug.sample.inputs import Frame, as_array, frame_from, numbers
 from arbiview_aug.scene.boxes import carried, checked_boxes, moved_boxes
 from arbiview_aug.scene.point_cloud import checked_points, own_car, seen_through

@@ -12,10 +12,9 @@ import numpy as np
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.scene.boxes import BoxSurface
-from arbiview_aug.scene.corrected import CorrectedSurface, Correction
 from arbiview_aug.scene.point_cloud import PointCloudSurface, PointCloudWithBoxes
 from arbiview_aug.scene.shapes import solids
-from arbiview_aug.scene.static import Far, Ground, Street
+from arbiview_aug.scene.static import CorrectedSurface, Correction, Far, Ground, Street
 from arbiview_aug.scene.surface import Points, StaticSurface, Surface
 
 _ROWS = 1 << 18  # hashed at once, to avoid a copy of all points

@@ -21,8 +21,7 @@ import torch
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName, Reduce
 from arbiview_aug.cli.arguments import add_data, add_downscale, command_parser, output_file, seed
-from arbiview_aug.cli.bench.study import benchmark, study
-from arbiview_aug.cli.bench.timing import machine_line, quartiles, show
+from arbiview_aug.cli.bench.study import benchmark, machine_line, quartiles, show, study
 from arbiview_aug.datasets import open_data, reduced_rig
 from arbiview_aug.datasets.depth_folder import WANTED
 from arbiview_aug.datasets.registry import data_name

@@ -15,8 +15,7 @@ import numpy as np
 from arbiview_aug import SampleKeys
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import add_output, command_parser, count, device_named, size, writable_folder
-from arbiview_aug.cli.bench.study import benchmark, study
-from arbiview_aug.cli.bench.timing import clock_of, machine_line, quartiles, show
+from arbiview_aug.cli.bench.study import benchmark, clock_of, machine_line, quartiles, show, study
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.frames import make_frame
 from arbiview_aug.evaluate.methods import retargeting

@@ -19,7 +19,7 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.agreement import target_consistency
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.training.measure import bootstrap
+from arbiview_aug.generator.training.held_out import bootstrap
 from integrations.benchmarks.generator import HELD_OUT_SEED, wide_target
 
 

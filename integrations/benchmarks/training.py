@@ -22,8 +22,7 @@ from arbiview_aug.generator.geometry import FrameGeometry
 from arbiview_aug.generator.training.command import fresh
 from arbiview_aug.generator.training.config import CONFIGS, PseudoViewConfig, TrainConfig, overridden
 from arbiview_aug.generator.training.data import Frames, open_frames
-from arbiview_aug.generator.training.held_out import gains, held_out_scores
-from arbiview_aug.generator.training.measure import mean_hole_psnr, sampled
+from arbiview_aug.generator.training.held_out import gains, held_out_scores, mean_hole_psnr, sampled
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
 from arbiview_aug.generator.training.step import without_attention
 from arbiview_aug.generator.training.trainer import Trainer

@@ -13,7 +13,7 @@ from arbiview_aug.__main__ import main
 from arbiview_aug.atomic_io import _host
 from arbiview_aug.datasets import FrameFolder, Neighbours, WithDepth, WithMotionDepth
 from arbiview_aug.datasets.depth_folder import FOLDER, DepthFolder
-from arbiview_aug.datasets.frame_writer import write_frame
+from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import SampleError
 

@@ -14,7 +14,7 @@ from arbiview_aug import RetargetedDataset, RigRetarget
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets import FrameFolder, WithDepth
 from arbiview_aug.datasets.depth_folder import LEARNED_FOLDER, DepthFolder
-from arbiview_aug.datasets.frame_writer import write_frame
+from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import DataError, SampleError
 from arbiview_aug.temporal.learned_depth import LearnedDepth

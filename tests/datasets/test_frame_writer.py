@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from arbiview_aug.datasets import FrameFolder
-from arbiview_aug.datasets.frame_writer import write_frame
+from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 
 

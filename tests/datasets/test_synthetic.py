@@ -20,11 +20,10 @@ from arbiview_aug.datasets.synthetic import (
     make_scene,
     raycast,
 )
-from arbiview_aug.datasets.synthetic.materials import MATERIALS, Surface
+from arbiview_aug.datasets.synthetic.materials import MATERIALS, Surface, band, noise, pulses
 from arbiview_aug.datasets.synthetic.raycast import cast
 from arbiview_aug.datasets.synthetic.render import Renderer, camera_rays
 from arbiview_aug.datasets.synthetic.shading import Hits, SceneTables, sky_color
-from arbiview_aug.datasets.synthetic.texture import band, noise, pulses
 
 SIZE = (64, 176)
 

@@ -11,7 +11,7 @@ import pytest
 from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import FrameFolder, Neighbours
-from arbiview_aug.datasets.frame_writer import write_frame
+from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.image_io import encoded_image
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.errors import CalibrationError

@@ -6,8 +6,7 @@ import numpy as np
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.evaluate.images import RenderedView
-from arbiview_aug.evaluate.report.pictures import HOLE
-from arbiview_aug.evaluate.report.sheet import frame_sheet, hatched_view, left_to_right, shrunk
+from arbiview_aug.evaluate.report.pictures import HOLE, frame_sheet, hatched_view, left_to_right, shrunk
 from arbiview_aug.evaluate.report.tables import (
     OVERLAP_COLUMNS,
     SEEN,

@@ -20,9 +20,8 @@ from arbiview_aug.evaluate.targets import named_targets
 from arbiview_aug.generator import Diffusion, Generator, compact
 from arbiview_aug.generator.checkpoint import read_checkpoint
 from arbiview_aug.generator.training.data import open_frames
-from arbiview_aug.generator.training.held_out import gains, held_out_scores
-from arbiview_aug.generator.training.masks import retarget
-from arbiview_aug.generator.training.measure import bootstrap
+from arbiview_aug.generator.training.held_out import bootstrap, gains, held_out_scores
+from arbiview_aug.generator.training.pseudo_views import retarget
 from tests.helpers import few_or_all
 
 FOLDER = Path(arbiview_aug.generator.__file__).with_name("weights")

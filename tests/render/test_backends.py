@@ -16,9 +16,9 @@ from arbiview_aug.image_ops import Scratch
 from arbiview_aug.render.atlas import AtlasLayout, FixedMap
 from arbiview_aug.render.config import RenderConfig
 from arbiview_aug.render.kernels import read_ahead
-from arbiview_aug.render.labels import render_labels
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import RenderPlan, build_plan
+from arbiview_aug.render.rendered import render_labels
 from arbiview_aug.render.torch_backend import maps_on, render_torch
 from arbiview_aug.transforms.settings import render_config
 

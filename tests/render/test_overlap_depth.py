@@ -12,16 +12,14 @@ import torch
 from arbiview_aug import PlanCache
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.overlap import half_way_view
-from arbiview_aug.cameras.projection import ego_rays, project_rays
+from arbiview_aug.cameras.projection import ego_rays, half_way_view, project_rays
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.render.overlap_depth import LIMITS, MIN_RISE_DB, OverlapDepth, overlap_depth
 from arbiview_aug.render.plan import build_plan
 from arbiview_aug.scene.boxes import draw_boxes
-from arbiview_aug.scene.corrected import CorrectedSurface, Correction
 from arbiview_aug.scene.scene import Scene
-from arbiview_aug.scene.static import Street
+from arbiview_aug.scene.static import CorrectedSurface, Correction, Street
 from arbiview_aug.scene.surface import StaticSurface
 from arbiview_aug.transforms import estimate_depth
 from arbiview_aug.transforms.estimate_depth import OverlapCache

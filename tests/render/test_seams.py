@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from arbiview_aug.image_ops import FRESH
-from arbiview_aug.render.seams import LEAST_SHARE, SecondBest, seam_weights
+from arbiview_aug.render.weights import LEAST_SHARE, SecondBest, seam_weights
 
 STEP = 4
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from arbiview_aug.cameras.overlap import adjacent_pairs
+from arbiview_aug.cameras.projection import adjacent_pairs
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.bench.data import as_of_another_frame
 from arbiview_aug.evaluate.targets import without_masks

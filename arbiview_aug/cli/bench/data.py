@@ -18,7 +18,7 @@ from arbiview_aug.choices import Reduce
 from arbiview_aug.cli.arguments import REAL_TARGET
 from arbiview_aug.datasets import Neighbours, open_data
 from arbiview_aug.datasets.depth_folder import FOLDERS, DepthFolder
-from arbiview_aug.datasets.frame_writer import write_drive, write_frame
+from arbiview_aug.datasets.frame_folder import write_drive, write_frame
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.errors import DataError

@@ -31,14 +31,19 @@ from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, as_of_anot
 from arbiview_aug.cli.bench.speed import remap_floor
 from arbiview_aug.cli.bench.study import (
     LEAST_GAIN_DB,
+    Quartiles,
     Row,
     advice,
     benchmark,
     distinct_steps,
+    machine_line,
     pareto_front,
+    peak_mib,
+    quartiles,
+    show,
     study,
+    timed_rounds,
 )
-from arbiview_aug.cli.bench.timing import Quartiles, machine_line, peak_mib, quartiles, show, timed_rounds
 from arbiview_aug.cli.parsers import EXECUTIONS
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.frames import ScoredFrame

@@ -18,9 +18,8 @@ import numpy as np
 
 from arbiview_aug.atomic_io import check_name, checksum, inside, link_whole, whole_file
 from arbiview_aug.cli.convert.manifest import Record
-from arbiview_aug.cli.convert.nuscenes_rows import NewCameras, Remaining, kept_sensors, view_stem
+from arbiview_aug.cli.convert.nuscenes_rows import NewCameras, Remaining, kept_sensors, view_stem, visible_shares
 from arbiview_aug.cli.convert.settings import FOLDER, Settings
-from arbiview_aug.cli.convert.visibility import visible_shares
 from arbiview_aug.cli.convert.writer import Converted, Writer
 from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
 from arbiview_aug.datasets.nuscenes.tables import (

@@ -9,9 +9,9 @@ import numpy as np
 
 from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cli.convert.job import coverage_of
 from arbiview_aug.cli.convert.manifest import Manifest
 from arbiview_aug.cli.convert.settings import FOLDER, Settings
-from arbiview_aug.cli.convert.views import coverage_of
 from arbiview_aug.datasets.depth_folder import FOLDERS
 from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.registry import kinds_of, open_data

@@ -11,8 +11,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from arbiview_aug.datasets.synthetic.materials import band, cell_hash, fade, mix, noise, octave, pulses, step
 from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, Scene, SceneClass, Street
-from arbiview_aug.datasets.synthetic.texture import band, cell_hash, fade, mix, noise, octave, pulses, step
 
 FloatGrid = npt.NDArray[np.float32]
 _Window = Callable[[np.ndarray, np.ndarray], tuple[slice, slice]]

@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from arbiview_aug.datasets.synthetic.ground import light_map, road_color, sample_light, slab_color
-from arbiview_aug.datasets.synthetic.materials import MATERIALS, Surface, dot
+from arbiview_aug.datasets.synthetic.materials import MATERIALS, Surface, dot, mix, octave, step
 from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, SKY_ID
 from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, Material, Scene
-from arbiview_aug.datasets.synthetic.texture import mix, octave, step
 
 _CHUNK = 32768  # hits shaded at a time: each temporary stays in the cache
 _HAZE_M = 1100.0  # distance at which half of the light is the air's

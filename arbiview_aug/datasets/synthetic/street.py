@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from arbiview_aug.datasets.synthetic import objects
+from arbiview_aug.datasets.synthetic.objects import add_two_wheeler, two_wheeler_size
 from arbiview_aug.datasets.synthetic.scene import (
     BOX,
     BoxClass,
@@ -19,7 +20,6 @@ from arbiview_aug.datasets.synthetic.scene import (
     Street,
     yaw_matrix,
 )
-from arbiview_aug.datasets.synthetic.two_wheelers import add_two_wheeler, two_wheeler_size
 
 CLEAR_X_M, CLEAR_Y_M = (-3.0, 6.5), 2.2  # of the ego frame without objects: no camera of a sensible rig is inside one
 

@@ -11,9 +11,8 @@ import numpy as np
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays
-from arbiview_aug.evaluate.report.pictures import Picture, overlay_confidence
+from arbiview_aug.evaluate.report.pictures import Picture, hatched_view, left_to_right, overlay_confidence, shrunk
 from arbiview_aug.evaluate.report.rig_picture import draw_rigs
-from arbiview_aug.evaluate.report.sheet import hatched_view, left_to_right, shrunk
 from arbiview_aug.evaluate.report.tables import Columns, Table, cell
 from arbiview_aug.evaluate.run import Evaluation
 

@@ -18,7 +18,7 @@ from arbiview_aug.generator.checkpoint import CONFIG_FILE, load_weights, read_ch
 from arbiview_aug.generator.training.config import AutoencoderTraining, TrainConfig
 from arbiview_aug.generator.training.data import Frames, item_workers
 from arbiview_aug.generator.training.losses import Perceptual
-from arbiview_aug.generator.training.masks import one_of
+from arbiview_aug.generator.training.pseudo_views import one_of
 
 FOLDER = "autoencoder"
 _SCALE_IMAGES = 64  # number of images that set the latents' scale, to within 0.1 %

@@ -22,10 +22,9 @@ from arbiview_aug.generator.config import TrainedOn
 from arbiview_aug.generator.training.checkpointing import Average, has_state, load_state, save_state, stop_requests
 from arbiview_aug.generator.training.config import TrainConfig
 from arbiview_aug.generator.training.data import Frames, item_workers
+from arbiview_aug.generator.training.held_out import mean_hole_psnr, picture, sampled
 from arbiview_aug.generator.training.losses import Perceptual
-from arbiview_aug.generator.training.masks import mask_bank
-from arbiview_aug.generator.training.measure import mean_hole_psnr, picture, sampled
-from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
+from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate, mask_bank
 from arbiview_aug.generator.training.step import Step, draw
 
 _LOG_EVERY = 10

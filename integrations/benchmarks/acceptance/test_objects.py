@@ -27,8 +27,8 @@ from arbiview_aug import Rig
 from arbiview_aug.cameras.projection import project_rays
 from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig
 from arbiview_aug.datasets.synthetic.scene import BoxClass, Material, Scene, SceneBuilder
-from arbiview_aug.render.labels import render_labels
 from arbiview_aug.render.plan import build_plan
+from arbiview_aug.render.rendered import render_labels
 from arbiview_aug.scene.boxes import BoxSurface, checked_boxes, draw_boxes
 from arbiview_aug.scene.scene import Scene as Geometry
 from arbiview_aug.scene.shapes import PIECES, whole

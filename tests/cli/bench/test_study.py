@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.bench.study import LEAST_GAIN_DB, Row, advice, distinct_steps, pareto_front, study
-from arbiview_aug.cli.bench.timing import Quartiles
+from arbiview_aug.cli.bench.study import LEAST_GAIN_DB, Quartiles, Row, advice, distinct_steps, pareto_front, study
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.frames import make_frame
 from arbiview_aug.evaluate.images import RenderedView

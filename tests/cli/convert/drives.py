@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from arbiview_aug import Rig
-from arbiview_aug.datasets.frame_writer import write_drive
+from arbiview_aug.datasets.frame_folder import write_drive
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from tests.datasets.nuscenes_root import Tables, streets, tables_of, write_root
 

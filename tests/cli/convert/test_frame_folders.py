@@ -16,7 +16,7 @@ import torch
 from arbiview_aug import Rig, RigRetarget, SampleKeys, load_rig
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.convert import command as command_module
-from arbiview_aug.cli.convert.views import coverage_of
+from arbiview_aug.cli.convert.job import coverage_of
 from arbiview_aug.datasets import FrameFolder, WithDepth
 from arbiview_aug.datasets.depth_folder import DepthFolder
 from arbiview_aug.errors import DataError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from arbiview_aug import Camera, Rig
-from arbiview_aug.cli.convert.visibility import level, visible_shares
+from arbiview_aug.cli.convert.nuscenes_rows import level, visible_shares
 
 K = np.array([[200.0, 0, 199.5], [0, 200.0, 199.5], [0, 0, 1]])
 

@@ -10,8 +10,7 @@ import torch
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.training.config import overridden, tiny
 from arbiview_aug.generator.training.data import open_frames
-from arbiview_aug.generator.training.held_out import gains, held_out_scores
-from arbiview_aug.generator.training.measure import hole_psnr, sampled
+from arbiview_aug.generator.training.held_out import gains, held_out_scores, hole_psnr, sampled
 from arbiview_aug.generator.training.pseudo_views import collate
 from arbiview_aug.generator.training.trainer import Trainer
 

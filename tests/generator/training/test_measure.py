@@ -16,8 +16,15 @@ from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import shown_condition
 from arbiview_aug.generator.training.data import Frames, open_frames
-from arbiview_aug.generator.training.held_out import case_of, gains, held_out_scores
-from arbiview_aug.generator.training.measure import bootstrap, hole_psnr, picture, sampled
+from arbiview_aug.generator.training.held_out import (
+    bootstrap,
+    case_of,
+    gains,
+    held_out_scores,
+    hole_psnr,
+    picture,
+    sampled,
+)
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
 from arbiview_aug.generator.training.step import without_attention
 from integrations.benchmarks import training
@@ -128,7 +135,7 @@ def test_scores_are_of_the_runs_own_steps_and_guidance(monkeypatch: pytest.Monke
         return torch.zeros(*noise.shape[:2], 3, *settings.image_size)
 
     monkeypatch.setattr("arbiview_aug.generator.completion.denoised", denoised)
-    monkeypatch.setattr("arbiview_aug.generator.training.measure.denoised", denoised)
+    monkeypatch.setattr("arbiview_aug.generator.training.held_out.denoised", denoised)
     real = Frames(OneColour(), config().generator.image_size, ["0"] * 5)
     held_out_scores(own, real, [0], mean_of=1, show=False)
     assert used == [(1, 2.5), (3, 2.5), (3, 2.5)]

@@ -11,8 +11,7 @@ import torch
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.generator.training.config import PseudoViewConfig
-from arbiview_aug.generator.training.masks import mask_bank
-from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate, favs
+from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate, favs, mask_bank
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.generator.training.small import SIZE, config, frames
 
