@@ -62,6 +62,20 @@ FLAGS = {
 }
 """Options and benchmarks of the command line."""
 
+SETTINGS = {
+    "clip": "max_grad_norm",
+    "drop": "cond_drop_prob",
+    "moved": "p_translate",
+    "known": "known_weight",
+    "transplanted": "p_mask_transfer",
+}
+"""Settings of a training."""
+
+
+def setting_hint(names: Iterable[str]) -> str:
+    """The new names of old settings among ``names``, for the end of an error; empty where there are none."""
+    return "".join(f"; since 0.3 {name} is {SETTINGS[name]}" for name in names if name in SETTINGS)
+
 
 def refuse_old_options(of: str, options: Iterable[str]) -> None:
     """Raise TypeError for options that ``of`` does not have; old ones with their new name."""

@@ -42,9 +42,9 @@ def test_one_version_everywhere() -> None:
 
 def test_the_changelog_lists_what_old_names_became() -> None:
     (table,) = re.findall(r"### Moving from 0.2\n(.*?)\n#", (ROOT / "CHANGELOG.md").read_text(), re.DOTALL)
-    rows = dict(re.findall(r"^\| (?:the key )?`(.+?)` \| `(.+?)` \|$", table, re.MULTILINE))
+    rows = dict(re.findall(r"^\| (?:the key |the setting )?`(.+?)` \| `(.+?)` \|$", table, re.MULTILINE))
     values = {f'{option}="{old}"': f'{option}="{new}"' for (option, old), new in renamed.VALUES.items()}
-    assert rows == renamed.OPTIONS | values | renamed.KEYS | renamed.NAMES | renamed.FLAGS
+    assert rows == renamed.OPTIONS | values | renamed.KEYS | renamed.NAMES | renamed.FLAGS | renamed.SETTINGS
 
 
 @pytest.mark.parametrize("option", renamed.OPTIONS)

@@ -9,6 +9,7 @@ from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
 from arbiview_aug.errors import ArbiviewError, GeneratorError, shown
 from arbiview_aug.generator.correspondence import FACING_M
+from arbiview_aug.renamed import setting_hint
 
 _MOST_LEVELS, _MOST_LAYERS, _MOST_CHANNELS, _MOST_PIXELS = 8, 16, 8192, 8192
 
@@ -53,7 +54,9 @@ def from_plain(kind: type[_Config], data: Any, where: str, error: type[ArbiviewE
     hints = get_type_hints(kind)
     unknown = sorted(set(data) - set(hints))
     if unknown:
-        raise error(f"{where}: expected keys among {', '.join(sorted(hints))}, got {', '.join(unknown)}")
+        raise error(
+            f"{where}: expected keys among {', '.join(sorted(hints))}, got {', '.join(unknown)}{setting_hint(unknown)}"
+        )
     values: dict[str, Any] = {}
     for key, value in data.items():
         nested = next((part for part in (hints[key], *get_args(hints[key])) if is_dataclass(part)), None)

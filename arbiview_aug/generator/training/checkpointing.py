@@ -7,7 +7,7 @@ replaced atomically, as a generator's folder is: a full disk or a killed process
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -24,46 +24,32 @@ from arbiview_aug.generator.training.config import TrainConfig
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 
 
-class Average:
-    """Moving average of a module's parameters that require gradients; decay (1 + step) / (10 + step) if smaller."""
-
-    def __init__(self, module: nn.Module, decay: float) -> None:
-        self.decay = decay
-        self.values = {n: p.detach().clone().float() for n, p in module.named_parameters() if p.requires_grad}
-
-    @torch.no_grad()
-    def update(self, module: nn.Module, step: int) -> None:
-        """Update after optimiser step number ``step``, from 0."""
-        decay = min(self.decay, (1 + step) / (10 + step))
-        parameters = dict(module.named_parameters())
-        for name, value in self.values.items():
-            value.lerp_(parameters[name].detach().float(), 1 - decay)
-
-    @contextmanager
-    def applied_to(self, module: nn.Module) -> Iterator[None]:
-        """Put the averaged parameters into the module for a while."""
-        parameters = dict(module.named_parameters())
-        trained = {name: parameters[name].detach().clone() for name in self.values}
-        _copy_parameters(module, self.values)
-        try:
-            yield
-        finally:
-            _copy_parameters(module, trained)
-
-
-@torch.no_grad()
-def _copy_parameters(module: nn.Module, values: Mapping[str, torch.Tensor]) -> None:
-    parameters = dict(module.named_parameters())
-    for name, value in values.items():
-        parameters[name].copy_(value)
+@contextmanager
+def averaged(average: Any, parameters: Iterable[nn.Parameter]) -> Iterator[None]:
+    """Put the weights of diffusers' ``EMAModel`` into the parameters for a while."""
+    parameters = list(parameters)
+    average.store(parameters)
+    average.copy_to(parameters)
+    try:
+        yield
+    finally:
+        average.restore(parameters)
 
 
 def save_state(
-    folder: Path, config: TrainConfig, step: int, module: nn.Module, average: Average, optimiser: torch.optim.Optimizer
+    folder: Path,
+    config: TrainConfig,
+    step: int,
+    parameters: Mapping[str, nn.Parameter],
+    average: Any,
+    optimiser: torch.optim.Optimizer,
 ) -> None:
-    """Write the state after ``step`` steps; OutputError if it fails, and the last state is unchanged."""
-    tensors = {f"weights.{n}": p.detach() for n, p in module.named_parameters() if p.requires_grad}
-    tensors |= {f"average.{name}": value for name, value in average.values.items()}
+    """Write the state after ``step`` steps; OutputError if it fails, and the last state is unchanged.
+
+    Not accelerate's ``save_state``: it pickles, and writes into the folder in place.
+    """
+    tensors = {f"weights.{name}": parameter.detach() for name, parameter in parameters.items()}
+    tensors |= {f"average.{name}": value for name, value in zip(parameters, average.shadow_params, strict=True)}
     for k, state in optimiser.state_dict()["state"].items():
         tensors |= {f"optimiser.{k}.{key}": torch.as_tensor(value) for key, value in state.items()}
     write_checkpoint(folder, {"step": step, "training": asdict(config)}, tensors)
@@ -82,7 +68,11 @@ def _training_config(folder: Path, data: Mapping[str, Any]) -> TrainConfig:
 
 
 def load_state(
-    folder: Path, config: TrainConfig, module: nn.Module, average: Average, optimiser: torch.optim.Optimizer
+    folder: Path,
+    config: TrainConfig,
+    parameters: Mapping[str, nn.Parameter],
+    average: Any,
+    optimiser: torch.optim.Optimizer,
 ) -> int:
     """Load a saved state into a run; returns its steps. TrainingError for other settings, or a broken state."""
     try:
@@ -97,12 +87,13 @@ def load_state(
             f"{folder}: a run with other settings of {', '.join(changed)}; resume with the same ones, or give another "
             "--output"
         )
-    missing = [f"{part}.{n}" for part in ("weights", "average") for n in average.values if f"{part}.{n}" not in tensors]
+    missing = [f"{part}.{n}" for part in ("weights", "average") for n in parameters if f"{part}.{n}" not in tensors]
     if missing:
         raise TrainingError(f"{folder}: expected {missing[0]} and others, {len(missing)} are missing")
-    _copy_parameters(module, {name: tensors[f"weights.{name}"] for name in average.values})
-    for name, value in average.values.items():
+    for (name, parameter), value in zip(parameters.items(), average.shadow_params, strict=True):
+        parameter.data.copy_(tensors[f"weights.{name}"])
         value.copy_(tensors[f"average.{name}"])
+    average.optimization_step = step
     state: dict[int, dict[str, torch.Tensor]] = {}
     for name, value in tensors.items():
         if name.startswith("optimiser."):

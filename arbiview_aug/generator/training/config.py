@@ -11,6 +11,7 @@ from typing import Any, Literal
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator import config as generators
 from arbiview_aug.generator.config import GeneratorConfig, check_fields, from_plain
+from arbiview_aug.renamed import setting_hint
 
 GeoMode = Literal["normalised", "frobenius_sum"]
 PseudoQuality = Literal["fast", "paper"]
@@ -29,9 +30,9 @@ class PseudoViewConfig:
     pitch_deg: float = 8.0  # half-widths of the other turns and moves
     lateral_m: float = 1.0
     vertical_m: float = 0.3
-    moved: float = 0.5  # probability that pseudo poses are translated; otherwise infinity is the only depth level
+    p_translate: float = 0.5  # probability that pseudo poses are translated; otherwise infinity is the only depth level
     focal: tuple[float, float] = (0.7, 1.3)  # range of the factor of the focal length
-    transplanted: float = 0.8  # probability of a target's coverage mask; Algorithm 1 leaves next to no holes
+    p_mask_transfer: float = 0.8  # probability of a target's coverage mask; Algorithm 1 leaves next to no holes
     hidden: float = 0.5  # share of these masks that hide the pixels from the source branches too, as at inference
     leave_one_out: float = 0.1  # probability that the real view is not among FAVS's sources
     virtual: float = 0.3  # probability that the target is the real view under a random turn and focal length
@@ -39,7 +40,7 @@ class PseudoViewConfig:
     mask_bank: int = 128  # coverage masks drawn from the retarget distribution before training
 
     def __post_init__(self) -> None:
-        shares = ("moved", "transplanted", "hidden", "leave_one_out", "virtual", "real_sources")
+        shares = ("p_translate", "p_mask_transfer", "hidden", "leave_one_out", "virtual", "real_sources")
         _check(self, "a probability", lambda p: 0 <= p <= 1, *shares)
         _check(self, "fast or paper", lambda q: q in ("fast", "paper"), "quality")
         _check(self, "at least 1", lambda n: n >= 1, "targets", "pairs", "mask_bank")
@@ -59,14 +60,14 @@ class LossConfig:
     perceptual_crop: int = 64  # side in pixels of the square that is compared
     snr_limit: float = 5.0  # γ of Min-SNR-γ (Hang et al. 2023); 0 as printed. Unused by residual generators
     snr_floor: float = 0.1  # lower bound of the weight: Min-SNR is .0047 at t = 999, where few-step samplers start
-    known: float = 0.2  # weight of known pixels relative to holes: they are pasted back at inference
+    known_weight: float = 0.2  # weight of known pixels relative to holes: they are pasted back at inference
     regression: float = 0.3  # share of the items that train the one-step regression; 0 switches it off
 
     def __post_init__(self) -> None:
         _check(self, "normalised or frobenius_sum", lambda m: m in ("normalised", "frobenius_sum"), "geo_mode")
         _check(self, "at least 0", lambda w: w >= 0, "geo", "perceptual", "snr_limit", "snr_floor")
         _check(self, "a value in [0, 1)", lambda p: 0 <= p < 1, "regression")
-        _check(self, "a value in (0, 1]", lambda w: 0 < w <= 1, "known")
+        _check(self, "a value in (0, 1]", lambda w: 0 < w <= 1, "known_weight")
         _check(self, "at least 1", lambda n: n >= 1, "perceptual_every", "perceptual_crop")
 
 
@@ -92,9 +93,9 @@ class TrainConfig:
     lr: float
     warmup: int = 100  # steps of linear warm-up, before the cosine to 0
     weight_decay: float = 1e-2
-    clip: float = 1.0  # largest gradient norm
-    ema: float = 0.999  # decay of the averaged weights; (1 + step) / (10 + step) while that is smaller
-    drop: float = 0.1  # probability that condition, pose and sources are dropped together, for classifier-free guidance
+    max_grad_norm: float = 1.0
+    ema: float = 0.999  # decay of diffusers' EMAModel; step / (9 + step) after each step while that is smaller
+    cond_drop_prob: float = 0.1  # of condition, pose and sources together, for classifier-free guidance
     attention: bool = True  # whether views read each other; off for the ablation only
     precision: Literal["no", "bf16"] = "no"
     checkpointing: bool = False  # gradient checkpointing: recompute blocks in the backward pass
@@ -110,7 +111,7 @@ class TrainConfig:
         _check(self, "at least 1", lambda n: n >= 1, *counts)
         _check(self, "no or bf16 (never fp16: it overflows)", lambda p: p in ("no", "bf16"), "precision")
         _check(self, "a value above 0", lambda lr: lr > 0, "lr")
-        _check(self, "a value in [0, 1)", lambda p: 0 <= p < 1, "ema", "drop")
+        _check(self, "a value in [0, 1)", lambda p: 0 <= p < 1, "ema", "cond_drop_prob")
         _check(self, "at least 0", lambda n: n >= 0, "warmup", "workers")
 
 
@@ -136,7 +137,8 @@ def overridden(config: TrainConfig, settings: Sequence[str]) -> TrainConfig:
 def _override(data: dict[str, Any], path: Sequence[str], value: Any, setting: str) -> None:
     name = path[0]
     if name not in data:
-        raise TrainingError(f"--set {setting}: expected one of {', '.join(data)}, got {name!r}")
+        hint = setting_hint([name])
+        raise TrainingError(f"--set {setting}: expected one of {', '.join(data)}, got {name!r}{hint}")
     default = data[name]
     if len(path) > 1:
         if not isinstance(default, dict):
@@ -162,9 +164,9 @@ def paper() -> TrainConfig:
     return TrainConfig(
         generator=generators.paper(),
         pseudo_views=PseudoViewConfig(
-            quality="paper", moved=1.0, transplanted=0.0, leave_one_out=0.0, virtual=0.0, real_sources=0.0
+            quality="paper", p_translate=1.0, p_mask_transfer=0.0, leave_one_out=0.0, virtual=0.0, real_sources=0.0
         ),
-        loss=LossConfig(snr_limit=0.0, known=1.0, regression=0.0),
+        loss=LossConfig(snr_limit=0.0, known_weight=1.0, regression=0.0),
         steps=100_000,
         batch=8,
         lr=1e-4,

@@ -5,7 +5,7 @@ the model's source branches and, warped to the target pose, its condition. FAVS 
 be the answer itself. An item may have several targets, of neighbouring cameras, each with its pair. Additions, each
 with its own probability:
 
-- *transplanted masks*: holes of real targets, imposed on the real view before FAVS, which hides them from the branches
+- *transferred masks*: holes of real targets, imposed on the real view before FAVS, which hides them from the branches
   too, or on the condition alone;
 - *leave-one-out*: the real view is not among FAVS's sources;
 - *virtual targets*: the target is the real view under a random turn and focal length, with the loss on valid pixels;
@@ -171,7 +171,7 @@ def neighbours(rig: Rig, camera: int) -> list[int]:
 class PseudoViews(Dataset[Batch]):
     """Items 0, 1, 2, …, without end, drawn from the frames ``indices``.
 
-    Masks (n, h, w) bool are transplanted. FAVS renders on ``device``, which is the CPU in workers.
+    Masks (n, h, w) bool are transferred. FAVS renders on ``device``, which is the CPU in workers.
     """
 
     def __init__(
@@ -200,7 +200,7 @@ class PseudoViews(Dataset[Batch]):
         targets, truths, valids = zip(*drawn, strict=True)
         rng = seeded(self.seed, "pair", k)
         # --- FAVS's sources
-        is_transplanted = uniform(rng, 0, 1) < config.transplanted
+        is_transferred = uniform(rng, 0, 1) < config.p_mask_transfer
         is_hidden = uniform(rng, 0, 1) < config.hidden
         masks = [self.masks[one_of(rng, len(self.masks))] for _ in places]
         left_out = uniform(rng, 0, 1) < config.leave_one_out and len(frame.rig) > len(places)
@@ -208,7 +208,7 @@ class PseudoViews(Dataset[Batch]):
         for i, mask in sorted(zip(places, masks, strict=True), key=lambda pair: -pair[0]):
             if left_out:
                 del images[i], cameras[i]
-            elif is_transplanted and is_hidden:
+            elif is_transferred and is_hidden:
                 own = cameras[i].mask
                 cameras[i] = replace(cameras[i], mask=mask.numpy() if own is None else own & mask.numpy())
         rig = frame.rig.with_cameras(cameras)
@@ -220,7 +220,7 @@ class PseudoViews(Dataset[Batch]):
             made = favs(images, rig, pair, config.quality)
             masked = [replace(c, mask=seen.cpu().numpy()) for c, seen in zip(pair, made.covered, strict=True)]
             at_target = favs(list(made.images), Rig(masked, ground_z_m=rig.ground_z_m), [target], config.quality)
-            if is_transplanted and not is_hidden:
+            if is_transferred and not is_hidden:
                 at_target = at_target._replace(covered=at_target.covered & mask.to(at_target.covered.device))
             shown.append(at_target)
             pseudo.append(made)
@@ -229,7 +229,7 @@ class PseudoViews(Dataset[Batch]):
         view_at = view_at * known[:, None]
         # --- the source branches
         sources, seen, _ = (torch.cat(maps) for maps in zip(*pseudo, strict=True))
-        shows_answer = not (left_out or (is_transplanted and is_hidden))
+        shows_answer = not (left_out or (is_transferred and is_hidden))
         others = [n for n in range(len(cameras)) if not (shows_answer and n in places)]
         if uniform(rng, 0, 1) < config.real_sources and len(others) >= len(branches):
             candidates = rig.with_cameras([cameras[n] for n in others])
@@ -270,7 +270,7 @@ class PseudoViews(Dataset[Batch]):
     def _pair(self, target: Camera, rng: torch.Generator) -> list[Camera]:
         """Draw a pseudo pose to the left and one to the right of a camera."""
         config = self.config
-        is_moved = uniform(rng, 0, 1) < config.moved
+        is_moved = uniform(rng, 0, 1) < config.p_translate
         cameras = []
         for name, side in (("left", 1), ("right", -1)):
             yaw, pitch = side * uniform(rng, *config.yaw_deg), uniform(rng, -config.pitch_deg, config.pitch_deg)

@@ -40,7 +40,7 @@ def draw(config: TrainConfig, batch: Batch, rng: torch.Generator) -> Draws:
     count, device = len(batch.tokens), batch.truth.device
     t = torch.randint(TIMESTEPS, (count,), generator=rng)
     is_regression = torch.rand(count, generator=rng) < config.loss.regression
-    drop = (torch.rand(count, generator=rng) < config.drop) & ~is_regression
+    drop = (torch.rand(count, generator=rng) < config.cond_drop_prob) & ~is_regression
     eps = torch.randn((*batch.truth.shape[:2], latent.autoencoder.latent_channels, *latent.latent_size), generator=rng)
     return Draws(torch.where(is_regression, REGRESSION, t).to(device), eps.to(device), drop.to(device), rng)
 
@@ -68,7 +68,7 @@ class Step(nn.Module):
             views, source_views = batch.conditions.encoded(config.generator, autoencoder, geometry)
         size = (x0.shape[-2], x0.shape[-1])
         valid = (pooled(batch.valid, size) > 0.99).float()[:, :, None]
-        pixel_weight = valid * (1 - (1 - loss.known) * pooled(batch.known, size)[:, :, None])
+        pixel_weight = valid * (1 - (1 - loss.known_weight) * pooled(batch.known, size)[:, :, None])
         is_regression = draws.t == REGRESSION
         t, regressed = draws.t.clamp(max=TIMESTEPS - 1), is_regression.view(-1, 1, 1, 1, 1)
         noisy = self.diffusion.noisy(x0, draws.eps, t)

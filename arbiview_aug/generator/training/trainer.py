@@ -19,7 +19,7 @@ from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import shown_condition
 from arbiview_aug.generator.conditioning import pooled
 from arbiview_aug.generator.config import TrainedOn
-from arbiview_aug.generator.training.checkpointing import Average, has_state, load_state, save_state, stop_requests
+from arbiview_aug.generator.training.checkpointing import averaged, has_state, load_state, save_state, stop_requests
 from arbiview_aug.generator.training.config import TrainConfig
 from arbiview_aug.generator.training.data import Frames, item_workers
 from arbiview_aug.generator.training.held_out import mean_hole_psnr, picture, sampled
@@ -85,10 +85,12 @@ class Trainer:
         self.optimiser = torch.optim.AdamW(
             [p for p in step.parameters() if p.requires_grad], lr=config.lr, weight_decay=config.weight_decay
         )
-        self.average = Average(generator.denoiser, config.ema)
+        self.trained = {n: p for n, p in generator.denoiser.named_parameters() if p.requires_grad}
+        ema = optional_package("diffusers.training_utils", "generator").EMAModel
+        self.average = ema(self.trained.values(), decay=config.ema, foreach=True)
         self.done, self.state_folder = 0, self.output / "state"
         if has_state(self.state_folder):
-            self.done = load_state(self.state_folder, config, generator.denoiser, self.average, self.optimiser)
+            self.done = load_state(self.state_folder, config, self.trained, self.average, self.optimiser)
             self.say(f"going on after step {self.done} of {self.state_folder}")
         # The optimiser is not placed: AdamW's step counters on a GPU would synchronise one by one.
         self.model, self._optimiser = self.accelerator.prepare(step, self.optimiser, device_placement=[True, False])
@@ -187,11 +189,11 @@ class Trainer:
                 f"{', '.join(batch.tokens)}. The last saved state is from before; try a lower lr, or bf16 off"
             )
         self.accelerator.backward(total)
-        if config.clip:
-            self.accelerator.clip_grad_norm_(self.model.parameters(), config.clip)
+        if config.max_grad_norm:
+            self.accelerator.clip_grad_norm_(self.model.parameters(), config.max_grad_norm)
         self._optimiser.step()
         self._optimiser.zero_grad(set_to_none=True)
-        self.average.update(self.generator.denoiser, self.done)
+        self.average.step(self.trained.values())
         return values
 
     def _batches(self) -> Iterator[Batch]:
@@ -212,9 +214,8 @@ class Trainer:
         """Write the state, and the generator with averaged weights; after an OutputError the last is unchanged."""
         try:
             if self.is_main:
-                denoiser = self.generator.denoiser
-                save_state(self.state_folder, self.config, self.done, denoiser, self.average, self.optimiser)
-                with self.average.applied_to(denoiser):
+                save_state(self.state_folder, self.config, self.done, self.trained, self.average, self.optimiser)
+                with averaged(self.average, self.trained.values()):
                     self.generator.save_pretrained(self.output / "generator")
         finally:  # the other processes wait in any case
             self.accelerator.wait_for_everyone()
@@ -253,7 +254,7 @@ class Trainer:
         batch = collate([self.validation[k] for k in range(config.validation_items)]).to(self.device)
         steps = max(2, config.generator.steps)
         methods = {"condition": batch.condition}
-        with self.average.applied_to(self.generator.denoiser):
+        with averaged(self.average, self.trained.values()):
             if config.loss.regression:
                 methods["one_step"] = sampled(self.generator, batch, steps=1, seed=0)
             methods[f"{steps}_steps"] = samples = sampled(self.generator, batch, steps=steps, seed=0)

@@ -23,7 +23,7 @@ def test_the_papers_settings() -> None:
     config = paper()
     assert (config.lr, config.batch, config.loss.geo, config.loss.perceptual) == (1e-4, 8, 0.1, 0.01)
     assert config.pseudo_views.quality == "paper" and config.pseudo_views.targets == 1
-    assert config.pseudo_views.transplanted == config.pseudo_views.virtual == config.loss.regression == 0.0
+    assert config.pseudo_views.p_mask_transfer == config.pseudo_views.virtual == config.loss.regression == 0.0
     assert config.generator.frozen_unet and config.generator.prediction == "epsilon"
 
 
@@ -39,6 +39,7 @@ def test_overrides() -> None:
     [
         ("step=7", "expected one of generator, .*got 'step'"),
         ("loss.nothing=1", "got 'nothing'"),
+        ("loss.known=1", "since 0.3 known is known_weight"),
         ("steps", "expected KEY=VALUE"),
         ("steps=1.5", "expected int"),
         ("steps=true", "expected int"),

@@ -16,12 +16,12 @@ from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.generator.training.small import SIZE, config, frames
 
 AS_WRITTEN: Mapping[str, Any] = {
-    "transplanted": 0.0,
+    "p_mask_transfer": 0.0,
     "hidden": 0.0,
     "leave_one_out": 0.0,
     "virtual": 0.0,
     "real_sources": 0.0,
-    "moved": 0.0,
+    "p_translate": 0.0,
     "mask_bank": 4,
 }
 HOLE = torch.ones(1, *SIZE, dtype=torch.bool)
@@ -40,12 +40,12 @@ def flat(item: Batch) -> list[torch.Tensor]:
 
 def test_an_item_is_its_number() -> None:
     every = {
-        "transplanted": 0.5,
+        "p_mask_transfer": 0.5,
         "hidden": 0.5,
         "leave_one_out": 0.3,
         "virtual": 0.5,
         "real_sources": 0.5,
-        "moved": 0.5,
+        "p_translate": 0.5,
     }
     first, second = items(**every), items(**every)
     for k in (3, 0, 17):
@@ -57,7 +57,7 @@ def test_an_item_is_its_number() -> None:
 
 
 def test_shapes_and_ranges() -> None:
-    made = items(transplanted=0.8, hidden=0.5, leave_one_out=0.2, virtual=0.4, real_sources=0.4, moved=0.5)
+    made = items(p_mask_transfer=0.8, hidden=0.5, leave_one_out=0.2, virtual=0.4, real_sources=0.4, p_translate=0.5)
     batch = collate([made[k] for k in range(12)])
     h, w = SIZE
     assert batch.truth.shape == batch.favs.shape == batch.condition.shape == (12, 1, 3, h, w)
@@ -114,14 +114,14 @@ def answer_is_shown(k: int, **changes: Any) -> tuple[bool, bool]:
 
 @pytest.mark.parametrize("k", range(4))
 def test_hidden_holes_are_shown_nowhere(k: int) -> None:
-    assert answer_is_shown(k, transplanted=1.0, hidden=1.0) == (False, False)
-    assert answer_is_shown(k, transplanted=1.0, hidden=1.0, real_sources=1.0) == (False, False)
+    assert answer_is_shown(k, p_mask_transfer=1.0, hidden=1.0) == (False, False)
+    assert answer_is_shown(k, p_mask_transfer=1.0, hidden=1.0, real_sources=1.0) == (False, False)
     assert answer_is_shown(k, leave_one_out=1.0) == (False, False)
 
 
 @pytest.mark.parametrize("k", range(2))
 def test_no_target_shows_the_answer_of_another(k: int) -> None:
-    two = {"targets": 2, "transplanted": 1.0}
+    two = {"targets": 2, "p_mask_transfer": 1.0}
     assert answer_is_shown(k, **two, hidden=1.0) == (False, False)
     assert answer_is_shown(k, **two, hidden=1.0, real_sources=1.0) == (False, False)
     assert answer_is_shown(k, **two, hidden=0.0, real_sources=1.0)[1] is False
@@ -147,14 +147,14 @@ def test_several_targets_are_neighbours_that_read_each_other(real_sources: float
 
 
 def test_holes_that_are_not_hidden_are_shown_by_the_sources() -> None:
-    shown = [answer_is_shown(k, transplanted=1.0, hidden=0.0) for k in range(4)]
+    shown = [answer_is_shown(k, p_mask_transfer=1.0, hidden=0.0) for k in range(4)]
     assert all(branches for _, branches in shown)
-    assert all(answer_is_shown(k, transplanted=0.0) == (True, True) for k in range(2))
+    assert all(answer_is_shown(k, p_mask_transfer=0.0) == (True, True) for k in range(2))
 
 
 def test_real_sources_never_hold_the_answer() -> None:
     for k in range(4):
-        assert answer_is_shown(k, transplanted=1.0, hidden=0.0, real_sources=1.0)[1] is False
+        assert answer_is_shown(k, p_mask_transfer=1.0, hidden=0.0, real_sources=1.0)[1] is False
 
 
 def test_leaving_the_real_view_out_leaves_little() -> None:
@@ -190,7 +190,7 @@ def test_favs_by_torch_is_favs_by_opencv() -> None:
 
 def test_pseudo_views_by_the_published_stages() -> None:
     """Pair and condition are those of ``quality="paper"``, whose images are the package's own where nothing moves."""
-    made, plain = items(quality="paper", moved=1.0), items(moved=1.0)
+    made, plain = items(quality="paper", p_translate=1.0), items(p_translate=1.0)
     item, again, other = made[0], made[0], plain[0]
     assert all(torch.equal(x, y) for x, y in zip(flat(item), flat(again), strict=True))
     assert torch.equal(item.truth, other.truth) and not torch.equal(item.sources, other.sources)

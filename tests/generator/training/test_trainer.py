@@ -131,7 +131,7 @@ def test_a_state_of_other_settings_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match="other settings of steps, lr"):
         run(tmp_path, lr=0.5)
     with pytest.raises(TrainingError, match="other settings of loss"):
-        run(tmp_path, steps=2, loss=replace(config().loss, known=0.5))
+        run(tmp_path, steps=2, loss=replace(config().loss, known_weight=0.5))
     run(tmp_path, steps=2, workers=1, save_every=7)  # those may change
 
 
@@ -145,7 +145,7 @@ def test_a_state_that_is_no_state_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_average_follows_what_is_trained(tmp_path: Path) -> None:
-    """Decay 1/10 after the first step and 2/11 after the second, which is below that of the settings."""
+    """Decay 0 after the first step and 2/11 after the second, which is below that of the settings."""
     made = run(tmp_path, steps=3)
     parameters = dict(made.generator.denoiser.named_parameters())
     expected = {name: value.detach().clone() for name, value in parameters.items()}
@@ -153,10 +153,11 @@ def test_the_average_follows_what_is_trained(tmp_path: Path) -> None:
         made.train_step(batch)
         made.done += 1
         for name, value in parameters.items():
-            expected[name] = torch.lerp(value.detach(), expected[name], (1 + step) / (10 + step))
+            expected[name] = torch.lerp(value.detach(), expected[name], (0, 2 / 11)[step])
     moved = [name for name, value in parameters.items() if not torch.equal(value, expected[name])]
-    assert moved and all(torch.allclose(made.average.values[name], expected[name], atol=1e-6) for name in expected)
-    assert any(not torch.allclose(made.average.values[name], parameters[name], atol=1e-6) for name in moved)
+    averages = dict(zip(made.trained, made.average.shadow_params, strict=True))
+    assert moved and all(torch.allclose(averages[name], expected[name], atol=1e-6) for name in averages)
+    assert any(not torch.allclose(averages[name], parameters[name], atol=1e-6) for name in moved)
 
 
 def test_the_learning_rate_warms_up_and_falls_to_nothing() -> None:
@@ -313,7 +314,7 @@ def test_what_the_condition_lacks_is_measured_and_shipped(tmp_path: Path, monkey
 def test_an_untrained_network_errs_by_one_unit_at_all_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In its unit the error of the linear guess does not depend on t: no time starves."""
     monkeypatch.setattr(trainer, "_DEVIATION_ITEMS", 32)
-    made = run(tmp_path, batch=8, loss=LossConfig(perceptual=0.0, known=1.0))
+    made = run(tmp_path, batch=8, loss=LossConfig(perceptual=0.0, known_weight=1.0))
     batch = collate([made.items[k] for k in range(8)])
     truth, condition = batch.truth * 2 - 1, batch.condition * 2 - 1
     views = batch.geometry.target_views(condition, batch.known, batch.confidence)
