@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import cv2
 import numpy as np
 
 from arbiview_aug.cameras.kernels import angle_row
@@ -90,17 +91,18 @@ def nearest_points(points: Any, origin: Any, bounds: Any, place: Any, q: Any, nu
 
 
 @compiled
-def drop_hidden(q: Any, number: Any, points: Any, origin: Any, away: int, side: int, sparse: int) -> tuple[Any, Any]:
+def drop_hidden(
+    q: Any, most: Any, number: Any, points: Any, origin: Any, away: int, side: int, sparse: int
+) -> tuple[Any, Any]:
     """Drop points that shine through gaps of what is nearer on both sides of them.
 
-    ``q`` and ``number`` are those of ``nearest_points``, ``away`` and ``side`` are ``SEE_THROUGH_RAD`` and ``SIDE_RAD``
-    in cells. Points from number ``sparse`` on are of depth maps, which show gaps as they are: only cells next to them
-    count. Returns the flat indices (n,) of cells that keep their point, and its ray (3, 1, n) in the ego frame,
-    float32.
+    ``q`` and ``number`` are those of ``nearest_points``, ``most`` is ``window_max`` of ``q`` over ``2 * side`` cells,
+    ``away`` and ``side`` are ``SEE_THROUGH_RAD`` and ``SIDE_RAD`` in cells. Points from number ``sparse`` on are of
+    depth maps, which show gaps as they are: only cells next to them count. Returns the flat indices (n,) of cells that
+    keep their point, and its ray (3, 1, n) in the ego frame, float32.
     """
     h, w = q.shape
-    most, more = q.copy(), away - 1 - 2 * side  # windows are longer than wide
-    _window_max(most, 2 * side, 2 * side)
+    more = away - 1 - 2 * side  # windows are longer than wide
     cells, n = np.empty(h * w, np.int64), 0
     for y in range(h):
         inside = away <= y < h - away
@@ -138,33 +140,49 @@ def seen_through(q: Any, rows: Any, columns: Any, most: Any, up: int, side: int,
         q: (n,) inverse distances of the others.
         rows: (n,) their rows in the panorama.
         columns: (n,) their columns.
-        most: (h, w) largest inverse distance of the scan's points in each cell, 0 without; becomes that of a window.
+        most: (h, w) ``window_max`` of the scan's largest inverse distance in each cell, 0 without points.
         up: Cells of the window above and below.
         side: ... and on each side.
         found: (n,) bool, written.
     """
     (h, w), (height, width) = most.shape, (2 * up, 2 * side)
-    _window_max(most, height, width)
     for i in range(q.shape[0]):
         row, column = int(np.rint(rows[i])) - up, int(np.rint(columns[i])) - side
         known = most[row, column] if 0 <= row < h - height and 0 <= column < w - width else _ZERO
         found[i] = known > _ZERO and _hidden_below(q[i]) > known
 
 
-@compiled
+def window_max(a: Any, rows: int, columns: int) -> Any:
+    """Largest of each cell of ``a`` (h, w) float32 and those up to so many rows and columns on."""
+    return cv2.dilate(a, np.ones((rows + 1, columns + 1), np.uint8), anchor=(0, 0))
+
+
 def complete(
-    cells: Any, own: Any, residuals: Any, reach: float, support: float, smooth: int, work: Any, layers: Any
+    cells: Any, own: Any, residuals: Any, reach: Any, support: Any, smooth: int, work: Any, layers: Any
 ) -> None:
     """Give every cell the residual of the nearest point, averaged on a step's nearer and on its farther side.
 
     ``layers`` (4, h, w) becomes those of ``Panorama``; the points' flat cells, inverse distances, residuals are (n,).
-    ``reach``, ``support`` and ``smooth`` are those of ``Cells``, ``work`` (5, >= (h + 4) * (w + 4)) is scratch.
+    ``reach``, ``support`` and ``smooth`` are those of ``Cells``, ``work`` (3, >= (h + 4) * (w + 4)) is scratch.
+    """
+    _, h, w = layers.shape
+    r, q = (plane[: h * w].reshape(h, w) for plane in work[:2])
+    code = work[2, : (h + 4) * (w + 4)].view(np.int32).reshape(h + 4, w + 4)
+    nearest_residuals(cells, own, residuals, reach, support, code, r, q, layers)
+    average_sides(r, q, *(window_max(a, 2 * smooth, 2 * smooth) for a in (r, -r)), smooth, layers)
+
+
+@compiled
+def nearest_residuals(
+    cells: Any, own: Any, residuals: Any, reach: float, support: float, code: Any, r: Any, q: Any, layers: Any
+) -> None:
+    """Give every cell of ``r`` and ``q`` (h, w) the residual and inverse distance of the nearest point.
+
+    The residual fades towards ``reach``. ``layers[3]`` becomes 1 within ``support``; ``code`` (h + 4, w + 4) int32 and
+    the other layers are scratch.
     """
     _, h, w = layers.shape
     size = h * w
-    r, q = work[0, :size].reshape(h, w), work[1, :size].reshape(h, w)
-    high, low = work[2, :size].reshape(h, w), work[3, :size].reshape(h, w)
-    code = work[4, : (h + 4) * (w + 4)].view(np.int32).reshape(h + 4, w + 4)
     code[:] = _NO_SEED
     seeds = layers[:2].reshape(2, size)  # until the layers are known
     seeds[:] = _ZERO
@@ -188,7 +206,6 @@ def complete(
             to_r[x] = residual[place[x]]
         for x in range(w):
             to_r[x] *= max(min(_TWO - _TWO * away[x] / reach, _ONE), _ZERO)
-    _average_sides(r, q, high, low, smooth, layers[0], layers[1], layers[2])
 
 
 @inlined
@@ -223,13 +240,22 @@ def seed(code: int) -> tuple[int, int]:
     return ((code >> 7) & 127) - 64, (code & 127) - 64
 
 
-@inlined
-def _average_sides(r: Any, q: Any, high: Any, low: Any, smooth: int, near: Any, far: Any, share: Any) -> None:
+@compiled
+def average_sides(r: Any, q: Any, high: Any, low: Any, smooth: int, layers: Any) -> None:
     """Average residuals over ``SMOOTH_RAD`` on both sides of steps; sides are told apart over twice that window.
 
     All that is averaged about a step then knows of it. Near the border, which only filters read, nothing is averaged.
+
+    Args:
+        r: (h, w) residuals, 1/m.
+        q: (h, w) inverse distances of the cells' nearest points.
+        high: ``window_max`` of ``r`` over ``2 * smooth`` cells.
+        low: ``window_max`` of ``-r``.
+        smooth: Half the window, cells.
+        layers: Those of ``Panorama``; the first three are written.
     """
     h, w = r.shape
+    near, far, share = layers[0], layers[1], layers[2]
     side, edge = 2 * smooth, 3 * smooth
     size, n, m = side + 1, w - 2 * side, w - 2 * edge  # of a window, and of the rows where they fit
     for y in range(h):
@@ -239,13 +265,6 @@ def _average_sides(r: Any, q: Any, high: Any, low: Any, smooth: int, near: Any, 
             near[y, x], far[y, x], share[y, x] = r[y, x], r[y, x], _ONE
         for x in range(w - edge, w):
             near[y, x], far[y, x], share[y, x] = r[y, x], r[y, x], _ONE
-    for y in range(h):
-        for x in range(w):
-            high[y, x] = r[y, x]
-        for x in range(w):
-            low[y, x] = -r[y, x]
-    _window_max(high, side, side)  # of the window that begins there
-    _window_max(low, side, side)
     wide, nearer, of_near = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
     sums, total = np.zeros((3, size, m), np.float32), np.zeros((3, m), np.float32)
     per, flat = np.float32(1 / (size * size)), np.empty(m, np.float32)
@@ -298,34 +317,6 @@ def _slide(row: Any, oldest: Any, total: Any) -> None:
         total[x] += oldest[x]
 
 
-@called
-def _window_max(a: Any, rows: int, columns: int) -> None:
-    """Replace each cell of ``a`` (h, w) by the largest of those up to so many rows and columns on."""
-    h, w = a.shape
-    line = np.empty(w, np.float32)
-    for y in range(h):
-        row = a[y]
-        size = 1
-        while size <= columns:
-            step = min(size, columns + 1 - size)
-            for x in range(w):  # line[:] = row takes three times as long
-                line[x] = row[x]
-            other = line[step:]
-            for x in range(w - step):
-                row[x] = max(line[x], other[x])
-            size += step
-    size = 1
-    while size <= rows:
-        step = min(size, rows + 1 - size)
-        for y in range(h - step):
-            row, other = a[y], a[y + step]
-            for x in range(w):
-                line[x] = row[x]
-            for x in range(w):  # in place, nothing vectorises
-                row[x] = max(line[x], other[x])
-        size += step
-
-
 @inlined
 def _hidden_below(known: Any) -> Any:
     """The evaluation protocol's tolerance, in inverse distance: nearer by a tenth of the distance and 0.3 m."""
@@ -334,16 +325,15 @@ def _hidden_below(known: Any) -> Any:
 
 
 @compiled
-def hidden_depths(layers: Any, base: Any, step: int, shrink: int, out: Any) -> None:
+def hidden_depths(layers: Any, silent: Any, base: Any, step: int, shrink: int, out: Any) -> None:
     """Inverse distances (h, w) below which points are hidden by a panorama's layers; 0 where nothing was measured.
 
-    ``base`` (ny + 1, nx + 1) is the static surface, on every ``step``-th cell; ``shrink`` is ``SHRINK_RAD`` in cells.
+    ``silent`` is ``window_max`` of what was not measured, over ``2 * shrink`` cells. ``base`` (ny + 1,
+    nx + 1) is the static surface, on every ``step``-th cell; ``shrink`` is ``SHRINK_RAD`` in cells.
     """
     h, w = out.shape
-    near, far, share, measured = layers[0], layers[1], layers[2], layers[3]
-    side = 2 * shrink
-    silent, line = _ONE - measured, np.empty(base.shape[1], np.float32)
-    _window_max(silent, side, side)
+    near, far, share = layers[0], layers[1], layers[2]
+    side, line = 2 * shrink, np.empty(base.shape[1], np.float32)
     static, known = np.empty(w, np.float32), np.empty(w, np.float32)
     for y in range(h):
         upsampled_row(base, step, y, np.int64(0), line, static)

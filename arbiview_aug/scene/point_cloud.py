@@ -184,25 +184,26 @@ class Panorama:
         memory: Memory = FRESH,
         mapped: int = 0,
     ) -> None:
-        from arbiview_aug.scene.completion import complete, drop_hidden, nearest_points
+        from arbiview_aug.scene.completion import complete, drop_hidden, nearest_points, window_max
 
         self.window, self._origin, self._street, self._place = window, origin, street, window.place
         shape, cells = window.shape, window.cells
         q, number = np.zeros(shape, np.float32), np.empty(shape, np.int32)
         nearest_points(points, origin, window.bounds, self._place, q, number)
-        found, rays = drop_hidden(q, number, points, origin, cells.see_through, cells.side, len(points) - mapped)
+        most, sparse = window_max(q, 2 * cells.side, 2 * cells.side), len(points) - mapped
+        found, rays = drop_hidden(q, most, number, points, origin, cells.see_through, cells.side, sparse)
         own = q.reshape(-1)[found]
         residual = own - street.along(origin, rays)[0]
         # Windows differ by some rows from frame to frame: blocks of few sizes are found again.
         block = -(-(shape[0] + 4) * (shape[1] + 4) // _BLOCK) * _BLOCK
         self.layers = memory.empty((4 * block,), np.float32)[: 4 * q.size].reshape(4, *shape)
-        work = memory.empty((5, block), np.float32)
+        work = memory.empty((3, block), np.float32)
         complete(found, own, residual, cells.reach, cells.support, cells.smooth, work, self.layers)
 
     @cached_property
     def hidden_below(self) -> Layer:
         """Points of a smaller inverse distance are hidden by what certainly stands there; 0 where it is silent."""
-        from arbiview_aug.scene.completion import hidden_depths
+        from arbiview_aug.scene.completion import hidden_depths, window_max
 
         rad, ends = self.window.cells.rad, (n + BASE_STEP for n in self.layers.shape[1:])
         rows, columns = (np.arange(0, end, BASE_STEP, dtype=np.float32) * np.float32(rad) for end in ends)
@@ -211,7 +212,9 @@ class Panorama:
         rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up])
         hidden = np.empty(self.layers.shape[1:], np.float32)
         static = self._street.along(self._origin, rays)
-        hidden_depths(self.layers, static, BASE_STEP, self.window.cells.shrink, hidden)
+        shrink = self.window.cells.shrink
+        silent = window_max(1 - self.layers[3], 2 * shrink, 2 * shrink)
+        hidden_depths(self.layers, silent, static, BASE_STEP, shrink, hidden)
         return hidden
 
     def cells(self, rays: Layer, R: FloatArray) -> tuple[Layer, Layer]:
@@ -405,7 +408,9 @@ def seen_through(points: Points, others: Points, origin: FloatArray) -> BoolArra
     completion.cells_of(rays, np.eye(3, dtype=np.float32), window.place, rows, columns)
     found = np.empty(len(others), bool)
     q = 1 / np.maximum(np.linalg.norm(rays[:, 0], axis=0), np.float32(NEAREST_M))
-    completion.seen_through(q, rows[0], columns[0], most, *AROUND_CELLS, found)
+    up, side = AROUND_CELLS
+    most = completion.window_max(most, 2 * up, 2 * side)
+    completion.seen_through(q, rows[0], columns[0], most, up, side, found)
     return found
 
 
