@@ -92,7 +92,7 @@ def compiled(function: Any) -> Any:
     Division by zero gives infinity, as in numpy. Operations keep their order, so results do not depend on the number of
     threads or processes; kinds of CPU may differ in the last bit.
     """
-    return _kernel(function)
+    return _kernel(function, no_cfunc_wrapper=True)
 
 
 def called(function: Any) -> Any:

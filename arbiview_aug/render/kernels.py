@@ -96,21 +96,19 @@ def cells_in_view(
             turn_row(rays[0, jj, corner], rays[1, jj, corner], rays[2, jj, corner], q, A, o, x, y, z)
             if kind == 0:
                 for i in range(nx):
-                    px, py = P[0] * x[i] + P[1] * y[i] + P[2] * z[i], P[3] * y[i] + P[4] * z[i]
-                    code = np.int32(1) if px < -_BORDER_PX * z[i] else np.int32(0)
-                    code |= np.int32(2) if px > right * z[i] else np.int32(0)
-                    code |= np.int32(4) if py < -_BORDER_PX * z[i] else np.int32(0)
-                    code |= np.int32(8) if py > bottom * z[i] else np.int32(0)
-                    code |= np.int32(16) if z[i] < _ZERO else np.int32(0)
-                    common[i] &= code
-                continue
-            project_row(x, y, z, kind, P, a, b, u, v)
+                    u[i], v[i] = P[0] * x[i] + P[1] * y[i] + P[2] * z[i], P[3] * y[i] + P[4] * z[i]
+            else:
+                project_row(x, y, z, kind, P, a, b, u, v)
             for i in range(nx):
-                code = np.int32(1) if u[i] < -_BORDER_PX else np.int32(0)
-                code |= np.int32(2) if u[i] > right else np.int32(0)
-                code |= np.int32(4) if v[i] < -_BORDER_PX else np.int32(0)
-                code |= np.int32(8) if v[i] > bottom else np.int32(0)
-                common[i] &= code if abs(u[i]) < np.float32(9e4) else np.int32(0)
+                one = z[i] if kind == 0 else _ONE  # of a lens, positions are no homogeneous coordinates
+                code = np.int32(1) if u[i] < -_BORDER_PX * one else np.int32(0)
+                code |= np.int32(2) if u[i] > right * one else np.int32(0)
+                code |= np.int32(4) if v[i] < -_BORDER_PX * one else np.int32(0)
+                code |= np.int32(8) if v[i] > bottom * one else np.int32(0)
+                code |= np.int32(16) if one < _ZERO else np.int32(0)
+                common[i] &= code if kind == 0 or abs(u[i]) < np.float32(9e4) else np.int32(0)
+            if kind == 0:
+                continue
             for i in range(nx):
                 a[i] = max(np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i]), _TINY)
             for i in range(nx):

@@ -138,7 +138,7 @@ def points_by_box(
 
 def whole(boxes: FloatArray) -> FloatArray:
     """Planes (B, 1, 6, 4) of the boxes' own faces."""
-    return _planes(boxes, np.broadcast_to(np.array([_BOX], np.float64), (len(boxes), 1, 8)))
+    return _planes(boxes, np.tile(np.array([_BOX], np.float64), (len(boxes), 1, 1)))
 
 
 def _planes(boxes: FloatArray, profiles: FloatArray) -> FloatArray:

@@ -128,6 +128,7 @@ class SweptImage:
         costs = np.full((len(walls), h, w), INVALID, np.uint16)
         if min(other.camera.size) < 2:  # nothing lies between its pixels
             return costs
+        walls = np.ascontiguousarray(walls)  # another layout would be compiled, too
         match_walls(
             self.rays, self.road, self.horizontal, self.windows, walls, pose, lens, other.grey, other.unmasked, costs
         )
