@@ -113,7 +113,7 @@ def samples(data: Path | None) -> dict[str, dict[str, Any]]:
 
 
 def outputs(sample: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """What every setting gives, for turned, lifted, lens and drawn targets."""
+    """Outputs of every setting, for turned, lifted, lens and drawn targets."""
     rig = sample["rig"]
     lifted = rig.turned(yaw_deg=11.0).with_cameras([c.shifted(z_m=0.5) for c in rig.turned(yaw_deg=11.0)])
     pinhole = all(camera.lens == "pinhole" for camera in rig)
@@ -157,7 +157,7 @@ def files_of(folder: Path) -> dict[str, str]:
 
 
 def commands(data: Path | None) -> Iterator[tuple[str, Any]]:
-    """What commands write: conversions by their bytes, rigs by their words."""
+    """Files that commands write: conversions by their bytes, rigs by their words."""
     with tempfile.TemporaryDirectory() as scratch:
         if data is not None:
             for kind, folder in (("nuscenes", "nuscenes-one"), ("frames", "ddad-one")):

@@ -100,7 +100,7 @@ def name_of(page: Path) -> str:
 
 
 def commands() -> set[str]:
-    """What follows ``python -m arbiview_aug`` in the README and the pages, without comments."""
+    """Commands after ``python -m arbiview_aug`` in the README and the pages, without comments."""
     pages = "\n".join(text_of(page) for page in (ROOT / "README.md", *DOCS))
     return {" ".join(command.split()) for command in re.findall(r"python -m arbiview_aug ([^`\n#]+)", pages)}
 
@@ -119,7 +119,7 @@ def prose(page: Path) -> str:
 
 
 def measured(mark: str) -> str:
-    """What stands between two marks."""
+    """The text between two marks."""
     (found,) = re.findall(rf"<!-- {mark}\b.*?-->\n(.*?)<!-- /{mark} -->", BENCHMARKS, re.DOTALL)
     return found
 
@@ -183,7 +183,7 @@ CHECKS: dict[str, Callable[[dict[str, Any]], None]] = {
     "holes.md": check_completed,
     "contributing.md": check_read,
 }
-"""What the names that a page's code leaves must be."""
+"""Values that a page's code must leave in its names."""
 
 
 @pytest.mark.parametrize("page", [p for p in DOCS if "```python" in text_of(p)], ids=name_of)

@@ -1,4 +1,4 @@
-"""What a release says of itself is one version, and its public names are importable."""
+"""A release has one version everywhere, and its public names are importable."""
 
 from __future__ import annotations
 

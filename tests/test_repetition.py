@@ -28,7 +28,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 
 
 def digest(out: Mapping[str, Any]) -> str:
-    """Of all tensors of an output, bit for bit."""
+    """Digest of all tensors of an output, bit for bit."""
     tensors = [out[key] for key in ("images", "coverage", "source_camera", "confidence") if key in out]
     return hashlib.sha256(b"".join(tensor.numpy().tobytes() for tensor in tensors)).hexdigest()
 

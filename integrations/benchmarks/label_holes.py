@@ -34,7 +34,7 @@ Floats = npt.NDArray[np.floating]
 
 TARGETS = {"up70": lambda size: demo_source_rig(size).shifted(z_m=0.7), "van": demo_target_rig}
 MARGIN_PX, LEAST_PX, SHARE, SLIDES = 6, 8, 0.05, 20
-"""Of the protocol: half the width of a ring, the least side of an object, the share of holes that counts as leak, and
+"""The protocol's half width of a ring, the least side of an object, the share of holes that counts as leak, and
 how often a ring is slid."""
 
 PATCH_PX, PROBE_SLIDES, EPOCHS = 32, 4, 6

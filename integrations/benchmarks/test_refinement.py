@@ -1,4 +1,4 @@
-"""What depth from overlap costs at 1600x900 on one thread, by CPU time, as a release check."""
+"""Cost of depth from overlap at 1600x900 on one thread, by CPU time, as a release check."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What calls cost on one thread, against bare ``cv2.remap`` calls, decoding, and stated milliseconds."""
+"""Cost of calls on one thread, against bare ``cv2.remap`` calls, decoding, and stated milliseconds."""
 
 from __future__ import annotations
 

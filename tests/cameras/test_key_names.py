@@ -29,7 +29,7 @@ def sample(**more: Any) -> dict[str, Any]:
 
 
 def warned(given: dict[str, Any], calls: int = 2, **settings: Any) -> list[str]:
-    """What is said of keys in so many calls."""
+    """Warnings about keys in so many calls."""
     retarget = RigRetarget(RIG.turned(yaw_deg=3), **settings)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -144,7 +144,7 @@ def write_frame(folder: Path, calib: dict[str, Any], camera: dict[str, Any]) -> 
 
 
 def read(folder: Path) -> list[str]:
-    """What is said when a frame is read, twice."""
+    """Warnings when a frame is read, twice."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         data = FrameFolder(folder)

@@ -165,7 +165,7 @@ def files_of(neighbour: Any) -> list[str]:
 
 
 def test_images_of_one_turn_go_together(dataset: NuScenesDataset) -> None:
-    """Of each camera the same exposure, though another one's may lie nearer in time: 35 ms apart, every 50 ms."""
+    """Each camera gives the same exposure, though another one's may lie nearer in time: 35 ms apart, every 50 ms."""
     seen = 0
     for k in range(len(dataset)):
         for neighbour in dataset[k]["neighbours"]:
@@ -254,7 +254,7 @@ def test_boxes_are_where_things_were(dataset: NuScenesDataset) -> None:
 
 
 def test_what_one_keyframe_alone_has_moves_by_its_velocity(tmp_path: Path) -> None:
-    """What is labelled up to 1.0 s, or from 1.5 s on."""
+    """Boxes that are labelled up to 1.0 s, or from 1.5 s on."""
 
     def lose(data: Tables) -> None:
         early = [f"goes-{b}-{k}" for b in range(0, 99, 2) for k in (3, 4)]

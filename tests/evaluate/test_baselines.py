@@ -1,4 +1,4 @@
-"""What others do, on cases worked out by hand."""
+"""Baselines, on cases worked out by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What methods get and what scores them; named methods; agreement of neighbours."""
+"""Samples that methods get, frames that score them, named methods, agreement of neighbours."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def test_depth_from_overlap_reaches_a_camera_alone() -> None:
 
 @pytest.mark.filterwarnings("ignore:the target rig")
 def test_a_camera_alone_knows_the_depth_that_all_together_use(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where boxes stand on the street, what shows them is not measured; over the street alone it is."""
+    """Pixels of boxes on the street are not measured; over the street alone they are."""
     drive = SyntheticDrive(demo_source_rig((48, 132)), num_frames=1, lidar=False)
     sample, given = drive[0], []
     rig: Rig = sample["rig"]

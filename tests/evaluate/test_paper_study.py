@@ -85,7 +85,7 @@ def test_losses_are_told() -> None:
 
 
 def test_real_sets_stand_in_the_papers_measure() -> None:
-    """What has the truth to be compared with is in the second table alone."""
+    """Rows with a truth to compare with stand in the second table alone."""
     real = {"fast": {"paper": {"raw_psnr_db": 27.0, "even_psnr_db": 28.0}}}
     true = {"fast": {"paper": {"raw_psnr_db": 26.0, "true_psnr_db": 25.0, "true_covered_psnr_db": 24.0}}}
     rows = rows_of(paper_report(Study({"here": real, "street": true})))

@@ -20,7 +20,7 @@ LEAST_DEPTH = 1e-6  # of unit directions, for lenses that see less than half a t
 
 
 class Seen(NamedTuple):
-    """What a source sees of a target's pixels, (h, w).
+    """Pixels (h, w) of a target that a source sees.
 
     Attributes:
         uv: (h, w, 2) source pixels; NaN where there is none.
@@ -42,7 +42,7 @@ def fisheye_radius(camera: Camera, theta: np.ndarray) -> np.ndarray:
 
 
 def fold(camera: Camera) -> float:
-    """Where the lens's radius stops rising, scanned: an angle for fisheyes, its tangent for radtan."""
+    """The point at which the lens's radius stops rising, scanned: an angle for fisheyes, its tangent for radtan."""
     if camera.lens == "fisheye":
         scan = np.linspace(0, np.pi, 200_001)
         radius = fisheye_radius(camera, scan)
@@ -145,7 +145,7 @@ def half_pixel_wider(box: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def seen(source: Camera, target: Camera, surface: str, ground_z_m: float, boxes: np.ndarray | None = None) -> Seen:
-    """Where the target's pixels lie in the source; ``valid`` says nothing of image bounds, masks or obstacles."""
+    """Positions of the target's pixels in the source; ``valid`` says nothing of image bounds, masks or obstacles."""
     directions, certain = rays(target)
     q = inverse_distance("street" if boxes is not None else surface, target.center_m, directions, ground_z_m)
     if boxes is not None:  # a labelled box wins over the guessed street, even where it stands a little below the road
@@ -160,7 +160,7 @@ def seen(source: Camera, target: Camera, surface: str, ground_z_m: float, boxes:
 
 
 def atlas_position(slot: Slot, uv: np.ndarray) -> np.ndarray:
-    """Where pixels (..., 2) of an image lie once it is halved and has its place in an atlas.
+    """Positions of an image's pixels (..., 2) once it is halved and has its place in an atlas.
 
     Outer edges stay, -0.5 is -0.5. The outer half pixel of the full image is read at the halved one's border.
     """

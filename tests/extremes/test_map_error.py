@@ -47,14 +47,14 @@ class Remembering(Scene):
 
 
 class Errors(NamedTuple):
-    """Of the pixels of one plan that some source wins."""
+    """Errors at the pixels of one plan that some source wins."""
 
     px: FloatArray  # (n,) distance from float64 in pixels of the image that is read, the larger of x and y
     on_edge: BoolArray  # (n,) the surface steps within two pixels
 
 
 def errors(plan: RenderPlan, surface: str, scene: Scene, at_most: int, edges: bool = False) -> Errors:
-    """Of at most so many pixels of each view, drawn at random."""
+    """Errors at no more pixels of each view, drawn at random."""
     rng = np.random.default_rng(0)
     found, stepped = [np.zeros(0)], [np.zeros(0, bool)]
     for view, camera in zip(plan.targets, plan.target, strict=True):

@@ -224,7 +224,7 @@ def test_blending_across_a_seam_has_no_step(worst: Worst) -> None:
 
 # --- gains ------------------------------------------------------------------------------------------------------------
 def pictures(rig: Rig) -> list[torch.Tensor]:
-    """What cameras at one centre see of a smooth world at infinity, (3, h, w) in [0.05, 0.85]."""
+    """Views (3, h, w) in [0.05, 0.85] of a smooth world at infinity, from one centre."""
     waves = np.array([[5.0, 3.0, 7.0], [-6.0, 4.0, 3.0], [2.0, -7.0, 5.0]])
     rays = [camera.unproject(camera.pixel_grid()).directions for camera in rig]
     return [torch.from_numpy((0.45 + 0.4 * np.sin(d @ waves.T)).transpose(2, 0, 1).copy()).float() for d in rays]

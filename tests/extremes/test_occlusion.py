@@ -1,4 +1,4 @@
-"""What stands before something hides it from a source, however well the target sees it: checked ray by ray."""
+"""Occlusion from a source, however well the target sees the place: checked ray by ray."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What holds for any rigs: only what a source truly sees is shown, and what is no change changes nothing."""
+"""Properties for any rigs: only what a source truly sees is shown, and no change changes nothing."""
 
 from __future__ import annotations
 
@@ -245,7 +245,7 @@ def coordinates(camera: Camera) -> torch.Tensor:
 
 
 def read_inside(plan: RenderPlan, k: int) -> np.ndarray:
-    """Where (h, w) a view reads between the outermost pixel centres of the images that it reads."""
+    """Pixels (h, w) of a view that read between the outermost pixel centres of their images."""
     view = plan.targets[k]
     x, y = np.moveaxis(view.at.to_float(), -1, 0)
     inside = np.zeros(view.coverage.shape, bool)

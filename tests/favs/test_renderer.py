@@ -32,7 +32,7 @@ def panorama(seed: int = 0) -> np.ndarray:
 
 
 def photo(view: Camera, around: np.ndarray) -> torch.Tensor:
-    """What a camera sees of an infinitely far panorama."""
+    """A camera's view of an infinitely far panorama."""
     d = view.unproject(view.pixel_grid()).directions
     x = (-np.degrees(np.arctan2(d[..., 1], d[..., 0])) % 360) * 8
     y = (90 - np.degrees(np.arcsin(d[..., 2]))) * 8

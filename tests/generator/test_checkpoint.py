@@ -87,7 +87,7 @@ def test_a_full_disk_leaves_the_old_checkpoint(generator: Generator, tmp_path: P
 
 
 def test_a_process_killed_while_writing_leaves_the_old_checkpoint(generator: Generator, tmp_path: Path) -> None:
-    """What it leaves behind is not looked at, and gone after the next save."""
+    """Leftovers of a killed save are not read, and gone after the next save."""
     generator.save_pretrained(tmp_path)
     host = f"{zlib.crc32(socket.gethostname().encode()):08x}"
     part = tmp_path / f".weights-123456789abc.safetensors.-{host}-999999999-01234567.part"

@@ -1,4 +1,4 @@
-"""What the denoiser is told besides the noise: rays, poses, masks; and the geometry of a frame as tensors."""
+"""Conditions of the denoiser besides the noise: rays, poses, masks; the geometry of a frame as tensors."""
 
 from __future__ import annotations
 

@@ -234,7 +234,7 @@ def test_it_is_one_graph_for_torch_compile(generator: Generator) -> None:
 # --- what the condition lacks -----------------------------------------------------------------------------------------
 @pytest.mark.parametrize("t", [0, 1, 300, 999])
 def test_an_untrained_residual_network_is_the_best_linear_guess(t: int) -> None:
-    """Of a residual that is white in truth: nobody does better, at any noise; and x0 comes back where nothing lacks."""
+    """For a white residual no estimate is better, at any noise; and x0 comes back where nothing lacks."""
     torch.manual_seed(0)
     config = small_config()
     denoiser = Generator.from_config(config).denoiser

@@ -26,7 +26,7 @@ from tests.helpers import few_or_all
 
 FOLDER = Path(arbiview_aug.generator.__file__).with_name("weights")
 SEED = 77
-"""Of streets that training never saw: its own come from seed 0."""
+"""Seed of streets that training never saw: its own come from seed 0."""
 
 
 def test_they_are_small_and_in_half_precision() -> None:

@@ -61,7 +61,7 @@ def drive() -> SyntheticDrive:
 
 
 def assert_completed(done: dict[str, Any], seen: dict[str, Any]) -> None:
-    """What was seen is as it was, all else is marked and no longer black."""
+    """Seen pixels are unchanged, all others are marked and no longer black."""
     coverage = seen["coverage"]
     assert torch.equal(done["coverage"], coverage) and torch.equal(done["generated"], ~coverage)
     pixels = coverage[..., None, :, :].expand_as(done["images"])

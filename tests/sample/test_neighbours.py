@@ -1,4 +1,4 @@
-"""What a sample says of other frames of its drive: good ones in their places, bad ones named and left out."""
+"""Other frames of a sample's drive: good ones in their places, bad ones named and left out."""
 
 import warnings
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What trainings may believe: boxes that are seen, and feature cells that saw something real."""
+"""Boxes that are seen, and feature cells that saw something real."""
 
 from __future__ import annotations
 

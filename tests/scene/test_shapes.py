@@ -1,4 +1,4 @@
-"""What labelled boxes hold: shapes by their sizes and points, roofs that nobody saw, and holes against true ones."""
+"""Shapes in labelled boxes: by their sizes and points, roofs that nobody saw, and holes against true ones."""
 
 import cv2
 import numpy as np

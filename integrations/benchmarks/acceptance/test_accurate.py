@@ -124,7 +124,7 @@ LEAST_GAIN_DB = {("fast", "yaw"): 0.1, ("fast", "up"): -0.21, ("accurate", "yaw"
 """Over the protocol's ground renderer."""
 
 LARGEST_CAMERA_LOSS_DB = 0.4
-"""What a single camera may lose to it."""
+"""Largest loss of a single camera."""
 
 BELOW = {
     ("nuscenes-one", "fast", "up"): 2.1,
@@ -133,7 +133,7 @@ BELOW = {
     ("ddad-one", "fast", "up"): 1.4,
     ("ddad-one", "accurate", "yaw"): 0.85,
 }
-"""Where a camera is measured to lose more: the reference's wall at 40 m is right there, the street's at 20 m is not."""
+"""Measured exceptions: the reference's wall at 40 m is right there, the street's at 20 m is not."""
 
 
 @pytest.mark.parametrize("name", SETS)

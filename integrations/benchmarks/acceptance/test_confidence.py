@@ -43,7 +43,7 @@ class Pixels(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """What the bins say, the least confident first."""
+    """Figures of the bins, the least confident first."""
 
     errors: list[float]
     spearman: float

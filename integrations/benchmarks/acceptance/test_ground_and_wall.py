@@ -73,7 +73,7 @@ def scores_db(images: torch.Tensor, truth: torch.Tensor, move: str, quality: Qua
     [pytest.param(wall, marks=pytest.mark.release if wall == "circle of 40 m" else pytest.mark.slow) for wall in WALLS],
 )
 def test_never_worse(wall: str) -> None:
-    """Of every view and every quarter of one."""
+    """Figures of every view and every quarter of one."""
     images = photographs(WALLS[wall], SOURCE)
     for move, target in TARGETS.items():
         truth = photographs(WALLS[wall], target)

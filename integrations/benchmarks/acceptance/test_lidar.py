@@ -1,4 +1,4 @@
-"""What measured points are worth: on real frames against the protocol's ``ground`` renderer, and on synthetic streets.
+"""Gain by measured points: on real frames against the protocol's ``ground`` renderer, and on synthetic streets.
 
 Real frames: half resolution, exposures made even, quality ``fast``; the surface is made of the points of every other
 degree of azimuth, the others score it. Synthetic streets: how far the outlines of vehicles are from the truth, and

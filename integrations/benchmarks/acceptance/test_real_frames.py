@@ -30,7 +30,7 @@ FRAMES = [pytest.param("nuscenes-one", marks=pytest.mark.slow), pytest.param("dd
 GEOMETRIES: tuple[GeometryName, ...] = ("auto", "ground", "infinity")
 REFERENCE = "reference ground"
 LARGEST_LOSS_DB = {"yaw": 0.1, "up": 0.25, "paper": 0.1}
-"""What ``auto`` may lose to the reference, by set of targets."""
+"""Largest loss of ``auto`` to the reference, by set of targets."""
 
 Scores = dict[tuple[str, bool], dict[str, float]]
 """By (method, raw): PSNR of each set of targets."""

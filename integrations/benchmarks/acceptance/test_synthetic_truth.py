@@ -29,7 +29,7 @@ GEOMETRIES: tuple[GeometryName, ...] = ("auto", *SINGLE)
 MOVES = ("0.6 m higher", "0.5 m forward", "turned by 20°")
 GAIN_OVER_FAR_DB = 3.0
 LARGEST_LOSS_DB = 0.1
-"""What ``auto`` may lose to the best single surface on covered pixels."""
+"""Largest loss of ``auto`` to the best single surface on covered pixels."""
 
 
 class Psnr(NamedTuple):

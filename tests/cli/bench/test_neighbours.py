@@ -1,4 +1,4 @@
-"""What frames without neighbours cost: nothing."""
+"""Frames without neighbours cost nothing."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ def tree(root: Path) -> dict[str, bytes]:
 
 
 def command(source: str | Path, output: Path, *more: str) -> list[str]:
-    """What to tell ``main``, in one process without a report."""
+    """Arguments of ``main``, in one process without a report."""
     fixed = ["--size", "24x40", "--geometry", "street", "--workers", "1", "--report", "0"]
     return ["convert", "--data", str(source), "--target", "argoverse2", "--output", str(output), *fixed, *more]
 

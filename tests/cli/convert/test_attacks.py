@@ -343,7 +343,7 @@ def test_an_interrupt_is_no_samples_fault(frames: Home, monkeypatch: pytest.Monk
 
 
 def test_errors_that_nobody_expects_in_ray_actors(frames: Home, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What an actor does: Ray itself is started by the slow test."""
+    """An actor's work: Ray itself is started by the slow test."""
 
     def broken(*_: Any) -> Any:
         raise ZeroDivisionError("of \ud800")

@@ -148,7 +148,7 @@ class Range:
 
 
 def judged(status: int, output: Path, said: str) -> Verdict:
-    """What a conversion left behind, against what it says."""
+    """Compare a conversion's files with its manifest."""
     words = next((line for line in said.splitlines() if f"{COMMAND}: " in line or ": failed: " in line), said[-200:])
     finished = (output / "conversion" / "provenance.json").is_file()
     assert "Traceback" not in said, said

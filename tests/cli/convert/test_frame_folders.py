@@ -274,7 +274,7 @@ def test_a_source_that_changed_is_converted_again(
 
 
 def test_a_neighbour_that_was_mended_fills_again(source: Path, tmp_path: Path) -> None:
-    """What was converted while it could not be read is made anew: the same bytes as undisturbed."""
+    """A frame that could not be read is converted anew: the same bytes as undisturbed."""
     asked = ("--neighbours", "1", "--on-error", "skip")
     assert main(command(source, tmp_path / "whole", *asked)) == 0
     shutil.copytree(source, tmp_path / "drive")

@@ -208,7 +208,7 @@ def test_bfloat16_and_recomputed_blocks_train(tmp_path: Path, checkpointing: boo
 
 
 class GpuAutocast(TorchFunctionMode):
-    """What CUDA's autocast does in float32 and the CPU's does not, after its list of ops."""
+    """Operations that CUDA's autocast computes in float32 and the CPU's does not, after its list of ops."""
 
     WIDE = ("sum", "prod", "cumsum", "norm", "pow", "softmax", "layer_norm", "group_norm", "exp", "log", "rsqrt")
 
