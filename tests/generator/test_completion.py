@@ -186,7 +186,7 @@ def test_it_can_be_sent_to_workers(generator: Generator) -> None:
 
 
 def test_without_diffusers_the_install_command_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Calls that need diffusers say how to get it; that importing the package needs none of it, ``test_imports`` tests."""
+    """Calls that need diffusers say how to get it; ``test_imports`` tests that importing the package does not."""
     monkeypatch.setitem(sys.modules, "diffusers", None)
     with pytest.raises(ImportError, match=r"diffusers is not installed: pip install 'arbiview_aug\[generator\]'"):
         Generator.from_config(small_config())

@@ -1,4 +1,4 @@
-"""Pixels that neighbouring frames fill, against the truth of synthetic drives: how right they are, and what moved through it.
+"""Pixels that neighbouring frames fill, against the truth of synthetic drives: how right they are, and what moved.
 
 Cameras 0.6 m higher (over the street alone: at their own height), pitched down by 15 degrees and 100 degrees wide, 128
 by 352 pixels. Run with ``-s`` for the numbers.
